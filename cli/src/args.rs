@@ -269,11 +269,11 @@ pub struct Coordinator {
     /// Forget jobs this many days after their end, with their history; results stay in their stores [default: never]
     #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
-    /// Look into stores below this path or URL before results that are recorded as done count for another job (give it
-    /// again for more) [default: into none; workers look before they run]
+    /// Verify results in stores below this path or URL (give it again for more), or in none [default: in folders of this
+    /// machine; no host is asked]
     #[arg(
         long,
-        value_name = "URL",
+        value_name = "URL|none",
         env = "PICOFARM_CHECK_STORES",
         value_delimiter = ' '
     )]
@@ -353,6 +353,11 @@ pub struct Worker {
     /// End after this many seconds without work [default: never]
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=1_000_000_000))]
     pub exit_idle_s: Option<u64>,
+    /// Stop work then and give the rest back: a time such as 2026-12-01T18:00:00Z, or a duration
+    /// such as 3h 50m. The coordinator grants only what the worker can finish by then [default: a
+    /// minute before the end of the Slurm job (SLURM_JOB_END_TIME); otherwise never]
+    #[arg(long, value_name = "TIME|DURATION", env = "PICOFARM_END_AT", value_parser = crate::ends::parse)]
+    pub end_at: Option<crate::ends::EndAt>,
     /// Touch only what lies in this path or URL (give it again for more) [default: anything]
     #[arg(long, value_name = "URL", value_parser = crate::paths::place)]
     pub store_prefix: Vec<String>,

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use picofarm_agent::{Access, Bearer, Target, Trouble, lost_connection};
+use picofarm_coordinator::auth::ACCEPTED;
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
@@ -13,14 +14,46 @@ use picofarm_proto::{
     wire::{self, jobs_client::JobsClient},
 };
 use serde::Serialize;
-use tonic::{Code as Grpc, Status, service::interceptor::InterceptedService, transport::Channel};
+use tonic::{
+    Code as Grpc, Response, Status,
+    service::interceptor::InterceptedService,
+    transport::{Channel, Endpoint},
+};
 
 use crate::error::{CliError, Code, Result};
+
+/// How long a coordinator may take to complete a connection, and to give its first answer if there
+/// is another to ask.
+const CONNECT: Duration = Duration::from_secs(5);
+/// How long the last coordinator of a list may take for its first answer.
+const LAST: Duration = Duration::from_secs(15);
+/// How long a call may take that reads or steers.
+const ANSWER: Duration = Duration::from_secs(60);
+/// How long planning or submitting may take: a large job is compared with what its stores have.
+/// Meanwhile pings tell whether the coordinator lives.
+const SUBMIT: Duration = Duration::from_secs(15 * 60);
+/// How often a connection is pinged, and how long the answer may take.
+const PING: Duration = Duration::from_secs(10);
+
+type Jobs = JobsClient<InterceptedService<Channel, Bearer>>;
+
+/// Calls a method of the coordinator within a time.
+macro_rules! call {
+    ($client:ident, $within:expr, $method:ident, $request:expr) => {{
+        let request = $request;
+        $client
+            .ask($within, |mut jobs| {
+                let request = request.clone();
+                async move { jobs.$method(request).await }
+            })
+            .await?
+    }};
+}
 
 /// A connection to a coordinator's job service.
 #[derive(Clone)]
 pub struct Client {
-    jobs: JobsClient<InterceptedService<Channel, Bearer>>,
+    jobs: Jobs,
     /// The coordinator in use, and all there are.
     url: String,
     urls: String,
@@ -69,62 +102,55 @@ fn required<T>(value: Option<T>, field: &'static str) -> Result<T> {
 }
 
 impl Client {
-    /// Connects to the first coordinator that answers, of a list of URLs with commas between them; each gets five
-    /// seconds.
+    /// Connects to the first coordinator that answers, of a list of URLs with commas between them.
     pub async fn connect(urls: &str, access: &Access) -> Result<Self> {
-        let mut first = None;
-        for url in urls.split(',') {
-            match Self::connect_to(url.trim(), access).await {
-                Ok(client) => {
-                    return Ok(Self {
-                        urls: urls.to_owned(),
-                        ..client
-                    });
-                }
-                Err(error) => first = first.or(Some(error)),
-            }
-        }
-        Err(first.expect("a text has at least one part between commas"))
-    }
-
-    async fn connect_to(url: &str, access: &Access) -> Result<Self> {
-        let target = access
-            .target(url)
-            .map_err(|e| CliError::input(format!("coordinator: {e}")))?;
-        let endpoint = target.endpoint.clone();
-        let connected = endpoint
-            .connect_timeout(Duration::from_secs(5))
-            .connect()
-            .await;
-        let channel = match connected {
-            Ok(channel) => channel,
-            Err(e) => return Err(no_connection(&target, url, &e).await),
-        };
-        let jobs = JobsClient::with_interceptor(channel, target.bearer.clone())
-            .max_decoding_message_size(64 << 20);
-        let mut client = Self {
-            jobs,
+        let all: Vec<_> = urls.split(',').map(str::trim).collect();
+        let (client, url) = first_that_answers(&all, access).await?;
+        Ok(Self {
+            jobs: client,
             url: url.to_owned(),
-            urls: url.to_owned(),
+            urls: urls.to_owned(),
             access: access.clone(),
-        };
-        // A client certificate is refused only after the handshake, and plain HTTP by a TLS port only when it is spoken:
-        // the first call tells.
-        let asked = client
-            .jobs
-            .get_server_info(wire::GetServerInfoRequest {})
-            .await;
-        if let Err(status) = asked
-            && lost_connection(&status)
-        {
-            return Err(no_connection(&target, url, &status).await);
-        }
-        Ok(client)
+        })
     }
 
     /// Connects again.
     pub async fn reconnect(&self) -> Result<Self> {
         Self::connect(&self.urls, &self.access).await
+    }
+
+    /// The answer to a call within a time. If a coordinator is silent and there are others, the
+    /// first of them that answers is asked and used from then on: every call has the same effect
+    /// once and twice.
+    async fn ask<T, F>(&mut self, within: Duration, call: impl Fn(Jobs) -> F) -> Result<T>
+    where
+        F: Future<Output = std::result::Result<Response<T>, Status>>,
+    {
+        let others = self.urls.split(',').map(str::trim);
+        let others: Vec<_> = others.filter(|url| *url != self.url).collect();
+        let mut silent = match answer(within, call(self.jobs.clone())).await {
+            Ok(reply) => return Ok(reply),
+            Err(NoAnswer::Unavailable(error)) if others.is_empty() => return Err(error),
+            Err(error) => vec![(self.url.as_str(), error.silence()?)],
+        };
+        for url in others {
+            let jobs = match connect_to(url, &self.access, CONNECT).await {
+                Ok(jobs) => jobs,
+                Err(error) => {
+                    silent.push((url, error.silence()?));
+                    continue;
+                }
+            };
+            match answer(within, call(jobs.clone())).await {
+                Ok(reply) => {
+                    tracing::warn!("{} is asked from now on: {}", url, list(&silent));
+                    (self.jobs, self.url) = (jobs, url.to_owned());
+                    return Ok(reply);
+                }
+                Err(error) => silent.push((url, error.silence()?)),
+            }
+        }
+        Err(none_answers(&silent))
     }
 
     pub fn url(&self) -> &str {
@@ -133,12 +159,7 @@ impl Client {
 
     /// (version, protocol, workers connected).
     pub async fn server(&mut self) -> Result<(String, u32, u32)> {
-        let info = self
-            .jobs
-            .get_server_info(wire::GetServerInfoRequest {})
-            .await
-            .map_err(|s| refused(&s))?
-            .into_inner();
+        let info = call!(self, ANSWER, get_server_info, wire::GetServerInfoRequest {});
         Ok((info.version, info.protocol, info.workers))
     }
 
@@ -146,10 +167,8 @@ impl Client {
         let request = wire::PlanJobRequest {
             spec: Some(spec.into()),
         };
-        let reply = self.jobs.plan_job(request).await.map_err(|s| refused(&s))?;
-        required(reply.into_inner().plan, "plan")?
-            .try_into()
-            .map_err(unreadable)
+        let reply = call!(self, SUBMIT, plan_job, request);
+        required(reply.plan, "plan")?.try_into().map_err(unreadable)
     }
 
     pub async fn submit(&mut self, spec: JobSpec, again: bool) -> Result<Submitted> {
@@ -157,12 +176,7 @@ impl Client {
             spec: Some(spec.into()),
             again,
         };
-        let reply = self
-            .jobs
-            .submit_job(request)
-            .await
-            .map_err(|s| refused(&s))?
-            .into_inner();
+        let reply = call!(self, SUBMIT, submit_job, request);
         Ok(Submitted {
             job: reply.job_id.parse().map_err(|e| {
                 unreadable(ConvertError::Invalid {
@@ -188,8 +202,7 @@ impl Client {
             user: ask.user.unwrap_or_default().into(),
             find: ask.find.unwrap_or_default().into(),
         };
-        let reply = self.jobs.list_jobs(request).await;
-        let reply = reply.map_err(|s| refused(&s))?.into_inner();
+        let reply = call!(self, ANSWER, list_jobs, request);
         let jobs = reply.jobs.into_iter();
         let jobs = jobs.map(|j| j.try_into().map_err(unreadable));
         let next = Some(reply.next_page_token).filter(|token| !token.is_empty());
@@ -200,10 +213,8 @@ impl Client {
         let request = wire::GetJobRequest {
             job_id: job.to_string(),
         };
-        let reply = self.jobs.get_job(request).await.map_err(|s| refused(&s))?;
-        required(reply.into_inner().job, "job")?
-            .try_into()
-            .map_err(unreadable)
+        let reply = call!(self, ANSWER, get_job, request);
+        required(reply.job, "job")?.try_into().map_err(unreadable)
     }
 
     /// Finds the one job whose id begins with `text`.
@@ -237,38 +248,22 @@ impl Client {
         let request = wire::WatchJobRequest {
             job_id: job.to_string(),
         };
-        let stream = self
-            .jobs
-            .watch_job(request)
-            .await
-            .map_err(|s| refused(&s))?;
-        Ok(Watch(stream.into_inner()))
+        Ok(Watch(call!(self, ANSWER, watch_job, request)))
     }
 
     pub async fn cancel(&mut self, job: JobId) -> Result<JobStatus> {
         let request = wire::CancelJobRequest {
             job_id: job.to_string(),
         };
-        let reply = self
-            .jobs
-            .cancel_job(request)
-            .await
-            .map_err(|s| refused(&s))?;
-        required(reply.into_inner().job, "job")?
-            .try_into()
-            .map_err(unreadable)
+        let reply = call!(self, ANSWER, cancel_job, request);
+        required(reply.job, "job")?.try_into().map_err(unreadable)
     }
 
     pub async fn retry(&mut self, job: JobId) -> Result<u64> {
         let request = wire::RetryJobRequest {
             job_id: job.to_string(),
         };
-        let reply = self
-            .jobs
-            .retry_job(request)
-            .await
-            .map_err(|s| refused(&s))?;
-        Ok(reply.into_inner().retried)
+        Ok(call!(self, ANSWER, retry_job, request).retried)
     }
 
     /// Holds a job, or lets it go on.
@@ -277,13 +272,11 @@ impl Client {
         let status = match paused {
             true => {
                 let request = wire::PauseJobRequest { job_id };
-                let reply = self.jobs.pause_job(request).await;
-                reply.map_err(|s| refused(&s))?.into_inner().job
+                call!(self, ANSWER, pause_job, request).job
             }
             false => {
                 let request = wire::ResumeJobRequest { job_id };
-                let reply = self.jobs.resume_job(request).await;
-                reply.map_err(|s| refused(&s))?.into_inner().job
+                call!(self, ANSWER, resume_job, request).job
             }
         };
         required(status, "job")?.try_into().map_err(unreadable)
@@ -294,8 +287,7 @@ impl Client {
         let request = wire::DrainWorkerRequest {
             worker: worker.to_owned(),
         };
-        let reply = self.jobs.drain_worker(request).await;
-        Ok(reply.map_err(|s| refused(&s))?.into_inner().workers)
+        Ok(call!(self, ANSWER, drain_worker, request).workers)
     }
 
     /// A job's events after a sequence number, at most a thousand.
@@ -328,12 +320,7 @@ impl Client {
             newest: page.newest,
             logs: page.logs,
         };
-        let reply = self
-            .jobs
-            .list_events(request)
-            .await
-            .map_err(|s| refused(&s))?
-            .into_inner();
+        let reply = call!(self, ANSWER, list_events, request);
         let events = reply.events.into_iter().map(TryInto::try_into);
         let events = events.collect::<Result<_, _>>().map_err(unreadable)?;
         Ok((events, reply.ended))
@@ -351,12 +338,7 @@ impl Client {
             stage,
             task,
         };
-        let reply = self
-            .jobs
-            .explain_job(request)
-            .await
-            .map_err(|s| refused(&s))?
-            .into_inner();
+        let reply = call!(self, ANSWER, explain_job, request);
         Ok(Explained {
             job: required(reply.job, "job")?.try_into().map_err(unreadable)?,
             reasons: reply.reasons.into_iter().map(Into::into).collect(),
@@ -382,20 +364,14 @@ impl Client {
             who: who.unwrap_or_default().to_owned(),
             job_id: job.map(|job| job.to_string()).unwrap_or_default(),
         };
-        let reply = self.jobs.list_audit(request).await;
-        let entries = reply.map_err(|s| refused(&s))?.into_inner().entries;
+        let entries = call!(self, ANSWER, list_audit, request).entries;
         let entries = entries.into_iter().map(TryInto::try_into);
         entries.collect::<Result<_, _>>().map_err(unreadable)
     }
 
     /// The workers connected to the coordinator that answers.
     pub async fn workers(&mut self) -> Result<Workers> {
-        let reply = self
-            .jobs
-            .list_workers(wire::ListWorkersRequest {})
-            .await
-            .map_err(|s| refused(&s))?
-            .into_inner();
+        let reply = call!(self, ANSWER, list_workers, wire::ListWorkersRequest {});
         Ok(Workers {
             coordinator: reply.coordinator,
             workers: reply.workers.into_iter().map(Into::into).collect(),
@@ -457,19 +433,211 @@ pub struct Workers {
     pub coordinators: u32,
 }
 
+/// Why a coordinator gave no answer that can be used.
+enum NoAnswer {
+    /// It refused: another one would do the same.
+    Refused(CliError),
+    /// It, or the connection to it, reported that it cannot answer; another one may.
+    Unavailable(CliError),
+    /// It was silent or away; another one may answer.
+    Silent(CliError),
+}
+
+impl NoAnswer {
+    fn silent(did: impl std::fmt::Display, hint: &str) -> Self {
+        Self::Silent(CliError::new(Code::Coordinator, did).hint(hint))
+    }
+
+    /// What a silent coordinator did.
+    ///
+    /// # Errors
+    /// It refused.
+    fn silence(self) -> Result<CliError> {
+        match self {
+            Self::Refused(error) => Err(error),
+            Self::Unavailable(error) | Self::Silent(error) => Ok(error),
+        }
+    }
+}
+
+/// The answer, within a time.
+async fn answer<T>(
+    within: Duration,
+    call: impl Future<Output = std::result::Result<Response<T>, Status>>,
+) -> Result<T, NoAnswer> {
+    match tokio::time::timeout(within, call).await {
+        Ok(Ok(reply)) => Ok(reply.into_inner()),
+        Ok(Err(status)) if lost_connection(&status) || status.code() == Grpc::Unavailable => {
+            Err(NoAnswer::Unavailable(refused(&status)))
+        }
+        Ok(Err(status)) => Err(NoAnswer::Refused(refused(&status))),
+        Err(_) => Err(NoAnswer::silent(
+            format!("it did not answer within {} s", within.as_secs()),
+            "it may be frozen or overloaded: see its log and /healthz, then run the same command again",
+        )),
+    }
+}
+
+/// "URL (what it did)" of each.
+fn list(silent: &[(&str, CliError)]) -> String {
+    let each = silent
+        .iter()
+        .map(|(url, error)| format!("{url} ({})", error.message));
+    each.collect::<Vec<_>>().join(", ")
+}
+
+/// The error of a command that no coordinator answers.
+fn none_answers(silent: &[(&str, CliError)]) -> CliError {
+    let error = CliError::new(
+        Code::Coordinator,
+        format!("no coordinator answers at {}", list(silent)),
+    );
+    CliError {
+        hint: silent.first().and_then(|(_, error)| error.hint.clone()),
+        ..error
+    }
+}
+
+/// The first of these coordinators that answers.
+///
+/// # Errors
+/// One cannot be asked with these settings; or none answers: what each of them did.
+async fn first_that_answers<'a>(urls: &[&'a str], access: &Access) -> Result<(Jobs, &'a str)> {
+    let (mut silent, mut wrong) = (Vec::new(), None);
+    for (i, url) in urls.iter().enumerate() {
+        // The last one is waited for longer: there is no other to ask.
+        let within = match i + 1 == urls.len() {
+            true => LAST,
+            false => CONNECT,
+        };
+        match connect_to(url, access, within).await {
+            Ok(jobs) => return Ok((jobs, *url)),
+            Err(no) => match no.silence() {
+                Ok(error) => silent.push((*url, error)),
+                // A wrong setting for one coordinator does not stop another from answering.
+                Err(error) => {
+                    wrong.get_or_insert(error);
+                }
+            },
+        }
+    }
+    let Some(wrong) = wrong else {
+        return Err(none_answers(&silent));
+    };
+    let message = match silent.is_empty() {
+        true => wrong.message,
+        false => format!(
+            "{}; no coordinator answers at {}",
+            wrong.message,
+            list(&silent)
+        ),
+    };
+    Err(CliError { message, ..wrong })
+}
+
+/// Connects to one coordinator and waits for its first answer, each within a time.
+async fn connect_to(url: &str, access: &Access, within: Duration) -> Result<Jobs, NoAnswer> {
+    let target = access
+        .target(url)
+        .map_err(|e| NoAnswer::Refused(CliError::input(format!("coordinator: {e}"))))?;
+    let endpoint = lively(target.endpoint.clone()).connect_timeout(CONNECT);
+    let channel = match tokio::time::timeout(CONNECT, endpoint.connect()).await {
+        Ok(Ok(channel)) => channel,
+        Ok(Err(e)) => return Err(no_connection(&target, &e).await),
+        Err(_) => return Err(mute("it did not complete the connection", CONNECT)),
+    };
+    let mut jobs = JobsClient::with_interceptor(channel, target.bearer.clone())
+        .max_decoding_message_size(64 << 20);
+    // A client certificate is refused only after the handshake, and plain HTTP by a TLS port only
+    // when it is spoken: the first call tells.
+    let first = jobs.get_server_info(wire::GetServerInfoRequest {});
+    match tokio::time::timeout(within, first).await {
+        Ok(Err(status)) if lost_connection(&status) => Err(no_connection(&target, &status).await),
+        Ok(_) => Ok(jobs),
+        Err(_) => Err(mute("it took the connection and did not answer", within)),
+    }
+}
+
+/// With pings, so that a connection to a coordinator that is frozen or gone ends.
+fn lively(endpoint: Endpoint) -> Endpoint {
+    endpoint
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(PING)
+        .keep_alive_timeout(PING)
+        .keep_alive_while_idle(true)
+}
+
+fn down(did: impl std::fmt::Display) -> NoAnswer {
+    NoAnswer::silent(
+        did,
+        "start one with `picofarm up`, or name another with --coordinator or PICOFARM_COORDINATOR",
+    )
+}
+
+fn mute(did: &str, within: Duration) -> NoAnswer {
+    down(format!("{did} within {} s", within.as_secs()))
+}
+
 /// Why there is no connection.
 async fn no_connection(
     target: &Target,
-    url: &str,
     error: &(dyn std::error::Error + Send + Sync + 'static),
-) -> CliError {
-    match target.trouble(error).await {
-        Trouble::Mismatch(what) => CliError::new(Code::Coordinator, what),
-        Trouble::Down(_) => {
-            CliError::new(Code::Coordinator, format!("no coordinator answers at {url}")).hint(
-                "start one with `picofarm up`, or name another with --coordinator or PICOFARM_COORDINATOR",
-            )
+) -> NoAnswer {
+    match tokio::time::timeout(CONNECT, target.trouble(error)).await {
+        Ok(Trouble::Mismatch(what)) => NoAnswer::Refused(CliError::new(Code::Coordinator, what)),
+        Ok(Trouble::Down(why)) => down(why),
+        Err(_) => mute("it did not complete the connection", CONNECT),
+    }
+}
+
+/// What a coordinator says about a proof.
+pub enum Standing {
+    /// It lets callers with this proof in, for this reason.
+    Accepted(String),
+    /// It does not.
+    Refused(String),
+    /// It cannot be asked.
+    Unknown(String),
+}
+
+/// Asks the coordinator at `url` whether a proof is accepted: `proof` is the SHA-256 of a token, or
+/// the name in a client certificate, with the scheme before it.
+pub async fn standing(url: &str, access: &Access, proof: &str) -> Standing {
+    let words = |no: NoAnswer| no.silence().unwrap_or_else(|refused| refused).message;
+    // The question is not the caller's: its own token stays here.
+    let asker = Access {
+        token: None,
+        ..access.clone()
+    };
+    let ask = async {
+        let target = asker.target(url).map_err(|e| e.to_string())?;
+        let bearer = Bearer::plain(proof).map_err(|e| e.to_string())?;
+        let endpoint = lively(target.endpoint.clone()).connect_timeout(CONNECT);
+        let channel = match endpoint.connect().await {
+            Ok(channel) => channel,
+            Err(e) => return Err(words(no_connection(&target, &e).await)),
+        };
+        let mut jobs = JobsClient::with_interceptor(channel, bearer);
+        match jobs.get_server_info(wire::GetServerInfoRequest {}).await {
+            Ok(_) => Ok(Standing::Accepted("it asks nobody for a token".into())),
+            Err(status) => match status.metadata().get(ACCEPTED).map(|v| v.as_bytes()) {
+                Some(b"yes") => Ok(Standing::Accepted(status.message().to_owned())),
+                Some(b"no") => Ok(Standing::Refused(status.message().to_owned())),
+                _ if lost_connection(&status) => Err(words(no_connection(&target, &status).await)),
+                _ => Err(format!(
+                    "it is of a version that does not answer this question ({})",
+                    status.message()
+                )),
+            },
         }
+    };
+    match tokio::time::timeout(2 * CONNECT, ask).await {
+        Ok(Ok(standing)) => standing,
+        Ok(Err(why)) => Standing::Unknown(why),
+        Err(_) => Standing::Unknown(format!(
+            "it did not answer within {} s",
+            (2 * CONNECT).as_secs()
+        )),
     }
 }
 
@@ -487,5 +655,38 @@ impl Watch {
                 .map_err(unreadable),
             Err(status) => Err(refused(&status)),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_coordinator_that_takes_connections_and_never_answers_is_left() {
+        let mute = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let mute = format!("http://{}", mute.local_addr().unwrap());
+        let soon = Duration::from_millis(100);
+        let Err(no) = connect_to(&mute, &Access::default(), soon).await else {
+            panic!("nobody answers");
+        };
+        let said = no.silence().map(|error| error.message).unwrap();
+        assert!(
+            said.contains("took the connection and did not answer"),
+            "{said}"
+        );
+        let never = std::future::pending::<std::result::Result<Response<()>, Status>>();
+        let Err(no) = answer(soon, never).await else {
+            panic!("nobody answers");
+        };
+        let silent = [
+            ("http://a", no.silence().unwrap()),
+            ("http://b", CliError::input("x")),
+        ];
+        let error = none_answers(&silent);
+        assert_eq!(error.code, Code::Coordinator);
+        let said =
+            "no coordinator answers at http://a (it did not answer within 0 s), http://b (x)";
+        assert_eq!(error.message, said);
     }
 }

@@ -177,7 +177,7 @@ fn store_and_folder(place: &str) -> Result<(String, String)> {
 /// What the failure of a task means for a command that runs it here.
 pub fn task_failed(error: TaskError) -> CliError {
     let (code, hint) = match &error {
-        TaskError::User(_) => (Code::Input, None),
+        TaskError::User(_) | TaskError::Damaged(_) => (Code::Input, None),
         TaskError::Crash(_) => (Code::Failed, None),
         TaskError::Interrupted(_) | TaskError::Store(_) => (
             Code::Resource,

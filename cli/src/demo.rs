@@ -27,6 +27,7 @@ use crate::{
     jobfile,
     local::Local,
     output::{Output, bytes},
+    reach::{self, Identity},
     roles::{self, Guarded},
     settings::Settings,
     signals,
@@ -104,7 +105,8 @@ async fn submit(
     output: Output,
 ) -> Result<(RenderTask, JobSpec, Submitted)> {
     if !taken(&task).await? {
-        let first = asked.job(&task)?;
+        let mut first = asked.job(&task)?;
+        reach::identify(&mut first, Identity::Create, output).await;
         match client.submit(first.clone(), false).await {
             Ok(submitted) => return Ok((task, first, submitted)),
             // A job of other settings was to write there, and made nothing yet.
@@ -120,7 +122,8 @@ async fn submit(
          go to {}",
         place(&task)
     ));
-    let own = asked.job(&task)?;
+    let mut own = asked.job(&task)?;
+    reach::identify(&mut own, Identity::Create, output).await;
     let submitted = client.submit(own.clone(), false).await?;
     Ok((task, own, submitted))
 }

@@ -4,14 +4,14 @@ use std::collections::BTreeSet;
 
 use picofarm_proto::{
     model::{
-        Event, JobPlan, JobSpec, JobStatus, StagePlan,
+        Estimate, Event, JobPlan, JobSpec, JobStatus, StagePlan,
         matrix::{same_matrix, together},
         memory::gib,
     },
     show,
 };
 
-use crate::output::{duration, table};
+use crate::output::{bytes, duration, table};
 
 pub fn describe_plan(plan: &JobPlan) -> String {
     let mut text = format!(
@@ -48,9 +48,58 @@ pub fn describe_plan(plan: &JobPlan) -> String {
             );
             text += &format!("{indent}each takes {each} {most} of memory\n");
         }
+        text += &cost(stages, indent);
     }
     if let Some(job) = plan.existing_job {
         text += &format!("  job {job} has this exact spec\n");
+    }
+    for warning in &plan.warnings {
+        text += &format!("  warning: {}\n", show::line(warning));
+    }
+    text
+}
+
+/// How long the tasks of a group of stages take and how much they store, as far as it can be told.
+fn cost(stages: &[StagePlan], indent: &str) -> String {
+    let running = || stages.iter().filter(|stage| stage.run > 0);
+    let sum = |each: &dyn Fn(&StagePlan) -> Option<Estimate>| {
+        running().try_fold(
+            Estimate {
+                low: 0.0,
+                high: 0.0,
+            },
+            |sum, stage| Some(sum.plus(each(stage)?)),
+        )
+    };
+    if running().next().is_none() {
+        return String::new();
+    }
+    let basis = match running().all(|stage| stage.measured) {
+        true => "from earlier tasks of this farm",
+        false => "a rule of thumb, since no task like these has run on this farm",
+    };
+    let workers = running().map(|stage| stage.workers).min().unwrap_or(0);
+    let at_once = |stage: &StagePlan| stage.run.min(u64::from(stage.workers.max(1))) as f64;
+    let time = sum(&|stage| Some(stage.task_seconds?.times(stage.run as f64 / at_once(stage))));
+    let mut text = String::new();
+    if let Some(time) = time {
+        let on = match workers {
+            0 => "on one worker, if it were there".to_owned(),
+            1 => "on 1 worker".to_owned(),
+            n => format!("on {n} workers"),
+        };
+        text += &format!(
+            "{indent}takes {} to {} {on} ({basis})\n",
+            duration(time.low),
+            duration(time.high)
+        );
+    }
+    if let Some(stored) = sum(&|stage| Some(stage.task_bytes?.times(stage.run as f64))) {
+        text += &format!(
+            "{indent}stores {} to {}\n",
+            bytes(stored.low as u64),
+            bytes(stored.high as u64)
+        );
     }
     text
 }
@@ -88,6 +137,17 @@ pub fn state(status: &JobStatus) -> String {
     }
 }
 
+/// A line about results that the coordinator has not found in their store.
+pub fn unverified(s: &JobStatus) -> String {
+    match s.unverified {
+        0 => String::new(),
+        n => format!(
+            "  {n} results are reported by workers and not verified in their store by the coordinator (`picofarm job plan` \
+             with the same job file says why)\n"
+        ),
+    }
+}
+
 pub fn describe(s: &JobStatus) -> String {
     let mut text = format!(
         "job {} \"{}\": {}\n  {}\n",
@@ -96,6 +156,7 @@ pub fn describe(s: &JobStatus) -> String {
         state(s),
         counts(s)
     );
+    text += &unverified(s);
     if let Some(mean) = s.mean_task_seconds {
         text += &format!("  {} a task on average\n", duration(mean));
     }
@@ -273,6 +334,10 @@ mod tests {
             reuse,
             run: 1 - reuse,
             memory_bytes,
+            workers: 1,
+            task_seconds: None,
+            task_bytes: None,
+            measured: false,
             reasons: reasons.iter().map(|r| (*r).to_owned()).collect(),
         };
         let stages = vec![
@@ -291,6 +356,7 @@ mod tests {
             run: 4,
             existing_job: None,
             stages,
+            warnings: vec!["stage last: render.error = 0.1 %".into()],
         };
         let text = "7 tasks: 3 reuse, 4 run
   split (train): 1 reuse, 0 run
@@ -305,6 +371,7 @@ mod tests {
   last (train): 0 reuse, 1 run
     old
     new
+  warning: stage last: render.error = 0.1 %
 ";
         assert_eq!(describe_plan(&plan), text);
         let names = ["rooms", "tof[1]", "tof[2]", "shadow[1]"].map(str::to_owned);

@@ -4,6 +4,8 @@ use std::fmt;
 
 use picofarm_proto::show;
 
+use crate::output::tell;
+
 /// Exit codes, as listed in `picofarm --help`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
@@ -53,11 +55,11 @@ impl CliError {
         if json {
             let error = serde_json::json!({"error": {
                 "code": self.code as u8, "message": self.message, "hint": self.hint}});
-            eprintln!("{}", show::json(&error.to_string()));
+            tell(show::json(&error.to_string()));
         } else {
-            eprintln!("{}", marked("error: ", &self.message));
+            tell(marked("error: ", &self.message));
             if let Some(hint) = &self.hint {
-                eprintln!("{}", marked("hint: ", hint));
+                tell(marked("hint: ", hint));
             }
         }
         self.code as u8

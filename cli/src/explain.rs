@@ -28,13 +28,15 @@ pub fn describe(explained: &Explained) -> String {
         return text;
     };
     text += &format!("task {}: {}\n", task.index, show::line(&task.words));
-    if task.failures + task.crashes > 0 {
+    if task.failures + task.crashes + task.interruptions > 0 {
         text += &format!(
-            "  {} of {} failures and {} of {} lost workers before it is given up; the last: {}\n",
+            "  {} of {} failures, {} of {} lost workers and {} of {} interruptions before it is given up; the last: {}\n",
             task.failures,
             task.max_failures,
             task.crashes,
             task.max_crashes,
+            task.interruptions,
+            task.max_interruptions,
             show::line(&task.last_error)
         );
     }
@@ -98,10 +100,9 @@ fn describe_workers(all: &Workers) -> String {
         let header =
             ["worker", "version", "cores", "leases", "tasks", "since", ""].map(String::from);
         let rows = all.workers.iter().map(|w| {
-            let note = if w.quarantined {
-                "on probation: its range crashed others"
-            } else {
-                ""
+            let note = match w.quarantined {
+                true if w.note.is_empty() => "on probation: its range crashed others",
+                _ => &*w.note,
             };
             vec![
                 w.name.clone(),

@@ -180,9 +180,15 @@ pub fn verdict(status: &JobStatus) -> Result<()> {
                 status.id
             ),
         ),
-        JobState::Cancelled => failed(
-            "was cancelled",
-            "submit its file again with --again: what is done is reused".into(),
-        ),
+        JobState::Cancelled => match status.passed_deadline() {
+            Some(deadline) => failed(
+                &format!("was cancelled as its deadline passed (limits.deadline = {deadline:?})"),
+                "set a later limits.deadline in its file, or none, and submit it again: what is done is reused".into(),
+            ),
+            None => failed(
+                "was cancelled",
+                "submit its file again with --again: what is done is reused".into(),
+            ),
+        },
     }
 }

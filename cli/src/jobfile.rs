@@ -9,7 +9,10 @@ use picofarm_proto::{
     show,
 };
 
-use crate::error::{CliError, Result, io};
+use crate::{
+    error::{CliError, Result},
+    files,
+};
 
 /// Reads a job file and pins everything a submission needs but the number of scenes of data sets that exist.
 #[cfg(test)]
@@ -24,7 +27,7 @@ fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
 }
 
 fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
-    let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
+    let text = files::read_text(path, files::LISTS)?;
     let failed = |e: &dyn std::fmt::Display| {
         let what = show::suggest(e.to_string().trim_end());
         CliError::input(format!("{}: {what}", path.display()))

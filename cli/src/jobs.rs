@@ -3,6 +3,7 @@
 mod dark;
 mod finish;
 mod submit;
+mod verdicts;
 
 use std::{
     path::{Path, PathBuf},
@@ -28,7 +29,7 @@ use crate::{
     follow::{Show, follow},
     jobfile, listing,
     output::Output,
-    reach,
+    reach::{self, Identity},
     settings::Settings,
     tail,
 };
@@ -37,7 +38,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
     if let Job::Init { file, kind } = &command {
         return init(file.as_deref(), *kind, output);
     }
-    let spec = match &command {
+    let mut spec = match &command {
         Job::Plan { file, scale } => {
             Some(jobfile::read_counted(file, scale.as_deref(), &settings.assets).await?)
         }
@@ -54,16 +55,32 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         _ => None,
     };
-    if let Some(spec) = &spec {
+    if let Some(spec) = &mut spec {
         reach::warn_of_stores(spec, output).await;
+        let submits = matches!(
+            command,
+            Job::Submit {
+                only_failed: false,
+                ..
+            }
+        );
+        let identity = match submits {
+            true => Identity::Create,
+            false => Identity::Read,
+        };
+        reach::identify(spec, identity, output).await;
     }
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     match command {
         Job::Init { .. } => Ok(()),
         Job::Plan { .. } => {
-            let plan = client.plan(spec.expect("read above")).await?;
+            let spec = spec.expect("read above");
+            let plan = client.plan(spec.clone()).await?;
             let twin = submit::twin(&mut client, &plan).await;
             output.result(&plan, || describe_plan(&plan) + &twin);
+            for line in reach::there(&spec, &plan).await {
+                output.warn(format!("note: {line}"));
+            }
             Ok(())
         }
         Job::Submit {

@@ -14,14 +14,17 @@ pub mod dataset;
 mod demo;
 mod describe;
 mod doctor;
+pub mod ends;
 pub mod error;
 mod explain;
+mod files;
 pub mod follow;
 mod groups;
 pub mod jobfile;
 mod jobs;
 mod listing;
 pub mod local;
+mod logging;
 mod model;
 pub mod output;
 mod pace;
@@ -49,7 +52,12 @@ mod traces;
 #[path = "without_traces.rs"]
 mod traces;
 
-use std::{future::Future, io::Write, pin::Pin, process::ExitCode};
+use std::{
+    future::Future,
+    io::{ErrorKind, Write},
+    pin::Pin,
+    process::ExitCode,
+};
 
 use tracing_subscriber::{Layer, prelude::*};
 
@@ -74,11 +82,25 @@ pub fn run_program(bench: Option<Bench>) -> ExitCode {
     rustls::crypto::ring::default_provider()
         .install_default()
         .expect("nothing has chosen one before main");
-    let cli = args::parse(std::env::args_os()).unwrap_or_else(|e| e.exit());
+    let cli = match args::parse(std::env::args_os()) {
+        Ok(cli) => cli,
+        Err(asked) => return usage(&asked),
+    };
     let json = cli.global.json;
     match start(cli, bench) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => ExitCode::from(e.report(json)),
+    }
+}
+
+/// Prints help, the version, or what is wrong with the arguments.
+fn usage(asked: &clap::Error) -> ExitCode {
+    let printed = asked.print().and_then(|()| std::io::stdout().flush());
+    match printed {
+        Err(e) if !asked.use_stderr() && e.kind() != ErrorKind::BrokenPipe => {
+            ExitCode::from(error::io("standard output", &e).report(false))
+        }
+        _ => ExitCode::from(u8::try_from(asked.exit_code()).unwrap_or(2)),
     }
 }
 
@@ -101,8 +123,10 @@ fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
             .map(|(url, service)| Traces::start(url, service))
             .transpose()?
     };
-    log(&resolved.settings.log, traces.as_ref())?;
-    let ended = runtime.block_on(run(cli.command, &resolved, output, bench));
+    let _last_lines = log(&resolved.settings.log, traces.as_ref())?;
+    let ended = runtime
+        .block_on(run(cli.command, &resolved, output, bench))
+        .and_then(|()| output::printed());
     if let Some(traces) = traces {
         traces.end();
     }
@@ -123,7 +147,7 @@ fn local_worker() -> Result<()> {
             .map(|url| Traces::start(url, "picofarm-worker"))
             .transpose()?
     };
-    log(&order.settings.log, traces.as_ref())?;
+    let _last_lines = log(&order.settings.log, traces.as_ref())?;
     picofarm_dataset::limit_bandwidth(order.settings.bandwidth()?);
     let ended = runtime.block_on(local::serve(order));
     if let Some(traces) = traces {
@@ -161,7 +185,7 @@ async fn run(
         Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Reconstruct(args) => reconstruct::run(args, output).await,
-        Command::Token(command) => token::run(command, output),
+        Command::Token(command) => token::run(command, resolved, output).await,
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,
         Command::Bench(command) => match bench {
@@ -176,8 +200,7 @@ async fn run(
         Command::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut args::command(), "picofarm", &mut script);
-            // A closed pipe (`| head`) is not an error worth a message.
-            let _ = std::io::stdout().write_all(&script);
+            output::print(&script);
             Ok(())
         }
     }
@@ -214,7 +237,7 @@ fn show_settings(resolved: &Resolved, output: Output) {
 }
 
 /// Log lines go to stderr, those of tasks also to their coordinator, and spans to a collector, if one is named.
-fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
+fn log(filter: &str, traces: Option<&Traces>) -> Result<logging::Flush> {
     // A driver that has nothing to list is no error.
     let filter = match filter.contains("wgpu") {
         true => filter.to_owned(),
@@ -224,9 +247,11 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
             .hint("e.g. --log info, or --log picofarm_agent=debug")
     })?;
+    let started = logging::LogLines::start(std::io::stderr());
+    let (lines, last_lines) = started.map_err(|e| error::io("cannot start a thread", &e))?;
     // Without colours: what is written is escaped as a whole, since lines may quote what others wrote.
     let stderr = tracing_subscriber::fmt::layer()
-        .with_writer(|| output::Escaped(std::io::stderr()))
+        .with_writer(move || output::Escaped(lines.clone()))
         .with_ansi(false)
         .with_filter(filter);
     tracing_subscriber::registry()
@@ -234,7 +259,7 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
         .with(picofarm_agent::task_logs())
         .with(traces.map(Traces::layer))
         .init();
-    Ok(())
+    Ok(last_lines)
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ use std::{
     path::Path,
 };
 
-use picofarm_dataset::{Checkpoint, Evaluation, ModelManifest, Models, open_store};
+use picofarm_dataset::{Checkpoint, Evaluation, ModelManifest, Models, Verdict, open_store};
 use picofarm_proto::show;
 use serde_json::{Value, json};
 
@@ -108,6 +108,11 @@ async fn list(store: &str, output: Output) -> Result<()> {
         let checkpoints = models.checkpoints(&name).await.map_err(failed)?;
         // A folder may hold evaluations, notes or a killed training's objects alone.
         if manifest.is_some() || !checkpoints.is_empty() {
+            let verdict = match &manifest {
+                Some(manifest) => Some(verdict(&models, manifest).await?),
+                None => None,
+            };
+            let manifest = manifest.zip(verdict);
             found.push((name, manifest, furthest(&checkpoints)));
         }
     }
@@ -117,8 +122,9 @@ async fn list(store: &str, output: Output) -> Result<()> {
     let document: Vec<Value> = found
         .iter()
         .map(|(name, manifest, step)| match manifest {
-            Some(m) => json!({"name": name, "finished": true, "kind": m.kind, "metrics": m.metrics,
-                              "dataset": m.lineage.dataset, "bytes": m.total_bytes(), "code": m.lineage.code}),
+            Some((m, verdict)) => json!({"name": name, "finished": true, "kind": m.kind, "metrics": m.metrics,
+                              "dataset": m.lineage.dataset, "bytes": m.total_bytes(), "code": m.lineage.code,
+                              "verdict": verdict}),
             None => json!({"name": name, "finished": false, "step": step}),
         })
         .collect();
@@ -126,7 +132,7 @@ async fn list(store: &str, output: Output) -> Result<()> {
         let header = ["name", "predicts", "trained on", "size", "figures"];
         let header = header.map(str::to_owned).to_vec();
         let rows = found.iter().map(|(name, manifest, step)| match manifest {
-            Some(m) => vec![
+            Some((m, _)) => vec![
                 name.clone(),
                 m.kind.clone(),
                 m.lineage.dataset.clone(),
@@ -144,9 +150,30 @@ async fn list(store: &str, output: Output) -> Result<()> {
                 },
             ],
         });
-        table(&[header].into_iter().chain(rows).collect::<Vec<_>>())
+        let mut text = table(&[header].into_iter().chain(rows).collect::<Vec<_>>());
+        for (name, manifest, _) in &found {
+            if let Some((_, verdict)) = manifest {
+                let line = format!("{name}: {}", verdict.text);
+                text += &format!("{}\n", show::line(&line));
+            }
+        }
+        text
     });
     Ok(())
+}
+
+/// What a model is worth beside trivial answers, by its evaluation on the most scenes.
+async fn verdict(models: &Models, manifest: &ModelManifest) -> Result<Verdict> {
+    let mut evaluations = models.evaluations(&manifest.name).await.map_err(failed)?;
+    let sha256 = manifest.sha256();
+    evaluations.retain(|e| e.model_sha256 == sha256);
+    Ok(match evaluations.iter().max_by_key(|e| e.scenes) {
+        Some(evaluation) => Verdict::of_evaluation(&manifest.kind, &evaluation.metrics),
+        None => Verdict {
+            doubtful: true,
+            text: "unknown: it was not evaluated; add a stage `evaluate` that names it".into(),
+        },
+    })
 }
 
 /// A store without models: where they were looked for.
@@ -247,7 +274,8 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
             e.code,
             figures(&e.metrics)
         );
-        text += &format!("\n{}\n", show::line(&said));
+        let verdict = Verdict::of_evaluation(&manifest.kind, &e.metrics);
+        text += &format!("\n{}\n{}\n", show::line(&said), show::line(&verdict.text));
     }
     text
 }

@@ -1,7 +1,8 @@
 //! What a command prints: text for people or JSON for programs, and progress on a terminal or as lines.
 
 use std::{
-    io::{IsTerminal, Write},
+    io::{ErrorKind, IsTerminal, Write},
+    sync::OnceLock,
     time::{Duration, Instant},
 };
 
@@ -9,6 +10,44 @@ use console::Term;
 use indicatif::{ProgressBar, ProgressStyle};
 use picofarm_proto::show;
 use serde::Serialize;
+
+use crate::error::{CliError, Result, io};
+
+/// Why the first write to stdout that failed did.
+static UNPRINTED: OnceLock<std::io::Error> = OnceLock::new();
+
+/// Writes to stdout. A failure is the command's, which ends with [`printed`].
+pub fn print(bytes: &[u8]) {
+    let mut stdout = std::io::stdout().lock();
+    if let Err(error) = stdout.write_all(bytes).and_then(|()| stdout.flush()) {
+        // Only the first is told, and it is likely the cause of the others.
+        let _ = UNPRINTED.set(error);
+    }
+}
+
+/// Whether everything that was printed has reached stdout.
+///
+/// # Errors
+/// Something has not, e.g. because the disk is full. A closed pipe (`| head`) is not an error worth
+/// a message.
+pub fn printed() -> Result<()> {
+    match UNPRINTED.get() {
+        Some(error) if error.kind() != ErrorKind::BrokenPipe => Err(unprinted(error)),
+        _ => Ok(()),
+    }
+}
+
+fn unprinted(error: &std::io::Error) -> CliError {
+    CliError {
+        message: format!("the result could not be written to standard output: {error}"),
+        ..io("standard output", error)
+    }
+}
+
+/// Writes a line to stderr. There is nobody to tell if that fails, and the work goes on.
+pub fn tell(line: impl std::fmt::Display) {
+    let _ = writeln!(std::io::stderr(), "{line}");
+}
 
 /// Where results go.
 #[derive(Clone, Copy)]
@@ -26,8 +65,7 @@ impl Output {
         } else {
             show::lines(&text()).into_owned()
         };
-        // A closed pipe (`| head`) is not an error worth a message.
-        let _ = writeln!(std::io::stdout(), "{}", shown.trim_end());
+        print(format!("{}\n", shown.trim_end()).as_bytes());
     }
 
     /// A warning on stderr, which begins with "warning: "; an object {"warning": …} with --json.
@@ -36,7 +74,7 @@ impl Output {
         if self.json {
             let warning = text.strip_prefix("warning: ").unwrap_or(text);
             let object = serde_json::json!({ "warning": warning });
-            eprintln!("{}", show::json(&object.to_string()));
+            tell(show::json(&object.to_string()));
         } else {
             self.say(text);
         }
@@ -45,7 +83,7 @@ impl Output {
     /// A remark for people on stderr; silent with --json.
     pub fn say(&self, text: impl AsRef<str>) {
         if !self.json {
-            eprintln!("{}", show::lines(text.as_ref()));
+            tell(show::lines(text.as_ref()));
         }
     }
 }
@@ -134,7 +172,7 @@ impl Meter {
                     at.elapsed() >= Self::BETWEEN_LINES || (fraction >= 1.0 && *text != message)
                 });
                 if due {
-                    eprintln!("[{:3.0}%] {message}", fraction * 100.0);
+                    tell(format_args!("[{:3.0}%] {message}", fraction * 100.0));
                     self.last = Some((Instant::now(), message));
                 }
             }
@@ -147,7 +185,7 @@ impl Meter {
         match &self.bar {
             Some(bar) => bar.println(text),
             None if self.quiet => {}
-            None => eprintln!("{text}"),
+            None => tell(text),
         }
     }
 
@@ -187,14 +225,18 @@ pub fn table(rows: &[Vec<String>]) -> String {
         .collect()
 }
 
-/// "1.5 s", "2 min 05 s", "3 h 10 min".
+/// "1.5 s", "2 min 05 s", "3 h 10 min", "42 days", "more than 1,000 years".
 pub fn duration(seconds: f64) -> String {
+    const DAY: u64 = 86_400;
+    const THOUSAND_YEARS: u64 = 365_250 * DAY;
     let s = seconds.max(0.0);
     let whole = s.round() as u64;
     match whole {
         0..=59 => format!("{s:.1} s"),
         60..=3599 => format!("{} min {:02} s", whole / 60, whole % 60),
-        _ => format!("{} h {:02} min", whole / 3600, whole / 60 % 60),
+        3600..864_000 => format!("{} h {:02} min", whole / 3600, whole / 60 % 60),
+        864_000..THOUSAND_YEARS => format!("{} days", whole / DAY),
+        _ => "more than 1,000 years".to_owned(),
     }
 }
 
@@ -226,6 +268,8 @@ mod tests {
         assert_eq!(duration(1.54), "1.5 s");
         assert_eq!(duration(125.0), "2 min 05 s");
         assert_eq!(duration(11_400.0), "3 h 10 min");
+        assert_eq!(duration(864_000.0), "10 days");
+        assert_eq!(duration(1e15), "more than 1,000 years");
     }
 
     #[test]

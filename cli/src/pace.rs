@@ -34,10 +34,12 @@ impl Pace {
         let left = |at: &usize| total(&s.stages[*at]) - done[*at];
         let open = (0..s.stages.len()).filter(|at| s.stages[*at].state == StageState::Open);
         let open: Vec<usize> = open.collect();
+        // A stage with a task in hand comes before one that waits for a worker.
+        let runs = |at: &usize| s.running.iter().any(|r| r.stage as usize == *at);
         let now_at = open
             .iter()
             .copied()
-            .max_by(|a, b| left(a).total_cmp(&left(b)));
+            .max_by(|a, b| runs(a).cmp(&runs(b)).then(left(a).total_cmp(&left(b))));
         match now_at {
             Some(at) if several => {
                 let stage = &s.stages[at];
@@ -70,7 +72,13 @@ impl Pace {
         if let [only] = &s.running[..]
             && !only.text.is_empty()
         {
-            text.push(only.text.clone());
+            // What a task says belongs to its own stage.
+            let other = s.stages.get(only.stage as usize);
+            let other = other.filter(|_| now_at != Some(only.stage as usize));
+            text.push(match other {
+                Some(stage) => format!("{}: {}", stage.name, only.text),
+                None => only.text.clone(),
+            });
         }
         (fraction, text.join(", "))
     }
@@ -167,6 +175,7 @@ mod tests {
             mean_task_seconds: None,
             running: Vec::new(),
             workers: 1,
+            unverified: 0,
         }
     }
 
@@ -222,6 +231,28 @@ mod tests {
         still.describe(&at(0.25), start);
         let (_, text) = still.describe(&at(0.25), start + Duration::from_secs(60));
         assert_eq!(text, "0/1 tasks, 1 worker, epoch 2 of 10");
+    }
+
+    #[test]
+    fn what_a_task_says_is_shown_with_its_own_stage() {
+        let mut s = status(&[("mirrors", "train", 0, 1), ("shadow", "train", 0, 1)]);
+        for stage in &mut s.stages {
+            stage.state = StageState::Open;
+        }
+        s.running.push(RunningTask {
+            stage: 0,
+            index: 0,
+            worker: "w".into(),
+            fraction: 0.5,
+            seconds: 1.0,
+            text: "epoch 1 of 2, loss 0.3".into(),
+            figures: std::collections::BTreeMap::new(),
+        });
+        let (_, text) = Pace::default().describe(&s, Instant::now());
+        assert_eq!(
+            text,
+            "stage 1 of 2 (mirrors) and 1 more: 0/1, 1 worker, epoch 1 of 2, loss 0.3"
+        );
     }
 
     #[test]

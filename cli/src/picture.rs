@@ -23,7 +23,8 @@ pub fn save(canvas: &Canvas, path: &std::path::Path) -> Result<()> {
 /// Writes a file whole or not at all.
 pub(crate) fn write_atomically(path: &std::path::Path, bytes: &[u8]) -> Result<()> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let partial = path.with_file_name(format!(".{name}.partial"));
+    // Another process may write the same file now.
+    let partial = path.with_file_name(format!(".{name}.{}.partial", uuid::Uuid::new_v4()));
     std::fs::write(&partial, bytes)
         .and_then(|()| std::fs::rename(&partial, path))
         .map_err(|e| {

@@ -1,10 +1,16 @@
-//! Whether the stores of a job can be written to, asked before it is sent. Only workers need reach them, so what is found
-//! is a warning.
+//! Asks the stores of a job before it is sent: whether they can be written to, their identities, and which results they
+//! have already. Only workers need to reach them, so the answers are remarks.
 
 use std::{collections::BTreeSet, time::Duration};
 
-use picofarm_dataset::check_writable;
-use picofarm_proto::model::JobSpec;
+use picofarm_dataset::{
+    Dataset, DatasetError, check_writable, identify_store, open_store, store_identity,
+};
+use picofarm_proto::{
+    key::{stage_key, task_key},
+    model::{JobPlan, JobSpec, StageSpec, kinds::Manifest},
+    show,
+};
 
 use crate::output::Output;
 
@@ -25,4 +31,113 @@ pub async fn warn_of_stores(spec: &JobSpec, output: Output) {
     for warning in futures::future::join_all(asked).await.into_iter().flatten() {
         output.warn(warning);
     }
+}
+
+/// Whether stores without an identity are given one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Identity {
+    /// Those that the job writes to are: it is submitted.
+    Create,
+    /// None is: the job is only planned.
+    Read,
+}
+
+/// Records the identities of the stores that this machine reaches in the job, so that its workers use no others.
+pub async fn identify(spec: &mut JobSpec, identity: Identity, output: Output) {
+    let written = spec.stages.iter().map(|stage| stage.task.results().store);
+    let written: BTreeSet<String> = written
+        .map(|s| s.trim_end_matches('/').to_owned())
+        .collect();
+    let places = spec.stages.iter().flat_map(|stage| stage.places());
+    let places: BTreeSet<String> = places.map(str::to_owned).collect();
+    let asked = places.into_iter().map(async |place| {
+        let create = identity == Identity::Create && written.contains(&place);
+        let found = tokio::time::timeout(WITHIN, identity_of(&place, create)).await;
+        let found = found
+            .unwrap_or_else(|_| Err(format!("it did not answer within {} s", WITHIN.as_secs())));
+        (place, found)
+    });
+    for (place, found) in futures::future::join_all(asked).await {
+        match found {
+            Ok(None) => {}
+            Ok(Some(identity)) => {
+                for stage in &mut spec.stages {
+                    if stage.places().contains(&*place) {
+                        let known = stage.stores.entry(place.clone());
+                        known.or_insert_with(|| identity.clone());
+                    }
+                }
+            }
+            Err(why) => output.warn(format!(
+                "warning: the identity of store {place} is not known: {why}\n  no worker is refused whose store is another \
+                 one (a folder that is not mounted); submit from a machine that reaches it to have them checked"
+            )),
+        }
+    }
+}
+
+async fn identity_of(place: &str, create: bool) -> Result<Option<String>, String> {
+    let found = async {
+        let (store, prefix) = open_store(place)?;
+        let identity = match create {
+            true => Some(identify_store(&*store, &prefix).await?),
+            false => store_identity(&*store, &prefix).await?,
+        };
+        Ok::<_, DatasetError>(identity.map(|identity| identity.to_string()))
+    };
+    found.await.map_err(|e| e.to_string())
+}
+
+/// Manifests of a data set that are read to see whether they are of these settings.
+const LOOKED_AT: usize = 8;
+
+/// A line for each stage whose scenes lie in its store although the coordinator knows nothing of them: workers take them.
+pub async fn there(spec: &JobSpec, plan: &JobPlan) -> Vec<String> {
+    let stages = spec.stages.iter().zip(&plan.stages);
+    let asked = stages
+        .filter(|(stage, planned)| planned.run > 0 && !stage.force)
+        .map(async |(stage, planned)| {
+            let found = tokio::time::timeout(WITHIN, scenes_of(stage, planned.total)).await;
+            // A store that cannot be read from here is a worker's to read.
+            let (place, [there, looked, equal]) = found.ok()?.ok()??;
+            (there > planned.reuse && equal > 0).then(|| {
+                let name = show::line(&stage.name).into_owned();
+                let place = show::line(&place).into_owned();
+                format!(
+                    "{name}: {place} holds {there} of {} scenes, and {equal} of {looked} looked at are of exactly these \
+                     settings; the coordinator has no record of them, so workers look at each and take those that fit",
+                    planned.total
+                )
+            })
+        });
+    let found = futures::future::join_all(asked).await;
+    found.into_iter().flatten().collect()
+}
+
+/// Where a stage's scenes are, how many are there, how many were looked at, and how many of those are of its settings; `None`
+/// for stages whose results are no scenes.
+async fn scenes_of(
+    stage: &StageSpec,
+    total: u64,
+) -> Result<Option<(String, [u64; 3])>, DatasetError> {
+    let results = stage.task.results();
+    let Manifest::Scene { dataset } = results.manifest else {
+        return Ok(None);
+    };
+    let (store, prefix) = open_store(results.store)?;
+    let dataset = Dataset::open(store, prefix.join(dataset)).await?;
+    let mut present = dataset.scenes_present().await?;
+    present.retain(|scene| *scene < total);
+    let key = stage_key(stage);
+    let step = present.len().div_ceil(LOOKED_AT).max(1);
+    let (mut looked, mut equal) = (0, 0);
+    for &scene in present.iter().step_by(step) {
+        let manifest = dataset.manifest(scene).await?;
+        looked += 1;
+        equal += u64::from(manifest.provenance.task_key == task_key(&key, scene).to_string());
+    }
+    Ok(Some((
+        dataset.place(),
+        [present.len() as u64, looked, equal],
+    )))
 }

@@ -13,6 +13,7 @@ mod written;
 use std::time::Instant;
 
 use picofarm_agent::{Memory, reconstruct};
+use picofarm_dataset::Verdict;
 use picofarm_figures::Canvas;
 use picofarm_proto::model::{
     kinds::reconstruct::grid_bytes,
@@ -160,6 +161,7 @@ fn make(
             FieldArg::Mlp => Shadows::Carve,
         },
         seed: args.seed,
+        accept_inconsistent: args.accept_inconsistent,
         ..Settings::default()
     };
     let start = Instant::now();
@@ -302,6 +304,9 @@ fn refused(e: ReconstructError) -> CliError {
             signals::interrupted("nothing was written")
         }
         ReconstructError::Render(RenderError::Memory { .. }) => CliError::new(Code::Resource, e),
+        e @ ReconstructError::Inconsistent { .. } => CliError::input(e).hint(
+            "correct the scene, the gate or the predictions; --accept-inconsistent goes on all the same",
+        ),
         e => CliError::input(e),
     }
 }
@@ -360,6 +365,8 @@ fn summary(args: &Reconstruct, made: &Made) -> String {
     }
     let [measuring, fitting, scoring] = made.seconds.map(duration);
     text += &format!("  measurements {measuring}, reconstruction {fitting}, errors {scoring}\n");
+    let verdict = Verdict::of_reconstruction(&made.metrics);
+    text += &format!("  verdict: {}\n", verdict.text);
     for note in &made.reconstructed.notes {
         text += &format!("  note: {note}\n");
     }

@@ -215,7 +215,7 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
             if !arrays.is_empty() {
                 text += &format!("  also {}\n", arrays.join(", "));
             }
-            text + &decided(&rendered.plan) + &warned(&rendered.warnings)
+            text + &noted(&order.scene) + &decided(&rendered.plan) + &warned(&rendered.warnings)
         },
     );
     Ok(())
@@ -286,7 +286,10 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
                 *rays as f64 / 1e6,
                 gib(memory),
             );
-            head + &decided(plan) + &carried(by_class, &classes) + &warned(warnings)
+            head + &noted(&order.scene)
+                + &decided(plan)
+                + &carried(by_class, &classes)
+                + &warned(warnings)
         },
     );
     Ok(())
@@ -340,6 +343,14 @@ fn decided(plan: &picofarm_transient::Plan) -> String {
 }
 
 /// What is wrong with scene or gate, one a line.
+/// Returns a line for each thing that was changed or left out while the scene was read.
+fn noted(scene: &Scene) -> String {
+    let notes = scene.provenance.notes.iter();
+    let read = notes.filter_map(|(key, note)| Some((key.strip_prefix("import.")?, note)));
+    read.map(|(key, note)| show::line(&format!("note: {key}: {note}")).to_string() + "\n")
+        .collect()
+}
+
 fn warned(warnings: &[String]) -> String {
     let lines = warnings.iter().map(|line| format!("warning: {line}\n"));
     lines.collect()
@@ -500,5 +511,20 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
         attributes["wavelengths_nm"] = json!(wavelengths);
     }
     let attributes = attributes.as_object().expect("written as an object");
+    for array in arrays.iter().filter(|array| array.name != "depth") {
+        if let Some(at) = array.data.iter().position(|x| !x.is_finite()) {
+            let (x, bins) = (array.data[at], r.gate.bins as usize);
+            let what = format!(
+                "scene {:?}: {} is {x} at pixel {}, bin {}; nothing was written",
+                scene.name,
+                array.name,
+                at / bins,
+                at % bins
+            );
+            return Err(CliError::new(Code::Failed, what).hint(
+                "the renderer is at fault: report it with the scene, or try another --seed",
+            ));
+        }
+    }
     write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
 }

@@ -1,10 +1,14 @@
 //! `picofarm coordinator` and `picofarm worker`: one role in one process.
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    net::SocketAddr,
+    sync::Arc,
+    time::{Duration, SystemTime},
+};
 
 use picofarm_agent::{AgentConfig, AgentError, Memory};
 use picofarm_coordinator::{
-    Connections, CoordinatorConfig, CoordinatorError, Running, Stored,
+    Connections, CoordinatorConfig, CoordinatorError, MemoryBounds, Running, Stored,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
@@ -13,7 +17,7 @@ use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args,
+    args, ends,
     error::{CliError, Code, Result},
     output::Output,
     settings::Settings,
@@ -32,6 +36,8 @@ pub struct Guarded {
     access: Access,
     quotas: Quotas,
     connections: Connections,
+    /// Of the process, MiB.
+    memory_mib: Option<u64>,
     /// How long the audit log is kept.
     audit_days: Option<u32>,
 }
@@ -61,6 +67,7 @@ impl Guarded {
                 per_address: args.max_connections_per_address,
                 ..Connections::default()
             },
+            memory_mib: args.memory_mib,
             audit_days: Some(args.audit_days),
         }
     }
@@ -126,12 +133,25 @@ pub fn agent_error(error: &AgentError) -> CliError {
                 .iter()
                 .any(|word| text.contains(word))
             {
-                ended.hint("compare `picofarm --version` on both machines and install the same one")
+                ended.hint("compare `picofarm --version` on both machines; upgrade coordinators first, then their workers")
             } else {
                 ended
             }
         }
         _ => ended,
+    }
+}
+
+/// The most memory that a coordinator takes where nobody says how much it may.
+const COORDINATOR_MIB: u64 = 4096;
+
+/// The memory of a coordinator's process: as asked, or the limit that it runs under. More than that limit is no help: the
+/// system would end the process.
+fn memory(asked_mib: Option<u64>) -> MemoryBounds {
+    let here = Memory::here().map_or(u64::MAX, |memory| memory.bytes);
+    let most = asked_mib.unwrap_or(COORDINATOR_MIB) << 20;
+    MemoryBounds {
+        process: most.min(here),
     }
 }
 
@@ -164,6 +184,7 @@ impl Coordinator {
         config.access = guarded.access;
         config.quotas = guarded.quotas;
         config.connections = guarded.connections;
+        config.memory = memory(guarded.memory_mib);
         if let Some(days) = guarded.audit_days {
             config.audit_for = Duration::from_secs(u64::from(days) * 86_400);
         }
@@ -225,10 +246,7 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     let forget_after = args
         .forget_after_days
         .map(|days| Duration::from_secs_f64(days * 86_400.0));
-    let stored = match args.check_stores.is_empty() {
-        true => None,
-        false => Some(StoreReader::below(&args.check_stores)?),
-    };
+    let stored = StoreReader::asked_for(&args.check_stores)?;
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
     let guarded = Guarded::of(&args.guard);
@@ -280,6 +298,7 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
         peers: args.peers,
         labels: args.label,
         exit_idle: args.exit_idle_s.map(Duration::from_secs),
+        ends_at: ends::ends_at(args.end_at, SystemTime::now())?,
         asset_dirs: vec![settings.assets.clone()],
         access: settings.access()?,
         store_prefixes: args.store_prefix,

@@ -14,7 +14,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     args::Global,
-    error::{CliError, Result, io},
+    error::{CliError, Result},
+    files,
 };
 
 /// What a settings file is called.
@@ -199,7 +200,7 @@ struct File {
 
 impl File {
     fn read(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
+        let text = files::read_text(path, files::SETTINGS)?;
         let table: toml::Table = toml::from_str(&text)
             .map_err(|e| CliError::input(format!("settings: {}: {e}", path.display())))?;
         let values = Value::serialize(table).ok().and_then(Value::into_dict);

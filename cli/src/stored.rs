@@ -1,9 +1,13 @@
-//! Looks into stores for a coordinator: whether they hold what workers have reported. Only into those that the operator
-//! allows: a submitter names a store's place, and must not make the coordinator ask any host or read any folder.
+//! Looks into stores for a coordinator: whether they hold what workers have reported.
+//!
+//! By default it looks into folders of the coordinator's machine only. A submitter names a store's place, and must not make
+//! the coordinator send requests to any host, so object stores are looked into only if the operator names them. In a folder
+//! only the names that results have are opened, and only their hash is compared, so that nobody learns what a file contains.
 
 use std::{
     collections::HashMap,
     fmt,
+    path::PathBuf,
     sync::{Arc, Mutex},
 };
 
@@ -11,13 +15,14 @@ use futures::future::BoxFuture;
 use object_store::{ObjectStore, path::Path};
 use picofarm_agent::StorePrefixes;
 use picofarm_coordinator::{Found, Stored};
-use picofarm_dataset::{DatasetError, Held, Holdings, PartName, open_store};
+use picofarm_dataset::{DatasetError, Held, Holdings, PartName, check_identity, open_store};
 use picofarm_proto::{
     key::task_key,
     model::{StageSpec, kinds::Manifest},
 };
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
+use uuid::Uuid;
 
 use crate::error::{CliError, Code, Result};
 
@@ -30,16 +35,38 @@ const ONE_IN: u64 = 8;
 
 /// What reads stores, on a runtime of its own.
 pub struct StoreReader {
-    /// `None`: any store.
-    allowed: Option<StorePrefixes>,
+    allowed: Allowed,
     opened: Mutex<HashMap<String, Place>>,
     /// Taken when dropped.
     runtime: Option<Runtime>,
 }
 
+/// Which stores are looked into.
+#[derive(Debug)]
+enum Allowed {
+    /// Folders of this machine.
+    Folders,
+    /// What lies below these prefixes.
+    Below(StorePrefixes),
+    /// Any.
+    Any,
+}
+
 type Place = (Arc<dyn ObjectStore>, Path);
 
 impl StoreReader {
+    /// What `--check-stores` asks for: folders of this machine by default, nothing for `none`, or stores below prefixes.
+    ///
+    /// # Errors
+    /// A prefix that cannot be used; no threads.
+    pub fn asked_for(texts: &[String]) -> Result<Option<Self>> {
+        match texts {
+            [] => Self::new(Allowed::Folders).map(Some),
+            [none] if none == "none" => Ok(None),
+            prefixes => Self::below(prefixes).map(Some),
+        }
+    }
+
     /// Reads stores below these prefixes.
     ///
     /// # Errors
@@ -47,7 +74,7 @@ impl StoreReader {
     pub fn below(prefixes: &[String]) -> Result<Self> {
         let allowed = StorePrefixes::new(prefixes)
             .map_err(|e| CliError::input(format!("--check-stores: {e}")))?;
-        Self::new(Some(allowed))
+        Self::new(Allowed::Below(allowed))
     }
 
     /// Reads any store: for a process that runs the tasks as well, and so reads and writes whatever store they name.
@@ -55,10 +82,10 @@ impl StoreReader {
     /// # Errors
     /// No threads.
     pub fn anywhere() -> Result<Self> {
-        Self::new(None)
+        Self::new(Allowed::Any)
     }
 
-    fn new(allowed: Option<StorePrefixes>) -> Result<Self> {
+    fn new(allowed: Allowed) -> Result<Self> {
         let runtime = Builder::new_multi_thread()
             .worker_threads(1)
             .max_blocking_threads(THREADS)
@@ -74,12 +101,21 @@ impl StoreReader {
     }
 
     fn open(&self, location: &str) -> std::result::Result<Place, String> {
-        if let Some(allowed) = &self.allowed
-            && !allowed.hold(location)
-        {
-            return Err(
-                "it lies in none of the places that --check-stores names to the coordinator".into(),
-            );
+        match &self.allowed {
+            Allowed::Any => {}
+            Allowed::Folders if folder(location).is_some() => {}
+            Allowed::Folders => {
+                return Err(
+                    "it is no folder of the coordinator's machine, and --check-stores does not name it".into(),
+                );
+            }
+            Allowed::Below(prefixes) if prefixes.hold(location) => {}
+            Allowed::Below(_) => {
+                return Err(
+                    "it lies in none of the places that --check-stores names to the coordinator"
+                        .into(),
+                );
+            }
         }
         let mut opened = self.opened.lock().expect("no panic while locked");
         if let Some(place) = opened.get(location) {
@@ -94,10 +130,22 @@ impl StoreReader {
     }
 }
 
+/// The folder of this machine that a location names.
+fn folder(location: &str) -> Option<PathBuf> {
+    let place = picofarm_proto::model::Place {
+        field: "store",
+        store: location,
+        folder: "".into(),
+    };
+    let path = place.normal();
+    path.starts_with('/').then(|| path.into())
+}
+
 /// The tasks of a question, each with the SHA-256 that was reported.
 type Results = Vec<(u64, [u8; 32])>;
 
 /// What a store is asked, as its data set or model knows it.
+#[derive(Clone)]
 enum Question {
     Scenes(String, Results),
     Parts(String, Vec<PartName>),
@@ -203,26 +251,55 @@ impl Stored for StoreReader {
         Box::pin(async move {
             let (location, question) = Question::of(stage, results)?;
             let (store, prefix) = self.open(&location)?;
-            let folder = !location.contains("://") || location.starts_with("file:");
+            let folder = folder(&location);
+            // An operator who names a store knows that it is the workers'.
+            let may_be_absent = matches!(self.allowed, Allowed::Folders);
+            let count = results.len();
+            let identity = stage.stores.get(location.trim_end_matches('/'));
+            let identity = identity.and_then(|text| Uuid::try_parse(text).ok());
             let asked = async move {
-                let thorough = |task: u64| folder || task.is_multiple_of(ONE_IN);
+                let local = folder.is_some();
+                let thorough = move |task: u64| local || task.is_multiple_of(ONE_IN);
+                if may_be_absent
+                    && let Some(folder) = &folder
+                    && let Ok(false) = tokio::fs::try_exists(folder).await
+                {
+                    let around = folder.parent().unwrap_or(folder);
+                    let found = match tokio::fs::try_exists(around).await {
+                        Ok(true) => Found::NoStore,
+                        _ => Found::NoFolder,
+                    };
+                    return Ok::<Vec<Found>, DatasetError>(vec![found; count]);
+                }
+                // Where this machine has not mounted it, everything would seem to be gone.
+                if let Some(identity) = identity {
+                    check_identity(&*store, &prefix, identity).await?;
+                }
                 let holdings = Holdings::new(store, prefix);
-                question.ask(&holdings, thorough).await
+                let mut held = question.clone().ask(&holdings, thorough).await?;
+                if let (Some(folder), Question::Scenes(dataset, _)) = (&folder, &question)
+                    && held.contains(&Held::Gone)
+                {
+                    // A network's file system remembers for a while that a file was missing. Opening its folder makes it
+                    // ask the server again; whether it can be opened does not matter.
+                    let _ = tokio::fs::read_dir(folder.join(dataset).join("manifests")).await;
+                    held = question.ask(&holdings, thorough).await?;
+                }
+                let found = held.into_iter().map(|held| match held {
+                    Held::Equal => Found::Equal,
+                    Held::Gone => Found::Gone,
+                    Held::Other => Found::Differs,
+                });
+                Ok(found.collect())
             };
             let runtime = self.runtime.as_ref().expect("there until it is dropped");
             // It ends with whoever waits for it.
             let running = AbortOnDropHandle::new(runtime.spawn(asked));
-            let held = match running.await {
-                Ok(Ok(held)) => held,
-                Ok(Err(error)) => return Err(unreadable(&error)),
-                Err(error) => return Err(format!("looking into the store failed: {error}")),
-            };
-            let found = held.into_iter().map(|held| match held {
-                Held::Equal => Found::Equal,
-                Held::Gone => Found::Gone,
-                Held::Other => Found::Differs,
-            });
-            Ok(found.collect())
+            match running.await {
+                Ok(Ok(found)) => Ok(found),
+                Ok(Err(error)) => Err(unreadable(&error)),
+                Err(error) => Err(format!("looking into the store failed: {error}")),
+            }
         })
     }
 }
@@ -279,6 +356,37 @@ mod tests {
             assert!(why.contains("--check-stores"), "{store}: {why}");
         }
         assert!(StoreReader::below(&["relative".into()]).is_err());
+    }
+
+    #[tokio::test]
+    async fn a_folder_that_is_not_mounted_here_is_not_taken_for_an_empty_store() {
+        let folder = tempfile::tempdir().unwrap();
+        let reader = StoreReader::anywhere().unwrap();
+        let place = folder.path().display().to_string();
+        let mut at = stage(&place);
+        let results = [(0, [0; 32])];
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        at.stores.insert(place, Uuid::nil().to_string());
+        let why = reader.look(&at, &results).await.unwrap_err();
+        assert!(why.contains("no store identity"), "{why}");
+    }
+
+    #[tokio::test]
+    async fn by_default_folders_are_looked_into_and_no_host_is_asked() {
+        let place = tempfile::tempdir().unwrap();
+        let reader = StoreReader::asked_for(&[]).unwrap().unwrap();
+        let results = [(0, [0; 32])];
+        let at = stage(&place.path().display().to_string());
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        let at = stage(&format!("file://{}/absent", place.path().display()));
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::NoStore]));
+        let at = stage(&format!("file://{}/absent/too", place.path().display()));
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::NoFolder]));
+        for store in ["s3://bucket/a", "http://169.254.169.254/latest"] {
+            let why = reader.look(&stage(store), &results).await.unwrap_err();
+            assert!(why.contains("--check-stores"), "{store}: {why}");
+        }
+        assert!(StoreReader::asked_for(&["none".into()]).unwrap().is_none());
     }
 
     #[tokio::test]

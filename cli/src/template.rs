@@ -72,6 +72,7 @@ pub fn template(kind: JobKind) -> String {
          [limits]\n\
          max_failures = 3          # a task's own failures before it is given up\n\
          max_crashes = 3           # losses of the worker under it before it is given up\n\
+         # max_interruptions = 20  # times that a worker gives it back half-way before it is given up\n\
          # max_workers = 8         # workers that may run the job at a time\n\
          # deadline = \"2027-01-31T18:00:00Z\"   # what is not done by then is cancelled\n\n\
          # [resources]             # what a worker must have\n\

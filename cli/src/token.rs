@@ -1,37 +1,53 @@
 //! `picofarm token`: who may use a coordinator.
 
-use std::path::Path;
+use std::{
+    path::Path,
+    time::{Duration, Instant, SystemTime},
+};
 
-use picofarm_coordinator::auth::{Roles, TokenError, Tokens};
+use picofarm_agent::Access;
+use picofarm_coordinator::auth::{
+    BY_CERTIFICATE, BY_DIGEST, Entry, Expiry, Roles, TokenError, Tokens,
+};
+use picofarm_credentials::CredentialError;
 use serde_json::json;
 
 use crate::{
     args::Token,
+    client::{Standing, standing},
     error::{CliError, Code, Result},
-    output::{Output, table},
+    output::{Output, printed, table},
+    settings::Resolved,
 };
+
+/// How long a coordinator may take to read the token file again. It looks every second.
+const NOTICED: Duration = Duration::from_secs(10);
+/// Between two questions.
+const PAUSE: Duration = Duration::from_millis(500);
 
 /// Runs one of the commands.
 ///
 /// # Errors
-/// The token file cannot be used, a name is taken, or there is no such name.
-pub fn run(command: Token, output: Output) -> Result<()> {
+/// The token file cannot be used, a name is taken, there is no such name, or a coordinator still
+/// accepts a revoked token.
+pub async fn run(command: Token, resolved: &Resolved, output: Output) -> Result<()> {
     match command {
         Token::Create {
             name,
             role,
             member,
             maintainer,
+            expires,
             file,
         } => {
             let projects = (member, maintainer);
-            create(&name, role.into(), projects, &file.tokens, output)
+            create(&name, role.into(), projects, expires, &file.tokens, output)
         }
         Token::List { file } => {
             list(&file.tokens, output)?;
             Ok(())
         }
-        Token::Revoke { name, file } => revoke(&name, &file.tokens, output),
+        Token::Revoke { name, file } => revoke(&name, &file.tokens, resolved, output).await,
     }
 }
 
@@ -39,42 +55,54 @@ fn create(
     name: &str,
     roles: Roles,
     (member, maintainer): (Vec<String>, Vec<String>),
+    expires: Option<Expiry>,
     path: &Path,
     output: Output,
 ) -> Result<()> {
-    let mut tokens = if path.exists() {
-        Tokens::read(path).map_err(unusable)?
-    } else {
-        Tokens::default()
-    };
     let said = roles.to_string();
-    let token = tokens
-        .create(name, roles, member, maintainer)
-        .map_err(|what| CliError::input(format!("{}: {what}", path.display())))?;
-    tokens.write(path).map_err(unusable)?;
+    let token = Tokens::edit_or_create(path, |tokens| {
+        tokens.create_until(name, roles, member, maintainer, expires)
+    })
+    .map_err(unusable)?;
+    let until = expires.map_or_else(String::new, |expires| format!(", until {expires}"));
     output.say(format!(
-        "{name} ({said}) is in {}; this is the token, which is shown only now:",
+        "{name} ({said}{until}) is in {}; this is the token, which is shown only now:",
         path.display()
     ));
     output.result(
-        &json!({"name": name, "roles": said.split(',').collect::<Vec<_>>(), "token": token.expose()}),
+        &json!({"name": name, "roles": said.split(',').collect::<Vec<_>>(), "expires": expires,
+            "token": token.expose()}),
         || token.expose().to_owned(),
     );
+    if let Err(unprinted) = printed() {
+        // Nobody has seen the token, and nobody ever will.
+        Tokens::edit(path, |tokens| Ok(tokens.revoke(name))).map_err(unusable)?;
+        return Err(unprinted.hint(format!(
+            "{name} was not added; free some space and try again"
+        )));
+    }
     output.say("set it as PICOFARM_TOKEN, or write it into a file for --token-file");
     Ok(())
 }
 
 fn list(path: &Path, output: Output) -> Result<()> {
     let tokens = Tokens::read(path).map_err(unusable)?;
+    let now = SystemTime::now();
     let proof = |certificate: &Option<String>| match certificate {
         Some(name) => format!("certificate {name}"),
         None => "token".to_owned(),
+    };
+    let until = |expires: Option<Expiry>| match expires {
+        None => "never expires".to_owned(),
+        Some(expires) if expires.is_over(now) => format!("expired {expires}"),
+        Some(expires) => format!("expires {expires}"),
     };
     let callers: Vec<_> = tokens
         .entries()
         .iter()
         .map(|e| {
             json!({"name": e.name, "roles": e.roles, "certificate": e.certificate,
+                "expires": e.expires, "expired": e.expires.is_some_and(|t| t.is_over(now)),
                 "member": e.member, "maintainer": e.maintainer})
         })
         .collect();
@@ -90,6 +118,7 @@ fn list(path: &Path, output: Output) -> Result<()> {
                     e.name.clone(),
                     e.roles.to_string(),
                     proof(&e.certificate),
+                    until(e.expires),
                     projects.join(", "),
                 ]
             })
@@ -99,24 +128,117 @@ fn list(path: &Path, output: Output) -> Result<()> {
     Ok(())
 }
 
-fn revoke(name: &str, path: &Path, output: Output) -> Result<()> {
-    let mut tokens = Tokens::read(path).map_err(unusable)?;
-    if !tokens.revoke(name) {
-        return Err(
-            CliError::input(format!("{}: there is no caller {name:?}", path.display()))
-                .hint("see `picofarm token list`"),
-        );
-    }
-    tokens.write(path).map_err(unusable)?;
-    output.result(&json!({"revoked": name}), || {
-        format!("{name} has no access any more; running coordinators notice within seconds")
+async fn revoke(name: &str, path: &Path, resolved: &Resolved, output: Output) -> Result<()> {
+    let urls = configured(resolved);
+    let access = Access {
+        ca: resolved.settings.ca.clone(),
+        certificate: resolved.settings.cert.clone(),
+        key: resolved.settings.key.clone(),
+        token: None,
+    };
+    let entry = Tokens::edit(path, |tokens| {
+        let entry = tokens.by_name(name).cloned();
+        let entry = entry.ok_or_else(|| format!("there is no caller {name:?}"))?;
+        tokens.revoke(name);
+        Ok(entry)
+    })
+    .map_err(|e| unusable(e).hint("see `picofarm token list`"))?;
+    let proof = proof(&entry);
+    let asked = urls.iter().map(async |url| {
+        let standing = refused_soon(url, &access, &proof).await;
+        (*url, standing)
     });
-    Ok(())
+    let asked = futures::future::join_all(asked).await;
+    let answers: Vec<_> = asked
+        .iter()
+        .map(|(url, standing)| {
+            let (answer, why) = match standing {
+                Standing::Accepted(why) => ("accepted", why),
+                Standing::Refused(why) => ("refused", why),
+                Standing::Unknown(why) => ("unknown", why),
+            };
+            json!({"url": url, "answer": answer, "reason": why})
+        })
+        .collect();
+    let document = json!({"revoked": name, "file": path, "coordinators": answers});
+    output.result(&document, || told(name, path, &asked));
+    let accepting: Vec<_> = asked
+        .iter()
+        .filter(|(_, standing)| matches!(standing, Standing::Accepted(_)))
+        .map(|(url, _)| *url)
+        .collect();
+    if accepting.is_empty() {
+        return Ok(());
+    }
+    Err(CliError::new(
+        Code::Coordinator,
+        format!("{name} still has access at {}", accepting.join(", ")),
+    )
+    .hint(format!(
+        "is {} the file that its --tokens names? Its log says when it read that file, or why it could not; stop it if \
+         {name} must not have access",
+        path.display()
+    )))
+}
+
+/// The coordinators that somebody has named; the default URL is only a guess.
+fn configured(resolved: &Resolved) -> Vec<&str> {
+    let named = resolved
+        .sources
+        .iter()
+        .any(|(name, source)| *name == "coordinator" && source != "default");
+    match named {
+        true => resolved
+            .settings
+            .coordinator
+            .split(',')
+            .map(str::trim)
+            .collect(),
+        false => Vec::new(),
+    }
+}
+
+/// What a question about this caller shows: not its proof, which is kept nowhere.
+fn proof(entry: &Entry) -> String {
+    match (&entry.sha256, &entry.certificate) {
+        (_, Some(name)) => format!("{BY_CERTIFICATE} {name}"),
+        (sha256, None) => format!("{BY_DIGEST} {}", sha256.as_deref().unwrap_or_default()),
+    }
+}
+
+/// Asks until the coordinator refuses the proof, or has had time to notice.
+async fn refused_soon(url: &str, access: &Access, proof: &str) -> Standing {
+    let since = Instant::now();
+    loop {
+        let now = standing(url, access, proof).await;
+        if !matches!(now, Standing::Accepted(_)) || since.elapsed() > NOTICED {
+            return now;
+        }
+        tokio::time::sleep(PAUSE).await;
+    }
+}
+
+fn told(name: &str, path: &Path, asked: &[(&str, Standing)]) -> String {
+    let mut text = format!("{name} is no longer in {}\n", path.display());
+    if asked.is_empty() {
+        text += "only the file was changed: no coordinator is configured, so none was asked; name them with \
+                 --coordinator to have them asked\n";
+    }
+    for (url, standing) in asked {
+        text += &match standing {
+            Standing::Refused(why) => format!("{url} refuses {name} now: {why}\n"),
+            Standing::Accepted(why) => format!("{url} STILL ACCEPTS {name}: {why}\n"),
+            Standing::Unknown(why) => {
+                format!("{url} could not be asked, so only the file was changed: {why}\n")
+            }
+        };
+    }
+    text
 }
 
 fn unusable(error: TokenError) -> CliError {
     let code = match error {
-        TokenError::Write { .. } => Code::Resource,
+        TokenError::File(CredentialError::Write { .. }) => Code::Resource,
         _ => Code::Input,
     };
     CliError::new(code, error)

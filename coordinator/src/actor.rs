@@ -13,8 +13,8 @@ use picofarm_catalog::{Catalog, CatalogError, Changes, Job, Settled};
 use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     model::{
-        Failure, FailureKind, Finished, JobPlan, JobState, SpecError, TaskLog, TaskProgress,
-        WorkerHello,
+        Failure, FailureKind, Finished, JobPlan, JobSpec, JobState, SpecError, TaskLog,
+        TaskProgress, WorkerHello,
     },
 };
 use tokio::{
@@ -27,8 +27,12 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{Core, JobLook, Learnt, Look, OutputHint, Overlay, Say, SessionId, Settings, Timings},
+    core::{
+        Core, Fits, JobLook, Learnt, Look, OutputHint, Overlay, Reported, Say, SessionId, Settings,
+        Timings,
+    },
     health::Health,
+    memory::{Memory, kept_cost},
     metrics::{Metrics, Tally},
     sessions::{Sessions, Waiting},
     trace,
@@ -38,6 +42,8 @@ use crate::{
 const BATCH: usize = 4096;
 /// How long to wait before trying a catalog again that failed.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
+/// Claims in one turn at most; the rest waits for the next turn.
+const ROUNDS: usize = 8;
 /// How often the catalog hears that this instance lives, and is asked for news.
 const BEAT: Duration = Duration::from_secs(1);
 /// Least time between two beats, whatever the hints.
@@ -80,11 +86,19 @@ pub(crate) enum Command {
         say: mpsc::Sender<Say>,
         /// Heartbeats of the session that wait here to be handled.
         waiting: Waiting,
+        /// The worker is on the coordinator's machine.
+        here: bool,
     },
     Worker(SessionId, FromWorker),
-    /// A report about which a store was asked. In words, where what was recorded instead of it is not in the store: that
-    /// record is no more.
-    Judged(SessionId, Finished, Option<String>),
+    /// Reports whose store was looked into.
+    Verified {
+        store: String,
+        reports: Vec<(Reported, Verdict)>,
+        /// The store turned out to be another one than that of the workers.
+        blind: bool,
+    },
+    /// A report of another result than the recorded one, and what became of that record.
+    Judged(SessionId, Finished, Ruling),
     /// The catalog has failed to write beside the actor: a new life begins, as when it fails to write here.
     Broken(CatalogError),
     /// A job that was recorded, if it is active; otherwise there is only something to look at.
@@ -105,6 +119,8 @@ pub(crate) enum Command {
     Drain(String, Reply<u32>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
+    /// Which connected workers could run a job that is planned.
+    Fits(Arc<JobSpec>, Reply<Fits>),
     /// What the instance knows, without asking the catalog.
     Look(Reply<Look>),
     LookAt {
@@ -115,10 +131,33 @@ pub(crate) enum Command {
     },
 }
 
+/// Which of two results of a task counts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Ruling {
+    /// The reported one: the record of the other is gone. In words.
+    Overruled(String),
+    /// The recorded one.
+    Stands,
+    /// That cannot be found out from here.
+    Unknown,
+}
+
+/// Whether a store holds what was reported.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// It does.
+    Held,
+    /// That cannot be found out from here.
+    Unknown,
+    /// It does not: why the report is refused.
+    Contradicted(String),
+}
+
 /// What a worker says in its session.
 pub(crate) enum FromWorker {
     Credit(u32),
-    Heartbeat(Vec<LeaseRef>, Vec<TaskProgress>),
+    /// With the milliseconds until the worker must end, where that is known.
+    Heartbeat(Vec<LeaseRef>, Vec<TaskProgress>, Option<u64>),
     Done(Finished),
     Failed(Failure),
     /// A report on this task that says what cannot be: why.
@@ -139,6 +178,7 @@ pub(crate) struct Actor {
     pub metrics: Arc<Metrics>,
     pub health: Arc<Health>,
     pub stop: CancellationToken,
+    pub memory: Arc<Memory>,
     pub aside: Arc<dyn Aside>,
 }
 
@@ -149,6 +189,12 @@ pub(crate) trait Aside: Send + Sync {
     /// Asks the store whether a report or what is recorded instead is right: [`Command::Judged`]. `false` where no store can
     /// be asked; then nothing comes.
     fn judge(&self, session: SessionId, report: &Finished, dispute: Dispute) -> bool;
+    /// Drops what is recorded instead of a report on which two workers agree: [`Command::Judged`].
+    fn replace(&self, session: SessionId, report: &Finished, dispute: Dispute);
+    /// Whether any store can be looked into.
+    fn looks(&self) -> bool;
+    /// Looks for reported results in their store: [`Command::Verified`].
+    fn verify(&self, store: String, reports: Vec<Reported>);
 }
 
 /// A report of another manifest than the one that is recorded.
@@ -171,10 +217,14 @@ struct Life<'a> {
     commits: Vec<Span>,
     /// By the clock that counts stalls and suspends: when that was looked at last.
     looked_ms: i64,
+    /// Memory that the specs of jobs take that have not ended.
+    kept: HashMap<JobId, u64>,
     /// Jobs that are being read, and since when.
     learning: HashMap<JobId, Instant>,
     /// Reports about which a store is being asked.
     disputes: usize,
+    /// Stores that are being looked into, and the reports that wait until that is done.
+    looking: HashMap<String, Vec<Reported>>,
 }
 
 impl Actor {
@@ -216,6 +266,8 @@ impl Actor {
         }
         tracing::debug!(instance = %snapshot.instance, jobs = snapshot.jobs.len(),
             ranges = snapshot.owned.ranges.len(), "an instance begins");
+        let jobs = snapshot.jobs.iter();
+        let kept = jobs.map(|job| (job.id, kept_cost(&job.spec))).collect();
         let core = Core::load(
             snapshot,
             &timings,
@@ -223,16 +275,20 @@ impl Actor {
             Box::new(Uuid::now_v7),
             self.clock.now_ms(),
         );
-        Ok(Life {
+        let life = Life {
             actor: self,
             core,
+            kept,
             sessions: Sessions::default(),
             tally: Tally::default(),
             commits: Vec::new(),
             looked_ms: self.clock.passed_ms(),
             learning: HashMap::new(),
             disputes: 0,
-        })
+            looking: HashMap::new(),
+        };
+        life.note_kept();
+        Ok(life)
     }
 }
 
@@ -291,10 +347,21 @@ impl Life<'_> {
                     () = tokio::time::sleep(due) => continue,
                 }
             }
-            self.supply().await?;
-            self.core.dispatch(self.now());
-            self.flush().await?;
+            self.serve().await?;
         }
+    }
+
+    /// Claims and grants until nothing more can be granted now: what a claim did not bring is
+    /// another job's turn.
+    async fn serve(&mut self) -> Result<(), CatalogError> {
+        for _ in 0..ROUNDS {
+            let claimed = self.supply().await?;
+            self.core.dispatch(self.now());
+            if !claimed {
+                break;
+            }
+        }
+        self.flush().await
     }
 
     /// A stall of this process (a suspended machine, a stopped debugger, a catalog that does not answer) is no worker's
@@ -316,11 +383,11 @@ impl Life<'_> {
         self.flush().await
     }
 
-    /// Claims what connected workers could run.
-    async fn supply(&mut self) -> Result<(), CatalogError> {
+    /// Claims what connected workers could run; `false` where nothing is to be claimed.
+    async fn supply(&mut self) -> Result<bool, CatalogError> {
         let wants = self.core.wants(self.now());
         if wants.is_empty() {
-            return Ok(());
+            return Ok(false);
         }
         // What is noted so far first: the catalog must know this instance's ranges as they are.
         self.flush().await?;
@@ -329,17 +396,20 @@ impl Life<'_> {
         for (want, claim) in wants.iter().zip(claims) {
             self.core.claimed(want.stage, claim, now);
         }
-        Ok(())
+        Ok(true)
     }
 
     /// Tells the catalog that this instance lives, and hears what is new.
     async fn beat(&mut self) -> Result<(), CatalogError> {
         self.core.give_back();
         self.flush().await?;
-        let news = self.actor.catalog.beat(self.core.connected()).await?;
+        let connected = self.core.connected();
+        let news = self.actor.catalog.beat(connected, self.now()).await?;
         self.actor.health.beat();
         let now = self.now();
         let unknown = self.core.hear(news, now);
+        self.kept.retain(|job, _| self.core.knows(*job));
+        self.note_kept();
         let begun = |at: &mut Instant| at.elapsed() < READ_AGAIN;
         self.learning
             .retain(|job, at| unknown.contains(job) && begun(at));
@@ -356,9 +426,16 @@ impl Life<'_> {
     fn learn(&mut self, learnt: Learnt) {
         self.learning.remove(&learnt.job.id);
         if !self.core.knows(learnt.job.id) {
+            self.kept.insert(learnt.job.id, learnt.kept);
             self.core
                 .add_job(&learnt.job, learnt.stages, &learnt.timings);
+            self.note_kept();
         }
+    }
+
+    /// Says how much memory the specs of jobs take that have not ended.
+    fn note_kept(&self) {
+        self.actor.memory.keep_jobs(self.kept.values().sum());
     }
 
     fn now(&self) -> i64 {
@@ -367,15 +444,20 @@ impl Life<'_> {
 
     async fn handle(&mut self, batch: &mut Vec<Command>) -> Result<(), CatalogError> {
         // What the catalog holds for the tasks reported, in one go.
-        let asked: Vec<(StageRef, u64)> = batch
-            .iter()
-            .filter_map(|command| match command {
-                Command::Worker(_, FromWorker::Done(report)) | Command::Judged(_, report, _) => {
-                    Some((self.core.stage_of(report)?, report.index))
-                }
-                _ => None,
-            })
+        let reports = batch.iter().flat_map(|command| match command {
+            Command::Worker(_, FromWorker::Done(report)) | Command::Judged(_, report, _) => {
+                vec![report]
+            }
+            Command::Verified { reports, .. } => reports
+                .iter()
+                .map(|(reported, _)| &reported.report)
+                .collect(),
+            _ => Vec::new(),
+        });
+        let asked: Vec<(StageRef, u64)> = reports
+            .filter_map(|report| Some((self.core.stage_of(report)?, report.index)))
             .collect();
+        let mut new: HashMap<String, Vec<Reported>> = HashMap::new();
         let found = self.actor.catalog.manifests(&asked).await?;
         let known: Known = asked.into_iter().zip(found).collect();
         for command in batch.drain(..) {
@@ -385,6 +467,7 @@ impl Life<'_> {
                     hello,
                     say,
                     waiting,
+                    here,
                 } => {
                     // The worker brings its leases along, from whichever coordinator.
                     self.flush().await?;
@@ -393,18 +476,38 @@ impl Life<'_> {
                     self.core.receive(owned, now);
                     self.sessions.open(session, say, waiting);
                     self.core.hello(session, hello, now);
+                    self.core.is_here(session, here);
                 }
                 Command::Worker(session, FromWorker::Done(report)) => {
-                    if !self.disputed(session, &report, &known) {
-                        self.done(session, &report, &known);
+                    let looks = self.actor.aside.looks();
+                    match self.core.reported(session, &report).filter(|_| looks) {
+                        _ if self.disputed(session, &report, &known) => {}
+                        Some(reported) => {
+                            let reports = new.entry(reported.store.clone()).or_default();
+                            reports.push(reported);
+                        }
+                        None => self.done(session, &report, &known, false),
                     }
                 }
-                Command::Judged(session, report, note) => {
+                Command::Verified {
+                    store,
+                    reports,
+                    blind,
+                } => {
+                    self.verified(&store, reports, blind, &known);
+                }
+                Command::Judged(session, report, ruling) => {
                     self.disputes = self.disputes.saturating_sub(1);
-                    if let Some(note) = note {
-                        self.core.alarm(session, &report, note, self.now());
+                    match ruling {
+                        Ruling::Unknown if self.outvoted(session, &report, &known) => {}
+                        Ruling::Overruled(note) => {
+                            self.core.overruled(session, &report, note, self.now());
+                            self.done(session, &report, &known, false);
+                        }
+                        Ruling::Stands | Ruling::Unknown => {
+                            self.done(session, &report, &known, false);
+                        }
                     }
-                    self.done(session, &report, &known);
                 }
                 Command::Worker(session, said) => self.worker_said(session, said),
                 Command::Broken(error) => return Err(error),
@@ -439,8 +542,11 @@ impl Life<'_> {
                 Command::Workers(reply) => {
                     let _ = reply.send(Ok(self.core.everywhere()));
                 }
+                Command::Fits(spec, reply) => {
+                    let _ = reply.send(Ok(self.core.fits(&spec)));
+                }
                 Command::Look(reply) => {
-                    let _ = reply.send(Ok(self.core.look()));
+                    let _ = reply.send(Ok(self.core.look(self.now())));
                 }
                 Command::LookAt {
                     job,
@@ -456,39 +562,104 @@ impl Life<'_> {
                 }
             }
         }
+        for (store, reports) in new {
+            self.look_for(store, reports);
+        }
         Ok(())
+    }
+
+    /// Has reported results looked for in their store: one look at a time, since the next one takes what has come meanwhile.
+    fn look_for(&mut self, store: String, reports: Vec<Reported>) {
+        match self.looking.entry(store) {
+            Entry::Occupied(mut waiting) => waiting.get_mut().extend(reports),
+            Entry::Vacant(entry) if !reports.is_empty() => {
+                self.actor.aside.verify(entry.key().clone(), reports);
+                entry.insert(Vec::new());
+            }
+            Entry::Vacant(_) => {}
+        }
+    }
+
+    /// Commits or refuses reports whose store was looked into.
+    fn verified(
+        &mut self,
+        store: &str,
+        reports: Vec<(Reported, Verdict)>,
+        blind: bool,
+        known: &Known,
+    ) {
+        if blind {
+            self.core.forgive(store);
+        }
+        for (
+            Reported {
+                session, report, ..
+            },
+            verdict,
+        ) in reports
+        {
+            match verdict {
+                Verdict::Contradicted(why) => {
+                    self.core.contradicted(session, &report, &why, self.now());
+                }
+                _ if self.disputed(session, &report, known) => {}
+                verdict => self.done(session, &report, known, verdict == Verdict::Held),
+            }
+        }
+        if let Some(waiting) = self.looking.remove(store) {
+            self.look_for(store.to_owned(), waiting);
+        }
+    }
+
+    /// Whether this report is the second of another result than the recorded one: then the record gives way, and the report
+    /// is answered after that.
+    fn outvoted(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
+        let Some(dispute) = self.dispute(report, known) else {
+            return false;
+        };
+        let outvoted = self.core.outvoted(session, report);
+        if outvoted {
+            self.disputes += 1;
+            self.actor.aside.replace(session, report, dispute);
+        }
+        outvoted
     }
 
     /// Whether a store is asked before this report is answered: another manifest is recorded, and who came first is no
     /// reason to believe it.
     fn disputed(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
-        let dispute = self.core.stage_of(report).and_then(|stage| {
-            let recorded = known.get(&(stage, report.index)).copied().flatten()?;
-            let same = hex::encode(recorded).eq_ignore_ascii_case(&report.manifest_sha256);
-            (!same).then_some(Dispute { stage, recorded })
-        });
-        let Some(dispute) = dispute else {
+        let Some(dispute) = self.dispute(report, known) else {
             return false;
         };
         let asked = self.disputes < DISPUTES && self.actor.aside.judge(session, report, dispute);
         self.disputes += usize::from(asked);
-        asked
+        asked || self.outvoted(session, report, known)
     }
 
-    fn done(&mut self, session: SessionId, report: &Finished, known: &Known) {
+    /// The record that a report contradicts.
+    fn dispute(&self, report: &Finished, known: &Known) -> Option<Dispute> {
+        let stage = self.core.stage_of(report)?;
+        let recorded = known.get(&(stage, report.index)).copied().flatten()?;
+        let same = hex::encode(recorded).eq_ignore_ascii_case(&report.manifest_sha256);
+        (!same).then_some(Dispute { stage, recorded })
+    }
+
+    fn done(&mut self, session: SessionId, report: &Finished, known: &Known, checked: bool) {
         self.commits.extend(trace::commit(report));
         let stage = self.core.stage_of(report);
         let hint = stage.and_then(|stage| known.get(&(stage, report.index)).copied().flatten());
         let now = self.now();
-        self.core.finished(session, report, OutputHint(hint), now);
+        self.core
+            .finished(session, report, OutputHint(hint), checked, now);
     }
 
     fn worker_said(&mut self, session: SessionId, said: FromWorker) {
         let now = self.now();
         match said {
             FromWorker::Credit(n) => self.core.credit(session, n),
-            FromWorker::Heartbeat(leases, progress) => {
+            FromWorker::Heartbeat(leases, progress, ends_in_ms) => {
                 self.sessions.heard(session);
+                self.core.ends(session, ends_in_ms, now);
                 self.core.heartbeat(session, &leases, &progress, now);
             }
             FromWorker::Done(_) => unreachable!("handled with what the catalog holds"),
@@ -512,6 +683,7 @@ impl Life<'_> {
             FromWorker::Closed => {
                 self.sessions.close(session);
                 self.core.closed(session, now);
+                self.core.is_here(session, false);
             }
         }
     }
@@ -669,7 +841,11 @@ fn refuse(command: Command, error: &str) {
     }
     match command {
         // Dropping a session's sender ends it.
-        Command::Open { .. } | Command::Worker(..) | Command::Judged(..) | Command::Broken(_) => {}
+        Command::Open { .. }
+        | Command::Worker(..)
+        | Command::Verified { .. }
+        | Command::Judged(..)
+        | Command::Broken(_) => {}
         Command::Learn(_, reply) | Command::Cancel { reply, .. } | Command::Pause { reply, .. } => {
             no(reply, error)
         }
@@ -677,6 +853,7 @@ fn refuse(command: Command, error: &str) {
         Command::Drain(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),
+        Command::Fits(_, reply) => no(reply, error),
         Command::Look(reply) => no(reply, error),
         Command::LookAt { reply, .. } => no(reply, error),
     }

@@ -1,8 +1,13 @@
-//! How often a task is tried: failures of its own and losses of its worker have separate budgets,
-//! interruptions are free.
+//! How often a task is tried: failures of its own, losses of its worker and interruptions have
+//! separate budgets.
 
 use picofarm_catalog::Exception;
-use picofarm_proto::model::{FailureKind, Limits};
+use picofarm_proto::{
+    ids::StageRef,
+    model::{FailureKind, Limits},
+};
+
+use crate::explain::span;
 
 /// Waiting times between tries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,28 +44,64 @@ pub struct Verdict {
     pub exception: Option<Exception>,
 }
 
-/// Charges a failure to a task's budgets. `before` is its record so far, `fresh` one without failures.
+/// An attempt at a task that did not end well.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Attempt<'a> {
+    /// How it ended.
+    pub kind: FailureKind,
+    /// The same for people.
+    pub message: &'a str,
+    /// How long it took, as far as is known, milliseconds.
+    pub ms: u64,
+    /// It is the task's to answer for: neither its worker's, nor did it come further than the one
+    /// before.
+    pub counts: bool,
+    /// The task need not wait the first time: its worker gave the whole lease back.
+    pub at_once: bool,
+}
+
+/// A task's record without failures.
+pub fn fresh(stage: StageRef, task: u64) -> Exception {
+    Exception {
+        stage,
+        task,
+        failures: 0,
+        crashes: 0,
+        interruptions: 0,
+        longest_ms: 0,
+        dead: false,
+        last_error: String::new(),
+    }
+}
+
+/// Charges an attempt to a task's budgets. `before` is its record so far, `fresh` one without
+/// failures.
 pub fn charge(
     before: Option<&Exception>,
     fresh: Exception,
-    kind: FailureKind,
-    message: &str,
+    attempt: Attempt<'_>,
     limits: &Limits,
     backoff: &Backoff,
     now_ms: i64,
 ) -> Verdict {
     let mut exception = before.cloned().unwrap_or(fresh);
-    let tries = match kind {
+    let tries = match attempt.kind {
         FailureKind::Interrupted => {
+            exception.longest_ms = exception.longest_ms.max(attempt.ms);
+            exception.interruptions += u32::from(attempt.counts);
+            let tries = exception.interruptions.max(1);
+            tries - u32::from(attempt.at_once)
+        }
+        // Its store's own wait decides, and of what is damaged the caller, who counts the tries.
+        FailureKind::Store | FailureKind::Damaged => {
             return Verdict {
-                retry_at_ms: Some(now_ms + backoff.after(1)),
+                retry_at_ms: Some(now_ms + 1),
                 exception: before.cloned(),
             };
         }
-        // Its store's own wait decides.
-        FailureKind::Store => {
+        FailureKind::User | FailureKind::Crash if !attempt.counts => {
             return Verdict {
-                retry_at_ms: Some(now_ms + 1),
+                retry_at_ms: Some(now_ms + backoff.after(1)),
                 exception: before.cloned(),
             };
         }
@@ -73,11 +114,24 @@ pub fn charge(
             exception.crashes
         }
     };
-    exception.last_error = message.to_owned();
-    exception.dead =
-        exception.failures >= limits.max_failures || exception.crashes >= limits.max_crashes;
+    exception.last_error = attempt.message.to_owned();
+    let interrupted = exception.interruptions >= limits.max_interruptions;
+    if interrupted {
+        exception.last_error = format!(
+            "interrupted {} times, for at most {} at a time; the last: {}",
+            exception.interruptions,
+            span(i64::try_from(exception.longest_ms).unwrap_or(i64::MAX)),
+            attempt.message
+        );
+    }
+    exception.dead = exception.failures >= limits.max_failures
+        || exception.crashes >= limits.max_crashes
+        || interrupted;
     Verdict {
-        retry_at_ms: (!exception.dead).then(|| now_ms + backoff.after(tries)),
+        retry_at_ms: (!exception.dead).then(|| match tries {
+            0 => 0,
+            _ => now_ms + backoff.after(tries),
+        }),
         exception: Some(exception),
     }
 }

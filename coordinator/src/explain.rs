@@ -4,7 +4,8 @@ use picofarm_catalog::{Exception, Holdups, TaskRecord};
 use picofarm_proto::{
     ids::JobId,
     model::{
-        Event, JobState, Limits, Reason, RunningTask, StageState, StageStatus, TaskCounts,
+        Event, EventKind, JobState, Limits, Reason, RunningTask, StageState, StageStatus,
+        TaskCounts,
         matrix::{same_matrix, together},
         memory::gib,
     },
@@ -23,11 +24,15 @@ pub struct Candidate {
     pub may_run: Result<(), String>,
     /// Bytes of memory that a task takes and that the worker has for it, where that is too little.
     pub lacks_memory: Option<(u64, u64)>,
+    /// What a task is taken to need, milliseconds, where the worker ends before that.
+    pub lacks_time: Option<i64>,
     /// It asks for work.
     pub idle: bool,
+    /// There is a task that it can be granted now, or may be.
+    pub gets: bool,
     /// It holds a range that crashed others, and gets nothing else.
     pub quarantined: bool,
-    /// It holds leases and was not heard of for so many milliseconds, longer than it should be.
+    /// Milliseconds since it was last heard of, where that is longer than it should be.
     pub silent_ms: Option<i64>,
 }
 
@@ -63,6 +68,11 @@ pub struct JobFacts {
     pub candidates: Vec<Candidate>,
     /// Tasks that workers have in hand for other jobs with the same outputs.
     pub shared: u64,
+    /// Tasks that wait for a worker with nothing else in hand: workers were lost while they ran
+    /// them.
+    pub suspects: u64,
+    /// The deadline that stopped the job, as in its file.
+    pub deadline: Option<String>,
     /// Jobs that go first and have tasks waiting for the same workers.
     pub ahead: Vec<JobId>,
     /// How many more of these there are that the asker may not see.
@@ -113,7 +123,7 @@ fn n(count: u64, what: &str) -> String {
 }
 
 /// "12 s", "3 min".
-fn span(ms: i64) -> String {
+pub fn span(ms: i64) -> String {
     let seconds = ms.max(0) as u64 / 1000;
     match seconds {
         0..120 => format!("{seconds} s"),
@@ -132,11 +142,23 @@ pub fn job(facts: &JobFacts) -> Vec<Reason> {
         }
         JobState::Cancelled => {
             let left = counts.total - counts.done;
-            let words = format!(
-                "the job was cancelled with {} not done; submit it with --again to run them (what is done is reused)",
-                n(left, "task")
-            );
-            reasons.push(reason("cancelled", left, words));
+            let tasks = n(left, "task");
+            let (code, words) = match &facts.deadline {
+                Some(deadline) => (
+                    "deadline",
+                    format!(
+                        "the job's deadline passed (limits.deadline = {deadline:?}) with {tasks} not done; set a later \
+                         limits.deadline in its file, or none, and submit it again (what is done is reused)"
+                    ),
+                ),
+                None => (
+                    "cancelled",
+                    format!(
+                        "the job was cancelled with {tasks} not done; submit it with --again to run them (what is done is reused)"
+                    ),
+                ),
+            };
+            reasons.push(reason(code, left, words));
         }
         JobState::Failed => blocked(facts, &mut reasons),
         JobState::Active => {
@@ -316,9 +338,13 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     if facts.candidates.is_empty() {
         let words = match facts.elsewhere {
             0 => format!(
-                "no worker is connected, and {tasks} could run: start one with `picofarm worker`"
+                "no worker is connected, and {tasks} could run: start one with `picofarm worker`{}",
+                lately(facts)
             ),
-            _ => format!("no worker is connected here for {tasks}{others}"),
+            _ => format!(
+                "no worker is connected here for {tasks}{others}{}",
+                lately(facts)
+            ),
         };
         let code = if facts.elsewhere == 0 {
             "no_workers"
@@ -332,6 +358,9 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         .iter()
         .filter(|c| c.may_run.is_ok())
         .collect();
+    if let Some(reason) = short_of_time(facts, ready, &able) {
+        return reason;
+    }
     if able.is_empty() {
         let (small, others_say): (Vec<&Candidate>, Vec<&Candidate>) = facts
             .candidates
@@ -366,7 +395,7 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         let named: Vec<String> = named.collect();
         let words = format!(
             "{tasks} wait: of {} that may run them nothing was heard ({}), although connected: frozen, suspended or \
-             overloaded; their leases pass on to others when they run out{others}",
+             overloaded; what they had passes on to others when its lease runs out{others}",
             if able.len() == 1 {
                 "the one worker".into()
             } else {
@@ -376,7 +405,8 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         );
         return reason("silent", ready, words);
     }
-    let idle = able.iter().filter(|c| c.idle && !c.quarantined).count();
+    let asks = |c: &&&Candidate| c.idle && !c.quarantined;
+    let idle = able.iter().filter(asks).filter(|c| c.gets).count();
     if idle > 0 {
         let words = format!(
             "{tasks} about to be leased: {} for work",
@@ -387,6 +417,12 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
             }
         );
         return reason("starting", ready, words);
+    }
+    if facts.suspects > 0 && able.iter().any(|c| asks(&c)) {
+        let words = format!(
+            "{tasks} wait for a worker with nothing else in hand: workers were lost while they ran them{others}"
+        );
+        return reason("suspects", ready, words);
     }
     let ahead = facts.ahead.len() as u64 + facts.unseen;
     if ahead > 0 {
@@ -413,6 +449,49 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         if able.len() == 1 { "is" } else { "are" },
     );
     reason("busy", ready, words)
+}
+
+/// Where those that may run the tasks all end too early.
+fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Reason> {
+    if able.iter().any(|c| c.lacks_time.is_none()) {
+        return None;
+    }
+    let needs = facts.candidates.iter().filter_map(|c| c.lacks_time).min()?;
+    let words = format!(
+        "no connected worker has {} left for {}: a task is taken to need that long, by those that are done and the attempts that \
+         were interrupted; start a worker that may run longer",
+        span(needs),
+        n(ready, "task")
+    );
+    Some(reason("time", ready, words))
+}
+
+/// Where workers were connected a moment ago: what became of their leases.
+fn lately(facts: &JobFacts) -> String {
+    const RECENT_MS: i64 = 600_000;
+    let back = facts.setback.as_ref().filter(|event| {
+        matches!(event.kind, EventKind::Released | EventKind::Expired)
+            && facts.now_ms - event.at_ms <= RECENT_MS
+    });
+    let Some(event) = back else {
+        return String::new();
+    };
+    let failed = facts.holdups.failed.iter();
+    let most = failed.max_by_key(|e| e.interruptions);
+    let count = most.filter(|e| e.interruptions > 0).map(|e| {
+        format!(
+            "; task {} was interrupted {} so far",
+            e.task,
+            n(u64::from(e.interruptions), "time")
+        )
+    });
+    format!(
+        "; the last one, {}, gave a lease back {} ago: {}{}",
+        event.worker,
+        span(facts.now_ms - event.at_ms),
+        event.message,
+        count.unwrap_or_default()
+    )
 }
 
 /// What a task needs and what the largest of the workers has that are too small for it, in words.

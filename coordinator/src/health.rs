@@ -1,22 +1,34 @@
 //! How the actor does, and how with its catalog: what `/healthz` and `/readyz` tell. Read without asking the actor.
 
 use std::{
+    collections::BTreeMap,
     fmt,
     sync::{
-        Mutex,
+        Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
     time::{Duration, Instant},
 };
+
+use picofarm_catalog::Catalog;
+use tokio_util::sync::CancellationToken;
 
 /// The actor is thought stuck when its loop has not turned for so long.
 const ALIVE: Duration = Duration::from_secs(30);
 /// The catalog is thought gone when it has not answered for so long.
 const READY: Duration = Duration::from_secs(10);
 
+/// How often it is tried whether the catalog can be written, and how long that may take; how soon after a failure.
+const TRY: Duration = Duration::from_secs(10);
+const TRY_AGAIN: Duration = Duration::from_secs(1);
+/// The catalog is thought full or stuck when no write has succeeded for so long.
+const WRITTEN: Duration = Duration::from_secs(30);
+
 /// How the actor does, and how with its catalog.
 pub(crate) struct Health {
     catalog: Mutex<State>,
+    /// Files by which callers are judged and that cannot be used, with the reason.
+    access: Mutex<BTreeMap<&'static str, String>>,
     began: Instant,
     /// When its loop turned last, milliseconds after `began`.
     turned: AtomicU64,
@@ -26,6 +38,7 @@ impl Default for Health {
     fn default() -> Self {
         Self {
             catalog: Mutex::default(),
+            access: Mutex::default(),
             began: Instant::now(),
             turned: AtomicU64::new(0),
         }
@@ -35,6 +48,10 @@ impl Default for Health {
 #[derive(Default)]
 struct State {
     beaten: Option<Instant>,
+    /// When a write that takes room last succeeded.
+    wrote: Option<Instant>,
+    /// Why the last one did not.
+    full: Option<(&'static str, String)>,
     /// In a few words for anyone, and in full for this machine.
     fault: Option<(&'static str, String)>,
 }
@@ -68,10 +85,21 @@ impl Health {
 
     /// The catalog has answered.
     pub(crate) fn beat(&self) {
-        *self.lock() = State {
-            beaten: Some(Instant::now()),
-            fault: None,
-        };
+        let mut state = self.lock();
+        state.beaten = Some(Instant::now());
+        state.fault = None;
+    }
+
+    /// The catalog has taken a write that needs room.
+    pub(crate) fn wrote(&self) {
+        let mut state = self.lock();
+        state.wrote = Some(Instant::now());
+        state.full = None;
+    }
+
+    /// The catalog has not taken a write that needs room.
+    pub(crate) fn full(&self, brief: &'static str, why: &str) {
+        self.lock().full = Some((brief, why.to_owned()));
     }
 
     /// A life of the actor has ended for this reason; another will be tried.
@@ -79,13 +107,33 @@ impl Health {
         self.lock().fault = Some((brief, why.to_owned()));
     }
 
+    /// A file by which callers are judged cannot be used (`Some`, with the reason), or can be used
+    /// again.
+    pub(crate) fn access(&self, file: &'static str, why: Option<String>) {
+        let mut access = self.access.lock().expect("no panic while locked");
+        match why {
+            Some(why) => access.insert(file, why),
+            None => access.remove(file),
+        };
+    }
+
     /// Whether jobs and reports can be taken.
     ///
     /// # Errors
     /// Why not.
     pub(crate) fn ready(&self) -> Result<(), Unready> {
+        let access = self.access.lock().expect("no panic while locked");
+        if let Some((file, why)) = access.first_key_value() {
+            return Err(Unready {
+                what: format!(
+                    "{file} cannot be used; every caller is refused until this is repaired"
+                ),
+                detail: Some(why.clone()),
+            });
+        }
+        drop(access);
         let state = self.lock();
-        if let Some((brief, why)) = &state.fault {
+        if let Some((brief, why)) = state.fault.as_ref().or(state.full.as_ref()) {
             return Err(Unready {
                 what: format!("{brief}; nothing is taken until it can be used again"),
                 detail: Some(why.clone()),
@@ -96,7 +144,13 @@ impl Health {
             Some(age) if age > READY => {
                 format!("the catalog has not answered for {} s", age.as_secs())
             }
-            Some(_) => return Ok(()),
+            Some(_) => match state.wrote.map(|at| at.elapsed()) {
+                None => "the catalog has not been written yet".into(),
+                Some(age) if age > WRITTEN => {
+                    format!("the catalog has not been written for {} s", age.as_secs())
+                }
+                Some(_) => return Ok(()),
+            },
         };
         Err(Unready { what, detail: None })
     }
@@ -129,6 +183,35 @@ impl Health {
     }
 }
 
+/// Tries again and again whether the catalog can be written, until `stop`: beside the actor, which waits for none of it.
+pub(crate) async fn try_writes(
+    health: Arc<Health>,
+    catalog: Arc<dyn Catalog>,
+    stop: CancellationToken,
+) {
+    loop {
+        let wait = match tokio::time::timeout(TRY, catalog.try_room()).await {
+            Ok(Ok(())) => {
+                health.wrote();
+                TRY
+            }
+            Ok(Err(error)) => {
+                health.full(error.brief(), &error.to_string());
+                TRY_AGAIN
+            }
+            Err(_) => {
+                let why = "a small write took over 10 s";
+                health.full("the catalog takes no writes", why);
+                TRY_AGAIN
+            }
+        };
+        tokio::select! {
+            () = tokio::time::sleep(wait) => {}
+            () = stop.cancelled() => return,
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -144,6 +227,18 @@ mod tests {
                 .contains("not answered yet")
         );
         health.beat();
+        let why = health.ready().unwrap_err().to_string();
+        assert!(why.contains("not been written yet"), "{why}");
+        health.wrote();
+        assert_eq!(health.ready(), Ok(()));
+        health.full("the disk is full", "no room in /var/lib/db");
+        health.beat();
+        let why = health.ready().unwrap_err();
+        assert!(
+            why.what.contains("disk is full"),
+            "a beat takes no room: {why}"
+        );
+        health.wrote();
         assert_eq!(health.ready(), Ok(()));
         health.fault("the catalog failed", "no route to db.example");
         let why = health.ready().unwrap_err();
@@ -155,6 +250,10 @@ mod tests {
         assert!(health.waits());
         health.beat();
         assert_eq!(health.ready(), Ok(()));
+        let long_ago = Instant::now().checked_sub(2 * WRITTEN);
+        health.lock().wrote = long_ago;
+        assert_eq!(health.ready().is_err(), long_ago.is_some());
+        health.wrote();
         let long_ago = Instant::now().checked_sub(2 * READY);
         health.lock().beaten = long_ago;
         assert_eq!(health.ready().is_err(), long_ago.is_some());

@@ -32,6 +32,7 @@ use crate::{
     auth::Throttle,
     connections::{Doors, Place},
     health::Health,
+    memory::Memory,
     metrics::{Gauges, Metrics},
     rpc::Link,
 };
@@ -55,6 +56,7 @@ pub(crate) struct Pages {
     pub health: Arc<Health>,
     /// Of the gRPC port.
     pub doors: Arc<Doors>,
+    pub memory: Arc<Memory>,
     pub gauges: Kept,
     /// Where the actor and the catalog's connections live.
     pub main: Handle,
@@ -106,7 +108,7 @@ pub(crate) fn start(
 }
 
 async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) {
-    let doors = Arc::new(Doors::new(CONNECTIONS, CONNECTIONS));
+    let doors = Arc::new(Doors::new(CONNECTIONS, CONNECTIONS, CONNECTIONS));
     let failed = Throttle::default();
     loop {
         let accepted = tokio::select! {
@@ -200,7 +202,8 @@ impl Pages {
                 let (gauges, connections) = (self.gauges().await, self.doors.counts());
                 page(
                     StatusCode::OK,
-                    self.metrics.page(gauges, connections, ready),
+                    self.metrics
+                        .page(gauges, connections, self.memory.used(), ready),
                 )
             }
             _ => page(
@@ -258,6 +261,7 @@ impl Pages {
     async fn read_gauges(&self) -> Option<Gauges> {
         let look = self.link.ask(Command::Look).await.ok()?;
         Some(Gauges {
+            ready: look.ready,
             jobs: look.jobs.len() as u64,
             workers: look.workers.len() as u64,
             instances: u64::from(look.instances),

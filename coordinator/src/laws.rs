@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use uuid::Uuid;
 
 use crate::{
-    budget::{Backoff, charge},
+    budget::{Attempt, Backoff, charge, fresh},
     place::lease_size,
     plan::expand,
     stage::Stage,
@@ -81,7 +81,11 @@ proptest! {
                     let lo = a % (2 * total);
                     let except = [Run { lo, hi: lo + b % 5 }];
                     let among = (lo..except[0].hi.min(total)).filter(|t| table[*t as usize] == Task::Pending);
-                    prop_assert_eq!(stage.pending_among(&except), among.count() as u64);
+                    let (plain, suspects) = stage.ready(i64::MAX, &except);
+                    let among = among.count() as u64;
+                    prop_assert_eq!(plain + suspects + among, stage.pending_tasks());
+                    prop_assert_eq!(stage.front(i64::MAX, false, &except).is_some(), plain > 0);
+                    prop_assert_eq!(stage.front(i64::MAX, true, &except).is_some(), plain + suspects > 0);
                     let Some((front, run)) = stage.front(i64::MAX, flag, &except) else { continue };
                     let front = front.clone();
                     prop_assert!(front.lo <= run.lo && run.lo < run.hi && run.hi <= front.hi);
@@ -232,22 +236,25 @@ proptest! {
     }
 
     #[test]
-    fn budgets_are_separate_and_interruptions_free(kinds in prop::collection::vec(0..4u8, 0..30)) {
-        let limits = Limits { max_failures: 3, max_crashes: 2, ..Limits::default() };
+    fn budgets_are_separate_and_those_of_stores_free(kinds in prop::collection::vec((0..5u8, any::<bool>(), any::<bool>()), 0..30)) {
+        let limits = Limits { max_failures: 3, max_crashes: 2, max_interruptions: 5, ..Limits::default() };
         let backoff = Backoff::default();
-        let fresh = || picofarm_catalog::Exception {
-            stage: stage_ref(), task: 0, failures: 0, crashes: 0, dead: false, last_error: String::new(),
-        };
-        let (mut record, mut failures, mut crashes) = (None, 0, 0);
-        for kind in kinds {
-            let kind = [FailureKind::User, FailureKind::Crash, FailureKind::Interrupted, FailureKind::Store][usize::from(kind)];
-            failures += u32::from(kind == FailureKind::User);
-            crashes += u32::from(kind == FailureKind::Crash);
-            let verdict = charge(record.as_ref(), fresh(), kind, "x", &limits, &backoff, 100);
-            let free = matches!(kind, FailureKind::Interrupted | FailureKind::Store);
-            let dead = !free && (failures >= 3 || crashes >= 2);
+        let (mut record, mut failures, mut crashes, mut interruptions) = (None, 0, 0, 0);
+        for (kind, counts, at_once) in kinds {
+            let kind = [FailureKind::User, FailureKind::Crash, FailureKind::Interrupted, FailureKind::Store, FailureKind::Damaged][usize::from(kind)];
+            failures += u32::from(kind == FailureKind::User && counts);
+            crashes += u32::from(kind == FailureKind::Crash && counts);
+            interruptions += u32::from(kind == FailureKind::Interrupted && counts);
+            let attempt = Attempt { kind, message: "x", ms: 7_000, counts, at_once };
+            let verdict = charge(record.as_ref(), fresh(stage_ref(), 0), attempt, &limits, &backoff, 100);
+            let dead = failures >= 3 || crashes >= 2 || interruptions >= 5;
             prop_assert_eq!(verdict.retry_at_ms.is_none(), dead);
-            prop_assert!(verdict.retry_at_ms.is_none_or(|at| at > 100));
+            let soon = kind == FailureKind::Interrupted && at_once && interruptions <= 1;
+            prop_assert!(verdict.retry_at_ms.is_none_or(|at| (at > 100) != soon));
+            if let Some(e) = &verdict.exception {
+                prop_assert_eq!((e.failures, e.crashes, e.interruptions), (failures, crashes, interruptions));
+                prop_assert_eq!(e.dead && interruptions >= 5, e.last_error.contains("interrupted 5 times"));
+            }
             record = verdict.exception;
             if dead {
                 break;

@@ -15,6 +15,7 @@ mod http;
 mod lanes;
 #[cfg(test)]
 mod laws;
+mod memory;
 mod metrics;
 pub mod place;
 pub mod plan;
@@ -31,6 +32,7 @@ pub mod transition;
 pub use budget::Backoff;
 pub use clock::Clock;
 pub use connections::Connections;
+pub use memory::MemoryBounds;
 pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
 pub use stored::{Found, Stored};
 

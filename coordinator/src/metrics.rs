@@ -15,6 +15,7 @@ use crate::{
     auth::METHODS,
     connections::Counts,
     core::{Say, SessionId},
+    memory::Used,
 };
 
 const SECONDS: &[f64] = &[
@@ -112,7 +113,9 @@ impl Tally {
         match kind {
             FailureKind::User => self.user += 1,
             FailureKind::Crash => self.crash += 1,
-            FailureKind::Interrupted | FailureKind::Store => self.interrupted += 1,
+            FailureKind::Interrupted | FailureKind::Store | FailureKind::Damaged => {
+                self.interrupted += 1;
+            }
         }
     }
 
@@ -158,6 +161,8 @@ impl Tally {
 pub(crate) struct Gauges {
     /// Tasks of the active jobs, together.
     pub tasks: TaskCounts,
+    /// Tasks that could be leased now.
+    pub ready: u64,
     pub jobs: u64,
     pub workers: u64,
     pub instances: u64,
@@ -204,7 +209,13 @@ impl Metrics {
     }
 
     /// The text that Prometheus reads. `gauges` is missing where the catalog cannot be read.
-    pub(crate) fn page(&self, gauges: Option<Gauges>, connections: Counts, ready: bool) -> String {
+    pub(crate) fn page(
+        &self,
+        gauges: Option<Gauges>,
+        connections: Counts,
+        memory: Used,
+        ready: bool,
+    ) -> String {
         let mut page = Page(String::with_capacity(16 << 10));
         page.family(
             "build_info",
@@ -222,6 +233,7 @@ impl Metrics {
             page.gauges(&gauges);
         }
         page.connections(connections);
+        page.memory(memory);
         self.counters(&mut page);
         self.histograms(&mut page);
         page.0
@@ -334,6 +346,39 @@ impl Page {
         );
     }
 
+    fn memory(&mut self, used: Used) {
+        self.one(
+            "request_memory_bytes",
+            "gauge",
+            "Memory that requests and answers are charged with.",
+            used.requests,
+        );
+        self.one(
+            "request_memory_most_bytes",
+            "gauge",
+            "The most memory that requests and answers were charged with since the start.",
+            used.most,
+        );
+        self.one(
+            "request_memory_limit_bytes",
+            "gauge",
+            "Memory that requests and answers may take now: less with more connections and jobs.",
+            used.allowed,
+        );
+        self.one(
+            "job_memory_bytes",
+            "gauge",
+            "Memory that the specs of jobs are charged with that have not ended.",
+            used.jobs,
+        );
+        self.one(
+            "requests_refused_total",
+            "counter",
+            "Requests and workers' messages refused for lack of memory.",
+            used.refused,
+        );
+    }
+
     fn family(&mut self, name: &str, kind: &str, help: &str) {
         let _ = writeln!(
             self.0,
@@ -379,6 +424,13 @@ impl Page {
             "gauge",
             "Tasks that wait for workers: what to scale workers by. Of the whole farm.",
             tasks.pending,
+        );
+        self.one(
+            "tasks_ready",
+            "gauge",
+            "Tasks that could be leased now; those that wait after a failure are not among them. Of the whole farm, \
+             without what other coordinators have claimed.",
+            gauges.ready,
         );
         self.one(
             "jobs_active",

@@ -70,6 +70,10 @@ pub fn plan(
             reuse,
             run: total - reuse,
             memory_bytes: memory.unwrap_or(0),
+            workers: 0,
+            task_seconds: None,
+            task_bytes: None,
+            measured: false,
             reasons: reasons(stage, total, there, recent),
         });
     }
@@ -80,6 +84,7 @@ pub fn plan(
         run: stages.iter().map(|s| s.run).sum(),
         existing_job,
         stages,
+        warnings: Vec::new(),
     }
 }
 

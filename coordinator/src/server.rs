@@ -24,9 +24,10 @@ use crate::{
     connections::{Connections, Streams, accept, follow_certificates, raise_open_files},
     core::Settings,
     forget,
-    health::Health,
+    health::{self, Health},
     http::{self, Kept, Pages},
     lanes::Lanes,
+    memory::{Charging, Memory, MemoryBounds},
     metrics::Metrics,
     rpc::{FarmService, JobsService, Link},
     stored::Stored,
@@ -38,6 +39,11 @@ use crate::{
 pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// Largest message of a worker: a heartbeat or hello that names some ten thousand leases.
 const MAX_WORKER_MESSAGE_BYTES: usize = 1 << 20;
+/// Open requests of one connection at a time. Those of clients wait on the client's side for their turn.
+const MAX_STREAMS: u32 = 100;
+/// What a client may send ahead of what is read: of one request, and of a connection.
+const STREAM_WINDOW: u32 = 64 << 10;
+const CONNECTION_WINDOW: u32 = 256 << 10;
 /// Largest headers of a request.
 const MAX_HEADERS_BYTES: u32 = 16 << 10;
 /// Commands that may wait for the actor; more senders wait for room.
@@ -77,6 +83,8 @@ pub struct CoordinatorConfig {
     pub quotas: Quotas,
     /// Bounds on connections.
     pub connections: Connections,
+    /// How much memory there is for requests and jobs.
+    pub memory: MemoryBounds,
     /// Where `/healthz`, `/readyz` and `/metrics` are served, for anyone who reaches it; port 0 = any free port; by default
     /// nowhere.
     pub http: Option<SocketAddr>,
@@ -105,6 +113,7 @@ impl CoordinatorConfig {
             access: Access::default(),
             quotas: Quotas::default(),
             connections: Connections::default(),
+            memory: MemoryBounds::default(),
             http: None,
             forget_after: None,
             audit_for: Duration::from_secs(365 * 86_400),
@@ -214,11 +223,20 @@ async fn start(
             Some((files.clone(), loaded))
         }
     };
-    let doors = Arc::new(config.connections.doors(raise_open_files()));
+    let doors = config.connections.doors(raise_open_files(), config.memory);
+    let doors = Arc::new(doors);
+    let memory = Arc::new(Memory::new(config.memory, Arc::clone(&doors)));
     let (all, per_address) = doors.bounds();
-    tracing::info!(all, per_address, "connections at most");
+    let mib = config.memory.process >> 20;
+    tracing::info!(mib, all, per_address, "memory and connections at most");
     let (audit, writer) = Audit::new(config.clock.clone());
-    let gate = Gate::new(&config.access, &audit, shutdown.clone())?;
+    let (metrics, health) = (Arc::new(Metrics::default()), Arc::new(Health::default()));
+    let (gate, judge) = Gate::new(
+        &config.access,
+        &audit,
+        Arc::clone(&health),
+        shutdown.clone(),
+    )?;
     let (listener, address) = listen(config.listen).await?;
     let endpoint = match config.http {
         Some(address) => Some(listen(address).await?),
@@ -232,7 +250,8 @@ async fn start(
     let writer = tokio::spawn(writer);
     let (commands, queue) = mpsc::channel(QUEUE);
     let (revision, seen) = watch::channel(0);
-    let (metrics, health) = (Arc::new(Metrics::default()), Arc::new(Health::default()));
+    let writes = health::try_writes(Arc::clone(&health), Arc::clone(&catalog), shutdown.clone());
+    tokio::spawn(writes);
     let lanes = Lanes::new(shutdown.clone());
     let submissions = Submissions::new(
         Arc::clone(&catalog),
@@ -241,6 +260,7 @@ async fn start(
         commands.clone(),
         config.clock.clone(),
         config.access.visibility,
+        Arc::clone(&memory),
     );
     let actor = Actor {
         catalog: Arc::clone(&catalog),
@@ -257,6 +277,7 @@ async fn start(
         metrics: Arc::clone(&metrics),
         health: Arc::clone(&health),
         stop: shutdown.clone(),
+        memory: Arc::clone(&memory),
         aside: Arc::new(submissions.clone()),
     };
     let link = Link {
@@ -278,6 +299,7 @@ async fn start(
             link: link.clone(),
             metrics: Arc::clone(&metrics),
             health,
+            memory: Arc::clone(&memory),
             doors: Arc::clone(&doors),
             gauges: Kept::default(),
             main: Handle::current(),
@@ -292,13 +314,18 @@ async fn start(
         tokio::spawn(forget::run(catalog, clock, age, shutdown.clone()));
     }
     let actor = tokio::spawn(actor.run(queue));
-    let tls = tls
-        .map(|(files, loaded)| follow_certificates(files, loaded, audit.clone(), shutdown.clone()));
+    let tls = tls.map(|(files, loaded)| {
+        follow_certificates(files, loaded, judge, audit.clone(), shutdown.clone())
+    });
     let connections = accept(listener, doors, config.connections, tls, shutdown.clone());
     let server = Server::builder()
         .http2_max_header_list_size(Some(MAX_HEADERS_BYTES))
+        .max_concurrent_streams(MAX_STREAMS)
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
         .layer(Timed(metrics))
         .layer(Guard::new(gate, audit))
+        .layer(Charging(Arc::clone(&memory)))
         .layer(Streams)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))

@@ -21,6 +21,11 @@ impl Waiting {
     pub(crate) fn arrived(&self) {
         self.0.fetch_add(1, Ordering::Relaxed);
     }
+
+    /// How many there are.
+    pub(crate) fn count(&self) -> u32 {
+        self.0.load(Ordering::Relaxed)
+    }
 }
 
 /// The open sessions.

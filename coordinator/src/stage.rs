@@ -152,16 +152,28 @@ impl Stage {
             .find_map(|range| Some((range, first_outside(range, except)?)))
     }
 
-    /// Pending tasks in hand that are among `runs` (disjoint).
-    pub fn pending_among(&self, runs: &[Run]) -> u64 {
-        let both = |run: &Run| {
-            let up_to = self.pending.range(..run.hi).rev();
-            up_to
-                .take_while(|(_, range)| range.hi > run.lo)
-                .map(|(_, range)| range.hi.min(run.hi) - range.lo.max(run.lo))
-                .sum::<u64>()
-        };
-        runs.iter().map(both).sum()
+    /// Whether any pending range may go at this time.
+    pub fn is_due(&self, now_ms: i64) -> bool {
+        self.queue.first().is_some_and(|(at, _)| *at <= now_ms)
+    }
+
+    /// Pending tasks that may go at this time, outside `except` (ascending, disjoint): those that
+    /// nobody suspects, and those with which workers were lost.
+    pub fn ready(&self, now_ms: i64, except: &[Run]) -> (u64, u64) {
+        let due = self.queue.iter().take_while(|(at, _)| *at <= now_ms);
+        let (mut plain, mut suspects) = (0, 0);
+        for range in due.filter_map(|(_, lo)| self.pending.get(lo)) {
+            let from = except.partition_point(|run| run.hi <= range.lo);
+            let both = except[from..].iter().take_while(|run| run.lo < range.hi);
+            let out: u64 = both
+                .map(|run| range.hi.min(run.hi) - range.lo.max(run.lo))
+                .sum();
+            match range.crashes {
+                0 => plain += range.len() - out,
+                _ => suspects += range.len() - out,
+            }
+        }
+        (plain, suspects)
     }
 
     /// The pending range that holds a task.

@@ -15,6 +15,11 @@ pub enum Found {
     Gone,
     /// Something else.
     Differs,
+    /// Nothing, because this machine has no folder at the store's place. Whether results were deleted, or only workers reach
+    /// the store, cannot be told.
+    NoFolder,
+    /// Nothing, because there is no folder at the store's place. This machine has the folder around it.
+    NoStore,
 }
 
 /// Looks into stores. Its caller bounds how long it waits and how many ask at a time.

@@ -183,6 +183,7 @@ fn hello(id: String) -> wire::Hello {
         cores: 1,
         held: Vec::new(),
         ended: String::new(),
+        ends_in_ms: 0,
         kinds: [("render".to_owned(), "r1".to_owned())].into(),
         assets: Vec::new(),
         memory_mib: 64 << 10,
@@ -241,8 +242,14 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
             fraction,
         },
     );
-    let beat = (leases(), vec(progress, 0..4))
-        .prop_map(|(leases, progress)| Say::Heartbeat(wire::Heartbeat { leases, progress }));
+    let beat =
+        (leases(), vec(progress, 0..4), number()).prop_map(|(leases, progress, ends_in_ms)| {
+            Say::Heartbeat(wire::Heartbeat {
+                leases,
+                progress,
+                ends_in_ms,
+            })
+        });
     let done = (
         lease(),
         number(),
@@ -273,6 +280,7 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
                 index,
                 kind,
                 message,
+                damaged: index % 2 == 0,
             })
         });
     let release = (lease(), ".{0,20}")

@@ -1,6 +1,8 @@
 //! The vocabulary of the farm and its wire: typed ids, the checked model of jobs, and the generated
 //! protobuf types with their conversions. No I/O.
 
+pub mod codec;
+pub mod compatibility;
 pub mod convert;
 pub mod ids;
 pub mod key;
@@ -15,5 +17,4 @@ pub mod wire {
     include!("generated/picofarm.v1.rs");
 }
 
-/// Version of the worker protocol; coordinator and worker must agree exactly.
-pub const PROTOCOL: u32 = 2;
+pub use compatibility::PROTOCOL;

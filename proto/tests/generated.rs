@@ -23,6 +23,7 @@ fn the_code_of_the_wire_is_what_the_schema_makes() {
     let out = tempfile::tempdir().unwrap();
     tonic_prost_build::configure()
         .emit_rerun_if_changed(false)
+        .codec_path("crate::codec::SmallCodec")
         .out_dir(out.path())
         .compile_fds(descriptors)
         .unwrap();

@@ -200,6 +200,11 @@ fn what_cannot_be_meant_is_refused_with_the_field_the_value_and_the_range() {
         ),
         (
             "limits",
+            json!({"max_interruptions": 0}),
+            ["limits.max_interruptions", "0 lies", "1..=1000000"],
+        ),
+        (
+            "limits",
             json!({"max_workers": 2_000_000}),
             ["limits.max_workers", "2000000", "0 is as many"],
         ),
@@ -226,6 +231,7 @@ fn what_cannot_be_meant_is_refused_with_the_field_the_value_and_the_range() {
         ("stage/2/train/depth_scale_m", json!(1.27)),
         ("stage/2/train/optimise", json!({"learning_rate": 10})),
         ("limits", json!({"max_crashes": 1_000_000})),
+        ("limits", json!({"max_interruptions": 1})),
     ] {
         with(at, value.clone()).unwrap_or_else(|e| panic!("{at} = {value}: {e}"));
     }

@@ -1,5 +1,5 @@
-//! A farm as it runs in earnest: several coordinators on one Postgres, workers that reach them through proxies, and any
-//! of them may fail at any time.
+//! A farm as it runs in earnest: several coordinators on one Postgres (or one on SQLite), workers that reach them through
+//! proxies, and any of them may fail at any time.
 
 use std::net::SocketAddr;
 
@@ -24,13 +24,24 @@ pub struct Cluster {
     pub coordinators: Vec<Coordinator>,
     cli: Cli,
     lease_s: f64,
-    /// The database.
-    pub postgres: Postgres,
+    database: Database,
     /// Its folder.
     pub scratch: Scratch,
 }
 
+/// What the coordinators keep their catalog in.
+enum Database {
+    Postgres(Postgres),
+    /// A SQLite file in the cluster's folder, for one coordinator.
+    Sqlite,
+}
+
 impl Cluster {
+    /// One coordinator on SQLite.
+    pub fn on_sqlite(name: &str, lease_s: f64) -> Self {
+        Self::with_database(Database::Sqlite, name, 1, lease_s, |cli| cli)
+    }
+
     /// Coordinators with leases of `lease_s` seconds; `None`, having said so, where there is no Postgres.
     pub fn start(name: &str, coordinators: usize, lease_s: f64) -> Option<Self> {
         Self::reaching(name, coordinators, lease_s, |cli| cli)
@@ -43,13 +54,29 @@ impl Cluster {
         lease_s: f64,
         with: impl FnOnce(Cli) -> Cli,
     ) -> Option<Self> {
-        let postgres = Postgres::start(name)?;
+        let database = Database::Postgres(Postgres::start(name)?);
+        Some(Self::with_database(
+            database,
+            name,
+            coordinators,
+            lease_s,
+            with,
+        ))
+    }
+
+    fn with_database(
+        database: Database,
+        name: &str,
+        coordinators: usize,
+        lease_s: f64,
+        with: impl FnOnce(Cli) -> Cli,
+    ) -> Self {
         let scratch = Scratch::new(name);
         let mut cluster = Self {
             coordinators: Vec::new(),
             cli: with(Cli::new(scratch.path())),
             lease_s,
-            postgres,
+            database,
             scratch,
         };
         for _ in 0..coordinators {
@@ -60,17 +87,29 @@ impl Cluster {
                 proxy: Proxy::before(address),
             });
         }
-        Some(cluster)
+        cluster
+    }
+
+    /// Ends the database without a word to anyone and starts it again. SQLite ends with its coordinator.
+    pub fn crash_database(&mut self) {
+        match &mut self.database {
+            Database::Postgres(postgres) => postgres.crash(),
+            Database::Sqlite => {
+                self.kill_coordinator(0);
+                self.start_coordinator(0);
+            }
+        }
     }
 
     fn launch(&self, listen: &str) -> (Process, SocketAddr) {
         let lease = self.lease_s.to_string();
         let args = ["coordinator", "--allow-insecure", "--json", "--log", "info"];
         let args = [&args[..], &["--listen", listen, "--lease-s", &lease]].concat();
-        let cli = self
-            .cli
-            .clone()
-            .with("PICOFARM_CATALOG", &self.postgres.url);
+        let catalog = match &self.database {
+            Database::Postgres(postgres) => postgres.url.clone(),
+            Database::Sqlite => "catalog.sqlite".into(),
+        };
+        let cli = self.cli.clone().with("PICOFARM_CATALOG", &catalog);
         let mut process = cli.start("coordinator", &args);
         let line = process.first_line();
         let document: Value = serde_json::from_str(&line).expect("the first line is JSON");
@@ -116,10 +155,17 @@ impl Cluster {
 
     /// Starts a worker with one thread that goes to the `first` coordinator before the others.
     pub fn worker(&self, name: &str, first: usize) -> Process {
+        self.worker_with(name, first, &[])
+    }
+
+    /// The same with further options.
+    pub fn worker_with(&self, name: &str, first: usize, options: &[&str]) -> Process {
         let args = ["worker", "--log", "info", "--name", name, "--threads", "1"];
         let urls = self.urls(first);
-        self.cli
-            .start(name, &[&args[..], &["--coordinator", &urls]].concat())
+        self.cli.start(
+            name,
+            &[&args[..], &["--coordinator", &urls], options].concat(),
+        )
     }
 
     /// Commands that go to whichever coordinator answers, past the proxies.

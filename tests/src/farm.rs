@@ -65,12 +65,19 @@ impl Farm {
     /// # Panics
     /// When it does not come up.
     pub fn start_coordinator(&mut self) {
+        self.start_coordinator_with(&[]);
+    }
+
+    /// The same with more arguments.
+    ///
+    /// # Panics
+    /// When it does not come up.
+    pub fn start_coordinator_with(&mut self, more: &[&str]) {
         let listen = match &self.url {
             Some(url) => url.trim_start_matches("http://").to_owned(),
             None => format!("127.0.0.1:{}", lasting()),
         };
         let lease = self.lease_s.to_string();
-        let stores = self.scratch.path().display().to_string();
         let args = [
             "coordinator",
             "--allow-insecure",
@@ -80,12 +87,7 @@ impl Farm {
             "--catalog",
             &self.catalog,
         ];
-        let args = [
-            &args[..],
-            &["--listen", &listen, "--lease-s", &lease],
-            &["--check-stores", &stores],
-        ]
-        .concat();
+        let args = [&args[..], &["--listen", &listen, "--lease-s", &lease], more].concat();
         let mut process = self.cli.start("coordinator", &args);
         let line = process.first_line();
         let document: Value = serde_json::from_str(&line).expect("the first line is JSON");

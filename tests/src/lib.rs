@@ -9,6 +9,7 @@ pub mod cli;
 pub mod cloud;
 pub mod cluster;
 pub mod farm;
+pub mod flood;
 pub mod http;
 pub mod job;
 pub mod mount;

@@ -86,6 +86,19 @@ impl Tmpfs {
         self.remount(&format!("size={mib}m"));
     }
 
+    /// Covers it with an empty file system, as if it were not mounted, until the value is dropped.
+    ///
+    /// # Panics
+    /// When the system refuses.
+    pub fn cover(&self) -> Cover {
+        let status = Command::new("mount")
+            .args(["-t", "tmpfs", "-o", "size=64m", "picofarm-test-cover"])
+            .arg(&self.0)
+            .status();
+        assert!(status.expect("there is `mount`").success(), "cover");
+        Cover(self.0.clone())
+    }
+
     /// KiB in use.
     ///
     /// # Panics
@@ -100,6 +113,16 @@ impl Tmpfs {
             .last()
             .and_then(|l| l.trim().parse().ok())
             .expect("df prints a number")
+    }
+}
+
+/// An empty file system over another one.
+pub struct Cover(PathBuf);
+
+impl Drop for Cover {
+    fn drop(&mut self) {
+        // Lazily, because a process may have a file open in it.
+        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
     }
 }
 

@@ -16,6 +16,8 @@ pub enum Signal {
     Interrupt,
     /// An orderly end.
     Terminate,
+    /// A terminal that closes.
+    Hangup,
     /// Freeze.
     Stop,
     /// Thaw.
@@ -107,6 +109,7 @@ impl Process {
         let name = match signal {
             Signal::Interrupt => "INT",
             Signal::Terminate => "TERM",
+            Signal::Hangup => "HUP",
             Signal::Stop => "STOP",
             Signal::Continue => "CONT",
         };

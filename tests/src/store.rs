@@ -9,8 +9,11 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
+/// The object in a store's root that has its identity, which no two stores share.
+const IDENTITY: &str = ".picofarm-store.json";
+
 /// Every object under a folder by its path in it, with the SHA-256 of its bytes. Left out are the unfinished files
-/// `name#1` that a killed writer leaves beside the objects; no reader sees them.
+/// `name#1` that a killed writer leaves beside the objects, which no reader sees, and the identity of a store.
 ///
 /// # Panics
 /// When a file cannot be read.
@@ -98,7 +101,7 @@ fn files(folder: &Path) -> BTreeMap<String, PathBuf> {
                 .to_string();
             if path.is_dir() {
                 folders.push(path);
-            } else if !unfinished(&name) {
+            } else if !unfinished(&name) && name != IDENTITY {
                 found.insert(name, path);
             }
         }

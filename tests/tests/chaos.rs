@@ -11,8 +11,8 @@ use std::{
 };
 
 use picofarm_tests::{
-    Cluster, Job, Process, Signal, farm::undisturbed, mount::Tmpfs, poison, proxy::Mode, rng::Rng,
-    s3, store,
+    Cli, Cluster, Job, Process, Scratch, Signal, farm::undisturbed, flood, mount::Tmpfs, poison,
+    proxy::Mode, rng::Rng, s3, store,
 };
 
 /// Short, so that what is frozen for longer is soon lost.
@@ -20,7 +20,7 @@ const LEASE_S: f64 = 3.0;
 const WORKERS: usize = 6;
 
 /// Rounds of the short form.
-const ROUNDS: u64 = 10;
+const ROUNDS: u64 = 8;
 /// Size of the store's disk when it is well, MiB.
 const DISK_MIB: u64 = 256;
 
@@ -66,6 +66,18 @@ enum Store {
 }
 
 impl Store {
+    /// The workers see an empty folder in its place, as if it were not mounted. (A service is away.)
+    fn vanish(&mut self, rng: &mut Rng) {
+        match self {
+            Self::S3(_) => self.strike(rng),
+            Self::Disk(disk) => {
+                let cover = disk.cover();
+                sleep(Duration::from_secs(1) + millis(rng, 3_000));
+                drop(cover);
+            }
+        }
+    }
+
     /// One misfortune, and its end.
     fn strike(&mut self, rng: &mut Rng) {
         match self {
@@ -113,7 +125,7 @@ impl Site {
         let cluster = &mut self.cluster;
         let which = (rng.number() % cluster.coordinators.len() as u64) as usize;
         let who = (rng.number() % WORKERS as u64) as usize;
-        match rng.number() % 11 {
+        match rng.number() % 15 {
             0 => {
                 let new = self.crew.start(cluster);
                 std::mem::replace(&mut self.crew.workers[who], new).kill();
@@ -147,7 +159,7 @@ impl Site {
                 sleep(millis(rng, 3_000));
                 coordinator.proxy.set(Mode::Pass);
             }
-            7 => cluster.postgres.crash(),
+            7 => cluster.crash_database(),
             8 => {
                 // Beside the honest job's data set, so that what is left of it is no object of that.
                 let place = cluster.scratch.join("elsewhere");
@@ -156,6 +168,21 @@ impl Site {
                 self.poisoned.push(cluster.submit(&job));
             }
             9 => poison::lie(&cluster.coordinators[which].proxy.url()),
+            // The store's mount is missing for a while, on every worker's machine.
+            10 => self.store.vanish(rng),
+            11 => {
+                flood::specs(&cluster.coordinators[which].proxy.url());
+                assert!(cluster.coordinator(which).runs(), "it survives the flood");
+            }
+            12 => race_tokens(&cluster.scratch, rng),
+            // An allocation with a wall time: the worker ends in order before it is killed.
+            13 => {
+                let name = format!("short-{}", self.crew.started);
+                let seconds = 2 + rng.number() % 6;
+                let end_at = format!("{seconds}s");
+                let short = cluster.worker_with(&name, which, &["--end-at", &end_at]);
+                short.end().ok();
+            }
             _ => self.store.strike(rng),
         }
         sleep(millis(rng, 800));
@@ -168,6 +195,35 @@ impl Site {
             assert_eq!(status["state"], "failed", "{status}");
             poison::assert_told(&self.cluster.events(id));
         }
+    }
+}
+
+/// Tokens that are made and revoked at the same moment: each call has its effect.
+fn race_tokens(scratch: &Scratch, rng: &mut Rng) {
+    let cli = Cli::new(scratch.path());
+    let number = rng.number();
+    let file = ["--tokens", "raced.toml"];
+    let create = |name: &str| {
+        let args = ["token", "create", "--name", name, "--role", "view"];
+        cli.start(name, &[&args[..], &file].concat())
+    };
+    let revoke = |name: &str| cli.start(name, &[&["token", "revoke", name][..], &file].concat());
+    let names: Vec<String> = (0..4).map(|i| format!("t{number}-{i}")).collect();
+    for name in &names[..2] {
+        create(name).end().ok();
+    }
+    let racing: Vec<_> = names
+        .iter()
+        .enumerate()
+        .map(|(i, name)| if i < 2 { revoke(name) } else { create(name) })
+        .collect();
+    for process in racing {
+        process.end().ok();
+    }
+    let listed = cli.run(&["token", "list", "--tokens", "raced.toml"]).ok();
+    for (i, name) in names.iter().enumerate() {
+        let there = listed.stdout.contains(name.as_str());
+        assert_eq!(there, i >= 2, "{name}: {}", listed.stdout);
     }
 }
 
@@ -193,13 +249,26 @@ fn done_once(cluster: &Cluster, id: &str, total: u64) {
 
 #[test]
 fn whatever_fails_every_scene_is_committed_once_and_the_store_is_as_if_nothing_had() {
-    let Some(cluster) = Cluster::start("chaos", 2, LEASE_S) else {
-        return;
-    };
+    if let Some(cluster) = Cluster::start("chaos", 2, LEASE_S) {
+        endure(cluster, "chaos", 5);
+    }
+}
+
+#[test]
+fn with_one_coordinator_on_sqlite_too() {
+    endure(
+        Cluster::on_sqlite("chaos-sqlite", LEASE_S),
+        "chaos-sqlite",
+        7,
+    );
+}
+
+/// Strikes a cluster with objects on a disk, and compares the store with that of an undisturbed run.
+fn endure(cluster: Cluster, name: &str, seed: u64) {
     let Some(disk) = Tmpfs::mount(&cluster.scratch.join("store"), DISK_MIB << 10) else {
         return;
     };
-    let mut rng = Rng::new(5);
+    let mut rng = Rng::new(seed);
     let mut site = Site::new(cluster, Store::Disk(disk));
     // The work lasts as long as the misfortunes: a job a few rounds, all into one data set that grows.
     let jobs = rounds().div_ceil(5);
@@ -214,7 +283,7 @@ fn whatever_fails_every_scene_is_committed_once_and_the_store_is_as_if_nothing_h
     }
     site.assert_poison_told();
     site.crew.workers.clear();
-    assert_eq!(store::hashes(&job.place()), undisturbed("chaos", &job));
+    assert_eq!(store::hashes(&job.place()), undisturbed(name, &job));
 }
 
 #[test]

@@ -5,6 +5,14 @@ use std::{
     fs,
 };
 
+use picofarm_proto::{
+    PROTOCOL,
+    key::{StageKey, task_key},
+    wire::{
+        self, farm_client::FarmClient, session_request::Message as Say,
+        session_response::Message as Heard,
+    },
+};
 use picofarm_tests::{Farm, Job, store};
 use serde_json::Value;
 
@@ -56,5 +64,104 @@ fn a_deleted_store_and_a_deleted_scene_are_made_again_by_the_same_job_file() {
     assert_eq!(differing(&made, &whole), [""; 0]);
 
     assert_eq!(farm.json(&["job", "submit", &file])["existed"], true);
+    worker.kill();
+}
+
+/// Takes a lease of a farm and reports a result that it has made up; returns the coordinator's answer.
+async fn lie(url: &str, renderer: &str) -> wire::Acknowledge {
+    let hello = wire::Hello {
+        worker_id: uuid::Uuid::new_v4().to_string(),
+        incarnation: uuid::Uuid::new_v4().to_string(),
+        name: "liar".into(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        protocol: PROTOCOL,
+        cores: 1,
+        memory_mib: 8_192,
+        kinds: [("render".to_owned(), renderer.to_owned())].into(),
+        ..wire::Hello::default()
+    };
+    let mut client = FarmClient::connect(url.to_owned()).await.unwrap();
+    let (to, requests) = tokio::sync::mpsc::channel(4);
+    let say = async |message| {
+        let request = wire::SessionRequest {
+            message: Some(message),
+        };
+        to.send(request).await.unwrap();
+    };
+    say(Say::Hello(hello)).await;
+    say(Say::Credit(wire::Credit { leases: 1 })).await;
+    let requests = tokio_stream::wrappers::ReceiverStream::new(requests);
+    let mut heard = client.session(requests).await.unwrap().into_inner();
+    loop {
+        match heard.message().await.unwrap().unwrap().message.unwrap() {
+            Heard::Lease(lease) => {
+                let key = StageKey::parse(&lease.stage_key).unwrap();
+                let done = wire::TaskDone {
+                    lease: lease.lease,
+                    index: lease.lo,
+                    task_key: task_key(&key, lease.lo).to_string(),
+                    manifest_sha256: "f".repeat(64),
+                    bytes: 1,
+                    seconds: 1.0,
+                    ..wire::TaskDone::default()
+                };
+                say(Say::Done(done)).await;
+            }
+            Heard::Acknowledge(answer) => return answer,
+            _ => {}
+        }
+    }
+}
+
+#[test]
+fn a_made_up_result_is_refused_and_an_honest_worker_finishes_the_job() {
+    let farm = Farm::start("made-up");
+    let job = Job::quick(&farm.store(), 1);
+    let id = farm.submit(&job);
+    let status = farm.status(&id);
+    let renderer = status["spec"]["stage"][0]["render"]["renderer"].as_str();
+    let renderer = renderer.unwrap_or_else(|| panic!("{status}")).to_owned();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let answer = runtime.block_on(lie(farm.url(), &renderer));
+    assert!(
+        !answer.accepted && answer.reason.contains("holds no such result"),
+        "{answer:?}"
+    );
+    assert_eq!(farm.status(&id)["state"], "active");
+    let worker = farm.worker("honest");
+    let status = farm.until_ended(&id);
+    assert_eq!(status["state"], "done", "{status}");
+    assert_eq!(status["unverified"], 0);
+    assert_eq!(farm.events_of(&id, "alarm").len(), 1);
+    assert_eq!(farm.events_of(&id, "committed").len(), 1);
+    worker.kill();
+}
+
+#[test]
+fn results_that_cannot_be_verified_are_stated() {
+    let mut farm = Farm::start("unverified");
+    farm.kill_coordinator();
+    farm.start_coordinator_with(&["--check-stores", "none"]);
+    let job = Job::quick(&farm.store(), 2);
+    let file = farm.scratch.join("job.toml");
+    job.write(&file);
+    let id = farm.submit(&job);
+    let worker = farm.worker("worker");
+    farm.until_done_once(&job, &id);
+    assert_eq!(farm.status(&id)["unverified"], 2);
+    let file = file.display().to_string();
+    let plan = farm.json(&["job", "plan", &file]);
+    assert_eq!((&plan["reuse"], &plan["run"]), (&2.into(), &0.into()));
+    assert!(
+        reasons(&plan).contains("2 of 2 scenes recorded as done could not be verified"),
+        "{plan}"
+    );
+    let again = farm.json(&["job", "submit", &file]);
+    assert_eq!((&again["existed"], &again["plan"]), (&true.into(), &plan));
+    let words = farm.run(&["job", "status", &id]).ok().stdout;
+    assert!(
+        words.contains("2 results are reported by workers and not verified"),
+        "{words}"
+    );
     worker.kill();
 }

@@ -1,8 +1,11 @@
 //! What a new user types, and what goes wrong on an ordinary day.
 
-use std::fs;
+use std::{
+    fs,
+    io::{BufRead, BufReader},
+};
 
-use picofarm_tests::{Cli, Farm, Job, Scratch, poison, store, wait::until};
+use picofarm_tests::{Cli, Farm, Job, Scratch, Signal, poison, store, wait::until};
 
 /// A small demo.
 fn demo(cli: &Cli, resolution: &str) -> serde_json::Value {
@@ -117,6 +120,159 @@ fn a_followed_job_whose_coordinator_stays_away_ends_with_a_code_of_its_own_and_s
     let ended = watching.end().fails(4, &["stayed away for"]);
     let way_on = format!("picofarm job watch {id}");
     assert!(ended.stderr.contains(&way_on), "{}", ended.stderr);
+}
+
+#[test]
+fn a_coordinator_that_does_not_answer_is_left_for_the_next() {
+    let mut farm = Farm::start("mute");
+    let job = Job::quick(&farm.store(), 2);
+    let id = farm.submit(&job);
+    job.write(&farm.scratch.join("job.toml"));
+    // Connections are taken by the system, and nobody ever reads from them.
+    let mute = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let mute = format!("http://{}", mute.local_addr().unwrap());
+    let good = farm.url().to_owned();
+    let at = |urls: &str| farm.cli().with("PICOFARM_COORDINATOR", urls);
+    let both = at(&format!("{mute},{good}"));
+    let status = ["job", "status", &id, "--json"];
+    let commands = [
+        &status[..],
+        &["job", "list"],
+        &["workers"],
+        &["job", "explain", &id],
+    ];
+    let all: Vec<_> = commands
+        .iter()
+        .map(|args| both.start("mute", args))
+        .collect();
+    let alone = at(&mute).start("mute", &["job", "list"]);
+    let gone = at(&format!("{mute},http://127.0.0.1:1")).start("mute", &["job", "list"]);
+    for process in all {
+        process.end().ok();
+    }
+    farm.coordinator().signal(Signal::Stop);
+    let frozen = farm.cli().start("frozen", &["job", "list"]);
+    let asked = farm.cli().start("frozen", &["job", "submit", "job.toml"]);
+    let silent = "it took the connection and did not answer";
+    alone
+        .end()
+        .fails(4, &["no coordinator answers", &mute, silent]);
+    gone.end()
+        .fails(4, &[&mute, silent, "http://127.0.0.1:1 (", "refused"]);
+    frozen
+        .end()
+        .fails(4, &["no coordinator answers", &good, silent]);
+    asked.end().fails(4, &["no coordinator answers", &good]);
+}
+
+#[test]
+fn results_that_do_not_reach_stdout_fail_the_command() {
+    let scratch = Scratch::new("stdout");
+    let cli = Cli::new(scratch.path());
+    let into = |args: &[&str], file: &str| {
+        let stdout = fs::OpenOptions::new().write(true).open(file).unwrap();
+        cli.command(args).stdout(stdout).output().unwrap()
+    };
+    let create = [
+        "token", "create", "--tokens", "t.toml", "--name", "a", "--role", "view",
+    ];
+    for args in [
+        &["config"][..],
+        &["config", "--json"],
+        &["--version"],
+        &["job", "--help"],
+        &["completions", "bash"],
+        &create,
+    ] {
+        let ended = into(args, "/dev/full");
+        let said = String::from_utf8_lossy(&ended.stderr);
+        assert_eq!(ended.status.code(), Some(7), "{args:?}: {said}");
+        assert!(said.contains("standard output"), "{args:?}: {said}");
+        assert_eq!(into(args, "/dev/null").status.code(), Some(0), "{args:?}");
+    }
+    // A reader that has seen enough.
+    let mut child = cli
+        .command(&["config"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let ended = child.wait_with_output().unwrap();
+    assert_eq!((ended.status.code(), &*ended.stderr), (Some(0), &[][..]));
+    // Nor does a full stderr end what is under way.
+    let full = fs::OpenOptions::new()
+        .write(true)
+        .open("/dev/full")
+        .unwrap();
+    let ended = cli.command(&["job", "status", "x"]).stderr(full).output();
+    assert_eq!(ended.unwrap().status.code(), Some(4));
+}
+
+#[test]
+fn files_that_never_end_are_refused_by_name() {
+    let scratch = Scratch::new("endless");
+    let cli = Cli::new(scratch.path());
+    for args in [
+        &["job", "plan", "/dev/zero"][..],
+        &["job", "submit", "/dev"],
+        &["sweep", "extend", "/dev/zero", "--trials", "2"],
+        &["job", "list", "--token-file", "/dev/zero"],
+        &[
+            "job",
+            "list",
+            "--coordinator",
+            "https://localhost:1",
+            "--ca",
+            "/dev/zero",
+        ],
+        &["token", "list", "--tokens", "/dev/zero"],
+    ] {
+        cli.run(args).fails(3, &["/dev"]);
+    }
+}
+
+#[test]
+fn a_terminal_that_closes_ends_a_farm_in_order() {
+    let scratch = Scratch::new("hangup");
+    let cli = Cli::new(scratch.path());
+    let args = ["--listen", "127.0.0.1:0"];
+    let up = [&["up", "--workers", "1"][..], &args].concat();
+    let alone = [&["coordinator", "--allow-insecure"][..], &args].concat();
+    for args in [up, alone] {
+        let mut farm = cli.start("farm", &args);
+        farm.first_line();
+        farm.signal(Signal::Hangup);
+        let ended = farm.end().ok();
+        assert!(ended.stderr.contains("stopping"), "{}", ended.stderr);
+    }
+}
+
+#[test]
+fn a_log_that_nobody_reads_stops_nobody() {
+    let scratch = Scratch::new("unread");
+    let cli = Cli::new(scratch.path());
+    let args = ["coordinator", "--allow-insecure", "--listen", "127.0.0.1:0"];
+    let mut coordinator = cli
+        .command(&[&args[..], &["--json", "--log", "trace"]].concat())
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    let stdout = coordinator.stdout.as_mut().unwrap();
+    BufReader::new(stdout).read_line(&mut line).unwrap();
+    let document: serde_json::Value = serde_json::from_str(&line).unwrap();
+    let cli = cli.with(
+        "PICOFARM_COORDINATOR",
+        document["coordinator"].as_str().unwrap(),
+    );
+    // Some 10 kB of log each; a pipe takes 64.
+    for _ in 0..20 {
+        cli.run(&["job", "list"]).ok();
+    }
+    coordinator.kill().unwrap();
+    coordinator.wait().unwrap();
 }
 
 #[test]

@@ -93,7 +93,9 @@ impl Graph {
     /// Every object but what a worker that is killed while it tries the store out may leave.
     fn objects(&self) -> BTreeMap<String, String> {
         let mut all = store::hashes(&self.farm.store());
-        all.retain(|name, _| !name.starts_with(".probe-"));
+        all.retain(|name, _| {
+            !name.starts_with(".probe-") && !name.ends_with(".picofarm-store.json")
+        });
         all
     }
 

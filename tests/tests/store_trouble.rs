@@ -1,6 +1,6 @@
 //! A full disk and a read-only store: the job waits, says why, loses nothing, and goes on when there is room.
 
-use std::time::SystemTime;
+use std::{path::Path, time::SystemTime};
 
 use picofarm_tests::{Cli, Farm, Job, Process, Scratch, mount::Tmpfs, store, wait::until};
 
@@ -118,6 +118,72 @@ fn a_job_whose_store_cannot_be_written_leaves_the_only_worker_to_others_and_ends
     std::fs::remove_file(&blocked).unwrap();
     std::fs::create_dir(&blocked).unwrap();
     farm.until_done_once(&waiting, &first);
+}
+
+/// Starts a worker that sees another folder in place of the store; `None` where nothing can be mounted.
+fn unmounted(farm: &Farm, instead: &Path) -> Option<Process> {
+    let (store, instead) = (farm.store(), instead.display().to_string());
+    let script = "mount --bind \"$0\" \"$1\" && shift && exec \"$@\"";
+    let store = store.display().to_string();
+    let args = ["-m", "sh", "-c", script, &instead, &store];
+    let unshare = |run: &[&str]| {
+        farm.cli()
+            .other("unshare".as_ref(), &[&args[..], run].concat())
+    };
+    let tried = unshare(&["true"]).output();
+    if !tried.is_ok_and(|output| output.status.success()) {
+        eprintln!("skipped: a folder cannot be mounted for one process alone here");
+        return None;
+    }
+    let program = picofarm_tests::binary::picofarm().display().to_string();
+    let worker = ["worker", "--log", "info", "--name", "unmounted"];
+    let more = ["--threads", "1", "--coordinator", farm.url()];
+    let run = [&[&*program], &worker[..], &more].concat();
+    Some(Process::start(
+        "unmounted",
+        unshare(&run),
+        farm.scratch.path(),
+    ))
+}
+
+#[test]
+fn a_worker_whose_store_is_not_mounted_gives_no_scene_and_stops_no_other() {
+    let farm = Farm::start("unmounted");
+    let job = Job::quick(&farm.store(), 6);
+    let id = farm.submit(&job);
+    let empty = farm.scratch.join("empty");
+    std::fs::create_dir(&empty).unwrap();
+    let words = "has no store identity; expected";
+    if let Some(mut without) = unmounted(&farm, &empty) {
+        without.until_says(words);
+        assert_eq!(farm.count(&id, "done"), 0);
+        let with = farm.worker("mounted");
+        farm.until_done_once(&job, &id);
+        let committed = farm.events_of(&id, "committed");
+        assert!(committed.iter().all(|e| e["worker"] == "mounted"));
+        assert_eq!(std::fs::read_dir(&empty).unwrap().count(), 0);
+        with.kill();
+        without.kill();
+    }
+
+    // A folder that vanishes under a job stops its tasks, and they go on when it is back.
+    let more = Job {
+        count: Some(9),
+        ..job
+    };
+    let id = farm.submit(&more);
+    let away = farm.scratch.join("away");
+    std::fs::rename(farm.store(), &away).unwrap();
+    let mut worker = farm.worker("worker");
+    worker.until_says(words);
+    let status = farm.status(&id);
+    assert_eq!(status["state"], "active", "{status}");
+    assert_eq!(status["tasks"]["dead"], 0, "{status}");
+    let explained = farm.run(&["job", "explain", &id]).ok().stdout;
+    assert!(explained.contains("is it mounted?"), "{explained}");
+    assert!(!farm.store().exists(), "the store's folder was made");
+    std::fs::rename(&away, farm.store()).unwrap();
+    farm.until_done_once(&more, &id);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Workers and coordinators of different versions refuse each other and say what to do.
+//! A coordinator serves workers of the previous minor version. Other versions are refused with what to do.
 
 use std::time::Duration;
 
@@ -12,9 +12,12 @@ use picofarm_proto::{
         session_response::Message as Answer,
     },
 };
-use picofarm_tests::{Cli, Farm, Job, Scratch, wait::until};
+use picofarm_tests::{Cli, Farm, Job, Scratch, store, wait::until};
 use tokio::net::TcpListener;
-use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
+use tokio_stream::{
+    StreamExt,
+    wrappers::{ReceiverStream, TcpListenerStream},
+};
 use tonic::{Code, Request, Response, Status, Streaming, transport::Server};
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
@@ -30,6 +33,7 @@ fn hello(version: &str, protocol: u32) -> wire::Hello {
         cores: 1,
         held: Vec::new(),
         ended: String::new(),
+        ends_in_ms: 0,
         kinds: [("render".to_owned(), "transient-0".to_owned())].into(),
         assets: Vec::new(),
         memory_mib: 0,
@@ -76,6 +80,7 @@ async fn a_coordinator_refuses_a_worker_of_another_version_and_names_both() {
     for part in [PROTOCOL, PROTOCOL + 1] {
         assert!(words.contains(&part.to_string()), "{words}");
     }
+    assert!(words.contains("upgrade the coordinator first"), "{words}");
 
     let mut nameless = hello(VERSION, PROTOCOL);
     nameless.worker_id = "nobody".into();
@@ -174,4 +179,115 @@ async fn a_worker_refused_for_its_version_exits_with_4_and_says_what_to_do() {
     .await
     .unwrap();
     server.abort();
+}
+
+/// Stands between a worker and its coordinator and reports another version of the worker.
+struct Relay {
+    coordinator: String,
+    version: String,
+}
+
+#[tonic::async_trait]
+impl FarmService for Relay {
+    type SessionStream = Streaming<SessionResponse>;
+
+    async fn session(
+        &self,
+        request: Request<Streaming<SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let mut client = FarmClient::connect(self.coordinator.clone())
+            .await
+            .map_err(|e| Status::unavailable(e.to_string()))?;
+        let version = self.version.clone();
+        let requests = request.into_inner().map_while(move |said| {
+            let mut said = said.ok()?;
+            if let Some(Said::Hello(hello)) = &mut said.message {
+                hello.version.clone_from(&version);
+            }
+            Some(said)
+        });
+        client.session(requests).await
+    }
+}
+
+/// This version with another minor number.
+fn with_minor(change: impl Fn(u64) -> u64) -> String {
+    let mut numbers = VERSION.split('.').map(|n| n.parse::<u64>().unwrap());
+    let (major, minor) = (numbers.next().unwrap(), numbers.next().unwrap());
+    format!("{major}.{}.9", change(minor))
+}
+
+/// Serves a relay to `coordinator`; returns its URL.
+async fn relay(coordinator: &str, version: String) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let relay = Relay {
+        coordinator: coordinator.to_owned(),
+        version,
+    };
+    tokio::spawn(
+        Server::builder()
+            .add_service(FarmServer::new(relay))
+            .serve_with_incoming(TcpListenerStream::new(listener)),
+    );
+    url
+}
+
+/// Runs a job on a farm whose worker reports this version; returns the hashes of the objects.
+async fn hashes_by(
+    name: &'static str,
+    version: String,
+) -> std::collections::BTreeMap<String, String> {
+    let farm = tokio::task::spawn_blocking(move || Farm::start(name))
+        .await
+        .unwrap();
+    let url = relay(farm.url(), version).await;
+    tokio::task::spawn_blocking(move || {
+        let job = Job::quick(&farm.store(), 2);
+        let id = farm.submit(&job);
+        let args = [
+            "worker",
+            "--name",
+            name,
+            "--threads",
+            "1",
+            "--coordinator",
+            &url,
+        ];
+        let worker = farm.cli().start(name, &args);
+        farm.until_done_once(&job, &id);
+        worker.kill();
+        store::hashes(&job.place())
+    })
+    .await
+    .unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_of_the_previous_minor_version_makes_the_same_bytes() {
+    let before = hashes_by(
+        "previous-version",
+        with_minor(|minor| minor.saturating_sub(1)),
+    )
+    .await;
+    let same = hashes_by("same-version", VERSION.to_owned()).await;
+    assert!(!same.is_empty());
+    assert_eq!(before, same);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_is_newer_than_its_coordinator_exits_and_says_what_to_upgrade() {
+    let farm = tokio::task::spawn_blocking(|| Farm::start("newer-worker"))
+        .await
+        .unwrap();
+    let newer = with_minor(|minor| minor + 1);
+    let url = relay(farm.url(), newer.clone()).await;
+    tokio::task::spawn_blocking(move || {
+        let args = ["worker", "--coordinator", &url];
+        farm.cli()
+            .run(&args)
+            .fails(4, &["upgrade the coordinator first", &newer]);
+    })
+    .await
+    .unwrap();
 }

@@ -1,9 +1,9 @@
 //! Options that say who may use a coordinator, and how much.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, time::SystemTime};
 
 use clap::{Args, Subcommand};
-use picofarm_coordinator::auth::{Role, Visibility};
+use picofarm_coordinator::auth::{Expiry, Role, Visibility};
 
 /// TLS, tokens and limits of a coordinator.
 #[derive(Args)]
@@ -67,6 +67,10 @@ pub struct Guard {
     /// Connections of one address at a time, at most; of IPv6, one /64 network [default: three quarters of all]
     #[arg(long, value_name = "N", value_parser = super::ranges::at_least_one)]
     pub max_connections_per_address: Option<usize>,
+    /// Memory that this process may use, MiB: what requests, jobs and connections may take follows from it [default: the
+    /// limit of its control group or of the machine, 4096 at most]
+    #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(128..=1 << 30), env = "PICOFARM_MEMORY_MIB")]
+    pub memory_mib: Option<u64>,
 }
 
 /// What can be done with the token file.
@@ -86,21 +90,30 @@ pub enum Token {
         /// Projects all of whose jobs it may cancel, pause, resume and retry
         #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
         maintainer: Vec<String>,
+        /// When it expires: a time from now (90d, 12h), a date (2027-03-01, its beginning in UTC),
+        /// or e.g. 2027-03-01T08:00:00Z [default: never]
+        #[arg(long, value_name = "TIME", value_parser = expiry)]
+        expires: Option<Expiry>,
         #[command(flatten)]
         file: TokenFile,
     },
-    /// List who has access
+    /// List who has access, and until when
     List {
         #[command(flatten)]
         file: TokenFile,
     },
-    /// Take someone's access away; running coordinators notice within seconds
+    /// Take someone's access away, and ask the coordinators that --coordinator names whether they
+    /// refuse it now
     Revoke {
         /// Whose
         name: String,
         #[command(flatten)]
         file: TokenFile,
     },
+}
+
+fn expiry(text: &str) -> Result<Expiry, String> {
+    Expiry::parse(text, SystemTime::now())
 }
 
 /// Where tokens are kept.

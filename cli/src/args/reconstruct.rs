@@ -38,6 +38,9 @@ pub struct Reconstruct {
     /// Leave out what closes the room by planes where the camera does not look
     #[arg(long)]
     pub no_planes: bool,
+    /// Go on where the measurements contradict one another: the result states how
+    #[arg(long)]
+    pub accept_inconsistent: bool,
     /// Novel views to measure errors in: a circle in the middle of the scene, or PlatoNeRF's 139 in its room
     #[arg(long, value_enum, default_value_t = ViewsArg::Around)]
     pub views: ViewsArg,

@@ -3,17 +3,18 @@
 use std::{path::Path, sync::Arc, time::Instant};
 
 use picofarm_dataset::{
-    Dataset, PROBE_WITHIN, Profile,
+    Dataset, PROBE_WITHIN, Profile, Verdict,
     import::{ImportError, Source, import_scene},
     open_store, probe,
 };
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
-use super::failed;
+use super::{failed, predictions::summed};
 use crate::{
     args::DatasetImport,
     error::{CliError, Code, Result, io},
+    files,
     output::{Meter, Output, bytes, duration},
     roles, signals,
 };
@@ -63,21 +64,25 @@ pub async fn run(args: DatasetImport, output: Output) -> Result<()> {
     }
     meter.finish();
     let seconds = start.elapsed().as_secs_f64();
+    let verdict = summed(done.verdicts.into_iter());
     let facts = json!({
         "source": args.source, "target": args.target, "format": work.source.format().name(), "scenes": scenes,
         "imported": done.imported, "found": done.found, "bytes_read": done.read, "bytes": done.written,
-        "seconds": seconds,
+        "seconds": seconds, "verdict": verdict,
     });
     output.result(&facts, || {
         format!(
-            "{}: {} scenes imported from {}, {} found finished; {} read, {} written in {}",
+            "{}: {} scenes imported from {}, {} found finished; {} read, {} written in {}{}",
             args.target,
             done.imported,
             work.source.format().name(),
             done.found,
             bytes(done.read),
             bytes(done.written),
-            duration(seconds)
+            duration(seconds),
+            verdict
+                .as_ref()
+                .map_or_else(String::new, |v| format!("\n{}", v.text))
         )
     });
     Ok(())
@@ -91,6 +96,8 @@ struct Done {
     written: u64,
     /// Quantities reported as missing.
     named: Vec<&'static str>,
+    /// By scene, how well its files agree.
+    verdicts: Vec<(u64, Verdict)>,
 }
 
 struct Work {
@@ -140,6 +147,8 @@ impl Work {
             ));
             done.named.extend(scene.missing.iter());
         }
+        done.verdicts
+            .push((index, Verdict::of_import(&scene.check)));
         done.read += scene.files.iter().map(|f| f.bytes).sum::<u64>();
         let (source, pool, dataset) =
             (self.source.clone(), self.pool.clone(), self.dataset.clone());
@@ -174,7 +183,7 @@ fn refused(error: ImportError) -> CliError {
 
 /// Names of scenes, one a line. The paper's list has a header, and names archives.
 fn names(file: &Path) -> Result<Vec<String>> {
-    let text = std::fs::read_to_string(file).map_err(|e| io(file.display(), &e))?;
+    let text = files::read_text(file, files::LISTS)?;
     let names = text
         .lines()
         .map(str::trim)

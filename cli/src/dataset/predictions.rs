@@ -1,7 +1,9 @@
 //! `picofarm dataset info|show|verify` of what models predict.
 
+use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_dataset::{
-    ModelUsed, PredictionManifest, PredictionSpec, Predictions, Problem, TimesUsed, open_store,
+    ModelUsed, PredictionManifest, PredictionSpec, Predictions, Problem, TimesUsed, Verdict,
+    open_store,
 };
 use serde_json::json;
 
@@ -16,6 +18,9 @@ use crate::{
     output::{Output, bytes, table},
 };
 
+/// Requests in flight.
+const CONCURRENCY: usize = 16;
+
 /// The predictions at a place, if it holds some.
 pub async fn find(place: &str) -> Result<Option<Predictions>> {
     let (store, prefix) = open_store(place).map_err(failed)?;
@@ -26,18 +31,56 @@ pub async fn find(place: &str) -> Result<Option<Predictions>> {
 pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()> {
     let present = there.scenes_present().await.map_err(failed)?;
     let spec = there.spec();
-    let facts = json!({"predictions": place, "spec": spec, "scenes": present.len()});
+    let read = present.iter().map(|&scene| there.manifest(scene));
+    let manifests: Vec<PredictionManifest> = stream::iter(read)
+        .buffered(CONCURRENCY)
+        .try_collect()
+        .await
+        .map_err(failed)?;
+    let verdicts = manifests
+        .iter()
+        .map(|m| (m.scene, Verdict::of_agreement(&m.agreement)));
+    let summary = summed(verdicts.filter_map(|(scene, verdict)| Some((scene, verdict?))));
+    let facts =
+        json!({"predictions": place, "spec": spec, "scenes": present.len(), "verdict": summary});
     output.result(&facts, || {
-        format!(
+        let mut text = format!(
             "{place}: what models predict ({}) of {} of {} scenes, {}x{} pixels\n",
             arrays(spec).join(", "),
             present.len(),
             spec.scenes,
             spec.width,
             spec.height
-        )
+        );
+        if let Some(summary) = &summary {
+            text += &format!("{}\n", summary.text);
+        }
+        text
     });
     Ok(())
+}
+
+/// The verdicts on several scenes as one; `None` without any.
+pub(super) fn summed(verdicts: impl Iterator<Item = (u64, Verdict)>) -> Option<Verdict> {
+    let all: Vec<(u64, Verdict)> = verdicts.collect();
+    let doubtful = || all.iter().filter(|(_, verdict)| verdict.doubtful);
+    let (scene, example) = doubtful().next().or(all.first())?;
+    let text = match doubtful().count() {
+        0 => format!(
+            "none of {} scenes is doubtful, e.g. scene {scene}: {}",
+            all.len(),
+            example.text
+        ),
+        n => format!(
+            "{n} of {} scenes are doubtful, e.g. scene {scene}: {}",
+            all.len(),
+            example.text
+        ),
+    };
+    Some(Verdict {
+        doubtful: example.doubtful,
+        text,
+    })
 }
 
 fn arrays(spec: &PredictionSpec) -> Vec<String> {
@@ -107,6 +150,9 @@ fn described(manifest: &PredictionManifest) -> String {
         Some(TimesUsed::Model(model)) => {
             rows.push(row("two-bounce times", format!("of {}", used(model))));
         }
+    }
+    if let Some(verdict) = Verdict::of_agreement(&manifest.agreement) {
+        rows.push(row("verdict", verdict.text));
     }
     table(&rows)
 }

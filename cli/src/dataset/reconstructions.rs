@@ -7,7 +7,7 @@ mod report;
 
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_dataset::{
-    DatasetError, Problem, Reconstructions, Verification, VerifyMode, open_store,
+    DatasetError, Problem, Reconstructions, Verdict, Verification, VerifyMode, open_store,
 };
 use serde_json::{Map, Value, json};
 
@@ -17,6 +17,7 @@ pub use report::run as report;
 use super::{
     failed,
     late::Late,
+    predictions::summed,
     problems::{broken_by, mode, problems_json_by},
 };
 use crate::{
@@ -87,7 +88,11 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
             means.insert(name.into(), json!({"mean": mean, "scenes": values.len()}));
         }
     }
-    let shown = json!({"reconstructions": place, "scenes": scenes.len(), "means": means});
+    let verdicts = scenes.iter().zip(&all);
+    let verdict = summed(verdicts.map(|(scene, m)| (*scene, Verdict::of_reconstruction(m))));
+    let shown = json!({
+        "reconstructions": place, "scenes": scenes.len(), "means": means, "verdict": verdict,
+    });
     output.result(&shown, || {
         let mut text = format!("{place}: reconstructions of {} scenes\n", scenes.len());
         for (name, mean) in &means {
@@ -96,6 +101,9 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
                 mean["mean"].as_f64().unwrap_or_default(),
                 mean["scenes"]
             );
+        }
+        if let Some(verdict) = &verdict {
+            text += &format!("{}\n", verdict.text);
         }
         text
     });

@@ -2,7 +2,7 @@
 
 use picofarm_proto::model::JobStatus;
 
-use super::dark;
+use super::{dark, verdicts};
 use crate::{client::Client, describe::describe, error::Result, follow::verdict, output::Output};
 
 /// Tells how it ended.
@@ -13,6 +13,12 @@ pub async fn finish(client: &mut Client, status: &JobStatus, output: Output) -> 
     output.result(status, || describe(status));
     if let Some(warning) = dark::warning(client, status).await {
         output.warn(warning);
+    }
+    for (doubtful, line) in verdicts::lines(client, status).await {
+        match doubtful {
+            true => output.warn(format!("warning: {line}")),
+            false => output.say(line),
+        }
     }
     verdict(status)
 }

@@ -6,7 +6,7 @@ use serde_json::json;
 use super::finish::finish;
 use crate::{
     client::{Client, Submitted},
-    describe::{counts, describe_plan, state},
+    describe::{counts, describe_plan, state, unverified},
     error::Result,
     follow::{Show, follow, verdict},
     output::Output,
@@ -38,9 +38,14 @@ fn line(s: &JobStatus) -> String {
             "  it has ended with dead tasks ({counts}): submitting runs nothing; `picofarm job retry {id}` runs those again, \
              and `--again` makes a new job of it\n"
         ),
-        JobState::Cancelled => {
-            format!("  it was cancelled ({counts}): submitting runs nothing unless with --again\n")
-        }
+        JobState::Cancelled => match s.passed_deadline() {
+            Some(deadline) => format!(
+                "  its deadline passed ({counts}): submitting runs nothing until limits.deadline = {deadline:?} is later, or left out\n"
+            ),
+            None => format!(
+                "  it was cancelled ({counts}): submitting runs nothing unless with --again\n"
+            ),
+        },
     }
 }
 
@@ -64,7 +69,11 @@ pub async fn answer(
         || match &there {
             Some(status) => {
                 let state = state(status);
-                format!("job {job} was there already: {state}; {}\n", counts(status))
+                let unverified = unverified(status);
+                format!(
+                    "job {job} was there already: {state}; {}\n{unverified}",
+                    counts(status)
+                )
             }
             None if existed => format!("job {job} was there already\n"),
             None => format!("job {job}\n{}", describe_plan(&plan)),

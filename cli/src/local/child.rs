@@ -15,6 +15,7 @@ use crate::{
     error::{CliError, Code, Result, io},
     roles,
     settings::Settings,
+    signals,
 };
 
 /// Name of the hidden command.
@@ -138,6 +139,7 @@ async fn work(order: Order) -> Result<()> {
         peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,
+        ends_at: crate::ends::ends_at(None, std::time::SystemTime::now())?,
         asset_dirs: vec![order.settings.assets],
         access,
         store_prefixes: Vec::new(),
@@ -166,17 +168,20 @@ fn listen(stop: CancellationToken) -> Result<()> {
     Ok(())
 }
 
-/// Ctrl-C in a terminal reaches the parent, too, which says what is to be done. A SIGTERM may be meant for this process
+/// Ctrl-C in a terminal, or its closing, reaches the parent, too, which says what is to be done. A
+/// SIGTERM may be meant for this process
 /// alone.
 fn heed_signals(stop: CancellationToken) -> Result<()> {
     let refused =
         |e: std::io::Error| CliError::new(Code::Failed, format!("cannot listen for signals: {e}"));
     let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(refused)?;
+    let mut hangup = signals::hangups().map_err(refused)?;
     tokio::spawn(async move {
         loop {
             tokio::select! {
                 _ = interrupt.recv() => {}
+                () = hangup.next() => {}
                 _ = terminate.recv() => stop.cancel(),
             }
         }

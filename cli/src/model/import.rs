@@ -1,14 +1,15 @@
 //! `picofarm model import`: a network that was trained elsewhere, as a model of a store.
 
-use std::{fs, path::Path};
+use std::path::Path;
 
-use picofarm_agent::{ImportFor, imported};
+use picofarm_agent::{ImportFor, NotImported, imported};
 use serde_json::json;
 
 use super::open;
 use crate::{
     dataset::{self, failed},
-    error::{CliError, Result, io},
+    error::{CliError, Result},
+    files,
     output::{Output, bytes},
 };
 
@@ -29,13 +30,13 @@ pub(super) async fn run(
         return Err(CliError::input(what).hint("render one, or choose another --dataset"));
     };
     let scene = rooms.manifest(first).await.map_err(failed)?;
-    let text = fs::read_to_string(settings).map_err(|e| io(settings.display(), &e))?;
+    let text = files::read_text(settings, files::SETTINGS)?;
     let table: toml::Table = toml::from_str(&text)
         .map_err(|e| CliError::input(format!("{}: {e}", settings.display())))?;
     let mut wanted = serde_json::to_value(table)
         .map_err(|e| CliError::input(format!("{}: {e}", settings.display())))?;
     wanted["model"] = json!(name);
-    let weights = fs::read(file).map_err(|e| io(file.display(), &e))?;
+    let weights = files::read(file, files::WEIGHTS)?;
     let called = file.file_name().unwrap_or_default().to_string_lossy();
     let of = ImportFor {
         dataset,
@@ -43,11 +44,9 @@ pub(super) async fn run(
         scene: &scene,
     };
     let new = imported(&weights, wanted, of, &called).map_err(|what| {
+        let hint = hint(&what);
         let what = format!("{} as {}: {what}", file.display(), settings.display());
-        CliError::input(what).hint(
-            "the file must hold the tensors of the network that the settings describe, by PyTorch's names; `picofarm model export` \
-             of a model of such a network shows which they are",
-        )
+        CliError::input(what).hint(hint)
     })?;
     let published = models.publish(new, false).await.map_err(failed)?;
     let manifest = &published.manifest;
@@ -62,4 +61,23 @@ pub(super) async fn run(
         )
     });
     Ok(())
+}
+
+/// How each kind of refusal is mended.
+fn hint(refused: &NotImported) -> &'static str {
+    match refused {
+        NotImported::Settings(_) => {
+            "correct the settings file; its fields are those of `train` in a job file, which `picofarm job init --kind train` writes"
+        }
+        NotImported::File(_) => {
+            "save the weights again, in PyTorch: safetensors.torch.save_file(network.state_dict(), \"network.safetensors\")"
+        }
+        NotImported::Tensors(_) => {
+            "the file must hold the tensors of the network that the settings describe, by PyTorch's names; `picofarm model export` \
+             of a model of such a network shows which they are"
+        }
+        NotImported::Values(_) => {
+            "take an earlier checkpoint of the training, or convert the weights again: a conversion to F16 overflows above 65504"
+        }
+    }
 }

@@ -147,8 +147,11 @@ pub fn measure(
     let rendered = render(scene, &settings.render_settings(), &Capture(watch))
         .map_err(|e| refused(e.into()))?;
     let mut shown = seen(scene, &rendered);
-    let failed = |e: ModelError| CliError::new(Code::Failed, e.to_string());
-    let depth = networks.tof.model.depth_m(&shown).map_err(failed)?;
+    let failed = |member: &Member, e: ModelError| {
+        CliError::new(Code::Failed, format!("model {:?}: {e}", member.name))
+    };
+    let tof = &networks.tof;
+    let depth = tof.model.depth_m(&shown).map_err(|e| failed(tof, e))?;
     shown.seen_depth_m = Some(depth.clone());
     let ask = |member: &Member| -> Result<Vec<u8>> {
         let mut tell = |done: usize, of: usize| {
@@ -158,7 +161,7 @@ pub fn measure(
             )
         };
         masks(&member.model, &shown, &mut tell)
-            .map_err(failed)?
+            .map_err(|e| failed(member, e))?
             .map(|said| said.into_iter().map(|p| u8::from(p >= 128)).collect())
             .ok_or_else(|| signals::interrupted("nothing was written"))
     };

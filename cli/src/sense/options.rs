@@ -4,7 +4,8 @@ use picofarm_transient::sensor::{DeadTime, Jitter, Pulse, Scale, Sensor};
 
 use crate::{
     args::SensorArgs,
-    error::{CliError, Result, io},
+    error::{CliError, Result},
+    files,
 };
 
 /// The settings file with the options on top.
@@ -12,7 +13,7 @@ pub fn settings(args: &SensorArgs) -> Result<Sensor> {
     let mut sensor = match &args.sensor {
         None => Sensor::default(),
         Some(path) => {
-            let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
+            let text = files::read_text(path, files::SETTINGS)?;
             let sensor: Sensor = toml::from_str(&text).map_err(|e| {
                 CliError::input(format!("{}: {}", path.display(), e.to_string().trim_end()))
             })?;

@@ -27,10 +27,12 @@ use crate::{
     args::{Extend, MoreTrials, Sampler, SweepRun},
     client::Client,
     error::{CliError, Result, io},
+    files,
     follow::{Show, follow, verdict},
     jobfile,
     model::open,
     output::{Output, table},
+    reach::{self, Identity},
     settings::Settings,
 };
 
@@ -77,7 +79,8 @@ pub async fn rounds(args: SweepRun, settings: &Settings, output: Output) -> Resu
     let mut files = Vec::new();
     for round in 0..=rounds {
         let (file, scale) = (&more.file, more.scale.as_deref());
-        let spec = jobfile::read_counted(file, scale, &settings.assets).await?;
+        let mut spec = jobfile::read_counted(file, scale, &settings.assets).await?;
+        reach::identify(&mut spec, Identity::Create, output).await;
         let job = client.submit(spec, false).await?.job;
         output.say(format!("round {round}: {}, job {job}", file.display()));
         let status = follow(&mut client, job, output, Show::Progress).await?;
@@ -158,7 +161,7 @@ async fn extend(
     let values: Vec<Values> = tried.into_iter().map(|t| t.values).collect();
     let values: Vec<Values> = values.into_iter().chain(proposed.iter().cloned()).collect();
     let promote = promote.map_or_else(|| format!("{name}-{total}"), str::to_owned);
-    let before = std::fs::read_to_string(file).map_err(|e| io(file.display(), &e))?;
+    let before = files::read_text(file, files::LISTS)?;
     let after = with_values(&before, &stage, &values, &promote).map_err(named)?;
     let out = match out {
         Some(out) => same_folder(file, out)?,
@@ -215,7 +218,7 @@ impl NewFile {
         match self.0.persist_noclobber(out) {
             Ok(_) => Ok(true),
             Err(e) if e.error.kind() == std::io::ErrorKind::AlreadyExists => {
-                Ok(std::fs::read(out)? == ours)
+                Ok(files::read(out, files::LISTS).is_ok_and(|theirs| theirs == ours))
             }
             Err(e) => Err(e.error),
         }

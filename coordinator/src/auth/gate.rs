@@ -1,6 +1,10 @@
 //! Who a caller is, by its proof; and the token file, read again whenever it changes.
 
-use std::{path::PathBuf, sync::Arc, time::Duration};
+use std::{
+    path::PathBuf,
+    sync::Arc,
+    time::{Duration, Instant, SystemTime},
+};
 
 use picofarm_credentials::Described;
 use picofarm_proto::{
@@ -14,23 +18,35 @@ use tonic::Status;
 use super::{
     access::Access,
     caller::Caller,
+    expiry::Expiry,
     roles::Role,
-    tokens::{TokenError, Tokens},
+    tokens::{Entry, TokenError, Tokens},
+    trust::{GRACE, Judge, Reader, Source, Trouble, Trust, Verdict, too_slow},
 };
-use crate::audit::{Audit, COORDINATOR};
+use crate::{
+    audit::{Audit, COORDINATOR},
+    health::Health,
+};
 
 /// How often the token file is looked at.
 const LOOK: Duration = Duration::from_secs(1);
 
 /// Knows callers by their proof.
 #[derive(Clone)]
-pub(crate) enum Gate {
-    /// No proof is asked for.
-    Open,
+pub(crate) struct Gate {
+    asks: Asks,
+    trust: watch::Receiver<Trust>,
+}
+
+/// What callers are asked for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Asks {
+    /// No proof.
+    Nothing,
     /// A token, or a certificate that the token file names.
-    Tokens(watch::Receiver<Arc<Tokens>>),
+    Token,
     /// Any certificate of the client CA, to submit and to work.
-    Certificates,
+    Certificate,
 }
 
 impl Gate {
@@ -41,54 +57,118 @@ impl Gate {
     pub(crate) fn new(
         access: &Access,
         audit: &Audit,
+        health: Arc<Health>,
         stop: CancellationToken,
-    ) -> Result<Self, TokenError> {
-        let Some(path) = access.tokens.clone() else {
-            return Ok(if access.authenticates() {
-                Self::Certificates
-            } else {
-                Self::Open
-            });
+    ) -> Result<(Self, Judge), TokenError> {
+        let tokens = match &access.tokens {
+            Some(path) => Tokens::read(path)?,
+            None => Tokens::default(),
         };
-        let (sender, receiver) = watch::channel(Arc::new(Tokens::read(&path)?));
-        tokio::spawn(follow(path, sender, audit.clone(), stop));
-        Ok(Self::Tokens(receiver))
+        let (judge, trust) = Judge::new(Trust::new(tokens), health);
+        let asks = match &access.tokens {
+            Some(path) => {
+                tokio::spawn(follow(path.clone(), judge.clone(), audit.clone(), stop));
+                Asks::Token
+            }
+            None if access.authenticates() => Asks::Certificate,
+            None => Asks::Nothing,
+        };
+        Ok((Self { asks, trust }, judge))
     }
 
-    /// Who it is.
+    /// Who it is, on a connection that began when the client certificate authorities had changed
+    /// `authorities` times.
     ///
     /// # Errors
-    /// UNAUTHENTICATED, with what to do.
+    /// UNAUTHENTICATED, with what to do; UNAVAILABLE while nobody can be judged.
     pub(crate) fn admit(
         &self,
         token: Option<&str>,
         certificate: Option<&Described>,
+        authorities: u64,
     ) -> Result<Caller, Status> {
-        let tokens = match self {
-            Self::Open => return Ok(Caller::anyone()),
-            Self::Certificates => return by_certificate_alone(certificate),
-            Self::Tokens(tokens) => tokens,
+        if self.asks == Asks::Nothing {
+            return Ok(Caller::anyone());
+        }
+        let now = self.trust.borrow();
+        now.judge_connection(authorities)?;
+        let mut caller = match self.asks {
+            Asks::Nothing | Asks::Certificate => by_certificate_alone(certificate)?,
+            Asks::Token => {
+                let entry = entry(&now.tokens, token, certificate)?;
+                Caller {
+                    name: entry.name.as_str().into(),
+                    roles: entry.roles.clone(),
+                    entry: Some(Arc::new(entry.clone())),
+                    until: entry.expires,
+                    authorities,
+                    trust: None,
+                }
+            }
         };
-        let now = tokens.borrow();
-        let entry = match token {
-            Some(token) => now.by_token(token).ok_or_else(|| {
-                Status::unauthenticated(
-                    "the token is not known to this coordinator: it was revoked, or is of another farm; ask for a new one \
-                     (`picofarm token create`)",
-                )
+        let valid = certificate.map(|c| Expiry::from_seconds(c.not_after));
+        caller.until = caller.until.into_iter().chain(valid).min();
+        caller.authorities = authorities;
+        caller.trust = Some(self.trust.clone());
+        match caller.until {
+            Some(until) if until.is_over(SystemTime::now()) => Err(caller.expired(until)),
+            _ => Ok(caller),
+        }
+    }
+
+    /// Whether the token with this SHA-256 is accepted now, and why.
+    pub(crate) fn accepts_digest(&self, digest: &[u8]) -> (bool, String) {
+        match self.asks {
+            Asks::Nothing => (true, "it asks nobody for a token".into()),
+            Asks::Certificate => (false, "it takes client certificates and no tokens".into()),
+            Asks::Token => self.accepts(|tokens| tokens.by_digest(digest)),
+        }
+    }
+
+    /// Whether a client certificate with this name is accepted now, and why.
+    pub(crate) fn accepts_certificate(&self, name: &str) -> (bool, String) {
+        match self.asks {
+            Asks::Nothing => (true, "it asks nobody for a certificate".into()),
+            Asks::Certificate => (true, "it takes every certificate of its --client-ca".into()),
+            Asks::Token => self.accepts(|tokens| {
+                let mut entries = tokens.entries().iter();
+                entries.find(|e| e.certificate.as_deref() == Some(name))
             }),
-            None => certificate.and_then(|c| now.by_certificate(c)).ok_or_else(|| {
-                Status::unauthenticated(
-                    "this coordinator wants a token: set PICOFARM_TOKEN or --token-file (`picofarm token create` makes one)",
-                )
-            }),
-        }?;
-        Ok(Caller {
-            name: entry.name.as_str().into(),
-            roles: entry.roles.clone(),
-            tokens: Some(tokens.clone()),
-            entry: Some(Arc::new(entry.clone())),
-        })
+        }
+    }
+
+    fn accepts(&self, find: impl FnOnce(&Tokens) -> Option<&Entry>) -> (bool, String) {
+        let now = self.trust.borrow();
+        if let Err(refused) = now.judge_connection(now.authorities) {
+            return (false, refused.message().to_owned());
+        }
+        match find(&now.tokens).map(|entry| entry.expires) {
+            None => (false, "it is not in the token file".into()),
+            Some(Some(expires)) if expires.is_over(SystemTime::now()) => {
+                (false, format!("it expired at {expires}"))
+            }
+            Some(_) => (true, "it is in the token file".into()),
+        }
+    }
+}
+
+fn entry<'a>(
+    tokens: &'a Tokens,
+    token: Option<&str>,
+    certificate: Option<&Described>,
+) -> Result<&'a Entry, Status> {
+    match token {
+        Some(token) => tokens.by_token(token).ok_or_else(|| {
+            Status::unauthenticated(
+                "the token is not known to this coordinator: it was revoked, or is of another farm; ask for a new one \
+                 (`picofarm token create`)",
+            )
+        }),
+        None => certificate.and_then(|c| tokens.by_certificate(c)).ok_or_else(|| {
+            Status::unauthenticated(
+                "this coordinator wants a token: set PICOFARM_TOKEN or --token-file (`picofarm token create` makes one)",
+            )
+        }),
     }
 }
 
@@ -108,48 +188,67 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
     Ok(Caller {
         name: name.into(),
         roles: vec![Role::Submit, Role::Work].into(),
-        tokens: None,
         entry: None,
+        until: None,
+        authorities: 0,
+        trust: None,
     })
 }
 
-/// Reads the token file again and again. One that cannot be used changes nothing, so that a slip of an editor does
-/// not stop the farm; the log says so.
-async fn follow(
-    path: PathBuf,
-    sender: watch::Sender<Arc<Tokens>>,
-    audit: Audit,
-    stop: CancellationToken,
-) {
-    let mut complaint = String::new();
+/// Reads the token file again and again. A file that cannot be used for a moment changes nothing,
+/// so that a slip of an editor does not stop the farm; after [`GRACE`] every caller is refused
+/// until it can be used again.
+async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationToken) {
+    let (mut reader, mut trouble) = (Reader::default(), Trouble::default());
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOOK) => {}
             () = stop.cancelled() => return,
         }
-        match Tokens::read(&path) {
-            Ok(tokens) => {
-                complaint.clear();
-                let mut what = String::new();
-                sender.send_if_modified(|now| {
-                    let changed = **now != tokens;
-                    if changed {
-                        what = now.difference(&tokens);
-                        *now = Arc::new(tokens);
-                    }
-                    changed
-                });
-                if !what.is_empty() {
-                    tracing::info!(file = %path.display(), "the token file was read again");
-                    audit.note(COORDINATOR, Act::Tokens, Outcome::Done, &what);
-                }
-            }
-            Err(error) if complaint == error.to_string() => {}
-            Err(error) => {
-                complaint = error.to_string();
-                tracing::error!("{complaint}; the tokens read before stay in force");
+        let file = path.clone();
+        let read = match reader.read(move || Tokens::read(&file)).await {
+            Some(read) => read.map_err(|e| e.to_string()),
+            None => Err(format!("{}: {}", path.display(), too_slow())),
+        };
+        let why = read.as_ref().err().cloned();
+        match trouble.judge(why.as_deref(), Instant::now()) {
+            Verdict::Same => {}
+            Verdict::Warn => {
+                let complaint = why.clone().unwrap_or_default();
+                tracing::error!(
+                    "{complaint}; every caller is refused unless this is repaired within {} s",
+                    GRACE.as_secs()
+                );
                 audit.note(COORDINATOR, Act::Tokens, Outcome::Failed, &complaint);
             }
+            Verdict::Close => {
+                let complaint = why.clone().unwrap_or_default();
+                tracing::error!("{complaint}; every caller is refused until this is repaired");
+                let line = format!("every caller is refused: {complaint}");
+                audit.note(COORDINATOR, Act::Tokens, Outcome::Failed, &line);
+                judge.fault(Source::Tokens, why.clone());
+            }
+            Verdict::Reopen => {
+                tracing::info!(file = %path.display(), "the token file can be read again");
+                let line = "the token file can be read again";
+                audit.note(COORDINATOR, Act::Tokens, Outcome::Done, line);
+            }
+        }
+        let Ok(tokens) = read else { continue };
+        let mut what = String::new();
+        judge.change(|trust| {
+            let changed = *trust.tokens != tokens;
+            if changed {
+                what = trust.tokens.difference(&tokens);
+                trust.tokens = Arc::new(tokens);
+            }
+            changed
+        });
+        // After the new list is in force, so that nobody is let in by the old one.
+        judge.fault(Source::Tokens, None);
+        if !what.is_empty() {
+            tracing::info!(file = %path.display(), "the token file was read again");
+            audit.note(COORDINATOR, Act::Tokens, Outcome::Done, &what);
         }
     }
 }

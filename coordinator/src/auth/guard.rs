@@ -8,7 +8,7 @@ use std::{
 use futures::future::{Either, Ready, ready};
 use picofarm_credentials::Described;
 use picofarm_proto::model::Outcome;
-use tonic::{Status, body::Body};
+use tonic::{Status, body::Body, metadata::MetadataValue};
 use tower::{Layer, Service};
 
 use super::{Caller, Gate, Needs, Throttle, act, needs};
@@ -31,9 +31,33 @@ impl Guard {
         }
     }
 
+    /// The answer to the question whether a proof is accepted, if this is one: the header
+    /// `authorization` has the SHA-256 of a token, or the name in a client certificate. Anyone may
+    /// ask, because neither is a proof; nobody is let in by it, and nothing but the header is read.
+    fn asked(&self, headers: &http::HeaderMap) -> Option<Status> {
+        let text = headers.get(http::header::AUTHORIZATION)?.to_str().ok()?;
+        let (scheme, proof) = text.split_once(' ')?;
+        let (accepted, reason) = if scheme.eq_ignore_ascii_case(BY_DIGEST) {
+            let digest = hex::decode(proof).ok().filter(|d| d.len() == 32)?;
+            self.gate.accepts_digest(&digest)
+        } else if scheme.eq_ignore_ascii_case(BY_CERTIFICATE) {
+            self.gate.accepts_certificate(proof)
+        } else {
+            return None;
+        };
+        let mut status = Status::unauthenticated(reason);
+        let accepted = if accepted { "yes" } else { "no" };
+        let accepted = MetadataValue::from_static(accepted);
+        status.metadata_mut().insert(ACCEPTED, accepted);
+        Some(status)
+    }
+
     fn check<B>(&self, request: &http::Request<B>) -> Result<Caller, Status> {
         let token = token(request.headers())?;
-        let caller = self.gate.admit(token, certificate(request).as_ref())?;
+        let peer = request.extensions().get::<Peer>();
+        let authorities = peer.map_or(0, |peer| peer.authorities);
+        let certificate = certificate(request);
+        let caller = self.gate.admit(token, certificate.as_ref(), authorities)?;
         let path = request.uri().path();
         match needs(path) {
             needed if caller.roles.allow(needed) => Ok(caller),
@@ -53,6 +77,16 @@ impl Guard {
         }
     }
 }
+
+/// The header by which a question whether a proof is accepted is answered: `yes` or `no`. The
+/// message has the reason.
+pub const ACCEPTED: &str = "picofarm-accepted";
+
+/// What stands before the SHA-256 of a token in the header `authorization`, to ask whether that
+/// token is accepted.
+pub const BY_DIGEST: &str = "Sha256";
+/// What stands before the name in a client certificate, to ask the same.
+pub const BY_CERTIFICATE: &str = "Certificate";
 
 /// The bearer token, where there is one.
 fn token(headers: &http::HeaderMap) -> Result<Option<&str>, Status> {
@@ -94,6 +128,10 @@ impl<S> Layer<S> for Guard {
     }
 }
 
+/// Whether a request comes from the coordinator's own machine.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SameMachine(pub bool);
+
 /// A service behind a [`Guard`].
 #[derive(Clone)]
 pub(crate) struct Guarded<S> {
@@ -114,9 +152,15 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
+        if let Some(status) = self.guard.asked(request.headers()) {
+            return Either::Right(ready(Ok(status.into_http())));
+        }
         match self.guard.check(&request) {
             Ok(caller) => {
+                let here = request.extensions().get::<Peer>();
+                let here = here.is_some_and(|peer| peer.address.ip().to_canonical().is_loopback());
                 request.extensions_mut().insert(caller);
+                request.extensions_mut().insert(SameMachine(here));
                 Either::Left(self.inner.call(request))
             }
             Err(status) => {

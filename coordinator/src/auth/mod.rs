@@ -3,6 +3,7 @@
 
 mod access;
 pub(crate) mod caller;
+mod expiry;
 mod gate;
 mod guard;
 mod quota;
@@ -10,11 +11,14 @@ mod rights;
 mod roles;
 mod tls;
 mod tokens;
+mod trust;
 
 pub use access::Access;
 pub use caller::Caller;
+pub use expiry::Expiry;
 pub(crate) use gate::Gate;
-pub(crate) use guard::Guard;
+pub use guard::{ACCEPTED, BY_CERTIFICATE, BY_DIGEST};
+pub(crate) use guard::{Guard, SameMachine};
 pub use quota::Quotas;
 pub(crate) use quota::{Throttle, WorkerIds};
 pub use rights::Visibility;
@@ -24,3 +28,4 @@ pub use roles::{METHODS, Needs, Role, Roles, needs};
 pub(crate) use tls::Loaded;
 pub use tls::TlsFiles;
 pub use tokens::{Entry, TOKEN_PREFIX, TokenError, Tokens};
+pub(crate) use trust::{GRACE, Judge, Reader, Source, Trouble, Verdict, too_slow};

@@ -167,12 +167,15 @@ mod tests {
         Caller {
             name: name.into(),
             roles: roles.clone(),
-            tokens: None,
+            until: None,
+            authorities: 0,
+            trust: None,
             entry: Some(Arc::new(Entry {
                 name: name.into(),
                 roles,
                 sha256: None,
                 certificate: Some("c".into()),
+                expires: None,
                 member: texts(member),
                 maintainer: texts(maintainer),
             })),

@@ -27,6 +27,8 @@ pub(crate) struct Loaded {
     pub config: Arc<ServerConfig>,
     /// Of all files.
     pub digest: [u8; 32],
+    /// Of the client certificate authorities alone.
+    pub authorities: [u8; 32],
     /// Whose certificate it is and until when, in words.
     pub about: String,
 }
@@ -57,13 +59,15 @@ impl TlsFiles {
         let builder = ServerConfig::builder_with_provider(Arc::clone(&provider))
             .with_safe_default_protocol_versions()
             .expect("the provider has the default versions of TLS");
+        let mut authorities = [0; 32];
         let builder = match &self.client_ca {
             None => builder.with_no_client_auth(),
             Some(path) => {
-                let (authorities, pem) = certificates(path)?;
+                let (certificates, pem) = certificates(path)?;
                 digest.update(&pem);
+                authorities = Sha256::digest(&pem).into();
                 let mut roots = RootCertStore::empty();
-                for authority in authorities {
+                for authority in certificates {
                     roots.add(authority).map_err(|e| unusable(path, &e))?;
                 }
                 let verifier =
@@ -83,7 +87,17 @@ impl TlsFiles {
         Ok(Loaded {
             config: Arc::new(config),
             digest: digest.finalize().into(),
+            authorities,
             about: about(&pair.described),
+        })
+    }
+
+    /// Whether the client certificate authorities are those of this digest. `false` also if they
+    /// cannot be read.
+    pub(crate) fn has_authorities(&self, digest: &[u8; 32]) -> bool {
+        self.client_ca.as_ref().is_none_or(|path| {
+            certificates(path)
+                .is_ok_and(|(_, pem)| <[u8; 32]>::from(Sha256::digest(&pem)) == *digest)
         })
     }
 

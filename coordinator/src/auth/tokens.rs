@@ -1,22 +1,21 @@
 //! The token file: who there is, with what roles, and the SHA-256 of each one's token. Tokens themselves are shown
 //! once, when they are made, and kept nowhere.
 
-use std::{
-    io::Write,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
-use picofarm_credentials::{CredentialError, Described, Secret, private};
+use picofarm_credentials::{CredentialError, Described, LockedFile, Secret, private, read_text};
 use picofarm_proto::model::check_project;
 use rustls::crypto::ring;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use subtle::ConstantTimeEq;
 
-use super::roles::Roles;
+use super::{expiry::Expiry, roles::Roles};
 
 /// Tokens begin with this, so that leaked ones are found by a search.
 pub const TOKEN_PREFIX: &str = "pf-";
+/// Largest token file, bytes: a hundred thousand callers.
+const LARGEST: u64 = 32 << 20;
 
 /// Why the token file cannot be used or changed.
 #[derive(Debug, thiserror::Error)]
@@ -31,14 +30,6 @@ pub enum TokenError {
         path: PathBuf,
         /// What was expected.
         what: String,
-    },
-    /// It cannot be written.
-    #[error("{}: {source}; check that this user may write there", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// The system's answer.
-        source: std::io::Error,
     },
 }
 
@@ -56,6 +47,9 @@ pub struct Entry {
     /// Common name or alternative name of a client certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub certificate: Option<String>,
+    /// When its access ends.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expires: Option<Expiry>,
     /// Projects that it may name in its jobs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub member: Vec<String>,
@@ -77,6 +71,7 @@ const HEAD: &str = "\
 # Roles: view, submit, work, admin. sha256 is that of the token, which is kept nowhere.
 # member = [\"PROJECT\"] lets a caller name the project in its jobs; maintainer = [\"PROJECT\"] lets it change all jobs of it.
 # In place of sha256, certificate = \"NAME\" knows a client certificate by its common name or an alternative name.
+# expires = \"2027-03-01T08:00:00Z\" ends a caller's access at that time.
 
 ";
 
@@ -87,14 +82,49 @@ impl Tokens {
     /// [`TokenError`]: it cannot be read, is open to everyone, or an entry makes no sense.
     pub fn read(path: &Path) -> Result<Self, TokenError> {
         private(path)?;
-        let text = std::fs::read_to_string(path).map_err(|source| CredentialError::Read {
-            path: path.to_owned(),
-            source,
-        })?;
-        Self::parse(&text).map_err(|what| TokenError::Invalid {
-            path: path.to_owned(),
-            what,
-        })
+        Self::parse(&read_text(path, LARGEST)?).map_err(|what| invalid(path, what))
+    }
+
+    /// Changes the file while no other process does. Owner, group, mode and access list stay as
+    /// they are.
+    ///
+    /// # Errors
+    /// [`TokenError`]: the file cannot be used or replaced, or the error of `change`, in words.
+    /// Nothing is changed then.
+    pub fn edit<T>(
+        path: &Path,
+        change: impl FnOnce(&mut Self) -> Result<T, String>,
+    ) -> Result<T, TokenError> {
+        Self::change(path, LockedFile::open(path)?, change)
+    }
+
+    /// Like [`Tokens::edit`], but makes the file if there is none.
+    ///
+    /// # Errors
+    /// As [`Tokens::edit`].
+    pub fn edit_or_create<T>(
+        path: &Path,
+        change: impl FnOnce(&mut Self) -> Result<T, String>,
+    ) -> Result<T, TokenError> {
+        Self::change(path, LockedFile::open_or_create(path)?, change)
+    }
+
+    fn change<T>(
+        path: &Path,
+        file: LockedFile,
+        change: impl FnOnce(&mut Self) -> Result<T, String>,
+    ) -> Result<T, TokenError> {
+        let text = String::from_utf8(file.read(LARGEST)?)
+            .map_err(|_| invalid(path, "is not a text file; expected UTF-8".into()))?;
+        let mut tokens = Self::parse(&text).map_err(|what| invalid(path, what))?;
+        let value = change(&mut tokens).map_err(|what| invalid(path, what))?;
+        file.replace(tokens.to_text().as_bytes())?;
+        Ok(value)
+    }
+
+    fn to_text(&self) -> String {
+        let text = toml::to_string(self).expect("entries are plain data");
+        format!("{HEAD}{text}")
     }
 
     fn parse(text: &str) -> Result<Self, String> {
@@ -158,18 +188,7 @@ impl Tokens {
 
     /// Whose token this is. Takes the same time for every token.
     pub fn by_token(&self, token: &str) -> Option<&Entry> {
-        let digest = Sha256::digest(token);
-        let mut found = None;
-        for entry in &self.entries {
-            let Some(sha256) = &entry.sha256 else {
-                continue;
-            };
-            let known = hex::decode(sha256).expect("checked when it was read");
-            if bool::from(known.ct_eq(&digest)) {
-                found = Some(entry);
-            }
-        }
-        found
+        self.by_digest(&Sha256::digest(token))
     }
 
     /// Whose client certificate this is.
@@ -180,7 +199,28 @@ impl Tokens {
         })
     }
 
-    /// Makes a token for a new caller and adds it, with the projects that it is a member and a maintainer of.
+    /// The entry with this name.
+    pub fn by_name(&self, name: &str) -> Option<&Entry> {
+        self.entries.iter().find(|entry| entry.name == name)
+    }
+
+    /// Whose token has this SHA-256.
+    pub(crate) fn by_digest(&self, digest: &[u8]) -> Option<&Entry> {
+        let mut found = None;
+        for entry in &self.entries {
+            let Some(sha256) = &entry.sha256 else {
+                continue;
+            };
+            let known = hex::decode(sha256).expect("checked when it was read");
+            if bool::from(known.ct_eq(digest)) {
+                found = Some(entry);
+            }
+        }
+        found
+    }
+
+    /// Makes a token for a new caller and adds it, with the projects that it is a member and a
+    /// maintainer of. It never expires.
     ///
     /// # Errors
     /// The name is taken or not plain, a project's name is not plain, or there are no roles; in words.
@@ -190,6 +230,21 @@ impl Tokens {
         roles: Roles,
         member: Vec<String>,
         maintainer: Vec<String>,
+    ) -> Result<Secret, String> {
+        self.create_until(name, roles, member, maintainer, None)
+    }
+
+    /// Like [`Tokens::create`], for a token that expires.
+    ///
+    /// # Errors
+    /// As [`Tokens::create`].
+    pub fn create_until(
+        &mut self,
+        name: &str,
+        roles: Roles,
+        member: Vec<String>,
+        maintainer: Vec<String>,
+        expires: Option<Expiry>,
     ) -> Result<Secret, String> {
         plain_name(name)?;
         for project in member.iter().chain(&maintainer) {
@@ -214,6 +269,7 @@ impl Tokens {
             roles,
             sha256: Some(hex::encode(Sha256::digest(&token))),
             certificate: None,
+            expires,
             member,
             maintainer,
         });
@@ -227,40 +283,20 @@ impl Tokens {
         self.entries.len() < before
     }
 
-    /// Writes the file in one step, for its owner and group only.
+    /// Writes the file in one step. A new file is for its owner alone.
     ///
     /// # Errors
-    /// [`TokenError::Write`].
+    /// [`TokenError`]: the file cannot be written, or is open to everyone.
     pub fn write(&self, path: &Path) -> Result<(), TokenError> {
-        use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
-        let failed = |source| TokenError::Write {
-            path: path.to_owned(),
-            source,
-        };
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty());
-        if let Some(folder) = folder {
-            std::fs::create_dir_all(folder).map_err(failed)?;
-        }
-        let mode = std::fs::metadata(path).map_or(0o600, |m| m.permissions().mode() & 0o770);
-        let mut temporary = path.as_os_str().to_owned();
-        temporary.push(format!(".{}", uuid::Uuid::new_v4()));
-        let text = toml::to_string(self).expect("entries are plain data");
-        let written = std::fs::OpenOptions::new()
-            .write(true)
-            .create_new(true)
-            .mode(mode)
-            .open(&temporary)
-            .and_then(|mut file| {
-                file.write_all(HEAD.as_bytes())?;
-                file.write_all(text.as_bytes())?;
-                file.sync_all()
-            })
-            .and_then(|()| std::fs::rename(&temporary, path));
-        written.map_err(|e| {
-            // What is left of it is of no use; the error that matters is the first.
-            let _ = std::fs::remove_file(&temporary);
-            failed(e)
-        })
+        let file = LockedFile::open_or_create(path)?;
+        Ok(file.replace(self.to_text().as_bytes())?)
+    }
+}
+
+fn invalid(path: &Path, what: String) -> TokenError {
+    TokenError::Invalid {
+        path: path.to_owned(),
+        what,
     }
 }
 
@@ -321,6 +357,72 @@ mod tests {
         assert!(back.revoke("ada") && !back.revoke("ada"));
         assert!(back.by_token(ada.expose()).is_none());
         assert_eq!(back.by_token(bob.expose()).unwrap().name, "bob");
+    }
+
+    #[test]
+    fn changes_at_the_same_moment_are_all_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens.toml");
+        let create = |name: String| {
+            Tokens::edit_or_create(&path, |tokens| {
+                tokens.create(&name, vec![Role::View].into(), vec![], vec![])
+            })
+            .unwrap();
+        };
+        for i in 0..5 {
+            create(format!("old-{i}"));
+        }
+        std::thread::scope(|scope| {
+            for i in 0..5 {
+                scope.spawn(move || create(format!("new-{i}")));
+                let path = &path;
+                scope.spawn(move || {
+                    let revoke = |tokens: &mut Tokens| Ok(tokens.revoke(&format!("old-{i}")));
+                    assert!(Tokens::edit(path, revoke).unwrap());
+                });
+            }
+        });
+        let mut names: Vec<_> = Tokens::read(&path).unwrap().entries;
+        names.sort_by(|a, b| a.name.cmp(&b.name));
+        let names: Vec<_> = names.iter().map(|e| &*e.name).collect();
+        assert_eq!(names, ["new-0", "new-1", "new-2", "new-3", "new-4"]);
+    }
+
+    #[test]
+    fn a_change_that_is_refused_leaves_the_file_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens.toml");
+        let refused = |_: &mut Tokens| Err::<(), _>("no".to_owned());
+        assert!(Tokens::edit_or_create(&path, refused).is_err());
+        assert!(!path.exists());
+        Tokens::default().write(&path).unwrap();
+        let before = std::fs::read(&path).unwrap();
+        let said = Tokens::edit(&path, refused).unwrap_err().to_string();
+        assert!(said.ends_with("tokens.toml: no"), "{said}");
+        assert_eq!(std::fs::read(&path).unwrap(), before);
+    }
+
+    #[test]
+    fn an_expiry_is_read_with_and_without_quotes() {
+        let digest = "00".repeat(32);
+        for expires in [
+            "\"2027-03-01T08:00:00Z\"",
+            "2027-03-01T08:00:00Z",
+            "2027-03-01 08:00:00Z",
+        ] {
+            let text = format!(
+                "[[caller]]\nname = \"a\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\nexpires = {expires}\n"
+            );
+            let tokens = Tokens::parse(&text).unwrap();
+            let expires = tokens.entries[0].expires.unwrap();
+            assert_eq!(expires.to_string(), "2027-03-01T08:00:00Z");
+            assert_eq!(Tokens::parse(&tokens.to_text()).unwrap(), tokens);
+        }
+        let text = format!(
+            "[[caller]]\nname = \"a\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\nexpires = \"soon\"\n"
+        );
+        let said = Tokens::parse(&text).unwrap_err();
+        assert!(said.contains("\"soon\" is not a time"), "{said}");
     }
 
     #[test]

@@ -10,9 +10,13 @@ use std::{
 
 use tokio_util::sync::CancellationToken;
 
+/// How long a full waiting room is left alone, for each connection more; and how often it is looked at meanwhile.
+const CROWDED: Duration = Duration::from_millis(20);
+const ASK_AGAIN: Duration = Duration::from_millis(2);
+
 /// Addresses that count as one: an IPv4 address, or a /64 network of IPv6, of which one machine has all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-struct Group([u8; 8]);
+pub(crate) struct Group([u8; 8]);
 
 impl From<IpAddr> for Group {
     fn from(address: IpAddr) -> Self {
@@ -35,8 +39,12 @@ pub(crate) struct Doors(Mutex<State>);
 struct State {
     all: usize,
     per_address: usize,
+    /// Connections without a request at a time.
+    silent: usize,
     next: u64,
     open: BTreeMap<u64, (Group, CancellationToken)>,
+    /// When the latest came that had to take the place of one without a request.
+    crowded: Option<Instant>,
     of: HashMap<Group, usize>,
     /// Those that wait for their first request, the oldest first; of all, and of each group.
     waiting: BTreeSet<u64>,
@@ -65,13 +73,15 @@ pub(crate) enum Full {
 }
 
 impl Doors {
-    /// So many places, and so many of one address.
-    pub(crate) fn new(all: usize, per_address: usize) -> Self {
+    /// So many places, so many of one address, and so many for connections that have not sent a request.
+    pub(crate) fn new(all: usize, per_address: usize, silent: usize) -> Self {
         Self(Mutex::new(State {
             all,
             per_address,
+            silent: silent.max(1),
             next: 0,
             open: BTreeMap::new(),
+            crowded: None,
             of: HashMap::new(),
             waiting: BTreeSet::new(),
             waiting_of: HashMap::new(),
@@ -86,6 +96,23 @@ impl Doors {
             open: state.open.len() as u64,
             ..state.counts
         }
+    }
+
+    /// How long the next connection had better wait: where there are many without a request, those that are about to send
+    /// theirs get some time before they are displaced.
+    pub(crate) fn patience(&self) -> Duration {
+        let mut state = self.lock();
+        if state.waiting.len() < state.silent {
+            state.crowded = None;
+            return Duration::ZERO;
+        }
+        let since = state.crowded.get_or_insert_with(Instant::now).elapsed();
+        if since < CROWDED {
+            return ASK_AGAIN;
+        }
+        // For this one; the next waits for its own time.
+        state.crowded = None;
+        Duration::ZERO
     }
 
     /// Places of all, and of one address.
@@ -106,7 +133,7 @@ impl Doors {
             let oldest = mine.and_then(|ids| ids.first().copied());
             state.make_room(oldest, Full::Address)?;
         }
-        if state.open.len() >= state.all {
+        if state.open.len() >= state.all || state.waiting.len() >= state.silent {
             let oldest = state.waiting.first().copied();
             state.make_room(oldest, Full::All)?;
         }
@@ -202,6 +229,16 @@ struct Use {
 }
 
 impl Place {
+    /// Its number, unique among the connections of these doors.
+    pub(crate) fn id(&self) -> u64 {
+        self.id
+    }
+
+    /// Ends the connection.
+    pub(crate) fn hang_up(&self) {
+        self.closed.cancel();
+    }
+
     /// A request was let in; it is open until the value is dropped.
     pub(crate) fn stream(self: &Arc<Self>) -> Stream {
         let first = {
@@ -237,7 +274,7 @@ impl Place {
         };
         tokio::select! {
             why = late => why,
-            () = self.closed.cancelled() => "others wait for its place, and it has sent no request",
+            () = self.closed.cancelled() => "others wait for its place and it has sent no request, or it takes no answer",
         }
     }
 
@@ -279,7 +316,7 @@ mod tests {
     use super::*;
 
     fn doors(all: usize, per_address: usize) -> Arc<Doors> {
-        Arc::new(Doors::new(all, per_address))
+        Arc::new(Doors::new(all, per_address, all))
     }
 
     fn ip(text: &str) -> IpAddr {
@@ -326,6 +363,20 @@ mod tests {
         let _third = doors.enter(ip("10.0.0.1")).unwrap();
         assert!(evicted(&first), "it is silent, and of the same address");
         assert!(!mine.iter().any(evicted));
+    }
+
+    #[test]
+    fn few_may_be_without_a_request_and_they_have_time_to_send_it() {
+        let doors = Arc::new(Doors::new(9, 9, 2));
+        let first = doors.enter(ip("10.0.0.1")).unwrap();
+        let second = doors.enter(ip("10.0.0.2")).unwrap();
+        assert_eq!(doors.patience(), ASK_AGAIN);
+        let _request = second.place().stream();
+        assert_eq!(doors.patience(), Duration::ZERO);
+        let third = doors.enter(ip("10.0.0.3")).unwrap();
+        assert!(!evicted(&first) && !evicted(&third));
+        let _fourth = doors.enter(ip("10.0.0.4")).unwrap();
+        assert_eq!([&first, &second, &third].map(evicted), [true, false, false]);
     }
 
     #[test]

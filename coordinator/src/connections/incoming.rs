@@ -11,7 +11,7 @@ use std::{
     time::Duration,
 };
 
-use rustls::{ServerConfig, pki_types::CertificateDer};
+use rustls::pki_types::CertificateDer;
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
     net::{TcpListener, TcpStream},
@@ -25,6 +25,7 @@ use tonic::transport::server::Connected;
 use super::{
     Connections,
     doors::{Doors, Held, Place},
+    watched::Certificates,
 };
 use crate::auth::Throttle;
 
@@ -40,7 +41,7 @@ pub(crate) fn accept(
     listener: TcpListener,
     doors: Arc<Doors>,
     bounds: Connections,
-    tls: Option<watch::Receiver<Arc<ServerConfig>>>,
+    tls: Option<watch::Receiver<Certificates>>,
     stop: CancellationToken,
 ) -> ReceiverStream<Result<Connection, io::Error>> {
     let (ready, connections) = mpsc::channel(READY);
@@ -62,6 +63,13 @@ pub(crate) fn accept(
                     continue;
                 }
             };
+            loop {
+                let wait = doors.patience();
+                if wait.is_zero() {
+                    break;
+                }
+                tokio::time::sleep(wait).await;
+            }
             let held = match doors.enter(address.ip()) {
                 Ok(held) => held,
                 Err(why) => {
@@ -73,7 +81,7 @@ pub(crate) fn accept(
             };
             // Small messages are not held back; a socket that cannot be told so works all the same.
             let _ = stream.set_nodelay(true);
-            let tls = tls.as_ref().map(|tls| Arc::clone(&tls.borrow()));
+            let tls = tls.as_ref().map(|tls| tls.borrow().clone());
             let ready = ready.clone();
             tokio::spawn(async move {
                 if let Some(connection) =
@@ -97,6 +105,8 @@ enum Io {
 pub(crate) struct Connection {
     io: Io,
     address: SocketAddr,
+    /// How often the client certificate authorities had changed when it began.
+    authorities: u64,
     held: Held,
     over: Option<Pin<Box<dyn Future<Output = &'static str> + Send>>>,
 }
@@ -108,7 +118,16 @@ pub(crate) struct Peer {
     pub address: SocketAddr,
     /// The client's certificate chain, verified.
     pub certificates: Option<Arc<Vec<CertificateDer<'static>>>>,
+    /// How often the client certificate authorities had changed when the connection began.
+    pub authorities: u64,
     pub(super) place: Arc<Place>,
+}
+
+impl Peer {
+    /// Its place among the connections.
+    pub(crate) fn place(&self) -> Arc<Place> {
+        Arc::clone(&self.place)
+    }
 }
 
 impl Connection {
@@ -118,13 +137,14 @@ impl Connection {
         address: SocketAddr,
         held: Held,
         bounds: Connections,
-        tls: Option<Arc<ServerConfig>>,
+        tls: Option<Certificates>,
     ) -> Option<Self> {
+        let authorities = tls.as_ref().map_or(0, |tls| tls.authorities);
         let over = Arc::clone(held.place()).over(bounds.first_request, bounds.idle);
         let mut over: Pin<Box<dyn Future<Output = _> + Send>> = Box::pin(over);
         let io = match tls {
             None => Io::Plain(stream),
-            Some(config) => tokio::select! {
+            Some(Certificates { config, .. }) => tokio::select! {
                 shaken = tokio::time::timeout(HANDSHAKE, TlsAcceptor::from(config).accept(stream)) => match shaken {
                     Ok(Ok(stream)) => Io::Tls(Box::new(stream)),
                     Ok(Err(error)) => {
@@ -145,6 +165,7 @@ impl Connection {
         Some(Self {
             io,
             address,
+            authorities,
             held,
             over: Some(over),
         })
@@ -177,6 +198,7 @@ impl Connected for Connection {
         Peer {
             address: self.address,
             certificates,
+            authorities: self.authorities,
             place: Arc::clone(self.held.place()),
         }
     }

@@ -7,7 +7,9 @@ mod watched;
 
 use std::time::Duration;
 
-pub(crate) use doors::{Counts, Doors, Place};
+use crate::memory::MemoryBounds;
+
+pub(crate) use doors::{Counts, Doors, Group, Place};
 pub(crate) use incoming::{Peer, accept};
 pub(crate) use streams::Streams;
 pub(crate) use watched::follow as follow_certificates;
@@ -40,15 +42,17 @@ impl Default for Connections {
 const OTHER_FILES: u64 = 512;
 
 impl Connections {
-    /// Doors for these bounds where so many files may be open. The greater part of a small limit is for connections.
-    pub(crate) fn doors(&self, files: u64) -> Doors {
+    /// Doors for these bounds where so many files may be open and there is so much memory. The greater part of a small limit
+    /// of files is for connections.
+    pub(crate) fn doors(&self, files: u64, memory: MemoryBounds) -> Doors {
         let room = files.saturating_sub(OTHER_FILES).max(files / 2);
         let all = self
             .all
             .min(usize::try_from(room).unwrap_or(usize::MAX))
+            .min(memory.connections())
             .max(1);
         let share = self.per_address.unwrap_or(all - all / 4);
-        Doors::new(all, share.clamp(1, all))
+        Doors::new(all, share.clamp(1, all), memory.silent().min(all))
     }
 }
 
@@ -82,7 +86,7 @@ mod tests {
                 per_address,
                 ..Connections::default()
             };
-            bounds.doors(files).bounds()
+            bounds.doors(files, MemoryBounds::default()).bounds()
         };
         assert_eq!(doors(20_000, None, 1 << 20), (20_000, 15_000));
         assert_eq!(doors(20_000, None, 1024), (512, 384));

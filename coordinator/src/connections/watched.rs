@@ -1,6 +1,9 @@
 //! Certificates that change while the coordinator runs: the files are looked at like the token file.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use picofarm_credentials::CredentialError;
 use picofarm_proto::model::{Act, Outcome};
@@ -10,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     audit::{Audit, COORDINATOR},
-    auth::{Loaded, TlsFiles},
+    auth::{GRACE, Judge, Loaded, Reader, Source, TlsFiles, Trouble, Verdict, too_slow},
 };
 
 /// How often the files are looked at.
@@ -55,37 +58,98 @@ impl Looks {
     }
 }
 
-/// The present certificates, of files that are read again until `stop`. Ones that cannot be used change nothing, and the
-/// log says so. Connections keep the certificates that they began with.
+/// What connections begin with.
+#[derive(Clone)]
+pub(crate) struct Certificates {
+    pub config: Arc<ServerConfig>,
+    /// How often the client certificate authorities have changed.
+    pub authorities: u64,
+}
+
+/// The present certificates, of files that are read again until `stop`.
+///
+/// An own certificate that cannot be used changes nothing, because it lets nobody in; the log says
+/// so. Connections keep the certificates that they began with. Client certificate authorities that
+/// have changed and are not in force let in somebody who may have been revoked: if they cannot be
+/// used within [`GRACE`], every caller is refused. When they have changed, callers on older
+/// connections are refused, and come back with a certificate that is judged anew.
 pub(crate) fn follow(
     files: TlsFiles,
     loaded: Loaded,
+    judge: Judge,
     audit: Audit,
     stop: CancellationToken,
-) -> watch::Receiver<Arc<ServerConfig>> {
-    let (sender, receiver) = watch::channel(loaded.config);
-    let mut now = loaded.digest;
+) -> watch::Receiver<Certificates> {
+    let (sender, receiver) = watch::channel(Certificates {
+        config: loaded.config,
+        authorities: 0,
+    });
+    let (mut now, mut authorities) = (loaded.digest, loaded.authorities);
     tokio::spawn(async move {
-        let mut looks = Looks::default();
+        let (mut looks, mut trouble) = (Looks::default(), Trouble::default());
+        let mut reader = Reader::default();
         loop {
             tokio::select! {
                 () = tokio::time::sleep(LOOK) => {}
                 () = stop.cancelled() => return,
             }
-            let read = files.read();
+            let aside = files.clone();
+            let look = move || {
+                let same = aside.has_authorities(&authorities);
+                (aside.read(), same)
+            };
+            let (read, same) = reader.read(look).await.unwrap_or_else(|| {
+                let slow = CredentialError::Unusable {
+                    path: files.certificate.clone(),
+                    what: too_slow(),
+                };
+                (Err(slow), files.client_ca.is_none())
+            });
+            let unknown = read.as_ref().err().filter(|_| !same);
+            let unknown = unknown.map(ToString::to_string);
+            match trouble.judge(unknown.as_deref(), Instant::now()) {
+                Verdict::Warn => tracing::error!(
+                    "{}; every caller is refused unless this is repaired within {} s",
+                    unknown.unwrap_or_default(),
+                    GRACE.as_secs()
+                ),
+                Verdict::Close => {
+                    let why = unknown.unwrap_or_default();
+                    tracing::error!("{why}; every caller is refused until this is repaired");
+                    let line = format!("every caller is refused: {why}");
+                    audit.note(COORDINATOR, Act::Certificates, Outcome::Failed, &line);
+                    judge.fault(Source::Authorities, Some(why));
+                }
+                Verdict::Same | Verdict::Reopen => {}
+            }
             match looks.judge(now, read.as_ref().map(|loaded| loaded.digest)) {
                 Seen::Same => {}
                 Seen::New => {
                     let loaded = read.expect("files that cannot be read are not new");
                     now = loaded.digest;
-                    sender.send_replace(loaded.config);
+                    let changed = loaded.authorities != authorities;
+                    authorities = loaded.authorities;
+                    let count = sender.borrow().authorities + u64::from(changed);
+                    sender.send_replace(Certificates {
+                        config: loaded.config,
+                        authorities: count,
+                    });
+                    judge.change(|trust| {
+                        trust.authorities = count;
+                        changed
+                    });
                     tracing::info!(certificate = %files.certificate.display(), "the certificates were read again");
                     audit.note(COORDINATOR, Act::Certificates, Outcome::Done, &loaded.about);
                 }
                 Seen::Unusable(why) => {
-                    tracing::error!("{why}; the certificates read before stay in force");
+                    if same {
+                        tracing::error!("{why}; the certificates read before stay in force");
+                    }
                     audit.note(COORDINATOR, Act::Certificates, Outcome::Failed, &why);
                 }
+            }
+            if trouble.is_over() {
+                judge.fault(Source::Authorities, None);
             }
         }
     });

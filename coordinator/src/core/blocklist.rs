@@ -1,40 +1,67 @@
-//! Workers on which one task of a stage after another fails: a full disk, a broken driver. Such a worker gets no more of
-//! that stage for a while, as long as others may run it.
+//! Workers on which one task of a stage after another fails: a full disk, a broken driver. Such a
+//! worker gets no more of that stage for a while, and for ever longer, as long as others may run
+//! it; and its failures are not the tasks'.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use picofarm_proto::ids::WorkerId;
+use picofarm_proto::{ids::WorkerId, model::FailureKind};
+
+use crate::budget::Backoff;
 
 /// Different tasks that fail on a worker in a row until it is passed over.
 const TASKS: usize = 3;
-/// For how long, milliseconds.
-const AVOID_MS: i64 = 600_000;
+/// For how long at most, milliseconds.
+const AVOID_MS: u32 = 600_000;
+/// It is passed over this many times as long as a task waits after a failure.
+const LONGER: u32 = 4;
 
 /// The workers on which tasks of one stage failed.
 #[derive(Debug, Default)]
 pub(super) struct Blocklist(BTreeMap<WorkerId, Row>);
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Row {
-    tasks: BTreeSet<u64>,
+    /// The tasks, with what they were charged with.
+    tasks: BTreeMap<u64, FailureKind>,
+    tries: u32,
+    until_ms: i64,
+    /// The same where no other worker may run the stage.
+    alone_until_ms: i64,
     last_ms: i64,
 }
 
 impl Blocklist {
     /// A task failed on a worker.
-    pub(super) fn failed(&mut self, worker: WorkerId, task: u64, now_ms: i64) {
-        let row = self.0.entry(worker).or_insert(Row {
-            tasks: BTreeSet::new(),
-            last_ms: now_ms,
-        });
-        if row.last_ms + AVOID_MS < now_ms {
-            row.tasks.clear();
+    pub(super) fn failed(
+        &mut self,
+        worker: WorkerId,
+        task: u64,
+        kind: FailureKind,
+        backoff: &Backoff,
+        now_ms: i64,
+    ) {
+        let row = self.0.entry(worker).or_default();
+        if row.last_ms.max(row.until_ms) + i64::from(AVOID_MS) < now_ms {
+            *row = Row::default();
         }
         // More are not needed to know.
         if row.tasks.len() < TASKS {
-            row.tasks.insert(task);
+            row.tasks.entry(task).or_insert(kind);
         }
         row.last_ms = now_ms;
+        // Tasks that ran on it at that time fail too, which counts once.
+        if row.tasks.len() >= TASKS && now_ms >= row.until_ms.min(row.alone_until_ms) {
+            let longer = Backoff {
+                first_ms: backoff.first_ms.saturating_mul(LONGER),
+                most_ms: AVOID_MS,
+            };
+            row.tries = row.tries.saturating_add(1);
+            row.until_ms = now_ms + longer.after(row.tries);
+            // The only worker of a stage rests shortly: its tasks may be as much to blame, and a wrong
+            // job must fail soon on a laptop.
+            let alone = i64::from(backoff.first_ms);
+            row.alone_until_ms = row.until_ms.min(now_ms + alone);
+        }
     }
 
     /// A task went well on a worker.
@@ -42,11 +69,36 @@ impl Blocklist {
         self.0.remove(&worker);
     }
 
+    /// Whether tasks failed on a worker one after another, and nothing has gone well on it since.
+    pub(super) fn doubts(&self, worker: WorkerId) -> bool {
+        self.0
+            .get(&worker)
+            .is_some_and(|row| row.tasks.len() >= TASKS)
+    }
+
     /// Whether a worker is to be passed over; then for how much longer, milliseconds.
     pub(super) fn avoids(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
-        let row = self.0.get(&worker)?;
-        let left = row.last_ms + AVOID_MS - now_ms;
-        (row.tasks.len() >= TASKS && left > 0).then_some(left)
+        let left = self.0.get(&worker)?.until_ms - now_ms;
+        (left > 0).then_some(left)
+    }
+
+    /// The same of a worker that is the only one for the stage.
+    pub(super) fn avoids_alone(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
+        let left = self.0.get(&worker)?.alone_until_ms - now_ms;
+        (left > 0).then_some(left)
+    }
+
+    /// The tasks that failed on a worker before it was passed over, with what they were charged
+    /// with: once.
+    pub(super) fn take_charged(&mut self, worker: WorkerId) -> Vec<(u64, FailureKind)> {
+        let Some(row) = self.0.get_mut(&worker) else {
+            return Vec::new();
+        };
+        let charged = |(task, kind): (&u64, &mut FailureKind)| {
+            let charged = std::mem::replace(kind, FailureKind::Interrupted);
+            (charged != FailureKind::Interrupted).then_some((*task, charged))
+        };
+        row.tasks.iter_mut().filter_map(charged).collect()
     }
 }
 
@@ -56,37 +108,68 @@ mod tests {
 
     use super::*;
 
+    const BACKOFF: Backoff = Backoff {
+        first_ms: 2_000,
+        most_ms: 300_000,
+    };
+
+    fn worker() -> WorkerId {
+        WorkerId::from_uuid(Uuid::from_u128(1))
+    }
+
+    fn fail(blocklist: &mut Blocklist, task: u64, now_ms: i64) {
+        blocklist.failed(worker(), task, FailureKind::User, &BACKOFF, now_ms);
+    }
+
     #[test]
-    fn three_tasks_in_a_row_and_a_worker_is_passed_over_for_a_while() {
-        let worker = WorkerId::from_uuid(Uuid::from_u128(1));
+    fn three_tasks_in_a_row_and_a_worker_is_passed_over_for_ever_longer() {
         let mut blocklist = Blocklist::default();
         for task in [1, 2, 2, 2] {
-            blocklist.failed(worker, task, 0);
+            fail(&mut blocklist, task, 0);
         }
+        let avoids = |b: &Blocklist, now| b.avoids(worker(), now);
         assert_eq!(
-            blocklist.avoids(worker, 0),
+            avoids(&blocklist, 0),
             None,
             "one task that fails is its own"
         );
-        blocklist.failed(worker, 3, 10);
-        assert_eq!(blocklist.avoids(worker, 10), Some(AVOID_MS));
-        assert_eq!(blocklist.avoids(worker, 10 + AVOID_MS), None);
-        blocklist.failed(worker, 4, 20 + 2 * AVOID_MS);
-        assert_eq!(
-            blocklist.avoids(worker, 20 + 2 * AVOID_MS),
-            None,
-            "long ago"
-        );
+        let mut now = 10;
+        let mut waits = Vec::new();
+        for task in 3..13 {
+            // All that was under way fails at once, which counts once.
+            fail(&mut blocklist, task, now);
+            fail(&mut blocklist, task + 100, now);
+            waits.push(avoids(&blocklist, now).unwrap());
+            assert!(blocklist.avoids_alone(worker(), now).unwrap() <= 2_000);
+            now += waits[waits.len() - 1];
+            assert_eq!(avoids(&blocklist, now), None);
+        }
+        assert_eq!(waits[..3], [8_000, 16_000, 32_000]);
+        assert_eq!(waits[9], i64::from(AVOID_MS));
+        fail(&mut blocklist, 4, now + 2 * i64::from(AVOID_MS));
+        assert_eq!(avoids(&blocklist, now + 2 * i64::from(AVOID_MS)), None);
     }
 
     #[test]
     fn a_task_that_goes_well_clears_the_worker() {
-        let worker = WorkerId::from_uuid(Uuid::from_u128(1));
         let mut blocklist = Blocklist::default();
         for task in 0..3 {
-            blocklist.failed(worker, task, 0);
+            fail(&mut blocklist, task, 0);
         }
-        blocklist.succeeded(worker);
-        assert_eq!(blocklist.avoids(worker, 1), None);
+        assert!(blocklist.doubts(worker()));
+        blocklist.succeeded(worker());
+        assert_eq!(blocklist.avoids(worker(), 1), None);
+    }
+
+    #[test]
+    fn what_was_charged_is_taken_back_once() {
+        let mut blocklist = Blocklist::default();
+        for task in 0..3 {
+            fail(&mut blocklist, task, 0);
+        }
+        let charged = blocklist.take_charged(worker());
+        assert_eq!(charged, [0, 1, 2].map(|task| (task, FailureKind::User)));
+        assert_eq!(blocklist.take_charged(worker()), []);
+        assert!(blocklist.doubts(worker()));
     }
 }

@@ -1,13 +1,15 @@
 //! Between the catalog and the workers: claiming pending tasks, giving back what nobody here wants, and what is heard
 //! of other instances.
 
+use std::collections::{BTreeSet, HashMap};
+
 use picofarm_catalog::{Changes, Claim, News, Owned, Range, RangeState, Want};
 use picofarm_proto::{
-    ids::{JobId, StageRef},
+    ids::{JobId, StageRef, WorkerId},
     model::EventKind,
 };
 
-use super::{About, Core};
+use super::{About, Core, ready::Ready};
 use crate::{place, transition::RangeEvent};
 
 /// Leases claimed for each one that is wanted now, so that short tasks do not cost a transaction each.
@@ -16,83 +18,151 @@ const AHEAD: u64 = 8;
 const ASK_AGAIN_MS: i64 = 100;
 
 impl Core {
-    /// The pending tasks that connected workers could run now and that are not in hand. Jobs of one priority share: the
-    /// first in rank are asked for as many as there are leases wanted. Those of lower priority get their turn when the
-    /// others have nothing left.
+    /// The pending tasks that connected workers could run now and that are not in hand. Jobs of one
+    /// priority share: each in its turn is given a lease, until nobody asks for more. Those of
+    /// lower priority get what the others cannot use: tasks that cannot run now, or on none of the
+    /// workers that ask, keep no worker from other jobs.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
+        let mut hungry = Hungry::new(
+            self.workers
+                .iter()
+                .filter(|(_, worker)| worker.hungry())
+                .map(|(id, worker)| Asks {
+                    id: *id,
+                    credits: worker.credits,
+                    empty_handed: worker.leases.is_empty(),
+                    ends: worker.ends_ms.is_some(),
+                }),
+        );
         // Mostly everyone is at work: then nothing need be looked at.
-        if !self.workers.values().any(super::WorkerEntry::hungry) {
+        if hungry.credits == 0 {
             return Vec::new();
         }
         let mut ranked: Vec<StageRef> = self
             .stages
             .iter()
-            .filter(|(_, entry)| entry.waits())
+            .filter(|(_, entry)| entry.waits(now_ms))
             .map(|(id, _)| *id)
             .collect();
         ranked.sort_by_cached_key(|id| self.rank(*id));
         let mut wants = Vec::new();
-        let mut covered = 0;
         for level in ranked.chunk_by(|a, b| self.priority(*a) == self.priority(*b)) {
-            let hungry: Vec<_> = level
-                .iter()
-                .map(|id| (*id, self.appetite(*id, now_ms)))
-                .filter(|(_, appetite)| appetite.leases > covered)
-                .collect();
-            let most = hungry.iter().map(|(_, a)| a.leases - covered).max();
-            let sharing = most.unwrap_or(0).min(hungry.len() as u64).max(1);
-            let mut found = 0;
-            for (id, appetite) in hungry.into_iter().take(sharing as usize) {
-                let entry = &self.stages[&id];
-                let leases = (appetite.leases - covered).div_ceil(sharing);
-                let others = self.done_for_others(id);
-                let have = entry.stage.pending_tasks() - entry.stage.pending_among(&others);
-                let size = self.lease_size(entry, appetite.able, u64::MAX);
-                let none = entry.stage.front(now_ms, true, &others).is_none();
-                let short = have < leases * size || none;
-                if short && entry.free != Some(0) && entry.ask_at_ms <= now_ms {
-                    wants.push(Want {
-                        stage: id,
-                        tasks: AHEAD * leases * size,
-                        now_ms,
-                        force: entry.spec(id).force,
-                    });
+            let mut demands: Vec<Demand> = level.iter().map(|id| Demand::new(*id)).collect();
+            let mut taken = true;
+            while taken && hungry.credits > 0 {
+                taken = false;
+                for demand in &mut demands {
+                    taken |= self.give_one(demand, &mut hungry, now_ms);
                 }
-                let there = entry
-                    .free
-                    .map_or(u64::MAX, |free| (free + have).div_ceil(size));
-                found += there.min(leases);
             }
-            covered += found;
-            if most.is_some_and(|most| found >= most) {
+            wants.extend(demands.iter().filter_map(|d| self.want(d, now_ms)));
+            if hungry.credits == 0 {
                 break;
             }
         }
         wants
     }
 
-    /// Workers that may run a stage now, and the leases they ask for.
-    fn appetite(&self, id: StageRef, now_ms: i64) -> Appetite {
-        let mut appetite = Appetite { able: 0, leases: 0 };
-        for (worker, entry) in &self.workers {
-            if self.may_run(id, *worker, now_ms).is_err() {
+    /// Gives a stage one lease more, of whichever of the hungry workers may run it next; `false`
+    /// where none may, or nothing is left.
+    fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
+        let id = demand.stage;
+        let job = &self.stages[&id].job;
+        let most = job.spec.limits.max_workers;
+        while hungry.credits > 0
+            && let Some(worker) = hungry.workers.get_mut(demand.next)
+        {
+            let joins = most > 0 && !self.load.works(job.id, worker.id);
+            let joined = hungry.joined.get(&job.id);
+            let room = !joins
+                || joined.is_none_or(|all| {
+                    all.contains(&worker.id) || (all.len() as u64) < self.load.room(job.id, most)
+                });
+            if worker.credits == 0 || !room || self.may_run(id, worker.id, now_ms).is_err() {
+                demand.next += 1;
                 continue;
             }
-            appetite.able += 1;
-            if entry.hungry() {
-                appetite.leases += u64::from(entry.credits);
+            // What there is of the stage may be too long for this worker.
+            if worker.ends && self.ready_for(id, worker.id, now_ms).is_none() {
+                demand.next += 1;
+                continue;
             }
+            let supply = demand.supply.get_or_insert_with(|| self.supply(id, now_ms));
+            let ready = &mut supply.ready;
+            if ready.plain >= 1 {
+                ready.plain = ready.plain.saturating_sub(supply.size);
+            } else if ready.suspects >= 1 && worker.empty_handed {
+                ready.suspects = ready.suspects.saturating_sub(supply.size);
+            } else if !ready.unknown {
+                if ready.is_none() {
+                    demand.next = hungry.workers.len();
+                } else {
+                    demand.next += 1;
+                }
+                continue;
+            }
+            demand.leases += 1;
+            demand.suspects |= worker.empty_handed;
+            worker.credits -= 1;
+            hungry.credits -= 1;
+            if joins {
+                hungry.joined.entry(job.id).or_default().insert(worker.id);
+            }
+            return true;
         }
-        appetite
+        false
+    }
+
+    fn supply(&self, id: StageRef, now_ms: i64) -> Supply {
+        let entry = &self.stages[&id];
+        let size = match entry.spec(id).task.resumes() {
+            true => 1,
+            false => self.lease_size(entry, self.able(id, now_ms), u64::MAX, now_ms),
+        };
+        Supply {
+            size,
+            ready: self.ready(id, now_ms),
+        }
+    }
+
+    /// The tasks to claim for a demand, beyond those in hand.
+    fn want(&self, demand: &Demand, now_ms: i64) -> Option<Want> {
+        let supply = demand.supply.as_ref().filter(|_| demand.leases > 0)?;
+        let entry = &self.stages[&demand.stage];
+        let here = self.ready_here(demand.stage, now_ms);
+        let have = match demand.suspects {
+            true => here.known(),
+            false => here.plain,
+        };
+        let needed = demand.leases * supply.size;
+        let short = have < needed && !entry.claimable(now_ms).is_none();
+        short.then(|| Want {
+            stage: demand.stage,
+            tasks: AHEAD * needed,
+            now_ms,
+            force: entry.spec(demand.stage).force,
+            suspects: demand.suspects,
+        })
     }
 
     /// Tasks of the next lease of a stage, at most `in_range`.
-    pub(super) fn lease_size(&self, entry: &super::StageEntry, able: u64, in_range: u64) -> u64 {
+    pub(super) fn lease_size(
+        &self,
+        entry: &super::StageEntry,
+        able: u64,
+        in_range: u64,
+        now_ms: i64,
+    ) -> u64 {
+        let claimable = entry.claimable(now_ms);
         // As long as it is not known how much there is, there is enough.
-        let free = entry.free.unwrap_or(u64::MAX / 2);
+        let free = match claimable.unknown {
+            true => u64::MAX / 2,
+            false => claimable.known(),
+        };
+        let (plain, suspects) = entry.stage.ready(now_ms, &[]);
         place::lease_size(
             self.sets[entry.set].timing.mean(),
-            entry.stage.pending_tasks().saturating_add(free),
+            (plain + suspects).saturating_add(free),
             in_range,
             able * u64::from(self.instances),
         )
@@ -133,7 +203,7 @@ impl Core {
     pub(crate) fn receive(&mut self, owned: Owned, now_ms: i64) {
         for exception in owned.exceptions {
             if let Some(entry) = self.stages.get_mut(&exception.stage) {
-                entry.exceptions.insert(exception.task, exception);
+                entry.note(exception);
             }
         }
         for range in owned.ranges {
@@ -188,6 +258,7 @@ impl Core {
 
     /// What the catalog tells from time to time. Returns the active jobs that are not known yet.
     pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
+        self.sick.tidy(now_ms);
         self.instances = news.instances.max(1);
         self.elsewhere = news.workers.saturating_sub(self.connected());
         let over: Vec<JobId> = self
@@ -199,9 +270,9 @@ impl Core {
         for job in over {
             self.drop_job(job, "the job was stopped");
         }
-        let mut held = std::collections::BTreeSet::new();
+        let mut held = BTreeSet::new();
         for (id, entry) in &mut self.stages {
-            entry.free = Some(news.free.get(id).copied().unwrap_or(0));
+            entry.free = Some(news.free.get(id).copied().unwrap_or_default());
             let paused = news.active.get(&id.job).copied().unwrap_or(false);
             if paused && !entry.job.paused {
                 held.insert(id.job);
@@ -239,10 +310,62 @@ impl Core {
     }
 }
 
-/// What connected workers ask of a stage.
-struct Appetite {
-    able: u64,
+/// The workers that ask for leases.
+struct Hungry {
+    workers: Vec<Asks>,
+    /// Leases that they ask for together.
+    credits: u64,
+    /// Workers that would join those of a job, where it has a limit.
+    joined: HashMap<JobId, BTreeSet<WorkerId>>,
+}
+
+struct Asks {
+    id: WorkerId,
+    credits: u32,
+    empty_handed: bool,
+    /// It must end at a time that is known.
+    ends: bool,
+}
+
+impl Hungry {
+    fn new(workers: impl Iterator<Item = Asks>) -> Self {
+        let workers: Vec<Asks> = workers.collect();
+        Self {
+            credits: workers.iter().map(|w| u64::from(w.credits)).sum(),
+            workers,
+            joined: HashMap::new(),
+        }
+    }
+}
+
+/// What the workers that ask could take of a stage.
+struct Demand {
+    stage: StageRef,
+    /// The worker to be looked at next.
+    next: usize,
     leases: u64,
+    /// One of the workers has nothing else in hand.
+    suspects: bool,
+    supply: Option<Supply>,
+}
+
+impl Demand {
+    fn new(stage: StageRef) -> Self {
+        Self {
+            stage,
+            next: 0,
+            leases: 0,
+            suspects: false,
+            supply: None,
+        }
+    }
+}
+
+/// What there is of a stage for them.
+struct Supply {
+    /// Tasks of a lease.
+    size: u64,
+    ready: Ready,
 }
 
 /// The pieces of a range whose job is not active, as the catalog keeps them.

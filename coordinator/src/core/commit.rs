@@ -32,18 +32,20 @@ impl Core {
             .map(|(id, _)| *id)
     }
 
-    /// Commits a finished task, or says why not. `hint` is what the catalog holds for it.
+    /// Commits a finished task, or says why not. `hint` is what the catalog holds for it. `checked`: its store was found to
+    /// hold the result.
     pub(crate) fn finished(
         &mut self,
         session: SessionId,
         report: &Finished,
         hint: OutputHint,
+        checked: bool,
         now_ms: i64,
     ) {
         let Some(worker) = self.sessions.get(&session).copied() else {
             return;
         };
-        let verdict = self.commit(session, report, hint, now_ms);
+        let verdict = self.commit(session, report, (hint, checked), now_ms);
         if let Err(reason) = &verdict {
             tracing::info!(%worker, range = %report.lease.range, task = report.index, reason, "report refused");
         }
@@ -71,7 +73,7 @@ impl Core {
         &mut self,
         session: SessionId,
         report: &Finished,
-        OutputHint(known): OutputHint,
+        (OutputHint(known), checked): (OutputHint, bool),
         now_ms: i64,
     ) -> Result<(), String> {
         let mut manifest = [0; 32];
@@ -99,8 +101,21 @@ impl Core {
         };
         match (live, known) {
             (Ok(range), None) => {
-                self.commit_new(session, id, &range, report, manifest, now_ms);
+                self.commit_new(session, id, &range, report, (manifest, checked), now_ms);
                 Ok(())
+            }
+            (Ok(range), Some(known))
+                if known != manifest && self.doubts.disputed(set, report.index) =>
+            {
+                let message = format!(
+                    "task {} has two different results: manifest {} is recorded, and {} was reported now. Nobody can look \
+                     into the store, so the task runs again: what two other workers agree on counts",
+                    report.index,
+                    hex_of(&known),
+                    report.manifest_sha256
+                );
+                self.undecided(&range, session, report.index, &message, now_ms);
+                Err(message)
             }
             (live, Some(known)) => {
                 // The output stands, whoever made it: the task is done.
@@ -131,7 +146,7 @@ impl Core {
                 }
                 let name = self.session_name(session);
                 let message = format!(
-                    "task {} has two different results: committed manifest {}, reported {}; the committed one stands. Is the renderer deterministic on this worker?",
+                    "task {} has two different results: manifest {} is recorded, and {} was reported now; the recorded one stands",
                     report.index,
                     hex_of(&known),
                     report.manifest_sha256
@@ -153,14 +168,16 @@ impl Core {
         id: StageRef,
         range: &Range,
         report: &Finished,
-        manifest: [u8; 32],
+        (manifest, checked): ([u8; 32], bool),
         now_ms: i64,
     ) {
         let task = report.index;
         let set = self.stages[&id].set;
+        self.away.mended((id, task));
         if let (Some(worker), Some(entry)) = (self.sessions.get(&session), self.stages.get_mut(&id))
         {
             entry.blocklist.succeeded(*worker);
+            self.sick.succeeded(*worker);
             let task = &entry.spec(id).task;
             if !report.adopted {
                 self.away.worked(store_of(task), *worker);
@@ -175,13 +192,18 @@ impl Core {
             seconds: report.seconds,
             epoch: range.epoch,
             adopted: report.adopted,
+            checked,
         });
+        if !checked && let Some(worker) = self.sessions.get(&session) {
+            self.doubts.unverified(set, task, *worker);
+        }
         let kind = if report.adopted {
             EventKind::Reused
         } else {
             let timing = &mut self.sets[set].timing;
             timing.tasks += 1;
             timing.seconds += report.seconds;
+            timing.bytes += report.bytes as f64;
             EventKind::Committed
         };
         let about = About::default()

@@ -9,7 +9,18 @@ use picofarm_proto::{
 };
 
 use super::{About, Core, Say, stores::store_of};
-use crate::transition::RangeEvent;
+use crate::{explain::span, transition::RangeEvent};
+
+/// Workers other than one that may run a stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Others {
+    /// There are some, on which its tasks do not fail.
+    Good,
+    /// There are some, and its tasks fail on all of them too.
+    Failed,
+    /// There is none.
+    None,
+}
 
 impl Core {
     /// Grants whatever is in hand and can be granted now.
@@ -18,7 +29,7 @@ impl Core {
         let waiting: Vec<StageRef> = self
             .stages
             .iter()
-            .filter(|(_, e)| e.waits())
+            .filter(|(_, e)| e.waits(now_ms))
             .map(|(id, _)| *id)
             .collect();
         for stage in &waiting {
@@ -35,7 +46,7 @@ impl Core {
         }
         let mut waiting: Vec<(StageRef, u64)> = waiting
             .into_iter()
-            .filter(|stage| self.stages[stage].stage.pending_tasks() > 0)
+            .filter(|stage| !self.ready_here(*stage, now_ms).is_none())
             .map(|stage| (stage, self.able(stage, now_ms)))
             .collect();
         // In rounds, so that the first worker does not take everything; and in order of rank, which each grant changes.
@@ -78,6 +89,9 @@ impl Core {
         worker: WorkerId,
         now_ms: i64,
     ) -> Result<(), String> {
+        if let Some(why) = self.doubts.blocked(worker) {
+            return Err(why.to_owned());
+        }
         let entry = &self.stages[&id];
         entry.suits(id, &self.workers[&worker].abilities)?;
         let store = store_of(&entry.spec(id).task);
@@ -88,24 +102,78 @@ impl Core {
                 "limits.max_workers = {most}, and so many work on the job"
             ));
         }
-        match entry.blocklist.avoids(worker, now_ms) {
-            Some(ms) if self.another(id, worker, now_ms) => Err(format!(
-                "tasks of the stage failed on it one after another; it is passed over for another {} min",
-                ms / 60_000 + 1
+        if let Err((needs, left)) = self.has_time(id, worker, now_ms) {
+            return Err(format!(
+                "a task is taken to need {}, and the worker ends in {}",
+                span(needs),
+                span(left)
+            ));
+        }
+        if let Some(ms) = self.sick.rests(worker, now_ms) {
+            return Err(format!(
+                "it failed, or gave back, one lease after another; it gets no tasks for another {}",
+                span(ms)
+            ));
+        }
+        if self.sick.is_try(worker) && !self.workers[&worker].leases.is_empty() {
+            return Err(
+                "it failed, or gave back, one lease after another; one task is trying it now"
+                    .into(),
+            );
+        }
+        match self.passed_over(id, worker, now_ms) {
+            Some(0) => Err(
+                "tasks of the stage failed on it one after another; one task is trying it now"
+                    .into(),
+            ),
+            Some(ms) => Err(format!(
+                "tasks of the stage failed on it one after another; it is passed over for another {}",
+                span(ms)
             )),
-            _ => Ok(()),
+            None => Ok(()),
         }
     }
 
-    /// Whether a worker other than this one may run a stage, and has not failed at it.
-    fn another(&self, id: StageRef, than: WorkerId, now_ms: i64) -> bool {
-        let entry = &self.stages[&id];
-        self.workers.iter().any(|(worker, w)| {
-            *worker != than
-                && !w.drains
-                && entry.blocklist.avoids(*worker, now_ms).is_none()
-                && entry.suits(id, &w.abilities).is_ok()
+    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer,
+    /// milliseconds, and 0 while one of them is a try. Where they fail on every worker, the tasks
+    /// are to blame, and no worker is passed over.
+    pub(super) fn passed_over(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
+        let blocklist = &self.stages[&id].blocklist;
+        if !blocklist.doubts(worker) {
+            return None;
+        }
+        let left = match self.others(id, worker, now_ms) {
+            Others::Good => blocklist.avoids(worker, now_ms),
+            Others::None => blocklist.avoids_alone(worker, now_ms),
+            Others::Failed => return None,
+        };
+        let mut leases = self.workers.get(&worker)?.leases.iter();
+        left.or_else(|| {
+            leases
+                .any(|lease| self.leases.get(lease) == Some(&id))
+                .then_some(0)
         })
+    }
+
+    /// What there is of workers other than this one that may run a stage.
+    pub(super) fn others(&self, id: StageRef, than: WorkerId, now_ms: i64) -> Others {
+        let entry = &self.stages[&id];
+        let others = self.workers.iter().filter(|(worker, w)| {
+            **worker != than
+                && !w.drains
+                && now_ms - w.heard_ms <= i64::from(self.settings.lease_ms)
+                && self.sick.rests(**worker, now_ms).is_none()
+                && entry.suits(id, &w.abilities).is_ok()
+                && self.has_time(id, **worker, now_ms).is_ok()
+        });
+        let mut found = Others::None;
+        for (worker, _) in others {
+            if !entry.blocklist.doubts(*worker) {
+                return Others::Good;
+            }
+            found = Others::Failed;
+        }
+        found
     }
 
     /// Grants one lease of a stage to a worker, if both can; `able` workers may run it.
@@ -116,18 +184,24 @@ impl Core {
             return false;
         }
         // A range under suspicion runs alone on its worker, so that it cannot draw others into its crash.
-        let others = self.done_for_others(id);
+        let others = self.not_for(id, worker, now_ms);
         let suspects = who.leases.is_empty();
         let Some((range, run)) = entry.stage.front(now_ms, suspects, &others) else {
             return false;
         };
         let range = range.clone();
         let store = store_of(&entry.spec(id).task).to_owned();
-        // A task that may run for days holds up no other.
-        let alone = self.away.is_try(&store) || entry.spec(id).task.resumes();
+        // A task that may run for days holds up no other; and what fails on this worker shall be
+        // one.
+        let alone = self.away.is_try(&store, worker)
+            || entry.spec(id).task.resumes()
+            || entry.blocklist.doubts(worker)
+            || self.sick.is_try(worker);
         let count = match alone {
             true => 1,
-            false => self.lease_size(entry, able, run.hi - run.lo),
+            false => self
+                .lease_size(entry, able, run.hi - run.lo, now_ms)
+                .min(self.most_that_fit(id, worker, now_ms)),
         };
         let entry = self.stages.get_mut(&id).expect("looked up above");
         let who = self.workers.get_mut(&worker).expect("looked up above");
@@ -152,7 +226,7 @@ impl Core {
         who.leases.insert(granted.id);
         who.quarantined = granted.crashes > 0;
         self.leases.insert(granted.id, id);
-        self.away.begun(&store, granted.id);
+        self.away.begun(&store, worker, granted.id);
         self.load.begun(granted.id, &entry.job, worker);
         let lease = Lease {
             lease: granted.lease(),

@@ -1,13 +1,13 @@
 //! What this instance knows of its workers and of the order of jobs, for those who ask why. Changes nothing.
 
 use picofarm_proto::{
-    ids::{JobId, StageRef},
+    ids::{JobId, StageRef, WorkerId},
     model::ConnectedWorker,
 };
 
 use super::{Core, StageEntry, WorkerEntry};
 use crate::{
-    explain::{Candidate, Runs},
+    explain::{Candidate, Runs, span},
     place,
 };
 
@@ -16,6 +16,9 @@ use crate::{
 pub(crate) struct Look {
     /// Active jobs, in the order in which they get workers.
     pub jobs: Vec<JobId>,
+    /// Tasks that could be leased now, if there were workers: those of nobody's and those in hand
+    /// here.
+    pub ready: u64,
     /// Workers connected here.
     pub workers: Vec<ConnectedWorker>,
     /// Workers connected to other instances.
@@ -31,6 +34,8 @@ pub(crate) struct JobLook {
     pub candidates: Vec<Candidate>,
     /// Tasks that wait only because workers have them in hand for other jobs with the same outputs.
     pub shared: u64,
+    /// Tasks that wait for a worker with nothing else in hand.
+    pub suspects: u64,
     /// Jobs that go first and have tasks waiting that one of these workers may run.
     pub ahead: Vec<JobId>,
     /// Workers connected to other instances.
@@ -41,7 +46,7 @@ pub(crate) struct JobLook {
 
 impl Core {
     /// What is known now.
-    pub(crate) fn look(&self) -> Look {
+    pub(crate) fn look(&self, now_ms: i64) -> Look {
         let mut stages: Vec<StageRef> = self.stages.keys().copied().collect();
         stages.sort_by_cached_key(|id| self.rank(*id));
         let mut jobs: Vec<JobId> = Vec::new();
@@ -65,21 +70,45 @@ impl Core {
             tasks: self.tasks_of(worker),
             since_ms: worker.since_ms,
             quarantined: worker.quarantined,
+            note: self.note(*id, worker, now_ms),
         });
         Look {
             jobs,
+            ready: self.ready_now(now_ms),
             workers: workers.collect(),
             elsewhere: self.elsewhere,
             instances: self.instances,
         }
     }
 
-    /// For how long a worker that holds leases was not heard of, where that is longer than it should be: it sends a sign of
-    /// life every sixth of a lease.
+    /// For how long a worker was not heard of, where that is longer than it should be: it sends a
+    /// sign of life every sixth of a lease, whether it has one or not.
     fn silent_ms(&self, worker: &WorkerEntry, now_ms: i64) -> Option<i64> {
         let silent = now_ms - worker.heard_ms;
         let long = silent > i64::from(self.settings.lease_ms) / 2;
-        (long && !worker.leases.is_empty()).then_some(silent)
+        long.then_some(silent)
+    }
+
+    /// Why a worker gets nothing, or when it ends.
+    fn note(&self, id: WorkerId, worker: &WorkerEntry, now_ms: i64) -> String {
+        if let Some(ms) = self.silent_ms(worker, now_ms) {
+            return format!(
+                "not heard of for {}: frozen, suspended or overloaded",
+                span(ms)
+            );
+        }
+        if worker.drains {
+            return "asked to end".into();
+        }
+        if let Some(ms) = self.sick.rests(id, now_ms) {
+            return format!(
+                "failed, or gave back, one lease after another: no tasks for another {}",
+                span(ms)
+            );
+        }
+        worker
+            .ends_ms
+            .map_or_else(String::new, |at| format!("ends in {}", span(at - now_ms)))
     }
 
     fn tasks_of(&self, worker: &WorkerEntry) -> u64 {
@@ -108,13 +137,12 @@ impl Core {
         task: Option<u64>,
         now_ms: i64,
     ) -> JobLook {
-        let waits = |e: &StageEntry| e.waits() && (e.stage.pending_tasks() > 0 || e.free > Some(0));
+        let waits = |e: &StageEntry| e.waits(now_ms);
         let first = |is: &dyn Fn(&StageEntry) -> bool| {
             let mut of_job = self.stages.iter().filter(|(id, _)| id.job == job);
             of_job.find(|(_, e)| is(e)).map(|(id, _)| id.stage)
         };
-        // Of a stage that has just begun it is not known yet how much waits.
-        let stage = stage.or_else(|| first(&waits).or_else(|| first(&StageEntry::waits)));
+        let stage = stage.or_else(|| first(&waits).or_else(|| first(&StageEntry::has_pending)));
         let here = StageRef {
             job,
             stage: stage.unwrap_or(0),
@@ -140,6 +168,8 @@ impl Core {
                     &worker.abilities,
                 ),
                 idle: worker.credits > 0,
+                gets: !self.ready_for(here, *id, now_ms).is_none(),
+                lacks_time: self.lacks_time(here, *id, now_ms),
                 quarantined: worker.quarantined,
                 silent_ms: self.silent_ms(worker, now_ms),
             })
@@ -162,6 +192,7 @@ impl Core {
         JobLook {
             candidates,
             shared: self.waits_for_others(here),
+            suspects: self.ready(here, now_ms).suspects,
             ahead,
             elsewhere: self.elsewhere,
             running: task.and_then(|task| self.runs(entry, task)),

@@ -158,6 +158,8 @@ pub(crate) struct Learnt {
     pub stages: Vec<StageRecord>,
     /// Of its result sets.
     pub timings: Timings,
+    /// Memory that its spec takes.
+    pub kept: u64,
 }
 
 /// What this instance adds to what the catalog knows of jobs.
@@ -198,6 +200,7 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
         job,
         stages,
         timing,
+        unverified,
     } = record;
     let stages = job.spec.stages.iter().zip(stages);
     JobStatus {
@@ -230,6 +233,7 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
         mean_task_seconds: timing.mean(),
         running: Vec::new(),
         workers: 0,
+        unverified,
     }
 }
 
@@ -329,6 +333,7 @@ impl Core {
     pub(crate) fn retried(&mut self, job: JobId) {
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
             entry.exceptions.clear();
+            entry.longest_ms = 0;
             entry.free = None;
         }
     }

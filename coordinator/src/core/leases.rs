@@ -1,13 +1,13 @@
 //! The life of a lease after its grant: heartbeat, failure, return, expiry.
 
-use picofarm_catalog::{Exception, Range, RangeState};
+use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
     ids::{Incarnation, LeaseRef, RangeId, WorkerId},
     model::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
-use super::{About, Core, Progress, Say, SessionId, stores::store_of};
-use crate::{budget, transition::RangeEvent};
+use super::{About, Core, Progress, Say, SessionId, dispatch::Others, sick::Trouble};
+use crate::transition::RangeEvent;
 
 /// Lost workers remembered at most.
 const CHARGED: usize = 4096;
@@ -22,17 +22,19 @@ impl Core {
             .held_to_do(session, failure.lease, failure.index, now_ms)
             .cloned();
         let verdict = held.map(|range| {
-            let name = self.session_name(session);
             self.leave(
                 &range,
                 failure.index,
                 failure.kind,
                 &failure.message,
-                &name,
                 now_ms,
             );
-            if failure.kind == FailureKind::Store {
-                self.take_back(range.id, &failure.message);
+            match failure.kind {
+                FailureKind::Store => {
+                    let why = format!("its tasks wait for their store: {}", failure.message);
+                    self.take_back(range.id, &why);
+                }
+                _ => self.take_back_all(session, range.stage, now_ms),
             }
             self.perhaps_over(range.stage, now_ms);
         });
@@ -59,8 +61,8 @@ impl Core {
             Ok(range) => {
                 let name = self.session_name(session);
                 tracing::warn!(worker = name, range = %lease.range, task = index, "{reason}");
-                let kind = FailureKind::User;
-                self.leave(&range, index, kind, &reason, &name, now_ms);
+                self.leave(&range, index, FailureKind::User, &reason, now_ms);
+                self.take_back_all(session, range.stage, now_ms);
                 self.perhaps_over(range.stage, now_ms);
                 reason
             }
@@ -68,7 +70,8 @@ impl Core {
         self.acknowledge(session, lease, index, Err(refusal));
     }
 
-    /// Takes a lease back that the worker gives up of itself.
+    /// Takes a lease back that the worker gives up of itself: an interruption of the tasks that it
+    /// had begun.
     pub(crate) fn released(
         &mut self,
         session: SessionId,
@@ -85,7 +88,16 @@ impl Core {
                 .tasks(range.lo, range.hi)
                 .worker(self.session_name(session));
             self.event(now_ms, range.stage, EventKind::Released, about);
-            self.close(&range, false);
+            for task in self.begun(&range) {
+                self.interrupted(&range, task, reason, now_ms);
+            }
+            if let Some(range) = self.range(range.id).cloned() {
+                self.close(&range, false);
+            }
+            if let Some(worker) = self.sessions.get(&session).copied() {
+                self.blame(worker, Trouble::GaveBack, Others::None, now_ms);
+            }
+            self.perhaps_over(range.stage, now_ms);
         });
         self.acknowledge(session, lease, 0, verdict);
     }
@@ -123,6 +135,7 @@ impl Core {
             let task = tasks
                 .entry(report.index)
                 .or_insert_with(|| Progress::since(now_ms));
+            task.first.get_or_insert(report.fraction);
             task.fraction = report.fraction;
             task.at = report.at.clone();
         }
@@ -209,6 +222,21 @@ impl Core {
         tasks
     }
 
+    /// The tasks of a lease that its worker has begun, as far as is known: it runs one at a time.
+    fn begun(&self, range: &Range) -> Vec<u64> {
+        let runs = |id: &RangeId| self.progress.get(id).is_some_and(|tasks| !tasks.is_empty());
+        let RangeState::Leased(lease) = &range.state else {
+            return Vec::new();
+        };
+        let holder = self.workers.get(&lease.worker);
+        let elsewhere =
+            holder.is_some_and(|w| w.leases.iter().any(|id| *id != range.id && runs(id)));
+        match elsewhere && !runs(&range.id) {
+            true => Vec::new(),
+            false => self.in_hand(range),
+        }
+    }
+
     /// The worker was lost without a goodbye: the task in hand is charged with a crash, the rest is halved.
     pub(crate) fn lost(&mut self, range: &Range, why: &str, now_ms: i64) {
         let Some((_, lease)) = self.stages[&range.stage].stage.lease(range.lease()) else {
@@ -236,13 +264,16 @@ impl Core {
         if charged.0 != incarnation {
             *charged = (incarnation, Vec::new());
         }
-        charged
-            .1
-            .extend(in_hand.iter().map(|task| (range.stage, *task)));
+        let mut counted = Vec::new();
         for task in in_hand {
-            if let Some(range) = self.range(range.id).cloned() {
-                self.leave(&range, task, FailureKind::Crash, why, &name, now_ms);
+            if let Some(range) = self.range(range.id).cloned()
+                && self.leave(&range, task, FailureKind::Crash, why, now_ms)
+            {
+                counted.push((range.stage, task));
             }
+        }
+        if let Some((_, charged)) = self.charged.get_mut(&worker) {
+            charged.extend(counted);
         }
         // The last task to leave has closed the lease.
         if let Some(range) = self.range(range.id).cloned() {
@@ -271,83 +302,6 @@ impl Core {
                     .insert((stage, task), exception.clone());
             }
         }
-    }
-
-    /// One task fails and leaves its lease.
-    fn leave(
-        &mut self,
-        range: &Range,
-        task: u64,
-        kind: FailureKind,
-        message: &str,
-        worker: &str,
-        now_ms: i64,
-    ) {
-        let entry = self
-            .stages
-            .get_mut(&range.stage)
-            .expect("a lease has a stage");
-        let fresh = Exception {
-            stage: range.stage,
-            task,
-            failures: 0,
-            crashes: 0,
-            dead: false,
-            last_error: String::new(),
-        };
-        let mut backoff = self.settings.backoff;
-        if kind == FailureKind::Crash && entry.spec(range.stage).task.resumes() {
-            // It goes on from where it was saved, so losing workers again and again is no sign that it never ends.
-            backoff.most_ms = backoff.first_ms;
-        }
-        let verdict = budget::charge(
-            entry.exceptions.get(&task),
-            fresh,
-            kind,
-            message,
-            &entry.job.spec.limits,
-            &backoff,
-            now_ms,
-        );
-        if let RangeState::Leased(lease) = &range.state {
-            match kind {
-                FailureKind::Interrupted => {}
-                FailureKind::Store => {
-                    let store = store_of(&entry.spec(range.stage).task);
-                    let backoff = &self.settings.backoff;
-                    self.away
-                        .failed(store, lease.worker, message, backoff, now_ms);
-                }
-                FailureKind::User | FailureKind::Crash => {
-                    entry.blocklist.failed(lease.worker, task, now_ms);
-                }
-            }
-        }
-        let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
-        if let Some(exception) = verdict.exception {
-            self.changes
-                .exceptions
-                .insert((range.stage, task), exception.clone());
-            entry.exceptions.insert(task, exception);
-        }
-        self.mark(
-            range,
-            &RangeEvent::Leave {
-                task,
-                retry_at_ms: verdict.retry_at_ms,
-                crashes,
-            },
-        );
-        let kind = match verdict.retry_at_ms {
-            // Free: the task was given back, nothing is wrong with it.
-            Some(_) if matches!(kind, FailureKind::Interrupted | FailureKind::Store) => {
-                EventKind::Released
-            }
-            Some(_) => EventKind::Failed,
-            None => EventKind::Dead,
-        };
-        let about = About::message(message).task(task).worker(worker);
-        self.event(now_ms, range.stage, kind, about);
     }
 
     /// Ends a lease; what is not done becomes pending.
@@ -393,23 +347,6 @@ impl Core {
         if left.is_none() {
             self.lease_over(range.id);
         }
-    }
-
-    /// Takes the rest of a lease from its worker, whose store does not play along: the worker is free for other work.
-    fn take_back(&mut self, id: RangeId, why: &str) {
-        let Some(range) = self.range(id).cloned() else {
-            return;
-        };
-        if let RangeState::Leased(lease) = &range.state
-            && let Some(entry) = self.workers.get(&lease.worker)
-        {
-            let revoke = Say::Revoke {
-                lease: range.lease(),
-                reason: format!("its tasks wait for their store: {why}"),
-            };
-            self.say.push((entry.session, revoke));
-        }
-        self.close(&range, false);
     }
 
     /// Forgets a lease.

@@ -72,14 +72,23 @@ impl Load {
         self.jobs.get(&job).map_or(0, |load| load.leases)
     }
 
+    /// Whether a worker has leases of a job.
+    pub(super) fn works(&self, job: JobId, worker: WorkerId) -> bool {
+        let load = self.jobs.get(&job);
+        load.is_some_and(|load| load.workers.contains_key(&worker))
+    }
+
+    /// How many workers more may join those that work on a job, of which there may be `most`.
+    pub(super) fn room(&self, job: JobId, most: u32) -> u64 {
+        let elsewhere = self.elsewhere.get(&job).copied().unwrap_or(0);
+        let here = self.jobs.get(&job).map_or(0, |load| load.workers.len());
+        u64::from(most).saturating_sub(here as u64 + u64::from(elsewhere))
+    }
+
     /// Whether a worker may join those that work on a job, of which there may be `most`. Of other instances' workers it is
     /// known how many there were a second ago: for so long there may be more.
     pub(super) fn may_join(&self, job: JobId, worker: WorkerId, most: u32) -> bool {
-        let elsewhere = self.elsewhere.get(&job).copied().unwrap_or(0);
-        let (known, here) = self.jobs.get(&job).map_or((false, 0), |load| {
-            (load.workers.contains_key(&worker), load.workers.len())
-        });
-        known || here as u64 + u64::from(elsewhere) < u64::from(most)
+        self.works(job, worker) || self.room(job, most) > 0
     }
 }
 

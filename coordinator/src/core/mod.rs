@@ -8,14 +8,20 @@ mod blocklist;
 mod claims;
 mod commit;
 mod dispatch;
+mod doubt;
+mod ends;
 mod facts;
+mod failures;
+mod fits;
 mod jobs;
 mod leases;
 mod load;
 mod log;
+mod ready;
 mod refused;
 mod sessions;
 mod shared;
+mod sick;
 mod stores;
 mod tail;
 #[cfg(test)]
@@ -24,7 +30,7 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use picofarm_catalog::{
-    Changes, Exception, Job, NewEvent, ResultSet, Run, Settled, Snapshot, StageRecord, Timing,
+    Changes, Exception, Free, Job, NewEvent, ResultSet, Run, Settled, Snapshot, StageRecord, Timing,
 };
 use picofarm_proto::{
     ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
@@ -39,7 +45,9 @@ use load::Load;
 use tail::Double;
 
 pub(crate) use commit::OutputHint;
+pub(crate) use doubt::Reported;
 pub(crate) use facts::{JobLook, Look};
+pub(crate) use fits::{Fit, Fits};
 pub(crate) use jobs::{
     Learnt, Overlay, Prepared, Timings, may_force, place_is_free, prepare, recorded_status,
     stands_for,
@@ -105,8 +113,10 @@ struct StageEntry {
     stage: Stage,
     /// Of tasks that were ever in hand.
     exceptions: BTreeMap<u64, Exception>,
+    /// Of these the longest attempt that did not end, milliseconds.
+    longest_ms: u64,
     /// Pending tasks that are nobody's, as last heard; `None` = ask.
-    free: Option<u64>,
+    free: Option<Free>,
     /// The catalog is not asked for tasks before this time: it had none to give just now.
     ask_at_ms: i64,
     /// Why no connected worker may run it, as last reported.
@@ -122,17 +132,18 @@ impl StageEntry {
         &self.job.spec.stages[id.stage as usize]
     }
 
+    /// Takes note of a task's failures.
+    fn note(&mut self, exception: Exception) {
+        self.longest_ms = self.longest_ms.max(exception.longest_ms);
+        self.exceptions.insert(exception.task, exception);
+    }
+
     /// Whether a worker has what its tasks need.
     ///
     /// # Errors
     /// Why not, in words.
     fn suits(&self, id: StageRef, worker: &Abilities) -> Result<(), String> {
         place::may_run(self.spec(id), &self.known, worker)
-    }
-
-    /// Whether it has or may have tasks to be given out now.
-    fn waits(&self) -> bool {
-        !self.job.paused && (self.stage.pending_tasks() > 0 || self.free != Some(0))
     }
 }
 
@@ -153,6 +164,8 @@ struct WorkerEntry {
     since_ms: i64,
     /// When it was last heard of.
     heard_ms: i64,
+    /// When it must end, where that is known.
+    ends_ms: Option<i64>,
     abilities: Abilities,
     credits: u32,
     leases: BTreeSet<RangeId>,
@@ -172,6 +185,8 @@ impl WorkerEntry {
 #[derive(Debug, Clone)]
 struct Progress {
     fraction: f32,
+    /// As first reported: that of what was saved by an earlier attempt.
+    first: Option<f32>,
     /// What it is at, in its worker's words.
     at: TaskAt,
     since_ms: i64,
@@ -184,6 +199,7 @@ impl Progress {
     fn since(since_ms: i64) -> Self {
         Self {
             fraction: 0.0,
+            first: None,
             at: TaskAt::default(),
             since_ms,
             log: LogAllowance::default(),
@@ -213,6 +229,10 @@ pub(crate) struct Core {
     help_at_ms: i64,
     /// Stores that tasks wait for.
     away: stores::Stores,
+    /// Workers that are not believed, and doubtful results.
+    doubts: doubt::Doubts,
+    /// Workers on which nothing goes well.
+    sick: sick::Sick,
     /// Connections that break before this time, Unix milliseconds, broke by a stall of the coordinator's own.
     graced_until_ms: i64,
     /// What workers were charged with when their connection broke, for the case that they live.
@@ -259,6 +279,8 @@ impl Core {
             doubles: BTreeMap::new(),
             help_at_ms: 0,
             away: stores::Stores::default(),
+            doubts: doubt::Doubts::default(),
+            sick: sick::Sick::default(),
             graced_until_ms: 0,
             charged: HashMap::new(),
             progress: BTreeMap::new(),
@@ -310,6 +332,7 @@ impl Core {
                     set,
                     stage: Stage::default(),
                     exceptions: BTreeMap::new(),
+                    longest_ms: 0,
                     free: None,
                     ask_at_ms: 0,
                     waiting: None,

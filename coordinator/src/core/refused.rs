@@ -1,13 +1,14 @@
 //! What a database refuses for its content is taken out of a change set, so that the rest becomes durable: a task whose result
 //! cannot be recorded is given up with the reason; a message that cannot be recorded gives way to the reason.
 
-use picofarm_catalog::{Changes, Culprit, Exception, Mark, NewEvent, Range, RangeState, Row, Run};
+use picofarm_catalog::{Changes, Culprit, Mark, NewEvent, Range, RangeState, Row, Run};
 use picofarm_proto::{
     ids::{LeaseRef, RangeId, StageRef, WorkerId},
     model::{EventKind, bounds},
 };
 
 use super::{Core, Say, SessionId};
+use crate::budget::fresh;
 
 impl Core {
     /// Changes what was just taken ([`Core::take`]) so that it no longer holds these rows as they are. `again`: they were
@@ -102,14 +103,7 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&stage) else {
             return;
         };
-        let exception = entry.exceptions.entry(task).or_insert(Exception {
-            stage,
-            task,
-            failures: 0,
-            crashes: 0,
-            dead: true,
-            last_error: String::new(),
-        });
+        let exception = entry.exceptions.entry(task).or_insert(fresh(stage, task));
         exception.failures += 1;
         exception.dead = true;
         exception.last_error.clone_from(&why);

@@ -17,6 +17,7 @@ impl Core {
         self.names.insert(id, hello.name.clone());
         self.doubles.retain(|_, double| double.worker != id);
         self.refund(id, hello.incarnation);
+        self.doubts.restarted(id, hello.incarnation);
         self.changes.workers.insert(
             id,
             Worker {
@@ -54,6 +55,7 @@ impl Core {
                 version: hello.version,
                 since_ms: now_ms,
                 heard_ms: now_ms,
+                ends_ms: super::ends::at(hello.ends_in_ms, now_ms),
                 abilities: hello.abilities,
                 credits: 0,
                 leases: Default::default(),

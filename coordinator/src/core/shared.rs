@@ -31,14 +31,7 @@ impl Core {
         });
         let elsewhere = others().filter_map(|other| self.shared_elsewhere.get(other));
         let mut runs: Vec<Run> = here.chain(elsewhere.flatten().copied()).collect();
-        runs.sort_unstable_by_key(|run| run.lo);
-        runs.dedup_by(|next, run| {
-            let joins = next.lo <= run.hi;
-            if joins {
-                run.hi = run.hi.max(next.hi);
-            }
-            joins
-        });
+        in_order(&mut runs);
         runs
     }
 
@@ -57,4 +50,16 @@ impl Core {
         let own: u64 = own.sum();
         runs.iter().map(|run| run.hi - run.lo).sum::<u64>() - own
     }
+}
+
+/// Makes runs ascending and disjoint.
+pub(super) fn in_order(runs: &mut Vec<Run>) {
+    runs.sort_unstable_by_key(|run| run.lo);
+    runs.dedup_by(|next, run| {
+        let joins = next.lo <= run.hi;
+        if joins {
+            run.hi = run.hi.max(next.hi);
+        }
+        joins
+    });
 }

@@ -1,10 +1,11 @@
-//! Stores that tasks wait for: away, full, forbidden. A store is tried by one task at a time and ever more rarely, however
-//! many tasks wait for it; meanwhile workers do other work.
+//! Stores that tasks wait for: away, full, forbidden, not mounted. Where one worker fails at a store, that worker waits, ever
+//! longer, and others go on. Where several fail at it and nobody succeeds, the store waits: it is tried by one task at a time
+//! and ever more rarely, however many tasks wait for it. Meanwhile workers do other work.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
 use picofarm_proto::{
-    ids::{RangeId, WorkerId},
+    ids::{RangeId, StageRef, WorkerId},
     model::TaskSpec,
 };
 
@@ -16,20 +17,40 @@ const MOST_MS: u32 = 300_000;
 const FORGET_MS: i64 = 2 * MOST_MS as i64;
 /// Longest reason kept, characters.
 const MOST_WORDS: usize = 600;
+/// Workers that must fail at a store, while nobody succeeds, for it to be the store's trouble and not theirs.
+const SEVERAL: usize = 2;
+/// Tasks that wait for what they read, remembered at most.
+const DAMAGED: usize = 4096;
 
-/// The stores on which tasks failed last, by location.
+/// The stores on which tasks failed last.
 #[derive(Debug, Default)]
-pub(super) struct Stores(BTreeMap<String, Row>);
+pub(super) struct Stores {
+    /// By location.
+    rows: BTreeMap<String, Row>,
+    /// How often tasks found damaged what they read.
+    damaged: HashMap<(StageRef, u64), u32>,
+}
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Row {
-    /// Nobody has used it since it failed.
+    /// Several workers failed at it, and nobody has used it since.
     shut: bool,
     wait: Wait,
     /// The lease that tries it now.
     trying: Option<RangeId>,
     /// Workers that failed to use it: others may be able to.
-    workers: BTreeMap<WorkerId, Wait>,
+    workers: BTreeMap<WorkerId, Faulty>,
+    why: String,
+}
+
+/// A worker that failed to use a store.
+#[derive(Debug, Default)]
+struct Faulty {
+    wait: Wait,
+    /// Its lease that tries the store now.
+    trying: Option<RangeId>,
+    /// Another worker has used the store since: the trouble is this worker's own.
+    alone: bool,
     why: String,
 }
 
@@ -54,6 +75,13 @@ pub(super) fn store_of(task: &TaskSpec) -> &str {
     task.results().store.trim_end_matches('/')
 }
 
+fn patient(backoff: &Backoff) -> Backoff {
+    Backoff {
+        first_ms: backoff.first_ms,
+        most_ms: MOST_MS,
+    }
+}
+
 impl Stores {
     /// A worker could not use a store.
     pub(super) fn failed(
@@ -64,40 +92,40 @@ impl Stores {
         backoff: &Backoff,
         now_ms: i64,
     ) {
-        let backoff = &Backoff {
-            first_ms: backoff.first_ms,
-            most_ms: MOST_MS,
-        };
-        let row = self.0.entry(store.to_owned()).or_insert_with(|| Row {
-            shut: true,
-            wait: Wait::default(),
-            trying: None,
-            workers: BTreeMap::new(),
-            why: String::new(),
-        });
-        row.shut = true;
-        row.trying = None;
-        row.why = why.chars().take(MOST_WORDS).collect();
-        row.wait.failed(backoff, now_ms);
-        let old = |wait: &Wait| wait.until_ms + FORGET_MS < now_ms;
-        row.workers.retain(|_, wait| !old(wait));
-        row.workers
-            .entry(worker)
-            .or_default()
-            .failed(backoff, now_ms);
+        let backoff = &patient(backoff);
+        let row = self.rows.entry(store.to_owned()).or_default();
+        let old = |faulty: &Faulty| faulty.wait.until_ms + FORGET_MS < now_ms;
+        row.workers.retain(|_, faulty| !old(faulty));
+        let faulty = row.workers.entry(worker).or_default();
+        faulty.wait.failed(backoff, now_ms);
+        faulty.trying = None;
+        faulty.why = why.chars().take(MOST_WORDS).collect();
+        if faulty.alone {
+            return;
+        }
+        row.why.clone_from(&faulty.why);
+        let several = row.workers.values().filter(|f| !f.alone).count() >= SEVERAL;
+        if row.shut || several {
+            row.shut = true;
+            row.trying = None;
+            row.wait.failed(backoff, now_ms);
+        }
     }
 
     /// A worker has used a store.
     pub(super) fn worked(&mut self, store: &str, worker: WorkerId) {
-        let Some(row) = self.0.get_mut(store) else {
+        let Some(row) = self.rows.get_mut(store) else {
             return;
         };
         row.shut = false;
         row.wait = Wait::default();
         row.trying = None;
         row.workers.remove(&worker);
+        for faulty in row.workers.values_mut() {
+            faulty.alone = true;
+        }
         if row.workers.is_empty() {
-            self.0.remove(store);
+            self.rows.remove(store);
         }
     }
 
@@ -106,43 +134,71 @@ impl Stores {
     /// # Errors
     /// Why not, and when it is tried again.
     pub(super) fn may_use(&self, store: &str, worker: WorkerId, now_ms: i64) -> Result<(), String> {
-        let Some(row) = self.0.get(store) else {
+        let Some(row) = self.rows.get(store) else {
             return Ok(());
         };
-        let own = row.workers.get(&worker).map_or(0, |wait| wait.until_ms);
-        let until_ms = match row.shut {
-            true => row.wait.until_ms.max(own),
-            false => own,
+        let own = row.workers.get(&worker);
+        let own_ms = own.map_or(0, |own| own.wait.until_ms);
+        let (until_ms, trying) = match row.shut {
+            true => (row.wait.until_ms.max(own_ms), row.trying.is_some()),
+            false => (own_ms, own.is_some_and(|own| own.trying.is_some())),
         };
         let when = if until_ms > now_ms {
             format!("next try in {} s", (until_ms - now_ms + 999) / 1000)
-        } else if row.shut && row.trying.is_some() {
+        } else if trying {
             "a task is trying it now".to_owned()
         } else {
             return Ok(());
         };
-        Err(format!("waits for store {store}: {}; {when}", row.why))
+        let why = own.map_or(&row.why, |own| &own.why);
+        Err(format!("waits for store {store}: {why}; {when}"))
     }
 
-    /// Whether a lease that uses a store is a try of it: then it has one task.
-    pub(super) fn is_try(&self, store: &str) -> bool {
-        self.0.get(store).is_some_and(|row| row.shut)
+    /// Whether a worker's lease that uses a store is a try of it: then it has one task.
+    pub(super) fn is_try(&self, store: &str, worker: WorkerId) -> bool {
+        let row = self.rows.get(store);
+        row.is_some_and(|row| row.shut || row.workers.contains_key(&worker))
     }
 
-    /// A lease that uses a store begins.
-    pub(super) fn begun(&mut self, store: &str, lease: RangeId) {
-        if let Some(row) = self.0.get_mut(store).filter(|row| row.shut) {
+    /// A worker's lease that uses a store begins.
+    pub(super) fn begun(&mut self, store: &str, worker: WorkerId, lease: RangeId) {
+        let Some(row) = self.rows.get_mut(store) else {
+            return;
+        };
+        if row.shut {
             row.trying = Some(lease);
+        }
+        if let Some(faulty) = row.workers.get_mut(&worker) {
+            faulty.trying = Some(lease);
         }
     }
 
     /// A lease is over, however it ended.
     pub(super) fn over(&mut self, lease: RangeId) {
-        for row in self.0.values_mut() {
-            if row.trying == Some(lease) {
-                row.trying = None;
+        for row in self.rows.values_mut() {
+            let workers = row.workers.values_mut().map(|faulty| &mut faulty.trying);
+            for trying in workers.chain([&mut row.trying]) {
+                if *trying == Some(lease) {
+                    *trying = None;
+                }
             }
         }
+    }
+
+    /// A task found damaged what it reads, which its store does not cure by waiting: only the task waits. How long,
+    /// milliseconds.
+    pub(super) fn damaged(&mut self, task: (StageRef, u64), backoff: &Backoff) -> i64 {
+        if self.damaged.len() >= DAMAGED && !self.damaged.contains_key(&task) {
+            self.damaged.clear();
+        }
+        let times = self.damaged.entry(task).or_default();
+        *times += 1;
+        patient(backoff).after(*times)
+    }
+
+    /// A task is done.
+    pub(super) fn mended(&mut self, task: (StageRef, u64)) {
+        self.damaged.remove(&task);
     }
 }
 
@@ -186,8 +242,8 @@ mod tests {
                 now += 500;
             }
             waits.push(now - begun);
-            assert!(stores.is_try(S));
-            stores.begun(S, range(1));
+            assert!(stores.is_try(S, worker(99)));
+            stores.begun(S, worker(99), range(1));
             let why = stores.may_use(S, worker(98), now).unwrap_err();
             assert!(why.contains("trying it now"), "{why}");
             stores.over(range(1));
@@ -198,23 +254,79 @@ mod tests {
     }
 
     #[test]
+    fn one_worker_that_cannot_use_a_store_stops_no_other() {
+        let mut stores = Stores::default();
+        let (mut now, mut waits) = (0, Vec::new());
+        for _ in 0..12 {
+            stores.failed(S, worker(1), "wrong keys", &backoff(), now);
+            assert_eq!(stores.may_use(S, worker(2), now), Ok(()));
+            assert!(!stores.is_try(S, worker(2)));
+            let why = stores.may_use(S, worker(1), now).unwrap_err();
+            assert!(why.contains(S) && why.contains("wrong keys"), "{why}");
+            // Others use it, or nobody does: it is the same.
+            if now > 60_000 {
+                stores.worked(S, worker(2));
+            }
+            let begun = now;
+            while stores.may_use(S, worker(1), now).is_err() {
+                now += 500;
+            }
+            waits.push(now - begun);
+            // It tries with one task at a time.
+            assert!(stores.is_try(S, worker(1)));
+            stores.begun(S, worker(1), range(1));
+            assert!(stores.may_use(S, worker(1), now).is_err());
+            stores.over(range(1));
+        }
+        assert_eq!(waits[..3], [1_000, 2_000, 4_000]);
+        assert_eq!(*waits.last().unwrap(), i64::from(MOST_MS));
+        // A second one with the same keys is known for it once the store works.
+        stores.failed(S, worker(3), "wrong keys", &backoff(), now);
+        assert_eq!(stores.may_use(S, worker(2), now), Ok(()));
+        stores.worked(S, worker(2));
+        stores.failed(S, worker(1), "wrong keys", &backoff(), now);
+        stores.failed(S, worker(3), "wrong keys", &backoff(), now);
+        assert_eq!(stores.may_use(S, worker(2), now), Ok(()));
+    }
+
+    #[test]
+    fn a_task_that_reads_what_is_damaged_waits_alone() {
+        let mut stores = Stores::default();
+        let stage = StageRef {
+            job: picofarm_proto::ids::JobId::from_uuid(Uuid::nil()),
+            stage: 0,
+        };
+        let waits: Vec<i64> = (0..3)
+            .map(|_| stores.damaged((stage, 7), &backoff()))
+            .collect();
+        assert_eq!(waits, [1_000, 2_000, 4_000]);
+        assert_eq!(stores.may_use(S, worker(1), 0), Ok(()));
+        stores.mended((stage, 7));
+        assert_eq!(stores.damaged((stage, 7), &backoff()), 1_000);
+    }
+
+    #[test]
     fn a_store_that_works_again_is_open_to_all_but_those_that_failed() {
         let mut stores = Stores::default();
         stores.failed(S, worker(1), "no keys", &backoff(), 0);
+        stores.failed(S, worker(4), "no keys", &backoff(), 0);
+        assert!(stores.may_use(S, worker(3), 0).is_err());
         stores.worked(S, worker(2));
-        assert!(!stores.is_try(S));
+        assert!(!stores.is_try(S, worker(2)));
         assert_eq!(stores.may_use(S, worker(3), 0), Ok(()));
         assert!(stores.may_use(S, worker(1), 0).is_err());
         assert_eq!(stores.may_use(S, worker(1), 1_000), Ok(()));
         stores.worked(S, worker(1));
-        assert!(stores.0.is_empty());
+        stores.worked(S, worker(4));
+        assert!(stores.rows.is_empty());
     }
 
     #[test]
     fn a_try_that_ends_without_a_word_leaves_the_store_to_the_next() {
         let mut stores = Stores::default();
         stores.failed(S, worker(1), "away", &backoff(), 0);
-        stores.begun(S, range(7));
+        stores.failed(S, worker(2), "away", &backoff(), 0);
+        stores.begun(S, worker(1), range(7));
         assert!(stores.may_use(S, worker(2), 5_000).is_err());
         stores.over(range(7));
         assert_eq!(stores.may_use(S, worker(2), 5_000), Ok(()));

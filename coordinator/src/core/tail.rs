@@ -46,8 +46,8 @@ impl Core {
         let mut stages: Vec<StageRef> = self
             .stages
             .iter()
-            .filter(|(_, e)| !e.job.paused && e.free == Some(0))
-            .filter(|(_, e)| e.stage.pending_tasks() == 0 && e.stage.leased_tasks() > 0)
+            // Tasks that wait after a failure keep nobody from helping.
+            .filter(|(_, e)| !e.job.paused && !e.waits(now_ms) && e.stage.leased_tasks() > 0)
             // Half of such a task's work would be in vain, and it has been saved on the way.
             .filter(|(id, e)| !e.spec(**id).task.resumes())
             .map(|(id, _)| *id)

@@ -2,6 +2,8 @@
 //! exactly once, the counts add up, and the catalog holds what the cores think. One instance over SQLite, two over
 //! Postgres, which lose their workers to each other, their time, and their memory.
 
+mod starving;
+mod troubled;
 mod world;
 
 use picofarm_catalog::{EventQuery, Sight};

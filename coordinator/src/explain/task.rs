@@ -7,11 +7,11 @@ use super::{TaskFacts, span};
 
 /// What became of a task and why.
 pub fn task(facts: TaskFacts) -> TaskExplanation {
-    let (failures, crashes, last_error) = facts
+    let (failures, crashes, interruptions, last_error) = facts
         .record
         .exception
         .as_ref()
-        .map(|e| (e.failures, e.crashes, e.last_error.clone()))
+        .map(|e| (e.failures, e.crashes, e.interruptions, e.last_error.clone()))
         .unwrap_or_default();
     let state = match (&facts.record.range, &facts.record.output) {
         (Some(range), output) => match &range.state {
@@ -30,9 +30,12 @@ pub fn task(facts: TaskFacts) -> TaskExplanation {
         TaskState::Leased => leased(&facts),
         TaskState::Done => done(&facts, output.as_ref()),
         TaskState::Dead => format!(
-            "given up after {} of {} failures and {} of {} lost workers: {last_error}; correct the cause, then \
-             `picofarm job retry {}`",
-            failures, facts.limits.max_failures, crashes, facts.limits.max_crashes, facts.job
+            "given up after {failures} of {} failures, {crashes} of {} lost workers and {interruptions} of {} interruptions: \
+             {last_error}; correct the cause, then `picofarm job retry {}`",
+            facts.limits.max_failures,
+            facts.limits.max_crashes,
+            facts.limits.max_interruptions,
+            facts.job
         ),
         TaskState::Gone => "its job was stopped before it ran".to_owned(),
     };
@@ -44,6 +47,8 @@ pub fn task(facts: TaskFacts) -> TaskExplanation {
         max_failures: facts.limits.max_failures,
         crashes,
         max_crashes: facts.limits.max_crashes,
+        interruptions,
+        max_interruptions: facts.limits.max_interruptions,
         last_error,
         reruns: reruns(&facts.events),
         output,

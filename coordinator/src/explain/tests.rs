@@ -32,6 +32,8 @@ fn facts() -> JobFacts {
         },
         candidates: vec![able("a")],
         shared: 0,
+        suspects: 0,
+        deadline: None,
         ahead: vec![],
         unseen: 0,
         elsewhere: 0,
@@ -47,6 +49,8 @@ fn able(name: &str) -> Candidate {
         may_run: Ok(()),
         lacks_memory: None,
         idle: false,
+        gets: true,
+        lacks_time: None,
         quarantined: false,
         silent_ms: None,
     }
@@ -58,6 +62,8 @@ fn failed(task: u64, dead: bool) -> Exception {
         task,
         failures: 2,
         crashes: 1,
+        interruptions: 0,
+        longest_ms: 0,
         dead,
         last_error: "no light in the scene".into(),
     }
@@ -390,6 +396,7 @@ fn a_finished_task_says_who_made_it() {
         seconds: 2.5,
         epoch: Epoch(1),
         adopted: false,
+        checked: false,
     };
     let mut facts = task_facts(RangeState::Done { reused: true });
     facts.record.output = Some(output);
@@ -513,4 +520,91 @@ fn what_was_given_back_says_why() {
         words.contains("No space left on device") && words.contains("rack-1"),
         "{words}"
     );
+}
+
+#[test]
+fn a_job_that_its_deadline_stopped_says_which_and_how_to_go_on() {
+    let (code, words) = first(&JobFacts {
+        state: JobState::Cancelled,
+        deadline: Some("2026-12-01T18:00:00Z".into()),
+        ..facts()
+    });
+    assert_eq!(code, "deadline");
+    assert!(
+        words.contains("limits.deadline = \"2026-12-01T18:00:00Z\"")
+            && words.contains("set a later limits.deadline")
+            && !words.contains("--again"),
+        "{words}"
+    );
+}
+
+#[test]
+fn tasks_that_no_worker_has_the_time_for_say_how_long_they_need() {
+    let short = |name: &str| Candidate {
+        may_run: Err("a task is taken to need 75 min, and the worker ends in 59 min".into()),
+        lacks_time: Some(75 * 60_000),
+        ..able(name)
+    };
+    let (code, words) = first(&JobFacts {
+        candidates: vec![short("a"), short("b")],
+        ..facts()
+    });
+    assert_eq!(code, "time");
+    assert!(
+        words.contains("no connected worker has 75 min left for 10 tasks"),
+        "{words}"
+    );
+    // Another one has the time and is at work.
+    let (code, _) = first(&JobFacts {
+        candidates: vec![short("a"), able("b")],
+        ..facts()
+    });
+    assert_eq!(code, "busy");
+}
+
+#[test]
+fn where_workers_come_and_give_their_leases_back_it_is_said() {
+    let back = event(EventKind::Released, "node-7", "the worker is shutting down");
+    let loops = JobFacts {
+        candidates: vec![],
+        setback: Some(back),
+        holdups: Holdups {
+            ready: 10,
+            failed: vec![Exception {
+                interruptions: 4,
+                ..failed(4, false)
+            }],
+            ..Holdups::default()
+        },
+        ..facts()
+    };
+    let (code, words) = first(&loops);
+    assert_eq!(code, "no_workers");
+    assert!(
+        words.contains("node-7, gave a lease back 5 s ago: the worker is shutting down")
+            && words.contains("task 4 was interrupted 4 times"),
+        "{words}"
+    );
+    // Long ago it is no reason any more.
+    let later = JobFacts {
+        now_ms: NOW + 3_600_000,
+        ..loops
+    };
+    assert!(!first(&later).1.contains("node-7"));
+}
+
+#[test]
+fn tasks_under_suspicion_wait_for_an_empty_hand() {
+    let asks = Candidate {
+        idle: true,
+        gets: false,
+        ..able("a")
+    };
+    let (code, words) = first(&JobFacts {
+        candidates: vec![asks],
+        suspects: 10,
+        ..facts()
+    });
+    assert_eq!(code, "suspects");
+    assert!(words.contains("nothing else in hand"), "{words}");
 }

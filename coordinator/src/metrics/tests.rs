@@ -8,14 +8,24 @@ use super::*;
 
 #[test]
 fn names_and_help_texts_are_as_documented() {
-    let page = Metrics::default().page(Some(Gauges::default()), Counts::default(), true);
+    let page = Metrics::default().page(
+        Some(Gauges::default()),
+        Counts::default(),
+        Used::default(),
+        true,
+    );
     let lines: Vec<&str> = page.lines().filter(|line| line.starts_with('#')).collect();
     insta::assert_snapshot!(lines.join("\n"));
 }
 
 #[test]
 fn every_line_is_a_sample_of_the_family_before_it() {
-    let page = Metrics::default().page(Some(Gauges::default()), Counts::default(), false);
+    let page = Metrics::default().page(
+        Some(Gauges::default()),
+        Counts::default(),
+        Used::default(),
+        false,
+    );
     let mut family = String::new();
     for line in page.lines() {
         if let Some(rest) = line.strip_prefix("# TYPE ") {
@@ -38,7 +48,7 @@ fn every_line_is_a_sample_of_the_family_before_it() {
 
 #[test]
 fn without_the_catalog_the_counters_are_told_and_the_gauges_are_not() {
-    let page = Metrics::default().page(None, Counts::default(), false);
+    let page = Metrics::default().page(None, Counts::default(), Used::default(), false);
     assert!(!page.contains("picofarm_tasks_pending"));
     assert!(page.contains("picofarm_leases_granted_total 0"));
 }
@@ -49,7 +59,7 @@ fn a_histogram_counts_up_to_each_bound() {
     for messages in [1, 2, 3, 5000] {
         metrics.handled(messages);
     }
-    let page = metrics.page(None, Counts::default(), true);
+    let page = metrics.page(None, Counts::default(), Used::default(), true);
     for line in [
         "picofarm_batch_messages_bucket{le=\"1\"} 1",
         "picofarm_batch_messages_bucket{le=\"2\"} 2",
@@ -70,7 +80,7 @@ fn calls_are_counted_by_method_and_unknown_paths_share_a_line() {
     for path in ["/", "/picofarm.v1.Jobs/Nonsense"] {
         metrics.called(path, Duration::from_millis(3));
     }
-    let page = metrics.page(None, Counts::default(), true);
+    let page = metrics.page(None, Counts::default(), Used::default(), true);
     for (method, count) in [("Jobs/GetJob", 1), ("other", 2), ("Farm/Session", 0)] {
         let line = format!("picofarm_grpc_request_seconds_count{{method=\"{method}\"}} {count}");
         assert!(page.contains(&line), "{line} in {page}");
@@ -89,6 +99,7 @@ fn what_fails_without_a_report_was_lost_with_its_worker() {
         seconds: 2.0,
         epoch: Epoch(1),
         adopted,
+        checked: false,
     };
     let changes = Changes {
         events: [
@@ -125,7 +136,7 @@ fn what_fails_without_a_report_was_lost_with_its_worker() {
     tally.note(&changes, &[acknowledge(true), acknowledge(false)]);
     let metrics = Metrics::default();
     metrics.add(&tally);
-    let page = metrics.page(None, Counts::default(), true);
+    let page = metrics.page(None, Counts::default(), Used::default(), true);
     for line in [
         "picofarm_leases_granted_total 1",
         "picofarm_leases_expired_total 1",

@@ -9,9 +9,9 @@ use std::{
     time::Duration,
 };
 
-use futures::Stream;
+use futures::{Stream, TryStreamExt};
 use picofarm_proto::{
-    PROTOCOL,
+    PROTOCOL, compatibility,
     convert::ConvertError,
     ids::LeaseRef,
     model::{WorkerHello, bounds},
@@ -23,11 +23,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::{Link, caller, invalid};
+use super::{Link, beats::Beats, caller, invalid};
 use crate::{
     VERSION,
     actor::{Command, FromWorker},
-    auth::{Caller, Quotas, WorkerIds},
+    auth::{Caller, Quotas, SameMachine, WorkerIds},
     core::{Say, SessionId},
     sessions::Waiting,
 };
@@ -36,6 +36,10 @@ use crate::{
 const HELLO: Duration = Duration::from_secs(20);
 /// Messages that may wait for a worker; one that reads none of them is let go.
 const OUTBOX: usize = 16_384;
+
+/// Heartbeats of a session that may wait for the actor, and how often it is looked whether it has come to them.
+const BEATS: u32 = 4;
+const PAUSE: Duration = Duration::from_millis(20);
 
 pub(crate) struct FarmService {
     link: Link,
@@ -78,7 +82,8 @@ impl Drop for Counted {
     }
 }
 
-type Out = mpsc::Sender<Result<wire::SessionResponse, Status>>;
+/// Boxed: a channel has room for 32 from the start.
+type Out = mpsc::Sender<Result<Box<wire::SessionResponse>, Status>>;
 
 #[tonic::async_trait]
 impl Farm for FarmService {
@@ -93,18 +98,29 @@ impl Farm for FarmService {
         let (out, stream) = mpsc::channel(16);
         let (link, ids) = (self.link.clone(), Arc::clone(&self.ids));
         let caller = caller(&request);
+        let here = request.extensions().get::<SameMachine>();
+        let here = here.is_some_and(|same| same.0);
         tokio::spawn(async move {
-            run(link, session, caller, ids, request.into_inner(), out).await;
+            run(
+                link,
+                (session, here),
+                caller,
+                ids,
+                request.into_inner(),
+                out,
+            )
+            .await;
             drop(counted);
         });
         // At once: a client may wait for this before it says hello.
-        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+        let stream = ReceiverStream::new(stream).map_ok(|response| *response);
+        Ok(Response::new(Box::pin(stream)))
     }
 }
 
 async fn run(
     link: Link,
-    session: SessionId,
+    (session, here): (SessionId, bool),
     caller: Caller,
     ids: Arc<WorkerIds>,
     mut input: Streaming<wire::SessionRequest>,
@@ -139,13 +155,22 @@ async fn run(
         hello,
         say,
         waiting: waiting.clone(),
+        here,
     };
     if link.commands.send(open).await.is_err() {
         return;
     }
+    let beats = Beats::new(link.lease_ms);
+    let listener = Listener {
+        link: &link,
+        session,
+        waiting: &waiting,
+        beats: &beats,
+        out: &out,
+    };
     let end = tokio::select! {
-        end = listen(&link, session, &waiting, &mut input) => end,
-        end = speak(&mut said, &out) => end,
+        end = listener.listen(&mut input) => end,
+        end = speak(&mut said, &out, &beats) => end,
         revoked = caller.revoked() => Err(revoked),
         () = link.stop.cancelled() => Err(Status::unavailable("the coordinator is stopping; reconnect")),
     };
@@ -173,44 +198,82 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
             "the first message of a session must be hello",
         ));
     };
-    if hello.protocol != PROTOCOL || hello.version != VERSION {
-        return Err(Status::failed_precondition(format!(
-            "worker {} is picofarm {} (protocol {}), the coordinator is picofarm {VERSION} (protocol {PROTOCOL}); install the same version on both",
+    compatibility::serves(VERSION, &hello.version, hello.protocol).map_err(|why| {
+        Status::failed_precondition(format!(
+            "worker {} is picofarm version {} (protocol {}), the coordinator is picofarm version {VERSION} (protocol \
+             {PROTOCOL}): {why}",
             bounds::quoted(&hello.name),
             bounds::cut(&hello.version, bounds::NAME_BYTES),
             hello.protocol
-        )));
-    }
+        ))
+    })?;
     WorkerHello::try_from(hello).map_err(invalid)
 }
 
-/// Passes on what the worker says, until it ends its side.
-async fn listen(
-    link: &Link,
+/// Where a session listens to its worker.
+struct Listener<'a> {
+    link: &'a Link,
     session: SessionId,
-    waiting: &Waiting,
-    input: &mut Streaming<wire::SessionRequest>,
-) -> Result<(), Status> {
-    loop {
-        let Some(request) = input.message().await? else {
-            return Ok(());
-        };
-        let said = match checked(request).map_err(invalid)? {
-            Ok(said) => said,
-            Err(why) => {
-                tracing::warn!(session, "a worker's log lines cannot be used: {why}");
+    waiting: &'a Waiting,
+    beats: &'a Beats,
+    out: &'a Out,
+}
+
+impl Listener<'_> {
+    /// Passes on what the worker says, until it ends its side.
+    async fn listen(&self, input: &mut Streaming<wire::SessionRequest>) -> Result<(), Status> {
+        loop {
+            let Some(request) = input.message().await? else {
+                return Ok(());
+            };
+            let said = match checked(request).map_err(invalid)? {
+                Ok(said) => said,
+                Err(why) => {
+                    let session = self.session;
+                    tracing::warn!(session, "a worker's log lines cannot be used: {why}");
+                    continue;
+                }
+            };
+            if let FromWorker::Heartbeat(leases, _, _) = &said
+                && !self.beat(leases).await?
+            {
                 continue;
             }
-        };
-        if matches!(said, FromWorker::Heartbeat(..)) {
-            waiting.arrived();
+            if matches!(said, FromWorker::Credit(0)) {
+                self.beats.withdraw();
+            }
+            let command = Command::Worker(self.session, said);
+            if self.link.commands.send(command).await.is_err() {
+                return Err(Status::unavailable(
+                    "the coordinator is stopping; reconnect",
+                ));
+            }
         }
-        let command = Command::Worker(session, said);
-        if link.commands.send(command).await.is_err() {
-            return Err(Status::unavailable(
-                "the coordinator is stopping; reconnect",
-            ));
+    }
+
+    /// Answers a heartbeat, if that can be done without the actor; `false` where the actor need not hear of it, because it
+    /// has not come to the one before.
+    async fn beat(&self, leases: &[LeaseRef]) -> Result<bool, Status> {
+        let answered = self.beats.answer(leases);
+        let behind = self.waiting.count() > 0;
+        // They are in memory together, and a worker sends the next one when it likes.
+        while answered.is_none() && self.waiting.count() >= BEATS {
+            tokio::time::sleep(PAUSE).await;
         }
+        let pass_on = answered.is_none() || !behind;
+        if pass_on {
+            // Before the answer: from then on no lease of this session runs out until the actor has come to it.
+            self.waiting.arrived();
+            self.beats.tell(answered.clone());
+        }
+        if let Some(leases) = answered {
+            let renewed = To::Renewed(wire::Renewed {
+                leases: leases.into_iter().map(Into::into).collect(),
+                ttl_ms: self.link.lease_ms,
+            });
+            send(self.out, renewed).await?;
+        }
+        Ok(pass_on)
     }
 }
 
@@ -251,6 +314,7 @@ fn checked(
                 .into_iter()
                 .map(TryInto::try_into)
                 .collect::<Result<_, _>>()?,
+            (beat.ends_in_ms > 0).then_some(beat.ends_in_ms),
         ),
         Some(From::Done(done)) => {
             let (about, index) = (done.lease.clone(), done.index);
@@ -277,52 +341,58 @@ fn checked(
 }
 
 /// Tells the worker what the actor says, until the actor lets it go.
-async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out) -> Result<(), Status> {
+async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out, beats: &Beats) -> Result<(), Status> {
     while let Some(say) = said.recv().await {
-        let message = match say {
-            Say::Lease(lease) => To::Lease((*lease).into()),
-            Say::Acknowledge {
-                lease,
-                index,
-                accepted,
-                reason,
-            } => To::Acknowledge(wire::Acknowledge {
-                lease: Some(lease.into()),
-                index,
-                accepted,
-                reason,
-            }),
-            Say::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
-                leases: leases.into_iter().map(Into::into).collect(),
-                ttl_ms,
-            }),
-            Say::Revoke { lease, reason } => To::Revoke(wire::Revoke {
-                lease: Some(lease.into()),
-                reason,
-            }),
-            Say::Trim { lease, hi } => To::Trim(wire::Trim {
-                lease: Some(lease.into()),
-                hi,
-            }),
-            Say::Drain => To::Drain(wire::Drain {}),
-            Say::Replaced => {
-                return Err(Status::aborted(
-                    "a newer session of this worker id took over; if that is another worker, give each its own id",
-                ));
-            }
-        };
-        send(out, message).await?;
+        for say in beats.hear(say) {
+            send(out, message(say)?).await?;
+        }
     }
     Err(Status::unavailable(
         "the coordinator let this session go; reconnect",
     ))
 }
 
+/// What the actor says, on the wire.
+fn message(say: Say) -> Result<To, Status> {
+    Ok(match say {
+        Say::Lease(lease) => To::Lease((*lease).into()),
+        Say::Acknowledge {
+            lease,
+            index,
+            accepted,
+            reason,
+        } => To::Acknowledge(wire::Acknowledge {
+            lease: Some(lease.into()),
+            index,
+            accepted,
+            reason,
+        }),
+        Say::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
+            leases: leases.into_iter().map(Into::into).collect(),
+            ttl_ms,
+        }),
+        Say::Revoke { lease, reason } => To::Revoke(wire::Revoke {
+            lease: Some(lease.into()),
+            reason,
+        }),
+        Say::Trim { lease, hi } => To::Trim(wire::Trim {
+            lease: Some(lease.into()),
+            hi,
+        }),
+        Say::Drain => To::Drain(wire::Drain {}),
+        Say::Replaced => {
+            return Err(Status::aborted(
+                "a newer session of this worker id took over; if that is another worker, give each its own id",
+            ));
+        }
+    })
+}
+
 async fn send(out: &Out, message: To) -> Result<(), Status> {
     let response = wire::SessionResponse {
         message: Some(message),
     };
-    out.send(Ok(response))
+    out.send(Ok(Box::new(response)))
         .await
         .map_err(|_| Status::cancelled("the worker is gone"))
 }

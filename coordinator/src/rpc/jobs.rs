@@ -2,8 +2,8 @@
 
 use std::{pin::Pin, sync::Arc, time::Duration};
 
-use futures::Stream;
-use picofarm_catalog::{AuditQuery, CatalogError, EventQuery, JobQuery, Sight};
+use futures::{Stream, TryStreamExt};
+use picofarm_catalog::{AuditQuery, EventQuery, JobQuery, Sight};
 use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
@@ -11,15 +11,17 @@ use picofarm_proto::{
     model::{Act, JobSpec, JobState, StageSpec, bounds},
     wire::{self, jobs_server::Jobs},
 };
+use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-use super::{Link, caller, invalid, look, refused};
+use super::{Link, account, broken, caller, invalid, look, refused};
 use crate::{
     VERSION,
     actor::{Command, Submitted},
     auth::{Caller, Quotas},
+    memory::{Account, Charge},
     submission::Draft,
 };
 
@@ -32,6 +34,11 @@ const EVENTS: u32 = 1_000;
 /// Jobs in one answer where the client names no number, and at most.
 const JOBS: u32 = 100;
 const MOST_JOBS: u32 = 1_000;
+/// Memory of a line of history or of the audit log, or of a job in a list, while it is read and sent: three times what the
+/// longest but few take.
+const LINE: u64 = 8 << 10;
+/// The same of a worker.
+const WORKER: u64 = 4 << 10;
 
 pub(crate) struct JobsService {
     link: Link,
@@ -44,16 +51,22 @@ impl JobsService {
     }
 
     /// Reads and checks a spec, beside everything else: a large one takes seconds.
-    async fn draft(&self, wire: Option<wire::JobSpec>, by: &Caller) -> Result<Arc<Draft>, Status> {
+    async fn draft(
+        &self,
+        wire: Option<wire::JobSpec>,
+        by: &Caller,
+        account: &Account,
+    ) -> Result<Arc<Draft>, Status> {
         let wire = wire.ok_or_else(|| invalid(ConvertError::Missing { field: "spec" }))?;
+        let charge = account.charge_spec(&wire.json).await?;
+        let account = account.clone();
         let (bytes, quotas, by) = (wire.json.len(), self.quotas, by.clone());
         let draft = self
             .link
             .lanes
-            .heavy(
-                bytes,
-                move || async move { draft(wire, bytes, &quotas, &by) },
-            )
+            .heavy(bytes, move || async move {
+                draft(wire, bytes, &quotas, &by, (account, charge))
+            })
             .await?;
         Ok(Arc::new(draft))
     }
@@ -65,6 +78,7 @@ impl JobsService {
         job: JobId,
         paused: bool,
         by: &Caller,
+        account: &Account,
     ) -> Result<wire::JobStatus, Status> {
         let act = if paused { Act::Pause } else { Act::Resume };
         let pause = |reply| Command::Pause {
@@ -74,15 +88,16 @@ impl JobsService {
             reply,
         };
         self.link.steer(by, act, job, pause).await?;
-        Ok(self.link.status(job).await?.into())
+        Ok(self.link.status(account, job).await?.into())
     }
 
     async fn submit(
         &self,
         request: wire::SubmitJobRequest,
         by: &Caller,
+        account: &Account,
     ) -> Result<Submitted, Status> {
-        let draft = self.draft(request.spec, by).await?;
+        let draft = self.draft(request.spec, by, account).await?;
         let most = self.quotas.jobs_per_user as u64;
         let submissions = &self.link.submissions;
         let submitted = submissions.submit(&draft, by, most, request.again).await;
@@ -90,16 +105,22 @@ impl JobsService {
     }
 }
 
+fn wrong(field: &str, what: &str) -> Status {
+    Status::invalid_argument(format!("{field}: {what}"))
+}
+
+/// A text that a list is filtered by; empty = not at all.
+fn filter(text: String, field: &str) -> Result<Option<String>, Status> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let checked = bounds::name(&text, bounds::NAME_BYTES);
+    checked.map_err(|what| wrong(field, &what))?;
+    Ok(Some(text))
+}
+
 /// What a list is to show.
 fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Status> {
-    let wrong = |field: &str, what: &str| Status::invalid_argument(format!("{field}: {what}"));
-    let some = |text: String, field: &str| match text.as_str() {
-        "" => Ok(None),
-        text => match bounds::name(text, bounds::NAME_BYTES) {
-            Ok(()) => Ok(Some(text.to_owned())),
-            Err(what) => Err(wrong(field, &what)),
-        },
-    };
     let state = match wire::JobState::try_from(request.state) {
         Ok(wire::JobState::Unspecified) => None,
         Ok(state) => Some(state.try_into().map_err(invalid)?),
@@ -122,19 +143,18 @@ fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Sta
             n => n.min(MOST_JOBS),
         },
         state,
-        user: some(request.user, "user")?,
-        find: some(request.find, "find")?,
+        user: filter(request.user, "user")?,
+        find: filter(request.find, "find")?,
     })
 }
 
-fn broken(error: CatalogError) -> Status {
-    match error {
-        CatalogError::Refused { what, .. } => Status::invalid_argument(bounds::message(&what)),
-        error => Status::unavailable(bounds::message(&error.to_string())),
-    }
-}
-
-fn draft(wire: wire::JobSpec, bytes: usize, quotas: &Quotas, by: &Caller) -> Result<Draft, Status> {
+fn draft(
+    wire: wire::JobSpec,
+    bytes: usize,
+    quotas: &Quotas,
+    by: &Caller,
+    charged: (Account, Charge),
+) -> Result<Draft, Status> {
     let spec = JobSpec::try_from(wire).map_err(invalid)?;
     spec.check_submitted().map_err(|e| invalid(e.into()))?;
     by.may_submit(&spec, quotas.max_priority)
@@ -146,7 +166,7 @@ fn draft(wire: wire::JobSpec, bytes: usize, quotas: &Quotas, by: &Caller) -> Res
             "the job's {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
         )));
     }
-    Ok(Draft::new(spec, bytes))
+    Ok(Draft::new(spec, bytes).charged(charged))
 }
 
 fn job_id(text: &str) -> Result<JobId, Status> {
@@ -171,8 +191,8 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::PlanJobRequest>,
     ) -> Result<Response<wire::PlanJobResponse>, Status> {
-        let by = caller(&request);
-        let draft = self.draft(request.into_inner().spec, &by).await?;
+        let (by, account) = (caller(&request), account(&request));
+        let draft = self.draft(request.into_inner().spec, &by, &account).await?;
         let plan = self.link.submissions.plan(&draft, &by).await;
         let plan = plan.map_err(refused)?;
         Ok(Response::new(wire::PlanJobResponse {
@@ -184,8 +204,8 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::SubmitJobRequest>,
     ) -> Result<Response<wire::SubmitJobResponse>, Status> {
-        let by = caller(&request);
-        let answer = self.submit(request.into_inner(), &by).await;
+        let (by, account) = (caller(&request), account(&request));
+        let answer = self.submit(request.into_inner(), &by, &account).await;
         let job = answer.as_ref().ok().map(|submitted| submitted.job);
         let done = match &answer {
             Ok(Submitted { existed: true, .. }) => "the same job is there already",
@@ -207,8 +227,11 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ListJobsRequest>,
     ) -> Result<Response<wire::ListJobsResponse>, Status> {
+        let account = account(&request);
         let sight = caller(&request).sight(self.link.visibility);
         let query = listing(request.into_inner(), sight)?;
+        let charge = account.charge("the list", LINE * u64::from(query.limit));
+        let _charge = charge.await?;
         let page = self
             .link
             .lanes
@@ -228,10 +251,10 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::GetJobRequest>,
     ) -> Result<Response<wire::GetJobResponse>, Status> {
-        let by = caller(&request);
+        let (by, account) = (caller(&request), account(&request));
         let id = job_id(&request.into_inner().job_id)?;
         self.link.may_see(&by, id).await?;
-        let job = self.link.status(id).await?;
+        let job = self.link.status(&account, id).await?;
         Ok(Response::new(wire::GetJobResponse {
             job: Some(job.into()),
         }))
@@ -244,27 +267,30 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
-        let caller = caller(&request);
+        let (caller, account) = (caller(&request), account(&request));
         let id = job_id(&request.into_inner().job_id)?;
         self.link.may_see(&caller, id).await?;
         // A job that does not exist is an error now, not in the stream.
         self.link.state(id).await?;
-        let (sender, stream) = mpsc::channel(4);
-        tokio::spawn(watch_while_allowed(self.link.clone(), caller, id, sender));
-        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+        let (sender, stream) = mpsc::channel(1);
+        let link = self.link.clone();
+        tokio::spawn(watch_while_allowed(link, caller, account, id, sender));
+        // Charged until it is encoded, and as a part of the answer from then on.
+        let stream = ReceiverStream::new(stream).map_ok(|(response, _charge)| response);
+        Ok(Response::new(Box::pin(stream)))
     }
 
     async fn cancel_job(
         &self,
         request: Request<wire::CancelJobRequest>,
     ) -> Result<Response<wire::CancelJobResponse>, Status> {
-        let by = caller(&request);
+        let (by, account) = (caller(&request), account(&request));
         let why = format!("by {}", by.name);
         let job = job_id(&request.into_inner().job_id)?;
         let cancel = |reply| Command::Cancel { job, why, reply };
         self.link.steer(&by, Act::Cancel, job, cancel).await?;
         Ok(Response::new(wire::CancelJobResponse {
-            job: Some(self.link.status(job).await?.into()),
+            job: Some(self.link.status(&account, job).await?.into()),
         }))
     }
 
@@ -272,10 +298,10 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::PauseJobRequest>,
     ) -> Result<Response<wire::PauseJobResponse>, Status> {
-        let who = caller(&request);
+        let (who, account) = (caller(&request), account(&request));
         let job = job_id(&request.into_inner().job_id)?;
         Ok(Response::new(wire::PauseJobResponse {
-            job: Some(self.pause(job, true, &who).await?),
+            job: Some(self.pause(job, true, &who, &account).await?),
         }))
     }
 
@@ -283,10 +309,10 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ResumeJobRequest>,
     ) -> Result<Response<wire::ResumeJobResponse>, Status> {
-        let who = caller(&request);
+        let (who, account) = (caller(&request), account(&request));
         let job = job_id(&request.into_inner().job_id)?;
         Ok(Response::new(wire::ResumeJobResponse {
-            job: Some(self.pause(job, false, &who).await?),
+            job: Some(self.pause(job, false, &who, &account).await?),
         }))
     }
 
@@ -332,7 +358,7 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ListEventsRequest>,
     ) -> Result<Response<wire::ListEventsResponse>, Status> {
-        let by = caller(&request);
+        let (by, account) = (caller(&request), account(&request));
         let request = request.into_inner();
         let job = match request.job_id.as_str() {
             "" => None,
@@ -359,6 +385,8 @@ impl Jobs for JobsService {
             logs: request.logs,
             sight: by.sight(self.link.visibility),
         };
+        let charge = account.charge("the history", LINE * u64::from(query.limit));
+        let _charge = charge.await?;
         let events = self
             .link
             .read(move |catalog| async move { catalog.events(&query).await })
@@ -373,31 +401,45 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ExplainJobRequest>,
     ) -> Result<Response<wire::ExplainJobResponse>, Status> {
-        let by = caller(&request);
+        let (by, account) = (caller(&request), account(&request));
         let request = request.into_inner();
         let job = job_id(&request.job_id)?;
         self.link.may_see(&by, job).await?;
-        let explained = look::explain(&self.link, &by, job, request.stage, request.task).await?;
+        let explained = look::explain(
+            &self.link,
+            (&by, &account),
+            job,
+            request.stage,
+            request.task,
+        )
+        .await?;
         Ok(Response::new(explained))
     }
 
     async fn list_workers(
         &self,
-        _: Request<wire::ListWorkersRequest>,
+        request: Request<wire::ListWorkersRequest>,
     ) -> Result<Response<wire::ListWorkersResponse>, Status> {
+        let workers = self.link.ask(Command::Workers).await?;
+        let charge = account(&request)
+            .charge("the list", WORKER * u64::from(workers))
+            .await?;
         let look = self.link.ask(Command::Look).await?;
-        Ok(Response::new(wire::ListWorkersResponse {
+        let answer = Response::new(wire::ListWorkersResponse {
             coordinator: self.link.name.to_string(),
             workers: look.workers.into_iter().map(Into::into).collect(),
             elsewhere: look.elsewhere,
             coordinators: look.instances,
-        }))
+        });
+        drop(charge);
+        Ok(answer)
     }
 
     async fn list_audit(
         &self,
         request: Request<wire::ListAuditRequest>,
     ) -> Result<Response<wire::ListAuditResponse>, Status> {
+        let account = account(&request);
         let request = request.into_inner();
         let query = AuditQuery {
             before: (request.before > 0).then_some(request.before),
@@ -405,44 +447,48 @@ impl Jobs for JobsService {
                 0 => EVENTS,
                 n => n.min(EVENTS),
             },
-            who: Some(request.who).filter(|who| !who.is_empty()),
+            who: filter(request.who, "who")?,
             job: match request.job_id.as_str() {
                 "" => None,
                 id => Some(job_id(id)?),
             },
         };
-        let lines = self.link.catalog.audited(&query).await;
-        let lines = lines.map_err(|e| Status::unavailable(e.to_string()))?;
+        let charge = account.charge("the log", LINE * u64::from(query.limit));
+        let _charge = charge.await?;
+        let lines = self
+            .link
+            .read(move |catalog| async move { catalog.audited(&query).await })
+            .await?;
         Ok(Response::new(wire::ListAuditResponse {
             entries: lines.into_iter().map(Into::into).collect(),
         }))
     }
 }
 
+/// What a watcher hears, with its charge.
+type Watched = Result<(wire::WatchJobResponse, Charge), Status>;
+
 /// Watches until the caller's token is revoked.
 async fn watch_while_allowed(
     link: Link,
     caller: Caller,
+    account: Account,
     id: JobId,
-    sender: mpsc::Sender<Result<wire::WatchJobResponse, Status>>,
+    sender: mpsc::Sender<Watched>,
 ) {
     let revoked = tokio::select! {
-        () = watch(link, id, sender.clone()) => return,
+        () = watch(link, account, id, sender.clone()) => return,
         status = caller.revoked() => status,
     };
     let _ = sender.send(Err(revoked)).await;
 }
 
 /// Reports at once and after each change, until the job ends or nobody listens.
-async fn watch(
-    mut link: Link,
-    id: JobId,
-    sender: mpsc::Sender<Result<wire::WatchJobResponse, Status>>,
-) {
+async fn watch(mut link: Link, account: Account, id: JobId, sender: mpsc::Sender<Watched>) {
     let mut last = None;
     loop {
         link.revision.mark_unchanged();
-        let status = match link.status(id).await {
+        let status = match link.status(&account, id).await {
             Ok(status) => status,
             Err(error) => {
                 let _ = sender.send(Err(error)).await;
@@ -452,11 +498,13 @@ async fn watch(
         let over = status.state != JobState::Active;
         if last.as_ref() != Some(&status) {
             let job = Some(status.clone().into());
-            if sender
-                .send(Ok(wire::WatchJobResponse { job }))
-                .await
-                .is_err()
-            {
+            let response = wire::WatchJobResponse { job };
+            // This one, and the last one to compare it with.
+            let bytes = 2 * response.encoded_len() as u64;
+            let charged = account.charge("the job's status", bytes).await;
+            let over = charged.is_err();
+            let heard = charged.map(|charge| (response, charge));
+            if sender.send(heard).await.is_err() || over {
                 return;
             }
             last = Some(status);

@@ -14,6 +14,7 @@ use crate::{
     auth::Caller,
     core::JobLook,
     explain::{self, JobFacts, TaskFacts},
+    memory::Account,
 };
 
 /// Lines of a task's history in an answer.
@@ -27,12 +28,12 @@ const OTHERS: usize = 20;
 /// NOT_FOUND for a job or task that there is not; UNAVAILABLE where the catalog is out of order.
 pub(super) async fn explain(
     link: &Link,
-    by: &Caller,
+    (by, account): (&Caller, &Account),
     job: JobId,
     stage: u32,
     task: Option<u64>,
 ) -> Result<wire::ExplainJobResponse, Status> {
-    let status = link.status(job).await?;
+    let status = link.status(account, job).await?;
     let Some(of) = status.stages.get(stage as usize) else {
         return Err(Status::not_found(format!(
             "job {job} has no stage {stage}: its {} stages count from 0",
@@ -59,6 +60,7 @@ pub(super) async fn explain(
     let JobLook {
         candidates,
         shared,
+        suspects,
         ahead,
         elsewhere,
         running,
@@ -75,6 +77,8 @@ pub(super) async fn explain(
             .await?,
         candidates,
         shared,
+        suspects,
+        deadline: status.passed_deadline().map(str::to_owned),
         ahead,
         unseen,
         elsewhere,

@@ -1,5 +1,6 @@
 //! The gRPC services. Protobuf types stay in here; behind it is the checked model.
 
+mod beats;
 mod farm;
 mod jobs;
 mod look;
@@ -7,7 +8,7 @@ mod rights;
 
 use std::sync::Arc;
 
-use picofarm_catalog::{Catalog, CatalogError};
+use picofarm_catalog::{Catalog, CatalogError, Specs};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
@@ -24,6 +25,7 @@ use crate::{
     clock::Clock,
     core::recorded_status,
     lanes::Lanes,
+    memory::{Account, stored_cost},
     submission::Submissions,
 };
 
@@ -78,13 +80,20 @@ impl Link {
     {
         let catalog = Arc::clone(&self.catalog);
         let read = self.lanes.read(move || work(catalog)).await;
-        read.map_err(|e| Status::unavailable(e.to_string()))
+        read.map_err(broken)
     }
 
     /// A job as people see it.
-    pub(crate) async fn status(&self, id: JobId) -> Result<JobStatus, Status> {
-        let recorded = self
-            .read(move |catalog| async move { Ok(catalog.job(id).await?.map(recorded_status)) });
+    pub(crate) async fn status(&self, account: &Account, id: JobId) -> Result<JobStatus, Status> {
+        let bytes = self.catalog.spec_bytes(Specs::Job(id)).await;
+        let bytes = bytes.map_err(broken)?;
+        let what = "reading the job's spec";
+        let charge = account.charge(what, stored_cost(bytes)).await?;
+        let recorded = self.read(move |catalog| async move {
+            // For as long as the spec is in memory, also where nobody waits for it any more.
+            let _charge = charge;
+            Ok(catalog.job(id).await?.map(recorded_status))
+        });
         let mut status = recorded
             .await?
             .ok_or_else(|| refused(Refusal::NoSuchJob(id)))?;
@@ -97,7 +106,7 @@ impl Link {
     pub(crate) async fn state(&self, id: JobId) -> Result<JobState, Status> {
         let state = self.catalog.state(id).await;
         state
-            .map_err(|e| Status::unavailable(e.to_string()))?
+            .map_err(broken)?
             .ok_or_else(|| refused(Refusal::NoSuchJob(id)))
     }
 }
@@ -106,7 +115,7 @@ impl Link {
 pub(crate) fn refused(why: Refusal) -> Status {
     match why {
         Refusal::NoSuchJob(id) => no_such_job(id),
-        Refusal::Denied(why) => Status::permission_denied(why),
+        Refusal::Denied(why) => Status::permission_denied(bounds::message(&why)),
         Refusal::Spec(why) => Status::invalid_argument(bounds::message(&why.to_string())),
         Refusal::Content(why) => Status::invalid_argument(bounds::message(&format!(
             "the catalog cannot hold this: {why}"
@@ -117,12 +126,26 @@ pub(crate) fn refused(why: Refusal) -> Status {
     }
 }
 
+/// Why the catalog could not be read, as a caller hears it: what it refuses for its content is the caller's error.
+fn broken(error: CatalogError) -> Status {
+    match error {
+        CatalogError::Refused { what, .. } => Status::invalid_argument(bounds::message(&what)),
+        error => Status::unavailable(bounds::message(&error.to_string())),
+    }
+}
+
 /// Who called.
 fn caller<T>(request: &Request<T>) -> Caller {
     let caller = request.extensions().get::<Caller>();
     caller
         .expect("the guard stands before every service")
         .clone()
+}
+
+/// Whose memory a request takes.
+fn account<T>(request: &Request<T>) -> Account {
+    let account = request.extensions().get::<Account>();
+    account.expect("each request is charged").clone()
 }
 
 /// An error as an answer. It may repeat what was sent, and an answer's words are a header, which must not be long.

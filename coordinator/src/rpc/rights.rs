@@ -13,7 +13,7 @@ use crate::{
 impl Link {
     async fn owner(&self, job: JobId) -> Result<Owner, Status> {
         let found = self.catalog.owner(job).await;
-        let found = found.map_err(|e| Status::unavailable(e.to_string()))?;
+        let found = found.map_err(super::broken)?;
         found.ok_or_else(|| no_such_job(job))
     }
 

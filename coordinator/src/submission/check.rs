@@ -72,10 +72,9 @@ impl Findings {
         }
         if let Some(why) = &self.why {
             words.push(match self.unseen {
-                0 => format!("{place} was not looked into, because {why}: {what} found there before count as done"),
+                0 => format!("{place} could not be looked into now, because {why}: {what} found there before count as done"),
                 n => format!(
-                    "{n} of {recorded} {what} recorded as done were never looked at, and cannot be now, because {why}: \
-                     workers look for them before they run"
+                    "{n} of {recorded} {what} recorded as done could not be verified in {place}, because {why}"
                 ),
             });
         }
@@ -118,6 +117,9 @@ pub(crate) fn suspicious(recorded: &[Recorded], found: &BTreeMap<u64, Found>) ->
         .any(|o| o.checked && found.get(&o.task).is_some_and(|f| *f != Found::Equal))
 }
 
+/// Why results in a folder that this machine does not have cannot be looked at.
+pub(super) const NO_FOLDER: &str = "the coordinator's machine has no such folder (mount the store there, or name the stores it reaches with --check-stores)";
+
 /// What follows from the store's answers, by task.
 pub(crate) fn judge(
     recorded: &[Recorded],
@@ -129,8 +131,19 @@ pub(crate) fn judge(
         why,
         ..Findings::default()
     };
+    let absent = |f: &Found| matches!(f, Found::NoFolder | Found::NoStore);
+    if findings.why.is_none()
+        && recorded
+            .iter()
+            .any(|o| !o.checked && found.get(&o.task).is_some_and(absent))
+    {
+        findings.why = Some(NO_FOLDER.into());
+    }
     for output in recorded {
         match found.get(&output.task) {
+            // It was found in this folder before.
+            Some(Found::NoFolder | Found::NoStore) if output.checked => findings.gone.push(*output),
+            Some(Found::NoFolder | Found::NoStore) => findings.unseen += 1,
             Some(Found::Gone) => findings.gone.push(*output),
             Some(Found::Differs) => findings.differ.push(*output),
             None if !output.checked => findings.unseen += 1,
@@ -170,6 +183,24 @@ mod tests {
         assert!((0..100).all(|i| chosen.contains(&i)));
         assert_eq!(chosen, choose(&many, "a"), "the seed decides");
         assert_ne!(chosen, choose(&many, "b"));
+    }
+
+    #[test]
+    fn without_the_folder_only_results_that_were_found_in_it_are_gone() {
+        let outputs = recorded(3, |task| task < 2);
+        let found: BTreeMap<u64, Found> = (0..3).map(|task| (task, Found::NoFolder)).collect();
+        let findings = judge(&outputs, &found, None);
+        assert_eq!((findings.gone.len(), findings.unseen), (2, 1));
+        assert!(
+            findings
+                .why
+                .is_some_and(|why| why.contains("no such folder"))
+        );
+        let never = recorded(3, |_| false);
+        assert!(
+            !judge(&never, &found, None).lost(3, true),
+            "it may be on another machine"
+        );
     }
 
     #[test]

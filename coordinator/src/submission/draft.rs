@@ -11,6 +11,8 @@ use picofarm_proto::{
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
 
+use crate::memory::{Account, Charge, kept_cost, stored_cost};
+
 /// A job that may be submitted.
 #[derive(Debug, Clone)]
 pub(crate) struct Draft {
@@ -21,6 +23,10 @@ pub(crate) struct Draft {
     stages: Vec<StageRecord>,
     /// Size of the spec as it was sent.
     pub bytes: usize,
+    /// Memory that the job takes until it ends.
+    pub kept: u64,
+    /// Who pays for its memory, until it is dropped.
+    charged: Option<Arc<(Account, Charge)>>,
 }
 
 impl Draft {
@@ -39,10 +45,33 @@ impl Draft {
             user: String::new(),
         };
         Self {
+            kept: kept_cost(&spec),
             spec,
             hash,
             stages: job.stages(),
             bytes,
+            charged: None,
+        }
+    }
+
+    /// The same, whose memory is on this account.
+    pub(crate) fn charged(mut self, charged: (Account, Charge)) -> Self {
+        self.charged = Some(Arc::new(charged));
+        self
+    }
+
+    /// Takes memory for specs of this length together that are read because of it.
+    ///
+    /// # Errors
+    /// There is none, in words.
+    pub(crate) async fn charge(&self, bytes: u64) -> Result<Option<Charge>, String> {
+        let Some(charged) = &self.charged else {
+            return Ok(None);
+        };
+        let what = "reading the specs that this job is compared with";
+        match charged.0.charge(what, stored_cost(bytes)).await {
+            Ok(charge) => Ok(Some(charge)),
+            Err(refused) => Err(refused.message().to_owned()),
         }
     }
 

@@ -1,12 +1,15 @@
 //! What the actor leaves to others: reading jobs that it has heard of, and asking a store who is right.
 
 use picofarm_catalog::{Gone, Recorded, ResultSet};
-use picofarm_proto::{ids::JobId, model::Finished};
+use picofarm_proto::{
+    ids::JobId,
+    model::{Finished, StageSpec},
+};
 
 use super::{Submissions, look};
 use crate::{
-    actor::{Aside, Command, Dispute},
-    core::SessionId,
+    actor::{Aside, Command, Dispute, Ruling},
+    core::{Reported, SessionId},
     stored::Found,
 };
 
@@ -26,18 +29,72 @@ impl Aside for Submissions {
         }
         let (it, report) = (self.clone(), report.clone());
         tokio::spawn(async move {
-            let note = it.judged(&report, dispute).await;
-            let command = Command::Judged(session, report, note);
+            let ruling = it.judged(&report, dispute).await.unwrap_or(Ruling::Unknown);
+            let command = Command::Judged(session, report, ruling);
             // An actor that is gone needs no answer.
             let _ = it.commands.send(command).await;
         });
         true
     }
+
+    fn replace(&self, session: SessionId, report: &Finished, dispute: Dispute) {
+        let (it, report) = (self.clone(), report.clone());
+        tokio::spawn(async move {
+            let ruling = match it.replaced(&report, dispute).await {
+                Some(note) => Ruling::Overruled(note),
+                None => Ruling::Stands,
+            };
+            let command = Command::Judged(session, report, ruling);
+            // An actor that is gone needs no answer.
+            let _ = it.commands.send(command).await;
+        });
+    }
+
+    fn looks(&self) -> bool {
+        self.stores.any()
+    }
+
+    fn verify(&self, store: String, reports: Vec<Reported>) {
+        let it = self.clone();
+        tokio::spawn(async move {
+            let (reports, blind) = it.verified(&store, reports).await;
+            let command = Command::Verified {
+                store,
+                reports,
+                blind,
+            };
+            // An actor that is gone needs no answer.
+            let _ = it.commands.send(command).await;
+        });
+    }
 }
 
 impl Submissions {
-    /// If the store holds what is reported, drops what is recorded instead, and says so.
-    async fn judged(&self, report: &Finished, dispute: Dispute) -> Option<String> {
+    /// Drops what is recorded instead of a report on which two workers agree, and says so.
+    async fn replaced(&self, report: &Finished, dispute: Dispute) -> Option<String> {
+        let (catalog, stage) = (self.catalog.clone(), dispute.stage);
+        let read = self.lanes.read(move || async move {
+            let record = catalog.job(stage.job).await.ok()??;
+            let spec = record.job.spec.stages.get(stage.stage as usize)?;
+            Some(ResultSet::of(spec))
+        });
+        let gone = Gone {
+            set: read.await?,
+            task: report.index,
+            manifest: dispute.recorded,
+        };
+        self.catalog.drop_output(&gone).await.ok()?.then(|| {
+            format!(
+                "task {} was recorded with manifest {}; two other workers agree on {}, which counts.",
+                gone.task,
+                hex::encode(gone.manifest),
+                report.manifest_sha256
+            )
+        })
+    }
+
+    /// If the store holds what is reported, drops what is recorded instead, and says so. `None` if that cannot be found out.
+    async fn judged(&self, report: &Finished, dispute: Dispute) -> Option<Ruling> {
         let mut manifest = [0; 32];
         hex::decode_to_slice(&report.manifest_sha256, &mut manifest).ok()?;
         let (catalog, stage) = (self.catalog.clone(), dispute.stage);
@@ -47,16 +104,11 @@ impl Submissions {
             Some((spec.clone(), ResultSet::of(spec)))
         });
         let (spec, set) = read.await?;
-        let output = Recorded {
-            task: report.index,
-            manifest,
-            checked: false,
-        };
-        let outputs = [output];
-        let asked = self.stores.look(&spec, &set, &outputs, look::deadline());
-        let (found, _) = asked.await;
-        if found.get(&report.index) != Some(&Found::Equal) {
-            return None;
+        if !self.holds(&spec, &set, report.index, manifest).await? {
+            let stands = self
+                .holds(&spec, &set, report.index, dispute.recorded)
+                .await?;
+            return stands.then_some(Ruling::Stands);
         }
         let gone = Gone {
             set,
@@ -65,13 +117,38 @@ impl Submissions {
         };
         let place = format!("{} in {}", gone.set.dataset, gone.set.store);
         self.catalog.drop_output(&gone).await.ok()?.then(|| {
-            format!(
+            Ruling::Overruled(format!(
                 "task {} was recorded with manifest {}, which is not what {place} holds; it holds what was reported now, {}, \
-                 and that counts. Who reported the first result?",
+                 and that counts.",
                 gone.task,
                 hex::encode(gone.manifest),
                 report.manifest_sha256
-            )
+            ))
         })
+    }
+
+    /// Whether the store holds this result; `None` if that cannot be found out.
+    async fn holds(
+        &self,
+        spec: &StageSpec,
+        set: &ResultSet,
+        task: u64,
+        manifest: [u8; 32],
+    ) -> Option<bool> {
+        let output = Recorded {
+            task,
+            manifest,
+            checked: false,
+        };
+        let outputs = [output];
+        let asked = self
+            .stores
+            .look(spec, &set.store, &outputs, look::deadline());
+        let (found, _) = asked.await;
+        match found.get(&task)? {
+            Found::Equal => Some(true),
+            Found::Gone | Found::Differs => Some(false),
+            Found::NoFolder | Found::NoStore => None,
+        }
     }
 }

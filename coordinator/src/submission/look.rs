@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use picofarm_catalog::{Recorded, ResultSet};
+use picofarm_catalog::Recorded;
 use picofarm_proto::model::StageSpec;
 use tokio::{
     sync::Semaphore,
@@ -17,6 +17,8 @@ use crate::stored::{Found, Stored};
 
 /// How long a plan or submission waits for stores.
 const PATIENCE: Duration = Duration::from_secs(20);
+/// How long a worker's report waits for its store.
+const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 /// How long a store that did not answer is not asked again.
 const SILENT: Duration = Duration::from_secs(60);
 /// Who may ask one store at a time, and all of them.
@@ -39,6 +41,11 @@ pub(crate) struct Stores {
 struct Store {
     lane: Arc<Semaphore>,
     silent_until: Option<Instant>,
+}
+
+/// When a report waits no longer for its store, and is committed as unverified.
+pub(crate) fn soon() -> Instant {
+    Instant::now() + REPORT_PATIENCE
 }
 
 /// When a plan waits no longer for stores.
@@ -64,7 +71,7 @@ impl Stores {
     pub(crate) async fn look(
         &self,
         stage: &StageSpec,
-        set: &ResultSet,
+        place: &str,
         outputs: &[Recorded],
         until: Instant,
     ) -> (BTreeMap<u64, Found>, Option<String>) {
@@ -75,7 +82,7 @@ impl Stores {
         let Some(reader) = &self.reader else {
             return (found, Some(UNTOLD.into()));
         };
-        let store = self.store(&set.store);
+        let store = self.store(place);
         if store.silent_until.is_some_and(|at| Instant::now() < at) {
             let why = "the store did not answer a moment ago";
             return (found, Some(why.into()));
@@ -94,7 +101,7 @@ impl Stores {
             Ok(Ok(())) => None,
             Ok(Err(why)) => Some(why),
             Err(_) if found.is_empty() => {
-                self.silent(&set.store);
+                self.silent(place);
                 let seconds = PATIENCE.as_secs();
                 Some(format!("the store did not answer within {seconds} s"))
             }
@@ -128,4 +135,4 @@ impl Stores {
 }
 
 /// Why a coordinator that was given nothing to look with does not look.
-const UNTOLD: &str = "this coordinator looks into no stores (--check-stores says into which)";
+const UNTOLD: &str = "this coordinator looks into no stores (--check-stores none)";

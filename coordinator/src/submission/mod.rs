@@ -6,18 +6,22 @@
 
 mod check;
 mod draft;
+mod foresee;
 mod judge;
 mod look;
+mod places;
 mod report;
+mod verify;
 
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, Run, StageRecord, Submission,
+    Catalog, CatalogError, Gone, Job, Outcome, OwnedPlace, Owner, Recorded, ResultSet, Run, Specs,
+    StageRecord, Submission,
 };
 use picofarm_proto::{
     ids::JobId,
-    model::{JobPlan, JobState},
+    model::{JobPlan, JobState, SpecError},
 };
 use tokio::sync::{Mutex, mpsc};
 use uuid::Uuid;
@@ -28,6 +32,7 @@ use crate::{
     clock::Clock,
     core::{Learnt, Prepared, Timings, may_force, place_is_free, prepare, stands_for},
     lanes::Lanes,
+    memory::{Charge, Memory, kept_cost},
     stored::{Found, Stored},
 };
 use check::Findings;
@@ -50,6 +55,9 @@ pub(crate) struct Submissions {
     clock: Clock,
     /// What callers see of others' jobs.
     visibility: Visibility,
+    memory: Arc<Memory>,
+    /// What is known of whether the stores here are those of the workers.
+    evidence: verify::Evidence,
     /// Held while a job is counted against its user's quota and recorded.
     turn: Arc<Mutex<()>>,
 }
@@ -59,6 +67,8 @@ struct Facts {
     /// By stage.
     recorded: Vec<Vec<Recorded>>,
     latest: Option<Latest>,
+    /// Normal forms of others' places that the caller may write into.
+    permitted: Vec<String>,
 }
 
 /// The latest job with the same spec.
@@ -77,6 +87,8 @@ struct Considered {
     lost: bool,
     /// By stage.
     findings: Vec<Findings>,
+    /// Normal forms of others' places that the caller may write into.
+    permitted: Vec<String>,
 }
 
 impl Submissions {
@@ -87,6 +99,7 @@ impl Submissions {
         commands: mpsc::Sender<Command>,
         clock: Clock,
         visibility: Visibility,
+        memory: Arc<Memory>,
     ) -> Self {
         Self {
             catalog,
@@ -95,13 +108,60 @@ impl Submissions {
             commands,
             clock,
             visibility,
+            memory,
+            evidence: Arc::default(),
             turn: Arc::default(),
         }
     }
 
     /// What submitting would do.
     pub(crate) async fn plan(&self, draft: &Arc<Draft>, by: &Caller) -> Result<JobPlan, Refusal> {
+        self.in_time(draft)?;
         Ok(self.consider(draft, by).await?.plan)
+    }
+
+    /// Refuses a deadline that has passed, because the job would be cancelled at once.
+    fn in_time(&self, draft: &Draft) -> Result<(), Refusal> {
+        let limits = &draft.spec.limits;
+        let deadline = limits.deadline_ms().map_err(Refusal::Spec)?;
+        if deadline.is_some_and(|at| at <= self.clock.now_ms()) {
+            let what = format!(
+                "{:?} is in the past, so the job would be cancelled at once; give a later time, or remove it",
+                limits.deadline
+            );
+            return Err(Refusal::Spec(SpecError::new("limits.deadline", what)));
+        }
+        Ok(())
+    }
+
+    /// Adds warnings and estimates to a plan.
+    async fn foresee(
+        &self,
+        draft: &Draft,
+        plan: &mut JobPlan,
+        recent: &[Job],
+    ) -> Result<(), Refusal> {
+        let (reply, answer) = tokio::sync::oneshot::channel();
+        let ask = Command::Fits(Arc::clone(&draft.spec), reply);
+        let gone = || Refusal::NotNow("the coordinator is stopping; try again".into());
+        self.commands.send(ask).await.map_err(|_| gone())?;
+        let fits = answer.await.map_err(|_| gone())??;
+        let stages = draft.spec.stages.iter().zip(&fits.stages);
+        for (planned, (stage, fit)) in plan.stages.iter_mut().zip(stages) {
+            planned.workers = fit.able;
+            if planned.run == 0 {
+                continue;
+            }
+            let mut measured = Vec::new();
+            for other in foresee::similar(stage, recent) {
+                let timing = self.catalog.timing(&ResultSet::of(other)).await;
+                measured.push((other, timing.map_err(broken)?));
+            }
+            (planned.task_seconds, planned.task_bytes, planned.measured) =
+                foresee::estimate(stage, fit, &measured);
+        }
+        plan.warnings = foresee::warnings(&draft.spec, plan, &fits);
+        Ok(())
     }
 
     /// Records a job, unless there is one that stands for it. `most`: jobs that the caller may have that have not ended.
@@ -112,6 +172,7 @@ impl Submissions {
         most: u64,
         again: bool,
     ) -> Result<Submitted, Refusal> {
+        self.in_time(draft)?;
         for _ in 0..ATTEMPTS {
             let considered = self.consider(draft, by).await?;
             let latest = considered.latest.as_ref();
@@ -148,7 +209,11 @@ impl Submissions {
                 |it, draft| async move { it.facts(&draft, &whose).await },
             )
             .await?;
-        let Facts { recorded, latest } = facts;
+        let Facts {
+            recorded,
+            latest,
+            permitted,
+        } = facts;
         let until = look::deadline();
         let mut findings = Vec::with_capacity(recorded.len());
         for (position, recorded) in recorded.into_iter().enumerate() {
@@ -160,11 +225,18 @@ impl Submissions {
             job.state == JobState::Done && lost.any(|lost| lost)
         });
         let existing = latest.as_ref().map(|job| job.id);
+        let stands = !lost
+            && latest
+                .as_ref()
+                .is_some_and(|job| job.state == JobState::Done);
         let (plan, findings) = self
             .heavy(draft, move |it, draft| async move {
                 let catalog = Arc::clone(&it.catalog);
+                let _charge = it.charge(&draft, Specs::Recent(RECENT, &sight)).await?;
                 let recent = catalog.recent(RECENT, &sight).await.map_err(broken)?;
-                Ok((report::plan(&draft, &findings, existing, &recent), findings))
+                let mut plan = report::plan(&draft, &findings, (existing, stands), &recent);
+                it.foresee(&draft, &mut plan, &recent).await?;
+                Ok((plan, findings))
             })
             .await?;
         Ok(Considered {
@@ -172,18 +244,28 @@ impl Submissions {
             latest,
             lost,
             findings,
+            permitted,
         })
+    }
+
+    /// Takes memory for these specs until the value is dropped.
+    async fn charge(&self, draft: &Draft, specs: Specs<'_>) -> Result<Option<Charge>, Refusal> {
+        let bytes = self.catalog.spec_bytes(specs).await.map_err(broken)?;
+        draft.charge(bytes).await.map_err(Refusal::TooMany)
     }
 
     /// What the catalog holds of it.
     async fn facts(&self, draft: &Draft, by: &Caller) -> Result<Facts, Refusal> {
         let catalog = &self.catalog;
         let sight = by.sight(self.visibility);
+        let permitted = self.permitted(draft, by).await?;
         let mut recorded = Vec::with_capacity(draft.stages().len());
         for (stage, record) in draft.spec.stages.iter().zip(draft.stages()) {
             let set = &record.set;
             let writes = stage.task.writes().is_some();
             if writes || stage.force {
+                let at = Specs::At(&set.store, &set.dataset);
+                let _charge = self.charge(draft, at).await?;
                 let others = catalog.jobs_at(&set.store, &set.dataset).await;
                 let others = others.map_err(broken)?;
                 if writes {
@@ -197,7 +279,9 @@ impl Submissions {
             recorded.push(catalog.recorded(set, record.tasks).await.map_err(broken)?);
         }
         let circle = self.visibility.circle(by, &draft.spec);
-        let latest = catalog.job_with(&draft.identity(&circle)).await;
+        let identity = draft.identity(&circle);
+        let _charge = self.charge(draft, Specs::With(&identity)).await?;
+        let latest = catalog.job_with(&identity).await;
         let latest = latest.map_err(broken)?;
         Ok(Facts {
             recorded,
@@ -206,7 +290,35 @@ impl Submissions {
                 id: job.id,
                 state: job.state,
             }),
+            permitted,
         })
+    }
+
+    /// Checks that the caller may write into every place that the job names. Returns others' places among them.
+    async fn permitted(&self, draft: &Draft, by: &Caller) -> Result<Vec<String>, Refusal> {
+        let sight = by.sight(self.visibility);
+        let owner = Owner {
+            user: by.name.to_string(),
+            project: draft.spec.project.clone(),
+        };
+        let mut permitted = Vec::new();
+        for (position, mine) in places::written(&draft.spec.stages, draft.stages(), &owner) {
+            let (stage, record) = (&draft.spec.stages[position], &draft.stages()[position]);
+            let near = self.catalog.owned_near(&mine.place).await.map_err(broken)?;
+            for (other, may_write) in places::of_others(&mine, &near, by) {
+                if !may_write {
+                    // The same results may be reused, but none added.
+                    let theirs = self.catalog.largest_stage(&record.set, &other.owner.user);
+                    let theirs = theirs.await.map_err(broken)?;
+                    if other.place != mine.place || record.tasks > theirs {
+                        let why = places::refused(stage, &mine, other, &sight);
+                        return Err(Refusal::Denied(draft.spec.at(stage, why).to_string()));
+                    }
+                }
+                permitted.push(other.place.clone());
+            }
+        }
+        Ok(permitted)
     }
 
     /// Asks the store of a stage about its recorded outputs.
@@ -220,13 +332,17 @@ impl Submissions {
         let (stage, set) = (&draft.spec.stages[position], &draft.stages()[position].set);
         let chosen = check::choose(&recorded, &draft.hash);
         let some: Vec<Recorded> = chosen.iter().map(|i| recorded[*i]).collect();
-        let (mut found, mut why) = self.stores.look(stage, set, &some, until).await;
+        let (mut found, mut why) = self.stores.look(stage, &set.store, &some, until).await;
         if why.is_none() && check::suspicious(&recorded, &found) {
             let passed = recorded.iter().filter(|o| !found.contains_key(&o.task));
             let passed: Vec<Recorded> = passed.copied().collect();
-            let (more, stopped) = self.stores.look(stage, set, &passed, until).await;
+            let (more, stopped) = self.stores.look(stage, &set.store, &passed, until).await;
             found.extend(more);
             why = stopped;
+        }
+        if let Some(another) = self.sees_another_disk(set.store.trim_end_matches('/')) {
+            found.retain(|_, found| *found == Found::Equal);
+            why = Some(another);
         }
         let is_new = |o: &&Recorded| !o.checked && found.get(&o.task) == Some(&Found::Equal);
         let new: Vec<Recorded> = recorded.iter().filter(is_new).copied().collect();
@@ -252,7 +368,8 @@ impl Submissions {
             .latest
             .filter(|_| considered.lost)
             .map(|job| job.id);
-        let findings = considered.findings;
+        let (findings, permitted) = (considered.findings, considered.permitted);
+        let anyone = by.is_anyone();
         let recorded = self.heavy(draft, move |it, draft| async move {
             let _turn = it.turn.lock().await;
             if it.catalog.jobs_of(&owner).await.map_err(broken)? >= most {
@@ -261,12 +378,20 @@ impl Submissions {
                      some to end, or cancel some"
                 )));
             }
+            it.memory.room_for_job(draft.kept).map_err(Refusal::TooMany)?;
             let counts: Vec<Vec<Run>> = findings.iter().map(|f| f.counts.clone()).collect();
             let mut make_id = Uuid::now_v7;
             let prepared = prepare(&draft, owner, &circle, &counts, &mut make_id, it.clock.now_ms());
             let dropped = findings.iter().zip(draft.stages());
             let gone: Vec<Gone> = dropped.flat_map(|(f, stage)| f.dropped(&stage.set)).collect();
-            it.commit(prepared, &gone, instead_of).await
+            let owner = Owner::from(&prepared.job);
+            // Without tokens, everybody is the same caller, and owns nothing.
+            let places = match anyone {
+                true => Vec::new(),
+                false => places::written(&draft.spec.stages, &prepared.stages, &owner),
+            };
+            let places: Vec<OwnedPlace> = places.into_iter().map(|(_, place)| place).collect();
+            it.commit(prepared, &gone, instead_of, (&places, &permitted)).await
         });
         let Some(job) = recorded.await? else {
             return Ok(None);
@@ -283,6 +408,7 @@ impl Submissions {
         prepared: Prepared,
         gone: &[Gone],
         instead_of: Option<JobId>,
+        (places, permitted): (&[OwnedPlace], &[String]),
     ) -> Result<Option<JobId>, Refusal> {
         let Prepared {
             job,
@@ -293,6 +419,8 @@ impl Submissions {
         let submission = Submission {
             gone,
             instead_of,
+            places,
+            permitted,
             ..Submission::new(&job, &stages, &ranges, &events)
         };
         match self.catalog.record(&submission).await {
@@ -326,6 +454,7 @@ impl Submissions {
         // A job without anything to run has ended by now.
         let state = self.catalog.state(job.id).await.map_err(broken)?;
         let learnt = Learnt {
+            kept: kept_cost(&job.spec),
             job,
             stages,
             timings,

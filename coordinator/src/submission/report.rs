@@ -6,11 +6,12 @@ use picofarm_proto::{ids::JobId, model::JobPlan};
 use super::{Draft, check::Findings};
 use crate::plan;
 
-/// The plan, given for each stage what was found of its outputs, the job that has this spec, and recent jobs.
+/// The plan, given for each stage what was found of its outputs, the job that has this spec, and recent jobs. If that job is
+/// done and `stands`, submitting answers with it, and nothing runs.
 pub(super) fn plan(
     draft: &Draft,
     findings: &[Findings],
-    existing_job: Option<JobId>,
+    (existing_job, stands): (Option<JobId>, bool),
     recent: &[Job],
 ) -> JobPlan {
     let counts: Vec<_> = findings.iter().map(|f| f.counts.clone()).collect();
@@ -18,6 +19,16 @@ pub(super) fn plan(
     let stages = plan.stages.iter_mut().zip(&draft.spec.stages);
     for ((planned, stage), (record, found)) in stages.zip(draft.stages().iter().zip(findings)) {
         let words = found.words(stage, &record.set);
+        if stands {
+            planned.reuse = planned.total;
+            planned.run = 0;
+            planned.reasons = vec![format!(
+                "{} of {} are done by that job",
+                planned.total, planned.total
+            )];
+            planned.reasons.extend(words);
+            continue;
+        }
         // Why the rest runs is said by these words alone, where all of it was recorded.
         let explained = found.recorded >= planned.total && !stage.force;
         if explained && !words.is_empty() {
@@ -25,5 +36,7 @@ pub(super) fn plan(
         }
         planned.reasons.extend(words);
     }
+    plan.reuse = plan.stages.iter().map(|stage| stage.reuse).sum();
+    plan.run = plan.stages.iter().map(|stage| stage.run).sum();
     plan
 }

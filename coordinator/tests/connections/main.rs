@@ -1,6 +1,7 @@
 //! What connections may do to a coordinator: hundreds that say nothing, slow ones, idle ones; and certificates that change
 //! while it runs.
 
+mod memory;
 mod pages;
 mod tls;
 
@@ -241,8 +242,11 @@ async fn new_certificates_are_used_without_a_restart_and_bad_ones_are_not() {
         }
     };
     assert!(refused, "the old authority's clients are let in still");
-    // Who was connected stays.
-    works(before).await;
+    // Nor is one that was connected before: it may have been revoked with its authority.
+    let info = wire::GetServerInfoRequest {};
+    let refused = JobsClient::new(before).get_server_info(info).await;
+    let refused = refused.expect_err("the old authority's clients are let in still");
+    assert!(refused.message().contains("connect again"), "{refused}");
 
     // The key of another certificate; the present ones stay in force.
     std::fs::write(folder.path().join("server.pem"), old.pem()).unwrap();

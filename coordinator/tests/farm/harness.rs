@@ -47,6 +47,8 @@ pub struct FakeStore {
     pub closed: Mutex<Option<String>>,
     /// It never answers.
     pub hangs: AtomicBool,
+    /// This machine has no such folder.
+    pub absent: AtomicBool,
     /// How many results it was asked about.
     pub asked: AtomicUsize,
 }
@@ -74,6 +76,9 @@ impl Stored for FakeStore {
             }
             if let Some(why) = &*self.closed.lock().unwrap() {
                 return Err(why.clone());
+            }
+            if self.absent.load(Ordering::SeqCst) {
+                return Ok(vec![Found::NoFolder; results.len()]);
             }
             self.asked.fetch_add(results.len(), Ordering::SeqCst);
             let instead = self.instead.lock().unwrap();
@@ -302,6 +307,7 @@ pub fn hello(name: &str) -> WorkerHello {
         protocol: PROTOCOL,
         held: Vec::new(),
         ended: String::new(),
+        ends_in_ms: None,
         abilities: Abilities {
             kinds: ["render", "reprocess"]
                 .map(|kind| (kind.to_owned(), "r1".to_owned()))
@@ -394,7 +400,8 @@ impl Worker {
         }
     }
 
-    pub async fn report(&mut self, lease: &Lease, index: u64, manifest: &str) -> wire::Acknowledge {
+    /// Reports a task and waits for no answer.
+    pub async fn say_done(&mut self, lease: &Lease, index: u64, manifest: &str) {
         let done = wire::TaskDone {
             lease: Some(lease.lease.into()),
             index,
@@ -406,6 +413,10 @@ impl Worker {
             traceparent: String::new(),
         };
         self.say(Say::Done(done)).await;
+    }
+
+    pub async fn report(&mut self, lease: &Lease, index: u64, manifest: &str) -> wire::Acknowledge {
+        self.say_done(lease, index, manifest).await;
         self.acknowledged().await
     }
 
@@ -419,6 +430,7 @@ impl Worker {
             index,
             kind: kind.into(),
             message: "no such mesh".into(),
+            damaged: false,
         }))
         .await;
         assert!(self.acknowledged().await.accepted);
@@ -446,6 +458,7 @@ impl Worker {
                 })
                 .into_iter()
                 .collect(),
+            ends_in_ms: 0,
         }))
         .await;
         match self.hear().await.unwrap() {

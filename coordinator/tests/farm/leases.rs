@@ -1,5 +1,6 @@
 //! Fencing: whoever lost a lease changes nothing any more, whoever still has it loses nothing.
 
+use picofarm_database::{CatalogPlace, testing::hold_writes};
 use picofarm_proto::{
     ids::Incarnation,
     model::JobState,
@@ -7,7 +8,7 @@ use picofarm_proto::{
 };
 use uuid::Uuid;
 
-use crate::harness::{Farm, LEASE_MS, hello, manifest, spec};
+use crate::harness::{Farm, LEASE_MS, catalog_of, hello, manifest, spec};
 
 #[tokio::test]
 async fn a_report_after_expiry_is_refused() {
@@ -36,19 +37,37 @@ async fn a_report_after_expiry_is_refused() {
 
 #[tokio::test]
 async fn a_heartbeat_keeps_a_lease() {
-    let farm = {
-        let mut farm = Farm::start().await;
-        farm.submit(&spec(1)).await;
-        farm
-    };
+    let mut farm = Farm::start().await;
+    let job = farm.submit(&spec(1)).await.job_id;
     let mut worker = farm.worker().await;
     let lease = worker.lease().await;
     for _ in 0..3 {
         farm.pass(i64::from(LEASE_MS) - 1_000);
         assert_eq!(worker.beat(&[&lease], Some(0)).await.len(), 1);
+        // The session answers before the actor has heard; the actor answers calls in order.
+        farm.status(&job).await;
     }
     assert!(worker.done(&lease, 0).await.accepted);
     assert!(worker.beat(&[&lease], None).await.is_empty());
+}
+
+#[tokio::test]
+async fn a_heartbeat_does_not_wait_for_the_catalog() {
+    let mut farm = Farm::start().await;
+    farm.submit(&spec(3)).await;
+    let mut worker = farm.worker().await;
+    let lease = worker.lease().await;
+    let CatalogPlace::Sqlite(path) = catalog_of(&farm) else {
+        panic!("this farm's catalog is a file");
+    };
+    let held = hold_writes(&path).await;
+    // What the actor now waits for.
+    worker.say_done(&lease, lease.lo, &manifest(lease.lo)).await;
+    for _ in 0..5 {
+        assert_eq!(worker.beat(&[&lease], None).await, [lease.lease.into()]);
+    }
+    drop(held);
+    assert!(worker.acknowledged().await.accepted);
 }
 
 #[tokio::test]
@@ -247,6 +266,7 @@ async fn a_lost_worker_is_charged_to_the_task_it_had_in_hand() {
     let in_hand = lease.hi - 1;
     assert!(in_hand > lease.lo);
     worker.beat(&[&lease], Some(in_hand)).await;
+    worker.beat(&[], None).await;
     let running = farm.status(&job).await.running;
     assert_eq!((running.len(), running[0].index), (1, in_hand));
     drop(worker);

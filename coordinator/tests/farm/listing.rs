@@ -100,3 +100,40 @@ async fn a_request_for_a_list_that_makes_no_sense_is_refused_by_its_field() {
         assert!(refused.message().starts_with(field), "{refused:?}");
     }
 }
+
+#[tokio::test]
+#[allow(clippy::needless_update, reason = "some requests have one field alone")]
+async fn each_text_of_each_call_is_checked_before_the_catalog_sees_it() {
+    for mut farm in Farm::start_on_each().await {
+        let jobs = &mut farm.jobs;
+        let texts = ["a\0b", "a\u{1b}[2Jb", &"x".repeat(100_000), "\u{202e}"];
+        for text in texts.map(str::to_owned) {
+            macro_rules! refused {
+                ($call:ident, $request:ident, $field:ident) => {{
+                    let mut request = wire::$request::default();
+                    request.$field = text.clone();
+                    let refused = jobs.$call(request).await.unwrap_err();
+                    let call = stringify!($call);
+                    assert_eq!(refused.code(), Code::InvalidArgument, "{call}: {refused:?}");
+                    let field = stringify!($field);
+                    assert!(refused.message().starts_with(field), "{call}: {refused:?}");
+                    assert!(refused.message().len() < 5_000, "{call}");
+                }};
+            }
+            refused!(list_audit, ListAuditRequest, who);
+            refused!(list_audit, ListAuditRequest, job_id);
+            refused!(list_events, ListEventsRequest, job_id);
+            refused!(explain_job, ExplainJobRequest, job_id);
+            refused!(get_job, GetJobRequest, job_id);
+            refused!(watch_job, WatchJobRequest, job_id);
+            refused!(cancel_job, CancelJobRequest, job_id);
+            refused!(pause_job, PauseJobRequest, job_id);
+            refused!(resume_job, ResumeJobRequest, job_id);
+            refused!(retry_job, RetryJobRequest, job_id);
+            refused!(drain_worker, DrainWorkerRequest, worker);
+            refused!(list_jobs, ListJobsRequest, user);
+            refused!(list_jobs, ListJobsRequest, find);
+            refused!(list_jobs, ListJobsRequest, page_token);
+        }
+    }
+}

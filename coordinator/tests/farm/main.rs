@@ -10,3 +10,4 @@ mod poison;
 mod results;
 mod sharing;
 mod start;
+mod verified;

@@ -39,6 +39,7 @@ fn failure(lease: &Lease, index: u64, message: &str) -> Say {
         index,
         kind: wire::FailureKind::User.into(),
         message: message.into(),
+        damaged: false,
     })
 }
 

@@ -81,7 +81,9 @@ async fn a_deleted_store_leaves_nothing_done() {
 #[tokio::test]
 async fn of_many_results_a_sample_is_looked_at_and_all_once_one_of_them_is_gone() {
     let mut farm = Farm::start().await;
+    farm.stored.close("it is on another machine");
     let (_, _worker) = done(&mut farm, 1_500).await;
+    *farm.stored.closed.lock().unwrap() = None;
     farm.plan(&spec(1_500)).await;
     let stored = farm.stored.clone();
     let first = stored.asked.swap(0, Ordering::SeqCst);
@@ -150,10 +152,10 @@ async fn between_two_manifests_the_store_decides_and_not_who_came_first() {
     for mut farm in Farm::start_on_each().await {
         let job = farm.submit(&spec(1)).await.job_id;
         let mut liar = farm.worker().await;
+        farm.stored.close("it is far away");
         let lease = liar.lease().await;
         assert!(liar.report(&lease, 0, &"f".repeat(64)).await.accepted);
         farm.until_ended(&job).await;
-        farm.stored.close("it is far away");
         let next = farm.submit(&renamed(1)).await.job_id;
         *farm.stored.closed.lock().unwrap() = None;
         farm.stored.put(0, Some(bytes(7)));

@@ -212,6 +212,7 @@ async fn of_a_held_job_a_worker_keeps_the_task_in_hand_alone() {
     assert!(held.len() > 1 && held[0].hi > held[0].lo + 1, "{held:?}");
     let leases: Vec<&Lease> = held.iter().collect();
     worker.beat(&leases, Some(held[0].lo)).await;
+    worker.beat(&[], None).await;
     let pause = wire::PauseJobRequest {
         job_id: job.clone(),
     };
@@ -274,6 +275,7 @@ async fn a_task_that_takes_far_too_long_runs_a_second_time_and_the_first_result_
     assert!(slow.done(&first, first.lo).await.accepted);
     let last = slow.lease().await;
     slow.beat(&[&last], Some(last.lo)).await;
+    slow.beat(&[], None).await;
     let mut idle = Worker::connect(farm.address(), hello("idle"))
         .await
         .unwrap();
@@ -307,6 +309,7 @@ async fn a_double_ends_with_the_task_and_costs_it_nothing() {
     assert!(slow.done(&first, first.lo).await.accepted);
     let last = slow.lease().await;
     slow.beat(&[&last], Some(last.lo)).await;
+    slow.beat(&[], None).await;
     farm.pass(15_000);
     let mut clumsy = Worker::connect(farm.address(), hello("clumsy"))
         .await
@@ -337,9 +340,15 @@ async fn a_worker_at_which_one_task_after_another_fails_is_passed_over_while_oth
         let lease = broken.lease().await;
         broken.fail(&lease, lease.lo, wire::FailureKind::User).await;
     }
-    // Alone it goes on: perhaps the job is to blame.
-    let lease = broken.lease().await;
-    assert!(broken.release(&lease).await.accepted);
+    // Alone it goes on, more slowly: perhaps the job is to blame.
+    broken.credit(1).await;
+    assert!(broken.beat(&[], None).await.is_empty());
+    farm.pass(10_001);
+    let Heard::Lease(lease) = broken.hear().await.unwrap() else {
+        panic!("expected a lease");
+    };
+    let lease: Lease = lease.try_into().unwrap();
+    broken.fail(&lease, lease.lo, wire::FailureKind::User).await;
     let mut sound = Worker::connect(farm.address(), hello("sound"))
         .await
         .unwrap();
@@ -415,4 +424,54 @@ async fn a_drained_worker_hears_it_and_gets_nothing_more() {
     };
     let unknown = farm.jobs.drain_worker(drain).await.unwrap_err();
     assert_eq!(unknown.code(), tonic::Code::NotFound);
+}
+
+#[tokio::test]
+async fn a_deadline_in_the_past_is_refused_by_plan_and_submission() {
+    let mut farm = Farm::start().await;
+    let mut late = spec(3);
+    // The clock of these tests begins 1,000 s after 1970.
+    late.limits.deadline = "1970-01-01T00:10:00Z".into();
+    let submit = wire::SubmitJobRequest {
+        spec: Some(late.clone().into()),
+        again: false,
+    };
+    let refused = farm.jobs.submit_job(submit).await.unwrap_err();
+    let plan = wire::PlanJobRequest {
+        spec: Some(late.into()),
+    };
+    for status in [refused, farm.jobs.plan_job(plan).await.unwrap_err()] {
+        assert_eq!(status.code(), tonic::Code::InvalidArgument, "{status:?}");
+        let said = status.message();
+        assert!(
+            said.contains("limits.deadline") && said.contains("is in the past"),
+            "{said}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_plan_warns_of_what_no_connected_worker_has_and_estimates_from_earlier_tasks() {
+    let mut farm = Farm::start().await;
+    let mut big = spec(2);
+    big.stages[0].resources.cores = 1000;
+    let plan = farm.plan(&big).await;
+    assert!(
+        plan.warnings[0].contains("no worker is connected"),
+        "{plan:?}"
+    );
+    let job = farm.submit(&spec(2)).await.job_id;
+    let mut worker = farm.worker().await;
+    let lease = worker.lease().await;
+    for task in lease.lo..lease.hi {
+        assert!(worker.done(&lease, task).await.accepted);
+    }
+    let plan = farm.plan(&big).await;
+    assert!(plan.warnings[0].contains("1000 cores"), "{plan:?}");
+    let plan = farm.plan(&named("more", 200)).await;
+    assert!(plan.warnings.is_empty(), "{plan:?}");
+    let stage = &plan.stages[0];
+    assert_eq!(stage.workers, 1);
+    assert!(stage.measured && stage.task_seconds.is_some(), "{stage:?}");
+    drop((worker, job));
 }

@@ -40,11 +40,11 @@ async fn a_restarted_coordinator_goes_on_where_it_was() {
 #[tokio::test]
 async fn a_worker_of_another_version_is_refused() {
     let farm = Farm::start().await;
-    let mut other = hello("old");
-    other.version = "0.0.1".into();
+    let mut other = hello("new");
+    other.version = "7.0.0".into();
     let error = farm.connect(other).await.err().unwrap();
     assert_eq!(error.code(), Code::FailedPrecondition);
-    assert!(error.message().contains("same version"), "{error}");
+    assert!(error.message().contains("worker is newer"), "{error}");
     let mut other = hello("strange");
     other.protocol += 1;
     let error = farm.connect(other).await.err().unwrap();

@@ -2,6 +2,7 @@
 //! of it.
 
 mod harness;
+mod places;
 
 use std::time::{Duration, Instant};
 

@@ -1,8 +1,12 @@
 //! Certificates, keys and secrets on disk, read the same way by both sides: every error names the file and how to
 //! repair it, and no secret can reach a log.
 
+mod locked;
+
 use std::{
-    fmt, io,
+    fmt,
+    fs::File,
+    io::{self, Read},
     path::{Path, PathBuf},
     time::{SystemTime, UNIX_EPOCH},
 };
@@ -16,6 +20,13 @@ use x509_parser::{
     extensions::GeneralName,
     prelude::{FromDer, X509Certificate},
 };
+
+pub use locked::LockedFile;
+
+/// Largest file with a secret, bytes.
+const LARGEST_SECRET: u64 = 1 << 20;
+/// Largest file with certificates or a key, bytes: a system's list of authorities is some 300 kB.
+const LARGEST_PEM: u64 = 16 << 20;
 
 /// A secret text. Shown by neither `Debug` nor `Display`; [`Secret::expose`] is the only way to it.
 #[derive(Clone, PartialEq, Eq)]
@@ -38,7 +49,8 @@ impl Secret {
     /// The file cannot be read, is empty, or is open to everyone on the machine.
     pub fn read(path: &Path) -> Result<Self, CredentialError> {
         private(path)?;
-        let text = std::fs::read_to_string(path).map_err(|e| CredentialError::read(path, e))?;
+        // It may come from a pipe, e.g. of a program that keeps secrets.
+        let text = text(path, read_bytes(path, LARGEST_SECRET)?)?;
         let line = text.lines().next().unwrap_or_default().trim();
         if line.is_empty() {
             return Err(CredentialError::unusable(
@@ -73,6 +85,14 @@ pub enum CredentialError {
         /// The system's answer.
         source: io::Error,
     },
+    /// The file cannot be written.
+    #[error("{}: {source}; check that this user may write there", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's answer.
+        source: io::Error,
+    },
     /// Everyone on the machine has access to it.
     #[error(
         "{}: others than its owner and group have access to it (mode {mode:03o}); run `chmod o-rwx {}`",
@@ -97,6 +117,13 @@ pub enum CredentialError {
 impl CredentialError {
     fn read(path: &Path, source: io::Error) -> Self {
         Self::Read {
+            path: path.to_owned(),
+            source,
+        }
+    }
+
+    fn write(path: &Path, source: io::Error) -> Self {
+        Self::Write {
             path: path.to_owned(),
             source,
         }
@@ -127,6 +154,49 @@ pub fn private(path: &Path) -> Result<(), CredentialError> {
     Ok(())
 }
 
+/// Reads a file of at most `most` bytes.
+///
+/// # Errors
+/// The file cannot be read, or is larger.
+pub fn read_bytes(path: &Path, most: u64) -> Result<Vec<u8>, CredentialError> {
+    let file = File::open(path).map_err(|e| CredentialError::read(path, e))?;
+    read_at_most(&file, path, most)
+}
+
+/// Reads a regular text file of at most `most` bytes. A pipe is not waited for.
+///
+/// # Errors
+/// The file cannot be read, is not a regular file, is larger, or is not UTF-8.
+pub fn read_text(path: &Path, most: u64) -> Result<String, CredentialError> {
+    let metadata = std::fs::metadata(path).map_err(|e| CredentialError::read(path, e))?;
+    if !metadata.is_file() {
+        return Err(CredentialError::unusable(
+            path,
+            "is not a regular file; give the path of one",
+        ));
+    }
+    text(path, read_bytes(path, most)?)
+}
+
+fn text(path: &Path, bytes: Vec<u8>) -> Result<String, CredentialError> {
+    String::from_utf8(bytes)
+        .map_err(|_| CredentialError::unusable(path, "is not a text file; expected UTF-8"))
+}
+
+fn read_at_most(file: &File, path: &Path, most: u64) -> Result<Vec<u8>, CredentialError> {
+    let mut bytes = Vec::new();
+    file.take(most.saturating_add(1))
+        .read_to_end(&mut bytes)
+        .map_err(|e| CredentialError::read(path, e))?;
+    if bytes.len() as u64 > most {
+        return Err(CredentialError::unusable(
+            path,
+            format!("has more than {most} bytes, the most that such a file may have"),
+        ));
+    }
+    Ok(bytes)
+}
+
 /// The certificates of a PEM file, and its bytes.
 ///
 /// # Errors
@@ -134,7 +204,7 @@ pub fn private(path: &Path) -> Result<(), CredentialError> {
 pub fn certificates(
     path: &Path,
 ) -> Result<(Vec<CertificateDer<'static>>, Vec<u8>), CredentialError> {
-    let bytes = std::fs::read(path).map_err(|e| CredentialError::read(path, e))?;
+    let bytes = read_bytes(path, LARGEST_PEM)?;
     let parsed: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
     let found = parsed.map_err(|e| {
         CredentialError::unusable(
@@ -183,7 +253,7 @@ impl Pair {
     pub fn read(certificate: &Path, key: &Path) -> Result<Self, CredentialError> {
         let (chain, certificate_pem) = certificates(certificate)?;
         private(key)?;
-        let key_pem = std::fs::read(key).map_err(|e| CredentialError::read(key, e))?;
+        let key_pem = read_bytes(key, LARGEST_PEM)?;
         let secret = PrivateKeyDer::from_pem_slice(&key_pem).map_err(|_| {
             // What the parser says could quote the file.
             CredentialError::unusable(
@@ -273,5 +343,21 @@ fn named(name: &GeneralName<'_>) -> Option<String> {
     match name {
         GeneralName::DNSName(name) | GeneralName::URI(name) => Some((*name).to_owned()),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endless_file_is_refused_by_name() {
+        for read in [
+            Secret::read(Path::new("/dev/zero")).map(drop),
+            certificates(Path::new("/dev/zero")).map(drop),
+        ] {
+            let said = read.unwrap_err().to_string();
+            assert!(said.starts_with("/dev/zero: has more than"), "{said}");
+        }
     }
 }

@@ -104,6 +104,9 @@ pub struct GridSettings {
     pub batch: u32,
     /// Seed of all random numbers.
     pub seed: u64,
+    /// Go on where the measurements contradict one another.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub accept_inconsistent: bool,
 }
 
 impl Default for GridSettings {
@@ -115,6 +118,7 @@ impl Default for GridSettings {
             iterations: 200,
             batch: 16_384,
             seed: 0,
+            accept_inconsistent: false,
         }
     }
 }

@@ -38,6 +38,8 @@ impl From<TaskExplanation> for wire::TaskExplanation {
             max_failures: m.max_failures,
             crashes: m.crashes,
             max_crashes: m.max_crashes,
+            interruptions: m.interruptions,
+            max_interruptions: m.max_interruptions,
             last_error: m.last_error,
             reruns: m.reruns,
             output: m.output.map(Into::into),
@@ -59,6 +61,8 @@ impl TryFrom<wire::TaskExplanation> for TaskExplanation {
             max_failures: w.max_failures,
             crashes: w.crashes,
             max_crashes: w.max_crashes,
+            interruptions: w.interruptions,
+            max_interruptions: w.max_interruptions,
             last_error: w.last_error,
             reruns: w.reruns,
             output: w.output.map(TryInto::try_into).transpose()?,
@@ -128,6 +132,7 @@ impl From<ConnectedWorker> for wire::ConnectedWorker {
             tasks: m.tasks,
             since_ms: m.since_ms,
             quarantined: m.quarantined,
+            note: m.note,
         }
     }
 }
@@ -144,6 +149,7 @@ impl From<wire::ConnectedWorker> for ConnectedWorker {
             tasks: w.tasks,
             since_ms: w.since_ms,
             quarantined: w.quarantined,
+            note: w.note,
         }
     }
 }

@@ -77,6 +77,7 @@ impl TryFrom<wire::Hello> for WorkerHello {
                 .map(LeaseRef::try_from)
                 .collect::<Result<_, _>>()?,
             ended: ended(&w.ended),
+            ends_in_ms: (w.ends_in_ms > 0).then_some(w.ends_in_ms),
             abilities: Abilities {
                 kinds: kinds(w.kinds)?,
                 assets: at_most(w.assets, bounds::LIST, "hello.assets")?
@@ -111,6 +112,7 @@ impl From<WorkerHello> for wire::Hello {
             protocol: m.protocol,
             held: m.held.into_iter().map(Into::into).collect(),
             ended: m.ended,
+            ends_in_ms: m.ends_in_ms.unwrap_or(0),
             kinds: m.abilities.kinds.into_iter().collect(),
             assets: m.abilities.assets,
             cores: m.abilities.cores,
@@ -131,6 +133,10 @@ impl TryFrom<wire::Lease> for Lease {
                 what: format!("{}..{} holds no task", w.lo, w.hi),
             });
         }
+        let mut stage = super::job::stage(w.stage)?;
+        if !w.stores.is_empty() {
+            stage.stores = w.stores.into_iter().collect();
+        }
         Ok(Lease {
             lease: lease_ref(w.lease)?,
             job: parse(&w.job_id, "lease.job_id")?,
@@ -138,7 +144,7 @@ impl TryFrom<wire::Lease> for Lease {
             hi: w.hi,
             skip: w.skip,
             ttl_ms: w.ttl_ms,
-            stage: super::job::stage(w.stage)?,
+            stage,
             ordinal: w.ordinal,
             key: StageKey::parse(&w.stage_key).ok_or(ConvertError::Invalid {
                 field: "lease.stage_key",
@@ -150,8 +156,9 @@ impl TryFrom<wire::Lease> for Lease {
 }
 
 impl From<Lease> for wire::Lease {
-    fn from(m: Lease) -> Self {
+    fn from(mut m: Lease) -> Self {
         wire::Lease {
+            stores: std::mem::take(&mut m.stage.stores).into_iter().collect(),
             lease: Some(m.lease.into()),
             job_id: m.job.to_string(),
             lo: m.lo,
@@ -231,6 +238,7 @@ impl TryFrom<wire::TaskFailed> for Failure {
             wire::FailureKind::User => FailureKind::User,
             wire::FailureKind::Crash => FailureKind::Crash,
             wire::FailureKind::Interrupted => FailureKind::Interrupted,
+            wire::FailureKind::Store if w.damaged => FailureKind::Damaged,
             wire::FailureKind::Store => FailureKind::Store,
             wire::FailureKind::Unspecified => {
                 return Err(ConvertError::Missing {
@@ -253,7 +261,7 @@ impl From<Failure> for wire::TaskFailed {
             FailureKind::User => wire::FailureKind::User,
             FailureKind::Crash => wire::FailureKind::Crash,
             FailureKind::Interrupted => wire::FailureKind::Interrupted,
-            FailureKind::Store => wire::FailureKind::Store,
+            FailureKind::Store | FailureKind::Damaged => wire::FailureKind::Store,
         };
         wire::TaskFailed {
             lease: Some(m.lease.into()),
@@ -261,6 +269,7 @@ impl From<Failure> for wire::TaskFailed {
             kind: kind.into(),
             // Longer than a message may be, it would end the session each time it is sent.
             message: bounds::message(&m.message),
+            damaged: m.kind == FailureKind::Damaged,
         }
     }
 }

@@ -3,8 +3,8 @@
 use super::{ConvertError, parse, required};
 use crate::{
     model::{
-        Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan,
-        StageState, StageStatus, TaskCounts, bounds,
+        Estimate, Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask,
+        StagePlan, StageState, StageStatus, TaskCounts, bounds,
     },
     wire,
 };
@@ -145,6 +145,7 @@ impl From<JobStatus> for wire::JobStatus {
                 .map(|(n, r)| running(r, n < bounds::RUNNING))
                 .collect(),
             workers: m.workers,
+            unverified: m.unverified,
         }
     }
 }
@@ -183,6 +184,7 @@ impl TryFrom<wire::JobStatus> for JobStatus {
                 })
                 .collect(),
             workers: w.workers,
+            unverified: w.unverified,
         })
     }
 }
@@ -239,10 +241,27 @@ impl From<JobPlan> for wire::JobPlan {
                     reuse: s.reuse,
                     run: s.run,
                     memory_bytes: s.memory_bytes,
+                    workers: s.workers,
+                    task_seconds: s.task_seconds.map(Into::into),
+                    task_bytes: s.task_bytes.map(Into::into),
+                    measured: s.measured,
                     reasons: s.reasons,
                 })
                 .collect(),
+            warnings: m.warnings,
         }
+    }
+}
+
+impl From<Estimate> for wire::Estimate {
+    fn from(Estimate { low, high }: Estimate) -> Self {
+        wire::Estimate { low, high }
+    }
+}
+
+impl From<wire::Estimate> for Estimate {
+    fn from(wire::Estimate { low, high }: wire::Estimate) -> Self {
+        Estimate { low, high }
     }
 }
 
@@ -269,9 +288,14 @@ impl TryFrom<wire::JobPlan> for JobPlan {
                     reuse: s.reuse,
                     run: s.run,
                     memory_bytes: s.memory_bytes,
+                    workers: s.workers,
+                    task_seconds: s.task_seconds.map(Into::into),
+                    task_bytes: s.task_bytes.map(Into::into),
+                    measured: s.measured,
                     reasons: s.reasons,
                 })
                 .collect(),
+            warnings: w.warnings,
         })
     }
 }

@@ -89,6 +89,9 @@ pub struct JobStatus {
     pub user: ::prost::alloc::string::String,
     #[prost(message, repeated, tag = "13")]
     pub stages: ::prost::alloc::vec::Vec<StageStatus>,
+    /// Results that workers have reported and that the coordinator has not found in their store.
+    #[prost(uint64, tag = "20")]
+    pub unverified: u64,
 }
 /// A job as a list shows it.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -180,8 +183,19 @@ pub struct JobPlan {
     pub existing_job: ::prost::alloc::string::String,
     #[prost(message, repeated, tag = "7")]
     pub stages: ::prost::alloc::vec::Vec<StagePlan>,
+    /// Settings that are probably not meant, and stages that no connected worker can run; in words.
+    #[prost(string, repeated, tag = "8")]
+    pub warnings: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+/// An estimated quantity: at least and at most.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Estimate {
+    #[prost(double, tag = "1")]
+    pub low: f64,
+    #[prost(double, tag = "2")]
+    pub high: f64,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StagePlan {
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
@@ -199,6 +213,18 @@ pub struct StagePlan {
     /// About how much memory each task takes; 0 = not known.
     #[prost(uint64, tag = "7")]
     pub memory_bytes: u64,
+    /// Connected workers that can run its tasks.
+    #[prost(uint32, tag = "8")]
+    pub workers: u32,
+    /// Seconds that one task takes on one of them; absent = not known.
+    #[prost(message, optional, tag = "9")]
+    pub task_seconds: ::core::option::Option<Estimate>,
+    /// Bytes that one task stores; absent = not known.
+    #[prost(message, optional, tag = "10")]
+    pub task_bytes: ::core::option::Option<Estimate>,
+    /// Whether the estimates come from tasks that this farm has run.
+    #[prost(bool, tag = "11")]
+    pub measured: bool,
 }
 /// One line of a job's history.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -421,6 +447,11 @@ pub struct TaskExplanation {
     /// Its history, oldest first.
     #[prost(message, repeated, tag = "11")]
     pub events: ::prost::alloc::vec::Vec<Event>,
+    /// Attempts that a worker gave back half-way.
+    #[prost(uint32, tag = "12")]
+    pub interruptions: u32,
+    #[prost(uint32, tag = "13")]
+    pub max_interruptions: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TaskOutput {
@@ -467,6 +498,9 @@ pub struct ConnectedWorker {
     /// It is on probation with a range that crashed others, and gets nothing else.
     #[prost(bool, tag = "9")]
     pub quarantined: bool,
+    /// For people: why it gets nothing, or when it ends; empty = nothing to say.
+    #[prost(string, tag = "10")]
+    pub note: ::prost::alloc::string::String,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
@@ -556,6 +590,9 @@ pub struct Hello {
     /// How the process of this worker before this one ended, where its parent knows; at most 256 bytes, empty = not known.
     #[prost(string, tag = "13")]
     pub ended: ::prost::alloc::string::String,
+    /// Milliseconds from the sending of this message until the worker must end, e.g. with its Slurm job; 0 = not known.
+    #[prost(uint64, tag = "14")]
+    pub ends_in_ms: u64,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Welcome {
@@ -581,7 +618,7 @@ pub struct LeaseRef {
     pub epoch: u64,
 }
 /// Tasks lo ≤ i \< hi of a stage, less those already done.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Lease {
     #[prost(message, optional, tag = "1")]
     pub lease: ::core::option::Option<LeaseRef>,
@@ -608,6 +645,12 @@ pub struct Lease {
     /// Where it belongs in a trace (W3C Trace Context); empty = nowhere.
     #[prost(string, tag = "10")]
     pub traceparent: ::prost::alloc::string::String,
+    /// The identities of the stage's stores by their places; not in `stage`, whose fields older workers would refuse.
+    #[prost(map = "string, string", tag = "11")]
+    pub stores: ::std::collections::HashMap<
+        ::prost::alloc::string::String,
+        ::prost::alloc::string::String,
+    >,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Heartbeat {
@@ -615,6 +658,9 @@ pub struct Heartbeat {
     pub leases: ::prost::alloc::vec::Vec<LeaseRef>,
     #[prost(message, repeated, tag = "2")]
     pub progress: ::prost::alloc::vec::Vec<TaskProgress>,
+    /// As in Hello.
+    #[prost(uint64, tag = "3")]
+    pub ends_in_ms: u64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TaskProgress {
@@ -671,6 +717,9 @@ pub struct TaskFailed {
     pub kind: i32,
     #[prost(string, tag = "4")]
     pub message: ::prost::alloc::string::String,
+    /// With FAILURE_KIND_STORE: the store answers, but an object in it is damaged. Only the task waits.
+    #[prost(bool, tag = "5")]
+    pub damaged: bool,
 }
 /// Answers TaskDone, TaskFailed and Release.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -743,7 +792,7 @@ pub enum FailureKind {
     User = 1,
     /// The executor panicked or ran out of a resource.
     Crash = 2,
-    /// Nothing is wrong with the task: shutdown, or the machine's trouble. Free.
+    /// Nothing is wrong with the task: shutdown, or the machine's trouble. Counts as an interruption.
     Interrupted = 3,
     /// Nothing is wrong with the task: its store cannot be reached or written. Free; the store is tried again later.
     Store = 4,
@@ -912,7 +961,7 @@ pub mod farm_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static("/picofarm.v1.Farm/Session");
             let mut req = request.into_streaming_request();
             req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Farm", "Session"));
@@ -1051,7 +1100,7 @@ pub mod farm_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = SessionSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -1418,7 +1467,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/GetServerInfo",
             );
@@ -1442,7 +1491,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static("/picofarm.v1.Jobs/PlanJob");
             let mut req = request.into_request();
             req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Jobs", "PlanJob"));
@@ -1464,7 +1513,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/SubmitJob",
             );
@@ -1488,7 +1537,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/ListJobs",
             );
@@ -1508,7 +1557,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static("/picofarm.v1.Jobs/GetJob");
             let mut req = request.into_request();
             req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Jobs", "GetJob"));
@@ -1530,7 +1579,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/WatchJob",
             );
@@ -1553,7 +1602,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/CancelJob",
             );
@@ -1578,7 +1627,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/PauseJob",
             );
@@ -1601,7 +1650,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/ResumeJob",
             );
@@ -1626,7 +1675,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/RetryJob",
             );
@@ -1649,7 +1698,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/ListEvents",
             );
@@ -1674,7 +1723,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/ExplainJob",
             );
@@ -1699,7 +1748,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/ListWorkers",
             );
@@ -1724,7 +1773,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/DrainWorker",
             );
@@ -1749,7 +1798,7 @@ pub mod jobs_client {
                         format!("Service was not ready: {}", e.into()),
                     )
                 })?;
-            let codec = tonic_prost::ProstCodec::default();
+            let codec = crate::codec::SmallCodec::default();
             let path = http::uri::PathAndQuery::from_static(
                 "/picofarm.v1.Jobs/ListAudit",
             );
@@ -1990,7 +2039,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetServerInfoSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2033,7 +2082,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = PlanJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2076,7 +2125,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = SubmitJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2119,7 +2168,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ListJobsSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2162,7 +2211,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2208,7 +2257,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = WatchJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2251,7 +2300,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = CancelJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2294,7 +2343,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = PauseJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2337,7 +2386,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ResumeJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2380,7 +2429,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = RetryJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2423,7 +2472,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ListEventsSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2466,7 +2515,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ExplainJobSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2509,7 +2558,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ListWorkersSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2552,7 +2601,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = DrainWorkerSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,
@@ -2595,7 +2644,7 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ListAuditSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
+                        let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
                                 accept_compression_encodings,

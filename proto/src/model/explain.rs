@@ -72,6 +72,10 @@ pub struct TaskExplanation {
     pub crashes: u32,
     /// Lost workers after which it is given up.
     pub max_crashes: u32,
+    /// Attempts that a worker gave back half-way.
+    pub interruptions: u32,
+    /// Interruptions after which it is given up.
+    pub max_interruptions: u32,
     /// The last failure; empty where there was none.
     pub last_error: String,
     /// Why it was run again, once for each time; for people.
@@ -131,4 +135,6 @@ pub struct ConnectedWorker {
     pub since_ms: i64,
     /// It is on probation with a range that crashed others, and gets nothing else.
     pub quarantined: bool,
+    /// Why it gets nothing, or when it ends, for people; empty = nothing to say.
+    pub note: String,
 }

@@ -26,6 +26,8 @@ pub struct WorkerHello {
     pub held: Vec<LeaseRef>,
     /// How its process before this one ended, in words, where its parent knows; empty otherwise.
     pub ended: String,
+    /// Milliseconds until it must end, where that is known.
+    pub ends_in_ms: Option<u64>,
     /// What it is able to do and what it has.
     pub abilities: Abilities,
 }
@@ -101,10 +103,12 @@ pub enum FailureKind {
     User,
     /// The executor panicked, or the worker was lost.
     Crash,
-    /// Shutdown, preemption: free.
+    /// Shutdown, preemption, the machine's trouble: counted by itself.
     Interrupted,
     /// The store cannot be reached or written: free, and all that use it wait.
     Store,
+    /// The store answers, but an object in it is damaged or missing: free, and the task waits until it is repaired.
+    Damaged,
 }
 
 /// A failed task as the worker reports it.

@@ -9,6 +9,8 @@ use super::{
 
 /// Most tasks in one job.
 pub const MAX_TASKS: u64 = 100_000_000;
+/// Default of `max_interruptions`.
+const MAX_INTERRUPTIONS: u32 = 20;
 /// Most stages in one job.
 pub const MAX_STAGES: usize = 1_000;
 
@@ -16,7 +18,7 @@ pub(super) fn check_count(field: &str, count: u64) -> Result<(), SpecError> {
     within(field, count, (1, MAX_TASKS), "scenes")
 }
 
-/// When a task, or the job, is given up. Interruptions are free and have no limit.
+/// When a task, or the job, is given up.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
@@ -24,6 +26,11 @@ pub struct Limits {
     pub max_failures: u32,
     /// Losses of the worker while it ran the task before it is dead.
     pub max_crashes: u32,
+    /// Attempts that a worker gave back half-way (it was told to end, or its machine was in
+    /// trouble) before the task is dead. An attempt at a task that goes on from where it was saved
+    /// does not count where it came further.
+    #[serde(skip_serializing_if = "is_usual")]
+    pub max_interruptions: u32,
     /// Workers that may run the job at a time; 0 = as many as there are.
     #[serde(skip_serializing_if = "is_zero")]
     pub max_workers: u32,
@@ -37,11 +44,18 @@ fn is_zero(n: &u32) -> bool {
     *n == 0
 }
 
+/// Left out of a job that does not say it, so that its hash is that of earlier versions.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_usual(n: &u32) -> bool {
+    *n == MAX_INTERRUPTIONS
+}
+
 impl Default for Limits {
     fn default() -> Self {
         Self {
             max_failures: 3,
             max_crashes: 3,
+            max_interruptions: MAX_INTERRUPTIONS,
             max_workers: 0,
             deadline: String::new(),
         }
@@ -76,6 +90,7 @@ impl Limits {
         for (field, value) in [
             ("limits.max_failures", self.max_failures),
             ("limits.max_crashes", self.max_crashes),
+            ("limits.max_interruptions", self.max_interruptions),
         ] {
             let unit = "attempts of a task; 1 gives it up at the first";
             within(field, value, (1, 1_000_000), unit)?;

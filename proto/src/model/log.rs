@@ -13,6 +13,9 @@ pub const BYTES: usize = 16 << 10;
 /// Bytes of a line, at most.
 pub const LINE_BYTES: usize = 2 << 10;
 
+/// How a task's line begins that states what its result is worth; `job watch` shows such lines when the job ends.
+pub const VERDICT: &str = "verdict: ";
+
 /// How grave a line is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogLevel {

@@ -2,6 +2,7 @@
 
 pub mod audit;
 pub mod bounds;
+mod destination;
 pub mod domain;
 pub mod explain;
 pub mod file;
@@ -25,6 +26,7 @@ mod texts;
 pub mod trial;
 
 pub use audit::{Act, AuditEntry, Outcome};
+pub use destination::{Destination, Place};
 pub use domain::{Domain, Interval};
 // What jobs share with data sets, the renderer and the networks.
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
@@ -54,8 +56,8 @@ pub use scale::scaled;
 pub use spec_error::SpecError;
 pub use stage::StageSpec;
 pub use status::{
-    Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan, StageState,
-    StageStatus, TaskCounts,
+    Estimate, Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan,
+    StageState, StageStatus, TaskCounts,
 };
 pub use stop::{Halving, Median, Stop};
 pub use trial::Trial;

@@ -1,6 +1,6 @@
 //! One stage of a job, and its checks: alone, and among the stages before and after it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -30,6 +30,10 @@ pub struct StageSpec {
     /// What a worker must have.
     #[serde(skip_serializing_if = "Resources::is_none")]
     pub resources: Resources,
+    /// The identities (UUIDs) of the stores that it uses, by their places: a worker whose store is another one works with
+    /// none. Filled in by the submission, where it reaches them; no part of any key.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub stores: BTreeMap<String, String>,
     /// What its tasks do.
     #[serde(flatten)]
     pub task: TaskSpec,
@@ -47,6 +51,7 @@ impl TryFrom<Value> for StageSpec {
             tolerate_dead: fields.or_default("tolerate_dead")?,
             force: fields.or_default("force")?,
             resources: fields.or_default("resources")?,
+            stores: fields.or_default("stores")?,
             task: TaskSpec::read(fields)?,
         })
     }
@@ -61,6 +66,7 @@ impl StageSpec {
             tolerate_dead: false,
             force: false,
             resources: Resources::default(),
+            stores: BTreeMap::new(),
             task,
         }
     }
@@ -77,6 +83,7 @@ impl StageSpec {
             name: self.name.clone(),
             needs: self.needs.clone(),
             resources: self.resources.clone(),
+            stores: self.stores.clone(),
             ..*self
         }
     }
@@ -88,7 +95,35 @@ impl StageSpec {
             return Err(SpecError::new("name", what));
         }
         self.resources.check()?;
+        self.check_identities()?;
         self.task.check()
+    }
+
+    /// The places of the stores that it uses, without a slash at the end: those that it writes to, and those that it reads.
+    pub fn places(&self) -> BTreeSet<&str> {
+        let read = self.task.reads().map(|source| &*source.store);
+        let models = self.task.models_store().map(String::as_str);
+        let all = [Some(self.task.results().store), read, models];
+        let all = all.into_iter().flatten().map(|s| s.trim_end_matches('/'));
+        all.filter(|place| !place.is_empty()).collect()
+    }
+
+    fn check_identities(&self) -> Result<(), SpecError> {
+        let places = self.places();
+        for (place, identity) in &self.stores {
+            if !places.contains(&**place) {
+                let what = format!("{place:?} is no store of this stage; leave it out");
+                return Err(SpecError::new("stores", what));
+            }
+            if uuid::Uuid::try_parse(identity).is_err() {
+                let what = format!(
+                    "{identity:?} of {place:?} is no store's identity, which is a UUID; leave it out, and the submission \
+                     fills it in"
+                );
+                return Err(SpecError::new("stores", what));
+            }
+        }
+        Ok(())
     }
 
     /// Checks that it fits the stages before it and after it.

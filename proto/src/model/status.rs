@@ -127,6 +127,18 @@ pub struct JobStatus {
     pub running: Vec<RunningTask>,
     /// Workers connected to the coordinator.
     pub workers: u32,
+    /// Results that workers have reported and that the coordinator has not found in their store.
+    pub unverified: u64,
+}
+
+impl JobStatus {
+    /// The deadline that stopped the job, as in its file.
+    pub fn passed_deadline(&self) -> Option<&str> {
+        let limits = &self.spec.limits;
+        let deadline = limits.deadline_ms().ok().flatten()?;
+        let passed = self.state == JobState::Cancelled && self.ended_at_ms? >= deadline;
+        passed.then_some(&*limits.deadline)
+    }
 }
 
 /// A job as a list shows it, without what it is made of.
@@ -153,7 +165,7 @@ pub struct JobSummary {
 }
 
 /// What a submission would do.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JobPlan {
     /// SHA-256 of the canonical spec, hexadecimal.
     pub spec_hash: String,
@@ -167,10 +179,47 @@ pub struct JobPlan {
     pub existing_job: Option<JobId>,
     /// The same by stage, with the reasons.
     pub stages: Vec<StagePlan>,
+    /// Settings that are probably not meant, and stages that no connected worker can run; in words.
+    pub warnings: Vec<String>,
+}
+
+/// An estimated quantity.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Estimate {
+    /// At least.
+    pub low: f64,
+    /// At most.
+    pub high: f64,
+}
+
+impl Estimate {
+    /// `middle` with an uncertainty of the factor `spread` (at least 1) in both directions.
+    pub fn within(middle: f64, spread: f64) -> Self {
+        Self {
+            low: middle / spread,
+            high: middle * spread,
+        }
+    }
+
+    /// The estimate of a sum of two quantities.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            low: self.low + other.low,
+            high: self.high + other.high,
+        }
+    }
+
+    /// The estimate of a multiple of the quantity.
+    pub fn times(self, factor: f64) -> Self {
+        Self {
+            low: self.low * factor,
+            high: self.high * factor,
+        }
+    }
 }
 
 /// What a submission would do in a stage.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StagePlan {
     /// Its name.
     pub name: String,
@@ -184,6 +233,16 @@ pub struct StagePlan {
     pub run: u64,
     /// About how much memory each takes; 0 = not known before a worker has seen what it reads.
     pub memory_bytes: u64,
+    /// Connected workers that can run its tasks.
+    pub workers: u32,
+    /// Seconds that one task takes on one of them; `None` = not known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_seconds: Option<Estimate>,
+    /// Bytes that one task stores; `None` = not known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_bytes: Option<Estimate>,
+    /// Whether the estimates come from tasks that this farm has run; otherwise they are rules of thumb.
+    pub measured: bool,
     /// Why tasks run, in words.
     pub reasons: Vec<String>,
 }

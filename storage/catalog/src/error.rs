@@ -31,6 +31,18 @@ pub enum CatalogError {
         /// The latest schema version of this program.
         known: i64,
     },
+    /// A build of another state of the source wrote it: one of its steps has another text than this program's.
+    #[error(
+        "catalog {place}: schema step {step} is not the one of this picofarm: a development build whose steps were edited \
+         later wrote it; open it with that build, or start with another catalog (finished results stay in their stores, and \
+         workers adopt them when the same jobs are submitted again)"
+    )]
+    OtherSchema {
+        /// The database.
+        place: String,
+        /// Version of the first step that differs.
+        step: i64,
+    },
     /// The folder or file cannot be used.
     #[error("catalog {}: {what}: {source}", path.display())]
     File {
@@ -122,6 +134,7 @@ impl CatalogError {
             Self::Server { .. } => "the catalog's server cannot be used",
             Self::Held { .. } => "another program holds the catalog",
             Self::Unusable { .. } => "the catalog is damaged",
+            Self::Newer { .. } | Self::OtherSchema { .. } => "another picofarm wrote the catalog",
             Self::Fenced => "the coordinator was out of touch with its catalog",
             _ => "the catalog failed",
         }

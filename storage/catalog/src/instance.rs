@@ -59,6 +59,21 @@ pub struct Want {
     pub now_ms: i64,
     /// Outputs that exist are not asked for.
     pub force: bool,
+    /// Ranges under suspicion too, which go only to a worker with nothing else in hand.
+    pub suspects: bool,
+}
+
+/// Pending tasks of an open stage that are nobody's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Free {
+    /// That may run at once, on any worker.
+    pub ready: u64,
+    /// That may run at once, alone on a worker: workers were lost while they ran them.
+    pub suspects: u64,
+    /// That may not run before a time.
+    pub later: u64,
+    /// The first of these times, Unix milliseconds.
+    pub next_ms: Option<i64>,
 }
 
 /// The answer to a [`Want`].
@@ -68,8 +83,8 @@ pub struct Claim {
     pub owned: Owned,
     /// Tasks of them whose outputs exist already, as maximal runs in ascending order.
     pub existing: Vec<Run>,
-    /// Pending tasks that are nobody's still, whether they may run now or later.
-    pub left: u64,
+    /// The tasks that are still nobody's.
+    pub left: Free,
 }
 
 /// What an instance learns from time to time.
@@ -82,7 +97,7 @@ pub struct News {
     /// Leased ranges of other instances, of stages whose outputs another stage of an active job has, too.
     pub shared: BTreeMap<StageRef, Vec<Run>>,
     /// Pending tasks that are nobody's and whose stage is open.
-    pub free: BTreeMap<StageRef, u64>,
+    pub free: BTreeMap<StageRef, Free>,
     /// Ranges of instances that were lost.
     pub taken: Owned,
     /// The leased ranges that are this instance's; `None` where nobody could have taken any.

@@ -82,6 +82,8 @@ pub struct JobRecord {
     pub stages: Vec<StageCounts>,
     /// How long its tasks took.
     pub timing: Timing,
+    /// Results that workers have reported and that the coordinator has not found in their store.
+    pub unverified: u64,
 }
 
 /// Where a stage stands.
@@ -134,6 +136,8 @@ pub struct Timing {
     pub tasks: u64,
     /// Sum of their seconds.
     pub seconds: f64,
+    /// Sum of their bytes.
+    pub bytes: f64,
 }
 
 impl Timing {

@@ -36,12 +36,12 @@ use picofarm_proto::{
 pub use changes::Changes;
 pub use error::CatalogError;
 pub use event::{EventQuery, NewEvent};
-pub use instance::{Claim, JobEnd, News, Owned, Settled, Snapshot, Want, Worker};
+pub use instance::{Claim, Free, JobEnd, News, Owned, Settled, Snapshot, Want, Worker};
 pub use job::{Holdups, Job, JobRecord, ResultSet, StageCounts, StageRecord, Timing};
 pub use listing::{Forgotten, JobQuery, Page};
 pub use range::{LeaseState, Mark, Range, RangeState, Run};
 pub use refused::{Culprit, Row, culprits, verdict};
-pub use rights::{AuditQuery, NewAudit, Owner, Rights, Sight};
+pub use rights::{AuditQuery, NewAudit, OwnedPlace, Owner, Rights, Sight};
 pub use submission::{Gone, Outcome, Recorded, Submission};
 pub use task::{Exception, Output, TaskRecord};
 
@@ -55,6 +55,19 @@ pub trait CatalogSource: fmt::Display + fmt::Debug + Send + Sync {
     async fn open(&self, holder: &str) -> Result<Arc<dyn Catalog>, CatalogError>;
 }
 
+/// Whose specs are to be read.
+#[derive(Debug, Clone, Copy)]
+pub enum Specs<'a> {
+    /// One job's: [`Catalog::job`].
+    Job(JobId),
+    /// That of the latest job with a spec hash: [`Catalog::job_with`].
+    With(&'a str),
+    /// Those of jobs that write into a data set (store, name): [`Catalog::jobs_at`].
+    At(&'a str, &'a str),
+    /// Those of the latest jobs that a reader may see: [`Catalog::recent`].
+    Recent(u32, &'a Sight),
+}
+
 /// Durable memory of coordinators. All methods may be called concurrently; each is one transaction.
 ///
 /// # Errors
@@ -65,11 +78,12 @@ pub trait Catalog: Rights {
     /// that are lost.
     async fn load(&self) -> Result<Snapshot, CatalogError>;
 
-    /// Says that the instance lives and has this many workers connected; to be called about once a second.
+    /// Says that the instance lives and has this many workers connected; to be called about once a
+    /// second. What may run is told of `now_ms`.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`] when it was thought lost; a new life must begin.
-    async fn beat(&self, workers: u32) -> Result<News, CatalogError>;
+    async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError>;
 
     /// Returns when another instance may have changed something: a hint to beat early. Safe to cancel.
     async fn changed(&self);
@@ -164,6 +178,17 @@ pub trait Catalog: Rights {
 
     /// A job and how far it is.
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError>;
+
+    /// Writes some ten pages for good or takes them back, to see that there is room: on a full disk the smallest writes may
+    /// still succeed, and those of a submission or a commit do not.
+    ///
+    /// # Errors
+    /// The catalog cannot be written.
+    async fn try_room(&self) -> Result<(), CatalogError>;
+
+    /// Bytes of the specs that a read would bring into memory, as they are stored: cheap, so that a reader can be refused
+    /// before they are read.
+    async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError>;
 
     /// Tasks of all active jobs by state, in one go.
     async fn active_tasks(&self) -> Result<TaskCounts, CatalogError>;

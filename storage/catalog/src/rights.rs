@@ -6,7 +6,7 @@ use picofarm_proto::{
     model::{Act, AuditEntry, Outcome},
 };
 
-use crate::{CatalogError, Job};
+use crate::{CatalogError, Job, ResultSet};
 
 /// Of whom a job is.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,6 +24,19 @@ impl From<&Job> for Owner {
             project: job.spec.project.clone(),
         }
     }
+}
+
+/// A folder of a store into which jobs write, and whose it is: the first submitter's.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OwnedPlace {
+    /// Its normal form (`picofarm_proto::model::Place`).
+    pub place: String,
+    /// It is a named record in a data set, which may be another user's; otherwise a folder with everything in it.
+    pub record: bool,
+    /// Whose it is.
+    pub owner: Owner,
+    /// The owner's latest job that writes there.
+    pub job: JobId,
 }
 
 /// Whose jobs a reader may see.
@@ -92,6 +105,13 @@ pub struct AuditQuery {
 pub trait Rights: Send + Sync + 'static {
     /// Of whom a job is; `None` where there is no such job.
     async fn owner(&self, job: JobId) -> Result<Option<Owner>, CatalogError>;
+
+    /// The owned places that are equal to this one, lie in it, or enclose it, by their normal form. Those of jobs that ended
+    /// without any result are left out.
+    async fn owned_near(&self, place: &str) -> Result<Vec<OwnedPlace>, CatalogError>;
+
+    /// Number of tasks of a user's largest stage with these results; 0 = the user has none.
+    async fn largest_stage(&self, set: &ResultSet, user: &str) -> Result<u64, CatalogError>;
 
     /// Appends lines to the audit log, all of them or none.
     async fn audit(&self, lines: &[NewAudit]) -> Result<(), CatalogError>;

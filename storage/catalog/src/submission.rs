@@ -1,6 +1,6 @@
 //! A job as it is recorded, and recorded outputs as a store is asked about them.
 
-use crate::{Job, NewEvent, Range, RangeState, ResultSet, Run, StageRecord};
+use crate::{Job, NewEvent, OwnedPlace, Range, RangeState, ResultSet, Run, StageRecord};
 use picofarm_proto::ids::JobId;
 
 /// What becomes durable when a job is submitted.
@@ -18,6 +18,10 @@ pub struct Submission<'a> {
     pub gone: &'a [Gone],
     /// A job with the same spec that is done and whose results are gone: this one takes its place.
     pub instead_of: Option<JobId>,
+    /// The places that the job writes into and that become its submitter's.
+    pub places: &'a [OwnedPlace],
+    /// Normal forms of others' places near those, which the submitter may write into.
+    pub permitted: &'a [String],
 }
 
 impl<'a> Submission<'a> {
@@ -35,6 +39,8 @@ impl<'a> Submission<'a> {
             events,
             gone: &[],
             instead_of: None,
+            places: &[],
+            permitted: &[],
         }
     }
 
@@ -63,7 +69,8 @@ pub enum Outcome {
     New,
     /// A job with the same spec is active or done; nothing is recorded.
     Exists,
-    /// An output that the layout counts on is no longer recorded as checked; nothing is recorded. Plan again.
+    /// An output that the layout counts on is no longer recorded as checked, or a place has become another's; nothing is
+    /// recorded. Plan again.
     Changed,
 }
 

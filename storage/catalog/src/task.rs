@@ -21,9 +21,11 @@ pub struct Output {
     pub epoch: Epoch,
     /// Found in the store and not computed.
     pub adopted: bool,
+    /// The store was found to hold this manifest.
+    pub checked: bool,
 }
 
-/// A task that failed at least once.
+/// A task that failed or was interrupted at least once.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Exception {
     /// The stage.
@@ -34,6 +36,10 @@ pub struct Exception {
     pub failures: u32,
     /// Workers lost while they ran it.
     pub crashes: u32,
+    /// Attempts that a worker gave back half-way.
+    pub interruptions: u32,
+    /// The longest attempt that did not end, milliseconds.
+    pub longest_ms: u64,
     /// Given up.
     pub dead: bool,
     /// The last failure, in words.

@@ -3,27 +3,45 @@
 
 use std::sync::LazyLock;
 
+use picofarm_catalog::CatalogError;
 use sqlx::{
     SqlSafeStr,
-    migrate::{Migration, MigrationType, Migrator},
+    migrate::{MigrateError, Migration, MigrationType, Migrator},
 };
 
 /// A step's version, its name and its statements.
 type Step = (i64, &'static str, &'static str);
 
 macro_rules! steps {
-    ($engine:literal: $($version:literal $name:literal),*) => {
+    ($engine:literal: $($version:literal $name:literal,)*) => {
         &[$((
             $version,
             $name,
-            include_str!(concat!("../migrations/", $engine, "/000", $version, "_", $name, ".sql")),
-        )),*]
+            include_str!(concat!("../migrations/", $engine, "/", $name, ".sql")),
+        ),)*]
     };
 }
 
-const SQLITE_STEPS: &[Step] = steps!("sqlite": 1 "init", 2 "stages", 3 "listing", 4 "rights");
+// Append only: a database remembers the checksum of every step it has run.
+const SQLITE_STEPS: &[Step] = steps!("sqlite":
+    1 "0001_init",
+    2 "0002_stages",
+    3 "0003_listing",
+    4 "0004_rights",
+    5 "0005_places",
+    6 "0006_unchecked",
+    8 "0008_interruptions",
+);
 #[cfg(feature = "postgres")]
-const POSTGRES_STEPS: &[Step] = steps!("postgres": 1 "init", 2 "stages", 3 "listing", 4 "rights");
+const POSTGRES_STEPS: &[Step] = steps!("postgres":
+    1 "0001_init",
+    2 "0002_stages",
+    3 "0003_listing",
+    4 "0004_rights",
+    5 "0005_places",
+    6 "0006_unchecked",
+    8 "0008_interruptions",
+);
 
 /// For SQLite.
 pub(crate) static SQLITE: LazyLock<Migrator> = LazyLock::new(|| migrator(SQLITE_STEPS));
@@ -37,7 +55,9 @@ fn migrator(steps: &[Step]) -> Migrator {
         let statements = statements.into_sql_str();
         Migration::new(
             version,
-            name.into(),
+            // sqlx stores the name without its number.
+            name.trim_start_matches(|c: char| c.is_ascii_digit() || c == '_')
+                .into(),
             MigrationType::Simple,
             statements,
             false,
@@ -51,31 +71,63 @@ pub(crate) fn latest(migrator: &Migrator) -> i64 {
     migrator.iter().map(|m| m.version).max().unwrap_or(0)
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+/// A first step as it was once committed, before steps were append-only.
+pub(crate) struct FormerStep {
+    /// SHA-384 of its text, as the database remembers it.
+    pub checksum: &'static str,
+    /// The statements that lead from its schema to today's first step.
+    pub upgrade: &'static str,
+}
 
-    #[test]
-    fn every_step_in_the_folders_is_listed() {
-        let listed = [
-            ("sqlite", SQLITE_STEPS),
-            #[cfg(feature = "postgres")]
-            ("postgres", POSTGRES_STEPS),
-        ];
-        for (engine, steps) in listed {
-            let folder = std::path::Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
-                .join("migrations")
-                .join(engine);
-            let mut files: Vec<String> = std::fs::read_dir(folder)
-                .unwrap()
-                .map(|f| f.unwrap().file_name().into_string().unwrap())
-                .collect();
-            files.sort();
-            let names: Vec<String> = steps
-                .iter()
-                .map(|(version, name, _)| format!("{version:04}_{name}.sql"))
-                .collect();
-            assert_eq!(files, names);
-        }
+impl FormerStep {
+    /// Whether a database that remembers this checksum began with the former step.
+    pub(crate) fn matches(&self, checksum: &[u8]) -> bool {
+        let hex: String = checksum.iter().map(|b| format!("{b:02x}")).collect();
+        hex == self.checksum
     }
 }
+
+/// SQLite's first step from 2026-11-21 to 2026-11-23.
+pub(crate) const SQLITE_FORMER: FormerStep = FormerStep {
+    checksum: "fd97ccc6a63d384b6f25a036178ea94d141da56f2a9aa38d0dbdb07d912de7042b7582aacb2274f0665cc57da2a31598",
+    upgrade: include_str!("../migrations/former/sqlite_upgrade.sql"),
+};
+/// Postgres' first step in the same days.
+#[cfg(feature = "postgres")]
+pub(crate) const POSTGRES_FORMER: FormerStep = FormerStep {
+    checksum: "29293c1424666f89f845bc2915996943590bc31d5e31e3052da3b239efe5d7b6957ade6534cf81d74883f8186e417d66",
+    upgrade: include_str!("../migrations/former/postgres_upgrade.sql"),
+};
+
+/// The checksum of the first step, which replaces a former one's after the upgrade.
+pub(crate) fn first_checksum(migrator: &Migrator) -> &[u8] {
+    migrator.iter().next().map_or(&[], |first| &first.checksum)
+}
+
+/// The error for a migration that failed; `classify` handles the database's own errors.
+pub(crate) fn failed(
+    place: String,
+    migrator: &Migrator,
+    error: MigrateError,
+    classify: impl FnOnce(sqlx::Error) -> CatalogError,
+) -> CatalogError {
+    let known = latest(migrator);
+    match error {
+        MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
+            CatalogError::Newer {
+                place,
+                found,
+                known,
+            }
+        }
+        MigrateError::VersionMismatch(step) => CatalogError::OtherSchema { place, step },
+        MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => classify(e),
+        other => CatalogError::Unusable {
+            place,
+            what: format!("its schema cannot be brought up to date ({other})"),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests;

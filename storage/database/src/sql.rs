@@ -451,6 +451,8 @@ macro_rules! queries {
                     task: uint(row, "task")?,
                     failures: small(row, "failures")?,
                     crashes: small(row, "crashes")?,
+                    interruptions: small(row, "interruptions")?,
+                    longest_ms: uint(row, "longest_ms")?,
                     dead: row.try_get("dead")?,
                     last_error: row.try_get("last_error")?,
                 })
@@ -501,6 +503,7 @@ macro_rules! queries {
                         seconds: row.try_get("seconds")?,
                         epoch: Epoch(uint(&row, "epoch")?),
                         adopted: row.try_get("adopted")?,
+                        checked: row.try_get("checked")?,
                     })
                 });
                 Ok(TaskRecord {

@@ -1,6 +1,18 @@
 //! The queries about jobs and stages, for one database: `job_queries!(SqliteConnection, SqliteRow)` makes a module
 //! `job_query` beside `query` (see [`crate::sql`]).
 
+/// The jobs with a stage in the data set `$2` of the store `$1` that are active or have written something.
+macro_rules! at {
+    () => {
+        "key IN (SELECT stage.job FROM stage \
+           JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2 \
+           AND (stage.done > 0 OR EXISTS (SELECT 1 FROM job AS live WHERE live.key = stage.job AND live.state = 0) \
+             OR EXISTS (SELECT 1 FROM task_range WHERE task_range.stage = stage.key \
+               AND task_range.state IN (2, 3))))"
+    };
+}
+pub(crate) use at;
+
 macro_rules! job_queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod job_query {
@@ -13,8 +25,8 @@ macro_rules! job_queries {
             use sqlx::Row;
 
             use super::query::{exception, marks, stage_of, uint};
-            use picofarm_catalog::{Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight};
-            use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}};
+            use picofarm_catalog::{Free, Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight, Specs};
+            use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}, sql_jobs::at};
 
             type Connection = $connection;
             type DbRow = $row;
@@ -53,23 +65,51 @@ macro_rules! job_queries {
             }
 
             /// Pending tasks of open stages of active jobs that are nobody's.
-            pub(crate) async fn free(c: &mut Connection) -> Result<BTreeMap<StageRef, u64>> {
-                let rows = sqlx::query(
-                    "SELECT job.id AS job_id, stage.ordinal, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
+            pub(crate) async fn free(c: &mut Connection, now_ms: i64) -> Result<BTreeMap<StageRef, Free>> {
+                let rows = sqlx::query(concat!(
+                    "SELECT job.id AS job_id, stage.ordinal, ",
+                    $crate::sql_jobs::free_columns!("$1"),
+                    " FROM task_range \
                      JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
                      WHERE task_range.state = 0 AND owner IS NULL AND stage.state = 1 AND job.state = 0 \
                      GROUP BY job.id, stage.ordinal",
-                )
+                ))
+                .bind(now_ms)
                 .fetch_all(c)
                 .await?;
                 rows.iter()
-                    .map(|row| Ok((stage_of(row)?, uint(row, "tasks")?)))
+                    .map(|row| Ok((stage_of(row)?, free_of(row)?)))
                     .collect()
+            }
+
+            /// The tasks of one stage that are nobody's.
+            pub(crate) async fn free_of_stage(c: &mut Connection, key: i64, now_ms: i64) -> Result<Free> {
+                let row = sqlx::query(concat!(
+                    "SELECT ",
+                    $crate::sql_jobs::free_columns!("$2"),
+                    " FROM task_range JOIN stage ON stage.key = task_range.stage \
+                     WHERE stage = $1 AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
+                ))
+                .bind(key)
+                .bind(now_ms)
+                .fetch_one(c)
+                .await?;
+                free_of(&row)
+            }
+
+            fn free_of(row: &DbRow) -> Result<Free> {
+                Ok(Free {
+                    ready: uint(row, "ready")?,
+                    suspects: uint(row, "suspects")?,
+                    later: uint(row, "later")?,
+                    next_ms: row.try_get("next_ms")?,
+                })
             }
 
             pub(crate) async fn timing(c: &mut Connection, set: &ResultSet) -> Result<Timing> {
                 let row = sqlx::query(
-                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds \
+                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds, \
+                     CAST(coalesce(sum(bytes), 0) AS DOUBLE PRECISION) AS bytes \
                      FROM output WHERE NOT adopted AND result_set = \
                      (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3)",
                 )
@@ -78,13 +118,10 @@ macro_rules! job_queries {
                 .bind(&set.stage_key.0[..])
                 .fetch_one(c)
                 .await?;
-                timing_of(&row)
-            }
-
-            fn timing_of(row: &DbRow) -> Result<Timing> {
                 Ok(Timing {
-                    tasks: uint(row, "timed")?,
+                    tasks: uint(&row, "timed")?,
                     seconds: row.try_get("seconds")?,
+                    bytes: row.try_get("bytes")?,
                 })
             }
 
@@ -108,8 +145,27 @@ macro_rules! job_queries {
                 Ok(Some(JobRecord {
                     job: job(&row)?,
                     stages,
-                    timing: timing_of(&row)?,
+                    timing: Timing {
+                        tasks: uint(&row, "timed")?,
+                        seconds: row.try_get("seconds")?,
+                        // A job's record keeps no bytes; the outputs have them.
+                        bytes: 0.0,
+                    },
+                    unverified: unverified(c, key).await?,
                 }))
+            }
+
+            /// Results of a job that its store was not found to hold.
+            async fn unverified(c: &mut Connection, key: i64) -> Result<u64> {
+                let row = sqlx::query(
+                    "SELECT count(*) AS results FROM stage JOIN output ON output.result_set = stage.result_set \
+                     AND output.task < stage.tasks WHERE stage.job = $1 AND output.checked = $2",
+                )
+                .bind(key)
+                .bind(false)
+                .fetch_one(c)
+                .await?;
+                uint(&row, "results")
             }
 
             /// The stages of a job that has ended, whose counts are final.
@@ -343,7 +399,7 @@ macro_rules! job_queries {
             }
 
             /// Size of the specs of the latest jobs together, at most: they are in memory at once.
-            const RECENT_BYTES: i64 = 64 << 20;
+            const RECENT_BYTES: i64 = 16 << 20;
 
             /// The latest jobs, whatever became of them, the last first.
             pub(crate) async fn recent(c: &mut Connection, most: u32, sight: &Sight) -> Result<Vec<Job>> {
@@ -365,16 +421,53 @@ macro_rules! job_queries {
                 rows.iter().map(job).collect()
             }
 
+            pub(crate) async fn spec_bytes(c: &mut Connection, specs: Specs<'_>) -> Result<u64> {
+                let bytes: Option<i64> = match specs {
+                    Specs::Job(id) => {
+                        sqlx::query_scalar("SELECT CAST(octet_length(spec) AS BIGINT) FROM job WHERE id = $1")
+                            .bind(id.uuid())
+                            .fetch_optional(c)
+                            .await?
+                    }
+                    Specs::With(hash) => {
+                        sqlx::query_scalar(
+                            "SELECT CAST(octet_length(spec) AS BIGINT) FROM job WHERE spec_hash = $1 \
+                             ORDER BY key DESC LIMIT 1",
+                        )
+                        .bind(hash)
+                        .fetch_optional(c)
+                        .await?
+                    }
+                    Specs::At(store, dataset) => {
+                        let text = concat!(
+                            "SELECT CAST(coalesce(sum(octet_length(spec)), 0) AS BIGINT) FROM job WHERE ",
+                            at!()
+                        );
+                        let sum = sqlx::query_scalar(text).bind(store).bind(dataset);
+                        sum.fetch_optional(c).await?
+                    }
+                    Specs::Recent(most, sight) => {
+                        let [all, user, projects] = crate::seen::columns(sight);
+                        let text = concat!(
+                            "SELECT CAST(coalesce(sum(octet_length(spec)), 0) AS BIGINT) FROM (SELECT spec FROM job WHERE ",
+                            seen!("$2", "$3", "$4"),
+                            " ORDER BY key DESC LIMIT $1) AS latest"
+                        );
+                        let sum = sqlx::query_scalar(text)
+                            .bind(i64::from(most))
+                            .bind(all)
+                            .bind(user)
+                            .bind(projects);
+                        let sum: Option<i64> = sum.fetch_optional(c).await?;
+                        sum.map(|sum| sum.min(RECENT_BYTES))
+                    }
+                };
+                Ok(bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0))
+            }
+
             /// Jobs with a stage in a data set that is active or has written something.
             pub(crate) async fn jobs_at(c: &mut Connection, store: &str, dataset: &str) -> Result<Vec<Job>> {
-                let rows = sqlx::query(
-                    "SELECT * FROM job WHERE key IN (SELECT stage.job FROM stage \
-                       JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2 \
-                       AND (stage.done > 0 OR EXISTS (SELECT 1 FROM job AS live WHERE live.key = stage.job AND live.state = 0) \
-                         OR EXISTS (SELECT 1 FROM task_range WHERE task_range.stage = stage.key \
-                           AND task_range.state IN (2, 3)))) \
-                     ORDER BY key DESC",
-                )
+                let rows = sqlx::query(concat!("SELECT * FROM job WHERE ", at!(), " ORDER BY key DESC"))
                 .bind(store)
                 .bind(dataset)
                 .fetch_all(c)
@@ -398,7 +491,7 @@ macro_rules! job_queries {
                 let failed = sqlx::query(
                     "SELECT exception.*, job.id AS job_id, stage.ordinal FROM exception \
                      JOIN stage ON stage.key = exception.stage JOIN job ON job.key = stage.job \
-                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes DESC, task LIMIT 5",
+                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes + interruptions DESC, task LIMIT 5",
                 )
                 .bind(job.uuid())
                 .fetch_all(c)
@@ -417,4 +510,27 @@ macro_rules! job_queries {
     };
 }
 
+/// The columns of a [`Free`](picofarm_catalog::Free), at the time of a parameter.
+macro_rules! free_columns {
+    ($now:literal) => {
+        concat!(
+            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ",
+            $now,
+            " AND crashes = 0 THEN hi - lo ELSE 0 END), 0) \
+             AS BIGINT) AS ready, ",
+            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ",
+            $now,
+            " AND crashes > 0 THEN hi - lo ELSE 0 END), 0) \
+             AS BIGINT) AS suspects, ",
+            "CAST(coalesce(sum(CASE WHEN not_before_ms > ",
+            $now,
+            " THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS later, ",
+            "min(CASE WHEN not_before_ms > ",
+            $now,
+            " THEN not_before_ms END) AS next_ms",
+        )
+    };
+}
+
+pub(crate) use free_columns;
 pub(crate) use job_queries;

@@ -8,12 +8,12 @@ macro_rules! rights_queries {
                 ids::JobId,
                 model::{Act, AuditEntry, Outcome},
             };
-            use sqlx::{Connection as _, Row};
+            use sqlx::{Connection as _, QueryBuilder, Row};
             use uuid::Uuid;
 
             use super::query::uint;
-            use picofarm_catalog::{AuditQuery, NewAudit, Owner};
-            use crate::{sql::bad};
+            use picofarm_catalog::{AuditQuery, NewAudit, OwnedPlace, Owner, ResultSet};
+            use crate::sql::bad;
 
             type Connection = $connection;
             type DbRow = $row;
@@ -31,6 +31,102 @@ macro_rules! rights_queries {
                     })
                 })
                 .transpose()
+            }
+
+            /// Owned places that are equal to this one, lie in it, or enclose it.
+            pub(crate) async fn owned_near(c: &mut Connection, place: &str) -> Result<Vec<OwnedPlace>> {
+                // A place ends with a slash, so those in it lie before the same text with the next character.
+                let after = format!("{}0", place.trim_end_matches('/'));
+                let mut query = QueryBuilder::<<$connection as sqlx::Connection>::Database>::new(
+                    "SELECT * FROM owned_place WHERE ((place >= ",
+                );
+                query.push_bind(place).push(" AND place < ").push_bind(after).push(") OR place IN (");
+                let mut around = query.separated(", ");
+                for (at, _) in place.match_indices('/') {
+                    around.push_bind(&place[..=at]);
+                }
+                query.push(
+                    ")) AND (NOT EXISTS (SELECT 1 FROM job WHERE job.id = owned_place.job) \
+                       OR EXISTS (SELECT 1 FROM job WHERE job.id = owned_place.job AND (job.state = 0 \
+                         OR EXISTS (SELECT 1 FROM stage WHERE stage.job = job.key AND (stage.done > 0 \
+                           OR EXISTS (SELECT 1 FROM task_range WHERE task_range.stage = stage.key \
+                             AND task_range.state IN (2, 3))))))) ORDER BY place",
+                );
+                let rows = query.build().fetch_all(c).await?;
+                rows.iter().map(owned_place).collect()
+            }
+
+            pub(crate) async fn largest_stage(c: &mut Connection, set: &ResultSet, user: &str) -> Result<u64> {
+                let row = sqlx::query(
+                    "SELECT COALESCE(MAX(stage.tasks), 0) AS tasks FROM stage JOIN job ON job.key = stage.job \
+                     JOIN result_set ON result_set.key = stage.result_set \
+                     WHERE store = $1 AND dataset = $2 AND stage_key = $3 AND job.username = $4",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .bind(user)
+                .fetch_one(c)
+                .await?;
+                uint(&row, "tasks")
+            }
+
+            fn owned_place(row: &DbRow) -> Result<OwnedPlace> {
+                Ok(OwnedPlace {
+                    place: row.try_get("place")?,
+                    record: row.try_get("record")?,
+                    owner: Owner {
+                        user: row.try_get("username")?,
+                        project: row.try_get("project")?,
+                    },
+                    job: JobId::from_uuid(row.try_get("job")?),
+                })
+            }
+
+            /// Those of the places that a job writes into which become its submitter's. `None` if another user has taken one
+            /// since the submitter was permitted to write there.
+            pub(crate) async fn free_places<'a>(
+                c: &mut Connection,
+                places: &'a [OwnedPlace],
+                permitted: &[String],
+            ) -> Result<Option<Vec<&'a OwnedPlace>>> {
+                let mut free = Vec::new();
+                for mine in places {
+                    let near = owned_near(&mut *c, &mine.place).await?;
+                    let others = near.iter().filter(|o| o.record == mine.record && o.owner.user != mine.owner.user);
+                    let mut others = others.peekable();
+                    if others.peek().is_none() {
+                        free.push(mine);
+                    } else if others.any(|other| !permitted.contains(&other.place)) {
+                        return Ok(None);
+                    }
+                }
+                Ok(Some(free))
+            }
+
+            /// Records these places as their submitter's.
+            pub(crate) async fn take_places(c: &mut Connection, places: &[&OwnedPlace]) -> Result<()> {
+                for mine in places {
+                    // One of somebody else's that is still there is of a job that left nothing.
+                    sqlx::query("DELETE FROM owned_place WHERE place = $1 AND record = $2 AND username <> $3")
+                        .bind(&mine.place)
+                        .bind(mine.record)
+                        .bind(&mine.owner.user)
+                        .execute(&mut *c)
+                        .await?;
+                    sqlx::query(
+                        "INSERT INTO owned_place (place, record, username, project, job) VALUES ($1, $2, $3, $4, $5) \
+                         ON CONFLICT (place, record) DO UPDATE SET project = excluded.project, job = excluded.job",
+                    )
+                    .bind(&mine.place)
+                    .bind(mine.record)
+                    .bind(&mine.owner.user)
+                    .bind(&mine.owner.project)
+                    .bind(mine.job.uuid())
+                    .execute(&mut *c)
+                    .await?;
+                }
+                Ok(())
             }
 
             /// Appends lines in one transaction.

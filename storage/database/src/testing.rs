@@ -49,6 +49,23 @@ pub async fn lose_instance(url: &str, instance: picofarm_proto::ids::InstanceId)
     .expect("the instance is there");
 }
 
+/// Keeps everyone else from writing a SQLite catalog until the value is dropped, as a slow disk would.
+///
+/// # Panics
+/// When the file cannot be opened or somebody writes it for too long.
+pub async fn hold_writes(path: &std::path::Path) -> SqliteConnection {
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(path);
+    let options = options.busy_timeout(std::time::Duration::from_secs(10));
+    let mut connection = SqliteConnection::connect_with(&options)
+        .await
+        .expect("the catalog can be opened");
+    sqlx::query("BEGIN IMMEDIATE")
+        .execute(&mut connection)
+        .await
+        .expect("nobody writes for ever");
+    connection
+}
+
 /// Makes a database refuse rows for their content, as a limit of its own would that nobody thought of: outputs of 666 bytes,
 /// error messages, lines of history and stores that begin with `poison`, and workers of that name.
 ///

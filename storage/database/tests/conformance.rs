@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Changes, EventQuery, Exception, Job, JobQuery, LeaseState, Mark,
+    Catalog, CatalogError, Changes, EventQuery, Exception, Free, Job, JobQuery, LeaseState, Mark,
     NewEvent, Output, Range, RangeState, Recorded, ResultSet, Run, Settled, Sight, Want, Worker,
 };
 use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
@@ -89,6 +89,7 @@ fn output(task: u64) -> Output {
         seconds: 1.5,
         epoch: Epoch(1),
         adopted: false,
+        checked: false,
     }
 }
 
@@ -98,6 +99,7 @@ fn want(tasks: u64) -> Want {
         tasks,
         now_ms: 100,
         force: false,
+        suspects: true,
     }
 }
 
@@ -126,6 +128,8 @@ async fn what_is_written_is_read_again_by_the_next_life(catalog: &dyn Catalog) {
         task: 2,
         failures: 3,
         crashes: 1,
+        interruptions: 2,
+        longest_ms: 60_000,
         dead: false,
         last_error: "no mesh".into(),
     };
@@ -178,14 +182,54 @@ async fn a_claim_takes_what_it_names_from_the_front_and_says_what_is_left(catalo
     let spans: Vec<_> = claim.owned.ranges.iter().map(|r| (r.lo, r.hi)).collect();
     assert_eq!(spans, [(0, 2), (2, 5)]);
     assert_eq!(claim.existing, [Run { lo: 1, hi: 2 }, Run { lo: 3, hi: 4 }]);
-    assert_eq!(claim.left, 4);
+    let later = Free {
+        later: 1,
+        next_ms: Some(200),
+        ..Free::default()
+    };
+    assert_eq!(claim.left, Free { ready: 3, ..later });
     let spans: Vec<_> = claim_all(catalog)
         .await
         .iter()
         .map(|r| (r.lo, r.hi))
         .collect();
     assert_eq!(spans, [(5, 8)], "what may not run yet is not given");
-    assert_eq!(catalog.beat(0).await.unwrap().free[&stage()], 1);
+    assert_eq!(
+        catalog.beat(0, 100).await.unwrap().free[&stage()],
+        later,
+        "what waits is not ready"
+    );
+    let due = Free {
+        ready: 1,
+        ..Free::default()
+    };
+    assert_eq!(catalog.beat(0, 200).await.unwrap().free[&stage()], due);
+}
+
+async fn ranges_under_suspicion_are_counted_and_claimed_by_themselves(catalog: &dyn Catalog) {
+    let suspect = Range {
+        crashes: 1,
+        ..pending(2, 4, 9)
+    };
+    submitted(catalog, &[pending(1, 0, 4), suspect]).await;
+    let plain = Want {
+        suspects: false,
+        ..want(99)
+    };
+    let claim = catalog.claim(&[plain]).await.unwrap().remove(0);
+    let spans: Vec<_> = claim.owned.ranges.iter().map(|r| (r.lo, r.hi)).collect();
+    assert_eq!(spans, [(0, 4)]);
+    let left = Free {
+        suspects: 5,
+        ..Free::default()
+    };
+    assert_eq!(claim.left, left);
+    let spans: Vec<_> = claim_all(catalog)
+        .await
+        .iter()
+        .map(|r| (r.lo, r.hi))
+        .collect();
+    assert_eq!(spans, [(4, 9)]);
 }
 
 async fn what_is_given_back_merges_with_its_neighbours(catalog: &dyn Catalog) {
@@ -276,7 +320,7 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
         (ended[0].job, ended[0].state, ended[0].at_ms),
         (id, JobState::Failed, 50)
     );
-    assert!(catalog.beat(0).await.unwrap().active.is_empty());
+    assert!(catalog.beat(0, 100).await.unwrap().active.is_empty());
     let record = catalog.job(id).await.unwrap().unwrap();
     assert_eq!(
         (
@@ -445,6 +489,7 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
         tasks: 9,
         now_ms: 0,
         force: false,
+        suspects: true,
     };
     catalog.claim(&[want]).await.unwrap();
     let mut changes = Changes::default();
@@ -461,6 +506,8 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
             task,
             failures: 1,
             crashes,
+            interruptions: 0,
+            longest_ms: 0,
             dead: false,
             last_error: "no light".into(),
         };
@@ -474,6 +521,7 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
         seconds: 1.5,
         epoch: Epoch(4),
         adopted: false,
+        checked: false,
     };
     changes.outputs.push(output.clone());
     catalog.commit(&changes).await.unwrap();
@@ -567,6 +615,7 @@ macro_rules! promises {
 promises! {
     what_is_written_is_read_again_by_the_next_life
     a_claim_takes_what_it_names_from_the_front_and_says_what_is_left
+    ranges_under_suspicion_are_counted_and_claimed_by_themselves
     what_is_given_back_merges_with_its_neighbours
     a_conflict_leaves_no_trace
     a_job_ends_with_its_last_task
@@ -616,8 +665,8 @@ async fn two_instances_never_claim_the_same_task() {
     }
     seen.sort_unstable();
     assert_eq!(seen, [0, 1, 2, 3, 5, 6, 7, 8]);
-    assert_eq!(a.beat(2).await.unwrap().instances, 2);
-    assert_eq!(b.beat(3).await.unwrap().workers, 5);
+    assert_eq!(a.beat(2, 100).await.unwrap().instances, 2);
+    assert_eq!(b.beat(3, 100).await.unwrap().workers, 5);
 }
 
 #[tokio::test]
@@ -636,9 +685,9 @@ async fn a_lost_instance_is_fenced_and_its_ranges_are_anothers() {
         mine[0].clone(),
         &[Mark::Done, Mark::Todo, Mark::Todo, Mark::Todo],
     ));
-    assert_eq!(b.beat(0).await.unwrap().taken.ranges.len(), 2);
+    assert_eq!(b.beat(0, 100).await.unwrap().taken.ranges.len(), 2);
     assert!(matches!(a.commit(&late).await, Err(CatalogError::Fenced)));
-    assert!(matches!(a.beat(0).await, Err(CatalogError::Fenced)));
+    assert!(matches!(a.beat(0, 100).await, Err(CatalogError::Fenced)));
     assert!(matches!(
         a.claim(&[want(1)]).await,
         Err(CatalogError::Fenced)
@@ -660,7 +709,14 @@ async fn a_worker_takes_its_leases_along_and_the_former_instance_learns_of_it() 
     let mut changes = Changes::default();
     changes.put(lease.clone());
     a.commit(&changes).await.unwrap();
-    assert!(a.beat(1).await.unwrap().leased.unwrap().contains(&lease.id));
+    assert!(
+        a.beat(1, 100)
+            .await
+            .unwrap()
+            .leased
+            .unwrap()
+            .contains(&lease.id)
+    );
     assert_eq!(
         b.adopt(worker().id).await.unwrap().ranges,
         std::slice::from_ref(&lease)
@@ -670,7 +726,7 @@ async fn a_worker_takes_its_leases_along_and_the_former_instance_learns_of_it() 
         [],
         "it is there already"
     );
-    assert!(a.beat(1).await.unwrap().leased.unwrap().is_empty());
+    assert!(a.beat(1, 100).await.unwrap().leased.unwrap().is_empty());
     let mut late = Changes::default();
     late.put(leased(lease, &[Mark::Done; 4]));
     assert!(matches!(
@@ -689,7 +745,7 @@ async fn an_instance_that_leaves_in_order_gives_back_what_nobody_runs() {
     a.close().await;
     assert_eq!(claim_all(&b).await.len(), 1, "the pending one");
     assert_eq!(
-        b.beat(0).await.unwrap().taken.ranges.len(),
+        b.beat(0, 100).await.unwrap().taken.ranges.len(),
         1,
         "the leased one"
     );

@@ -68,6 +68,7 @@ async fn claim(catalog: &dyn Catalog, stage: u32) -> Vec<Range> {
         tasks: 99,
         now_ms: 100,
         force: false,
+        suspects: true,
     };
     let claim = catalog.claim(&[want]).await.unwrap().remove(0);
     claim.owned.ranges
@@ -97,14 +98,17 @@ async fn a_stage_waits_for_those_that_it_needs(catalog: &dyn Catalog) {
     submitted(catalog).await;
     assert_eq!(states(catalog).await, [Open, Blocked, Open, Blocked]);
     assert!(claim(catalog, 1).await.is_empty());
-    let free = catalog.beat(0).await.unwrap().free;
+    let free = catalog.beat(0, 100).await.unwrap().free;
     assert_eq!(
-        free.into_iter().collect::<Vec<_>>(),
+        free.into_iter()
+            .map(|(stage, free)| (stage, free.ready))
+            .collect::<Vec<_>>(),
         [(at(0), 3), (at(2), 2)]
     );
     assert_eq!(done(catalog, 0, DONE).await, (vec![1], vec![]));
     assert_eq!(states(catalog).await, [Done, Open, Open, Blocked]);
-    assert_eq!(catalog.beat(0).await.unwrap().free[&at(1)], 3);
+    let free = catalog.beat(0, 100).await.unwrap().free;
+    assert_eq!(free[&at(1)].ready, 3);
     assert_eq!(done(catalog, 1, DONE).await, (vec![3], vec![]));
     assert_eq!(done(catalog, 3, DONE).await, (vec![], vec![]));
     assert_eq!(done(catalog, 2, DONE).await, (vec![], vec![JobState::Done]));
@@ -158,11 +162,11 @@ async fn a_held_job_gives_nothing_until_it_goes_on(catalog: &dyn Catalog) {
         "once"
     );
     assert!(claim(catalog, 0).await.is_empty());
-    assert!(catalog.beat(0).await.unwrap().active[&id]);
+    assert!(catalog.beat(0, 100).await.unwrap().active[&id]);
     assert!(catalog.job(id).await.unwrap().unwrap().job.paused);
     assert!(catalog.pause(id, false, "by ada", 62).await.unwrap());
     assert_eq!(claim(catalog, 0).await.len(), 1);
-    assert!(!catalog.beat(0).await.unwrap().active[&id]);
+    assert!(!catalog.beat(0, 100).await.unwrap().active[&id]);
     assert!(catalog.cancel(id, "enough", 63).await.unwrap());
     assert!(
         !catalog.pause(id, true, "", 64).await.unwrap(),
@@ -202,6 +206,7 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
         seconds: 1.5,
         epoch: Epoch(1),
         adopted: false,
+        checked: false,
     };
     let changes = Changes {
         outputs: vec![output],
@@ -236,6 +241,7 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
         tasks: 1,
         now_ms: 100,
         force: true,
+        suspects: true,
     };
     let first = catalog.claim(&[want]).await.unwrap().remove(0);
     assert!(first.existing.is_empty() && first.owned.ranges.len() == 1);

@@ -145,6 +145,7 @@ async fn outputs_leave_with_the_last_job_of_their_result_set_and_not_before() {
                 seconds: 1.5,
                 epoch: Epoch(1),
                 adopted: false,
+                checked: false,
             }],
             ..Changes::default()
         };

@@ -18,6 +18,7 @@ mod repair;
 mod reports;
 mod scenes;
 mod store;
+mod verdict;
 mod verify;
 
 /// What a program says that was built without the feature `formats`, and how to get one with it.
@@ -63,9 +64,12 @@ pub use scenes::parts::PartName;
 pub use scenes::read::Stored;
 pub use scenes::snapshot::{Difference, Pinned, Snapshot};
 pub use scenes::summary::Summary;
+pub use store::folder::check_own_folder;
 pub use store::objects::publish_files;
 pub use store::{
-    Bandwidth, PROBE_WITHIN, Writable, check_location, check_writable, limit_bandwidth,
-    local_ground, open_store, probe,
+    Bandwidth, PROBE_WITHIN, Writable, check_identity, check_location, check_writable,
+    expect_identity, identify_store, limit_bandwidth, local_ground, open_store, probe,
+    store_identity,
 };
+pub use verdict::{GUESS, Verdict};
 pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};

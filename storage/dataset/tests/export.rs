@@ -236,3 +236,32 @@ async fn the_table_of_scenes_names_a_place_for_each_that_is_there_and_no_number(
         }
     }
 }
+
+#[tokio::test]
+async fn an_export_writes_into_no_folder_of_another_kind() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, scenes) = source(folder.path(), Profile::default()).await;
+    let notes = folder.path().join("notes");
+    std::fs::create_dir(&notes).unwrap();
+    std::fs::write(notes.join("diary.txt"), "dear diary").unwrap();
+    for (place, name) in [
+        ("source", "zarr.json"),
+        ("notes", "diary.txt"),
+        ("", "source"),
+    ] {
+        let place = folder.path().join(place);
+        let before = files(&place);
+        for format in ExportFormat::ALL {
+            let (store, prefix) = open_store(place.to_str().unwrap()).unwrap();
+            let Ok(mut export) = Exporter::new(format, &dataset, &scenes, &*store, prefix) else {
+                continue;
+            };
+            let error = export.step(0).await.unwrap_err().to_string();
+            assert!(error.starts_with("export.dest: "), "{error}");
+            assert!(error.contains("new or empty folder"), "{error}");
+            let named = format == ExportFormat::Zarr || error.contains(name) || name == "zarr.json";
+            assert!(named || place == folder.path(), "{error}");
+        }
+        assert!(files(&place) == before, "nothing was written");
+    }
+}

@@ -329,3 +329,69 @@ async fn our_own_layout_may_have_two_bounce_paths_and_no_depth() {
         "{said}"
     );
 }
+
+/// Our own layout with true paths of six spots, in the order `order`; `late` metres are added to them, and x of the spots is
+/// times `x`. With `depth` it has that too.
+fn bounced(folder: &Path, order: [u32; 6], late: f32, x: f32, depth: bool) -> Source {
+    let spots = [3u32, 17, 34, 51, 68, 86];
+    let room = Room::new(16, 637);
+    let (w, h) = (room.width, room.height);
+    let put = |name: &str, bytes: Vec<u8>| std::fs::write(folder.join(name), bytes).unwrap();
+    put(
+        "h.npy",
+        npy("<f4", &[h, w, room.bins], &room.transient(&spots)),
+    );
+    let lights = spots.map(|s| room.lights[s as usize]);
+    let lights = lights.map(|[a, b, c]| [x * a, b, c]).concat();
+    put("spots.npy", npy("<f4", &[6, 3], &lights));
+    let paths = order.map(|s| {
+        let path = |p| room.path(s as usize, p) as f32 + late;
+        (0..w * h).map(path).collect::<Vec<f32>>()
+    });
+    put("paths.npy", npy("<f4", &[6, h, w], &paths.concat()));
+    let mut description = json!({
+        "format": "picofarm-scene-1",
+        "length_unit": "m",
+        "histogram": {"file": "h.npy", "axes": ["row", "column", "bin"],
+                      "gate_start": room.gate[0], "bin_width": room.gate[1], "gate_unit": "length"},
+        "camera": {"fx": 8.0, "fy": 8.0, "cx": 8.0, "cy": 8.0, "pixel_centre": 0.5, "axes": ["right", "down", "forward"]},
+        "laser": [0.0, 0.0, 0.0],
+        "spots": {"file": "spots.npy"},
+        "two_bounce": {"file": "paths.npy"},
+    });
+    if depth {
+        put("depth.npy", npy("<f4", &[h, w], &room.depth));
+        description["depth"] = json!({"file": "depth.npy", "kind": "z"});
+    }
+    std::fs::write(folder.join("scene.json"), description.to_string()).unwrap();
+    Source::open(folder, None, ImportOptions::default(), None).unwrap()
+}
+
+#[test]
+fn two_bounce_paths_must_fit_spots_and_depth() {
+    const RIGHT: [u32; 6] = [3, 17, 34, 51, 68, 86];
+    const EXCHANGED: [u32; 6] = [86, 17, 34, 51, 68, 3];
+    for depth in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = import_scene(&bounced(folder.path(), RIGHT, 0.0, 1.0, depth), 0).unwrap();
+        let found = &scene.check["two_bounce_paths"];
+        assert!(found["residual_m"].as_f64().unwrap() < 1e-3, "{found}");
+        assert!(found["pairs"].as_u64().unwrap() > 1000, "{found}");
+        let refused = |order, late, x| {
+            let source = bounced(folder.path(), order, late, x, depth);
+            import_scene(&source, 0).unwrap_err().to_string()
+        };
+        let said = refused(EXCHANGED, 0.0, 1.0);
+        assert!(
+            said.contains("paths.npy: paths") && said.contains("exchanged"),
+            "{said}"
+        );
+        if depth {
+            let said = refused(RIGHT, 0.1, 1.0);
+            assert!(said.contains("0.100 m longer"), "{said}");
+        } else {
+            let said = refused(RIGHT, 0.0, -1.0);
+            assert!(said.contains("paths.npy: paths"), "{said}");
+        }
+    }
+}

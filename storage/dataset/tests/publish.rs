@@ -206,6 +206,40 @@ async fn racing_publishers_of_the_same_task_all_succeed_and_of_different_ones_co
 }
 
 #[tokio::test]
+async fn what_broken_puts_have_left_is_replaced_when_the_scene_is_published_again() {
+    let spec = spec(Profile::default());
+    let (store, dataset) = in_memory(&spec).await;
+    let scene = Scene::new(&spec, 1);
+    let publish = async || dataset.publish(1, &scene.record(), &provenance()).await;
+    let manifest = publish().await.unwrap();
+    let at = |key: &str| Path::from(format!("{}/{key}", dataset.prefix()));
+    let file = at("manifests/1.json");
+    for object in &manifest.objects {
+        let path = at(&object.key);
+        let whole = store.get(&path).await.unwrap().bytes().await.unwrap();
+        let mut flipped = whole.to_vec();
+        flipped[whole.len() / 2] ^= 0x10;
+        for broken in [flipped, whole[..whole.len() / 2].to_vec(), Vec::new()] {
+            // With the manifest that proves what was there, and before there was one.
+            for published in [true, false] {
+                if !published {
+                    store.delete(&file).await.unwrap();
+                }
+                store.put(&path, broken.clone().into()).await.unwrap();
+                assert_eq!(publish().await.unwrap(), manifest, "{}", object.key);
+                let now = store.get(&path).await.unwrap().bytes().await.unwrap();
+                assert_eq!(now, whole, "{}", object.key);
+            }
+        }
+    }
+    store.put(&file, "{".into()).await.unwrap();
+    assert_eq!(publish().await.unwrap(), manifest);
+    // Where somebody names its folder as a store, that has an identity.
+    identify_store(&*store, dataset.prefix()).await.unwrap();
+    assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
+}
+
+#[tokio::test]
 async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
     let folder = tempfile::tempdir().unwrap();
     let location = folder.path().to_str().unwrap();
@@ -241,4 +275,44 @@ async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
     dataset.collect(Duration::ZERO, true).await.unwrap();
     assert!(!torn.exists());
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
+}
+
+/// A manifest of scene 0 that was made up, with its checksum.
+fn made_up(true_manifest: &Manifest) -> Manifest {
+    let mut made_up = true_manifest.clone();
+    for object in &mut made_up.objects {
+        object.sha256 = "ab".repeat(32);
+    }
+    made_up.sealed()
+}
+
+#[tokio::test]
+async fn a_made_up_manifest_gives_way_to_the_scene_and_a_true_one_does_not() {
+    for with_objects in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        let (store, prefix) = open_store(folder.path().to_str().unwrap()).unwrap();
+        let spec = spec(Profile::default());
+        let dataset = Dataset::create_or_open(store, prefix, &spec).await.unwrap();
+        let encode = |seed| {
+            let scene = Scene::new(&spec, seed);
+            dataset.encode(0, &scene.record(), &provenance()).unwrap()
+        };
+        let honest = dataset.publish_encoded(encode(1)).await.unwrap();
+        let manifest = folder.path().join("manifests/0.json");
+        std::fs::write(&manifest, made_up(&honest).to_bytes()).unwrap();
+        for object in honest.objects.iter().filter(|_| !with_objects) {
+            std::fs::remove_file(folder.path().join(&object.key)).unwrap();
+        }
+        let conflict = dataset.publish_encoded(encode(1)).await.unwrap_err();
+        assert!(
+            matches!(conflict, DatasetError::Conflict { .. }),
+            "{conflict}"
+        );
+        let replaced = dataset.replace_unfounded(encode(1)).await.unwrap().unwrap();
+        assert_eq!(replaced, honest);
+        assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
+        // Another result of the same scene does not replace one that is whole.
+        assert_eq!(dataset.replace_unfounded(encode(2)).await.unwrap(), None);
+        assert_eq!(dataset.published(0).await.unwrap(), Some(honest));
+    }
 }

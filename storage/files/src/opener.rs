@@ -9,6 +9,10 @@ use std::{
 
 use crate::{FileError, read_bounded};
 
+/// Longest name of a file, bytes: no system opens longer ones, and finding where a path leads
+/// takes time for each part.
+const MAX_NAME: usize = 4096;
+
 /// Opens files that lie below the folders it was given, wherever links lead; regular files only.
 ///
 /// Hard links cannot be distinguished from files: who may write to a folder decides what lies in it.
@@ -36,9 +40,12 @@ impl Opener {
     /// The path that a file in `folder` means by `name`.
     ///
     /// # Errors
-    /// [`FileError::Name`] for URLs, and for names with a backslash or a NUL.
+    /// [`FileError::Name`] for URLs, for names with a backslash or a NUL, and for names of more
+    /// than 4096 bytes.
     pub fn named(folder: &Path, name: &str) -> Result<PathBuf, FileError> {
-        let why = if name.contains('\\') {
+        let why = if name.len() > MAX_NAME {
+            "it is longer than 4096 bytes"
+        } else if name.contains('\\') {
             "it has a backslash"
         } else if name.contains('\0') {
             "it has a NUL"
@@ -49,7 +56,8 @@ impl Opener {
         } else {
             return Ok(folder.join(name));
         };
-        let name = name.replace('\0', "\\0").chars().take(200).collect();
+        let name = name.chars().take(80).collect::<String>();
+        let name = name.replace('\0', "\\0");
         Err(FileError::Name { name, why })
     }
 
@@ -285,9 +293,11 @@ mod tests {
             "file:/etc/passwd",
             "http://example/a",
             "",
+            &"a/".repeat(32_000),
         ] {
             let refused = Opener::named(folder, name).unwrap_err();
             assert!(!refused.to_string().contains('\0'));
+            assert!(refused.to_string().len() < 500, "{refused}");
         }
         assert_eq!(
             Opener::named(folder, "meshes/a.ply").unwrap(),

@@ -9,7 +9,7 @@ pub mod execute;
 mod run;
 
 #[cfg(feature = "networks")]
-pub use execute::{ImportFor, imported, infer_version, model_version, report, takes};
+pub use execute::{ImportFor, NotImported, imported, infer_version, model_version, report, takes};
 pub use execute::{
     SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version,
     resolve, scene_size,

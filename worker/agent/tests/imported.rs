@@ -4,7 +4,7 @@ mod place;
 
 use std::collections::BTreeMap;
 
-use picofarm_agent::{ImportFor, imported};
+use picofarm_agent::{ImportFor, NotImported, TaskError, imported};
 use picofarm_dataset::{Dataset, Manifest, NewModel, open_store};
 use picofarm_model::weights;
 use serde_json::{Value, json};
@@ -24,7 +24,7 @@ impl Rooms {
         Self { dataset, scene }
     }
 
-    fn import(&self, weights: &[u8], settings: Value) -> Result<NewModel, String> {
+    fn import(&self, weights: &[u8], settings: Value) -> Result<NewModel, NotImported> {
         let of = ImportFor {
             dataset: "rooms",
             spec: self.dataset.spec(),
@@ -122,7 +122,8 @@ async fn what_does_not_fit_is_named() {
         (json!({"nets": {}}), "nets"),
         (json!({"target": "depth"}), "depth"),
     ] {
-        let refused = rooms.import(&weights, settings(more.clone())).unwrap_err();
+        let refused = rooms.import(&weights, settings(more.clone()));
+        let refused = refused.unwrap_err().to_string();
         assert!(refused.contains(said), "{more}: {refused}");
     }
     let (mut named, _) = weights::read(&weights).unwrap();
@@ -131,6 +132,8 @@ async fn what_does_not_fit_is_named() {
     values[0] = f32::NAN;
     let odd = weights::write(&named, &BTreeMap::new());
     let refused = rooms.import(&odd, settings(json!({}))).unwrap_err();
+    assert!(matches!(refused, NotImported::Values(_)), "{refused:?}");
+    let refused = refused.to_string();
     let part = name.trim_start_matches("module.");
     assert!(
         refused.contains("holds NaN") && refused.contains(part),
@@ -143,6 +146,63 @@ async fn what_does_not_fit_is_named() {
         b"PK\x03\x04",
     ] {
         let refused = rooms.import(torn, settings(json!({}))).unwrap_err();
-        assert!(refused.contains("safetensors"), "{refused}");
+        assert!(matches!(refused, NotImported::File(_)), "{refused:?}");
+        assert!(refused.to_string().contains("safetensors"), "{refused}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_negative_variance_is_refused_by_its_name() {
+    let place = Place::new().await;
+    run(place.training(json!({"optimise": {"epochs": 1, "batch": 2}})))
+        .await
+        .unwrap();
+    let rooms = Rooms::of(&place).await;
+    let (mut named, _) = weights::read(&foreign(&place, "m").await).unwrap();
+    let variance = named.keys().find(|name| name.ends_with("running_var"));
+    let variance = variance.expect("it normalises").clone();
+    named.get_mut(&variance).unwrap().1[0] = -0.25;
+    let odd = weights::write(&named, &BTreeMap::new());
+    let settings = json!({"target": "tof", "model": "i", "net": {"width": 2, "levels": 2}});
+    let refused = rooms.import(&odd, settings).unwrap_err();
+    assert!(matches!(refused, NotImported::Values(_)), "{refused:?}");
+    let (refused, part) = (refused.to_string(), variance.trim_start_matches("module."));
+    assert!(
+        refused.contains(part) && refused.contains("-0.25 (value 0)"),
+        "{refused}"
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn answers_that_are_no_numbers_fail_with_model_and_scene() {
+    let place = Place::new().await;
+    run(place.training(json!({"optimise": {"epochs": 1, "batch": 2}})))
+        .await
+        .unwrap();
+    let rooms = Rooms::of(&place).await;
+    let (mut named, _) = weights::read(&foreign(&place, "m").await).unwrap();
+    let matching = named
+        .iter_mut()
+        .filter(|(name, _)| name.ends_with("weight"));
+    for (_, (_, values)) in matching {
+        values.fill(3e38);
+    }
+    let odd = weights::write(&named, &BTreeMap::new());
+    let settings = json!({"target": "tof", "model": "odd", "net": {"width": 2, "levels": 2}});
+    let new = rooms.import(&odd, settings).unwrap();
+    place.models().publish(new, false).await.unwrap();
+    let asked = [
+        run(place.evaluation(json!({"models": ["odd"]}))).await,
+        run(place.inference(json!({"models": ["odd"]}))).await,
+    ];
+    for said in asked {
+        let Err(TaskError::User(said)) = said else {
+            panic!("{said:?}")
+        };
+        assert!(
+            said.contains("model \"odd\", scene ") && said.contains("the network answers"),
+            "{said}"
+        );
+    }
+    assert!(place.models().evaluations("odd").await.unwrap().is_empty());
 }

@@ -101,6 +101,12 @@ async fn what_is_kept_is_what_evaluations_found() {
         assert!((ours - found).abs() < 1e-9, "{name}: {ours}, {found}");
     }
     let manifest = place.manifest(scene).await;
+    // Whether predictions agree is stated with figures, whatever they are worth.
+    let agreement = &manifest.agreement;
+    assert!(
+        agreement["verdict"].is_string() && agreement["reasons"].is_array(),
+        "{agreement}"
+    );
     let models = place.models();
     let (tof, shadow) = (
         models.manifest("m").await.unwrap(),

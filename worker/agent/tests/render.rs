@@ -12,7 +12,7 @@ use std::{
 
 use common::{FakeFarm, soon, spec, stage};
 use picofarm_agent::{Control, Executor, Output, Task, TaskError, execute::TaskExecutor};
-use picofarm_dataset::{Dataset, Quantity, VerifyMode, Wavelengths, open_store};
+use picofarm_dataset::{Dataset, Quantity, VerifyMode, Wavelengths, identify_store, open_store};
 use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
@@ -298,6 +298,51 @@ async fn a_store_that_cannot_be_written_is_an_interruption() {
 }
 
 #[tokio::test]
+async fn a_worker_whose_store_is_not_the_jobs_renders_nothing_and_leaves_nothing() {
+    let place = Place::new();
+    let store = place.dir.path().join("store");
+    let location = place.spec.output.store.clone();
+    let (opened, prefix) = open_store(&location).unwrap();
+    let identity = identify_store(&*opened, &prefix).await.unwrap();
+    let control = || {
+        let stores = BTreeMap::from([(location.clone(), identity.to_string())]);
+        Arc::new(Control::expecting(&stores))
+    };
+    // The machine that has the store.
+    place.run_with(1, 0, control()).await.unwrap();
+    let before = files(&store);
+
+    // One where it is not mounted: the folder is empty, or is not there.
+    let mounted = place.dir.path().join("elsewhere");
+    fs::rename(&store, &mounted).unwrap();
+    for there in [true, false] {
+        if there {
+            fs::create_dir(&store).unwrap();
+        }
+        match place.run_with(1, 1, control()).await {
+            Err(TaskError::Store(text)) => assert!(
+                text.contains("has no store identity; expected") && text.contains("is it mounted?"),
+                "{text}"
+            ),
+            other => panic!("{other:?}"),
+        }
+        assert_eq!(store.exists(), there, "the store's folder was made");
+        if there {
+            assert!(files(&store).is_empty());
+            fs::remove_dir(&store).unwrap();
+        }
+    }
+
+    // It is mounted again. The identity is no part of what is published.
+    fs::rename(&mounted, &store).unwrap();
+    assert_eq!(files(&store), before);
+    place.run_with(1, 1, control()).await.unwrap();
+    let other = Place::new();
+    other.run(1).await.unwrap();
+    assert_eq!(other.manifest(1), place.manifest(1));
+}
+
+#[tokio::test]
 async fn a_store_of_another_kind_or_a_data_set_of_another_gate_fails_the_task() {
     let mut place = Place::new();
     place.run(0).await.unwrap();
@@ -326,15 +371,17 @@ async fn a_scene_of_another_job_in_the_same_place_fails_the_task_and_stays_as_it
 async fn a_conflicting_object_is_an_alarm_that_names_it_and_nothing_is_overwritten() {
     let place = Place::new();
     place.run(0).await.unwrap();
+    place.run(1).await.unwrap();
     let victim = place.dataset().join("depth/c/0/0/0");
     fs::remove_file(place.dataset().join("manifests/0.json")).unwrap();
-    fs::write(&victim, b"not ours").unwrap();
+    let other = fs::read(place.dataset().join("depth/c/1/0/0")).unwrap();
+    fs::write(&victim, &other).unwrap();
     let text = place.complaint(0).await;
     assert!(
         text.contains("conflict") && text.contains("depth/c/0/0/0"),
         "{text}"
     );
-    assert_eq!(fs::read(&victim).unwrap(), b"not ours");
+    assert_eq!(fs::read(&victim).unwrap(), other);
     assert!(!place.dataset().join("manifests/0.json").exists());
 }
 

@@ -554,7 +554,9 @@ async fn a_damaged_source_is_named_and_nothing_is_published_from_it() {
     let mut bytes = fs::read(&victim).unwrap();
     bytes[9] ^= 1;
     fs::write(&victim, bytes).unwrap();
-    let text = place.complaint(0).await;
-    assert!(text.contains("source/depth/c/0/0/0"), "{text}");
+    match place.run(0).await {
+        Err(TaskError::Damaged(text)) => assert!(text.contains("source/depth/c/0/0/0"), "{text}"),
+        other => panic!("expected the store's trouble, found {other:?}"),
+    }
     assert!(!place.dir.path().join("target/manifests").exists());
 }

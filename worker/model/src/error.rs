@@ -12,6 +12,26 @@ pub enum ModelError {
         /// What is wrong, what was expected, how to correct it.
         what: String,
     },
+    /// Bytes that are no file of weights.
+    #[error("{what}")]
+    File {
+        /// What is wrong with them.
+        what: String,
+    },
+    /// Weights that no network can compute with.
+    #[error("{what}")]
+    Values {
+        /// Which tensor, what it holds, and what was expected.
+        what: String,
+    },
+    /// A network that answers with what is no finite number.
+    #[error("{what}")]
+    Answer {
+        /// The scene, by its index among the scenes given, where there are several.
+        scene: Option<usize>,
+        /// Where, and what is likely at fault.
+        what: String,
+    },
     /// Weights or a checkpoint that do not belong to this network, or are damaged.
     #[error("{what}")]
     Weights {
@@ -55,6 +75,22 @@ impl ModelError {
         Self::Invalid {
             field: field.into(),
             what: what.into(),
+        }
+    }
+
+    /// Bytes that are no file of weights.
+    pub(crate) fn file(what: impl Into<String>) -> Self {
+        Self::File { what: what.into() }
+    }
+
+    /// The same, with the scene of an answer where that is not known yet.
+    pub(crate) fn in_scene(self, index: usize) -> Self {
+        match self {
+            Self::Answer { scene: None, what } => Self::Answer {
+                scene: Some(index),
+                what,
+            },
+            other => other,
         }
     }
 

@@ -66,7 +66,8 @@ impl Evaluated {
 /// how many scenes are done of how many and says whether to go on; where it does not, there is no answer.
 ///
 /// # Errors
-/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or the baseline.
+/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or the baseline,
+/// [`ModelError::Answer`] for the first answer that is no finite number.
 pub fn evaluate(
     model: &Model,
     baseline: &Baseline,
@@ -95,7 +96,8 @@ pub fn answered(
             scene: index,
             source,
         })?;
-        each.push(of_scene(model, baseline, &scene)?);
+        let answered = of_scene(model, baseline, &scene);
+        each.push(answered.map_err(|e| e.in_scene(index))?);
         if !tell(index + 1, scenes.len()) {
             return Ok(None);
         }
@@ -169,7 +171,8 @@ fn answers_while(
             ..Visit::default()
         };
         example(&mut batch, question, scene, visit)?;
-        if !hear(&model.answer(&batch), &batch) {
+        let asked_of = question.by_spot().then_some(spot);
+        if !hear(&model.finite_answer(&batch, asked_of)?, &batch) {
             return Ok(false);
         }
     }
@@ -207,9 +210,8 @@ pub fn masks(
     Ok(whole.then_some(masks))
 }
 
-/// 1/(1 + e^−x) times 255, rounded; 0 where x is no number.
+/// 1/(1 + e^−x) times 255, rounded; x is a finite number.
 fn probability(logit: f32) -> u8 {
-    // Casting saturates, and NaN becomes 0.
     (255.0 / (1.0 + libm::exp(-f64::from(logit)))).round() as u8
 }
 
@@ -219,7 +221,7 @@ mod tests {
 
     #[test]
     fn probabilities_of_logits_fill_a_byte() {
-        let said = [f32::NEG_INFINITY, -100.0, -1.0, 0.0, 1.0, 100.0, f32::NAN].map(probability);
-        assert_eq!(said, [0, 0, 69, 128, 186, 255, 0]);
+        let said = [-100.0, -1.0, 0.0, 1.0, 100.0].map(probability);
+        assert_eq!(said, [0, 69, 128, 186, 255]);
     }
 }

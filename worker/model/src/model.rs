@@ -28,7 +28,8 @@ impl Model {
     /// From what [`crate::train::Training::finish`] gave.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] where the bytes are damaged or do not say what they are.
+    /// [`ModelError::File`] where the bytes are damaged, [`ModelError::Weights`] where they do not say what they are,
+    /// [`ModelError::Values`] where no network can compute with them.
     pub fn read(bytes: &[u8], device: &Device) -> Result<Self, ModelError> {
         let (named, metadata) = weights::read(bytes)?;
         let plan = metadata.get(PLAN).ok_or_else(|| {
@@ -41,6 +42,7 @@ impl Model {
         computes(&plan.net, device)?;
         let net = Net::new(plan.net.clone())?;
         let named = weights::from_torch(named, net.declared(), plan.question.part())?;
+        weights::check(&named)?;
         let parameters = Parameters::from_named(net.declared().to_vec(), named, device)?;
         Ok(Self {
             plan,
@@ -53,20 +55,14 @@ impl Model {
     /// Of a file that holds a depth and a shadow network together, the one that the plan asks for.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] where the bytes are damaged, or a tensor is missing, has another shape or holds what is no finite
-    /// number.
+    /// [`ModelError::File`] where the bytes are damaged, [`ModelError::Weights`] where a tensor is missing or has another
+    /// shape, [`ModelError::Values`] where one holds what is no finite number or a negative variance.
     pub fn import(bytes: &[u8], plan: &Plan, device: &Device) -> Result<Vec<u8>, ModelError> {
         let net = Net::new(plan.net.clone())?;
         let declared = net.declared();
         let (named, _) = weights::read(bytes)?;
         let named = weights::from_torch(named, declared, plan.question.part())?;
-        let odd = |values: &[f32]| values.iter().copied().find(|value| !value.is_finite());
-        if let Some((name, value)) = named.iter().find_map(|(n, (_, v))| Some((n, odd(v)?))) {
-            let what = format!(
-                "{name:?} holds {value}; expected finite numbers: convert the weights again"
-            );
-            return Err(ModelError::weights(what));
-        }
+        weights::check(&named)?;
         let parameters = Parameters::from_named(declared.to_vec(), named, device)?;
         let named = weights::to_torch(parameters.to_named());
         Ok(weights::write(
@@ -95,10 +91,27 @@ impl Model {
         predict(&self.net, &self.parameters, batch)
     }
 
+    /// The same, which must be finite numbers; `spot` is the one that the network is asked of.
+    ///
+    /// # Errors
+    /// [`ModelError::Answer`] naming the first that is not.
+    pub(crate) fn finite_answer(
+        &self,
+        batch: &Batch,
+        spot: Option<usize>,
+    ) -> Result<Vec<f32>, ModelError> {
+        let said = self.answer(batch);
+        match said.iter().position(|value| !value.is_finite()) {
+            None => Ok(said),
+            Some(at) => Err(not_finite(&said, at, batch, spot)),
+        }
+    }
+
     /// Depths of a scene, metres: `[row][column]`.
     ///
     /// # Errors
-    /// [`ModelError::Invalid`] where it is no depth network, or the scene does not fit it.
+    /// [`ModelError::Invalid`] where it is no depth network, or the scene does not fit it; [`ModelError::Answer`] where it
+    /// answers with what is no finite number.
     pub fn depth_m(&self, scene: &Scene) -> Result<Vec<f32>, ModelError> {
         if self.question().target != Target::Tof {
             let what = "two-bounce times follow from depths; this model predicts none";
@@ -106,9 +119,30 @@ impl Model {
         }
         let mut batch = Batch::default();
         example(&mut batch, self.question(), scene, Visit::default())?;
-        let scaled = self.answer(&batch);
+        let scaled = self.finite_answer(&batch, None)?;
         let scale = self.question().depth_scale_m;
         let depth = scaled.iter().map(|z| z.clamp(0.0, 1.0) * scale);
         Ok(depth.collect())
+    }
+}
+
+/// That a network answers with what is no finite number, and whether its input or its weights are at fault.
+pub(crate) fn not_finite(
+    said: &[f32],
+    at: usize,
+    batch: &Batch,
+    spot: Option<usize>,
+) -> ModelError {
+    let (value, pixel) = (said[at], at % (batch.height * batch.width).max(1));
+    let (row, column) = (pixel / batch.width.max(1), pixel % batch.width.max(1));
+    let of = spot.map_or_else(String::new, |spot| format!(" of spot {spot}"));
+    let fault = match batch.dense.iter().find(|x| !x.is_finite()) {
+        Some(x) => format!("its input holds {x}; import or render the scene again"),
+        None => "its input is finite, so its weights are at fault; train it again, or import it again from a file that works"
+            .to_owned(),
+    };
+    ModelError::Answer {
+        scene: None,
+        what: format!("the network answers {value} at row {row}, column {column}{of}: {fault}"),
     }
 }

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
+use half::{bf16, f16};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
 pub use crate::parameters::Named;
@@ -22,10 +23,10 @@ pub fn write(named: &Named, metadata: &BTreeMap<String, String>) -> Vec<u8> {
 /// Tensors and metadata of safetensors; f32, or f16, bf16, f64 and integers converted.
 ///
 /// # Errors
-/// [`ModelError::Weights`].
+/// [`ModelError::File`].
 pub fn read(bytes: &[u8]) -> Result<(Named, BTreeMap<String, String>), ModelError> {
     let broken = |e: safetensors::SafeTensorError| {
-        ModelError::weights(format!("these are no whole safetensors: {e}"))
+        ModelError::file(format!("these are no whole safetensors: {e}"))
     };
     let tensors = SafeTensors::deserialize(bytes).map_err(broken)?;
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
@@ -36,13 +37,12 @@ pub fn read(bytes: &[u8]) -> Result<(Named, BTreeMap<String, String>), ModelErro
             Dtype::F32 => each(data, f32::from_le_bytes),
             Dtype::F64 => each(data, |b| f64::from_le_bytes(b) as f32),
             Dtype::I64 => each(data, |b| i64::from_le_bytes(b) as f32),
-            Dtype::BF16 => each(data, |b| {
-                f32::from_bits(u32::from(u16::from_le_bytes(b)) << 16)
-            }),
+            Dtype::F16 => each(data, |b| f16::from_le_bytes(b).to_f32()),
+            Dtype::BF16 => each(data, |b| bf16::from_le_bytes(b).to_f32()),
             other => {
                 let what =
-                    format!("{name:?} is stored as {other:?}; expected F32, F64, BF16 or I64");
-                return Err(ModelError::weights(what));
+                    format!("{name:?} is stored as {other:?}; expected F32, F64, F16, BF16 or I64");
+                return Err(ModelError::file(what));
             }
         };
         // PyTorch counts batches in a scalar.
@@ -54,6 +54,32 @@ pub fn read(bytes: &[u8]) -> Result<(Named, BTreeMap<String, String>), ModelErro
     }
     let metadata = header.metadata().clone().unwrap_or_default();
     Ok((named, metadata.into_iter().collect()))
+}
+
+/// Checks that a network can compute with these values.
+///
+/// # Errors
+/// [`ModelError::Values`] naming the first tensor that holds what is no finite number, or a variance below zero.
+pub fn check(named: &Named) -> Result<(), ModelError> {
+    for (name, (_, values)) in named {
+        let odd = |refused: &dyn Fn(f32) -> bool| {
+            let at = values.iter().position(|value| refused(*value))?;
+            Some((at, values[at]))
+        };
+        if let Some((at, value)) = odd(&|value| !value.is_finite()) {
+            let what = format!("{name:?} holds {value} (value {at}); expected finite numbers");
+            return Err(ModelError::Values { what });
+        }
+        if name.ends_with("running_var")
+            && let Some((at, value)) = odd(&|value| value < 0.0)
+        {
+            let what = format!(
+                "{name:?} holds {value} (value {at}); expected 0 or more: a variance cannot be negative"
+            );
+            return Err(ModelError::Values { what });
+        }
+    }
+    Ok(())
 }
 
 fn each<const N: usize>(bytes: &[u8], to: impl Fn([u8; N]) -> f32) -> Vec<f32> {
@@ -120,4 +146,33 @@ pub fn from_torch(named: Named, declared: &[Declared], part: &str) -> Result<Nam
 fn interleave(a: &[f32], of_a: usize, b: &[f32], of_b: usize) -> Vec<f32> {
     let rows = a.chunks_exact(of_a).zip(b.chunks_exact(of_b));
     rows.flat_map(|(a, b)| [a, b].concat()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_precision_is_read_as_the_numbers_it_stands_for() {
+        let values = [1.0f32, -0.5, 65504.0, 6e-8];
+        let half: Vec<u8> = values
+            .iter()
+            .flat_map(|v| f16::from_f32(*v).to_le_bytes())
+            .collect();
+        let brain: Vec<u8> = values
+            .iter()
+            .flat_map(|v| bf16::from_f32(*v).to_le_bytes())
+            .collect();
+        let view = |dtype, bytes| TensorView::new(dtype, vec![4], bytes).unwrap();
+        let views = [
+            ("half", view(Dtype::F16, &half[..])),
+            ("brain", view(Dtype::BF16, &brain[..])),
+        ];
+        let bytes = safetensors::serialize(views, None).unwrap();
+        let (named, _) = read(&bytes).unwrap();
+        let expected = values.map(|v| f16::from_f32(v).to_f32());
+        assert_eq!(named["half"], (vec![4], expected.to_vec()));
+        let expected = values.map(|v| bf16::from_f32(v).to_f32());
+        assert_eq!(named["brain"], (vec![4], expected.to_vec()));
+    }
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use burn::tensor::Device;
 use common::{plan, scenes, sources};
 use picofarm_model::{
-    Answered, Evaluated, Model, Random, answered, answers,
+    Answered, Evaluated, Model, ModelError, Random, answered, answers,
     baseline::{Baseline, DepthBaseline, MaskBaseline},
     evaluate,
     input::{ShadowVariant, Target},
@@ -351,4 +351,64 @@ fn random_numbers_are_uniform_and_permutations_whole() {
     assert_ne!(order, (0..1_000).collect::<Vec<_>>());
     order.sort_unstable();
     assert_eq!(order, (0..1_000).collect::<Vec<_>>());
+}
+
+/// Weights of a network whose every weight of this name is `value`.
+fn with(weights_of: &[u8], ends: &str, value: f32) -> Vec<u8> {
+    let (mut named, metadata) = weights::read(weights_of).unwrap();
+    let matching = named.iter_mut().filter(|(name, _)| name.ends_with(ends));
+    for (_, (_, values)) in matching {
+        values.fill(value);
+    }
+    weights::write(&named, &metadata)
+}
+
+#[test]
+fn an_answer_that_is_no_number_fails_at_the_first_scene_and_is_never_a_figure() {
+    for (target, variant) in [
+        (Target::Tof, ShadowVariant::Concat),
+        (Target::Shadow, ShadowVariant::Concat),
+    ] {
+        let plan = Plan {
+            epochs: 1,
+            ..plan(target, variant)
+        };
+        let weights = trained(&plan, sources()).weights;
+        let broken = with(&weights, "weight", 3e38);
+        let model = Model::read(&broken, &Device::flex()).unwrap();
+        let baseline = Baseline::fit(model.question(), &scenes(0, 8), 8).unwrap();
+        let error = evaluate(&model, &baseline, &scenes(500, 7), &mut |_, _| true).unwrap_err();
+        let ModelError::Answer { scene, what } = &error else {
+            panic!("{error}")
+        };
+        assert_eq!(*scene, Some(0));
+        assert!(
+            what.contains("row 0, column 0") && what.contains("its weights"),
+            "{what}"
+        );
+    }
+}
+
+#[test]
+fn impossible_weights_are_refused_by_name() {
+    let plan = Plan {
+        epochs: 1,
+        ..plan(Target::Tof, ShadowVariant::Concat)
+    };
+    let weights = trained(&plan, sources()).weights;
+    for (ends, value, said) in [
+        ("running_var", -0.5, "a variance cannot be negative"),
+        ("weight", f32::NAN, "expected finite numbers"),
+        ("bias", f32::INFINITY, "expected finite numbers"),
+    ] {
+        let odd = with(&weights, ends, value);
+        for error in [
+            Model::read(&odd, &Device::flex()).unwrap_err(),
+            Model::import(&odd, &plan, &Device::flex()).unwrap_err(),
+        ] {
+            assert!(matches!(error, ModelError::Values { .. }), "{error}");
+            let text = error.to_string();
+            assert!(text.contains(said) && text.contains(ends), "{text}");
+        }
+    }
 }

@@ -84,7 +84,7 @@ pub fn depth_alone(
     checked(settings)?;
     measured.check()?;
     let mut measured = measured.clone();
-    let raw = closed_form(&mut measured);
+    let raw = closed_form(&mut measured).0;
     some_depth(&raw)?;
     let mut depth = smooth(&measured, &raw);
     let walls = match settings.planes {

@@ -7,7 +7,10 @@ mod smooth;
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
 
-use crate::{Measured, MeasuredSpot};
+use crate::{
+    Measured, MeasuredSpot,
+    agreement::{self, Times},
+};
 
 pub use smooth::smooth;
 
@@ -33,19 +36,22 @@ pub struct Depth {
 }
 
 /// Depth of every pixel. The distances of spots that lie straight along their beams are refined on the way, since each is
-/// known to half a bin only.
-pub fn closed_form(measured: &mut Measured) -> Depth {
-    let mut range = medians(measured);
-    for _ in 0..ROUNDS {
+/// known to half a bin only. And how well the times agreed before that.
+pub fn closed_form(measured: &mut Measured) -> (Depth, Times) {
+    let mut range = fit(measured, &medians(measured)).0;
+    let times = agreement::times(measured, &range);
+    refine_spots(measured, &range);
+    for _ in 1..ROUNDS {
         range = fit(measured, &range).0;
         refine_spots(measured, &range);
     }
     let (range, error) = fit(measured, &range);
-    Depth {
+    let depth = Depth {
         normal: vec![Vec3::ZERO; range.len()],
         range,
         error,
-    }
+    };
+    (depth, times)
 }
 
 /// A spot relative to the camera, which is one focus.

@@ -13,6 +13,12 @@ pub enum ReconstructError {
         /// What was found, what was expected, and how to mend it.
         what: String,
     },
+    /// The measurements contradict one another.
+    #[error("the measurements contradict one another: {}", reasons.join("; "))]
+    Inconsistent {
+        /// Why, a sentence each.
+        reasons: Vec<String>,
+    },
     /// The renderer that made the measurements or the truth refused.
     #[error(transparent)]
     Render(#[from] RenderError),

@@ -5,6 +5,7 @@
 //! closed form and from carving. `docs/reconstruction.md` explains it and has the figures. This crate knows nothing of jobs
 //! or stores; files are the caller's.
 
+mod agreement;
 pub mod baseline;
 mod carve;
 mod checkpoint;
@@ -26,6 +27,7 @@ pub mod source;
 mod start;
 mod world;
 
+pub use agreement::{Agreement, Verdict};
 pub use closed_form::Depth;
 pub use error::ReconstructError;
 pub use measured::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE};
@@ -38,4 +40,4 @@ pub use reconstruction::{Evidence, Reconstructed, Reconstruction, reconstruct};
 pub use world::{Hit, World};
 
 /// Version of the reconstruction: part of every task key. Change it whenever any bit of a result may change.
-pub const VERSION: &str = "reconstruct-4";
+pub const VERSION: &str = "reconstruct-5";

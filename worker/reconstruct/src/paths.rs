@@ -108,6 +108,11 @@ impl<'a> Paths<'a> {
         spot.path_m + (x - spot.point).length() + (x - self.measured.camera.origin).length()
     }
 
+    /// Normals of what a pixel sees and of what a spot lies on; zero where unknown.
+    pub fn normals(&self, spot: usize, pixel: usize) -> (Vec3, Vec3) {
+        (self.normals[pixel], self.spot_normals[spot])
+    }
+
     /// The path from what a pixel sees to a spot; `None` where it tells nothing.
     #[inline]
     pub fn get(&self, spot: usize, pixel: usize) -> Option<LightPath> {

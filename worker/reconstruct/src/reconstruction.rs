@@ -6,7 +6,7 @@ use picofarm_settings::{GridSettings as Settings, Shadows};
 use rayon::prelude::*;
 
 use crate::{
-    Depth, Measured, ReconstructError,
+    Agreement, Depth, Measured, ReconstructError, Verdict, agreement,
     carve::carve,
     closed_form::{closed_form, smooth},
     field::{EMPTY, Field, SOLID},
@@ -50,6 +50,8 @@ pub struct Reconstructed {
     pub held_out_loss: Option<f64>,
     /// Iterations done.
     pub iterations: u32,
+    /// How well the measurements agree with one another.
+    pub agreement: Agreement,
     /// What somebody should know before trusting it.
     pub notes: Vec<String>,
 }
@@ -64,6 +66,7 @@ pub struct Reconstruction {
     evidence: Vec<Evidence>,
     trainable: Trainable,
     saved: Option<Saved>,
+    agreement: Agreement,
     notes: Vec<String>,
 }
 
@@ -97,7 +100,7 @@ impl Reconstruction {
             .map_err(|(field, what)| ReconstructError::invalid(field, what))?;
         let mut notes = measured.check()?;
         begin(progress, Phase::Depth)?;
-        let raw = closed_form(&mut measured);
+        let (raw, times) = closed_form(&mut measured);
         if !raw.range.iter().any(|r| r.is_finite()) {
             let what = "no time gives a depth: all are shorter than the way by the spot; check the gate and the laser's place";
             return Err(ReconstructError::invalid("tau", what));
@@ -108,6 +111,11 @@ impl Reconstruction {
             true => planes(&measured, &depth, settings.seed),
             false => Vec::new(),
         };
+        let agreement = agreement::check(&measured, &depth, &times);
+        if agreement.verdict == Verdict::Contradicts && !settings.accept_inconsistent {
+            let reasons = agreement.reasons;
+            return Err(ReconstructError::Inconsistent { reasons });
+        }
         settle(&measured, &mut depth, &walls);
         if settings.planes && walls.is_empty() {
             notes.push(
@@ -141,6 +149,7 @@ impl Reconstruction {
             evidence,
             trainable: these,
             saved: None,
+            agreement,
             notes,
         })
     }
@@ -149,7 +158,8 @@ impl Reconstruction {
     /// depend neither on stops nor on the number of threads.
     ///
     /// # Errors
-    /// [`ReconstructError::Stopped`] where it was stopped before the first iteration.
+    /// [`ReconstructError::Stopped`] where it was stopped before the first iteration; [`ReconstructError::Invalid`] where a
+    /// density is no finite number.
     pub fn run(&mut self, progress: &dyn Progress) -> Result<bool, ReconstructError> {
         if self.settings.shadows != Shadows::Optimise || self.trainable.0.is_empty() {
             return Ok(true);
@@ -176,6 +186,13 @@ impl Reconstruction {
             optimiser.settles = saved.settles;
         }
         let ended = optimiser.run(&mut field, progress);
+        if let Some(odd) = field.logit.iter().find(|u| !u.is_finite()) {
+            let what = format!(
+                "holds {odd} after iteration {}; check the measurements for values that are far too large",
+                optimiser.done
+            );
+            return Err(ReconstructError::invalid("field", what));
+        }
         let (done, loss) = (optimiser.done, optimiser.loss);
         let (held_out, misses, settles) = (optimiser.held_out, optimiser.misses, optimiser.settles);
         let (nodes, moments) = optimiser.state();
@@ -213,8 +230,14 @@ impl Reconstruction {
             loss,
             held_out_loss,
             iterations,
+            agreement: self.agreement,
             notes: self.notes,
         }
+    }
+
+    /// How well the measurements agree with one another.
+    pub fn agreement(&self) -> &Agreement {
+        &self.agreement
     }
 
     /// Its settings.

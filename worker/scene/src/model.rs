@@ -79,6 +79,14 @@ pub enum SceneError {
         /// Field, what was expected, what was found, and how to correct it.
         what: String,
     },
+    /// A file states no laser, and none was stated on import.
+    #[error("{path}: has no laser: {hint}")]
+    NoLaser {
+        /// The file.
+        path: PathBuf,
+        /// How to state one in this format.
+        hint: &'static str,
+    },
     /// A scene's content is unusable, whatever its source.
     #[error("scene {scene:?}: {field}: {what}")]
     Invalid {

@@ -238,7 +238,7 @@ fn elements_outside_the_subset_are_refused_by_name() {
         (
             GGX.into(),
             "<include filename=\"b.xml\"/>",
-            "<include>: this element is not supported",
+            "<include>: is not supported",
         ),
         (
             GGX.into(),

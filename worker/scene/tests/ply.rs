@@ -109,7 +109,7 @@ fn damage_is_refused_and_named() {
         ("7 5 0 1 2 3 4", "7 5 0 1 2 3 9", "index 9 points past 5"),
         ("7 5 0 1 2 3 4", "7 5 0 1 -2 3 4", "index -2"),
         ("7 5 0 1 2 3 4", "7 250 0 1 2 3 4", "does not fit"),
-        ("1 1 0 255", "1 nan 0 255", "positions[2]"),
+        ("1 1 0 255", "1 nan 0 255", "vertex 2 is not finite"),
         ("1 1 0 255", "1 one 0 255", "row 2: expected a number"),
         ("double y", "quadruple y", "header line 6"),
         ("format ascii", "format morse", "header line 2"),

@@ -74,6 +74,19 @@ pub struct Target {
 #[derive(Debug, Clone, Default)]
 pub struct Bearer(Option<Arc<MetadataValue<Ascii>>>);
 
+impl Bearer {
+    /// Sends this text as the header `authorization` instead of a token.
+    ///
+    /// # Errors
+    /// [`AccessError::Settings`]: the text has characters that a header must not have.
+    pub fn plain(text: &str) -> Result<Self, AccessError> {
+        let value = text.parse().map_err(|_| {
+            AccessError::Settings(format!("{text:?} cannot be sent; expected ASCII letters"))
+        })?;
+        Ok(Self(Some(Arc::new(value))))
+    }
+}
+
 impl Interceptor for Bearer {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
         if let Some(value) = &self.0 {

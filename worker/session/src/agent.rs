@@ -4,7 +4,7 @@ use std::{
     future::Future,
     pin::Pin,
     sync::Arc,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use picofarm_proto::{
@@ -80,6 +80,7 @@ async fn work(
         protocol: PROTOCOL,
         held: Vec::new(),
         ended: config.ended,
+        ends_in_ms: None,
         abilities: Abilities {
             kinds: executor.kinds(),
             assets: executor.assets(),
@@ -113,6 +114,11 @@ async fn work(
         summary: Summary::default(),
         coordinator: config.coordinator,
     };
+    if let Some(at) = config.ends_at {
+        let left = at.duration_since(SystemTime::now()).unwrap_or_default();
+        info!(in_s = left.as_secs_f64(), "the worker stops work then");
+        agent.assignments.must_end(Instant::now() + left);
+    }
     let outcome = agent.live(shutdown).await;
     agent.summary.unacknowledged = agent.assignments.unacknowledged_outputs() as u64;
     outcome.map(|()| {
@@ -221,6 +227,7 @@ impl Agent {
             }
             self.work(now);
             self.idle(now);
+            self.end_in_time(now);
             let wake = self.wake(now);
             let stopping = self
                 .leaving
@@ -258,7 +265,7 @@ impl Agent {
     fn work(&mut self, now: Instant) {
         if let Some(task) = self.assignments.begin(now) {
             info!(job = %task.job, task = task.index, "task starts");
-            let control = Arc::new(Control::default());
+            let control = Arc::new(Control::expecting(&task.spec.stores));
             self.control = Some(control.clone());
             let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
                 task = task.index);
@@ -299,6 +306,19 @@ impl Agent {
         }
     }
 
+    /// Ends a worker whose time is over.
+    fn end_in_time(&mut self, now: Instant) {
+        let over = self.assignments.ends_at().is_some_and(|at| now >= at);
+        let stopping = self
+            .leaving
+            .as_ref()
+            .is_some_and(|l| l.haste == Haste::Stop);
+        if over && !stopping {
+            info!("the worker's time is over");
+            self.begin_leaving(Haste::Stop);
+        }
+    }
+
     /// When the loop must look again although nothing came.
     fn wake(&self, now: Instant) -> Instant {
         let leaving = self.leaving.iter().flat_map(|l| [l.stop_at, l.give_up]);
@@ -306,6 +326,7 @@ impl Agent {
         leaving
             .chain(idle.map(|(since, most)| since + most))
             .chain(self.assignments.paused_until())
+            .chain(self.assignments.ends_at())
             .chain(self.assignments.in_hand().map(|_| self.tell_at))
             .filter(|at| *at > now)
             .min()
@@ -318,6 +339,7 @@ impl Agent {
             Event::Retry => {
                 let mut hello = self.hello.clone();
                 hello.held = self.assignments.held();
+                hello.ends_in_ms = self.assignments.ends_in_ms(now);
                 self.link = Link::Opening(Box::pin(session::open(self.target().clone(), hello)));
             }
             Event::Opened(Ok((welcome, session))) => {
@@ -503,6 +525,10 @@ impl Agent {
             Err(TaskError::Store(why)) => {
                 self.summary.failed += 1;
                 warn!(%job, task, why, "the task waits for its store; the worker takes other work");
+            }
+            Err(TaskError::Damaged(why)) => {
+                self.summary.failed += 1;
+                warn!(%job, task, why, "the task waits until what it reads is repaired");
             }
             Err(error) => {
                 self.summary.failed += 1;

@@ -97,6 +97,8 @@ pub(crate) struct Assignments {
     pace: Option<(StageKey, Duration)>,
     /// No new work before this time.
     paused_until: Option<Instant>,
+    /// When the worker must end, where that is known.
+    ends_at: Option<Instant>,
     draining: bool,
 }
 
@@ -111,6 +113,7 @@ impl Assignments {
             asked: false,
             pace: None,
             paused_until: None,
+            ends_at: None,
             draining: false,
         }
     }
@@ -155,6 +158,24 @@ impl Assignments {
         for beat in &mut self.beats {
             beat.slept += long;
         }
+        // Its end is a time of day.
+        self.ends_at = self.ends_at.map(|at| at.checked_sub(long).unwrap_or(at));
+    }
+
+    /// The worker must end then.
+    pub(crate) fn must_end(&mut self, at: Instant) {
+        self.ends_at = Some(at);
+    }
+
+    /// When the worker must end, where that is known.
+    pub(crate) fn ends_at(&self) -> Option<Instant> {
+        self.ends_at
+    }
+
+    /// Milliseconds until the worker must end, at least 1, where that is known.
+    pub(crate) fn ends_in_ms(&self, now: Instant) -> Option<u64> {
+        let left = self.ends_at?.saturating_duration_since(now);
+        Some(u64::try_from(left.as_millis()).unwrap_or(u64::MAX).max(1))
     }
 
     /// When the oldest unanswered heartbeat was sent.
@@ -324,6 +345,7 @@ impl Assignments {
                     TaskError::Crash(_) => FailureKind::Crash,
                     TaskError::Interrupted(_) | TaskError::Stopped => FailureKind::Interrupted,
                     TaskError::Store(_) => FailureKind::Store,
+                    TaskError::Damaged(_) => FailureKind::Damaged,
                 },
                 message: error.to_string(),
             })),
@@ -462,7 +484,11 @@ impl Assignments {
                 at: at.clone(),
             })
             .collect();
-        Outgoing::Heartbeat { leases, progress }
+        Outgoing::Heartbeat {
+            leases,
+            progress,
+            ends_in_ms: self.ends_in_ms(now).unwrap_or(0),
+        }
     }
 
     /// Forgets leases that are worked off and about which nothing waits for an acknowledgement.

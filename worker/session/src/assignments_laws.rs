@@ -202,7 +202,7 @@ proptest! {
                     assignments.suspended(long);
                 }
                 Step::Heartbeat => {
-                    let Outgoing::Heartbeat { leases, progress } = assignments.heartbeat(now, 0.5, TaskAt::default()) else {
+                    let Outgoing::Heartbeat { leases, progress, .. } = assignments.heartbeat(now, 0.5, TaskAt::default()) else {
                         unreachable!()
                     };
                     prop_assert!(progress.iter().all(|p| leases.contains(&p.lease)));

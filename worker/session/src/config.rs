@@ -1,6 +1,9 @@
 //! A worker's settings, its summary at the end, and why it may end early.
 
-use std::{path::PathBuf, time::Duration};
+use std::{
+    path::PathBuf,
+    time::{Duration, SystemTime},
+};
 
 use picofarm_proto::{ids::WorkerId, model::check_label};
 use picofarm_settings::Gpus;
@@ -34,6 +37,9 @@ pub struct AgentConfig {
     pub labels: Vec<String>,
     /// The worker ends when it has had nothing to do for so long, while connected; `None` = never.
     pub exit_idle: Option<Duration>,
+    /// The worker stops work then, as at a signal; it tells the coordinator, which grants what it
+    /// can finish by then. `None` = not known.
+    pub ends_at: Option<SystemTime>,
     /// Folders to look in for furniture, besides the usual ones.
     pub asset_dirs: Vec<PathBuf>,
     /// What this worker has to show, and whom it trusts.

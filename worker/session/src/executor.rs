@@ -62,6 +62,9 @@ pub enum TaskError {
     /// Nothing is wrong with the task: its store cannot be reached, or takes nothing.
     #[error("{0}")]
     Store(String),
+    /// Nothing is wrong with the task: its store answers, but an object in it is damaged or missing.
+    #[error("{0}")]
+    Damaged(String),
     /// [`Control::stop`] was called.
     #[error("stopped on request")]
     Stopped,
@@ -97,6 +100,8 @@ pub struct Control {
     stop: AtomicBool,
     /// What it has done is not wanted either.
     unwanted: AtomicBool,
+    /// The identities of stores by their places.
+    stores: BTreeMap<String, String>,
 }
 
 impl Default for Control {
@@ -107,11 +112,31 @@ impl Default for Control {
             at: Mutex::default(),
             stop: AtomicBool::default(),
             unwanted: AtomicBool::default(),
+            stores: BTreeMap::new(),
         }
     }
 }
 
 impl Control {
+    /// For a task that expects these identities of stores, by their places.
+    pub fn expecting(stores: &BTreeMap<String, String>) -> Self {
+        Self {
+            stores: stores.clone(),
+            ..Self::default()
+        }
+    }
+
+    /// The identity that the store at a place must have, if the task expects one.
+    pub fn identity(&self, place: &str) -> Option<&str> {
+        let identity = self.stores.get(place.trim_end_matches('/'))?;
+        Some(identity)
+    }
+
+    /// The places of stores that must have an identity.
+    pub fn identified(&self) -> impl Iterator<Item = &str> {
+        self.stores.keys().map(String::as_str)
+    }
+
     /// How long the task has been running.
     pub fn elapsed(&self) -> Duration {
         self.begun.elapsed()

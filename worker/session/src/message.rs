@@ -17,6 +17,8 @@ pub(crate) enum Outgoing {
         leases: Vec<LeaseRef>,
         /// The task in hand.
         progress: Vec<TaskProgress>,
+        /// Milliseconds until the worker must end; 0 = not known.
+        ends_in_ms: u64,
     },
     /// What the task in hand has logged.
     Log(TaskLog),
@@ -90,7 +92,12 @@ impl From<Outgoing> for wire::SessionRequest {
         use session_request::Message as M;
         let message = match message {
             Outgoing::Credit(leases) => M::Credit(wire::Credit { leases }),
-            Outgoing::Heartbeat { leases, progress } => M::Heartbeat(wire::Heartbeat {
+            Outgoing::Heartbeat {
+                leases,
+                progress,
+                ends_in_ms,
+            } => M::Heartbeat(wire::Heartbeat {
+                ends_in_ms,
                 leases: leases.into_iter().map(Into::into).collect(),
                 progress: progress.into_iter().map(Into::into).collect(),
             }),

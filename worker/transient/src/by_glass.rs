@@ -13,7 +13,8 @@
 //!
 //! Where no leg is straight, light paths whose legs are all turned and camera paths whose first leg is meet on a surface: see
 //! [`photons`]. That alone is an approximation: it blurs what it finds over about a pixel. The spots are among what is found so,
-//! where the camera sees them in glass. Each class is found in one way, so nothing is weighed and nothing counted twice. A reflection
+//! where the camera sees them in bodies of glass or by several panes; one that a planar pane alone shows is a point of light
+//! ([`images`]). Each class is found in one way, so nothing is weighed and nothing counted twice. A reflection
 //! counts as a bounce, and refraction does not; a spot that the camera sees by refraction alone, one bounce, is left out.
 //!
 //! Camera paths that scatter aim at glass with half of their directions: see [`aim`].
@@ -40,6 +41,8 @@ use self::{
 use crate::{
     api::{RenderError, Stop},
     bvh::Stack,
+    caustic::Splat,
+    film::Film,
     glass::Crossing,
     light_vertices::LightVertices,
     targets::{Target, Targets},
@@ -64,6 +67,8 @@ pub(crate) struct ByGlass {
     of_pane: Vec<u32>,
     of_triangle: Vec<u32>,
     images: Images,
+    /// What each pass draws of the spots that the camera sees in planar panes.
+    seen: Vec<Splat>,
     /// What camera paths aim at.
     aim: Aim,
     /// Where points of [`Lit`] lie.
@@ -77,6 +82,9 @@ pub(crate) struct ByGlass {
 }
 
 const NONE: u32 = u32::MAX;
+
+/// Index of refraction outside of all bodies.
+const AIR: f32 = 1.0;
 
 /// Buffers of a thread.
 #[derive(Debug)]
@@ -110,7 +118,11 @@ impl ByGlass {
     ///
     /// # Errors
     /// [`RenderError::Stopped`].
-    pub fn find(walk: &Walk, centres: &Centres, stop: Stop) -> Result<Option<Self>, RenderError> {
+    pub fn find(
+        (walk, film): (&Walk, &Film),
+        centres: &Centres,
+        stop: Stop,
+    ) -> Result<Option<Self>, RenderError> {
         let (world, emitters) = (walk.world, walk.emitters);
         let images = Images::find(world, stop);
         let area = |[a, b, c]: [Vec3; 3]| 0.5 * (b - a).cross(c - a).length();
@@ -162,8 +174,14 @@ impl ByGlass {
         let targets = Targets::new(&all, emitters, stop);
         stop.check()?;
         let mut stack = world.bvh.stack();
-        let forward = world.camera.forward;
+        let around = world.medium(&mut stack, Vec3::ZERO, world.camera.forward);
+        let seen = match around == AIR {
+            true => images.seen((walk, film), &mut Buffers::new(walk), stop),
+            false => vec![],
+        };
+        stop.check()?;
         Ok(targets.map(|targets| Self {
+            seen,
             targets,
             elsewhere: (BY_AREA * glass / areas.whole() as f32).clamp(ELSEWHERE, 1.0),
             areas,
@@ -172,8 +190,18 @@ impl ByGlass {
             of_pane,
             of_triangle,
             sees: sees(world, centres, &mut stack),
-            around: world.medium(&mut stack, Vec3::ZERO, forward),
+            around,
         }))
+    }
+
+    /// Whether spots that planar panes show are points of light: where the camera is in no body of glass.
+    fn points_of_light(&self) -> bool {
+        self.around == AIR
+    }
+
+    /// What each pass draws of the spots that the camera sees in planar panes.
+    pub fn seen(&self) -> &[Splat] {
+        &self.seen
     }
 
     /// How likely a pixel gets a camera path in a pass.

@@ -105,7 +105,7 @@ pub(crate) fn plan(
     if walk.glass.is_some() && longest >= 2 {
         strategies.push("glass: light and camera paths by what it reflects and refracts".into());
         approximations.push(
-            "what the camera sees in glass by light that comes from a spot by glass, and spots seen in glass, are blurred over about a pixel"
+            "what the camera sees in glass by light that comes from a spot by glass, and spots seen in bodies of glass or by several panes, are blurred over about a pixel"
                 .into(),
         );
     }

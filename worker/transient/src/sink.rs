@@ -87,6 +87,8 @@ pub(crate) enum Technique {
     Vertex,
     /// By the photons of such paths.
     Photon,
+    /// A spot that a planar pane shows to the camera.
+    SeenSpot,
 }
 
 impl Technique {
@@ -100,7 +102,7 @@ impl Technique {
 }
 
 /// Their names.
-pub(crate) const TECHNIQUES: [&str; 8] = [
+pub(crate) const TECHNIQUES: [&str; 9] = [
     "light path by near-mirrors",
     "light path in a zone",
     "light path by glass",
@@ -109,6 +111,7 @@ pub(crate) const TECHNIQUES: [&str; 8] = [
     "camera path, image of a lit point in a pane",
     "camera path by glass, light path by glass",
     "camera path by glass, photon",
+    "spot seen in a pane",
 ];
 
 /// Takes what a walk finds: optical path in metres, light, spot, bounces of the whole path, and how it was found.

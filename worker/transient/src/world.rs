@@ -9,7 +9,7 @@ use picofarm_scene::{Camera, Material, Scene, Texture, Vec3};
 use crate::{
     api::{RenderError, Stop},
     bsdf::Surface,
-    bvh::{Bvh, Stack, normal},
+    bvh::{Bvh, Stack, is_needle, normal},
     extent::{self, Point, wide},
     fresnel::Body,
     glass::{Crossing, Panes},
@@ -698,9 +698,47 @@ pub(crate) fn point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
     let u = c.0 * b.1 - c.1 * b.0;
     let v = a.0 * c.1 - a.1 * c.0;
     let w = b.0 * a.1 - b.1 * a.0;
-    let k = 1.0 / (u + v + w);
+    let det = u + v + w;
+    let size = |p: f32, q: f32, r: f32| p.abs().max(q.abs()).max(r.abs());
+    let whole = size(a.0, b.0, c.0) * size(a.1, b.1, c.1);
+    if det.abs() * SLIM < whole && is_needle(t) {
+        return needle_point(t, o, d);
+    }
+    let k = 1.0 / det;
     let (u, v) = (u * k, v * k);
     t[0] * u + t[1] * v + t[2] * (1.0 - u - v)
+}
+
+/// How much less than the square around it a triangle's area is where [`point`] asks whether it is a needle.
+const SLIM: f32 = 8.0;
+
+/// [`point`] in f64, for triangles of which f32 would find a place some millimetres off along them.
+#[cold]
+fn needle_point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
+    let (o, d) = (wide(o), wide(d));
+    let minus = |a: Point, b: Point| [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    let cross = |a: Point, b: Point| {
+        [
+            a[1] * b[2] - a[2] * b[1],
+            a[2] * b[0] - a[0] * b[2],
+            a[0] * b[1] - a[1] * b[0],
+        ]
+    };
+    let dot = |a: Point, b: Point| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let corners = t.map(wide);
+    let [a, b, c] = corners.map(|v| minus(v, o));
+    // Volumes with the ray's direction: in proportion to the barycentric coordinates.
+    let all = [
+        dot(d, cross(c, b)),
+        dot(d, cross(a, c)),
+        dot(d, cross(b, a)),
+    ];
+    let sum = all[0] + all[1] + all[2];
+    let at = |k: usize| {
+        let each = all.iter().zip(&corners);
+        (each.map(|(share, v)| share * v[k]).sum::<f64>() / sum) as f32
+    };
+    Vec3::new(at(0), at(1), at(2))
 }
 
 /// A point moved off its surface by a few units in the last place, along `n` (Wächter and Binder, Ray

@@ -145,6 +145,38 @@ fn a_spot_seen_in_a_window_is_as_bright_as_its_mirror_image() {
 }
 
 #[test]
+fn a_spot_seen_in_a_window_is_as_bright_at_any_resolution_beside_the_windows_edge() {
+    // Its image is seen in the window at (0.12, -0.08).
+    let image = |edge: f32, size: u32| {
+        let wall = quad(
+            v(-6.0, -6.0, 1.0),
+            v(12.0, 0.0, 0.0),
+            v(0.0, 12.0, 0.0),
+            grey(0.5),
+        );
+        let window = quad(
+            v(-3.0, -3.0, -2.0),
+            v(0.0, 6.0, 0.0),
+            v(3.0 + edge, 0.0, 0.0),
+            Material::glass("window"),
+        );
+        let s = scene(vec![wall, window], size, &[v(0.3, -0.2, 1.0)]);
+        let r = ok(&s, &settings(Budget::Samples(2)));
+        parts(&r)[0] / f64::from(size * size)
+    };
+    let (d2, z) = (0.3f64 * 0.3 + 0.2 * 0.2 + 25.0, 5.0);
+    let cos = z / d2.sqrt();
+    // The film is 2 wide at unit distance.
+    let expected = 0.5 / std::f64::consts::PI * cos * pane(cos) / (4.0 * d2 * cos.powi(3));
+    for size in [3, 24, 64, 161] {
+        let off = image(0.121, size) / expected - 1.0;
+        println!("{size}: {:+.3} %", 100.0 * off);
+        assert!(off.abs() < 1e-3, "{size}: {off}");
+        assert_eq!(image(0.119, size), 0.0, "{size}, beyond the edge");
+    }
+}
+
+#[test]
 fn light_takes_its_time_through_a_body_and_loses_what_fresnel_says() {
     let scene = |ior| {
         let mut objects = room(v(-2.0, -2.0, -4.0), v(2.0, 2.0, 2.0), &grey(0.5));

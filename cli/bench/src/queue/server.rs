@@ -156,6 +156,8 @@ fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, Str
             "127.0.0.1:0",
         ])
         .args(["--lease-s", &lease_s.to_string(), "--log", "warn"])
+        // Simulated workers store nothing.
+        .args(["--check-stores", "none"])
         // A lost session counts until it is noticed.
         .args(["--max-sessions", "100000"])
         // Not an argument: it may hold a password.

@@ -68,6 +68,7 @@ impl Simulated {
             protocol: PROTOCOL,
             held: Vec::new(),
             ended: String::new(),
+            ends_in_ms: None,
             abilities: Abilities {
                 kinds: [("render".to_owned(), RENDERER.to_owned())].into(),
                 cores: 1,
@@ -165,7 +166,7 @@ impl Simulated {
                 _ = beat.tick() => {
                     beats.push_back(Instant::now());
                     let leases = self.leases.iter().map(|h| h.lease.into()).collect();
-                    say(&to, Say::Heartbeat(wire::Heartbeat { leases, progress: Vec::new() }));
+                    say(&to, Say::Heartbeat(wire::Heartbeat { leases, progress: Vec::new(), ends_in_ms: 0 }));
                 }
                 () = stop.cancelled() => return End::Stopped,
             }

@@ -86,7 +86,15 @@ fn table(report: &Report) -> String {
             bytes(group.bytes / group.scenes.max(1) as u64)
         );
     }
-    let _ = write!(out, "</tbody></table></div><p class=\"note\">{CLASSES}</p>");
+    let _ = write!(out, "</tbody></table></div>");
+    for group in &report.groups {
+        if let Some(verdict) = &group.verdict {
+            let class = if verdict.doubtful { "warn" } else { "note" };
+            let (name, text) = (Safe(name(group)), Safe(&verdict.text));
+            let _ = write!(out, "<p class=\"{class}\">{name}: {text}</p>");
+        }
+    }
+    let _ = write!(out, "<p class=\"note\">{CLASSES}</p>");
     out
 }
 
@@ -238,6 +246,7 @@ mod tests {
             spots: Some([16, 16]),
             image: Some([512, 512]),
             figures: BTreeMap::from([("l1_m", figure)]),
+            verdict: None,
             as_published,
             extremes: vec![Extreme {
                 rank: "best",

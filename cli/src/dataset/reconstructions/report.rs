@@ -6,14 +6,14 @@
 use std::collections::BTreeMap;
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{DatasetError, ReconstructionManifest, Reconstructions};
+use picofarm_dataset::{DatasetError, ReconstructionManifest, Reconstructions, Verdict};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::{CONCURRENCY, FIGURES, figure, metrics, opened, page};
 use crate::{
     args::DatasetReport,
-    dataset::failed,
+    dataset::{failed, predictions::summed},
     error::{CliError, Result},
     output::Output,
     picture::write_atomically,
@@ -49,6 +49,8 @@ pub(super) struct Group {
     /// 16 spots, 512 x 512 pixels, and PlatoNeRF's room.
     pub as_published: bool,
     pub extremes: Vec<Extreme>,
+    /// What they are worth together.
+    pub verdict: Option<Verdict>,
 }
 
 /// Mean over scenes, and its standard error where there are two scenes and more.
@@ -228,6 +230,11 @@ async fn group(place: &str, there: &Reconstructions, scenes: &[Scene]) -> Result
             && scenes.iter().all(of_the_paper),
         image,
         figures: figures.collect(),
+        verdict: summed(
+            scenes
+                .iter()
+                .map(|s| (s.manifest.scene, Verdict::of_reconstruction(&s.metrics))),
+        ),
         extremes: extremes(there, scenes).await?,
     })
 }

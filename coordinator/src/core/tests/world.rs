@@ -24,6 +24,8 @@ use super::super::{Core, OutputHint, Say, Settings, Timings, prepare, stands_for
 use crate::{budget::Backoff, submission::Draft};
 
 pub(super) const TASKS: u64 = 12;
+/// As the actor's.
+const ROUNDS: usize = 8;
 const WORKERS: u8 = 3;
 pub(super) const SETTINGS: Settings = Settings {
     lease_ms: 1_000,
@@ -61,6 +63,8 @@ pub(super) enum Op {
     Cancel,
     /// A second job over the same outputs.
     Grow,
+    /// The worker must end in this many milliseconds.
+    Ends(u8, u16),
 }
 
 pub(super) fn op() -> impl Strategy<Value = Op> {
@@ -103,6 +107,8 @@ pub(super) struct FakeWorker {
     /// The instance and the session there.
     pub(super) session: Option<(usize, u64)>,
     incarnation: u128,
+    /// When it must end, as it reports.
+    pub(super) ends_in_ms: Option<u64>,
     /// Latest first.
     pub(super) leases: Vec<Lease>,
 }
@@ -205,8 +211,11 @@ impl World {
     }
 
     async fn submit(&mut self, h: usize, count: u64) {
+        self.submit_as(h, "ada", spec(count)).await;
+    }
+
+    pub(super) async fn submit_as(&mut self, h: usize, user: &str, spec: JobSpec) {
         self.flush(h).await;
-        let spec = spec(count);
         let catalog = self.instances[h].catalog.clone();
         let latest = catalog
             .job_with(&picofarm_proto::key::spec_hash(&spec))
@@ -220,7 +229,7 @@ impl World {
         let draft = Draft::new(spec, 0);
         let mut runs = Vec::new();
         for stage in draft.stages() {
-            let recorded = catalog.recorded(&stage.set, count).await.unwrap();
+            let recorded = catalog.recorded(&stage.set, stage.tasks).await.unwrap();
             // The store holds every other one; of the rest nobody knows.
             let seen: Vec<_> = recorded.into_iter().filter(|o| o.task % 2 == 0).collect();
             let marked = catalog.mark_checked(&stage.set, &seen).await;
@@ -233,7 +242,7 @@ impl World {
             };
             runs.push(seen.iter().map(run).collect::<Vec<_>>());
         }
-        let prepared = prepare(&draft, "ada".into(), "", &runs, &mut Uuid::now_v7, self.now);
+        let prepared = prepare(&draft, user.into(), "", &runs, &mut Uuid::now_v7, self.now);
         let submission = Submission::new(
             &prepared.job,
             &prepared.stages,
@@ -290,7 +299,7 @@ impl World {
         self.instances[h].core.give_back();
         self.flush(h).await;
         let connected = self.instances[h].core.connected();
-        let news = self.instances[h].catalog.beat(connected).await;
+        let news = self.instances[h].catalog.beat(connected, self.now).await;
         let Some(news) = self.or_reload(h, news).await else {
             return;
         };
@@ -314,10 +323,13 @@ impl World {
             protocol: PROTOCOL,
             held: worker.leases.iter().map(|l| l.lease).collect(),
             ended: String::new(),
+            ends_in_ms: worker.ends_in_ms,
             abilities: Abilities {
                 kinds: ["render", "reprocess"]
                     .map(|kind| (kind.to_owned(), "r".to_owned()))
                     .into(),
+                // One of them has a label.
+                labels: (w == 2).then(|| "x".to_owned()).into_iter().collect(),
                 ..Abilities::default()
             },
         };
@@ -350,7 +362,7 @@ impl World {
         };
         instance
             .core
-            .finished(session, &report, OutputHint(hint), self.now);
+            .finished(session, &report, OutputHint(hint), false, self.now);
         let said = self.flush(h).await;
         let accepted = said
             .iter()
@@ -365,6 +377,32 @@ impl World {
             }
             self.committed
                 .insert((lease.ordinal, index), report.manifest_sha256);
+        }
+    }
+
+    /// The first worker's task fails.
+    pub(super) async fn fail(&mut self, lease: &Lease, index: u64, kind: FailureKind) {
+        self.fail_on(0, lease, index, kind).await;
+    }
+
+    /// A worker's task fails.
+    pub(super) async fn fail_on(&mut self, w: usize, lease: &Lease, index: u64, kind: FailureKind) {
+        let Some((h, session)) = self.workers[w].session else {
+            return;
+        };
+        let failure = Failure {
+            lease: lease.lease,
+            index,
+            kind,
+            message: "no".into(),
+        };
+        self.instances[h].core.failed(session, &failure, self.now);
+        self.flush(h).await;
+    }
+
+    pub(super) async fn close(self) {
+        for instance in &self.instances {
+            instance.catalog.close().await;
         }
     }
 
@@ -483,6 +521,12 @@ impl World {
                 }
             }
             Op::Grow => self.submit(0, TASKS + 4).await,
+            Op::Ends(w, ms) => {
+                if let Some((h, session)) = self.workers[usize::from(*w)].session {
+                    let core = &mut self.instances[h].core;
+                    core.ends(session, Some(u64::from(*ms)), self.now);
+                }
+            }
         }
         for h in 0..self.instances.len() {
             self.step(h).await;
@@ -492,18 +536,24 @@ impl World {
     /// One turn of an instance's actor.
     async fn step(&mut self, h: usize) {
         self.instances[h].core.expire(self.now);
-        let wants = self.instances[h].core.wants(self.now);
-        if !wants.is_empty() {
-            self.flush(h).await;
-            let claims = self.instances[h].catalog.claim(&wants).await;
-            let Some(claims) = self.or_reload(h, claims).await else {
-                return;
-            };
-            for (want, claim) in wants.iter().zip(claims) {
-                self.instances[h].core.claimed(want.stage, claim, self.now);
+        for _ in 0..ROUNDS {
+            let wants = self.instances[h].core.wants(self.now);
+            let claimed = !wants.is_empty();
+            if claimed {
+                self.flush(h).await;
+                let claims = self.instances[h].catalog.claim(&wants).await;
+                let Some(claims) = self.or_reload(h, claims).await else {
+                    return;
+                };
+                for (want, claim) in wants.iter().zip(claims) {
+                    self.instances[h].core.claimed(want.stage, claim, self.now);
+                }
+            }
+            self.instances[h].core.dispatch(self.now);
+            if !claimed {
+                break;
             }
         }
-        self.instances[h].core.dispatch(self.now);
         self.flush(h).await;
     }
 

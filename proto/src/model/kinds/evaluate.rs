@@ -13,6 +13,7 @@ use super::{
 };
 use crate::{
     model::{
+        destination::Destination,
         limits::check_count,
         memory::{BASE, Known},
         places::{SourceSettings, check_source},
@@ -138,6 +139,10 @@ impl TaskKind for EvaluateShardTask {
         })
     }
 
+    fn destination(&self) -> Destination<'_> {
+        Destination::Shared
+    }
+
     fn results(&self) -> Results<'_> {
         let source = &self.whole.source;
         Results {
@@ -240,6 +245,10 @@ impl TaskKind for EvaluateTask {
             "count": self.count,
             "settings": settings,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::Shared
     }
 
     fn results(&self) -> Results<'_> {

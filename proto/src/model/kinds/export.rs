@@ -8,6 +8,7 @@ use super::{
     kind::{Declared, Manifest, Results, TaskKind},
 };
 use crate::model::{
+    destination::Destination,
     limits::check_count,
     memory::{BASE, Known},
     places::{SourceSettings, check_source},
@@ -92,6 +93,10 @@ impl TaskKind for ExportTask {
             "count": self.count,
             "settings": self.export,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::folder("export.dest", &self.export.dest, "")
     }
 
     fn results(&self) -> Results<'_> {

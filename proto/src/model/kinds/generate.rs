@@ -12,6 +12,7 @@ use super::{
 };
 use crate::{
     model::{
+        destination::Destination,
         memory::{BASE, Known},
         spec_error::{SpecError, within},
     },
@@ -112,6 +113,10 @@ impl TaskKind for GenerateTask {
             "resolution": self.generate.resolution,
             "version": self.generate.version,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::folder("generate.dest", &self.generate.dest, "")
     }
 
     fn results(&self) -> Results<'_> {

@@ -8,6 +8,7 @@ use super::{
     kind::{Declared, Results, TaskKind},
 };
 use crate::model::{
+    destination::Destination,
     limits::MAX_TASKS,
     memory::{BASE, Known},
     places::OutputSettings,
@@ -133,6 +134,10 @@ impl TaskKind for ImportTask {
             "import": self.import,
             "profile": self.output.profile,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.output)
     }
 
     fn results(&self) -> Results<'_> {

@@ -13,6 +13,7 @@ use super::{
     train::check_spots,
 };
 use crate::model::{
+    destination::Destination,
     limits::check_count,
     memory::{BASE, Known, Network},
     places::{OutputSettings, SourceSettings, check_source, default_profile},
@@ -123,6 +124,10 @@ impl TaskKind for InferTask {
             "source": self.source.shaping(),
             "settings": self.infer,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.output)
     }
 
     fn results(&self) -> Results<'_> {

@@ -8,6 +8,7 @@ use super::{division::Division, fields::Fields, scenes::SceneSource};
 use crate::{
     key::hash::StageKey,
     model::{
+        destination::Destination,
         memory::{Known, Network, Shape},
         places::{OutputSettings, SourceSettings},
         spec_error::SpecError,
@@ -68,8 +69,16 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         Ok(())
     }
 
+    /// Settings that can be used but are probably not meant, in words that name the field. They are warnings of a plan.
+    fn remarks(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Everything that shapes its results but their number: what the key of its stage hashes.
     fn shaping(&self) -> Value;
+
+    /// Where its tasks write, which decides whose that is. Without a default, so that no kind leaves it out.
+    fn destination(&self) -> Destination<'_>;
 
     /// Where its results lie.
     fn results(&self) -> Results<'_>;

@@ -13,6 +13,7 @@ use super::{
 use crate::{
     key::hash::StageKey,
     model::{
+        destination::Destination,
         memory::{BASE, Known, LIGHT_PATHS},
         spec_error::SpecError,
     },
@@ -89,6 +90,10 @@ impl TaskKind for PartTask {
             "whole": self.whole.stage_key().to_string(),
             "parts": self.whole.parts,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.whole.output)
     }
 
     fn results(&self) -> Results<'_> {

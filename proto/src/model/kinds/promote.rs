@@ -9,6 +9,7 @@ use super::{
     names::check_model,
 };
 use crate::model::{
+    destination::Destination,
     limits::{MAX_STAGES, check_count},
     memory::{BASE, Known, Network},
     places::{MODELS, SourceSettings, check_source},
@@ -92,6 +93,11 @@ impl TaskKind for PromoteTask {
             "source": self.source.shaping(),
             "settings": self.promote,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        let folder = format!("{MODELS}/{}", self.promote.model);
+        Destination::folder("promote.model", &self.source.store, folder)
     }
 
     fn results(&self) -> Results<'_> {

@@ -9,6 +9,7 @@ use super::{
     kind::{Declared, Results, TaskKind},
 };
 use crate::model::{
+    destination::Destination,
     limits::check_count,
     memory::{BASE, Known, Shape},
     places::{OutputSettings, SourceSettings, check_source, default_profile},
@@ -178,6 +179,10 @@ impl TaskKind for ReconstructTask {
             "source": self.source.shaping(),
             "settings": self.reconstruct,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.output)
     }
 
     fn results(&self) -> Results<'_> {

@@ -11,6 +11,7 @@ use super::{
 use crate::{
     key::hash::StageKey,
     model::{
+        destination::Destination,
         memory::{Known, LIGHT_PATHS, Rendering, Shape},
         places::OutputSettings,
         spec_error::{SpecError, within},
@@ -136,6 +137,11 @@ impl TaskKind for RenderTask {
                         `picofarm scene plan` tells how many that would be";
             return Err(SpecError::new("parts", what));
         }
+        if self.output.profile == "counts-u16" {
+            let what = "\"counts-u16\" stores whole photon counts, and a render has none; use \"sqrt-u16\", or detect \
+                        photons in a reprocess stage";
+            return Err(SpecError::new("output.profile", what));
+        }
         if let [smallest, ..] = self.render.subsets[..]
             && self.scenes.spots != Spots::Grid(100)
         {
@@ -151,6 +157,10 @@ impl TaskKind for RenderTask {
         self.output.check()
     }
 
+    fn remarks(&self) -> Vec<String> {
+        self.render.remarks(&self.scenes.kind)
+    }
+
     /// File scenes count by content and position, not by path; the place where results go does not count, nor the number
     /// of parts.
     fn shaping(&self) -> Value {
@@ -163,6 +173,10 @@ impl TaskKind for RenderTask {
             "render": self.render,
             "profile": self.output.profile,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.output)
     }
 
     fn results(&self) -> Results<'_> {

@@ -10,6 +10,7 @@ use super::{
     names::check_model,
 };
 use crate::model::{
+    destination::Destination,
     memory::{BASE, Known},
     places::REPORTS,
     spec_error::{SpecError, within},
@@ -81,6 +82,11 @@ impl TaskKind for ReportTask {
 
     fn shaping(&self) -> Value {
         json!({"stage": "report", "settings": self.report})
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        let folder = format!("{REPORTS}/{}", self.report.name);
+        Destination::folder("report.name", &self.report.store, folder)
     }
 
     fn results(&self) -> Results<'_> {

@@ -12,6 +12,7 @@ use super::{
 use crate::{
     key::hash::StageKey,
     model::{
+        destination::Destination,
         limits::check_count,
         memory::{BASE, Known, Shape},
         places::{OutputSettings, SourceSettings, check_source},
@@ -77,6 +78,10 @@ impl TaskKind for ReprocessTask {
             "source": self.source.shaping(),
             "settings": self.reprocess.stage_key(&self.output.profile).to_string(),
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.output)
     }
 
     fn results(&self) -> Results<'_> {

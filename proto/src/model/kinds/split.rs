@@ -9,6 +9,7 @@ use super::{
 };
 use crate::{
     model::{
+        destination::{Destination, Place},
         limits::check_count,
         memory::{BASE, Known},
         places::{SourceSettings, check_source},
@@ -63,6 +64,15 @@ impl TaskKind for SplitTask {
             "source": self.source.shaping(),
             "count": self.count,
             "settings": self.split,
+        })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        let folder = format!("{}/split/{}", self.source.dataset, self.split.name);
+        Destination::Record(Place {
+            field: "split.name",
+            store: &self.source.store,
+            folder: folder.into(),
         })
     }
 

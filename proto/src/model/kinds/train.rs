@@ -14,6 +14,7 @@ use super::{
     scenes::SceneSource,
 };
 use crate::model::{
+    destination::Destination,
     limits::check_count,
     memory::{BASE, Known, Network, Shape},
     places::{MODELS, SourceSettings, check_source},
@@ -85,6 +86,11 @@ impl TaskKind for TrainTask {
             description["trial"] = json!(trial);
         }
         description
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        let folder = format!("{MODELS}/{}", self.train.model);
+        Destination::folder("train.model", &self.source.store, folder)
     }
 
     fn results(&self) -> Results<'_> {

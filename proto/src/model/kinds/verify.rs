@@ -8,6 +8,7 @@ use super::{
     kind::{Declared, Manifest, Results, TaskKind},
 };
 use crate::model::{
+    destination::Destination,
     limits::check_count,
     memory::{BASE, Known},
     places::{SourceSettings, check_source},
@@ -67,6 +68,10 @@ impl TaskKind for VerifyTask {
             "source": self.source.shaping(),
             "settings": self.verify,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::Shared
     }
 
     fn results(&self) -> Results<'_> {

@@ -23,6 +23,20 @@ pub(super) async fn fence(c: &mut PgConnection, instance: InstanceId) -> Result<
     alive.map(|_| ()).ok_or(WriteError::Fenced)
 }
 
+/// Fills some pages of a table of its own: those of other tables may have room left where the disk has none. The caller's
+/// transaction takes it back, or ends with it.
+pub(super) async fn try_room(c: &mut PgConnection) -> Sql<()> {
+    // 64 rows of 1 KiB, which are too short to be compressed.
+    for step in [
+        "CREATE TEMPORARY TABLE room (filler TEXT NOT NULL) ON COMMIT DROP",
+        "INSERT INTO room SELECT repeat('x', 1024) FROM generate_series(1, 64)",
+        "DROP TABLE room",
+    ] {
+        sqlx::query(step).execute(&mut *c).await?;
+    }
+    Ok(())
+}
+
 /// Founds an instance, which inherits from a former life of the same process.
 pub(super) async fn found(
     c: &mut PgConnection,

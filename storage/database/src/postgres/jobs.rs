@@ -10,7 +10,7 @@ use picofarm_proto::{
 use sqlx::PgConnection;
 
 use super::{
-    job_query, query,
+    job_query, query, rights_query,
     rows::{give, insert_events, insert_ranges},
     writer::{RANGE, Result, WriteError, Writer, ranges},
 };
@@ -58,6 +58,17 @@ pub(super) async fn record(
             return Ok(Outcome::Changed);
         }
     }
+    if !submission.places.is_empty() {
+        // Two submitters at two coordinators must not both take a folder and one inside it.
+        sqlx::query("LOCK TABLE owned_place IN SHARE ROW EXCLUSIVE MODE")
+            .execute(&mut *writer.c)
+            .await?;
+    }
+    let free =
+        rights_query::free_places(&mut *writer.c, submission.places, submission.permitted).await?;
+    let Some(free) = free else {
+        return Ok(Outcome::Changed);
+    };
     if let Some(former) = submission.instead_of {
         job_query::supersede(&mut *writer.c, former).await?;
     }
@@ -79,6 +90,7 @@ pub(super) async fn record(
     let Some(key) = key else {
         return Ok(Outcome::Exists);
     };
+    rights_query::take_places(&mut *writer.c, &free).await?;
     for gone in submission.gone {
         query::drop_output(&mut *writer.c, gone).await?;
     }

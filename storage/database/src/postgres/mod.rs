@@ -32,7 +32,7 @@ use uuid::Uuid;
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Range, RangeState, Recorded, ResultSet, Run, Settled,
-    Sight, Snapshot, Submission, TaskRecord, Timing, Want,
+    Sight, Snapshot, Specs, Submission, TaskRecord, Timing, Want,
 };
 
 use hints::Hints;
@@ -178,6 +178,7 @@ impl Catalog for PostgresCatalog {
         let snapshot = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
+            instance::try_room(&mut tx).await?;
             instance::found(&mut tx, instance, former, &self.name, INSTANCE_SECONDS).await?;
             let ranges = instance::take_lost(&mut tx, instance).await?;
             let snapshot = Snapshot {
@@ -197,7 +198,7 @@ impl Catalog for PostgresCatalog {
         Ok(snapshot)
     }
 
-    async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+    async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError> {
         let instance = self.instance()?;
         let news = async {
             let mut connection = self.pool.acquire().await?;
@@ -211,7 +212,7 @@ impl Catalog for PostgresCatalog {
                 active: job_query::active(&mut tx).await?,
                 busy: instance::busy(&mut tx, instance).await?,
                 shared: instance::shared(&mut tx, instance).await?,
-                free: job_query::free(&mut tx).await?,
+                free: job_query::free(&mut tx, now_ms).await?,
                 taken: Owned {
                     exceptions: query::exceptions(&mut tx, &taken).await?,
                     ranges: taken,
@@ -366,6 +367,23 @@ impl Catalog for PostgresCatalog {
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
         job_query::record(&mut c, id)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn try_room(&self) -> Result<(), CatalogError> {
+        let mut connection = self.reader().await?;
+        let tried = async {
+            let mut tx = connection.begin().await?;
+            instance::try_room(&mut tx).await?;
+            tx.rollback().await
+        };
+        tried.await.map_err(|e| self.failed(e))
+    }
+
+    async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::spec_bytes(&mut c, specs)
             .await
             .map_err(|e| self.failed(e))
     }

@@ -34,14 +34,17 @@ pub(super) async fn write_rows(writer: &mut Writer<'_>, changes: &Changes) -> Re
 async fn put_exception(writer: &mut Writer<'_>, exception: &Exception) -> Result<()> {
     let stage = writer.keys(exception.stage).await?.stage;
     sqlx::query(
-        "INSERT INTO exception (stage, task, failures, crashes, dead, last_error) VALUES ($1, $2, $3, $4, $5, $6) \
+        "INSERT INTO exception (stage, task, failures, crashes, interruptions, longest_ms, dead, last_error) \
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8) \
          ON CONFLICT (stage, task) DO UPDATE SET failures = excluded.failures, crashes = excluded.crashes, \
-         dead = excluded.dead, last_error = excluded.last_error",
+         interruptions = excluded.interruptions, longest_ms = excluded.longest_ms, dead = excluded.dead, last_error = excluded.last_error",
     )
     .bind(stage)
     .bind(int(exception.task))
     .bind(i64::from(exception.failures))
     .bind(i64::from(exception.crashes))
+    .bind(i64::from(exception.interruptions))
+    .bind(int(exception.longest_ms))
     .bind(exception.dead)
     .bind(&exception.last_error)
     .execute(&mut *writer.c)
@@ -124,9 +127,9 @@ async fn insert_outputs(writer: &mut Writer<'_>, outputs: &[Output]) -> Result<(
         sets.push(writer.keys(output.stage).await?.result_set);
     }
     let written = sqlx::query(
-        "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted) \
+        "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted, checked) \
          SELECT * FROM UNNEST($1::BIGINT[], $2::BIGINT[], $3::BYTEA[], $4::BIGINT[], $5::DOUBLE PRECISION[], \
-         $6::BIGINT[], $7::BOOLEAN[]) ON CONFLICT DO NOTHING",
+         $6::BIGINT[], $7::BOOLEAN[], $8::BOOLEAN[]) ON CONFLICT DO NOTHING",
     )
     .bind(sets)
     .bind(outputs.iter().map(|o| int(o.task)).collect::<Vec<_>>())
@@ -140,6 +143,7 @@ async fn insert_outputs(writer: &mut Writer<'_>, outputs: &[Output]) -> Result<(
     .bind(outputs.iter().map(|o| o.seconds).collect::<Vec<_>>())
     .bind(outputs.iter().map(|o| int(o.epoch.0)).collect::<Vec<_>>())
     .bind(outputs.iter().map(|o| o.adopted).collect::<Vec<_>>())
+    .bind(outputs.iter().map(|o| o.checked).collect::<Vec<_>>())
     .execute(&mut *writer.c)
     .await?
     .rows_affected();

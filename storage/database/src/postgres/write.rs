@@ -5,7 +5,7 @@ use picofarm_proto::ids::RangeId;
 use uuid::Uuid;
 
 use super::{
-    jobs, query,
+    job_query, jobs, query,
     rows::{give, insert_ranges, write_rows},
     writer::{RANGE, Result, WriteError, Writer},
 };
@@ -19,6 +19,7 @@ pub(super) async fn claim(writer: &mut Writer<'_>, wants: &[Want]) -> Result<Vec
         let key = writer.keys(want.stage).await?.stage;
         let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
             "SELECT {RANGE} FROM task_range WHERE stage = $1 AND state = 0 AND owner IS NULL AND not_before_ms <= $2 \
+             AND ($4 OR crashes = 0) \
              AND EXISTS (SELECT 1 FROM job JOIN stage ON stage.job = job.key \
                WHERE stage.key = $1 AND stage.state = 1 AND job.state = 0 AND NOT job.paused) \
              ORDER BY not_before_ms, lo LIMIT $3 FOR UPDATE SKIP LOCKED"
@@ -26,6 +27,7 @@ pub(super) async fn claim(writer: &mut Writer<'_>, wants: &[Want]) -> Result<Vec
         .bind(key)
         .bind(want.now_ms)
         .bind(LOOK_AT)
+        .bind(want.suspects)
         .fetch_all(&mut *writer.c)
         .await?;
         let mut claimed: Vec<Range> = Vec::new();
@@ -62,20 +64,13 @@ pub(super) async fn claim(writer: &mut Writer<'_>, wants: &[Want]) -> Result<Vec
             existing.extend(query::runs_of_stage(writer.c, want.stage, range.lo, range.hi).await?);
         }
         existing.sort_unstable_by_key(|run| run.lo);
-        let left: i64 = sqlx::query_scalar(
-            "SELECT CAST(coalesce(sum(hi - lo), 0) AS BIGINT) FROM task_range JOIN stage ON stage.key = task_range.stage \
-             WHERE stage = $1 AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
-        )
-        .bind(key)
-        .fetch_one(&mut *writer.c)
-        .await?;
         claims.push(Claim {
             owned: Owned {
                 exceptions: query::exceptions(writer.c, &claimed).await?,
                 ranges: claimed,
             },
             existing,
-            left: left.unsigned_abs(),
+            left: job_query::free_of_stage(writer.c, key, want.now_ms).await?,
         });
     }
     Ok(claims)

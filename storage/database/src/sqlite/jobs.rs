@@ -9,7 +9,7 @@ use picofarm_proto::{
 use sqlx::SqliteConnection;
 
 use super::{
-    job_query, query,
+    job_query, query, rights_query,
     rows::{give, insert_events, insert_ranges},
     writer::{Keys, Result, WriteError},
 };
@@ -58,6 +58,10 @@ pub(super) async fn record(
             return Ok(Outcome::Changed);
         }
     }
+    let free = rights_query::free_places(&mut *c, submission.places, submission.permitted).await?;
+    let Some(free) = free else {
+        return Ok(Outcome::Changed);
+    };
     if let Some(former) = submission.instead_of {
         job_query::supersede(&mut *c, former).await?;
     }
@@ -78,6 +82,7 @@ pub(super) async fn record(
     let Some(key) = key else {
         return Ok(Outcome::Exists);
     };
+    rights_query::take_places(&mut *c, &free).await?;
     for gone in submission.gone {
         query::drop_output(&mut *c, gone).await?;
     }

@@ -23,7 +23,6 @@ use picofarm_proto::{
 };
 use sqlx::{
     ConnectOptions, Connection, SqliteConnection, SqlitePool,
-    migrate::MigrateError,
     pool::PoolConnection,
     sqlite::{
         SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
@@ -36,7 +35,7 @@ use crate::{lock::CatalogLock, migrations};
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Recorded, ResultSet, Run, Settled, Sight, Snapshot,
-    Submission, TaskRecord, Timing, Want,
+    Specs, Submission, TaskRecord, Timing, Want,
 };
 
 crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
@@ -158,26 +157,44 @@ impl SqliteCatalog {
 }
 
 async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), CatalogError> {
-    let known = migrations::latest(&migrations::SQLITE);
+    upgrade_former(connection)
+        .await
+        .map_err(|e| errors::classify(path, e))?;
     migrations::SQLITE
         .run_direct(None, connection, false)
         .await
-        .map_err(|error| match error {
-            MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
-                CatalogError::Newer {
-                    place: path.display().to_string(),
-                    found,
-                    known,
-                }
-            }
-            MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
+        .map_err(|error| {
+            let place = path.display().to_string();
+            migrations::failed(place, &migrations::SQLITE, error, |e| {
                 errors::classify(path, e)
-            }
-            other => CatalogError::Unusable {
-                place: path.display().to_string(),
-                what: format!("its schema is not this program's ({other})"),
-            },
+            })
         })
+}
+
+/// Upgrades a catalog whose first step was written before steps were append-only.
+async fn upgrade_former(connection: &mut SqliteConnection) -> Result<(), sqlx::Error> {
+    let mut tx = connection.begin().await?;
+    let tables: i64 =
+        sqlx::query_scalar("SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'")
+            .fetch_one(&mut *tx)
+            .await?;
+    if tables == 0 {
+        return tx.rollback().await;
+    }
+    let checksum: Option<Vec<u8>> =
+        sqlx::query_scalar("SELECT checksum FROM _sqlx_migrations WHERE version = 1")
+            .fetch_optional(&mut *tx)
+            .await?;
+    let former = &migrations::SQLITE_FORMER;
+    if !checksum.is_some_and(|checksum| former.matches(&checksum)) {
+        return tx.rollback().await;
+    }
+    sqlx::raw_sql(former.upgrade).execute(&mut *tx).await?;
+    sqlx::query("UPDATE _sqlx_migrations SET checksum = ? WHERE version = 1")
+        .bind(migrations::first_checksum(&migrations::SQLITE))
+        .execute(&mut *tx)
+        .await?;
+    tx.commit().await
 }
 
 #[async_trait]
@@ -206,7 +223,7 @@ impl Catalog for SqliteCatalog {
         read.await.map_err(|e| self.failed(e))
     }
 
-    async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+    async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError> {
         {
             let writer = self.writer.lock().await;
             let writer = writer.as_ref().ok_or(CatalogError::Closed)?;
@@ -218,7 +235,7 @@ impl Catalog for SqliteCatalog {
                 active: job_query::active(&mut c).await?,
                 busy: BTreeMap::new(),
                 shared: BTreeMap::new(),
-                free: job_query::free(&mut c).await?,
+                free: job_query::free(&mut c, now_ms).await?,
                 taken: Owned::default(),
                 leased: None,
                 instances: 1,
@@ -343,6 +360,17 @@ impl Catalog for SqliteCatalog {
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
         job_query::record(&mut c, id)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn try_room(&self) -> Result<(), CatalogError> {
+        self.write(async |c, _| Ok(write::try_room(c).await?)).await
+    }
+
+    async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::spec_bytes(&mut c, specs)
             .await
             .map_err(|e| self.failed(e))
     }

@@ -4,13 +4,27 @@ use async_trait::async_trait;
 use picofarm_proto::{ids::JobId, model::AuditEntry};
 
 use super::{SqliteCatalog, rights_query};
-use picofarm_catalog::{AuditQuery, CatalogError, NewAudit, Owner, Rights};
+use picofarm_catalog::{AuditQuery, CatalogError, NewAudit, OwnedPlace, Owner, ResultSet, Rights};
 
 #[async_trait]
 impl Rights for SqliteCatalog {
     async fn owner(&self, job: JobId) -> Result<Option<Owner>, CatalogError> {
         let mut c = self.reader().await?;
         rights_query::owner(&mut c, job)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn owned_near(&self, place: &str) -> Result<Vec<OwnedPlace>, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::owned_near(&mut c, place)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn largest_stage(&self, set: &ResultSet, user: &str) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::largest_stage(&mut c, set, user)
             .await
             .map_err(|e| self.failed(e))
     }

@@ -22,14 +22,17 @@ pub(super) async fn write_rows(
     for exception in changes.exceptions.values() {
         let stage = keys.of(c, exception.stage).await?.stage;
         sqlx::query(
-            "INSERT INTO exception (stage, task, failures, crashes, dead, last_error) VALUES (?, ?, ?, ?, ?, ?) \
+            "INSERT INTO exception (stage, task, failures, crashes, interruptions, longest_ms, dead, last_error) \
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?) \
              ON CONFLICT DO UPDATE SET failures = excluded.failures, crashes = excluded.crashes, \
-             dead = excluded.dead, last_error = excluded.last_error",
+             interruptions = excluded.interruptions, longest_ms = excluded.longest_ms, dead = excluded.dead, last_error = excluded.last_error",
         )
         .bind(stage)
         .bind(int(exception.task))
         .bind(exception.failures)
         .bind(exception.crashes)
+        .bind(exception.interruptions)
+        .bind(int(exception.longest_ms))
         .bind(exception.dead)
         .bind(&exception.last_error)
         .execute(&mut *c)
@@ -119,7 +122,7 @@ async fn insert_outputs(
             sets.push(keys.of(c, output.stage).await?.result_set);
         }
         let mut insert = QueryBuilder::<Sqlite>::new(
-            "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted) ",
+            "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted, checked) ",
         );
         insert.push_values(chunk.iter().zip(sets), |mut row, (output, set)| {
             row.push_bind(set)
@@ -128,7 +131,8 @@ async fn insert_outputs(
                 .push_bind(int(output.bytes))
                 .push_bind(output.seconds)
                 .push_bind(int(output.epoch.0))
-                .push_bind(output.adopted);
+                .push_bind(output.adopted)
+                .push_bind(output.checked);
         });
         insert.push(" ON CONFLICT DO NOTHING");
         let written = insert.build().execute(&mut *c).await?.rows_affected();

@@ -6,7 +6,7 @@ use sqlx::{QueryBuilder, Sqlite, SqliteConnection};
 use uuid::Uuid;
 
 use super::{
-    jobs, query,
+    job_query, jobs, query,
     rows::{ROWS, give, insert_ranges, write_rows},
     writer::{Keys, Result, WriteError},
 };
@@ -26,6 +26,18 @@ pub(super) async fn found(
     sqlx::query("INSERT OR REPLACE INTO life (key, instance, room) VALUES (1, ?, zeroblob(?))")
         .bind(instance.uuid())
         .bind(ROOM)
+        .execute(c)
+        .await?;
+    Ok(())
+}
+
+/// Bytes that are written while a life lasts, to see that there is room.
+const SOME_ROOM: i64 = 64 << 10;
+
+/// Writes a page for each 4 KiB of it anew.
+pub(super) async fn try_room(c: &mut SqliteConnection) -> std::result::Result<(), sqlx::Error> {
+    sqlx::query("UPDATE life SET room = zeroblob(?) WHERE key = 1")
+        .bind(SOME_ROOM)
         .execute(c)
         .await?;
     Ok(())
@@ -55,11 +67,12 @@ pub(super) async fn claim(
         let rows = sqlx::query(
             "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
              JOIN job ON job.key = stage.job WHERE stage = ? AND task_range.state = 0 AND owner IS NULL \
-             AND not_before_ms <= ? AND stage.state = 1 AND job.state = 0 AND NOT job.paused \
+             AND not_before_ms <= ? AND (? OR crashes = 0) AND stage.state = 1 AND job.state = 0 AND NOT job.paused \
              ORDER BY not_before_ms, lo LIMIT ?",
         )
         .bind(key)
         .bind(want.now_ms)
+        .bind(want.suspects)
         .bind(LOOK_AT)
         .fetch_all(&mut *c)
         .await?;
@@ -94,20 +107,13 @@ pub(super) async fn claim(
             existing.extend(query::runs_of_stage(c, want.stage, range.lo, range.hi).await?);
         }
         existing.sort_unstable_by_key(|run| run.lo);
-        let left: Option<i64> = sqlx::query_scalar(
-            "SELECT sum(hi - lo) FROM task_range JOIN stage ON stage.key = task_range.stage \
-             WHERE stage = ? AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
-        )
-        .bind(key)
-        .fetch_one(&mut *c)
-        .await?;
         claims.push(Claim {
             owned: Owned {
                 exceptions: query::exceptions(c, &ranges).await?,
                 ranges,
             },
             existing,
-            left: left.unwrap_or(0).unsigned_abs(),
+            left: job_query::free_of_stage(c, key, want.now_ms).await?,
         });
     }
     Ok(claims)

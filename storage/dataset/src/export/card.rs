@@ -74,6 +74,11 @@ impl Row {
     }
 }
 
+/// The table of scenes, which is written after them.
+pub(super) const TABLE: &str = "scenes.csv";
+/// The metadata that every export has, written after the table.
+pub(super) const CROISSANT: &str = "croissant.json";
+
 /// The files, in the order in which they are written.
 pub(super) fn files(
     name: &str,
@@ -87,8 +92,8 @@ pub(super) fn files(
     croissant.push(b'\n');
     let card = readme(name, format, spec, rows);
     vec![
-        ("scenes.csv", table.into_bytes()),
-        ("croissant.json", croissant),
+        (TABLE, table.into_bytes()),
+        (CROISSANT, croissant),
         ("README.md", card.into_bytes()),
     ]
 }

@@ -23,7 +23,7 @@ use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::layout::quantity::Quantity;
 use crate::scenes::dataset::Dataset;
-use crate::store::objects;
+use crate::store::{folder, objects};
 
 #[cfg(feature = "formats")]
 use hdf5::file as hdf5_file;
@@ -168,9 +168,13 @@ impl<'a> Exporter<'a> {
     /// Does step `k`; they are done in their order.
     ///
     /// # Errors
+    /// [`DatasetError::Invalid`] if the destination is a folder of another kind;
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`] naming the source's object at fault;
     /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
     pub async fn step(&mut self, k: usize) -> Result<(), DatasetError> {
+        if k == 0 {
+            self.check_folder().await?;
+        }
         let of = |each: usize| k * each..self.scenes.len().min((k + 1) * each);
         match self.format {
             ExportFormat::Zarr => {
@@ -211,6 +215,39 @@ impl<'a> Exporter<'a> {
             }
         }
         Ok(())
+    }
+
+    /// Checks that the destination is empty, a finished export (it has the metadata that every export ends with), or one of
+    /// this format that was interrupted.
+    async fn check_folder(&self) -> Result<(), DatasetError> {
+        let (store, prefix) = (self.out.store, &self.out.prefix);
+        let names = folder::names(store, prefix).await?;
+        if names.iter().any(|name| name == card::CROISSANT) {
+            return Ok(());
+        }
+        match names.iter().find(|name| !self.writes(name)) {
+            None => Ok(()),
+            Some(name) => Err(folder::foreign(store, prefix, "export.dest", name)),
+        }
+    }
+
+    /// Whether an export of this format writes such a name before its Croissant metadata.
+    fn writes(&self, name: &str) -> bool {
+        let scene = |text: &str| text.len() >= 6 && text.bytes().all(|b| b.is_ascii_digit());
+        if name == card::TABLE {
+            return true;
+        }
+        match self.format {
+            ExportFormat::Zarr => packed::writes(self.source, name),
+            ExportFormat::Sb3d => scene(name),
+            ExportFormat::Hdf5 => name.strip_suffix(".h5").is_some_and(scene),
+            ExportFormat::WebDataset => {
+                let number = name.strip_prefix("scenes-");
+                number
+                    .and_then(|n| n.strip_suffix(".tar"))
+                    .is_some_and(scene)
+            }
+        }
     }
 
     fn note(&mut self, manifest: &Manifest, file: &str) {

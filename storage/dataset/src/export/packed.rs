@@ -67,6 +67,12 @@ pub(super) async fn pack(
     Ok(manifests)
 }
 
+/// Whether scenes of a data set are packed into something of this name, directly below the export.
+pub(super) fn writes(source: &Dataset, name: &str) -> bool {
+    let mut arrays = source.arrays.iter();
+    name == "manifests" || arrays.any(|array| array.layout.quantity.name() == name)
+}
+
 /// Writes the metadata, the root's last: the group exists once all packs do.
 pub(super) async fn finish(
     source: &Dataset,

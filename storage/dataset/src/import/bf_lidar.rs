@@ -296,9 +296,15 @@ pub(super) fn read(
     scene.judge_beams(true);
     // They are counts.
     scene.scale = Some(1.0);
-    scene.check = Value::Array(checks);
     scene.missing.extend([
         "depth", "range", "specular", "normal", "instance", "label", "rgb", "camera",
     ]);
+    if !scene.two_bounce.is_empty() && !options.unchecked {
+        let found = super::paths::check(&scene, &item.folder)?;
+        if let Some(Value::Object(given)) = checks.last_mut() {
+            given.insert("two_bounce_paths".into(), found);
+        }
+    }
+    scene.check = Value::Array(checks);
     Ok(scene)
 }

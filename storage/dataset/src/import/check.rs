@@ -12,9 +12,11 @@ use serde_json::{Value, json};
 use super::ImportError;
 use super::masks;
 use super::profile::{
-    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Reading, TOLERANCE, Which, profile, step,
+    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Reading, TOLERANCE, Which, profile, profile_of,
+    step,
 };
 use super::vector::norm;
+use crate::layout::record::Spot;
 
 /// Spots may lie so far off the surface that the depth image shows, relative to their depth.
 const OFF_SURFACE: f64 = 0.05;
@@ -100,11 +102,24 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
             ),
         ));
     }
+    let (weakest, contrast) = weakest_spot(g).unzip();
     Ok(json!({
+        "weakest_spot": weakest, "weakest_spot_contrast": contrast.map(round),
         "pairs": lit.pairs, "tolerance_m": TOLERANCE as f64 * step, "peak_shift_m": peak as f64 * step,
         "energy_at_prediction": round(hit), "energy_around": round(background),
         "spots_off_surface": surface.map(round), "lit_over_shadow": separation.map(round),
     }))
+}
+
+/// The spot whose two-bounce light stands out least, and its energy at the prediction relative to that around.
+fn weakest_spot(g: &Geometry<'_>) -> Option<(usize, f64)> {
+    let of = |(mask, spot): (usize, &Option<Spot>)| -> Option<(usize, f64)> {
+        let one = profile_of(g, Reading::default(), Which::Lit, &[(mask, (*spot)?)]);
+        let contrast = one.hit() / one.background().max(f64::MIN_POSITIVE);
+        (one.pairs >= MIN_PAIRS).then_some((mask, contrast))
+    };
+    let all = g.spots.iter().enumerate().filter_map(of);
+    all.min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
 /// Few digits: the manifest is for people, too.

@@ -19,6 +19,7 @@ mod mat;
 pub(crate) mod npy;
 mod npy_folder;
 mod options;
+mod paths;
 mod platonerf;
 mod profile;
 mod publish;
@@ -43,7 +44,7 @@ use scene::Shape;
 use crate::layout::spec::{DatasetSpec, Profile, Wavelengths};
 
 /// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
-pub const IMPORT_VERSION: &str = "import-3";
+pub const IMPORT_VERSION: &str = "import-4";
 
 /// Scenes in a folder that can be imported.
 #[derive(Debug, Clone)]

@@ -12,6 +12,7 @@ use picofarm_files::Opener;
 use super::check::check;
 use super::files::Files;
 use super::npy::{self, Array};
+use super::paths;
 use super::profile::{Blame, Geometry};
 use super::scene::{ImportedScene, Shape, clean};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity};
@@ -264,6 +265,12 @@ pub(super) fn read(
         None => {
             let what = "histogram not checked: there is no depth";
             scene.conversions.push(what.into());
+        }
+    }
+    if let Some(file) = is.two_bounce.as_ref().filter(|_| !options.unchecked) {
+        let found = paths::check(&scene, &about.folder.join(&file.file))?;
+        if !found.is_null() {
+            scene.check["two_bounce_paths"] = found;
         }
     }
     Ok(scene)

@@ -115,6 +115,18 @@ pub(super) fn step(g: &Geometry<'_>) -> usize {
 
 /// The energy around the predictions in a sample of pixels.
 pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
+    let spots = g.spots.iter().enumerate();
+    let spots: Vec<(usize, Spot)> = spots.filter_map(|(i, s)| Some((i, (*s)?))).collect();
+    profile_of(g, reading, which, &spots)
+}
+
+/// The same of these spots alone: each with the number of its mask.
+pub(super) fn profile_of(
+    g: &Geometry<'_>,
+    reading: Reading,
+    which: Which,
+    spots: &[(usize, Spot)],
+) -> Profile {
     let shape = g.shape;
     let (w, h, bins) = (
         shape.width as usize,
@@ -148,8 +160,7 @@ pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profi
                 (true, true) => depth * norm(d),
             };
             let x = d.map(|c| c * z);
-            for (index, spot) in g.spots.iter().enumerate() {
-                let Some(spot) = spot else { continue };
+            for &(index, spot) in spots {
                 let lit = g.visibility.is_none_or(|v| {
                     let at = reading
                         .masks

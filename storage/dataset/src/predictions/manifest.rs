@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
@@ -29,6 +30,10 @@ pub struct PredictionManifest {
     /// was given any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub two_bounce_times: Option<TimesUsed>,
+    /// Whether what is predicted agrees with itself and with the spots, with figures and `reasons`; null where nothing was
+    /// compared.
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    pub agreement: Value,
     /// Its objects; filled in.
     pub objects: Vec<ObjectEntry>,
     /// What [`crate::layout::manifest::seal`] says of the rest.

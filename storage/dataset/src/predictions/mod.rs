@@ -254,7 +254,7 @@ impl Predictions {
     /// Codes what is predicted of the scene that `manifest` names; its format, objects and checksum are filled in.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the values are not those of the group's arrays;
+    /// [`DatasetError::Invalid`] where the values are not those of the group's arrays, or a depth is not finite;
     /// [`DatasetError::SceneOutOfRange`].
     pub fn encode(
         &self,
@@ -267,6 +267,13 @@ impl Predictions {
                 scene,
                 scenes: self.spec.scenes,
             });
+        }
+        if let Some(at) = predicted.depth_m.iter().position(|z| !z.is_finite()) {
+            let z = predicted.depth_m[at];
+            let what = format!(
+                "scene {scene}: expected finite depths, found {z} at pixel {at}; NaN stands for a scene that is not there"
+            );
+            return Err(DatasetError::invalid("depth", what));
         }
         let (mut objects, mut bytes) = (Vec::new(), Vec::new());
         for plate in self.plates.iter() {

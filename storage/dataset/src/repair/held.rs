@@ -23,6 +23,9 @@ const LARGEST: u64 = 64 << 20;
 /// Larger scenes are not read to be compared, bytes.
 const LARGEST_SCENE: u64 = 256 << 20;
 
+/// Objects of a scene that are together no larger are read and compared with their SHA-256, bytes.
+pub(crate) const SMALL: u64 = 256 << 10;
+
 /// What a store holds of a result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Held {
@@ -30,7 +33,7 @@ pub enum Held {
     Equal,
     /// No manifest, or not all of its objects.
     Gone,
-    /// Another manifest.
+    /// Another manifest, or objects that are not the manifest's.
     Other,
 }
 
@@ -45,6 +48,9 @@ pub struct Holdings {
 #[derive(Deserialize)]
 struct Named {
     objects: Vec<ObjectEntry>,
+    /// Only manifests of a data set's scenes have it.
+    #[serde(default)]
+    provenance: Option<serde::de::IgnoredAny>,
 }
 
 impl Holdings {
@@ -216,10 +222,21 @@ impl Holdings {
         let Ok(named) = serde_json::from_slice::<Named>(&bytes) else {
             return Ok(Held::Other);
         };
+        if named.objects.is_empty() {
+            return Ok(Held::Other);
+        }
+        let size = named.objects.iter().map(|object| object.size).sum::<u64>();
+        let small = named.provenance.is_some() && size <= SMALL;
         for object in named.objects.iter().filter(|_| thorough) {
             let path = objects::path_of(folder, &object.key);
             if objects::size(&*self.store, &path).await? != Some(object.size) {
                 return Ok(Held::Gone);
+            }
+            if small
+                && let Some(bytes) = objects::get(&*self.store, &path).await?
+                && hex::encode(digest(&bytes)) != object.sha256
+            {
+                return Ok(Held::Other);
             }
         }
         Ok(Held::Equal)
@@ -264,7 +281,11 @@ mod tests {
     #[tokio::test]
     async fn a_scene_is_held_if_its_manifest_is_the_reported_one_and_its_objects_are_there() {
         let store: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
-        let manifest = br#"{"objects": [{"key": "depth/c/0", "size": 3, "sha256": ""}]}"#;
+        let sha256 = hex::encode(digest(b"abc"));
+        let manifest = format!(
+            r#"{{"provenance": {{}}, "objects": [{{"key": "depth/c/0", "size": 3, "sha256": "{sha256}"}}]}}"#
+        );
+        let manifest = manifest.as_bytes();
         put(&store, "s/d/manifests/0.json", manifest).await;
         put(&store, "s/d/depth/c/0", b"abc").await;
         let holdings = Holdings::new(store.clone(), Path::from("s"));
@@ -276,6 +297,14 @@ mod tests {
         assert_eq!(held, [Held::Gone], "an object was cut short");
         let held = holdings.scenes("d", &asked[..1], |_| false).await.unwrap();
         assert_eq!(held, [Held::Equal], "its manifest alone is looked at");
+        put(&store, "s/d/depth/c/0", b"xyz").await;
+        let held = holdings.scenes("d", &asked[..1], |_| true).await.unwrap();
+        assert_eq!(held, [Held::Other], "an object has other bytes");
+        let empty = br#"{"objects": []}"#;
+        put(&store, "s/d/manifests/2.json", empty).await;
+        let asked = [(2, digest(empty))];
+        let held = holdings.scenes("d", &asked, |_| false).await.unwrap();
+        assert_eq!(held, [Held::Other], "it names nothing");
     }
 
     #[tokio::test]

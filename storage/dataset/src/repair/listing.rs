@@ -8,6 +8,7 @@ use crate::layout::group::METADATA;
 use crate::layout::published::manifest_scene;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::part_scene;
+use crate::store::identity::IDENTITY;
 use crate::{
     repair::recipe,
     scenes::{snapshot, splits},
@@ -113,7 +114,8 @@ impl Dataset {
             listing.metadata.push(key);
         } else if snapshot::is_snapshot(&key) || recipe::is_recipe(&key) || splits::is_split(&key) {
             listing.records.push(key);
-        } else {
+        } else if key != IDENTITY {
+            // The identity is there where the data set's folder was named as a store.
             listing.foreign.push(key);
         }
     }

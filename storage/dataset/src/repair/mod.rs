@@ -7,3 +7,4 @@ pub(crate) mod put_back;
 pub(crate) mod recipe;
 pub(crate) mod restore;
 pub(crate) mod root;
+pub(crate) mod unfounded;

@@ -175,7 +175,7 @@ impl Dataset {
     }
 
     /// One atomic put over whatever is there, read back.
-    async fn replace(
+    pub(crate) async fn replace(
         &self,
         path: &object_store::path::Path,
         bytes: bytes::Bytes,

@@ -14,7 +14,7 @@ use crate::layout::group::{METADATA, create_metadata, is_predictions, is_reconst
 use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
-use crate::store::objects;
+use crate::store::objects::{self, Rereads};
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -99,6 +99,17 @@ impl Dataset {
     /// [`DatasetError::NoDataset`], [`DatasetError::Damaged`] where the root is not a data set of ours,
     /// [`DatasetError::Store`].
     pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
+        let mut rereads = Rereads::new(&*store);
+        loop {
+            let read = Self::open_once(store.clone(), prefix.clone()).await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
+    async fn open_once(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
         let root = objects::path_of(&prefix, METADATA);
         let Some(bytes) = objects::get(&*store, &root).await? else {
             return Err(DatasetError::NoDataset {

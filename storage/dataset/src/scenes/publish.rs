@@ -30,12 +30,80 @@ impl Dataset {
     /// Publishes a coded scene. Objects first, the manifest last, all create-only; an object that exists with equal
     /// bytes counts as written, so that a scene half-written by a killed worker is completed and publishing twice
     /// succeeds. When it returns, each object was there at a time when the manifest already protected it from
-    /// [`Self::collect`].
+    /// [`Self::collect`]. An object that a broken put has left is replaced: where the scene's manifest names these bytes
+    /// and no others, or where there is no manifest and the object is damaged by its own checksums.
     ///
     /// # Errors
-    /// [`DatasetError::Conflict`] where an object exists with other bytes (nothing stored is changed);
-    /// [`DatasetError::Store`].
+    /// [`DatasetError::Conflict`] where an object exists with other bytes, and nothing proves that they are wrong (nothing
+    /// stored is changed); [`DatasetError::Store`].
     pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
+        match self.publish_once(scene.clone()).await {
+            Err(conflict @ DatasetError::Conflict { .. }) => self.heal(scene, conflict).await,
+            published => published,
+        }
+    }
+
+    /// Replaces what a broken put has left of a scene, and publishes it.
+    async fn heal(
+        &self,
+        scene: EncodedScene,
+        conflict: DatasetError,
+    ) -> Result<Manifest, DatasetError> {
+        let ours = scene.manifest.clone();
+        let path = self.path(&Manifest::key(ours.scene));
+        if let Some(stored) = objects::get(&*self.store, &path).await? {
+            let stored = Manifest::parse(&stored, ours.scene, &self.shown(&path));
+            if stored.is_ok_and(|stored| !stored.same_as(&ours)) {
+                return Err(conflict);
+            }
+            return match self.restore(scene, None).await {
+                Ok(restored) => {
+                    for object in restored.written {
+                        tracing::warn!(%object, "an object that was stored wrongly is replaced");
+                    }
+                    self.manifest(ours.scene).await
+                }
+                Err(DatasetError::Diverged { .. } | DatasetError::Damaged { .. }) => Err(conflict),
+                Err(error) => Err(error),
+            };
+        }
+        let mut broken = Vec::new();
+        for (object, bytes) in ours.objects.iter().zip(&scene.bytes) {
+            let path = self.path(&object.key);
+            match objects::get(&*self.store, &path).await? {
+                Some(stored) if stored != *bytes => {
+                    if self.is_whole(&ours, &object.key, &stored) {
+                        return Err(conflict);
+                    }
+                    broken.push((path, bytes.clone()));
+                }
+                _ => {}
+            }
+        }
+        for (path, bytes) in broken {
+            self.replace(&path, bytes).await?;
+            tracing::warn!(
+                object = self.shown(&path),
+                "an object that was stored wrongly is replaced"
+            );
+        }
+        self.publish_once(scene).await
+    }
+
+    /// Whether an object's own checksums hold, and it may be another result of the same task.
+    fn is_whole(&self, manifest: &Manifest, key: &str, bytes: &Bytes) -> bool {
+        let array = self
+            .arrays
+            .iter()
+            .find(|a| a.layout.key(manifest.scene) == key);
+        let Some(array) = array else { return true };
+        if array.layout.quantity.is_transient() {
+            return self.shard_is_whole(manifest, array, bytes);
+        }
+        array.codec.decode(bytes).is_ok()
+    }
+
+    async fn publish_once(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
         let EncodedScene { manifest, bytes } = scene;
         let paths = manifest.objects.iter().map(|object| self.path(&object.key));
         let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();

@@ -12,7 +12,7 @@ use crate::layout::published::scenes_in;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::record::{Intrinsics, Spot};
 use crate::scenes::dataset::{ArrayCodec, Dataset};
-use crate::store::objects;
+use crate::store::objects::{self, Rereads};
 
 /// A type in which an array may be stored.
 pub trait Stored: bytemuck::Pod + sealed::Stored {}
@@ -39,6 +39,17 @@ impl Dataset {
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
     pub async fn manifest(&self, scene: u64) -> Result<Manifest, DatasetError> {
+        let mut rereads = Rereads::new(&*self.store);
+        loop {
+            let read = self.manifest_once(scene).await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
+    async fn manifest_once(&self, scene: u64) -> Result<Manifest, DatasetError> {
         self.check_scene(scene)?;
         let path = self.path(&Manifest::key(scene));
         match objects::get(&*self.store, &path).await? {
@@ -113,7 +124,24 @@ impl Dataset {
         target: &mut Vec<f32>,
         decode: impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), DatasetError>,
     ) -> Result<(), DatasetError> {
-        let manifest = self.manifest(scene).await?;
+        let mut rereads = Rereads::new(&*self.store);
+        loop {
+            let read = self.decode_once(scene, array, target, &decode).await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
+    async fn decode_once(
+        &self,
+        scene: u64,
+        array: &ArrayCodec,
+        target: &mut Vec<f32>,
+        decode: &impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), DatasetError>,
+    ) -> Result<(), DatasetError> {
+        let manifest = self.manifest_once(scene).await?;
         let path = self.path(&array.layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
         let len = array.layout.planes() * self.spec.transient_len();
@@ -167,7 +195,18 @@ impl Dataset {
 
     /// A scene's transient, decoded on a thread of its own.
     async fn read_apart(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
-        let manifest = self.manifest(scene).await?;
+        let mut rereads = Rereads::new(&*self.store);
+        loop {
+            let read = self.clone().read_apart_once(scene).await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
+    async fn read_apart_once(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        let manifest = self.manifest_once(scene).await?;
         let path = self.path(&self.array(Quantity::Transient).layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
         let decoded = tokio::task::spawn_blocking(move || {
@@ -280,10 +319,25 @@ impl Dataset {
             );
             return Err(DatasetError::invalid("quantity", what));
         }
+        let mut rereads = Rereads::new(&*self.store);
+        loop {
+            let read = self.read_once(scene, array).await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
+    async fn read_once<T: Stored>(
+        &self,
+        scene: u64,
+        array: &ArrayCodec,
+    ) -> Result<Vec<T>, DatasetError> {
         let path = self.path(&array.layout.key(scene));
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
             // Tells a scene that is not there from one that lost an object.
-            self.manifest(scene).await?;
+            self.manifest_once(scene).await?;
             return Err(DatasetError::Damaged {
                 object: self.shown(&path),
                 what: "the object is missing".into(),

@@ -13,6 +13,7 @@ use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::{ArrayCodec, Dataset};
+use crate::store::objects::Rereads;
 
 /// Inner chunks so close to each other are fetched by one request, with the bytes between them.
 const GAP: u64 = 16 * 1024;
@@ -25,14 +26,30 @@ impl Dataset {
         array: &ArrayCodec,
         part: Part,
     ) -> Result<Vec<f32>, DatasetError> {
+        let mut rereads = Rereads::new(&*self.store);
+        loop {
+            let read = self.read_part_once(manifest, array, &part).await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
+    async fn read_part_once(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        part: &Part,
+    ) -> Result<Vec<f32>, DatasetError> {
         let tiles = Tiles::new(&self.spec, &array.layout);
         let wanted: Vec<usize> = (0..tiles.count())
-            .filter(|tile| tiles.touches(*tile, &part))
+            .filter(|tile| tiles.touches(*tile, part))
             .collect();
         let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
         let mut target = vec![0f32; part.len()];
         let decoding = self.decoding(manifest, array);
-        let complete = decoding.part(&tiles, chunks, &part, &mut target);
+        let complete = decoding.part(&tiles, chunks, part, &mut target);
         let path = self.path(&array.layout.key(manifest.scene));
         let complete = complete.map_err(|e| e.in_object(|| self.shown(&path)))?;
         self.complete(manifest, complete)?;
@@ -69,7 +86,8 @@ impl Dataset {
         };
         let index = self.store.get_range(&path, start..entry.size);
         let index = index.await.map_err(fetch_error)?;
-        let index = shard::parse_index(&index, tiles.count(), entry.size)?;
+        let index = shard::parse_index(&index, tiles.count(), entry.size)
+            .map_err(|e| e.in_object(|| self.shown(&path)))?;
         let ranges: Vec<(usize, Range<u64>)> = wanted
             .iter()
             .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
@@ -127,6 +145,18 @@ impl Dataset {
     ) -> Result<(), DatasetError> {
         let whole = self.decoding(manifest, array).planes(bytes, target)?;
         self.complete(manifest, whole)
+    }
+
+    /// Whether a shard can be decoded, whatever it says.
+    pub(crate) fn shard_is_whole(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        bytes: &Bytes,
+    ) -> bool {
+        let len = array.layout.planes() * self.spec.transient_len();
+        let decoding = self.decoding(manifest, array);
+        decoding.shard(bytes, &mut vec![0f32; len]).is_ok()
     }
 
     fn decoding<'a>(&'a self, manifest: &'a Manifest, array: &'a ArrayCodec) -> Decoding<'a> {

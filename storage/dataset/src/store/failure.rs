@@ -5,17 +5,34 @@ use std::io;
 use object_store::Error;
 
 use super::account::Failure;
+use super::identity::Mismatch;
 use super::service::Service;
 
 impl Failure {
     /// The account of an error of any store; of an object store's with its service.
     pub(crate) fn of(error: &Error, service: Option<Service>) -> Self {
         let chain = chain(error);
+        if let Some(mismatch) = Mismatch::among(&chain) {
+            return Self {
+                account: mismatch.to_string(),
+                hint: None,
+            };
+        }
         #[cfg(feature = "clouds")]
         if let Some(failure) =
             super::clouds::failure::failure(&chain, service.unwrap_or(Service::S3))
         {
             return failure;
+        }
+        #[cfg(feature = "clouds")]
+        if let Some(broken) = chain
+            .iter()
+            .find_map(|e| e.downcast_ref::<super::steady::Broken>())
+        {
+            return Self {
+                account: broken.to_string(),
+                hint: Some("check the network and the proxies before the store"),
+            };
         }
         #[cfg(not(feature = "clouds"))]
         let _ = service;
@@ -36,6 +53,14 @@ pub(crate) fn no_bucket(error: &Error) -> bool {
         let _ = error;
         false
     }
+}
+
+/// Whether a request or its answer broke off, or arrived otherwise than it was sent.
+#[cfg(feature = "clouds")]
+pub(super) fn breaks_off(error: &Error) -> bool {
+    let chain = chain(error);
+    chain.iter().any(|e| e.is::<super::steady::Broken>())
+        || super::clouds::failure::breaks_off(&chain)
 }
 
 fn chain(error: &Error) -> Vec<&(dyn std::error::Error + 'static)> {

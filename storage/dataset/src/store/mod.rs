@@ -5,12 +5,17 @@ mod bandwidth;
 #[cfg(feature = "clouds")]
 mod clouds;
 pub(crate) mod failure;
+pub(crate) mod folder;
+mod guard;
+pub(crate) mod identity;
 mod local;
 pub(crate) mod many;
 pub(crate) mod objects;
 mod place;
 mod probe;
 pub(crate) mod service;
+#[cfg(feature = "clouds")]
+mod steady;
 mod writable;
 
 use std::sync::Arc;
@@ -22,6 +27,7 @@ use object_store::path::Path;
 use crate::error::DatasetError;
 
 pub use bandwidth::{Bandwidth, limit_bandwidth};
+pub use identity::{check_identity, expect_identity, identify_store, store_identity};
 pub(crate) use local::{leftovers, probe_leftovers};
 pub(crate) use probe::PROBE;
 pub use probe::{PROBE_WITHIN, probe};

@@ -15,6 +15,40 @@ const ATTEMPTS: usize = 4;
 /// Between them.
 const PAUSE: Duration = Duration::from_millis(250);
 
+/// Before an object of a store over a network is read again that does not read as it should, milliseconds.
+const REREAD_MS: [u64; 4] = [200, 400, 800, 1600];
+
+/// Reads again what does not read as it should: on the way from a store over a network answers come late, old, cut or
+/// changed. A folder is read once.
+pub(crate) struct Rereads {
+    remote: bool,
+    done: usize,
+}
+
+impl Rereads {
+    pub(crate) fn new(store: &dyn ObjectStore) -> Self {
+        Self {
+            remote: shown(store, &Path::default()).contains("://"),
+            done: 0,
+        }
+    }
+
+    /// How long to wait before reading again; `None` where that is of no use, or has been none.
+    pub(crate) fn pause<T>(&mut self, read: &Result<T, DatasetError>) -> Option<Duration> {
+        let error = read.as_ref().err().filter(|_| self.remote)?;
+        let most = match error {
+            DatasetError::Damaged { .. } | DatasetError::Codec { .. } => REREAD_MS.len(),
+            // Which may be true: nothing names them but whoever asks.
+            DatasetError::NotPublished { .. } | DatasetError::NoDataset { .. } => 2,
+            _ => 0,
+        };
+        let pause = REREAD_MS.get(self.done).filter(|_| self.done < most)?;
+        self.done += 1;
+        tracing::warn!(%error, "what was read is not what it should be; it is read again");
+        Some(Duration::from_millis(*pause))
+    }
+}
+
 /// Full path of a key relative to `prefix`.
 pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
     key.split('/')
@@ -165,5 +199,28 @@ pub(crate) async fn size(
         Ok(meta) => Ok(Some(meta.size)),
         Err(e @ Error::NotFound { .. }) if !no_bucket(&e) => Ok(None),
         Err(e) => Err(DatasetError::store("look up", shown(store, path), e)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn what_is_damaged_is_read_again_from_a_network_and_not_from_a_folder() {
+        let missing = || DatasetError::Damaged {
+            object: "a".into(),
+            what: "the object is missing".into(),
+        };
+        let memory = object_store::memory::InMemory::new();
+        let mut rereads = Rereads::new(&memory);
+        assert_eq!(rereads.pause::<()>(&Err(missing())), None);
+        rereads.remote = true;
+        assert_eq!(rereads.pause(&Ok(())), None);
+        for pause in REREAD_MS {
+            let again = rereads.pause::<()>(&Err(missing()));
+            assert_eq!(again, Some(Duration::from_millis(pause)));
+        }
+        assert_eq!(rereads.pause::<()>(&Err(missing())), None);
     }
 }

@@ -7,7 +7,7 @@ use object_store::path::Path;
 use super::report::{Fault, VerifyMode};
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, sha256_hex};
-use crate::store::objects;
+use crate::store::objects::{self, Rereads};
 
 /// What is wrong with an object, or its bytes where they were read: not with [`VerifyMode::Fast`].
 ///
@@ -47,6 +47,21 @@ pub(crate) async fn looked_at(
 /// # Errors
 /// [`DatasetError::Damaged`] where it is missing or another; [`DatasetError::Store`].
 pub(crate) async fn intact(
+    store: &dyn ObjectStore,
+    path: &Path,
+    entry: &ObjectEntry,
+) -> Result<Bytes, DatasetError> {
+    let mut rereads = Rereads::new(store);
+    loop {
+        let read = intact_once(store, path, entry).await;
+        match rereads.pause(&read) {
+            None => return read,
+            Some(pause) => tokio::time::sleep(pause).await,
+        }
+    }
+}
+
+async fn intact_once(
     store: &dyn ObjectStore,
     path: &Path,
     entry: &ObjectEntry,

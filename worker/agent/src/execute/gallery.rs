@@ -41,7 +41,7 @@ pub(super) fn show(
     control: &Control,
 ) -> Result<Shown, TaskError> {
     let dataset = stores.open_source(store, &evaluation.dataset, control)?;
-    let models = stores.source_models(store)?;
+    let models = stores.source_models(store, control)?;
     let split = ("report", &*evaluation.split.name);
     let found = sides(stores, &dataset, split, [&*evaluation.side], control)?;
     let [mut scenes] = found.scenes;

@@ -30,7 +30,7 @@ use kinds::{evaluate, train};
 pub use kinds::{
     infer::infer_version,
     report,
-    train::{ImportFor, imported, model_version, takes},
+    train::{ImportFor, NotImported, imported, model_version, takes},
 };
 pub use memory::{SceneSize, check_memory, render_bytes, scene_size};
 pub use submission::{Submission, absolute};

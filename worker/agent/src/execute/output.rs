@@ -2,7 +2,7 @@
 //! patience. Says who is to blame when the store does not play along.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
@@ -10,11 +10,11 @@ use std::{
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, PROBE_WITHIN, Profile, Subsets,
-    open_store, probe,
+    Verdict, check_identity, check_own_folder, expect_identity, open_store, probe,
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderTask, TaskSpec, memory::Known},
+    model::{RenderTask, TaskSpec, log::VERDICT, memory::Known},
     trace,
 };
 use picofarm_scene::Scene;
@@ -22,12 +22,15 @@ use picofarm_session::{Backoff, memory_mib, random};
 use picofarm_transient::Settings;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
-use tracing::{debug_span, warn};
+use tracing::{debug_span, info, warn};
+use uuid::Uuid;
 
 use super::{Control, TaskError, memory};
 
 /// A store and the prefix in it.
 type Place = (Arc<dyn ObjectStore>, Path);
+/// A store's place, and the identity that is expected of it.
+type StoreName = (String, Option<Uuid>);
 
 /// How long what is finished is held at least for a store that does not take it.
 const LEAST_PATIENCE: Duration = Duration::from_secs(3);
@@ -38,9 +41,11 @@ const STOP_LOOK: Duration = Duration::from_millis(50);
 pub(super) struct Stores {
     runtime: Handle,
     /// Opened stores that passed the probe, by location: their connections are kept from task to task.
-    probed: Mutex<BTreeMap<String, Place>>,
+    probed: Mutex<BTreeMap<StoreName, Place>>,
+    /// Folders that were found to be empty or of the kind that writes there.
+    own_folders: Mutex<BTreeSet<String>>,
     /// Opened stores that are only read, by location.
-    sources: Mutex<BTreeMap<String, Place>>,
+    sources: Mutex<BTreeMap<StoreName, Place>>,
     /// How long a rendered scene is held at most for a store that does not take it.
     patience: Duration,
     /// Memory that tasks may take, MiB; 0 = not known.
@@ -52,6 +57,7 @@ impl Stores {
         Self {
             runtime,
             probed: Mutex::default(),
+            own_folders: Mutex::default(),
             sources: Mutex::default(),
             patience,
             memory_mib: memory_mib(),
@@ -118,7 +124,11 @@ impl Stores {
     ) -> Result<Dataset, TaskError> {
         let (store, prefix) = self.probed(location, control)?;
         let prefix = prefix.join(dataset);
-        self.wait(control, Dataset::create_or_open(store, prefix, spec))
+        self.wait_for(
+            control,
+            Dataset::create_or_open(store, prefix, spec),
+            of_open,
+        )
     }
 
     /// Opens a data set to read; creates nothing, and asks of its store nothing but reading.
@@ -128,8 +138,8 @@ impl Stores {
         dataset: &str,
         control: &Control,
     ) -> Result<Dataset, TaskError> {
-        let (store, prefix) = self.source(location)?;
-        self.wait(control, Dataset::open(store, prefix.join(dataset)))
+        let (store, prefix) = self.source(location, control)?;
+        self.wait_for(control, Dataset::open(store, prefix.join(dataset)), of_open)
     }
 
     /// The models of a store, to read only; asks of it nothing else.
@@ -137,20 +147,34 @@ impl Stores {
     pub(super) fn source_models(
         &self,
         location: &str,
+        control: &Control,
     ) -> Result<picofarm_dataset::Models, TaskError> {
-        let (store, prefix) = self.source(location)?;
+        let (store, prefix) = self.source(location, control)?;
         Ok(picofarm_dataset::Models::new(store, &prefix))
     }
 
     /// A place to read from.
-    pub(super) fn source(&self, location: &str) -> Result<Place, TaskError> {
+    pub(super) fn source(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+        let name = named(location, control)?;
         let known = || self.sources.lock().expect("no panic while locked");
-        if let Some(place) = known().get(location) {
+        if let Some(place) = known().get(&name) {
             return Ok(place.clone());
         }
-        let place = open_store(location).map_err(of_dataset)?;
-        known().insert(location.to_owned(), place.clone());
+        let place = opened(&name)?;
+        known().insert(name, place.clone());
         Ok(place)
+    }
+
+    /// Checks the stores of a task that must have an identity: before it works with them, and before what it has done counts.
+    /// A store that is mounted between counts as one that is not.
+    pub(super) fn check_identities(&self, control: &Control) -> Result<(), TaskError> {
+        for location in control.identified() {
+            let (store, prefix) = self.source(location, control)?;
+            if let (_, Some(identity)) = named(location, control)? {
+                self.wait(control, check_identity(&*store, &prefix, identity))?;
+            }
+        }
+        Ok(())
     }
 
     /// Stores a recipe where there is none yet. It is looked for with every scene: who deletes a data set while this worker
@@ -169,13 +193,30 @@ impl Stores {
 
     /// A place to write to. The first use of a location proves that its store is safe.
     pub(super) fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+        let name = named(location, control)?;
         let known = || self.probed.lock().expect("no panic while locked");
-        if let Some(place) = known().get(location) {
+        if let Some(place) = known().get(&name) {
             return Ok(place.clone());
         }
-        let (store, prefix) = open_store(location).map_err(of_dataset)?;
+        let (store, prefix) = opened(&name)?;
         self.wait(control, probe(&*store, &prefix, PROBE_WITHIN))?;
-        known().insert(location.to_owned(), (store.clone(), prefix.clone()));
+        known().insert(name, (store.clone(), prefix.clone()));
+        Ok((store, prefix))
+    }
+
+    /// The same for a folder that a field names, and in which every name must satisfy `is_own`. It is looked at once.
+    pub(super) fn probed_own(
+        &self,
+        (field, location): (&str, &str),
+        is_own: impl Fn(&str) -> bool,
+        control: &Control,
+    ) -> Result<Place, TaskError> {
+        let (store, prefix) = self.probed(location, control)?;
+        let known = || self.own_folders.lock().expect("no panic while locked");
+        if !known().contains(location) {
+            self.wait(control, check_own_folder(&*store, &prefix, field, is_own))?;
+            known().insert(location.to_owned());
+        }
         Ok((store, prefix))
     }
 
@@ -237,6 +278,13 @@ impl Stores {
                 manifest.provenance.task_key
             )));
         }
+        if !self.wait(control, dataset.agrees(&manifest))? {
+            warn!(
+                task = index,
+                "a published scene has other bytes than its manifest names; it is made again to repair it"
+            );
+            return Ok(None);
+        }
         Ok(Some(manifest))
     }
 
@@ -249,7 +297,14 @@ impl Stores {
     ) -> Result<Manifest, TaskError> {
         let _in = debug_span!(target: trace::TARGET, "publish").entered();
         self.patiently(control, async || {
-            dataset.publish_encoded(scene.clone()).await
+            match dataset.publish_encoded(scene.clone()).await {
+                Err(conflict @ DatasetError::Conflict { .. }) => {
+                    // A manifest that somebody made up must not hold the scene for ever.
+                    let replaced = dataset.replace_unfounded(scene.clone()).await?;
+                    replaced.ok_or(conflict)
+                }
+                published => published,
+            }
         })
     }
 
@@ -290,6 +345,25 @@ impl Stores {
     }
 }
 
+/// A store's place with the identity that a task expects there.
+fn named(location: &str, control: &Control) -> Result<StoreName, TaskError> {
+    let identity = control.identity(location).map(Uuid::parse_str);
+    let identity = identity.transpose().map_err(|e| {
+        TaskError::User(format!(
+            "stores: the identity of {location}: {e}; submit the job again"
+        ))
+    })?;
+    Ok((location.to_owned(), identity))
+}
+
+fn opened((location, identity): &StoreName) -> Result<Place, TaskError> {
+    let (store, prefix) = open_store(location).map_err(of_dataset)?;
+    Ok(match identity {
+        Some(identity) => (expect_identity(store, &prefix, *identity), prefix),
+        None => (store, prefix),
+    })
+}
+
 /// The data set that a job's settings describe.
 pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> {
     let render = &spec.render;
@@ -314,6 +388,23 @@ pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
     hex::encode(Sha256::digest(manifest.to_bytes()))
 }
 
+/// The same where it is opened: what is there may be no data set of ours at all.
+fn of_open(error: DatasetError) -> TaskError {
+    match of_dataset(error) {
+        TaskError::Damaged(text) => TaskError::User(text),
+        other => other,
+    }
+}
+
+/// Tells in the task's log what a result is worth; `job watch` shows it when the job ends.
+pub(super) fn saying(verdict: &Verdict, of: &str) {
+    let text = &verdict.text;
+    match verdict.doubtful {
+        true => warn!("{VERDICT}{of}: {text}"),
+        false => info!("{VERDICT}{of}: {text}"),
+    }
+}
+
 /// Who is to blame for a data set's error.
 pub(super) fn of_dataset(error: DatasetError) -> TaskError {
     let text = error.to_string();
@@ -322,6 +413,8 @@ pub(super) fn of_dataset(error: DatasetError) -> TaskError {
         DatasetError::Store { .. }
         | DatasetError::StoreSettings { .. }
         | DatasetError::Io { .. } => TaskError::Store(text),
+        // Repeated reading has not helped. To run the task elsewhere may, and repairing the store does.
+        DatasetError::Damaged { .. } => TaskError::Damaged(text),
         DatasetError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),
     }

@@ -125,7 +125,7 @@ impl Repairer {
             }
             let restored = restore_root(store.clone(), prefix.clone(), &spec);
             match self.stores.wait(control, restored) {
-                Err(error @ TaskError::User(_)) => last = Some(error),
+                Err(error @ (TaskError::User(_) | TaskError::Damaged(_))) => last = Some(error),
                 other => return other,
             }
         }
@@ -249,7 +249,7 @@ impl Repairer {
             match self.keyed(stage, task, scene, control) {
                 Ok((way, key)) if found.iter().all(|(_, k)| *k != key) => found.push((way, key)),
                 Ok(_) => {}
-                Err(TaskError::User(why)) => others.push(why),
+                Err(TaskError::User(why) | TaskError::Damaged(why)) => others.push(why),
                 Err(error) => return Err(error),
             }
         }

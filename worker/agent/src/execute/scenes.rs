@@ -145,8 +145,8 @@ fn read(
 /// Reads a scene with its own laser, or one aimed as the job says where it has none.
 fn with_laser(path: &Path, aim: &Aim, bounds: &Bounds) -> Result<Scene, SceneError> {
     match import::read_scene_with(path, &ImportOptions::default(), bounds) {
-        // The importer's word for a file without a laser; one with an unusable laser is not repaired here.
-        Err(SceneError::Format { what, .. }) if what.starts_with("laser: ") => {
+        // A file with an unusable laser is not repaired here.
+        Err(SceneError::NoLaser { .. }) => {
             warn!(path = %path.display(), spots = aim.film().len(), "the file has no laser; the job's spots are used");
             let options = ImportOptions {
                 laser: Some(aim.clone()),

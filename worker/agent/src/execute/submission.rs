@@ -90,6 +90,12 @@ impl Submission<'_> {
 /// # Errors
 /// The path is empty, or there is no current folder.
 pub fn absolute(base: &Path, path: &str) -> Result<PathBuf, String> {
+    if path == "~" || path.starts_with("~/") {
+        // A shell expands it; here it would make a folder of this name.
+        return Err(format!(
+            "{path:?}: `~` is not expanded here; write the whole path (or \"./{path}\" for a folder named ~)"
+        ));
+    }
     let whole = std::path::absolute(base.join(path)).map_err(|e| format!("{path:?}: {e}"))?;
     let mut plain = PathBuf::new();
     for part in whole.components() {

@@ -35,7 +35,7 @@ impl Times {
                 predictions: None,
             });
         }
-        let (place, prefix) = stores.source(store)?;
+        let (place, prefix) = stores.source(store, control)?;
         let opened = stores.wait(control, Predictions::open(place, prefix.join(name)));
         let predictions = opened.map_err(|e| at(field, e))?;
         let (theirs, ours) = (predictions.spec(), dataset.spec());

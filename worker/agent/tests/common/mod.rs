@@ -401,6 +401,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,
+        ends_at: None,
         asset_dirs: Vec::new(),
         access: Default::default(),
         store_prefixes: Vec::new(),

@@ -103,6 +103,7 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
         if !groups.is_empty() {
             let _ = write!(out, "<h3>{}</h3>", target_name(target));
             out.push_str(&table(report, target, &groups));
+            out.extend(groups.iter().filter_map(|group| verdict(group)));
             for order in summary.orders.iter().filter(|o| o.target == target) {
                 out.push_str(&ordered(order));
             }
@@ -112,6 +113,20 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
         let _ = write!(out, "<p class=\"note\">{}</p>", Safe(paper::NOTE));
     }
     out
+}
+
+/// What an experiment is worth beside the best trivial answer, in a line.
+pub(super) fn verdict(group: &Group) -> Option<String> {
+    let (name, ratio) = group.beside_best_baseline.as_ref()?;
+    let (class, better) = match *ratio < 1.0 {
+        true => ("note", "better than every trivial answer"),
+        false => ("warn", "no better than a trivial answer"),
+    };
+    let (label, name) = (Safe(&group.label), Safe(name));
+    let ratio = digits(*ratio, 2);
+    Some(format!(
+        "<p class=\"{class}\">{label}: {better}: {ratio} times the error of \u{201c}{name}\u{201d}.</p>"
+    ))
 }
 
 /// The table of one target.

@@ -288,6 +288,16 @@ fn a_report_without_an_evaluation_says_so() {
 }
 
 #[test]
+fn an_experiment_that_loses_to_a_trivial_answer_says_so_in_a_line() {
+    let page = html(&report(vec![
+        shadow("lost", ShadowVariant::Concat, 1, 0.4),
+        shadow("won", ShadowVariant::Difference, 1, 0.9),
+    ]));
+    assert!(page.contains("lost: no better than a trivial answer: 1.2 times the error of"));
+    assert!(page.contains("won: better than every trivial answer: 0.20 times"));
+}
+
+#[test]
 fn the_order_of_experiments_is_compared_with_the_published_one() {
     let of = |difference| {
         let all = report(vec![

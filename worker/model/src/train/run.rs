@@ -22,7 +22,7 @@ use crate::{
     device::computes,
     input::Visit,
     metric::{Metrics, Tally},
-    model::PLAN,
+    model::{PLAN, not_finite},
     net::Net,
     parameters::Parameters,
     scene::Scenes,
@@ -497,9 +497,16 @@ impl Training {
             loading: self.loading,
         };
         making.ahead(|ready| {
-            for _ in 0..scenes.len().div_ceil(self.plan.batch) {
+            for at in 0..scenes.len().div_ceil(self.plan.batch) {
                 let batch = ready.next()?;
                 let said = self.learner.predict(&batch);
+                if let Some(odd) = said.iter().position(|value| !value.is_finite()) {
+                    let scene = at * self.plan.batch + odd / (said.len() / batch.images.max(1));
+                    let step = self.learner.steps();
+                    let why = not_finite(&said, odd, &batch, None);
+                    let what = format!("validation scene {scene} (counted from 0): {why}");
+                    return Err(ModelError::NotFinite { step, what });
+                }
                 tally.add(question, &said, &batch.target, [batch.height, batch.width]);
             }
             Ok::<(), ModelError>(())

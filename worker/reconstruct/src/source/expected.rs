@@ -44,7 +44,7 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
     let (pixels, k) = (measured.pixels(), measured.spots.len());
     let tolerance = BINS * measured.bin_width_m;
     let mut refined = measured.clone();
-    let raw = closed_form(&mut refined);
+    let raw = closed_form(&mut refined).0;
     let depth = smooth(&refined, &raw);
     let paths = Paths::new(&refined, &depth);
     // Return over geometry where both are known and agree in time.

@@ -3,7 +3,7 @@
 
 use std::io::Cursor;
 
-use crate::{Bsdf, Material, Mesh, Vec3};
+use crate::{Bsdf, Material, Mesh, Vec3, import::polygon::Triangulation};
 
 use super::catalogue::{Archive, Item};
 
@@ -44,7 +44,7 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
     let bytes = archive.read(&item.model).map_err(|e| e.to_string())?;
     let folder = item.model.rsplit_once('/').map_or("", |(folder, _)| folder);
     let options = tobj::LoadOptions {
-        triangulate: true,
+        triangulate: false,
         ignore_points: true,
         ignore_lines: true,
         ..tobj::LoadOptions::default()
@@ -81,8 +81,8 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
             .material_id
             .unwrap_or(materials.len())
             .min(materials.len()) as u32;
-        for t in part.indices.chunks_exact(3) {
-            mesh.triangles.push([t[0] + base, t[1] + base, t[2] + base]);
+        for t in triangles(part) {
+            mesh.triangles.push(t.map(|v| v + base));
             mesh.triangle_material.push(slot);
         }
     }
@@ -102,6 +102,31 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
     }
     mesh.make_canonical();
     Ok(loaded)
+}
+
+/// The polygons of a part as triangles. A polygon whose edges cross becomes a fan, because models of
+/// a library are not corrected.
+fn triangles(part: &tobj::Mesh) -> Vec<[u32; 3]> {
+    if part.face_arities.is_empty() {
+        return part.indices.as_chunks::<3>().0.to_vec();
+    }
+    let place = |v: u32| {
+        let at = 3 * v as usize;
+        std::array::from_fn(|k| f64::from(part.positions.get(at + k).copied().unwrap_or(f32::NAN)))
+    };
+    let (mut all, mut rest) = (Vec::new(), part.indices.as_slice());
+    let (mut split, mut parts) = (Triangulation::default(), Vec::new());
+    for &arity in &part.face_arities {
+        let (face, after) = rest.split_at(rest.len().min(arity as usize));
+        rest = after;
+        let corners: Vec<[f64; 3]> = face.iter().map(|v| place(*v)).collect();
+        parts.clear();
+        if split.split(&corners, &mut parts).is_err() {
+            parts = (2..face.len() as u32).map(|k| [0, k - 1, k]).collect();
+        }
+        all.extend(parts.iter().map(|t| t.map(|c| face[c as usize])));
+    }
+    all
 }
 
 /// Catalogue rotations are rows of a 3×3 matrix.
@@ -250,6 +275,25 @@ mod tests {
         assert_eq!(model.mesh.materials[0].bsdf, face);
         let changes: Vec<_> = asset.changes().collect();
         assert_eq!(changes, ["transparent materials made opaque"]);
+    }
+
+    #[test]
+    fn concave_faces_keep_their_notch() {
+        let text = "v 0 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\nv 1 2 0\nv 0 2 0\nf 2 3 4 5 6 1\nf 1 2 3\n";
+        let (models, _) = tobj::load_obj_buf(
+            &mut std::io::Cursor::new(text),
+            &tobj::LoadOptions::default(),
+            |_| Err(tobj::LoadError::OpenFileFailed),
+        )
+        .expect("reads");
+        let part = &models[0].mesh;
+        let at = |v: u32| [0, 1].map(|k| part.positions[3 * v as usize + k]);
+        let area = |t: &[u32; 3]| {
+            let [a, b, c] = t.map(at);
+            0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs()
+        };
+        let found: f32 = super::triangles(part).iter().map(area).sum();
+        assert_eq!(found, 4.0);
     }
 
     #[test]

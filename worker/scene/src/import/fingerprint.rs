@@ -4,7 +4,7 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::{Bounds, buffers::buffer_file, is_xml, mitsuba, read_file};
+use super::{Bounds, buffers::buffer_file, gltf_file, is_xml, mitsuba, read_file};
 use crate::SceneError;
 
 /// SHA-256 of a scene's content, hexadecimal. For a file that stands alone (every `.glb` and reference scene of ours)
@@ -25,8 +25,8 @@ pub fn fingerprint(path: &Path, bounds: &Bounds) -> Result<String, SceneError> {
         }
     }
     // Other files, unreadable ones too, stand alone.
-    if let Ok(file) = gltf::Gltf::from_slice_without_validation(&bytes) {
-        let json = file.document.as_json();
+    if let Ok(file) = gltf_file::document::parse(&bytes) {
+        let json = &file.root;
         let buffers = json.buffers.iter().filter_map(|b| b.uri.as_deref());
         let images = json.images.iter().filter_map(|i| i.uri.as_deref());
         for uri in buffers.chain(images) {

@@ -10,6 +10,8 @@ use zune_jpeg::{
 
 use crate::{Texture, Wrap};
 
+use super::quoted;
+
 /// Most texels of all textures of one file (800 MB).
 const MAX_TEXELS: u64 = 1 << 28;
 
@@ -63,11 +65,32 @@ pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, St
     };
     let (size, texels) = decoded.map_err(|refused| match refused {
         Refused::Damaged(why) => {
-            format!("image {name:?} is not readable ({why}); save it as 8-bit PNG or JPEG")
+            format!(
+                "image {} is not readable ({why}); save it as 8-bit PNG or JPEG",
+                quoted(name)
+            )
         }
-        Refused::TooLarge(why) => format!("image {name:?}: {why}"),
+        Refused::TooLarge(why) => format!("image {}: {why}", quoted(name)),
     })?;
     Texture::new(name, size.0, size.1, texels, wrap)
+}
+
+/// The smallest alpha of an image; 255 for one without.
+///
+/// # Errors
+/// An image that cannot be read.
+pub(super) fn least_alpha(bytes: &[u8]) -> Result<u8, String> {
+    if !bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
+        return Ok(255);
+    }
+    let (_, samples, each) = png_samples(bytes).map_err(|refused| match refused {
+        Refused::Damaged(why) | Refused::TooLarge(why) => format!("image is not readable ({why})"),
+    })?;
+    let alpha = samples.chunks_exact(each).map(|p| p[each - 1]);
+    Ok(match each {
+        2 | 4 => alpha.min().unwrap_or(255),
+        _ => 255,
+    })
 }
 
 enum Refused {
@@ -79,6 +102,14 @@ enum Refused {
 type Decoded = ((u32, u32), Vec<[u8; 3]>);
 
 fn png(bytes: &[u8]) -> Result<Decoded, Refused> {
+    let (size, samples, each) = png_samples(bytes)?;
+    Ok((size, texels(&samples, each)))
+}
+
+/// Width and height, 8-bit samples row by row, and how many samples a pixel has.
+type Samples = ((u32, u32), Vec<u8>, usize);
+
+fn png_samples(bytes: &[u8]) -> Result<Samples, Refused> {
     let damaged = |e: png::DecodingError| Refused::Damaged(e.to_string());
     let limits = png::Limits {
         bytes: 16 * Texture::MAX_TEXELS as usize,
@@ -96,7 +127,7 @@ fn png(bytes: &[u8]) -> Result<Decoded, Refused> {
         let rounded = |pair: &[u8; 2]| ((u32::from(u16::from_be_bytes(*pair)) + 128) / 257) as u8;
         samples = samples.as_chunks::<2>().0.iter().map(rounded).collect();
     }
-    Ok((size, texels(&samples, info.color_type.samples())))
+    Ok((size, samples, info.color_type.samples()))
 }
 
 fn jpeg(bytes: &[u8]) -> Result<Decoded, Refused> {

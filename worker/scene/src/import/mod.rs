@@ -2,18 +2,24 @@
 //! the reference scenes' JSON.
 
 mod buffers;
+mod far;
 mod fingerprint;
 mod gltf_file;
 mod image;
 mod mitsuba;
+mod obj;
 mod ply;
+pub(crate) mod polygon;
 mod reference;
 
-use std::path::{Path, PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use picofarm_files::{FileError, Opener};
 
-use crate::{Affine, Aim, Camera, Scene, SceneError, Vec3};
+use crate::{Aim, Camera, Scene, SceneError};
 
 pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
@@ -172,7 +178,42 @@ fn of_file(error: FileError) -> SceneError {
 fn format_error(path: &Path, what: impl Into<String>) -> SceneError {
     SceneError::Format {
         path: path.to_path_buf(),
-        what: what.into(),
+        what: shortened(what.into()),
+    }
+}
+
+/// Longest message on a file, and longest note, letters.
+const MAX_MESSAGE: usize = 1000;
+/// Letters of a file's own text that a message quotes.
+const MAX_QUOTE: usize = 80;
+
+/// A message, cut where it is too long to be read.
+fn shortened(mut message: String) -> String {
+    if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE) {
+        message.truncate(end);
+        message.push('…');
+    }
+    message
+}
+
+/// Most notes on a file.
+const MAX_NOTES: usize = 256;
+
+/// Adds a note. Keys and texts may have names of the file in them, and a file may have any number
+/// of these.
+fn add_note(notes: &mut BTreeMap<String, String>, key: &str, what: String) {
+    let key: String = key.chars().take(2 * MAX_QUOTE).collect();
+    match notes.len() < MAX_NOTES || notes.contains_key(&key) {
+        true => notes.insert(key, shortened(what)),
+        false => notes.insert("more".into(), "there are too many notes to list".into()),
+    };
+}
+
+/// Text of a file in quotes, cut where it is long.
+fn quoted(text: &str) -> String {
+    match text.char_indices().nth(MAX_QUOTE) {
+        None => format!("{text:?}"),
+        Some((end, _)) => format!("{:?}… ({} bytes)", &text[..end], text.len()),
     }
 }
 
@@ -184,22 +225,5 @@ fn validated(path: &Path, scene: Scene) -> Result<Scene, SceneError> {
             Err(format_error(path, format!("{field}: {what}")))
         }
         Err(other) => Err(other),
-    }
-}
-
-/// `outer` after `inner`.
-fn compose(outer: &Affine, inner: &Affine) -> Affine {
-    if *outer == Affine::IDENTITY {
-        return *inner;
-    }
-    let column = |k: usize| {
-        let c = Vec3::new(inner.linear[0][k], inner.linear[1][k], inner.linear[2][k]);
-        outer.direction(c)
-    };
-    let (x, y, z) = (column(0), column(1), column(2));
-    let row = |k: usize| Vec3::new(x[k], y[k], z[k]);
-    Affine {
-        linear: [row(0), row(1), row(2)],
-        translation: outer.point(inner.translation),
     }
 }

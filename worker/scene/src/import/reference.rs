@@ -100,22 +100,26 @@ pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Scene, SceneError> {
         })
         .collect::<Result<Vec<_>, _>>()?;
     let mut labels: Vec<String> = Vec::new();
-    let objects = meshes
-        .into_iter()
-        .map(|mesh| {
-            let known = labels.iter().position(|l| *l == mesh.name);
-            let label = known.unwrap_or_else(|| {
+    let mut known: BTreeMap<String, u16> = BTreeMap::new();
+    let mut objects = Vec::with_capacity(meshes.len());
+    for mesh in meshes {
+        let label = match known.get(&mesh.name) {
+            Some(label) => *label,
+            None => {
+                let label = u16::try_from(labels.len())
+                    .map_err(|_| format_error(path, "meshes[].name: more than 65535 names"))?;
                 labels.push(mesh.name.clone());
-                labels.len() - 1
-            });
-            Object {
-                name: mesh.name.clone(),
-                mesh: Arc::new(mesh),
-                to_world: Affine::IDENTITY,
-                label: label as u16,
+                known.insert(mesh.name.clone(), label);
+                label
             }
-        })
-        .collect();
+        };
+        objects.push(Object {
+            name: mesh.name.clone(),
+            mesh: Arc::new(mesh),
+            to_world: Affine::IDENTITY,
+            label,
+        });
+    }
     let beams = file
         .spots
         .iter()

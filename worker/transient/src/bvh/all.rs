@@ -54,7 +54,7 @@ impl Bvh {
                 continue;
             }
             for pack in &self.packs[packs(current)] {
-                for (lane, &id) in pack.id.iter().enumerate() {
+                for lane in 0..8 {
                     let at = |v: usize, k: usize| pack.vertex[3 * v + k][lane] - o[k];
                     let corner = |v: usize| {
                         let z = at(v, kz);
@@ -67,9 +67,12 @@ impl Bvh {
                     // Lanes without a triangle are NaN and inside of nothing.
                     let inside = u.min(v).min(w) >= 0.0 || u.max(v).max(w) <= 0.0;
                     let det = u + v + w;
-                    let t = shear[2] * (u * a[2] + v * b[2] + w * c[2]) / det;
+                    let t = match inside && pack.is_needle(lane) {
+                        true => pack.exactly(lane, o, d),
+                        false => shear[2] * (u * a[2] + v * b[2] + w * c[2]) / det,
+                    };
                     if inside && det != 0.0 && t > 0.0 && t <= limit {
-                        out.push((t, id));
+                        out.push((t, pack.triangle(lane)));
                     }
                 }
             }

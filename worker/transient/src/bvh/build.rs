@@ -15,7 +15,7 @@ use picofarm_scene::Vec3;
 
 use crate::api::{RenderError, Stop};
 
-use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, alike, plan::Plan, simd};
+use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, alike, needle, plan::Plan, simd};
 
 const NO_NODE: Node = Node {
     bounds: [
@@ -186,7 +186,7 @@ impl Bvh {
                         pack.vertex[3 * v + d][lane] = p[d];
                     }
                 }
-                pack.id[lane] = id;
+                pack.id[lane] = id | needle::mark(&triangles[id as usize]);
             }
             self.packs.push(pack);
         }

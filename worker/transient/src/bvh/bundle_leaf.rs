@@ -1,5 +1,7 @@
 //! Bundles at a leaf: which rays meet its box, and which a triangle of it.
 
+use picofarm_scene::Vec3;
+
 use super::{
     Bvh, Pack,
     lanes::Lanes,
@@ -91,9 +93,25 @@ impl Rays {
                 E::splat(self.shear[1][k]),
                 E::splat(self.shear[2][k]),
             ];
-            hit |= u64::from(meets(&vertices, &shear) != 0) << k;
+            let (hits, crosses) = meets(&vertices, &shear);
+            let mut needles = pack.needles(crosses);
+            let mut met = hits & !needles != 0;
+            while !met && needles != 0 {
+                let lane = needles.trailing_zeros() as usize & 7;
+                needles &= needles - 1;
+                met = self.meets_needle(pack, lane, k);
+            }
+            hit |= u64::from(met) << k;
         }
         hit
+    }
+
+    /// Whether ray `k` meets the needle in a lane that it crosses.
+    #[inline(always)]
+    fn meets_needle(&self, pack: &Pack, lane: usize, k: usize) -> bool {
+        let d = Vec3::new(self.d[0][k], self.d[1][k], self.d[2][k]);
+        let t = pack.exactly(lane, self.o, d);
+        t > 0.0 && t <= 1.0
     }
 
     #[inline(always)]
@@ -116,7 +134,17 @@ impl Rays {
                     W::load(&self.shear[1][k..]),
                     W::load(&self.shear[2][k..]),
                 ];
-                hit |= (u64::from(meets(&vertices, &shear)) & lanes) << k;
+                let (mut hits, crosses) = meets(&vertices, &shear);
+                if pack.is_needle(lane) {
+                    hits = 0;
+                    let mut rest = crosses & lanes as u32;
+                    while rest != 0 {
+                        let i = rest.trailing_zeros() as usize & (W::N - 1);
+                        rest &= rest - 1;
+                        hits |= u32::from(self.meets_needle(pack, lane, k + i)) << i;
+                    }
+                }
+                hit |= (u64::from(hits) & lanes) << k;
             }
         }
         hit
@@ -124,9 +152,9 @@ impl Rays {
 }
 
 /// The triangle test of the single ray with limit 1: vertices relative to the origin, axes in the order
-/// of the shear.
+/// of the shear. Which lanes are met, and which are crossed anywhere along the ray's line.
 #[inline(always)]
-fn meets<L: Lanes>(v: &[[L; 3]; 3], [sx, sy, sz]: &[L; 3]) -> u32 {
+fn meets<L: Lanes>(v: &[[L; 3]; 3], [sx, sy, sz]: &[L; 3]) -> (u32, u32) {
     let [[ax, ay, az], [bx, by, bz], [cx, cy, cz]] = *v;
     let (ax, ay) = (ax.sub(sx.mul(az)), ay.sub(sy.mul(az)));
     let (bx, by) = (bx.sub(sx.mul(bz)), by.sub(sy.mul(bz)));
@@ -138,9 +166,10 @@ fn meets<L: Lanes>(v: &[[L; 3]; 3], [sx, sy, sz]: &[L; 3]) -> u32 {
     let (low, high) = (u.min(v).min(w), u.max(v).max(w));
     let inside = zero.le(low) | high.le(zero);
     if inside == 0 {
-        return 0;
+        return (0, 0);
     }
     let det = u.add(v).add(w);
     let t = sz.mul(u.mul(az).add(v.mul(bz)).add(w.mul(cz))).div(det);
-    inside & det.differs(zero) & t.gt(zero) & t.le(L::splat(1.0))
+    let crosses = inside & det.differs(zero);
+    (crosses & t.gt(zero) & t.le(L::splat(1.0)), crosses)
 }

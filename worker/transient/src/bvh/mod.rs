@@ -11,6 +11,7 @@ mod build;
 mod bundle;
 mod bundle_leaf;
 mod lanes;
+mod needle;
 mod plan;
 mod pyramid;
 mod rays;
@@ -20,6 +21,7 @@ mod traverse;
 use picofarm_scene::Vec3;
 
 pub(crate) use build::normal;
+pub(crate) use needle::is_needle;
 
 use crate::api::{RenderError, Stop, Unstopped};
 
@@ -31,7 +33,8 @@ struct Node {
     child: [u32; 8],
 }
 
-/// Eight triangles: vertex components a.xyz, b.xyz, c.xyz; NaN in unused lanes, which never hit.
+/// Eight triangles: vertex components a.xyz, b.xyz, c.xyz; NaN in unused lanes, which never hit. The highest bit of an index marks
+/// a needle ([`needle`]).
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
 struct Pack {

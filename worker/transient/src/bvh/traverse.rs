@@ -154,22 +154,36 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
                 }
                 let det = u.add(v).add(w);
                 let t = sz.mul(u.mul(az).add(v.mul(bz)).add(w.mul(cz))).div(det);
-                let mut hits = inside & det.differs(zero) & t.gt(zero) & t.le(L::splat(best));
-                if hits == 0 {
+                let crosses = inside & det.differs(zero);
+                let mut hits = crosses & t.gt(zero) & t.le(L::splat(best));
+                let mut needles = pack.needles(crosses);
+                if hits | needles == 0 {
                     continue;
                 }
+                let mut distances = [0.0; 8];
+                if !ANY || needles != 0 {
+                    t.store(&mut distances);
+                }
+                let mut t = distances;
+                while needles != 0 {
+                    let k = needles.trailing_zeros() as usize & 7;
+                    needles &= needles - 1;
+                    t[k] = pack.exactly(k, o, d);
+                    let hit = t[k] > 0.0 && t[k] <= best;
+                    hits = hits & !(1 << k) | u32::from(hit) << k;
+                }
                 if ANY {
+                    if hits == 0 {
+                        continue;
+                    }
                     return (0.0, 0);
                 }
-                let mut distances = [0.0; 8];
-                t.store(&mut distances);
-                let t = distances;
                 while hits != 0 {
                     let k = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;
-                    if t[k] < best || (t[k] == best && pack.id[k] < id) {
+                    if t[k] < best || (t[k] == best && pack.triangle(k) < id) {
                         best = t[k];
-                        id = pack.id[k];
+                        id = pack.triangle(k);
                     }
                 }
             }

@@ -68,7 +68,9 @@ impl ByGlass {
                 return;
             }
             if first && turned {
-                let limits = (walk.max_bounces, world);
+                // The spots themselves are seen as points of light where they can be.
+                let spots = !(point.shows && self.points_of_light());
+                let limits = (walk.max_bounces, world, spots);
                 photons.around(limits, &point, |splat, ratios| {
                     add(film, (pixel, splat), || ratios, out);
                 });

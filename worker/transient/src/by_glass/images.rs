@@ -1,5 +1,6 @@
 //! Mirror images of the spots in planar panes: light that a pane reflects once on its way from a spot comes straight from the image
 //! behind it. So a camera path's points connect to images as they do to spots, as far as the pane reaches and nothing stands between.
+//! The camera itself does so too: a spot that it sees in a planar pane is a point of light, in one pixel and one bin.
 
 use picofarm_scene::Vec3;
 
@@ -7,6 +8,8 @@ use super::{Buffers, camera::Found, lit::Lit, ray::Point};
 use crate::{
     api::Stop,
     bsdf::frame,
+    caustic::Splat,
+    film::Film,
     glass::Panes,
     rng::Rng,
     sink::Technique,
@@ -50,15 +53,18 @@ struct Plane {
 /// The planes of a scene's panes.
 #[derive(Debug, Default)]
 pub(super) struct Images {
+    /// The largest first.
     planes: Vec<Plane>,
-    /// Plane of each pane, [`NONE`] for those of none that is kept.
-    of_pane: Vec<u8>,
+    /// How many of them points of camera paths are connected by.
+    kept: usize,
+    /// Plane of each pane, [`NONE`] for those of none.
+    of_pane: Vec<u32>,
 }
 
-const NONE: u8 = u8::MAX;
+const NONE: u32 = u32::MAX;
 
 impl Images {
-    /// The largest planes. Whoever stops it gets what must not be used.
+    /// The planes of all panes. Whoever stops it gets what must not be used.
     pub fn find(world: &World, stop: Stop) -> Self {
         let Some(panes) = &world.panes else {
             return Self::default();
@@ -92,16 +98,17 @@ impl Images {
             all.push(pane);
         }
         let whole: f32 = planes.iter().map(|(p, _)| p.area).sum();
-        planes.retain(|(p, _)| p.area >= LEAST * whole);
         planes.sort_by(|a, b| b.0.area.total_cmp(&a.0.area));
-        planes.truncate(MOST);
+        let large = planes.iter().filter(|(p, _)| p.area >= LEAST * whole);
+        let kept = large.count().min(MOST);
         let mut of_pane = vec![NONE; panes.triangles().count()];
         for (k, (_, all)) in planes.iter().enumerate() {
             for &pane in all {
-                of_pane[pane] = k as u8;
+                of_pane[pane] = k as u32;
             }
         }
         Self {
+            kept,
             planes: planes.into_iter().map(|(plane, _)| plane).collect(),
             of_pane,
         }
@@ -109,12 +116,69 @@ impl Images {
 
     /// Whether there are any.
     pub fn any(&self) -> bool {
-        !self.planes.is_empty()
+        self.kept > 0
     }
 
-    /// Whether spots have images in a pane.
+    /// Whether points of camera paths are connected to the spots' images in a pane.
     pub fn has(&self, pane: u32) -> bool {
+        (self.of_pane[pane as usize] as usize) < self.kept
+    }
+
+    /// Whether the spots that the camera sees in a pane are among [`Images::seen`].
+    pub fn shows(&self, pane: u32) -> bool {
         self.of_pane[pane as usize] != NONE
+    }
+
+    /// The spots that the camera sees in planar panes, each a point of light: what each pass draws of them into the image. As a spot
+    /// seen without glass ([`crate::one_bounce`]), from where its image is. Whoever stops it gets what must not be used.
+    pub fn seen(
+        &self,
+        (walk, film): (&Walk, &Film),
+        buffers: &mut Buffers,
+        stop: Stop,
+    ) -> Vec<Splat> {
+        let (world, mut seen) = (walk.world, vec![]);
+        let Some(panes) = &world.panes else {
+            return seen;
+        };
+        let (camera, i) = (&world.camera, &world.camera.intrinsics);
+        let area = world.sensitive.powi(2) / (i.fx * i.fy);
+        for (k, plane) in self.planes.iter().enumerate() {
+            if stop.asked() {
+                break;
+            }
+            for (spot, e) in walk.emitters.list.iter().enumerate() {
+                let place = (e.p, e.n);
+                let Some(way) = self.way((world, panes), k, (Vec3::ZERO, 1.0), place, buffers)
+                else {
+                    continue;
+                };
+                let image = e.p - plane.normal * (2.0 * (plane.normal.dot(e.p) - plane.offset));
+                let (q, d) = (camera.direction_to_camera(image), image.length());
+                let Some(pixel) = world.pixel(q) else {
+                    continue;
+                };
+                let cos = q.z / d;
+                let value = e.intensity(way.back) * way.free / (d * d * cos * cos * cos * area);
+                let ratios = match film.spectral {
+                    true => e.ratios(world, way.back),
+                    false => ONES,
+                };
+                let slot = film.slot(e.path_m + way.length_m) as u32;
+                let each = (0u8..).zip(ratios).take(film.wavelengths);
+                seen.extend(each.map(|(wavelength, ratio)| Splat {
+                    pixel: pixel as u32,
+                    slot,
+                    spot: spot as u16,
+                    wavelength,
+                    value: value * ratio,
+                    bounces: 2,
+                    technique: Technique::SeenSpot,
+                }));
+            }
+        }
+        seen.retain(|s| s.value > 0.0);
+        seen
     }
 
     /// Connects a point of a camera path to `count` images, drawn by what they would bring if nothing stood between.
@@ -132,7 +196,7 @@ impl Images {
         let spots = emitters.list.len();
         let mut weights = std::mem::take(&mut buffers.lights);
         weights.clear();
-        for plane in &self.planes {
+        for plane in &self.planes[..self.kept] {
             let of = (&point.hit, point.back);
             let each = emitters.list.iter();
             weights.extend(each.map(|e| plane.weight(panes, of, e.p, |w| e.intensity(w))));
@@ -159,7 +223,8 @@ impl Images {
     ) -> Option<(f32, Found, Ratios)> {
         let (world, path) = (walk.world, &point.path);
         let e = &walk.emitters.list[spot];
-        let way = self.way((world, panes), plane, point, (e.p, e.n), buffers)?;
+        let from = (lift(point.hit.p, point.hit.n), point.medium);
+        let way = self.way((world, panes), plane, from, (e.p, e.n), buffers)?;
         let found = Found {
             value: 0.0,
             path_m: path.length_m + way.length_m + e.path_m,
@@ -192,18 +257,16 @@ impl Images {
         let (Some(panes), all) = (&world.panes, lit.list.len()) else {
             return;
         };
-        if all == 0 || self.planes.is_empty() {
+        if all == 0 || self.kept == 0 {
             return;
         }
-        let some = (LOOKED_AT / self.planes.len())
-            .clamp(OF_ONE.0, OF_ONE.1)
-            .min(all);
+        let some = (LOOKED_AT / self.kept).clamp(OF_ONE.0, OF_ONE.1).min(all);
         let first = ((rng.uniform() * all as f32) as usize).min(all - 1);
         let of = |k: usize| &lit.list[(first + k) % all];
         let mut weights = std::mem::take(&mut buffers.lights);
         weights.clear();
         let h = &point.hit;
-        for plane in &self.planes {
+        for plane in &self.planes[..self.kept] {
             for k in 0..some {
                 let y = of(k);
                 let sends = |back: Vec3| y.sum * y.hit.n.dot(back).max(0.0);
@@ -215,7 +278,8 @@ impl Images {
         draw(&weights, count, rng.uniform(), |k, value| {
             let (plane, y) = (k / some, of(k % some));
             let place = (y.hit.p, y.hit.n);
-            let Some(way) = self.way((world, panes), plane, point, place, buffers) else {
+            let from = (lift(h.p, h.n), point.medium);
+            let Some(way) = self.way((world, panes), plane, from, place, buffers) else {
                 return;
             };
             let factor = point.path.weight * value * scale * way.share / y.sum;
@@ -239,17 +303,16 @@ impl Images {
         buffers.lights = weights;
     }
 
-    /// The way from a point to another by a pane of a plane, where it is free.
+    /// The way from a point, lifted off its surface, in a medium of some index to another point by a pane of a plane, where it is free.
     fn way(
         &self,
         (world, panes): (&World, &Panes),
         k: usize,
-        point: &Point,
+        (from, medium): (Vec3, f32),
         (p, n): (Vec3, Vec3),
         buffers: &mut Buffers,
     ) -> Option<Way> {
-        let (plane, h) = (&self.planes[k], &point.hit);
-        let from = lift(h.p, h.n);
+        let plane = &self.planes[k];
         // From where the ray starts: it meets the pane there.
         let q = plane.between(from, p)?;
         let to = q - from;
@@ -263,7 +326,7 @@ impl Images {
         let mut passes = 1.0;
         let mut reflects = 0.0;
         for c in &buffers.crossings {
-            if usize::from(self.of_pane[c.pane as usize]) == k {
+            if self.of_pane[c.pane as usize] as usize == k {
                 reflects = c.reflects;
                 break;
             }
@@ -282,9 +345,10 @@ impl Images {
         let length = to.length() + (p - q).length();
         (free > 0.0).then(|| Way {
             share: free / panes.weight(plane.pane, cos),
+            free,
             w,
             back: (q - p).normalized(),
-            length_m: world.metres(length) * f64::from(point.medium),
+            length_m: world.metres(length) * f64::from(medium),
         })
     }
 }
@@ -293,6 +357,8 @@ impl Images {
 struct Way {
     /// What passes and is reflected, as a share of what weights count with.
     share: f32,
+    /// The same of all light.
+    free: f32,
     /// Unit directions from both ends.
     w: Vec3,
     back: Vec3,

@@ -75,10 +75,11 @@ impl Photons {
         [p.x, p.y, p.z].map(|x| (x / self.cell).floor() as i32)
     }
 
-    /// Calls `each` with what every photon near a camera path's point brings, and its ratios.
+    /// Calls `each` with what every photon near a camera path's point brings, and its ratios; without `spots`, what lies behind the
+    /// first bounce alone.
     pub(super) fn around(
         &self,
-        (max_bounces, world): (u32, &World),
+        (max_bounces, world, spots): (u32, &World, bool),
         point: &Point,
         mut each: impl FnMut(Found, Ratios),
     ) {
@@ -103,6 +104,7 @@ impl Photons {
                         || h.n.dot(to).abs() > FLAT * radius
                         || h.n.dot(z.hit.n) < ALIKE
                         || !(2..=max_bounces).contains(&bounces)
+                        || (z.bounces == 1 && !spots)
                     {
                         continue;
                     }

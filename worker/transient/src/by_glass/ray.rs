@@ -130,8 +130,9 @@ pub(super) struct Point {
     pub medium: f32,
     /// How often glass turned light on the leg that led here.
     pub turns: u32,
-    /// It was a single time, at a pane in which points have images.
+    /// It was a single time, at a pane in which points have images; at one in which spots are seen as points of light.
     pub imaged: bool,
+    pub shows: bool,
 }
 
 /// Shares of light that go one way or another on a straight way.
@@ -227,6 +228,7 @@ pub(super) fn arrive(
 ) -> Option<Point> {
     let (ray, mut hit) = follow(world, ray, seek, rng, tools)?;
     hit.choose_part(world, rng);
+    let once = ray.last.filter(|_| ray.turns == 1);
     Some(Point {
         hit,
         back: -ray.w,
@@ -238,7 +240,8 @@ pub(super) fn arrive(
         },
         medium: ray.medium,
         turns: ray.turns,
-        imaged: ray.turns == 1 && ray.last.is_some_and(|pane| images.has(pane)),
+        imaged: once.is_some_and(|pane| images.has(pane)),
+        shows: once.is_some_and(|pane| images.shows(pane)),
     })
 }
 

@@ -139,7 +139,7 @@ pub(super) fn prepare<R>(
         _ => Contacts::find(&world, emitters),
     };
     walk.contacts = contacts.as_ref();
-    let glass = ByGlass::find(&walk, &centres, stop)?;
+    let glass = ByGlass::find((&walk, &film), &centres, stop)?;
     walk.glass = glass.as_ref();
     let frame = Frame {
         walk,

@@ -200,6 +200,7 @@ impl<'a> Sources<'a> {
         all: &mut Vec<Splat>,
     ) -> u64 {
         let (walk, width) = (&frame.walk, frame.width);
+        all.extend_from_slice(glass.seen());
         let pixels = width * frame.height;
         let chunk = |buffers: &mut Buffers, chunk: u32, found: &mut Vec<Splat>| {
             let pass = u64::from(at.pass);

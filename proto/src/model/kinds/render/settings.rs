@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Strategy, Wavelengths};
 use serde::{Deserialize, Serialize};
 
-use crate::model::spec_error::{SpecError, within};
+use crate::model::{
+    SceneKind,
+    spec_error::{SpecError, within},
+};
 
 /// How scenes are rendered.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -154,6 +157,57 @@ impl RenderSettings {
             ),
             n => within("render.max_bounces", n, (0, 1_000_000), "bounces; 0 is all"),
         }
+    }
+}
+
+/// Longest path of two-bounce light in a room of at most 4.5 m a side, metres: the default gate ends there.
+const ROOM_PATH_M: f64 = 25.456;
+/// Shortest gate that records the two-bounce light of most rooms, metres of path.
+const ROOM_GATE_M: f64 = 8.0;
+/// Widest bin that tells the depths in a room apart, metres of path.
+const ROOM_BIN_M: f64 = 0.5;
+/// Errors below this take thousands of paths a pixel.
+const SMALL_ERROR: f64 = 0.005;
+
+impl RenderSettings {
+    /// Settings that can be used but are probably not meant for such scenes, each named by its field.
+    pub(super) fn remarks(&self, scenes: &SceneKind) -> Vec<String> {
+        let mut remarks = Vec::new();
+        let gate = self.gate();
+        let (start, end, width) = (gate.start_m, gate.end_m(), gate.bin_width_m);
+        let (rooms, desktop) = match scenes {
+            SceneKind::Furnished { .. } => (true, false),
+            SceneKind::Primitive { rooms } => (true, rooms.scale[1] < 1.0),
+            SceneKind::Files { .. } => (false, false),
+        };
+        if rooms && start >= ROOM_PATH_M {
+            remarks.push(format!(
+                "render.gate_start_m = {start}: light in generated rooms returns within {ROOM_PATH_M} m of path, so all \
+                 histograms will be empty; the default is 1"
+            ));
+        } else if rooms && !desktop && end < ROOM_GATE_M {
+            remarks.push(format!(
+                "render.bins = {} of {width} m: the gate ends at {end:.2} m of path, before most light of a room \
+                 returns; the default ends at {ROOM_PATH_M} m",
+                self.bins
+            ));
+        }
+        if width > ROOM_BIN_M {
+            remarks.push(format!(
+                "render.bin_width_m = {width}: a bin of {:.0} ns cannot tell the depths in a room apart; 128 ps are 0.0384 m",
+                width / 0.299_792_458
+            ));
+        }
+        if let Budget::Error(error) = self.budget
+            && error < SMALL_ERROR
+        {
+            remarks.push(format!(
+                "render.error = {error}: takes about {:.0e} paths a pixel, {:.0e} times the work of 0.1",
+                8.0 * (0.1 / error).powi(2),
+                (0.1 / error).powi(2)
+            ));
+        }
+        remarks
     }
 }
 

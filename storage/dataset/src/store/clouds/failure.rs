@@ -32,6 +32,19 @@ pub(in crate::store) fn no_bucket(chain: &[&(dyn std::error::Error + 'static)]) 
     })
 }
 
+/// Whether a request or its answer broke off, or the server found that it arrived otherwise than it was sent.
+pub(in crate::store) fn breaks_off(chain: &[&(dyn std::error::Error + 'static)]) -> bool {
+    if chain.iter().any(|e| e.is::<HttpError>()) {
+        return true;
+    }
+    let mut requests = chain.iter().filter_map(|e| Request::parse(&e.to_string()));
+    requests.any(|r| {
+        r.status == Some(400)
+            && r.code
+                .is_some_and(|code| code.contains("Digest") || code.contains("SHA256"))
+    })
+}
+
 /// A request that failed, from the words of `object_store`, whose type for it is not public. Of a server's answer only
 /// its code and message are kept: some servers repeat tokens and signatures in the rest.
 struct Request {

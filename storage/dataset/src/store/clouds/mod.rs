@@ -14,6 +14,7 @@ use object_store::limit::LimitStore;
 
 use super::place::{self, Place};
 use super::service::Service;
+use super::steady::Steady;
 use crate::error::DatasetError;
 
 use client::{CONCURRENCY, Settings};
@@ -38,8 +39,8 @@ pub(super) fn connect(place: &Place) -> Result<Arc<dyn ObjectStore>, DatasetErro
 fn shared(store: impl ObjectStore) -> Arc<dyn ObjectStore> {
     let store = LimitStore::new(store, CONCURRENCY);
     match limited::limits() {
-        limits if limits.any() => Arc::new(Limited::new(store, limits)),
-        _ => Arc::new(store),
+        limits if limits.any() => Arc::new(Steady::new(Limited::new(store, limits))),
+        _ => Arc::new(Steady::new(store)),
     }
 }
 

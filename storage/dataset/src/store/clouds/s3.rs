@@ -1,7 +1,7 @@
 //! S3 and servers that speak it: `s3://bucket/prefix`, with place and credentials from the usual `AWS_…` variables.
 
 use object_store::ClientConfigKey;
-use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};
+use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, Checksum, S3ConditionalPut};
 
 use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, retries};
 use super::place::Place;
@@ -17,7 +17,9 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, Da
     let client = AmazonS3ConfigKey::Client;
     let mut builder = AmazonS3Builder::new()
         .with_config(client(ClientConfigKey::Timeout), TIMEOUT)
-        .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT);
+        .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT)
+        // The server refuses what arrives otherwise than it was sent.
+        .with_checksum_algorithm(Checksum::SHA256);
     for (name, value) in settings.iter() {
         // Variables that it does not know are other programs'.
         if let Ok(key) = name.to_ascii_lowercase().parse() {
@@ -78,7 +80,16 @@ fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashMap;
+    use std::io::{BufRead, BufReader, Read, Write};
+    use std::net::TcpListener;
+    use std::sync::{Arc, Mutex};
+
+    use object_store::path::Path;
+    use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
+
     use super::*;
+    use crate::store::steady::Steady;
 
     const SECRET: &str = "Very/Secret+Key";
 
@@ -148,5 +159,81 @@ mod tests {
             connected(&[]).is_ok(),
             "an instance's role is not told by variables"
         );
+    }
+
+    /// A server of a few lines that drops the first of three requests, refuses the second and carries out the third.
+    fn stumbling() -> (String, Arc<Mutex<Vec<String>>>) {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let url = format!("http://{}", listener.local_addr().unwrap());
+        let heads: Arc<Mutex<Vec<String>>> = Arc::default();
+        let seen = heads.clone();
+        std::thread::spawn(move || {
+            let mut objects: HashMap<String, Vec<u8>> = HashMap::new();
+            for (n, stream) in listener.incoming().enumerate() {
+                let mut stream = BufReader::new(stream.unwrap());
+                let mut head = String::new();
+                while !head.ends_with("\r\n\r\n") && stream.read_line(&mut head).unwrap() > 0 {}
+                let head = head.to_ascii_lowercase();
+                let length = head.split("content-length: ").nth(1);
+                let length = length.map_or(0, |l| l.lines().next().unwrap().parse().unwrap());
+                let mut body = vec![0; length];
+                stream.read_exact(&mut body).unwrap();
+                let path = head.split(' ').nth(1).unwrap().to_owned();
+                seen.lock().unwrap().push(head.clone());
+                let (status, answer) = match (n % 3, head.starts_with("put")) {
+                    (0, _) => continue,
+                    (1, _) => ("403 Forbidden", Vec::new()),
+                    (_, true) if objects.contains_key(&path) => {
+                        ("412 Precondition Failed", Vec::new())
+                    }
+                    (_, true) => {
+                        objects.insert(path.clone(), body);
+                        ("200 OK", Vec::new())
+                    }
+                    (_, false) => ("200 OK", objects[&path].clone()),
+                };
+                let tag = objects.get(&path).map_or(String::new(), |o| {
+                    hex::encode(<md5::Md5 as md5::Digest>::digest(o))
+                });
+                let head = format!(
+                    "HTTP/1.1 {status}\r\nETag: \"{tag}\"\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
+                    answer.len()
+                );
+                let stream = stream.get_mut();
+                stream.write_all(head.as_bytes()).unwrap();
+                stream.write_all(&answer).unwrap();
+            }
+        });
+        (url, heads)
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_server_that_breaks_off_and_refuses_is_asked_again_and_gets_a_checksum() {
+        let (url, heads) = stumbling();
+        let variables = [
+            ("AWS_ENDPOINT_URL", &*url),
+            ("AWS_ALLOW_HTTP", "true"),
+            ("AWS_ACCESS_KEY_ID", "keyid"),
+            ("AWS_SECRET_ACCESS_KEY", SECRET),
+        ];
+        let store = Steady::new(connected(&variables).unwrap());
+        for k in 0..2 {
+            let (path, body) = (Path::from(format!("a/{k}")), format!("body {k}"));
+            let create = PutOptions::from(PutMode::Create);
+            store
+                .put_opts(&path, body.clone().into(), create.clone())
+                .await
+                .unwrap();
+            let read = store.get(&path).await.unwrap().bytes().await.unwrap();
+            assert_eq!(read, body);
+            let second = store.put_opts(&path, "another".into(), create).await;
+            assert!(matches!(
+                second,
+                Err(object_store::Error::AlreadyExists { .. })
+            ));
+        }
+        let heads = heads.lock().unwrap();
+        let mut puts = heads.iter().filter(|head| head.starts_with("put"));
+        assert!(puts.all(|head| head.contains("x-amz-checksum-sha256: ")));
     }
 }

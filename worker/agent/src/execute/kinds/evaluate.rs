@@ -5,7 +5,9 @@
 
 use std::ops::Range;
 
-use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed, sha256_hex};
+use picofarm_dataset::{
+    Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed, Verdict, sha256_hex,
+};
 use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline, memory::Kept};
 use picofarm_proto::{
     key::evaluation_key,
@@ -20,9 +22,9 @@ use tracing::{info, warn};
 use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError,
     examples::{Examples, first, sides},
-    output::Stores,
+    output::{Stores, saying},
     times::Times,
-    train::{Known, at, model_version, of_model, pin},
+    train::{Known, at, model_version, of_answers, of_model, pin},
     truth,
 };
 
@@ -266,6 +268,7 @@ impl<'a> EvaluationRun<'a> {
         let name = &settings.models[which];
         let asked = self.asked(which, control)?;
         if let Some(found) = self.found(&asked, control)? {
+            self.tell(&asked, &found)?;
             return Ok((found, false));
         }
         let mut answered = Vec::with_capacity(self.scenes.len());
@@ -314,11 +317,34 @@ impl<'a> EvaluationRun<'a> {
                 warn!(%error, "a shard that was joined is left behind");
             }
         }
-        if new {
-            return Ok((made, true));
+        // Where somebody else was faster, what stands is what counts.
+        let found = match new {
+            true => made,
+            false => self.found(&asked, control)?.unwrap_or(made),
+        };
+        self.tell(&asked, &found)?;
+        Ok((found, true))
+    }
+
+    /// Tells what the model is worth beside trivial answers.
+    fn tell(&self, asked: &Asked, found: &Evaluation) -> Result<(), TaskError> {
+        let target = asked.model.model.question().target;
+        let verdict = Verdict::of_evaluation(target.name(), &found.metrics);
+        let name = &found.model;
+        // An older version kept figures of answers that are no numbers.
+        if found.metrics["mae_m"].is_null() && found.metrics["iou"].is_null() {
+            return Err(TaskError::User(format!(
+                "model {name:?}: its evaluation {} has no figures; an older version kept it of answers that are no numbers: \
+                 remove models/{name}/evaluations/{}.json and evaluate it again",
+                found.key, found.key
+            )));
         }
-        // Somebody else was faster, and what stands is what counts.
-        Ok((self.found(&asked, control)?.unwrap_or(made), true))
+        let on = format!(
+            "{} {} scenes of {}",
+            found.scenes, found.side, found.dataset
+        );
+        saying(&verdict, &format!("{name} on {on}"));
+        Ok(())
     }
 
     fn shard(&self, asked: &Asked, index: u32) -> ShardName {
@@ -408,8 +434,10 @@ impl<'a> EvaluationRun<'a> {
             control.say(text, &[]);
             control.at(share * 0.99)
         };
+        let place = self.dataset.place();
+        let asked_of = &self.scenes[self.range(shard)];
         answered(&model.model, &baseline, &scenes, &mut tell)
-            .map_err(of_model)?
+            .map_err(of_answers(name, &place, asked_of))?
             .ok_or(TaskError::Stopped)
     }
 }

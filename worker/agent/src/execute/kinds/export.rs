@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use picofarm_dataset::{Dataset, DatasetError, ExportFormat, Exporter, open_store};
+use picofarm_dataset::{Dataset, DatasetError, ExportFormat, Exporter};
 use picofarm_proto::{
     model::{ExportTask, SpecError, TaskSpec},
     split::{SIDES, SplitRecord},
@@ -122,8 +122,9 @@ impl RunTask for ExportTask {
         let scenes = stores
             .wait(control, which.of(&source))
             .map_err(|e| field(e, "export.scenes"))?;
-        let (store, prefix) =
-            open_store(&spec.export.dest).map_err(|e| field(of_dataset(e), "export.dest"))?;
+        let (store, prefix) = stores
+            .source(&spec.export.dest, control)
+            .map_err(|e| field(e, "export.dest"))?;
         let format = ExportFormat::parse(&spec.export.format)
             .map_err(|what| TaskError::User(format!("export.format: {what}")))?;
         let mut export =

@@ -12,7 +12,7 @@ use tracing::info;
 use crate::execute::{Context, Control, Output, RunTask, Submission, Task, TaskError, scenes};
 
 /// Version of the files that are written of a scene.
-const FILES_VERSION: &str = "scene-files-1";
+const FILES_VERSION: &str = "scene-files-2";
 
 /// Everything of this program that decides a scene file's bytes.
 pub fn generator_version() -> String {
@@ -51,7 +51,8 @@ impl RunTask for GenerateTask {
                 vec![(format!("{name}.glb"), bytes.into())]
             }
         };
-        let (store, prefix) = stores.probed(&settings.dest, control)?;
+        let dest = ("generate.dest", &*settings.dest);
+        let (store, prefix) = stores.probed_own(dest, is_scene_file, control)?;
         stores.patiently(control, async || {
             publish_files(&*store, &prefix, &files).await
         })?;
@@ -72,6 +73,12 @@ impl RunTask for GenerateTask {
     fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
         here.scenes(&mut self.scenes)
     }
+}
+
+/// Whether generated scenes have such a name: `000007.glb`, or the folder `000007`.
+fn is_scene_file(name: &str) -> bool {
+    let number = name.strip_suffix(".glb").unwrap_or(name);
+    number.len() >= 6 && number.bytes().all(|b| b.is_ascii_digit())
 }
 
 /// The files of a scene for Mitsuba, below `name`; the one that names the others comes last.

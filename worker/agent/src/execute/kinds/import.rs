@@ -6,7 +6,7 @@ use std::{
 };
 
 use picofarm_dataset::{
-    DatasetSpec, Profile,
+    DatasetSpec, Profile, Verdict,
     import::{Format, IMPORT_VERSION, ImportError, ImportOptions, Source, import_scene},
 };
 use picofarm_files::{FileError, Opener};
@@ -15,7 +15,7 @@ use tracing::info;
 
 use crate::execute::{
     Context, Control, Output, RunTask, Submission, Task, TaskError,
-    output::{manifest_sha256, of_dataset},
+    output::{manifest_sha256, of_dataset, saying},
 };
 
 /// Everything of this program that decides an imported scene's bytes.
@@ -117,6 +117,7 @@ impl RunTask for ImportTask {
         }
         let scene = import_scene(&source, index).map_err(of_import)?;
         info!(scene = scene.name, missing = ?scene.missing, "scene read");
+        saying(&Verdict::of_import(&scene.check), &scene.name);
         if !control.at(0.6) {
             return Err(TaskError::Stopped);
         }

@@ -10,6 +10,7 @@ use std::{
 
 use picofarm_dataset::{
     Dataset, DatasetError, ENCODER_VERSION, Models, Predicted, PredictionManifest, Predictions,
+    Verdict,
 };
 use picofarm_model::{
     Device, Model, ModelError, masks,
@@ -18,14 +19,15 @@ use picofarm_model::{
 use picofarm_proto::model::{InferTask, TaskSpec};
 use tracing::{info, warn};
 
+mod agreement;
 mod panel;
 
 use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError,
     examples::Examples,
-    output::{Stores, of_dataset},
+    output::{Stores, of_dataset, saying},
     reprocess::source_manifest,
-    train::{at, model_version, of_model},
+    train::{at, model_version, of_answers, of_model},
     truth,
 };
 use panel::{Member, Panel, Shown, Times};
@@ -33,9 +35,13 @@ use panel::{Member, Panel, Shown, Times};
 /// Progress once everything is asked.
 const ASKED: f32 = 0.95;
 
-/// Everything of this program that decides the bytes of predictions: networks and encoder. Part of every key.
+/// Version of what a manifest states of how predictions agree.
+const AGREEMENT: &str = "agreement-1";
+
+/// Everything of this program that decides the bytes of predictions and their manifests: networks, encoder, and what is
+/// compared. Part of every key.
 pub fn infer_version() -> String {
-    format!("{}/{ENCODER_VERSION}", model_version())
+    format!("{}/{ENCODER_VERSION}/{AGREEMENT}", model_version())
 }
 
 /// Models that are kept from task to task: those of the latest one.
@@ -63,7 +69,7 @@ impl RunTask for InferTask {
         stores.fits(TaskSpec::Infer(task.clone()), Some(dataset.spec()))?;
         let found = source_manifest(stores, &dataset, index, control)?;
         let models = stores
-            .source_models(&place.store)
+            .source_models(&place.store, control)
             .map_err(|e| at("source.store", e))?;
         let panel = Panel::of(stores, &models, &dataset, (task, &found), control)?;
         truth::check(
@@ -71,7 +77,7 @@ impl RunTask for InferTask {
             &panel.needs(),
             &[(index, found.missing())],
         )?;
-        let manifest = panel.manifest(task, index, &found);
+        let mut manifest = panel.manifest(task, index, &found);
         let (store, prefix) = stores.probed(&task.output.store, control)?;
         let prefix = prefix.join(&*task.output.dataset);
         let spec = panel.spec(&dataset);
@@ -84,6 +90,7 @@ impl RunTask for InferTask {
             false => finished(stores, &predictions, &manifest, control)?,
         };
         if let Some(there) = finished {
+            tell(&there);
             return Ok(output(&there, true));
         }
         let predicted = panel.ask(
@@ -93,6 +100,8 @@ impl RunTask for InferTask {
             (&dataset, index),
             control,
         )?;
+        manifest.agreement =
+            agreement::of(stores, (&dataset, index), &predicted, &spec.spots, control)?;
         let encoded = predictions
             .encode(manifest, &predicted)
             .map_err(of_dataset)?;
@@ -100,8 +109,19 @@ impl RunTask for InferTask {
         for object in written {
             info!(%object, "was missing or changed, and is put back");
         }
+        tell(&encoded.manifest);
         control.at(1.0);
         Ok(output(&encoded.manifest, false))
+    }
+}
+
+/// Tells whether the predictions of a scene agree.
+fn tell(manifest: &PredictionManifest) {
+    if let Some(verdict) = Verdict::of_agreement(&manifest.agreement) {
+        saying(
+            &verdict,
+            &format!("predictions of scene {}", manifest.scene),
+        );
     }
 }
 
@@ -231,7 +251,10 @@ impl Asked<'_> {
         self.control
             .say(format!("asks {}", tof.checked.manifest.name), &[]);
         let (model, scene) = (self.model(tof)?, self.scene(tof)?);
-        model.depth_m(&scene).map_err(of_model)
+        let place = self.dataset.place();
+        let scenes = [self.index];
+        let fault = of_answers(&tof.checked.manifest.name, &place, &scenes);
+        model.depth_m(&scene).map_err(fault)
     }
 
     /// Two-bounce times follow from `depth_m`, where there is some.
@@ -260,7 +283,9 @@ impl Asked<'_> {
             self.control
                 .at(share.start + part * (share.end - share.start))
         };
-        let said = masks(&model, &scene, &mut tell).map_err(of_model)?;
+        let place = self.dataset.place();
+        let scenes = [self.index];
+        let said = masks(&model, &scene, &mut tell).map_err(of_answers(name, &place, &scenes))?;
         said.ok_or(TaskError::Stopped)
     }
 

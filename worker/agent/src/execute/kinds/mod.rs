@@ -303,7 +303,13 @@ impl Executor for TaskExecutor {
             // Others say it when they have seen what they read.
             self.0.stores.fits(spec.clone(), None)?;
         }
-        let run = || runner(spec).run(&self.0, task, control);
+        let run = || {
+            self.0.stores.check_identities(control)?;
+            let output = runner(spec).run(&self.0, task, control)?;
+            // What was written while the store was not mounted is not there.
+            self.0.stores.check_identities(control)?;
+            Ok(output)
+        };
         #[cfg(feature = "networks")]
         return device::on_gpu(self.0.gpu(task), run);
         #[cfg(not(feature = "networks"))]

@@ -17,7 +17,7 @@ use std::collections::BTreeMap;
 
 use bytes::Bytes;
 use picofarm_dataset::{
-    DatasetError, Manifest, ReconstructionManifest, Reconstructions, SceneUsed,
+    DatasetError, Manifest, ReconstructionManifest, Reconstructions, SceneUsed, Verdict,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -36,7 +36,7 @@ use tracing::{info, warn};
 
 use crate::execute::{
     Context, Control, Output, RunTask, Submission, Task, TaskError,
-    output::{Stores, manifest_sha256, of_dataset},
+    output::{Stores, manifest_sha256, of_dataset, saying},
     remade,
     reprocess::source_manifest,
 };
@@ -47,6 +47,8 @@ pub use written::{density, errors, facts};
 
 /// Pixels a side of a novel view.
 const VIEW_SIDE: u32 = 128;
+/// The figures of a reconstruction.
+const METRICS: &str = "metrics.json";
 /// Progress once everything is measured, and once the field is fitted.
 const MEASURED: f32 = 0.2;
 const FITTED: f32 = 0.85;
@@ -78,6 +80,8 @@ impl RunTask for ReconstructTask {
             && let Some(there) = finished(stores, &folder, &manifest, control)?
         {
             mlp::forget(self, &folder, &manifest, (stores, control))?;
+            let metrics = stores.wait(control, folder.read(index, METRICS))?;
+            tell(index, &metrics)?;
             return Ok(output(&there, true));
         }
         let predictions = predictions.map(|(predictions, _)| predictions);
@@ -88,9 +92,23 @@ impl RunTask for ReconstructTask {
             folder.restore(manifest.clone(), files.clone()).await
         })?;
         mlp::forget(self, &folder, &manifest, (stores, control))?;
+        if let Some(metrics) = files.get(METRICS) {
+            tell(index, metrics)?;
+        }
         control.at(1.0);
         Ok(output(&made, false))
     }
+}
+
+/// Tells what a reconstruction is worth, by its metrics.
+fn tell(scene: u64, metrics: &[u8]) -> Result<(), TaskError> {
+    let metrics = serde_json::from_slice(metrics)
+        .map_err(|e| TaskError::Crash(format!("{METRICS} of scene {scene} is not JSON: {e}")))?;
+    saying(
+        &Verdict::of_reconstruction(&metrics),
+        &format!("scene {scene}"),
+    );
+    Ok(())
 }
 
 fn output(manifest: &ReconstructionManifest, adopted: bool) -> Output {
@@ -226,7 +244,7 @@ impl Work<'_> {
         let glb = mesh.glb(&made.measured).map_err(of_reconstruction)?;
         files.insert("mesh.glb".into(), glb.into());
         let text = serde_json::to_string_pretty(&metrics).expect("metrics are plain data");
-        files.insert("metrics.json".into(), (text + "\n").into());
+        files.insert(METRICS.into(), (text + "\n").into());
         Ok(files)
     }
 }
@@ -259,9 +277,12 @@ fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {
     }
 }
 
-fn of_reconstruction(error: ReconstructError) -> TaskError {
+pub(super) fn of_reconstruction(error: ReconstructError) -> TaskError {
     match error {
         ReconstructError::Stopped => TaskError::Stopped,
+        error @ ReconstructError::Inconsistent { .. } => TaskError::User(format!(
+            "reconstruct: {error}; correct the source, or go on with grid = {{ accept_inconsistent = true }}"
+        )),
         error => TaskError::User(format!("reconstruct: {error}")),
     }
 }

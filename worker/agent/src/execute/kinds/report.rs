@@ -53,7 +53,7 @@ impl Collector {
         pictures: usize,
         control: &Control,
     ) -> Result<Entry, TaskError> {
-        let models = self.stores.source_models(store)?;
+        let models = self.stores.source_models(store, control)?;
         let subject = Subject::find(&self.stores, &models, name, control)?;
         subject.entry(&self.stores, (store, &models), (pictures, &cpu()), control)
     }

@@ -43,7 +43,7 @@ mod verdict;
 use super::saver::{PIECE, Saver};
 use along::{Reporter, loading};
 use board::Board;
-pub use imported::{ImportFor, imported};
+pub use imported::{ImportFor, NotImported, imported};
 pub use known::takes;
 pub(in crate::execute) use known::{CheckedModel, Known};
 pub(in crate::execute) use results::WEIGHTS;
@@ -518,10 +518,26 @@ pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
             Err(error) => TaskError::Crash(format!("scene {scene}: {error}")),
         },
         // What is in the store has its checksum: this program made it, and does not know it again.
-        ModelError::Weights { what } => TaskError::Crash(what),
+        ModelError::Weights { what } | ModelError::File { what } => TaskError::Crash(what),
         ModelError::Group(what) => TaskError::Interrupted(what),
         error @ ModelError::Gpu { .. } => TaskError::Crash(error.to_string()),
         other => TaskError::User(other.to_string()),
+    }
+}
+
+/// The same of a model's answers, with the names of model and scene: `scenes` are those that it was asked of.
+pub(in crate::execute) fn of_answers<'a>(
+    model: &'a str,
+    dataset: &'a str,
+    scenes: &'a [u64],
+) -> impl Fn(ModelError) -> TaskError + 'a {
+    move |error| match error {
+        ModelError::Answer { scene, what } => {
+            let scene = scenes.get(scene.unwrap_or(0));
+            let scene = scene.map_or_else(String::new, |scene| format!("scene {scene} of "));
+            TaskError::User(format!("model {model:?}, {scene}{dataset}: {what}"))
+        }
+        other => of_model(other),
     }
 }
 

@@ -1,7 +1,7 @@
 //! Materials of a glTF file: what maps to Lambertian, conductor, mix and albedo texture, and a note on
 //! whatever does not.
 
-use std::path::Path;
+use std::{borrow::Cow, path::Path};
 
 use gltf::{image::Source, material::AlphaMode, texture::WrappingMode};
 
@@ -9,7 +9,8 @@ use crate::{
     Bsdf, Distribution, Material, SceneError, SpectrumPoint, Texture, Wrap,
     extras::{MaterialExtras, StatedSpectrum, metallic_roughness},
     import::{
-        buffers::{buffer_file, data_uri},
+        add_note,
+        buffers::{Buffers, buffer_file, data_uri},
         format_error, image, read_file,
     },
 };
@@ -25,7 +26,9 @@ const DIELECTRIC: f32 = 0.08;
 /// What a spectrum in extras looks like.
 const SPECTRUM: &str = r#"[{"nm": 905, "reflectance": 0.7}, …], by ascending nm"#;
 /// Extensions whose content is used, or noted by name below.
-const KNOWN: [&str; 9] = [
+const KNOWN: [&str; 11] = [
+    "KHR_node_visibility",
+    "EXT_mesh_gpu_instancing",
     "KHR_texture_transform",
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
@@ -52,12 +55,13 @@ struct Standard<'a> {
 
 impl Walk<'_> {
     pub(super) fn note(&mut self, key: &str, what: impl Into<String>) {
-        self.notes.insert(key.into(), what.into());
+        add_note(&mut self.notes, key, what.into());
     }
 
-    /// Notes what a document holds that no scene of ours does.
-    pub(super) fn dropped_parts(&mut self, document: &gltf::Document) {
-        if document.skins().len() > 0 || document.animations().len() > 0 {
+    /// Notes what a document has that no scene of ours does.
+    pub(super) fn dropped_parts(&mut self) {
+        let document = self.document;
+        if self.facts.animated {
             self.note("animation", "ignored; nodes and meshes are at rest");
         }
         if document.lights().is_some_and(|l| l.len() > 0) {
@@ -90,18 +94,23 @@ impl Walk<'_> {
         }
     }
 
-    /// A material as ours; `has_uv` says whether the mesh brings the texture coordinates it asks for.
+    /// A material as ours. `has_uv` is true if the mesh has the texture coordinates that the material
+    /// asks for; `tint` is the colour of its vertices.
     pub(super) fn material(
         &mut self,
         file: &gltf::Material<'_>,
         has_uv: bool,
+        tint: [f32; 3],
     ) -> Result<Material, SceneError> {
         let at = format!("materials[{}]", file.index().unwrap_or(0));
         self.dropped_features(file);
         let standard = match file.pbr_specular_glossiness() {
-            Some(pbr) => self.specular_glossiness(&pbr),
-            None => self.metallic_roughness(file, &at)?,
+            Some(pbr) => self.specular_glossiness(&pbr, tint),
+            None => self.metallic_roughness(file, &at, tint)?,
         };
+        if self.strict && file.alpha_mode() == AlphaMode::Mask {
+            self.check_mask(file, &at, has_uv)?;
+        }
         let mut material =
             Material::diffuse(file.name().unwrap_or("material").to_owned(), standard.rgb);
         material.bsdf = standard.bsdf;
@@ -127,6 +136,9 @@ impl Walk<'_> {
             .map_err(|what| format_error(self.path, format!("{extras}.{what}")))?;
         match standard.texture {
             Some(_) if material.transmits() => self.note("glass.textures", "left out"),
+            Some(info) if self.is_sourceless(&info.texture()) => {
+                self.note("textures.source", "left out: textures without a source");
+            }
             Some(info) if has_uv => {
                 material.texture = Some(self.texture(&info.texture(), &at)?);
             }
@@ -137,6 +149,44 @@ impl Walk<'_> {
             None => {}
         }
         Ok(material)
+    }
+
+    /// True for a texture without any image. A texture with an image of an unread format has one.
+    fn is_sourceless(&self, texture: &gltf::Texture<'_>) -> bool {
+        self.facts.sourceless.contains(&texture.index())
+            && texture.extensions().is_none_or(|all| all.is_empty())
+    }
+
+    /// Refuses a mask that cuts holes: surfaces here are whole.
+    fn check_mask(
+        &mut self,
+        file: &gltf::Material<'_>,
+        at: &str,
+        has_uv: bool,
+    ) -> Result<(), SceneError> {
+        let [.., factor] = match file.pbr_specular_glossiness() {
+            Some(pbr) => pbr.diffuse_factor(),
+            None => file.pbr_metallic_roughness().base_color_factor(),
+        };
+        let texture = albedo_texture(file).map(|info| info.texture());
+        let least = match texture.filter(|t| has_uv && !self.is_sourceless(t)) {
+            None => 1.0,
+            Some(texture) => {
+                let fail = |what: String| format_error(self.path, format!("{at}: {what}"));
+                let (bytes, _) = self.image_bytes(&texture, at)?;
+                let least = image::least_alpha(&bytes).map_err(fail)?;
+                f32::from(least) / 255.0
+            }
+        };
+        match factor * least >= file.alpha_cutoff().unwrap_or(0.5) {
+            true => Ok(()),
+            false => Err(format_error(
+                self.path,
+                format!(
+                    "{at}: alphaMode MASK cuts holes into surfaces, which is not supported; cut the mesh, or set alphaMode OPAQUE"
+                ),
+            )),
+        }
     }
 
     /// The spectrum that anyone may state in a material's extras; unchecked.
@@ -237,7 +287,8 @@ impl Walk<'_> {
             if passes > 0.0 {
                 self.note("transmission", "of less than one half: ignored, opaque");
             }
-            if file.alpha_mode() != AlphaMode::Opaque {
+            let mask = self.strict && file.alpha_mode() == AlphaMode::Mask;
+            if file.alpha_mode() != AlphaMode::Opaque && !mask {
                 self.note("transparency", "ignored; such materials are opaque");
             }
             return None;
@@ -253,22 +304,32 @@ impl Walk<'_> {
         &mut self,
         file: &gltf::Material<'f>,
         at: &str,
+        tint: [f32; 3],
     ) -> Result<Standard<'f>, SceneError> {
         let pbr = file.pbr_metallic_roughness();
-        let [r, g, b, _] = pbr.base_color_factor();
+        let [r, g, b] = tinted(pbr.base_color_factor(), tint);
         let (mut metallic, mut roughness) = (pbr.metallic_factor(), pbr.roughness_factor());
         if let Some(info) = pbr.metallic_roughness_texture() {
-            let texture = self.texture(&info.texture(), at)?;
-            let texels = texture.texels();
-            let mean = |channel: usize| {
-                let sum: f64 = texels.iter().map(|t| f64::from(t[channel])).sum();
-                (sum / texels.len() as f64 / 255.0) as f32
-            };
-            (roughness, metallic) = (roughness * mean(1), metallic * mean(2));
-            self.note(
-                "metallic_roughness_textures",
-                "replaced by their means over the image",
-            );
+            match self.texture(&info.texture(), at) {
+                Ok(texture) => {
+                    let texels = texture.texels();
+                    let mean = |channel: usize| {
+                        let sum: f64 = texels.iter().map(|t| f64::from(t[channel])).sum();
+                        (sum / texels.len() as f64 / 255.0) as f32
+                    };
+                    (roughness, metallic) = (roughness * mean(1), metallic * mean(2));
+                    self.note(
+                        "metallic_roughness_textures",
+                        "replaced by their means over the image",
+                    );
+                }
+                // Of such a texture no more than its mean would be used.
+                Err(SceneError::Format { what, .. }) => self.note(
+                    "metallic_roughness_textures.unread",
+                    format!("left out, factors used: {what}"),
+                ),
+                Err(other) => return Err(other),
+            }
         }
         let mean = (r + g + b) / 3.0;
         // glTF's own BRDF is GGX with α = roughness².
@@ -284,8 +345,9 @@ impl Walk<'_> {
     fn specular_glossiness<'f>(
         &mut self,
         pbr: &gltf::material::PbrSpecularGlossiness<'f>,
+        tint: [f32; 3],
     ) -> Standard<'f> {
-        let [r, g, b, _] = pbr.diffuse_factor();
+        let [r, g, b] = tinted(pbr.diffuse_factor(), tint);
         if pbr.specular_glossiness_texture().is_some() {
             self.note("specular_glossiness_textures", "ignored; factors used");
         }
@@ -362,28 +424,53 @@ impl Walk<'_> {
             WrappingMode::MirroredRepeat => Wrap::Mirror,
             WrappingMode::Repeat => Wrap::Repeat,
         };
+        let (bytes, name) = self.image_bytes(file, at)?;
+        let (path, image) = (self.path, file.source().index());
+        self.images
+            .get((image, wrap), || image::decode(&name, &bytes, wrap))
+            .map_err(|what| format_error(path, format!("{at}: images[{image}]: {what}")))
+    }
+}
+
+impl<'a> Walk<'a> {
+    /// The bytes of a texture's image, and its name.
+    fn image_bytes(
+        &self,
+        file: &gltf::Texture<'_>,
+        at: &str,
+    ) -> Result<(Cow<'a, [u8]>, String), SceneError> {
+        let at = format!("{at}: textures[{}]", file.index());
+        if self.facts.sourceless.contains(&file.index()) {
+            let names = file.extensions().into_iter().flat_map(|all| all.keys());
+            let names: Vec<&str> = names.map(String::as_str).collect();
+            let what = match names.is_empty() {
+                true => "has no source; state an image".to_owned(),
+                false => format!(
+                    "has an image by {} alone, which is not supported; export it as PNG or JPEG",
+                    names.join(", ")
+                ),
+            };
+            return Err(format_error(self.path, format!("{at}: {what}")));
+        }
         let image = file.source();
-        let (path, buffers) = (self.path, self.buffers);
-        let fail = |what: String| {
-            let at = format!("{at}: images[{}]", image.index());
-            format_error(path, format!("{at}: {what}"))
-        };
+        let at = format!("{at}: images[{}]", image.index());
+        let fail = |what: String| format_error(self.path, format!("{at}: {what}"));
+        if self.facts.damaged_images.contains(&image.index()) {
+            return Err(fail(
+                "needs a uri, or a bufferView with mimeType; export the file again".into(),
+            ));
+        }
         let external = match image.source() {
-            Source::Uri { uri, .. } => buffer_file(path, uri)?,
+            Source::Uri { uri, .. } => buffer_file(self.path, uri)?,
             Source::View { .. } => None,
         };
-        let held;
-        let bytes: &[u8] = match (&external, image.source()) {
-            (Some(file), _) => {
-                held = read_file(self.files, file)?;
-                &held
-            }
-            (None, Source::View { view, .. }) => buffers.view(&view).map_err(fail)?,
-            (None, Source::Uri { uri, .. }) => {
-                held = data_uri(uri)
-                    .map_err(|why| fail(format!("data URI cannot be read ({why})")))?;
-                &held
-            }
+        let buffers: &'a Buffers = self.buffers;
+        let bytes: Cow<'a, [u8]> = match (&external, image.source()) {
+            (Some(file), _) => read_file(self.files, file)?.into(),
+            (None, Source::View { view, .. }) => buffers.view(&view).map_err(fail)?.into(),
+            (None, Source::Uri { uri, .. }) => data_uri(uri)
+                .map_err(|why| fail(format!("data URI cannot be read ({why})")))?
+                .into(),
         };
         let stem = external.as_deref().and_then(Path::file_stem);
         let name = match (image.name(), stem) {
@@ -391,10 +478,13 @@ impl Walk<'_> {
             (None, Some(stem)) => stem.to_string_lossy().into_owned(),
             (None, None) => format!("image{}", image.index()),
         };
-        self.images
-            .get((image.index(), wrap), || image::decode(&name, bytes, wrap))
-            .map_err(fail)
+        Ok((bytes, name))
     }
+}
+
+/// A factor times the colour of vertices.
+fn tinted([r, g, b, _]: [f32; 4], tint: [f32; 3]) -> [f32; 3] {
+    [r * tint[0], g * tint[1], b * tint[2]]
 }
 
 fn albedo_texture<'a>(file: &gltf::Material<'a>) -> Option<gltf::texture::Info<'a>> {

@@ -10,11 +10,14 @@ use gltf::{
 
 use crate::{Mesh, SceneError, Vec3, import::format_error};
 
-use super::{Walk, material::Coordinates};
+use super::{Walk, deform::Deformation, material::Coordinates};
 
 /// Most vertices and corners that one file may place in its meshes, rows of spectra included: accessors and materials can be
 /// used many times over.
-const MAX_CORNERS: usize = 1 << 28;
+pub(super) const MAX_CORNERS: usize = 1 << 28;
+
+/// Colours of vertices closer than this are the same.
+const SAME_COLOUR: f32 = 0.5 / 255.0;
 
 /// What decides whether primitives can share vertices: accessor of the positions, that of the texture
 /// coordinates, and what is done to these.
@@ -22,14 +25,18 @@ type VertexKey = (usize, Option<usize>, [u32; 5]);
 
 impl Walk<'_> {
     /// A mesh's triangles over one vertex list; `None` (with a note) if it has only lines or points.
-    pub(super) fn mesh(&mut self, file: &gltf::Mesh<'_>) -> Result<Option<Mesh>, SceneError> {
+    pub(super) fn mesh(
+        &mut self,
+        file: &gltf::Mesh<'_>,
+        deformation: &Deformation,
+    ) -> Result<Option<Mesh>, SceneError> {
         let path = self.path;
         let mut mesh = Mesh {
             name: file.name().unwrap_or("mesh").to_owned(),
             ..Mesh::default()
         };
         let mut vertex_base: BTreeMap<VertexKey, u32> = BTreeMap::new();
-        let mut material_index: BTreeMap<(Option<usize>, bool), u32> = BTreeMap::new();
+        let mut material_index: BTreeMap<(Option<usize>, bool, [u32; 3]), u32> = BTreeMap::new();
         for primitive in file.primitives() {
             let at = format!("meshes[{}].primitives[{}]", file.index(), primitive.index());
             let fail = |what: String| format_error(path, format!("{at}: {what}"));
@@ -37,6 +44,11 @@ impl Walk<'_> {
                 primitive.mode(),
                 Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip
             ) {
+                if self.strict && primitive.mode() == Mode::Points {
+                    return Err(fail(
+                        "is a point cloud, which has no surface; export a mesh of triangles".into(),
+                    ));
+                }
                 self.note("dropped", "points and lines");
                 continue;
             }
@@ -45,11 +57,8 @@ impl Walk<'_> {
                     "has no POSITION; export the mesh with its vertices".into(),
                 ));
             };
-            if primitive.get(&Semantic::Colors(0)).is_some() {
-                self.note("vertex_colours", "ignored; materials' colours used");
-            }
             if primitive.morph_targets().len() > 0 {
-                self.note("morphs", "ignored; meshes are in their base shape");
+                self.note("morphs", "at their default weights");
             }
             self.buffers
                 .check(&accessor, Dimensions::Vec3, &[DataType::F32])
@@ -73,14 +82,20 @@ impl Walk<'_> {
             if let Some(uv) = &uv_accessor {
                 self.check_uv(uv, accessor.count()).map_err(fail)?;
             }
-            let slot = match material_index.get(&(material.index(), uv_accessor.is_some())) {
+            let tint = self.vertex_colour(&primitive, accessor.count(), &at)?;
+            let look = (
+                material.index(),
+                uv_accessor.is_some(),
+                tint.map(f32::to_bits),
+            );
+            let slot = match material_index.get(&look) {
                 Some(&slot) => slot,
                 None => {
-                    let read = self.material(&material, uv_accessor.is_some())?;
+                    let read = self.material(&material, uv_accessor.is_some(), tint)?;
                     self.corners += read.spectrum.len();
                     mesh.materials.push(read);
                     let slot = mesh.materials.len() as u32 - 1;
-                    material_index.insert((material.index(), uv_accessor.is_some()), slot);
+                    material_index.insert(look, slot);
                     slot
                 }
             };
@@ -90,12 +105,18 @@ impl Walk<'_> {
                 uv_accessor.map(|a| a.index()),
                 coordinates.bits(),
             );
-            let base = match vertex_base.get(&key) {
+            // Deformed vertices depend on more than their accessor.
+            let known = vertex_base.get(&key).filter(|_| deformation.is_none());
+            let base = match known {
                 Some(&base) => base,
                 None => {
                     let base = mesh.positions.len();
                     let read = reader.read_positions().into_iter().flatten();
                     mesh.positions.extend(read.map(Vec3::from));
+                    if !deformation.is_none() {
+                        let positions = &mut mesh.positions[base..];
+                        self.deformed(&primitive, positions, deformation, &at)?;
+                    }
                     if let Some(uv) = reader.read_tex_coords(coordinates.set) {
                         mesh.uv.resize(base, [0.0; 2]);
                         mesh.uv
@@ -125,6 +146,52 @@ impl Walk<'_> {
                 .extend(triangles.iter().map(|t| t.map(|v| v + base)));
         }
         Ok((!mesh.triangles.is_empty()).then_some(mesh))
+    }
+
+    /// The colour of all vertices of a primitive, by which its material's is multiplied.
+    fn vertex_colour(
+        &mut self,
+        primitive: &gltf::Primitive<'_>,
+        vertices: usize,
+        at: &str,
+    ) -> Result<[f32; 3], SceneError> {
+        const WHITE: [f32; 3] = [1.0; 3];
+        let Some(accessor) = primitive.get(&Semantic::Colors(0)) else {
+            return Ok(WHITE);
+        };
+        if !self.strict {
+            self.note("vertex_colours", "ignored; materials' colours used");
+            return Ok(WHITE);
+        }
+        let fail = |what: String| format_error(self.path, format!("{at}.COLOR_0: {what}"));
+        let types = [DataType::F32, DataType::U8, DataType::U16];
+        let dimensions = match accessor.dimensions() {
+            Dimensions::Vec3 => Dimensions::Vec3,
+            _ => Dimensions::Vec4,
+        };
+        self.buffers
+            .check(&accessor, dimensions, &types)
+            .map_err(fail)?;
+        if accessor.count() != vertices {
+            return Err(fail(format!(
+                "{} colours for {vertices} vertices",
+                accessor.count()
+            )));
+        }
+        let reader = primitive.reader(|b| self.buffers.get(&b));
+        let Some(colours) = reader.read_colors(0) else {
+            return Ok(WHITE);
+        };
+        let mut colours = colours.into_rgb_f32();
+        let first = colours.next().unwrap_or(WHITE);
+        let differs = |c: [f32; 3]| (0..3).any(|k| (c[k] - first[k]).abs() > SAME_COLOUR);
+        if !first.iter().all(|c| (0.0..=1.0).contains(c)) || colours.any(differs) {
+            return Err(fail(
+                "colours that differ by vertex are not supported; bake them into a base colour texture, or remove them"
+                    .into(),
+            ));
+        }
+        Ok(first)
     }
 
     fn check_uv(&self, uv: &Accessor<'_>, vertices: usize) -> Result<(), String> {

@@ -1,12 +1,15 @@
 //! glTF 2.0 to scene: node transforms, labels and ids from extras, materials, camera and laser.
 
+mod deform;
+pub(super) mod document;
 mod material;
 mod mesh;
+mod nodes;
 mod parts;
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
-use gltf::{Gltf, Node, Semantic, json::validation::Checked};
+use gltf::{Node, camera::Projection};
 use serde::de::DeserializeOwned;
 
 use crate::{
@@ -14,9 +17,11 @@ use crate::{
     extras::{FORMAT, Keyed, NodeExtras, SceneExtras},
 };
 
+use super::{
+    ImportOptions, Opener, buffers::Buffers, far, format_error, image::Images, mitsuba::Matrix,
+};
+use document::Facts;
 use parts::laser_of;
-
-use super::{ImportOptions, Opener, buffers::Buffers, compose, format_error, image::Images};
 
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 1000;
@@ -30,7 +35,7 @@ pub(super) fn read(
     options: &ImportOptions,
     files: &Opener,
 ) -> Result<Scene, SceneError> {
-    let (document, buffers) = open(path, bytes, files)?;
+    let (document, buffers, facts) = open(path, bytes, files)?;
     let root = root(path, &document)?;
     let ours: Option<SceneExtras> = keyed(
         path,
@@ -49,7 +54,15 @@ pub(super) fn read(
         ));
     }
     let labels = ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone());
-    let walk = Walk::over((path, files), &document, &buffers, labels)?;
+    let mut walk = Walk::new((path, files), &document, &buffers, &facts)?;
+    for (k, label) in labels.iter().enumerate() {
+        walk.known_labels.entry(label.clone()).or_insert(k);
+    }
+    walk.labels = labels;
+    if ours.is_none() && options.camera.is_none() {
+        walk.move_to_camera(&root);
+    }
+    walk.walk(&root)?;
     walk.finish(&root, ours, options)
 }
 
@@ -60,8 +73,10 @@ pub(super) fn read_model(
     bytes: &[u8],
     files: &Opener,
 ) -> Result<(Mesh, BTreeMap<String, String>), SceneError> {
-    let (document, buffers) = open(path, bytes, files)?;
-    let walk = Walk::over((path, files), &document, &buffers, Vec::new())?;
+    let (document, buffers, facts) = open(path, bytes, files)?;
+    let mut walk = Walk::new((path, files), &document, &buffers, &facts)?;
+    walk.strict = false;
+    walk.walk(&root(path, &document)?)?;
     let mut all = Mesh {
         name: path
             .file_stem()
@@ -96,42 +111,16 @@ fn open(
     path: &Path,
     bytes: &[u8],
     files: &Opener,
-) -> Result<(gltf::Document, Buffers), SceneError> {
-    let fail = |e: gltf::Error| {
-        let what = format!("is not readable glTF 2.0 ({e}); copy or export it again");
-        format_error(path, what)
-    };
-    let Gltf { document, blob } = Gltf::from_slice_without_validation(bytes).map_err(fail)?;
-    let json = document.into_json();
-    unguarded(&json).map_err(|what| format_error(path, what))?;
-    let document = gltf::Document::from_json(json).map_err(fail)?;
+) -> Result<(gltf::Document, Buffers, Facts), SceneError> {
+    let fail = |what: String| format_error(path, what);
+    let parsed = document::parse(bytes).map_err(|e| {
+        fail(format!(
+            "is not readable glTF 2.0 ({e}); copy or export it again"
+        ))
+    })?;
+    let (document, blob, facts) = parsed.document(bytes).map_err(fail)?;
     let buffers = Buffers::read(path, &document, blob, files)?;
-    Ok((document, buffers))
-}
-
-/// What the `gltf` crate relies on before or without checking it.
-fn unguarded(json: &gltf::json::Root) -> Result<(), String> {
-    let position = Checked::Valid(Semantic::Positions);
-    for (m, mesh) in json.meshes.iter().enumerate() {
-        for (p, primitive) in mesh.primitives.iter().enumerate() {
-            let accessor = primitive.attributes.get(&position);
-            if accessor.is_some_and(|a| a.value() >= json.accessors.len()) {
-                return Err(format!(
-                    "meshes[{m}].primitives[{p}].attributes.POSITION: no such accessor; export the file again"
-                ));
-            }
-        }
-    }
-    let whole = |i: &gltf::json::Image| match i.buffer_view {
-        Some(_) => i.mime_type.is_some(),
-        None => i.uri.is_some(),
-    };
-    match json.images.iter().position(|i| !whole(i)) {
-        Some(k) => Err(format!(
-            "images[{k}]: needs a uri, or a bufferView with mimeType; export the file again"
-        )),
-        None => Ok(()),
-    }
+    Ok((document, buffers, facts))
 }
 
 fn root<'a>(path: &Path, document: &'a gltf::Document) -> Result<gltf::Scene<'a>, SceneError> {
@@ -196,87 +185,150 @@ fn under<'r>(
     Ok(value.get(key).is_some().then_some(raw))
 }
 
+/// Meshes by their index; those that a node deforms are that node's own.
+type MeshKey = (usize, Option<usize>);
+
 struct Walk<'a> {
     path: &'a Path,
     files: &'a Opener,
+    document: &'a gltf::Document,
     buffers: &'a Buffers,
+    facts: &'a Facts,
+    /// World transforms by node, in the file's coordinates.
+    worlds: Vec<Option<Matrix>>,
+    /// Place of the scene's origin in the file's coordinates.
+    origin: [f64; 3],
+    /// Refuses surfaces that would look otherwise; models of a library are taken with a note.
+    strict: bool,
     images: Images<(usize, Wrap)>,
     /// Vertices and corners read so far.
     corners: usize,
-    meshes: BTreeMap<usize, Option<Arc<Mesh>>>,
+    /// Vertices and corners of all objects.
+    placed: usize,
+    meshes: BTreeMap<MeshKey, Option<Arc<Mesh>>>,
     objects: Vec<(Option<u32>, Object)>,
     labels: Vec<String>,
-    camera: Option<Camera>,
+    /// Indices of `labels`.
+    known_labels: BTreeMap<String, usize>,
+    /// The first perspective camera; refused only if it is used.
+    camera: Option<Result<Camera, SceneError>>,
     laser: Option<(Affine, NodeExtras)>,
     notes: BTreeMap<String, String>,
 }
 
 impl<'a> Walk<'a> {
-    /// Everything that the document's scene places.
-    fn over(
+    fn new(
         (path, files): (&'a Path, &'a Opener),
-        document: &gltf::Document,
+        document: &'a gltf::Document,
         buffers: &'a Buffers,
-        labels: Vec<String>,
+        facts: &'a Facts,
     ) -> Result<Self, SceneError> {
         let root = root(path, document)?;
         is_a_forest(path, document, &root)?;
-        let mut walk = Walk {
+        Ok(Walk {
             path,
             files,
+            document,
             buffers,
+            facts,
+            worlds: nodes::worlds(path, document, &root, facts)?,
+            origin: [0.0; 3],
+            strict: true,
             images: Images::default(),
             corners: 0,
+            placed: 0,
             meshes: BTreeMap::new(),
             objects: Vec::new(),
-            labels,
+            labels: Vec::new(),
+            known_labels: BTreeMap::new(),
             camera: None,
             laser: None,
             notes: BTreeMap::new(),
-        };
-        walk.dropped_parts(document);
-        for node in root.nodes() {
-            walk.node(&node, &Affine::IDENTITY, None, 0)?;
-        }
-        Ok(walk)
+        })
     }
 
+    /// Everything that the document's scene places.
+    fn walk(&mut self, root: &gltf::Scene<'_>) -> Result<(), SceneError> {
+        self.dropped_parts();
+        for node in root.nodes() {
+            self.node(&node, None, true)?;
+        }
+        Ok(())
+    }
+
+    /// A scene far from the origin of its file is moved to its camera.
+    fn move_to_camera(&mut self, root: &gltf::Scene<'_>) {
+        // In the order of the walk.
+        let mut open: Vec<Node<'_>> = root.nodes().collect();
+        open.reverse();
+        while let Some(node) = open.pop() {
+            if node.camera().is_some_and(|c| is_perspective(&c)) {
+                let world = self.worlds.get(node.index()).copied().flatten();
+                let origin = world.unwrap_or(Matrix::IDENTITY).origin();
+                if far::is_lossy(origin, f64::INFINITY) {
+                    self.origin = origin;
+                    self.note("origin", far::note(origin));
+                }
+                return;
+            }
+            let children: Vec<Node<'_>> = node.children().collect();
+            open.extend(children.into_iter().rev());
+        }
+    }
+
+    /// A transform to the scene's coordinates.
+    fn placed(&self, world: &Matrix) -> Matrix {
+        match self.origin == [0.0; 3] {
+            true => *world,
+            false => Matrix::translation(self.origin.map(|x| -x)).after(world),
+        }
+    }
+
+    /// The index of a label.
+    fn label(&mut self, label: &str) -> usize {
+        if let Some(known) = self.known_labels.get(label) {
+            return *known;
+        }
+        self.labels.push(label.to_owned());
+        let index = self.labels.len() - 1;
+        self.known_labels.insert(label.to_owned(), index);
+        index
+    }
+
+    /// `worlds` has bounded the depth.
     fn node(
         &mut self,
         node: &Node<'_>,
-        parent: &Affine,
         label: Option<&str>,
-        depth: usize,
+        visible: bool,
     ) -> Result<(), SceneError> {
-        if depth > MAX_DEPTH {
-            let what = format!("nodes[{}]: nested deeper than {MAX_DEPTH}", node.index());
-            return Err(format_error(self.path, what));
-        }
-        let to_world = compose(parent, &affine(node.transform().matrix()));
-        let at = format!("nodes[{}].extras", node.index());
-        let extras: NodeExtras = match node.extras() {
-            Some(raw) => serde_json::from_str(raw.get()).map_err(|e| {
-                format_error(
-                    self.path,
-                    format!("{at}: {e}; expected label (text) and instance (number)"),
-                )
-            })?,
-            None => NodeExtras::default(),
-        };
+        let world = self.worlds.get(node.index()).copied().flatten();
+        let to_world = self.placed(&world.unwrap_or(Matrix::IDENTITY));
+        let extras = self.extras(node)?;
         let label = extras.label.as_deref().or(label);
+        let visible = visible && !nodes::is_hidden(node);
         if let Some(mesh) = node.mesh() {
-            self.object(node, &mesh, to_world, label, extras.instance)?;
+            match visible {
+                true => self.object(node, &mesh, &to_world, label, extras.instance)?,
+                false => self.note("hidden", "meshes of nodes that are not visible left out"),
+            }
         }
-        if let (None, Some(camera)) = (&self.camera, node.camera()) {
-            self.camera = Some(self.camera_of(&to_world, &camera)?);
+        if let Some(camera) = node.camera() {
+            match (is_perspective(&camera), &self.camera) {
+                (false, _) => self.note("cameras", "orthographic ones ignored"),
+                (true, Some(_)) => {}
+                (true, None) => {
+                    self.camera = Some(self.camera_of(&to_world.affine(), &camera));
+                }
+            }
         }
         if self.laser.is_none()
             && (extras.laser_spots.is_some() || extras.laser_directions.is_some())
         {
-            self.laser = Some((to_world, extras.clone()));
+            self.laser = Some((to_world.affine(), extras.clone()));
         }
         for child in node.children() {
-            self.node(&child, &to_world, label, depth + 1)?;
+            self.node(&child, label, visible)?;
         }
         Ok(())
     }
@@ -285,15 +337,18 @@ impl<'a> Walk<'a> {
         &mut self,
         node: &Node<'_>,
         mesh: &gltf::Mesh<'_>,
-        to_world: Affine,
+        to_world: &Matrix,
         label: Option<&str>,
         instance: Option<u32>,
     ) -> Result<(), SceneError> {
-        let shared = match self.meshes.get(&mesh.index()) {
+        let deformation = self.deformation(node, mesh)?;
+        let own = (!deformation.is_none()).then(|| node.index());
+        let key = (mesh.index(), own);
+        let shared = match self.meshes.get(&key) {
             Some(known) => known.clone(),
             None => {
-                let read = self.mesh(mesh)?.map(Arc::new);
-                self.meshes.insert(mesh.index(), read.clone());
+                let read = self.mesh(mesh, &deformation)?.map(Arc::new);
+                self.meshes.insert(key, read.clone());
                 read
             }
         };
@@ -305,26 +360,37 @@ impl<'a> Walk<'a> {
             );
             UNLABELLED
         });
-        let known = self.labels.iter().position(|l| l == label);
-        let label = known.unwrap_or_else(|| {
-            self.labels.push(label.to_owned());
-            self.labels.len() - 1
-        });
-        let label = u16::try_from(label).map_err(|_| {
+        let label = u16::try_from(self.label(label)).map_err(|_| {
             format_error(
                 self.path,
                 "nodes[].extras.label: more than 65535 categories",
             )
         })?;
-        self.objects.push((
-            instance,
-            Object {
-                mesh: shared,
-                to_world,
-                label,
-                name: node.name().or(mesh.name()).unwrap_or("object").to_owned(),
-            },
-        ));
+        for place in self.instances(node)? {
+            self.placed += shared.positions.len() + shared.triangles.len();
+            if self.placed > mesh::MAX_CORNERS {
+                let what = format!(
+                    "nodes[{}]: more than {} vertices and triangles in all objects; split the scene",
+                    node.index(),
+                    mesh::MAX_CORNERS
+                );
+                return Err(format_error(self.path, what));
+            }
+            // A skin puts vertices where its joints are, wherever the mesh's node is.
+            let to_world = match deformation.is_skinned() {
+                true => Affine::IDENTITY,
+                false => to_world.after(&place).affine(),
+            };
+            self.objects.push((
+                instance,
+                Object {
+                    mesh: shared.clone(),
+                    to_world,
+                    label,
+                    name: node.name().or(mesh.name()).unwrap_or("object").to_owned(),
+                },
+            ));
+        }
         Ok(())
     }
 
@@ -349,21 +415,30 @@ impl<'a> Walk<'a> {
         let (camera, laser, mut provenance, name) = match ours {
             Some(e) => (e.camera, e.laser, e.provenance, e.name),
             None => {
-                let camera = options.camera.or(self.camera).ok_or_else(|| {
-                    format_error(
-                        path,
-                        "camera: no node has one; add a perspective camera, or state one on import",
-                    )
-                })?;
+                let camera = match (options.camera, self.camera) {
+                    (Some(camera), _) => camera,
+                    (None, Some(camera)) => camera?,
+                    (None, None) => {
+                        let what = match self.notes.contains_key("cameras") {
+                            true => {
+                                "camera: is orthographic; add a perspective camera, or state one on import"
+                            }
+                            false => {
+                                "camera: no node has one; add a perspective camera, or state one on import"
+                            }
+                        };
+                        return Err(format_error(path, what));
+                    }
+                };
                 let laser = match (&options.laser, &self.laser) {
                     (Some(aim), _) => aim.laser(&camera),
                     (None, Some((to_world, extras))) => laser_of(path, to_world, extras, &camera)?,
                     (None, None) => {
-                        return Err(format_error(
-                            path,
-                            "laser: no node's extras hold \"laser_spots\" (1, 4, 16, 25 or 100) or \
-                             \"laser_directions\" ([[x, y, z], …]); add one, or state a grid on import",
-                        ));
+                        return Err(SceneError::NoLaser {
+                            path: path.to_path_buf(),
+                            hint: "no node's extras have \"laser_spots\" (1, 4, 16, 25 or 100) or \"laser_directions\" \
+                                   ([[x, y, z], …]); add one, or state a grid on import",
+                        });
                     }
                 };
                 let provenance = Provenance {
@@ -389,11 +464,6 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// glTF's column-major matrix as an affine map.
-fn affine(m: [[f32; 4]; 4]) -> Affine {
-    let row = |k: usize| Vec3::new(m[0][k], m[1][k], m[2][k]);
-    Affine {
-        linear: [row(0), row(1), row(2)],
-        translation: Vec3::new(m[3][0], m[3][1], m[3][2]),
-    }
+fn is_perspective(camera: &gltf::Camera<'_>) -> bool {
+    matches!(camera.projection(), Projection::Perspective(_))
 }

@@ -22,6 +22,7 @@ use super::{
     bsdf::{Look, named},
     colour::{Colour, mean_of, spectrum_of},
     node::Node,
+    properties,
     transform::Matrix,
 };
 
@@ -103,6 +104,7 @@ impl Mix {
 
 impl Reader<'_> {
     pub(super) fn blend(&mut self, node: &Rc<Node>, depth: usize) -> Result<Mix, String> {
+        self.only(node, &properties::BLEND)?;
         let weight = node.number("weight")?.ok_or_else(|| {
             node.fail("weight: expected a number (textures as weights are not supported)")
         })? as f32;

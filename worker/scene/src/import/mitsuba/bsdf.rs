@@ -5,6 +5,7 @@ use std::rc::Rc;
 use crate::{
     Bsdf, Distribution, Material,
     export::mitsuba::text::{MaterialExtras, bsdf_text},
+    import::quoted,
 };
 
 use super::{
@@ -12,6 +13,7 @@ use super::{
     blend::{Leaf, Mix},
     colour::Colour,
     node::Node,
+    properties,
     transform::Matrix,
 };
 
@@ -126,6 +128,7 @@ impl Reader<'_> {
         match node.kind.as_str() {
             "diffuse" | "roughconductor" | "conductor" => Ok(Mix::of(self.leaf(node)?)),
             "twosided" => {
+                self.only(node, &properties::TWO_SIDED)?;
                 let inner = self.children(node, "bsdf")?;
                 let [inner] = inner.as_slice() else {
                     return Err(node.fail(format!(
@@ -138,7 +141,7 @@ impl Reader<'_> {
                 Ok(mix)
             }
             "blendbsdf" => self.blend(node, depth),
-            other => Err(node.fail(format!("bsdf {other:?} is not supported; {SUBSET}"))),
+            other => Err(node.fail(format!("bsdf {} is not supported; {SUBSET}", quoted(other)))),
         }
     }
 
@@ -149,7 +152,7 @@ impl Reader<'_> {
             return Ok(known.clone());
         }
         let leaf = Rc::new(if node.kind == "diffuse" {
-            self.ignored(node, &["reflectance"]);
+            self.only(node, &properties::DIFFUSE)?;
             let colour = self.colour(node, "reflectance")?;
             Leaf {
                 colour: colour.unwrap_or(Colour::grey(0.5)),
@@ -168,15 +171,7 @@ impl Reader<'_> {
 
     /// Glass, thin or a body.
     fn glass(&mut self, node: &Node) -> Result<Material, String> {
-        self.ignored(
-            node,
-            &[
-                "int_ior",
-                "ext_ior",
-                "specular_reflectance",
-                "specular_transmittance",
-            ],
-        );
+        self.only(node, &properties::GLASS)?;
         let ior = index(node, "int_ior", "bk7")? / index(node, "ext_ior", "air")?;
         if !(1.0..=f64::from(Material::MAX_IOR)).contains(&ior) {
             let hint = match node.kind.as_str() {
@@ -224,19 +219,16 @@ impl Reader<'_> {
     }
 
     fn conductor(&mut self, node: &Node) -> Result<(Colour, f32, Distribution), String> {
-        self.ignored(
+        let smooth = node.kind == "conductor";
+        self.only(
             node,
-            &[
-                "alpha",
-                "alpha_u",
-                "alpha_v",
-                "distribution",
-                "material",
-                "specular_reflectance",
-                "sample_visible",
-            ],
-        );
-        let alpha = if node.kind == "conductor" {
+            if smooth {
+                &properties::CONDUCTOR
+            } else {
+                &properties::ROUGH_CONDUCTOR
+            },
+        )?;
+        let alpha = if smooth {
             self.note(
                 "smooth_conductors",
                 format!("are rough ones of α = {}", Material::MIN_ALPHA),
@@ -260,7 +252,10 @@ impl Reader<'_> {
             "beckmann" => Distribution::Beckmann,
             "ggx" => Distribution::Ggx,
             other => {
-                return Err(node.fail(format!("distribution: {other:?}; use beckmann or ggx")));
+                return Err(node.fail(format!(
+                    "distribution: {}; use beckmann or ggx",
+                    quoted(other)
+                )));
             }
         };
         let fresnel = match node.text("material")? {
@@ -275,7 +270,7 @@ impl Reader<'_> {
             found => {
                 return Err(node.fail(format!(
                     "material: {}; use \"none\" with specular_reflectance, or one of Ag, Al, Au, Cr, Cu",
-                    found.map_or("missing (Mitsuba's default is Cu)".into(), |m| format!("{m:?} is not known"))
+                    found.map_or("missing (Mitsuba's default is Cu)".into(), |m| format!("{} is not known", quoted(m)))
                 )));
             }
         };
@@ -314,7 +309,8 @@ fn index(node: &Node, name: &str, default: &str) -> Result<f64, String> {
     let known = MEDIA.iter().find(|(known, _)| *known == medium);
     known.map(|(_, ior)| *ior).ok_or_else(|| {
         node.fail(format!(
-            "{name}: {medium:?} is not known; use a number, or one of {}",
+            "{name}: {} is not known; use a number, or one of {}",
+            quoted(medium),
             MEDIA.map(|m| m.0).join(", ")
         ))
     })

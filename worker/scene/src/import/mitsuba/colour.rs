@@ -12,7 +12,7 @@ use std::{path::Path, sync::Arc};
 
 use crate::{
     SpectrumPoint, Texture, Wrap,
-    import::{image, read_file},
+    import::{image, quoted, read_file},
     spectrum::{PRIMARIES_NM, check_points, interpolated},
     texture::srgb_byte,
 };
@@ -20,6 +20,7 @@ use crate::{
 use super::{
     Reader,
     node::{Node, Value},
+    properties,
     transform::Matrix,
 };
 
@@ -151,14 +152,11 @@ impl Reader<'_> {
     fn bitmap(&mut self, node: &Node) -> Result<(Arc<Texture>, Matrix), String> {
         if node.kind != "bitmap" {
             return Err(node.fail(format!(
-                "texture {:?} is not supported; use bitmap",
-                node.kind
+                "texture {} is not supported; use bitmap",
+                quoted(&node.kind)
             )));
         }
-        self.ignored(
-            node,
-            &["filename", "filter_type", "wrap_mode", "raw", "to_uv"],
-        );
+        self.only(node, &properties::BITMAP)?;
         let filename = node
             .text("filename")?
             .ok_or_else(|| node.fail("needs a filename"))?;
@@ -167,11 +165,21 @@ impl Reader<'_> {
             "mirror" => Wrap::Mirror,
             "clamp" => Wrap::Clamp,
             other => {
-                return Err(node.fail(format!("wrap_mode: {other:?}; use repeat, mirror or clamp")));
+                return Err(node.fail(format!(
+                    "wrap_mode: {}; use repeat, mirror or clamp",
+                    quoted(other)
+                )));
             }
         };
-        if node.text("filter_type")? == Some("nearest") {
-            self.note("textures.filter", "nearest; bilinear used");
+        match node.text("filter_type")?.unwrap_or("bilinear") {
+            "bilinear" => {}
+            other @ ("nearest" | "trilinear" | "ewa") => {
+                self.note("textures.filter", format!("{other}; bilinear used"));
+            }
+            other => {
+                let what = format!("filter_type: {}; use bilinear or nearest", quoted(other));
+                return Err(node.fail(what));
+            }
         }
         let file = self.named(node, filename)?;
         let stem = file.file_stem().unwrap_or_default().to_string_lossy();

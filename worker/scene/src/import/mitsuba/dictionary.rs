@@ -4,7 +4,7 @@ use std::{collections::BTreeSet, fmt, rc::Rc};
 
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 
-use crate::SpectrumPoint;
+use crate::{SpectrumPoint, import::quoted};
 
 use super::{
     node::{Child, Node, Value, point, triple},
@@ -56,7 +56,7 @@ const TAGS: [(&str, &[&str]); 6] = [
     ),
 ];
 /// What says how to render, which is the job's business.
-const SKIPPED: [&str; 21] = [
+const SKIPPED: [&str; 25] = [
     "path",
     "direct",
     "volpath",
@@ -77,8 +77,15 @@ const SKIPPED: [&str; 21] = [
     "orthogonal",
     "ldsampler",
     "box",
+    "tent",
+    "mitchell",
+    "catmullrom",
+    "lanczos",
     "gaussian",
 ];
+
+/// Letters of a place in the file that errors quote.
+const MAX_PLACE: usize = 200;
 
 /// JSON whose keys keep their order: it decides which BSDF of a blend is the first.
 enum Json {
@@ -118,10 +125,9 @@ impl<'de> Deserialize<'de> for Json {
             }
 
             fn visit_f64<E: serde::de::Error>(self, value: f64) -> Result<Json, E> {
-                // Through f32, so that what was written as f32 comes back.
-                let value = value as f32;
-                if value.is_finite() {
-                    Ok(Json::Number(f64::from(value)))
+                // Everything is single precision in the end.
+                if (value as f32).is_finite() {
+                    Ok(Json::Number(value))
                 } else {
                     Err(E::custom("a number is too large"))
                 }
@@ -151,7 +157,10 @@ impl<'de> Deserialize<'de> for Json {
                 let (mut all, mut known) = (Vec::new(), BTreeSet::new());
                 while let Some((key, value)) = fields.next_entry::<String, Json>()? {
                     if !known.insert(key.clone()) {
-                        return Err(A::Error::custom(format!("key {key:?} is stated twice")));
+                        return Err(A::Error::custom(format!(
+                            "key {} is stated twice",
+                            quoted(&key)
+                        )));
                     }
                     all.push((key, value));
                 }
@@ -183,6 +192,7 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
     if SKIPPED.contains(&kind) || matches!(key, "integrator" | "sampler" | "rfilter") {
         return Ok(None);
     }
+    let at = &shortened(at);
     let tag = TAGS.iter().find(|(_, kinds)| kinds.contains(&kind));
     let mut out = Node {
         tag: tag.map_or("", |(tag, _)| tag).to_owned(),
@@ -191,7 +201,7 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
             .and_then(Json::text)
             .unwrap_or(key)
             .to_owned(),
-        at: format!("{at} (type {kind:?})"),
+        at: format!("{at} (type {})", quoted(kind)),
         ..Node::default()
     };
     for (name, value) in json {
@@ -225,18 +235,28 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
                     )
                 }
                 _ => {
-                    if let Some(child) = node(fields, name, &inner)? {
-                        out.children
-                            .push((name.clone(), Child::Node(Rc::new(child))));
+                    match node(fields, name, &inner)? {
+                        Some(child) => out
+                            .children
+                            .push((name.clone(), Child::Node(Rc::new(child)))),
+                        None => out.skipped.push("integrator".into()),
                     }
                     continue;
                 }
             },
             Json::Null => return Err(wrong("a value, found null")),
         };
-        out.parameters.insert(name.clone(), value);
+        out.set(name.clone(), value, inner)?;
     }
     Ok(Some(out))
+}
+
+/// The path of keys to a value, which a hostile file can make long.
+fn shortened(at: &str) -> String {
+    match at.char_indices().rev().nth(MAX_PLACE) {
+        None => at.to_owned(),
+        Some((start, _)) => format!("…{}", &at[start..]),
+    }
 }
 
 /// Rows of numbers, or numbers, as one list.

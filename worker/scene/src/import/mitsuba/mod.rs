@@ -6,8 +6,11 @@
 //! all these, nested too; `dielectric` on closed shapes and `thindielectric`, by themselves; `bitmap` textures;
 //! `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a reflectance; references, `<default>` parameters, and
 //! every transform. A shape without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
-//! Integrators, samplers and media are skipped; any other plugin is an error that names it. As in Mitsuba, `rotate`
-//! takes its axis as it is: one of another length than 1 shears.
+//! Integrators, samplers and media are skipped with a note; any other plugin is an error that names
+//! it. As in Mitsuba, every property of a plugin must be used: any other is an error, unless it
+//! changes neither geometry nor light. Files of versions before 2 may have the names of their time
+//! (`toWorld`, `fovAxis`). As in Mitsuba, `rotate` takes its axis as it is: one of another length
+//! than 1 shears.
 //!
 //! **The laser.** Mitsuba has no collimated emitter. As mitransient's users do, a beam is an emitter `projector`
 //! with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`; several make a grid, and all
@@ -25,6 +28,8 @@ mod bsdf;
 mod colour;
 mod dictionary;
 mod node;
+mod old;
+mod properties;
 mod shape;
 mod transform;
 mod view;
@@ -42,12 +47,12 @@ use crate::{
     export::mitsuba::text::Extras,
 };
 
-use super::{ImportOptions, Opener, format_error, image::Images, of_file};
+use super::{ImportOptions, Opener, add_note, far, format_error, image::Images, of_file, quoted};
 use blend::Leaf;
 use bsdf::Look;
 use node::{Child, Node};
 use shape::Geometry;
-use transform::Matrix;
+pub(super) use transform::Matrix;
 
 /// Category of shapes whose id names none.
 const UNLABELLED: &str = "unlabelled";
@@ -70,7 +75,7 @@ pub(super) fn read_xml(
         .map_err(|e| fail(format!("comment picofarm: {e}; remove it, or export again")))?;
     Reader::new((path, files), root, extras)
         .scene(options)
-        .map_err(fail)
+        .map_err(|refusal| refusal.of_file(path))
 }
 
 /// Reads a scene from its dictionary in JSON; the caller validates the result.
@@ -84,7 +89,7 @@ pub(super) fn read_dictionary(
     let root = dictionary::parse(bytes).map_err(fail)?;
     Reader::new((path, files), root, None)
         .scene(options)
-        .map_err(fail)
+        .map_err(|refusal| refusal.of_file(path))
 }
 
 /// The files that a scene in XML or JSON refers to, in order of their names.
@@ -120,6 +125,32 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
+/// Why a scene is not read.
+enum Refusal {
+    /// It has no beam, and none was stated.
+    NoLaser,
+    Format(String),
+}
+
+impl From<String> for Refusal {
+    fn from(what: String) -> Self {
+        Self::Format(what)
+    }
+}
+
+impl Refusal {
+    fn of_file(self, path: &Path) -> SceneError {
+        match self {
+            Self::Format(what) => format_error(path, what),
+            Self::NoLaser => SceneError::NoLaser {
+                path: path.to_path_buf(),
+                hint: "it has no beam; add <emitter type=\"projector\"> with fov 0.1 and to_world for each beam, or state a grid \
+                       on import",
+            },
+        }
+    }
+}
+
 struct Reader<'a> {
     path: &'a Path,
     files: &'a Opener,
@@ -133,6 +164,8 @@ struct Reader<'a> {
     leaves: BTreeMap<usize, Rc<Leaf>>,
     geometries: BTreeMap<PathBuf, Geometry>,
     notes: BTreeMap<String, String>,
+    /// Place of the scene's origin in the file's coordinates.
+    origin: [f64; 3],
 }
 
 impl<'a> Reader<'a> {
@@ -161,6 +194,7 @@ impl<'a> Reader<'a> {
             leaves: BTreeMap::new(),
             geometries: BTreeMap::new(),
             notes: BTreeMap::new(),
+            origin: [0.0; 3],
         }
     }
 
@@ -170,21 +204,40 @@ impl<'a> Reader<'a> {
     }
 
     fn note(&mut self, key: &str, what: impl Into<String>) {
-        self.notes.insert(key.into(), what.into());
+        add_note(&mut self.notes, key, what.into());
     }
 
-    /// Notes parameters that have no meaning here.
-    fn ignored(&mut self, node: &Node, known: &[&str]) {
-        for name in node.others(known) {
-            self.note(&format!("ignored {name}"), "this parameter is not used");
+    /// A transform to the scene's coordinates.
+    fn placed(&self, place: &Matrix) -> Matrix {
+        match self.origin == [0.0; 3] {
+            true => *place,
+            false => Matrix::translation(self.origin.map(|x| -x)).after(place),
         }
+    }
+
+    /// A scene far from the origin of its file is moved to its camera.
+    fn move_to_camera(&mut self, sensor: Option<&Rc<Node>>) -> Result<(), String> {
+        if self.extras.is_some() {
+            return Ok(());
+        }
+        if let Some(sensor) = sensor {
+            let origin = sensor.transform("to_world")?.origin();
+            if far::is_lossy(origin, f64::INFINITY) {
+                self.origin = origin;
+                self.note("origin", far::note(origin));
+            }
+        }
+        Ok(())
     }
 
     fn resolved(&self, node: &Node, child: &Child) -> Result<Rc<Node>, String> {
         match child {
             Child::Node(child) => Ok(child.clone()),
             Child::Reference(id) => self.ids.get(id).cloned().ok_or_else(|| {
-                node.fail(format!("refers to {id:?}, which no element has as its id"))
+                node.fail(format!(
+                    "refers to {}, which no element has as its id",
+                    quoted(id)
+                ))
             }),
         }
     }
@@ -197,7 +250,7 @@ impl<'a> Reader<'a> {
             if child.tag == tag {
                 found.push(child);
             } else if child.tag.is_empty() {
-                let what = format!("plugin {:?} is not supported", child.kind);
+                let what = format!("plugin {} is not supported", quoted(&child.kind));
                 return Err(child.fail(what));
             }
         }
@@ -212,11 +265,42 @@ impl<'a> Reader<'a> {
             .collect()
     }
 
-    fn scene(mut self, options: &ImportOptions) -> Result<Scene, String> {
+    /// Notes what was skipped while the file was parsed.
+    fn note_skipped(&mut self) {
+        let mut open = vec![self.root.clone()];
+        while let Some(node) = open.pop() {
+            for tag in &node.skipped {
+                match tag.as_str() {
+                    "medium" | "volume" | "phase" => self.note(
+                        "media",
+                        "left out: light travels through empty space and through glass only",
+                    ),
+                    // Files of ours have such elements for other programs.
+                    _ if self.extras.is_none() => self.note(
+                        "skipped",
+                        "integrators, samplers and filters: the job or the options of a render decide these",
+                    ),
+                    _ => {}
+                }
+            }
+            for (_, child) in &node.children {
+                if let Child::Node(child) = child {
+                    open.push(child.clone());
+                }
+            }
+        }
+    }
+
+    fn scene(mut self, options: &ImportOptions) -> Result<Scene, Refusal> {
         let root = self.root.clone();
         let shapes = self.children(&root, "shape")?;
-        let (objects, labels) = self.objects(&shapes)?;
+        self.only(&root, &properties::SCENE)?;
+        self.note_skipped();
         let sensors = self.children(&root, "sensor")?;
+        if options.camera.is_none() {
+            self.move_to_camera(sensors.first())?;
+        }
+        let (objects, labels) = self.objects(&shapes)?;
         if sensors.len() > 1 {
             self.note("sensors", "more than one; the first is the camera");
         }
@@ -224,19 +308,17 @@ impl<'a> Reader<'a> {
             (Some(camera), _) => camera,
             (None, Some(sensor)) => self.camera(sensor)?,
             (None, None) => {
-                return Err(
-                    "has no <sensor>; add a perspective one, or state a camera on import".into(),
-                );
+                return Err(Refusal::from(
+                    "has no <sensor>; add a perspective one, or state a camera on import"
+                        .to_owned(),
+                ));
             }
         };
         let laser = match &options.laser {
             Some(aim) => aim.laser(&camera),
             None => {
                 let emitters = self.children(&root, "emitter")?;
-                self.laser(&emitters)?.ok_or(
-                    "has no beam: add <emitter type=\"projector\"> with fov 0.1 and to_world for each, or \
-                     state a grid on import",
-                )?
+                self.laser(&emitters)?.ok_or(Refusal::NoLaser)?
             }
         };
         let stem = self.path.file_stem().unwrap_or_default();
@@ -268,6 +350,10 @@ impl<'a> Reader<'a> {
             .extras
             .as_ref()
             .map_or_else(Vec::new, |e| e.scene.labels.clone());
+        let mut known: BTreeMap<String, usize> = BTreeMap::new();
+        for (k, label) in labels.iter().enumerate() {
+            known.entry(label.clone()).or_insert(k);
+        }
         let mut objects = Vec::new();
         let mut size = 0;
         let mut shared: BTreeMap<Vec<String>, Arc<Mesh>> = BTreeMap::new();
@@ -291,9 +377,8 @@ impl<'a> Reader<'a> {
                     (name.clone(), label.to_owned())
                 }
             };
-            let known = labels.iter().position(|l| *l == label);
-            let label = known.unwrap_or_else(|| {
-                labels.push(label);
+            let label = *known.entry(label).or_insert_with_key(|label| {
+                labels.push(label.clone());
                 labels.len() - 1
             });
             let label =
@@ -379,7 +464,13 @@ impl<'a> Reader<'a> {
                 [bsdf] => self.look(bsdf)?,
                 _ => return Err(part.fail("has more than one BSDF")),
             };
-            let (geometry, inner) = self.geometry(part)?;
+            let (mut geometry, inner) = self.geometry(part)?;
+            let mut inner = inner;
+            if parts.len() == 1 {
+                inner = inner.after(&Matrix::translation(geometry.origin));
+            } else {
+                geometry.restore();
+            }
             let slot = mesh.materials.len() as u32;
             let mut material = look.material;
             if material.texture.is_some() && geometry.uv.is_empty() {
@@ -391,7 +482,7 @@ impl<'a> Reader<'a> {
             }
             mesh.materials.push(material);
             geometry.append_to(&mut mesh, slot, &look.to_uv);
-            place = part.transform("to_world")?.after(&inner);
+            place = self.placed(&part.transform("to_world")?.after(&inner));
         }
         Ok((mesh, place.affine()))
     }

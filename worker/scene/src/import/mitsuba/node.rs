@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, rc::Rc};
 
-use crate::SpectrumPoint;
+use crate::{SpectrumPoint, import::quoted};
 
 use super::transform::Matrix;
 
@@ -40,6 +40,10 @@ pub(super) struct Node {
     /// Its own XML text; empty from a dictionary.
     pub(super) text: String,
     pub(super) parameters: BTreeMap<String, Value>,
+    /// Where each parameter stands, for errors.
+    pub(super) places: BTreeMap<String, String>,
+    /// Tags of the elements in it that are skipped.
+    pub(super) skipped: Vec<String>,
     /// (parameter name or empty, child), in order.
     pub(super) children: Vec<(String, Child)>,
 }
@@ -94,28 +98,39 @@ impl Node {
         }
     }
 
-    /// Names of parameters that are not among `known`.
-    pub(super) fn others(&self, known: &[&str]) -> Vec<String> {
-        let names = self.parameters.keys();
-        names
-            .filter(|n| !known.contains(&n.as_str()))
-            .map(|n| format!("{} {}", self.kind, n))
-            .collect()
+    /// Sets a parameter.
+    ///
+    /// # Errors
+    /// A name that was set before.
+    pub(super) fn set(&mut self, name: String, value: Value, place: String) -> Result<(), String> {
+        if self.parameters.contains_key(&name) {
+            return Err(format!(
+                "{place}: property {} is stated twice",
+                quoted(&name)
+            ));
+        }
+        self.places.insert(name.clone(), place);
+        self.parameters.insert(name, value);
+        Ok(())
     }
 }
 
-/// Numbers separated by commas or white space; each through f32, so that what was written as f32 comes back.
+/// Numbers separated by commas or white space.
 pub(super) fn numbers(text: &str) -> Result<Vec<f64>, String> {
     text.split(|c: char| c == ',' || c.is_ascii_whitespace())
         .filter(|w| !w.is_empty())
-        .map(|w| finite(w).map(f64::from))
+        .map(|w| match w.parse::<f64>() {
+            // Everything is single precision in the end.
+            Ok(x) if (x as f32).is_finite() => Ok(x),
+            _ => Err(format!("expected a finite number, found {}", quoted(w))),
+        })
         .collect()
 }
 
 fn finite(word: &str) -> Result<f32, String> {
     match word.parse::<f32>() {
         Ok(x) if x.is_finite() => Ok(x),
-        _ => Err(format!("expected a finite number, found {word:?}")),
+        _ => Err(format!("expected a finite number, found {}", quoted(word))),
     }
 }
 
@@ -125,7 +140,7 @@ pub(super) fn pairs(text: &str) -> Result<Vec<SpectrumPoint>, String> {
         .filter(|w| !w.is_empty())
         .map(|w| match w.split_once(':') {
             Some((nm, value)) => Ok(point(finite(nm)?, finite(value)?)),
-            None => Err(format!("expected wavelength:value, found {w:?}")),
+            None => Err(format!("expected wavelength:value, found {}", quoted(w))),
         })
         .collect()
 }

@@ -1,13 +1,13 @@
 //! Mitsuba's shapes as meshes in their own frame.
 
-use std::{io::Cursor, path::Path};
+use std::collections::BTreeMap;
 
 use crate::{
     Mesh, Vec3,
-    import::{ply, read_file},
+    import::{far, obj, ply, quoted, read_file},
 };
 
-use super::{Reader, node::Node, transform::Matrix};
+use super::{Reader, node::Node, properties as p, transform::Matrix};
 
 /// Facets of a tessellated sphere from pole to pole, and half of those around.
 const SPHERE_ROWS: u32 = 48;
@@ -20,9 +20,25 @@ pub(super) struct Geometry {
     pub(super) positions: Vec<Vec3>,
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) triangles: Vec<[u32; 3]>,
+    /// The origin of `positions` in the file's coordinates. A mesh far from its origin is moved
+    /// before it is rounded.
+    pub(super) origin: [f64; 3],
+    /// Keys and texts of notes.
+    notes: BTreeMap<String, String>,
 }
 
 impl Geometry {
+    /// Vertices in the file's coordinates.
+    pub(super) fn restore(&mut self) {
+        if self.origin != [0.0; 3] {
+            let origin = Vec3::from(self.origin.map(|x| x as f32));
+            for p in &mut self.positions {
+                *p += origin;
+            }
+            self.origin = [0.0; 3];
+        }
+    }
+
     fn vertex(&mut self, p: [f32; 3], uv: [f32; 2]) {
         self.positions.push(Vec3::from(p));
         self.uv.push(uv);
@@ -68,35 +84,27 @@ fn placed(to_uv: &Matrix, [u, v]: [f32; 2]) -> [f32; 2] {
 impl Reader<'_> {
     /// A shape's geometry, and what its own parameters add to `to_world`.
     pub(super) fn geometry(&mut self, node: &Node) -> Result<(Geometry, Matrix), String> {
-        const COMMON: [&str; 4] = [
-            "to_world",
-            "flip_normals",
-            "face_normals",
-            "flip_tex_coords",
-        ];
         let mut place = Matrix::IDENTITY;
         let geometry = match node.kind.as_str() {
             "ply" | "obj" => {
-                let mut known = COMMON.to_vec();
-                known.push("filename");
-                self.ignored(node, &known);
+                self.only(node, &p::MESH_FILE)?;
                 self.file(node)?
             }
             "rectangle" => {
-                self.ignored(node, &COMMON);
+                self.only(node, &p::PRIMITIVE)?;
                 rectangle()
             }
             "cube" => {
-                self.ignored(node, &COMMON);
+                self.only(node, &p::PRIMITIVE)?;
                 cube()
             }
             "disk" => {
-                self.ignored(node, &COMMON);
+                self.only(node, &p::PRIMITIVE)?;
                 self.note("disks", format!("have {DISK_SECTORS} flat sectors"));
                 disk()
             }
             "sphere" => {
-                self.ignored(node, &["to_world", "flip_normals", "center", "radius"]);
+                self.only(node, &p::SPHERE)?;
                 let rows = SPHERE_ROWS;
                 self.note(
                     "spheres",
@@ -112,7 +120,8 @@ impl Reader<'_> {
             }
             other => {
                 return Err(node.fail(format!(
-                    "shape {other:?} is not supported; use ply, obj, rectangle, cube, sphere or disk"
+                    "shape {} is not supported; use ply, obj, rectangle, cube, sphere or disk",
+                    quoted(other)
                 )));
             }
         };
@@ -135,13 +144,16 @@ impl Reader<'_> {
                 let read = if obj {
                     read_obj(&bytes)
                 } else {
-                    self.read_ply(&bytes)
+                    read_ply(&bytes)
                 };
                 let geometry = read.map_err(|e| node.fail(format!("{}: {e}", path.display())))?;
                 self.geometries.insert(path, geometry.clone());
                 geometry
             }
         };
+        for (key, note) in std::mem::take(&mut geometry.notes) {
+            self.note(&key, note);
+        }
         if flip {
             for uv in &mut geometry.uv {
                 uv[1] = 1.0 - uv[1];
@@ -149,55 +161,36 @@ impl Reader<'_> {
         }
         Ok(geometry)
     }
+}
 
-    fn read_ply(&mut self, bytes: &[u8]) -> Result<Geometry, String> {
-        let ply = ply::parse(bytes)?;
-        if ply.colour.is_some() {
-            self.note("vertex_colours", "ignored; materials' colours used");
-        }
-        if ply.skipped > 0 {
-            self.note("faces", "with fewer than three corners left out");
-        }
-        Ok(Geometry {
-            positions: ply.positions,
-            uv: ply.uv,
-            triangles: ply.triangles,
-        })
+fn read_ply(bytes: &[u8]) -> Result<Geometry, String> {
+    let ply = ply::parse(bytes)?;
+    let mut notes = ply.notes;
+    if ply.colour.is_some() {
+        let what = "ignored; materials' colours used".to_owned();
+        notes.insert("vertex_colours".into(), what);
     }
+    let (positions, origin) = far::local(&ply.positions);
+    Ok(Geometry {
+        positions,
+        uv: ply.uv,
+        triangles: ply.triangles,
+        origin,
+        notes,
+    })
 }
 
 fn read_obj(bytes: &[u8]) -> Result<Geometry, String> {
-    let options = tobj::LoadOptions {
-        triangulate: true,
-        single_index: true,
-        ignore_points: true,
-        ignore_lines: true,
-    };
     // Mitsuba takes the material from the shape, never from the OBJ.
-    let nothing = |_: &Path| Ok((Vec::new(), Default::default()));
-    let (models, _) = tobj::load_obj_buf(&mut Cursor::new(bytes), &options, nothing)
-        .map_err(|e| format!("is not readable OBJ: {e}"))?;
-    let mut all = Geometry::default();
-    for model in models {
-        let (base, part) = (all.positions.len() as u32, model.mesh);
-        let points = part.positions.as_chunks::<3>().0;
-        all.positions.extend(points.iter().map(|p| Vec3::from(*p)));
-        let coordinates = part.texcoords.as_chunks::<2>().0;
-        if coordinates.len() == points.len() {
-            all.uv.resize(base as usize, [0.0; 2]);
-            all.uv.extend(coordinates);
-        }
-        if !all.uv.is_empty() {
-            all.uv.resize(all.positions.len(), [0.0; 2]);
-        }
-        let corners = part.indices.as_chunks::<3>().0;
-        all.triangles
-            .extend(corners.iter().map(|t| t.map(|v| v + base)));
-    }
-    if all.triangles.is_empty() {
-        return Err("has no faces".into());
-    }
-    Ok(all)
+    let obj = obj::parse(bytes).map_err(|e| format!("is not readable OBJ: {e}"))?;
+    let (positions, origin) = far::local(&obj.positions);
+    Ok(Geometry {
+        positions,
+        uv: obj.uv,
+        triangles: obj.triangles,
+        origin,
+        notes: obj.notes,
+    })
 }
 
 fn rectangle() -> Geometry {

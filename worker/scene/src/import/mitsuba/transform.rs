@@ -4,10 +4,10 @@ use crate::{Affine, Vec3};
 
 /// A 4×4 matrix by rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Matrix(pub(super) [[f64; 4]; 4]);
+pub(in crate::import) struct Matrix(pub(in crate::import) [[f64; 4]; 4]);
 
 impl Matrix {
-    pub(super) const IDENTITY: Matrix = Matrix([
+    pub(in crate::import) const IDENTITY: Matrix = Matrix([
         [1.0, 0.0, 0.0, 0.0],
         [0.0, 1.0, 0.0, 0.0],
         [0.0, 0.0, 1.0, 0.0],
@@ -15,7 +15,7 @@ impl Matrix {
     ]);
 
     /// `self` after `inner`.
-    pub(super) fn after(&self, inner: &Matrix) -> Matrix {
+    pub(in crate::import) fn after(&self, inner: &Matrix) -> Matrix {
         if *inner == Self::IDENTITY {
             return *self;
         }
@@ -24,13 +24,13 @@ impl Matrix {
         }))
     }
 
-    pub(super) fn translation([x, y, z]: [f64; 3]) -> Matrix {
+    pub(in crate::import) fn translation([x, y, z]: [f64; 3]) -> Matrix {
         let mut m = Self::IDENTITY;
         (m.0[0][3], m.0[1][3], m.0[2][3]) = (x, y, z);
         m
     }
 
-    pub(super) fn scale([x, y, z]: [f64; 3]) -> Matrix {
+    pub(in crate::import) fn scale([x, y, z]: [f64; 3]) -> Matrix {
         let mut m = Self::IDENTITY;
         (m.0[0][0], m.0[1][1], m.0[2][2]) = (x, y, z);
         m
@@ -38,7 +38,7 @@ impl Matrix {
 
     /// Rotation by `degrees` about an axis (Rodrigues). As in Mitsuba, an axis of another length than 1 is not
     /// normalised: it shears.
-    pub(super) fn rotation([x, y, z]: [f64; 3], degrees: f64) -> Result<Matrix, String> {
+    pub(in crate::import) fn rotation([x, y, z]: [f64; 3], degrees: f64) -> Result<Matrix, String> {
         if [x, y, z] == [0.0; 3] {
             return Err("rotate: the axis has no direction; set x, y or z".into());
         }
@@ -53,7 +53,7 @@ impl Matrix {
     }
 
     /// Places +z along target − origin, with +y towards `up`.
-    pub(super) fn look_at(
+    pub(in crate::import) fn look_at(
         origin: [f64; 3],
         target: [f64; 3],
         up: [f64; 3],
@@ -70,7 +70,7 @@ impl Matrix {
     }
 
     /// 16 numbers by rows, or the 9 of the linear part.
-    pub(super) fn from_numbers(n: &[f64]) -> Result<Matrix, String> {
+    pub(in crate::import) fn from_numbers(n: &[f64]) -> Result<Matrix, String> {
         let mut m = Self::IDENTITY;
         match n.len() {
             16 => {
@@ -91,19 +91,24 @@ impl Matrix {
         Ok(m)
     }
 
-    pub(super) fn affine(&self) -> Affine {
+    /// The place of the origin.
+    pub(in crate::import) fn origin(&self) -> [f64; 3] {
+        [0, 1, 2].map(|r| self.0[r][3])
+    }
+
+    pub(in crate::import) fn affine(&self) -> Affine {
         let row = |r: usize| {
             let [x, y, z, _] = self.0[r].map(|x| x as f32);
             Vec3::new(x, y, z)
         };
         Affine {
             linear: [row(0), row(1), row(2)],
-            translation: Vec3::from([0, 1, 2].map(|r| self.0[r][3] as f32)),
+            translation: Vec3::from(self.origin().map(|x| x as f32)),
         }
     }
 
     /// Column `k` of the linear part, of unit length.
-    pub(super) fn axis(&self, k: usize) -> Option<Vec3> {
+    pub(in crate::import) fn axis(&self, k: usize) -> Option<Vec3> {
         unit([self.0[0][k], self.0[1][k], self.0[2][k]]).map(|v| Vec3::from(v.map(|x| x as f32)))
     }
 }

@@ -3,9 +3,10 @@
 use crate::{
     Beam, Camera, Intrinsics, Laser, Vec3,
     export::mitsuba::text::{beam_text, sensor_text},
+    import::quoted,
 };
 
-use super::{Reader, node::Node};
+use super::{Reader, node::Node, properties};
 
 /// Widest full angle of an emitter that counts as a beam, degrees.
 const BEAM_DEG: f64 = 2.0;
@@ -24,24 +25,16 @@ impl Reader<'_> {
             );
         }
         if node.kind != "perspective" {
-            let what = format!("sensor {:?} is not supported; use perspective", node.kind);
+            let what = format!(
+                "sensor {} is not supported; use perspective",
+                quoted(&node.kind)
+            );
             return Err(node.fail(what));
         }
-        self.ignored(
-            node,
-            &[
-                "to_world",
-                "fov",
-                "fov_axis",
-                "near_clip",
-                "far_clip",
-                "principal_point_offset_x",
-                "principal_point_offset_y",
-                "focus_distance",
-            ],
-        );
+        self.only(node, &properties::PERSPECTIVE)?;
         let mut film = FILM;
         for child in self.children(node, "film")? {
+            self.film(&child)?;
             for (k, name) in ["width", "height"].into_iter().enumerate() {
                 film[k] = child.number(name)?.unwrap_or(film[k]);
             }
@@ -68,13 +61,14 @@ impl Reader<'_> {
             "larger" => width.max(height),
             other => {
                 return Err(node.fail(format!(
-                    "fov_axis: {other:?}; use x, y, diagonal, smaller or larger"
+                    "fov_axis: {}; use x, y, diagonal, smaller or larger",
+                    quoted(other)
                 )));
             }
         };
         let f = (across * 0.5 / libm::tan(fov.to_radians() * 0.5)) as f32;
         let offset = |name: &str| Ok::<_, String>(0.5 - node.number(name)?.unwrap_or(0.0));
-        let pose = node.transform("to_world")?;
+        let pose = self.placed(&node.transform("to_world")?);
         let axis = |k: usize| {
             pose.axis(k)
                 .ok_or_else(|| node.fail("to_world: has no inverse"))
@@ -95,6 +89,39 @@ impl Reader<'_> {
         })
     }
 
+    /// Checks a film's properties, and notes a gate that it states: gates belong to renders.
+    fn film(&mut self, node: &Node) -> Result<(), String> {
+        if node.kind == "specfilm" {
+            self.note("film", "its bands are not used: renders state wavelengths");
+        } else {
+            self.only(node, &properties::FILM)?;
+        }
+        let gated = ["temporal_bins", "bin_width_opl", "start_opl"];
+        let stated = gated.iter().any(|name| node.parameters.contains_key(*name));
+        if !stated && !node.kind.starts_with("transient") && !node.kind.starts_with("phasor") {
+            return Ok(());
+        }
+        // Values that are not stated are mitransient's.
+        let bins = node.number(gated[0])?.unwrap_or(2048.0);
+        let width = node.number(gated[1])?.unwrap_or(0.003);
+        let start = node.number(gated[2])?.unwrap_or(0.0);
+        if !(1.0..=65536.0).contains(&bins) || bins.fract() != 0.0 {
+            let what = format!("temporal_bins: {bins}; expected a whole number from 1 to 65536");
+            return Err(node.fail(what));
+        }
+        if width.partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
+            return Err(node.fail(format!("bin_width_opl: {width}; expected metres above 0")));
+        }
+        self.note(
+            "gate",
+            format!(
+                "the film states {bins} bins of {width} m from {start} m, which are not used: render with --bins {bins} \
+                 --bin-width-m {width} --gate-start-m {start} (bins, bin_width_m and gate_start_m in a job)"
+            ),
+        );
+        Ok(())
+    }
+
     /// The laser of the emitters that are beams; `None` without any.
     pub(super) fn laser(
         &mut self,
@@ -103,13 +130,19 @@ impl Reader<'_> {
         let mut beams: Vec<(Vec3, Vec3, &Node)> = Vec::new();
         for node in emitters {
             let angle = match node.kind.as_str() {
-                "projector" => node.number("fov")?,
-                "spot" => Some(2.0 * node.number("cutoff_angle")?.unwrap_or(20.0)),
+                "projector" => {
+                    self.only(node, &properties::PROJECTOR)?;
+                    node.number("fov")?
+                }
+                "spot" => {
+                    self.only(node, &properties::SPOT)?;
+                    Some(2.0 * node.number("cutoff_angle")?.unwrap_or(20.0))
+                }
                 _ => None,
             };
             match angle {
                 Some(angle) if angle <= BEAM_DEG => {
-                    let pose = node.transform("to_world")?;
+                    let pose = self.placed(&node.transform("to_world")?);
                     let along = pose
                         .axis(2)
                         .ok_or_else(|| node.fail("to_world: has no inverse"))?;
@@ -146,6 +179,14 @@ impl Reader<'_> {
         let Some(&(origin, _, _)) = beams.first() else {
             return Ok(None);
         };
+        let powers = ["irradiance", "intensity", "scale"];
+        let states_power = |n: &Node| powers.iter().any(|p| n.parameters.contains_key(*p));
+        if beams.iter().any(|(_, _, node)| states_power(node)) {
+            self.note(
+                "beams",
+                "of unit energy each, whatever power the file states",
+            );
+        }
         let reach = 1e-5 * (1.0 + origin.length());
         if let Some((other, _, node)) = beams
             .iter()

@@ -1,11 +1,17 @@
 //! Mitsuba's XML as a tree: defaults, ids and transforms resolved.
 
-use std::{collections::BTreeMap, rc::Rc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    rc::Rc,
+};
 
 use roxmltree::{Document, ParsingOptions};
 
+use crate::import::quoted;
+
 use super::{
     node::{Child, Node, Value, numbers, pairs, triple},
+    old,
     transform::Matrix,
 };
 
@@ -15,6 +21,8 @@ const MAX_DEPTH: usize = 32;
 const MAX_NODES: u32 = 4_000_000;
 /// Longest attribute with its parameters replaced, bytes.
 const MAX_VALUE: usize = 1 << 16;
+/// Most `<default>` parameters of a file.
+const MAX_DEFAULTS: usize = 1024;
 /// Elements that are plugins.
 const PLUGINS: [&str; 7] = [
     "scene", "shape", "bsdf", "sensor", "emitter", "texture", "film",
@@ -49,9 +57,12 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
     if root.tag_name().name() != "scene" {
         return Err("expected <scene> as the outermost element: not a Mitsuba scene".into());
     }
+    let ends = text.bytes().enumerate().filter(|(_, b)| *b == b'\n');
     let mut parser = Parser {
-        document: &document,
         text,
+        line_ends: ends.map(|(k, _)| k).collect(),
+        old: old::is_old(root.attribute("version"))?,
+        ids: BTreeSet::new(),
         defaults: BTreeMap::new(),
     };
     let node = parser.plugin(root, 0)?;
@@ -63,8 +74,11 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
 }
 
 struct Parser<'a> {
-    document: &'a Document<'a>,
     text: &'a str,
+    line_ends: Vec<usize>,
+    /// The file is of a version before 2, with names in camelCase.
+    old: bool,
+    ids: BTreeSet<String>,
     /// Longest name first when replaced.
     defaults: BTreeMap<String, String>,
 }
@@ -73,11 +87,26 @@ type Element<'a> = roxmltree::Node<'a, 'a>;
 
 impl<'a> Parser<'a> {
     fn at(&self, e: Element<'a>) -> String {
-        let line = self.document.text_pos_at(e.range().start).row;
-        let name = e.tag_name().name();
+        let line = self.line_ends.partition_point(|k| *k < e.range().start) + 1;
+        let name = quoted(e.tag_name().name());
+        let name = name.trim_matches('"');
         match e.attribute("type") {
-            Some(kind) => format!("line {line}, <{name} type={kind:?}>"),
+            Some(kind) => format!("line {line}, <{name} type={}>", quoted(kind)),
             None => format!("line {line}, <{name}>"),
+        }
+    }
+
+    /// Refuses attributes that are not among `known`.
+    fn only(&self, e: Element<'a>, known: &[&str]) -> Result<(), String> {
+        let other = e.attributes().find(|a| !known.contains(&a.name()));
+        match other {
+            None => Ok(()),
+            Some(other) => Err(format!(
+                "{}: the attribute {} is not known; use {}",
+                self.at(e),
+                quoted(other.name()),
+                known.join(", ")
+            )),
         }
     }
 
@@ -86,6 +115,9 @@ impl<'a> Parser<'a> {
         let Some(raw) = e.attribute(name) else {
             return Ok(None);
         };
+        if !raw.contains('$') {
+            return Ok(Some(raw.to_owned()));
+        }
         let mut value = raw.to_owned();
         let mut names: Vec<&String> = self.defaults.keys().collect();
         names.sort_by_key(|n| std::cmp::Reverse(n.len()));
@@ -102,8 +134,9 @@ impl<'a> Parser<'a> {
         }
         if value.contains('$') {
             return Err(format!(
-                "{}: {name}={raw:?} uses a parameter without <default>; add <default name=… value=…/> before it",
-                self.at(e)
+                "{}: {name}={} uses a parameter without <default>; add <default name=… value=…/> before it",
+                self.at(e),
+                quoted(raw)
             ));
         }
         Ok(Some(value))
@@ -126,26 +159,43 @@ impl<'a> Parser<'a> {
             text: self.text[e.range()].to_owned(),
             ..Node::default()
         };
-        if depth > 0 && node.kind.is_empty() {
-            return Err(node.fail("needs the attribute type"));
+        match depth {
+            // The scene's own text would double the file.
+            0 => node.text.clear(),
+            _ => {
+                self.only(e, &["type", "id", "name"])?;
+                if node.kind.is_empty() {
+                    return Err(node.fail("needs the attribute type"));
+                }
+            }
         }
-        // The scene's own text would double the file.
-        if depth == 0 {
-            node.text.clear();
+        if !node.id.is_empty() && !self.ids.insert(node.id.clone()) {
+            return Err(node.fail(format!("the id {} is stated twice", quoted(&node.id))));
         }
         for child in e.children().filter(Element::is_element) {
             let tag = child.tag_name().name();
-            let name = self.attribute(child, "name")?.unwrap_or_default();
+            let mut name = self.attribute(child, "name")?.unwrap_or_default();
+            if self.old && tag != "default" {
+                name = old::name(&name);
+            }
             if PLUGINS.contains(&tag) && tag != "scene" {
                 let inner = Rc::new(self.plugin(child, depth + 1)?);
                 node.children.push((name, Child::Node(inner)));
             } else if tag == "ref" {
+                self.only(child, &["id", "name"])?;
                 let id = self.needs(child, "id")?;
                 node.children.push((name, Child::Reference(id)));
             } else if tag == "default" {
+                self.only(child, &["name", "value"])?;
                 let value = self.needs(child, "value")?;
                 self.defaults.entry(name).or_insert(value);
-            } else if !SKIPPED.contains(&tag) {
+                if self.defaults.len() > MAX_DEFAULTS {
+                    let what = format!("more than {MAX_DEFAULTS} <default> parameters");
+                    return Err(format!("{}: {what}", self.at(child)));
+                }
+            } else if SKIPPED.contains(&tag) {
+                node.skipped.push(tag.to_owned());
+            } else {
                 let at = self.at(child);
                 let value = self.value(child, tag).map_err(|e| {
                     if e.starts_with("line ") {
@@ -154,18 +204,34 @@ impl<'a> Parser<'a> {
                         format!("{at}: {e}")
                     }
                 })?;
-                node.parameters.insert(name, value);
+                if name.is_empty() {
+                    return Err(format!("{at}: needs the attribute name"));
+                }
+                node.set(name, value, at)?;
             }
+        }
+        if self.old {
+            old::upgrade(&mut node)?;
         }
         Ok(node)
     }
 
     fn value(&self, e: Element<'a>, tag: &str) -> Result<Value, String> {
         if tag == "transform" {
+            self.only(e, &["name"])?;
             return self.transform(e).map(Value::Transform);
         }
         if matches!(tag, "vector" | "point") {
+            self.only(e, &["name", "value", "x", "y", "z"])?;
             return self.vector(e, 0.0).map(Value::Vector);
+        }
+        if tag == "include" {
+            return Err("is not supported; put the elements of the file in its place".into());
+        }
+        if tag == "path" {
+            return Err(
+                "is not supported; state the path of each file relative to the scene file".into(),
+            );
         }
         if !matches!(
             tag,
@@ -175,17 +241,22 @@ impl<'a> Parser<'a> {
                 "this element is not supported; see the documentation for the subset".into(),
             );
         }
+        match tag {
+            // 0.6 had an intent of colours.
+            "rgb" | "spectrum" if self.old => self.only(e, &["name", "value", "intent"])?,
+            _ => self.only(e, &["name", "value"])?,
+        }
         let value = self.needs(e, "value")?;
         Ok(match tag {
             "string" => Value::Text(value),
             "boolean" => match value.trim() {
                 "true" => Value::Switch(true),
                 "false" => Value::Switch(false),
-                _ => return Err(format!("expected true or false, found {value:?}")),
+                _ => return Err(format!("expected true or false, found {}", quoted(&value))),
             },
             "float" | "integer" => match numbers(&value)?[..] {
                 [x] => Value::Number(x),
-                _ => return Err(format!("expected one number, found {value:?}")),
+                _ => return Err(format!("expected one number, found {}", quoted(&value))),
             },
             "spectrum" if value.contains(':') => Value::Spectrum(pairs(&value)?),
             _ => Value::Colour(colour(&value)?),
@@ -209,13 +280,14 @@ impl<'a> Parser<'a> {
     fn one(&self, value: &str) -> Result<f64, String> {
         match numbers(value)?[..] {
             [x] => Ok(x),
-            _ => Err(format!("expected one number, found {value:?}")),
+            _ => Err(format!("expected one number, found {}", quoted(value))),
         }
     }
 
     fn transform(&self, e: Element<'a>) -> Result<Matrix, String> {
         let mut all = Matrix::IDENTITY;
         for step in e.children().filter(Element::is_element) {
+            self.only(step, attributes_of(step.tag_name().name()))?;
             let point = |name: &str| triple(&numbers(&self.needs(step, name)?)?);
             let matrix = match step.tag_name().name() {
                 "translate" => Matrix::translation(self.vector(step, 0.0)?),
@@ -224,7 +296,7 @@ impl<'a> Parser<'a> {
                     let angle = self.one(&self.needs(step, "angle")?)?;
                     Matrix::rotation(self.vector(step, 0.0)?, angle)?
                 }
-                "lookat" | "look_at" => {
+                "lookat" | "look_at" | "lookAt" => {
                     let up = match step.attribute("up") {
                         Some(_) => point("up")?,
                         None => [0.0, 1.0, 0.0],
@@ -234,13 +306,24 @@ impl<'a> Parser<'a> {
                 "matrix" => Matrix::from_numbers(&numbers(&self.needs(step, "value")?)?)?,
                 other => {
                     return Err(format!(
-                        "<{other}> is no transform; use translate, rotate, scale, matrix or lookat"
+                        "<{}> is no transform; use translate, rotate, scale, matrix or lookat",
+                        quoted(other).trim_matches('"')
                     ));
                 }
             };
             all = matrix.after(&all);
         }
         Ok(all)
+    }
+}
+
+/// Attributes of a step of a transform.
+fn attributes_of(step: &str) -> &'static [&'static str] {
+    match step {
+        "rotate" => &["value", "x", "y", "z", "angle"],
+        "matrix" => &["value"],
+        "lookat" | "look_at" | "lookAt" => &["origin", "target", "up"],
+        _ => &["value", "x", "y", "z"],
     }
 }
 
@@ -254,7 +337,7 @@ fn colour(text: &str) -> Result<[f32; 3], String> {
         };
         return match (byte(0), byte(1), byte(2)) {
             (Some(r), Some(g), Some(b)) => Ok([r, g, b]),
-            _ => Err(format!("expected #rrggbb, found {text:?}")),
+            _ => Err(format!("expected #rrggbb, found {}", quoted(text))),
         };
     }
     if text.contains(':') {

@@ -34,6 +34,19 @@ impl Number {
         }
     }
 
+    /// Least and largest value of a whole-number type; `None` for the others.
+    pub(super) fn range(self) -> Option<(f64, f64)> {
+        Some(match self {
+            Self::I8 => (f64::from(i8::MIN), f64::from(i8::MAX)),
+            Self::U8 => (0.0, f64::from(u8::MAX)),
+            Self::I16 => (f64::from(i16::MIN), f64::from(i16::MAX)),
+            Self::U16 => (0.0, f64::from(u16::MAX)),
+            Self::I32 => (f64::from(i32::MIN), f64::from(i32::MAX)),
+            Self::U32 => (0.0, f64::from(u32::MAX)),
+            Self::F32 | Self::F64 => return None,
+        })
+    }
+
     fn named(name: &str) -> Option<Self> {
         Some(match name {
             "char" | "int8" => Self::I8,
@@ -76,9 +89,12 @@ impl Element {
 /// Format, elements, and the offset at which the body starts.
 pub(super) fn parse(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize), String> {
     let (mut at, mut encoding, mut elements) = (0, None, Vec::<Element>::new());
+    // The first line shows how lines end: files of old Macs have a carriage return alone.
+    let cr = bytes.starts_with(b"ply\r") && bytes.get(4) != Some(&b'\n');
+    let ending = if cr { b'\r' } else { b'\n' };
     for number in 1.. {
         let rest = &bytes[at..bytes.len().min(MAX_HEADER)];
-        let Some(end) = rest.iter().position(|&b| b == b'\n') else {
+        let Some(end) = rest.iter().position(|&b| b == ending) else {
             return Err("header: has no line end_header; the file is cut short".into());
         };
         let line = std::str::from_utf8(&rest[..end])
@@ -101,6 +117,9 @@ pub(super) fn parse(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize), Str
                 let Ok(count) = count.parse() else {
                     return fail("expected a count");
                 };
+                if elements.iter().any(|e| e.name == *name) {
+                    return fail("this element is stated twice");
+                }
                 elements.push(Element {
                     name: (*name).to_owned(),
                     count,
@@ -117,9 +136,15 @@ pub(super) fn parse(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize), Str
                 let (Ok(length), Some(number)) = (length, Number::named(number)) else {
                     return fail("this type is not known; use char … double");
                 };
+                if length.is_some_and(|l| l.range().is_none()) {
+                    return fail("the length of a list needs a whole-number type, such as uchar");
+                }
                 let Some(element) = elements.last_mut() else {
                     return fail("comes before any element");
                 };
+                if element.properties.iter().any(|p| p.name == *name) {
+                    return fail("this property is stated twice");
+                }
                 element.properties.push(Property {
                     name: (*name).to_owned(),
                     number,

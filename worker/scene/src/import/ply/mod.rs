@@ -1,6 +1,7 @@
 //! PLY meshes: ascii and binary of either byte order, faces of any number of corners, texture
 //! coordinates; colours as their mean.
 
+mod body;
 mod header;
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
@@ -9,8 +10,9 @@ use crate::{
     Affine, Camera, Intrinsics, Material, Mesh, Object, Provenance, Scene, SceneError, Vec3,
 };
 
-use super::{ImportOptions, format_error};
-use header::{Element, Encoding, Number};
+use super::{ImportOptions, far, format_error, polygon::Triangulation};
+use body::{Body, Row};
+use header::{Element, Number};
 
 /// Linear albedo of a mesh without colours.
 const GREY: f32 = 0.5;
@@ -18,17 +20,31 @@ const GREY: f32 = 0.5;
 const FRAME_PIXELS: u32 = 256;
 const FRAME_FOV_DEG: f32 = 60.0;
 
-/// What a PLY file holds.
+/// A mesh that shows less than this share of its area to a camera is edge-on.
+const EDGE_ON: f64 = 1e-3;
+/// Elements with geometry that is not read, which a mesh must not lose in silence.
+const UNREAD_SURFACES: [&str; 2] = ["tristrips", "range_grid"];
+
+/// The content of a PLY file.
 #[derive(Debug, Default)]
 pub(super) struct Ply {
-    pub(super) positions: Vec<Vec3>,
+    /// As the file states them.
+    pub(super) positions: Vec<[f64; 3]>,
     /// One a vertex, or none.
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) triangles: Vec<[u32; 3]>,
     /// Mean linear colour of the vertices, or else of the faces.
     pub(super) colour: Option<[f32; 3]>,
-    /// Faces with fewer than three corners.
-    pub(super) skipped: usize,
+    /// Keys and texts of notes on what was changed or left out.
+    pub(super) notes: BTreeMap<String, String>,
+}
+
+/// Faces as the file states them.
+#[derive(Default)]
+struct Polygons {
+    corners: Vec<u32>,
+    /// Number of corners of each.
+    lengths: Vec<usize>,
 }
 
 /// True for the first bytes of a PLY file.
@@ -44,11 +60,29 @@ pub(super) fn read(
 ) -> Result<Scene, SceneError> {
     let ply = parse(bytes).map_err(|what| format_error(path, what))?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy();
-    let mut notes = ply.notes();
+    let mut notes: BTreeMap<String, String> = ply
+        .notes
+        .iter()
+        .map(|(key, note)| (format!("import.{key}"), note.clone()))
+        .collect();
+    if ply.colour.is_some() {
+        notes.insert(
+            "import.colours".into(),
+            "replaced by their mean over the mesh".into(),
+        );
+    }
+    let mut origin = [0.0; 3];
+    if options.camera.is_none()
+        && let Some((centre, size)) = far::centre(&ply.positions)
+        && far::is_lossy(centre, size)
+    {
+        origin = centre;
+        notes.insert("import.origin".into(), far::note(centre));
+    }
     let mesh = Mesh {
         name: name.clone().into_owned(),
         triangle_material: vec![0; ply.triangles.len()],
-        positions: ply.positions,
+        positions: far::relative(&ply.positions, origin),
         uv: ply.uv,
         triangles: ply.triangles,
         materials: vec![Material::diffuse("ply", ply.colour.unwrap_or([GREY; 3]))],
@@ -63,6 +97,13 @@ pub(super) fn read(
              `picofarm scene export FILE --frame --out scene.glb` put both in front of it",
         ));
     };
+    if options.camera.is_none() && is_edge_on(&mesh) {
+        return Err(format_error(
+            path,
+            "is edge-on as seen from +z, where --frame puts the camera: turn the mesh, or place it in a glTF or Mitsuba \
+             scene with a camera",
+        ));
+    }
     notes.insert("import.units".into(), "not stated; metres assumed".into());
     Ok(Scene {
         name: name.clone().into_owned(),
@@ -83,22 +124,16 @@ pub(super) fn read(
     })
 }
 
-impl Ply {
-    /// What was changed or left out.
-    pub(super) fn notes(&self) -> BTreeMap<String, String> {
-        let mut notes = BTreeMap::new();
-        if self.colour.is_some() {
-            notes.insert(
-                "import.colours".into(),
-                "replaced by their mean over the mesh".into(),
-            );
-        }
-        if self.skipped > 0 {
-            let what = format!("{} with fewer than three corners left out", self.skipped);
-            notes.insert("import.faces".into(), what);
-        }
-        notes
+/// True for a mesh that a camera on its +z side sees as a line.
+fn is_edge_on(mesh: &Mesh) -> bool {
+    let (mut seen, mut whole) = (0.0, 0.0);
+    for t in &mesh.triangles {
+        let [a, b, c] = t.map(|v| mesh.positions[v as usize]);
+        let normal = (b - a).cross(c - a);
+        seen += f64::from(normal.z.abs());
+        whole += f64::from(normal.length());
     }
+    seen <= EDGE_ON * whole
 }
 
 /// A camera in front (towards +z) of a mesh that sees all of it.
@@ -118,44 +153,129 @@ fn frame(mesh: &Mesh) -> Option<Camera> {
     Some(camera)
 }
 
-/// Reads a whole file; the message names the element and quotes nothing: the file may be something else.
+/// Reads a whole file; the message names the element and quotes nothing: the file may be something
+/// else.
 pub(super) fn parse(bytes: &[u8]) -> Result<Ply, String> {
     if !is_ply(bytes) {
         return Err("is not PLY: its first line is not `ply`".into());
     }
     let (encoding, elements, start) = header::parse(bytes)?;
-    let mut body = Body {
-        encoding,
-        rest: &bytes[start..],
-    };
+    let mut body = Body::new(encoding, &bytes[start..]);
     let mut ply = Ply::default();
-    let mut vertices = 0;
+    let mut polygons = Polygons::default();
+    let mut ignored = Vec::new();
     for element in &elements {
-        body.fits(element)?;
         let mut colour = Mean::default();
         match element.name.as_str() {
-            "vertex" => {
-                read_vertices(&mut body, element, &mut ply, &mut colour)?;
-                vertices = ply.positions.len();
+            "vertex" => read_vertices(&mut body, element, &mut ply, &mut colour)?,
+            "face" => read_faces(&mut body, element, (&mut polygons, &mut ply), &mut colour)?,
+            name => {
+                if UNREAD_SURFACES.contains(&name) && element.count > 0 {
+                    return Err(format!(
+                        "element {name}: is not supported; export the mesh with element face"
+                    ));
+                }
+                ignored.push(name);
+                body.rows(element, |_| Ok(()))?;
             }
-            "face" => read_faces(&mut body, element, &mut ply, &mut colour)?,
-            _ => read_rows(&mut body, element, |_| Ok(()))?,
         }
         ply.colour = ply.colour.or(colour.finish());
     }
+    let left = body.left_over()?;
+    if left > 0 {
+        ply.note(
+            "trailing_bytes",
+            format!("{left} after the last row ignored"),
+        );
+    }
+    if !ignored.is_empty() {
+        ply.note("elements", format!("ignored: {}", ignored.join(", ")));
+    }
+    ply.triangulate(&polygons)?;
     if ply.triangles.is_empty() {
         return Err("element face: no triangles; export a mesh with faces (no point cloud)".into());
     }
-    match ply
-        .triangles
-        .iter()
-        .flatten()
-        .find(|&&v| v as usize >= vertices)
-    {
-        Some(v) => Err(format!(
-            "element face: index {v} points past {vertices} vertices"
-        )),
-        None => Ok(ply),
+    ply.drop_stray_vertices();
+    Ok(ply)
+}
+
+impl Ply {
+    fn note(&mut self, key: &str, what: impl Into<String>) {
+        self.notes.insert(key.into(), what.into());
+    }
+
+    fn triangulate(&mut self, polygons: &Polygons) -> Result<(), String> {
+        let (mut split, mut skipped) = (Triangulation::default(), 0);
+        let (mut places, mut parts) = (Vec::new(), Vec::new());
+        let mut rest = polygons.corners.as_slice();
+        for (k, &length) in polygons.lengths.iter().enumerate() {
+            let (corners, after) = rest.split_at(length);
+            rest = after;
+            if let Some(v) = corners
+                .iter()
+                .find(|v| **v as usize >= self.positions.len())
+            {
+                return Err(format!(
+                    "element face row {k}: index {v} points past {} vertices",
+                    self.positions.len()
+                ));
+            }
+            if length < 3 {
+                skipped += 1;
+            }
+            let finite = |v: u32| self.positions[v as usize].iter().all(|x| x.is_finite());
+            if let Some(v) = corners.iter().find(|v| !finite(**v)) {
+                return Err(format!(
+                    "element face row {k}: vertex {v} is not finite; repair the mesh"
+                ));
+            }
+            places.clear();
+            places.extend(corners.iter().map(|v| self.positions[*v as usize]));
+            parts.clear();
+            split
+                .split(&places, &mut parts)
+                .map_err(|what| format!("element face row {k}: {what}"))?;
+            let triangle = |t: &[u32; 3]| t.map(|c| corners[c as usize]);
+            self.triangles.extend(parts.iter().map(triangle));
+        }
+        if skipped > 0 {
+            self.note(
+                "faces",
+                format!("{skipped} with fewer than three corners left out"),
+            );
+        }
+        if let Some(note) = split.note() {
+            self.note("polygons", note);
+        }
+        Ok(())
+    }
+
+    /// Vertices that no face has are no part of the surface, and must not decide where a camera
+    /// stands.
+    fn drop_stray_vertices(&mut self) {
+        let mut places = vec![u32::MAX; self.positions.len()];
+        for v in self.triangles.iter().flatten() {
+            places[*v as usize] = 0;
+        }
+        let stray = places.iter().filter(|p| **p == u32::MAX).count();
+        if stray == 0 {
+            return;
+        }
+        for (next, place) in (0..).zip(places.iter_mut().filter(|p| **p == 0)) {
+            *place = next;
+        }
+        let mut k = places.iter();
+        self.positions
+            .retain(|_| k.next().is_some_and(|p| *p != u32::MAX));
+        let mut k = places.iter();
+        self.uv.retain(|_| k.next().is_some_and(|p| *p != u32::MAX));
+        for t in &mut self.triangles {
+            *t = t.map(|v| places[v as usize]);
+        }
+        self.note(
+            "stray_vertices",
+            format!("{stray} that no face has left out"),
+        );
     }
 }
 
@@ -165,23 +285,24 @@ fn read_vertices(
     ply: &mut Ply,
     colour: &mut Mean,
 ) -> Result<(), String> {
-    let needs = |name: &str| {
-        element
-            .find(&[name])
-            .ok_or_else(|| format!("element vertex: has no property {name}"))
+    let needs = |name: &str| match element.find(&[name]) {
+        Some(k) if element.properties[k].length.is_none() => Ok(k),
+        Some(_) => Err(format!(
+            "element vertex: property {name} is a list, expected a number"
+        )),
+        None => Err(format!("element vertex: has no property {name}")),
     };
     let place = [needs("x")?, needs("y")?, needs("z")?];
-    let coordinates =
-        element
-            .find(&["u", "s", "texture_u"])
-            .zip(element.find(&["v", "t", "texture_v"]));
+    let number = |names: &[&str]| {
+        let k = element.find(names)?;
+        element.properties[k].length.is_none().then_some(k)
+    };
+    let coordinates = number(&["u", "s", "texture_u"]).zip(number(&["v", "t", "texture_v"]));
     let channels = Channels::of(element);
-    ply.positions.reserve(element.count);
-    read_rows(body, element, |row| {
-        let at = |k: usize| row.first(k) as f32;
-        ply.positions.push(Vec3::from(place.map(at)));
+    body.rows(element, |row| {
+        ply.positions.push(place.map(|k| row.first(k)));
         if let Some((u, v)) = coordinates {
-            ply.uv.push([at(u), at(v)]);
+            ply.uv.push([row.first(u) as f32, row.first(v) as f32]);
         }
         channels.add(row, colour);
         Ok(())
@@ -191,154 +312,33 @@ fn read_vertices(
 fn read_faces(
     body: &mut Body<'_>,
     element: &Element,
-    ply: &mut Ply,
+    (polygons, ply): (&mut Polygons, &mut Ply),
     colour: &mut Mean,
 ) -> Result<(), String> {
-    let Some(list) = element.find(&["vertex_indices", "vertex_index"]) else {
+    let list = element.find(&["vertex_indices", "vertex_index"]);
+    let list = list.filter(|k| element.properties[*k].length.is_some());
+    let Some(list) = list else {
         return Err("element face: has no list vertex_indices; export the mesh with faces".into());
     };
+    if element.find(&["texcoord", "texnumber"]).is_some() {
+        ply.note(
+            "face_textures",
+            "ignored: texture coordinates are read by vertex only",
+        );
+    }
     let channels = Channels::of(element);
-    read_rows(body, element, |row| {
+    body.rows(element, |row| {
         let corners = row.all(list);
-        let index = |k: usize| {
-            let v = corners[k];
-            if (0.0..=f64::from(u32::MAX)).contains(&v) {
-                Ok(v as u32)
-            } else {
-                Err(format!("element face: index {v} is no vertex"))
+        for &v in corners {
+            if v.fract() != 0.0 || !(0.0..=f64::from(u32::MAX)).contains(&v) {
+                return Err(format!("index {v} is no vertex"));
             }
-        };
-        if corners.len() < 3 {
-            ply.skipped += 1;
+            polygons.corners.push(v as u32);
         }
-        for k in 2..corners.len() {
-            ply.triangles.push([index(0)?, index(k - 1)?, index(k)?]);
-        }
+        polygons.lengths.push(corners.len());
         channels.add(row, colour);
         Ok(())
     })
-}
-
-/// The numbers of one row, and where each property's start.
-struct Row {
-    numbers: Vec<f64>,
-    starts: Vec<usize>,
-}
-
-impl Row {
-    fn first(&self, property: usize) -> f64 {
-        self.all(property).first().copied().unwrap_or(f64::NAN)
-    }
-
-    fn all(&self, property: usize) -> &[f64] {
-        &self.numbers[self.starts[property]..self.starts[property + 1]]
-    }
-}
-
-fn read_rows(
-    body: &mut Body<'_>,
-    element: &Element,
-    mut each: impl FnMut(&Row) -> Result<(), String>,
-) -> Result<(), String> {
-    if element.properties.is_empty() {
-        return Ok(());
-    }
-    let mut row = Row {
-        numbers: Vec::new(),
-        starts: Vec::new(),
-    };
-    for k in 0..element.count {
-        row.numbers.clear();
-        row.starts.clear();
-        let at = |what: String| format!("element {} row {k}: {what}", element.name);
-        for property in &element.properties {
-            row.starts.push(row.numbers.len());
-            let count = match property.length {
-                None => 1,
-                Some(length) => {
-                    let count = body.number(length).map_err(at)?;
-                    let most = body.rest.len() / body.least(property.number);
-                    if !(0.0..=most as f64).contains(&count) {
-                        let what = format!("list {} of {count} does not fit", property.name);
-                        return Err(at(what));
-                    }
-                    count as usize
-                }
-            };
-            for _ in 0..count {
-                row.numbers.push(body.number(property.number).map_err(at)?);
-            }
-        }
-        row.starts.push(row.numbers.len());
-        each(&row)?;
-    }
-    Ok(())
-}
-
-/// What is left of the file after the header.
-struct Body<'a> {
-    encoding: Encoding,
-    rest: &'a [u8],
-}
-
-impl Body<'_> {
-    /// Fewest bytes that a number takes up.
-    fn least(&self, number: Number) -> usize {
-        match self.encoding {
-            Encoding::Ascii => 1,
-            _ => number.size(),
-        }
-    }
-
-    /// Refuses counts that the rest of the file cannot hold, before anything is allocated for them.
-    fn fits(&self, element: &Element) -> Result<(), String> {
-        let one: usize = element
-            .properties
-            .iter()
-            .map(|p| self.least(p.length.unwrap_or(p.number)))
-            .sum();
-        let need = element.count.checked_mul(one);
-        if need.is_some_and(|need| need <= self.rest.len()) {
-            return Ok(());
-        }
-        Err(format!(
-            "element {}: {} rows do not fit the {} bytes left; the file is cut short or damaged",
-            element.name,
-            element.count,
-            self.rest.len()
-        ))
-    }
-
-    fn number(&mut self, number: Number) -> Result<f64, String> {
-        const SHORT: &str = "the file is cut short";
-        if self.encoding == Encoding::Ascii {
-            let start = self.rest.iter().position(|b| !b.is_ascii_whitespace());
-            let rest = &self.rest[start.ok_or(SHORT)?..];
-            let end = rest.iter().position(u8::is_ascii_whitespace);
-            let (word, rest) = rest.split_at(end.unwrap_or(rest.len()));
-            self.rest = rest;
-            let text = std::str::from_utf8(word).unwrap_or("?");
-            return text.parse().map_err(|_| "expected a number".to_owned());
-        }
-        let (word, rest) = self.rest.split_at_checked(number.size()).ok_or(SHORT)?;
-        self.rest = rest;
-        let mut bytes = [0; 8];
-        bytes[..word.len()].copy_from_slice(word);
-        if self.encoding == Encoding::Big {
-            bytes[..word.len()].reverse();
-        }
-        let [a, b, c, d, ..] = bytes;
-        Ok(match number {
-            Number::I8 => f64::from(a as i8),
-            Number::U8 => f64::from(a),
-            Number::I16 => f64::from(i16::from_le_bytes([a, b])),
-            Number::U16 => f64::from(u16::from_le_bytes([a, b])),
-            Number::I32 => f64::from(i32::from_le_bytes([a, b, c, d])),
-            Number::U32 => f64::from(u32::from_le_bytes([a, b, c, d])),
-            Number::F32 => f64::from(f32::from_le_bytes([a, b, c, d])),
-            Number::F64 => f64::from_le_bytes(bytes),
-        })
-    }
 }
 
 /// Where an element keeps its colour: bytes are sRGB, floats linear.

@@ -36,7 +36,7 @@ impl Work<'_> {
             TaskError::User(what) => TaskError::User(format!("reconstruct.predictions: {what}")),
             other => other,
         };
-        let (store, prefix) = stores.source(&self.0.source.store)?;
+        let (store, prefix) = stores.source(&self.0.source.store, control)?;
         let opened = Predictions::open(store, prefix.join(&**folder));
         let predictions = stores.wait(control, opened).map_err(at)?;
         let spec = predictions.spec();

@@ -34,6 +34,7 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
         "iterations": made.iterations,
         "loss": made.loss,
         "held_out_loss": made.held_out_loss,
+        "agreement": made.agreement,
         "vertices": mesh.positions.len(),
         "triangles": mesh.triangles.len(),
         "evidence": {

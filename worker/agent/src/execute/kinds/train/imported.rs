@@ -1,9 +1,11 @@
 //! Networks that were trained elsewhere, as models of a store: released checkpoints, and one's own.
 
+use std::fmt;
+
 use picofarm_dataset::{
     DatasetSpec, Lineage, Manifest, ModelManifest, NewModel, SplitUsed, sha256_hex,
 };
-use picofarm_model::{Model, cpu, train::Plan};
+use picofarm_model::{Model, ModelError, cpu, train::Plan};
 use picofarm_proto::model::{Histogram, TrainSettings, train::Normalise};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
@@ -26,20 +28,43 @@ pub struct ImportFor<'a> {
     pub scene: &'a Manifest,
 }
 
+/// Why a network is not imported.
+#[derive(Debug)]
+pub enum NotImported {
+    /// The settings cannot be used.
+    Settings(String),
+    /// The file is no safetensors, or stores numbers in a form that is not known.
+    File(String),
+    /// A tensor is missing, too many, or has another shape than the settings say.
+    Tensors(String),
+    /// A tensor holds what no network can compute with.
+    Values(String),
+}
+
+impl fmt::Display for NotImported {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (Self::Settings(what) | Self::File(what) | Self::Tensors(what) | Self::Values(what)) =
+            self;
+        f.write_str(what)
+    }
+}
+
 /// A network that was trained elsewhere as a model of a store: `weights` are safetensors by PyTorch's names, alone, of a
 /// wrapped or of a combined network; `settings` say what it is, as `train` in a job file does; `from` is what the file is
 /// called. Trained settings that shape no answer (rates, epochs) may be left out.
 ///
 /// # Errors
-/// A sentence that names the setting, or the tensor that is missing or has another shape.
+/// [`NotImported`] naming the setting, or the tensor that is missing, has another shape or impossible values.
 pub fn imported(
     weights: &[u8],
     settings: Value,
     of: ImportFor<'_>,
     from: &str,
-) -> Result<NewModel, String> {
-    let settings: TrainSettings = serde_json::from_value(settings).map_err(|e| e.to_string())?;
-    settings.check().map_err(|e| e.to_string())?;
+) -> Result<NewModel, NotImported> {
+    let unusable = NotImported::Settings;
+    let settings: TrainSettings =
+        serde_json::from_value(settings).map_err(|e| unusable(e.to_string()))?;
+    settings.check().map_err(|e| unusable(e.to_string()))?;
     for (field, given) in [
         ("from", !settings.from.is_empty()),
         ("trial", settings.trial.is_some()),
@@ -47,18 +72,18 @@ pub fn imported(
         ("shadow.times", settings.times().is_some()),
     ] {
         if given {
-            return Err(format!(
+            return Err(unusable(format!(
                 "train.{field}: says what a training begins with or learns from, and nothing is trained here; remove it"
-            ));
+            )));
         }
     }
     let quantity = quantity(settings.histogram);
     if !of.spec.quantities().contains(&quantity) {
-        return Err(format!(
+        return Err(unusable(format!(
             "train.histogram: {} has no {}",
             of.dataset,
             quantity.name()
-        ));
+        )));
     }
     let spots = match settings.histogram {
         Histogram::Transient => of.spec.spots as usize,
@@ -67,18 +92,23 @@ pub fn imported(
     };
     let greatest = match (settings.input.normalise, settings.input.max) {
         (Normalise::Log, 0.0) => {
-            return Err(
+            return Err(unusable(
                 "train.input.max: is missing; with normalise = \"log\" it is the largest bin of the scenes that were learnt from"
                     .into(),
-            );
+            ));
         }
         (_, max) => max as f32,
     };
     let plan: Plan = plan::plan(&settings, of.spec, spots, greatest).map_err(|e| match e {
-        TaskError::User(what) => what,
-        other => other.to_string(),
+        TaskError::User(what) => unusable(what),
+        other => unusable(other.to_string()),
     })?;
-    let ours = Model::import(weights, &plan, &cpu()).map_err(|e| e.to_string())?;
+    let ours = Model::import(weights, &plan, &cpu()).map_err(|e| match e {
+        ModelError::File { what } => NotImported::File(what),
+        ModelError::Weights { what } => NotImported::Tensors(what),
+        ModelError::Values { what } => NotImported::Values(what),
+        other => unusable(other.to_string()),
+    })?;
     let sha256 = sha256_hex(weights);
     let key = json!({"import": sha256, "settings": settings.shaping(), "gate": of.spec.gate, "code": model_version()});
     let metrics = json!({"imported": {"file": from, "sha256": sha256}});

@@ -1,0 +1,164 @@
+//! What results are worth, as tasks tell it in their logs: shown when a job ends that was followed.
+
+use std::collections::BTreeMap;
+
+use picofarm_proto::{
+    model::{Event, EventKind, JobStatus, log::VERDICT},
+    show,
+};
+
+use crate::client::{Client, Page};
+
+/// Lines of history that are searched.
+const LINES: u32 = 10_000;
+/// Lines of a stage that are shown one by one; of more, they are counted.
+const EACH: usize = 4;
+/// Kinds of stages whose tasks tell it.
+const KINDS: [&str; 4] = ["evaluate", "import", "infer", "reconstruct"];
+
+/// A line, and whether it is a warning.
+pub type Line = (bool, String);
+
+/// The lines about a job, as far as its latest history tells.
+pub async fn lines(client: &mut Client, status: &JobStatus) -> Vec<Line> {
+    if !status.stages.iter().any(|s| KINDS.contains(&&*s.kind)) {
+        return Vec::new();
+    }
+    let page = Page {
+        job: Some(status.id),
+        stage: None,
+        task: None,
+        after: 0,
+        limit: LINES,
+        newest: true,
+        logs: true,
+    };
+    // They are remarks: where the history cannot be read, others say so.
+    let Ok((events, _)) = client.history(page).await else {
+        return Vec::new();
+    };
+    told(status, &events)
+}
+
+/// The lines of a history: each by itself where a stage has few, else how many are doubtful, with an example.
+fn told(status: &JobStatus, events: &[Event]) -> Vec<Line> {
+    // By stage, then by task and text: a task that ran twice tells the same twice.
+    let mut stages: BTreeMap<u32, BTreeMap<(u64, &str), bool>> = BTreeMap::new();
+    for event in events.iter().filter(|e| e.kind == EventKind::Log) {
+        let said = event.message.split_once(": ");
+        let Some((level, rest)) = said else { continue };
+        let Some(text) = rest.strip_prefix(VERDICT) else {
+            continue;
+        };
+        let lines = stages.entry(event.stage.unwrap_or_default()).or_default();
+        lines.insert((event.task.unwrap_or_default(), text), level == "warn");
+    }
+    let mut out = Vec::new();
+    for (at, lines) in &stages {
+        if lines.len() <= EACH {
+            let each = lines.iter();
+            out.extend(each.map(|((_, text), bad)| (*bad, show::line(text).into_owned())));
+            continue;
+        }
+        let name = status.stages.get(*at as usize).map_or("", |s| &*s.name);
+        let bad: Vec<_> = lines.iter().filter(|(_, bad)| **bad).collect();
+        let example = bad.first().map_or_else(
+            || format!("none of {} results is doubtful", lines.len()),
+            |((task, text), _)| {
+                let all = lines.len();
+                format!(
+                    "{} of {all} results are doubtful, e.g. task {task}: {text}",
+                    bad.len()
+                )
+            },
+        );
+        let line = format!("{name}: {example}");
+        out.push((!bad.is_empty(), show::line(&line).into_owned()));
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use picofarm_proto::{
+        ids::JobId,
+        model::{JobSpec, JobState, Limits, StageState, StageStatus, TaskCounts},
+    };
+
+    use super::*;
+
+    fn event(task: u64, message: &str) -> Event {
+        Event {
+            sequence: task,
+            at_ms: 0,
+            job: JobId::from_uuid(uuid::Uuid::nil()),
+            stage: Some(0),
+            kind: EventKind::Log,
+            task: Some(task),
+            lo: None,
+            hi: None,
+            worker: String::new(),
+            message: message.into(),
+            seconds: 0.0,
+        }
+    }
+
+    fn status() -> JobStatus {
+        JobStatus {
+            id: JobId::from_uuid(uuid::Uuid::nil()),
+            name: "j".into(),
+            state: JobState::Done,
+            tasks: TaskCounts::default(),
+            submitted_at_ms: 0,
+            ended_at_ms: None,
+            paused: false,
+            user: String::new(),
+            stages: vec![StageStatus {
+                name: "rooms3d".into(),
+                kind: "reconstruct".into(),
+                state: StageState::Done,
+                needs: Vec::new(),
+                tasks: TaskCounts::default(),
+            }],
+            spec: JobSpec {
+                name: "j".into(),
+                priority: 0,
+                limits: Limits::default(),
+                nonce: String::new(),
+                project: String::new(),
+                stages: Vec::new(),
+            },
+            mean_task_seconds: None,
+            running: Vec::new(),
+            workers: 0,
+            unverified: 0,
+        }
+    }
+
+    #[test]
+    fn few_verdicts_are_shown_and_many_are_counted() {
+        let bad = "warn: verdict: scene 3: do not trust it";
+        let few = [
+            event(2, "info: verdict: scene 2: times agree"),
+            event(3, bad),
+            event(3, bad),
+            event(4, "info: something else"),
+        ];
+        let shown = told(&status(), &few);
+        let expected = [
+            (false, "scene 2: times agree".to_owned()),
+            (true, "scene 3: do not trust it".to_owned()),
+        ];
+        assert_eq!(shown, expected);
+        let good = |task| event(task, &format!("info: verdict: scene {task}: fine"));
+        let many: Vec<Event> = (10..70).map(good).chain([event(3, bad)]).collect();
+        let [(doubtful, line)] = &told(&status(), &many)[..] else {
+            panic!("one line");
+        };
+        assert!(*doubtful);
+        assert_eq!(
+            line,
+            "rooms3d: 1 of 61 results are doubtful, e.g. task 3: scene 3: do not trust it"
+        );
+    }
+}

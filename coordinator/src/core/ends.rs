@@ -1,0 +1,139 @@
+//! Workers that must end at a time that is known: with their Slurm job, or as they were told. They
+//! are given what they can finish by then, as far as it is known how long tasks take.
+
+use picofarm_catalog::{Mark, RangeState, Run};
+use picofarm_proto::ids::{StageRef, WorkerId};
+
+use super::{Core, SessionId};
+
+/// A task is taken to need this many times the mean of its like, and of the longest attempt at it
+/// that did not end.
+const MARGIN: f64 = 1.25;
+
+/// How long a task is taken to need that took so long.
+fn with_margin(ms: f64) -> i64 {
+    // Casting saturates.
+    (MARGIN * ms) as i64
+}
+
+impl Core {
+    /// A worker reports in how many milliseconds it must end.
+    pub(crate) fn ends(&mut self, session: SessionId, ends_in_ms: Option<u64>, now_ms: i64) {
+        if let Some(worker) = self.sessions.get(&session)
+            && let Some(entry) = self.workers.get_mut(worker)
+        {
+            entry.ends_ms = at(ends_in_ms, now_ms);
+        }
+    }
+
+    /// What a worker has left for another lease, milliseconds; `None` where it need not end.
+    fn time_left(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
+        let entry = self.workers.get(&worker)?;
+        let left = entry.ends_ms? - now_ms;
+        let leases = entry.leases.iter().filter_map(|id| {
+            let entry = self.stages.get(self.leases.get(id)?)?;
+            let RangeState::Leased(lease) = &entry.stage.leased_range(*id)?.state else {
+                return None;
+            };
+            let todo = lease.marks.iter().filter(|m| **m == Mark::Todo).count();
+            Some(todo as f64 * 1000.0 * self.sets[entry.set].timing.mean()?)
+        });
+        let busy: f64 = leases.sum();
+        Some(left.saturating_sub(busy as i64))
+    }
+
+    /// What a task of a stage is taken to need, milliseconds; `None` where that is not known, or
+    /// where a task goes on from where it was saved.
+    fn needs_ms(&self, id: StageRef) -> Option<i64> {
+        let entry = &self.stages[&id];
+        if entry.spec(id).task.resumes() {
+            return None;
+        }
+        match self.sets[entry.set].timing.mean() {
+            Some(mean) => Some(with_margin(mean * 1000.0)),
+            None => (entry.longest_ms > 0).then(|| with_margin(entry.longest_ms as f64)),
+        }
+    }
+
+    /// Whether a worker has the time that a task of a stage is taken to need.
+    ///
+    /// # Errors
+    /// What it needs and what there is, milliseconds.
+    pub(super) fn has_time(
+        &self,
+        id: StageRef,
+        worker: WorkerId,
+        now_ms: i64,
+    ) -> Result<(), (i64, i64)> {
+        match (self.time_left(worker, now_ms), self.needs_ms(id)) {
+            (Some(left), _) if left <= 0 => Err((self.needs_ms(id).unwrap_or(0), 0)),
+            (Some(left), Some(needs)) if needs > left => Err((needs, left)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Tasks of a stage that took longer than a worker has left, and did not end: ascending,
+    /// disjoint.
+    fn too_long(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
+        let entry = &self.stages[&id];
+        let Some(left) = self.time_left(worker, now_ms) else {
+            return Vec::new();
+        };
+        if with_margin(entry.longest_ms as f64) <= left || entry.spec(id).task.resumes() {
+            return Vec::new();
+        }
+        let long = entry.exceptions.values();
+        long.filter(|e| with_margin(e.longest_ms as f64) > left)
+            .map(|e| Run {
+                lo: e.task,
+                hi: e.task + 1,
+            })
+            .collect()
+    }
+
+    /// Tasks of a stage that this worker is not to be given now: ascending, disjoint.
+    pub(super) fn not_for(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
+        let mut runs = self.done_for_others(id);
+        let long = self.too_long(id, worker, now_ms);
+        if !long.is_empty() {
+            runs.extend(long);
+            super::shared::in_order(&mut runs);
+        }
+        runs
+    }
+
+    /// How many tasks of a stage a worker can finish before it ends.
+    pub(super) fn most_that_fit(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> u64 {
+        match (self.time_left(worker, now_ms), self.needs_ms(id)) {
+            (Some(left), Some(needs)) => (left / needs.max(1)).max(1).unsigned_abs(),
+            _ => u64::MAX,
+        }
+    }
+
+    /// Whether it is for want of time that a worker gets no task of a stage; then what one is taken
+    /// to need, milliseconds.
+    pub(super) fn lacks_time(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
+        let entry = &self.stages[&id];
+        let abilities = &self.workers.get(&worker)?.abilities;
+        entry.suits(id, abilities).ok()?;
+        if let Err((needs, _)) = self.has_time(id, worker, now_ms) {
+            return Some(needs);
+        }
+        let long = self.too_long(id, worker, now_ms);
+        let pending = |run: &&Run| entry.stage.pending_at(run.lo).is_some();
+        let needs = long.iter().filter(pending).filter_map(|run| {
+            let exception = entry.exceptions.get(&run.lo)?;
+            Some(with_margin(exception.longest_ms as f64))
+        });
+        let needs = needs.min()?;
+        self.ready_for(id, worker, now_ms)
+            .is_none()
+            .then_some(needs)
+    }
+}
+
+/// The time at which a worker must end, from the milliseconds that it reports.
+pub(super) fn at(ends_in_ms: Option<u64>, now_ms: i64) -> Option<i64> {
+    let ms = i64::try_from(ends_in_ms?).unwrap_or(i64::MAX);
+    Some(now_ms.saturating_add(ms))
+}

@@ -1,0 +1,273 @@
+//! Attempts that do not end well: whom they are put down to, what they cost the task and the
+//! worker.
+
+use picofarm_catalog::{Range, RangeState};
+use picofarm_proto::{
+    ids::{RangeId, StageRef, WorkerId},
+    model::{EventKind, FailureKind},
+};
+
+use super::{About, Core, Say, SessionId, dispatch::Others, sick::Trouble, stores::store_of};
+use crate::{
+    budget::{self, Attempt, Verdict},
+    transition::RangeEvent,
+};
+
+impl Core {
+    /// One task fails and leaves its lease; `true` where that counts against the task.
+    pub(super) fn leave(
+        &mut self,
+        range: &Range,
+        task: u64,
+        kind: FailureKind,
+        message: &str,
+        now_ms: i64,
+    ) -> bool {
+        let RangeState::Leased(lease) = &range.state else {
+            return false;
+        };
+        let worker = lease.worker;
+        let counts = self.counts(range, task, kind, worker, message, now_ms);
+        let attempt = Attempt {
+            kind,
+            message,
+            ms: self.attempt_ms(range.id, task, now_ms),
+            counts,
+            at_once: false,
+        };
+        let verdict = self.charge(range, task, attempt, now_ms);
+        let event = match verdict.retry_at_ms {
+            None => EventKind::Dead,
+            // The task was given back, nothing is wrong with it.
+            _ if matches!(
+                kind,
+                FailureKind::Interrupted | FailureKind::Store | FailureKind::Damaged
+            ) =>
+            {
+                EventKind::Released
+            }
+            Some(_) => EventKind::Failed,
+        };
+        let blamed = matches!(kind, FailureKind::User | FailureKind::Crash) && !counts;
+        let about = match (&verdict.exception, blamed) {
+            (Some(e), _) if e.dead => e.last_error.clone(),
+            (_, true) => format!(
+                "{message}; not counted, as one task of the stage after another fails on this worker alone"
+            ),
+            _ => message.to_owned(),
+        };
+        let about = About::message(about)
+            .task(task)
+            .worker(self.name_of(worker));
+        self.event(now_ms, range.stage, event, about);
+        counts
+    }
+
+    /// A task leaves a lease that its worker gives back. It is pending at once the first time.
+    pub(super) fn interrupted(&mut self, range: &Range, task: u64, reason: &str, now_ms: i64) {
+        let attempt = Attempt {
+            kind: FailureKind::Interrupted,
+            message: reason,
+            ms: self.attempt_ms(range.id, task, now_ms),
+            counts: !self.came_further(range, task),
+            at_once: true,
+        };
+        let Some(range) = self.range(range.id).cloned() else {
+            return;
+        };
+        let verdict = self.charge(&range, task, attempt, now_ms);
+        if verdict.retry_at_ms.is_none() {
+            let why = verdict.exception.map(|e| e.last_error).unwrap_or_default();
+            let worker = match &range.state {
+                RangeState::Leased(lease) => self.name_of(lease.worker),
+                _ => String::new(),
+            };
+            let about = About::message(why).task(task).worker(worker);
+            self.event(now_ms, range.stage, EventKind::Dead, about);
+        }
+    }
+
+    /// A task leaves its lease because its worker is not believed: it is pending at once and costs the task nothing.
+    pub(super) fn withdraw(&mut self, range: &Range, task: u64, message: &str, now_ms: i64) {
+        let attempt = Attempt {
+            kind: FailureKind::Interrupted,
+            message,
+            ms: 0,
+            counts: false,
+            at_once: true,
+        };
+        self.charge(range, task, attempt, now_ms);
+        let worker = match &range.state {
+            RangeState::Leased(lease) => self.name_of(lease.worker),
+            _ => String::new(),
+        };
+        let about = About::message(message).task(task).worker(worker);
+        self.event(now_ms, range.stage, EventKind::Released, about);
+    }
+
+    /// How long a task has run under a lease, as far as is known, milliseconds.
+    fn attempt_ms(&self, range: RangeId, task: u64, now_ms: i64) -> u64 {
+        let progress = self.progress.get(&range).and_then(|tasks| tasks.get(&task));
+        progress.map_or(0, |p| (now_ms - p.since_ms).max(0).unsigned_abs())
+    }
+
+    /// Whether a task that goes on from where it was saved came further under this lease.
+    fn came_further(&self, range: &Range, task: u64) -> bool {
+        let resumes = self.stages[&range.stage].spec(range.stage).task.resumes();
+        let progress = self
+            .progress
+            .get(&range.id)
+            .and_then(|tasks| tasks.get(&task));
+        resumes && progress.is_some_and(|p| p.first.is_some_and(|first| p.fraction > first))
+    }
+
+    /// Puts a failure down to whom it belongs; `false` where it is not the task's to answer for.
+    fn counts(
+        &mut self,
+        range: &Range,
+        task: u64,
+        kind: FailureKind,
+        worker: WorkerId,
+        message: &str,
+        now_ms: i64,
+    ) -> bool {
+        let id = range.stage;
+        let backoff = self.settings.backoff;
+        let others = self.others(id, worker, now_ms);
+        let entry = self.stages.get_mut(&id).expect("a lease has a stage");
+        match kind {
+            FailureKind::Interrupted => {
+                self.blame(worker, Trouble::GaveBack, others, now_ms);
+                !self.came_further(range, task)
+            }
+            // The object is at fault, and is replaced or comes back.
+            FailureKind::Damaged => false,
+            FailureKind::Store => {
+                let store = store_of(&entry.spec(id).task).to_owned();
+                self.away.failed(&store, worker, message, &backoff, now_ms);
+                self.blame(worker, Trouble::Store(store), others, now_ms);
+                false
+            }
+            FailureKind::User | FailureKind::Crash => {
+                entry.blocklist.failed(worker, task, kind, &backoff, now_ms);
+                let doubts = entry.blocklist.doubts(worker);
+                self.blame(worker, Trouble::Stage(id), others, now_ms);
+                if doubts && others == Others::Good {
+                    self.take_charges_back(id, worker);
+                }
+                !(doubts && others == Others::Good)
+            }
+        }
+    }
+
+    /// Something went wrong on a worker, whatever it was.
+    pub(super) fn blame(
+        &mut self,
+        worker: WorkerId,
+        trouble: Trouble,
+        others: Others,
+        now_ms: i64,
+    ) {
+        let backoff = self.settings.backoff;
+        let others = others == Others::Good;
+        self.sick.failed(worker, trouble, others, &backoff, now_ms);
+    }
+
+    /// What tasks of a stage were charged with on a worker is the worker's. (A task that was given
+    /// up by that stays so; `retry` is for that.)
+    fn take_charges_back(&mut self, id: StageRef, worker: WorkerId) {
+        let entry = self.stages.get_mut(&id).expect("a lease has a stage");
+        for (task, kind) in entry.blocklist.take_charged(worker) {
+            let Some(exception) = entry.exceptions.get_mut(&task).filter(|e| !e.dead) else {
+                continue;
+            };
+            let count = match kind {
+                FailureKind::Crash => &mut exception.crashes,
+                _ => &mut exception.failures,
+            };
+            *count = count.saturating_sub(1);
+            self.changes
+                .exceptions
+                .insert((id, task), exception.clone());
+        }
+    }
+
+    /// Charges an attempt to its task, which leaves the lease.
+    fn charge(&mut self, range: &Range, task: u64, attempt: Attempt<'_>, now_ms: i64) -> Verdict {
+        let entry = self
+            .stages
+            .get_mut(&range.stage)
+            .expect("a lease has a stage");
+        let mut backoff = self.settings.backoff;
+        if attempt.kind == FailureKind::Crash && entry.spec(range.stage).task.resumes() {
+            // It goes on from where it was saved, so losing workers again and again is no sign that
+            // it never ends.
+            backoff.most_ms = backoff.first_ms;
+        }
+        let mut verdict = budget::charge(
+            entry.exceptions.get(&task),
+            budget::fresh(range.stage, task),
+            attempt,
+            &entry.job.spec.limits,
+            &backoff,
+            now_ms,
+        );
+        if attempt.kind == FailureKind::Damaged {
+            let wait = self
+                .away
+                .damaged((range.stage, task), &self.settings.backoff);
+            verdict.retry_at_ms = Some(now_ms + wait);
+        }
+        let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
+        if let Some(exception) = &verdict.exception {
+            self.changes
+                .exceptions
+                .insert((range.stage, task), exception.clone());
+            entry.note(exception.clone());
+        }
+        self.mark(
+            range,
+            &RangeEvent::Leave {
+                task,
+                retry_at_ms: verdict.retry_at_ms,
+                crashes,
+            },
+        );
+        verdict
+    }
+
+    /// Takes the rest of a lease from its worker, which is free for other work.
+    pub(super) fn take_back(&mut self, id: RangeId, why: &str) {
+        let Some(range) = self.range(id).cloned() else {
+            return;
+        };
+        if let RangeState::Leased(lease) = &range.state
+            && let Some(entry) = self.workers.get(&lease.worker)
+        {
+            let revoke = Say::Revoke {
+                lease: range.lease(),
+                reason: why.to_owned(),
+            };
+            self.say.push((entry.session, revoke));
+        }
+        self.close(&range, false);
+    }
+
+    /// Takes from a session's worker what it would not be given now: of a stage that fails on it,
+    /// or all where nothing goes well.
+    pub(super) fn take_back_all(&mut self, session: SessionId, stage: StageRef, now_ms: i64) {
+        let Some(worker) = self.sessions.get(&session).copied() else {
+            return;
+        };
+        let rests = self.sick.rests(worker, now_ms).is_some();
+        if !rests && self.passed_over(stage, worker, now_ms).is_none() {
+            return;
+        }
+        let leases: Vec<RangeId> = self.workers[&worker].leases.iter().copied().collect();
+        for id in leases {
+            if rests || self.leases.get(&id) == Some(&stage) {
+                self.take_back(id, "one task after another fails on this worker");
+            }
+        }
+    }
+}

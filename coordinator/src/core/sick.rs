@@ -1,0 +1,166 @@
+//! Workers that fail, or give back, whatever they get: a full disk, a wrong mount, a machine about
+//! to end. Such a worker rests ever longer, whatever the kind of its failures, until something goes
+//! well on it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use picofarm_proto::ids::{StageRef, WorkerId};
+
+use crate::budget::Backoff;
+
+/// Leases given back in a row that cost nothing: a worker that ends gives back all it has.
+const FREE: u32 = 3;
+/// Stages and stores that fail on a worker, and nothing goes well between, until the worker is to
+/// blame.
+const SUBJECTS: usize = 3;
+/// After so long without trouble the count begins again, milliseconds.
+const FORGET_MS: i64 = 300_000;
+
+/// The workers on which nothing has gone well since the last failure.
+#[derive(Debug, Default)]
+pub(super) struct Sick(BTreeMap<WorkerId, Row>);
+
+/// What went wrong on a worker.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Trouble {
+    /// A task of this stage failed, or was lost with the worker.
+    Stage(StageRef),
+    /// This store could not be used.
+    Store(String),
+    /// It gave a task or a lease back.
+    GaveBack,
+}
+
+#[derive(Debug, Default)]
+struct Row {
+    subjects: BTreeSet<Trouble>,
+    given_back: u32,
+    tries: u32,
+    until_ms: i64,
+    last_ms: i64,
+}
+
+impl Sick {
+    /// Something went wrong on a worker. `others`: there are workers that could take its work.
+    pub(super) fn failed(
+        &mut self,
+        worker: WorkerId,
+        trouble: Trouble,
+        others: bool,
+        backoff: &Backoff,
+        now_ms: i64,
+    ) {
+        let row = self.0.entry(worker).or_default();
+        if row.last_ms.max(row.until_ms) + FORGET_MS < now_ms {
+            *row = Row::default();
+        }
+        row.last_ms = now_ms;
+        let blamed = if trouble == Trouble::GaveBack {
+            row.given_back = row.given_back.saturating_add(1);
+            row.given_back > FREE
+        } else {
+            if row.subjects.len() < SUBJECTS {
+                row.subjects.insert(trouble);
+            }
+            // Where it is the only one, its tasks may be as much to blame.
+            others && row.subjects.len() >= SUBJECTS
+        };
+        // Tasks that ran on it at that time fail too, which counts once.
+        if blamed && now_ms >= row.until_ms {
+            row.tries = row.tries.saturating_add(1);
+            row.until_ms = now_ms + backoff.after(row.tries);
+        }
+    }
+
+    /// Something went well on a worker.
+    pub(super) fn succeeded(&mut self, worker: WorkerId) {
+        self.0.remove(&worker);
+    }
+
+    /// Whether a worker rests; then for how much longer, milliseconds.
+    pub(super) fn rests(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
+        let left = self.0.get(&worker)?.until_ms - now_ms;
+        (left > 0).then_some(left)
+    }
+
+    /// Whether the next lease of a worker is a try: then it has one task.
+    pub(super) fn is_try(&self, worker: WorkerId) -> bool {
+        self.0.get(&worker).is_some_and(|row| row.tries > 0)
+    }
+
+    /// Forgets workers that have had no trouble for long.
+    pub(super) fn tidy(&mut self, now_ms: i64) {
+        self.0
+            .retain(|_, row| row.last_ms.max(row.until_ms) + FORGET_MS >= now_ms);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use picofarm_proto::ids::JobId;
+    use uuid::Uuid;
+
+    use super::*;
+
+    const BACKOFF: Backoff = Backoff {
+        first_ms: 1_000,
+        most_ms: 60_000,
+    };
+
+    fn worker(n: u128) -> WorkerId {
+        WorkerId::from_uuid(Uuid::from_u128(n))
+    }
+
+    fn stage(n: u128) -> Trouble {
+        Trouble::Stage(StageRef {
+            job: JobId::from_uuid(Uuid::from_u128(n)),
+            stage: 0,
+        })
+    }
+
+    #[test]
+    fn a_worker_that_gives_everything_back_gets_ever_less() {
+        let (mut sick, mut now, mut leases) = (Sick::default(), 0, 0);
+        // It asks again every millisecond.
+        while now < 60_000 {
+            if sick.rests(worker(1), now).is_none() {
+                leases += 1;
+                sick.failed(worker(1), Trouble::GaveBack, false, &BACKOFF, now);
+            }
+            now += 1;
+        }
+        assert!((5..=10).contains(&leases), "{leases} leases in a minute");
+        assert!(sick.is_try(worker(1)) && sick.rests(worker(2), 0).is_none());
+        sick.succeeded(worker(1));
+        assert_eq!(sick.rests(worker(1), 4), None);
+    }
+
+    #[test]
+    fn failures_of_one_stage_are_not_the_workers_and_those_of_three_are() {
+        let mut sick = Sick::default();
+        for _ in 0..9 {
+            sick.failed(worker(1), stage(1), true, &BACKOFF, 0);
+        }
+        sick.failed(worker(1), stage(2), true, &BACKOFF, 0);
+        assert_eq!(sick.rests(worker(1), 0), None);
+        let store = Trouble::Store("s3://b/x".into());
+        sick.failed(worker(1), store, true, &BACKOFF, 0);
+        assert_eq!(sick.rests(worker(1), 0), Some(1_000));
+        for n in 1..=9 {
+            sick.failed(worker(2), stage(n), false, &BACKOFF, 0);
+        }
+        assert_eq!(sick.rests(worker(2), 0), None, "it is the only one");
+    }
+
+    #[test]
+    fn trouble_long_ago_is_forgotten() {
+        let mut sick = Sick::default();
+        for hour in 0..9 {
+            let now = hour * 3_600_000;
+            sick.failed(worker(1), Trouble::GaveBack, true, &BACKOFF, now);
+            assert_eq!(sick.rests(worker(1), now), None);
+        }
+        sick.tidy(9 * 3_600_000);
+        assert!(sick.0.is_empty());
+    }
+}

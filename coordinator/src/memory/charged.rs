@@ -1,0 +1,331 @@
+//! The layer that charges requests and answers. It is behind the guard: nothing of a request's body is read before its
+//! caller is known.
+
+use std::{
+    collections::VecDeque,
+    future::{Future, poll_fn},
+    pin::Pin,
+    sync::Arc,
+    task::{Context, Poll},
+    time::Duration,
+};
+
+use bytes::Bytes;
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use tokio_util::sync::{CancellationToken, DropGuard};
+use tonic::{Status, body::Body};
+use tower::{Layer, Service};
+
+use super::{Account, Charge, Memory, TWICE, Who};
+use crate::{
+    auth::Caller,
+    connections::{Peer, Place},
+};
+
+/// The one method whose requests are a stream; its messages are small.
+const SESSION: &str = "/picofarm.v1.Farm/Session";
+/// A message's flags and length.
+const PREFIX: usize = 5;
+/// What an open request takes by itself: headers, task, buffers.
+const CALL: u64 = 16 << 10;
+/// How long the beginning of a message may take.
+const BEGINNING: Duration = Duration::from_secs(20);
+/// How long the rest may take.
+const WHOLE: Duration = Duration::from_secs(120);
+/// Messages of a session up to this length are free: there is room for them anyway.
+const FREE: u64 = 16 << 10;
+/// A part of an answer that is longer has to be taken in time.
+const LARGE: usize = 32 << 10;
+/// How long taking it may take, and for each MiB.
+const TAKEN: Duration = Duration::from_secs(30);
+
+/// Charges requests.
+#[derive(Clone)]
+pub(crate) struct Charging(pub Arc<Memory>);
+
+impl<S> Layer<S> for Charging {
+    type Service = Charged<S>;
+
+    fn layer(&self, inner: S) -> Charged<S> {
+        Charged {
+            inner,
+            memory: Arc::clone(&self.0),
+        }
+    }
+}
+
+/// A service whose requests are charged.
+#[derive(Clone)]
+pub(crate) struct Charged<S> {
+    inner: S,
+    memory: Arc<Memory>,
+}
+
+impl<S> Service<http::Request<Body>> for Charged<S>
+where
+    S: Service<http::Request<Body>, Response = http::Response<Body>> + Clone + Send + 'static,
+    S::Future: Send + 'static,
+{
+    type Response = S::Response;
+    type Error = S::Error;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        let place = request.extensions().get::<Peer>().map(Peer::place);
+        let account = account(&self.memory, &request);
+        // The service that is ready is this one.
+        let ready = self.inner.clone();
+        let mut inner = std::mem::replace(&mut self.inner, ready);
+        if request.uri().path() == SESSION {
+            let request = request.map(|body| Body::new(Messages::new(body, account)));
+            return Box::pin(inner.call(request));
+        }
+        Box::pin(async move {
+            let (mut parts, body) = request.into_parts();
+            let (body, call, charge) = match begin(body, &account).await {
+                Ok(begun) => begun,
+                Err(refused) => return Ok(refused.into_http()),
+            };
+            parts.extensions.insert(account.clone().holding(charge));
+            let request = http::Request::from_parts(parts, Body::new(body));
+            let answer = inner.call(request).await?;
+            Ok(answer.map(|body| {
+                Body::new(Answer {
+                    body,
+                    account,
+                    place,
+                    part: None,
+                    _call: call,
+                })
+            }))
+        })
+    }
+}
+
+fn account<B>(memory: &Arc<Memory>, request: &http::Request<B>) -> Account {
+    let (caller, peer) = (
+        request.extensions().get::<Caller>(),
+        request.extensions().get::<Peer>(),
+    );
+    let address = peer.map(|peer| Who::Address(peer.address.ip().into()));
+    let name = caller.map(|caller| Who::Name(Arc::clone(&caller.name)));
+    let unknown = caller.is_none_or(Caller::is_anyone);
+    let who = match unknown {
+        true => address.or(name),
+        false => name,
+    };
+    let who = who.unwrap_or_else(|| Who::Name("".into()));
+    let connection = peer.map_or(u64::MAX, |peer| peer.place().id());
+    Account::new(Arc::clone(memory), who, connection)
+}
+
+/// Reads a request's body up to the length of its message, and charges it.
+async fn begin(mut body: Body, account: &Account) -> Result<(Begun, Charge, Charge), Status> {
+    let mut first = VecDeque::new();
+    let mut prefix = Vec::with_capacity(PREFIX);
+    let reading = async {
+        while prefix.len() < PREFIX {
+            let Some(frame) = poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await
+            else {
+                break;
+            };
+            let frame = frame?;
+            if let Some(data) = frame.data_ref() {
+                prefix.extend(data.iter().take(PREFIX - prefix.len()));
+            }
+            first.push_back(frame);
+        }
+        Ok::<_, Status>(())
+    };
+    let read = tokio::time::timeout(BEGINNING, reading).await;
+    read.map_err(|_| {
+        Status::deadline_exceeded("no message within 20 s of the request's headers")
+    })??;
+    let length = length(&prefix).unwrap_or(0);
+    if length > crate::server::MAX_MESSAGE_BYTES as u64 {
+        return Err(Status::resource_exhausted(format!(
+            "the message is {length} bytes long; at most {} are allowed",
+            crate::server::MAX_MESSAGE_BYTES
+        )));
+    }
+    let call = account.charge("the request", CALL).await?;
+    let charge = account.charge("the request", TWICE * length).await?;
+    let begun = Begun {
+        first,
+        rest: body,
+        late: Box::pin(tokio::time::sleep(WHOLE)),
+    };
+    Ok((begun, call, charge))
+}
+
+/// The length in a message's prefix.
+fn length(prefix: &[u8]) -> Option<u64> {
+    let length: [u8; 4] = prefix.get(1..PREFIX)?.try_into().ok()?;
+    Some(u32::from_be_bytes(length).into())
+}
+
+/// A request's body whose beginning was read.
+struct Begun {
+    first: VecDeque<Frame<Bytes>>,
+    rest: Body,
+    late: Pin<Box<tokio::time::Sleep>>,
+}
+
+impl HttpBody for Begun {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        if let Some(frame) = self.first.pop_front() {
+            return Poll::Ready(Some(Ok(frame)));
+        }
+        match Pin::new(&mut self.rest).poll_frame(context) {
+            Poll::Pending => self.late.as_mut().poll(context).map(|()| {
+                Some(Err(Status::deadline_exceeded(
+                    "the request's message did not arrive within 120 s",
+                )))
+            }),
+            frame => frame,
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.first.is_empty() && self.rest.is_end_stream()
+    }
+}
+
+/// The messages of a session as they come. Its buffer keeps the size of the longest.
+struct Messages {
+    body: Body,
+    account: Account,
+    prefix: Vec<u8>,
+    /// Bytes of the message in hand that are still to come.
+    left: u64,
+    longest: u64,
+    charges: Vec<Charge>,
+}
+
+impl Messages {
+    fn new(body: Body, account: Account) -> Self {
+        Self {
+            body,
+            account,
+            prefix: Vec::with_capacity(PREFIX),
+            left: 0,
+            longest: FREE,
+            charges: Vec::new(),
+        }
+    }
+
+    fn pass(&mut self, mut data: &[u8]) -> Result<(), Status> {
+        while !data.is_empty() {
+            if self.left > 0 {
+                let some = self.left.min(data.len() as u64);
+                self.left -= some;
+                data = data.get(some as usize..).unwrap_or_default();
+                continue;
+            }
+            let some = (PREFIX - self.prefix.len()).min(data.len());
+            let (begin, rest) = data.split_at(some);
+            self.prefix.extend_from_slice(begin);
+            data = rest;
+            if let Some(length) = length(&self.prefix) {
+                self.prefix.clear();
+                self.left = length;
+                if length > self.longest {
+                    let more = TWICE * (length - self.longest);
+                    let charge = self.account.charge_now("a worker's message", more)?;
+                    self.charges.push(charge);
+                    self.longest = length;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl HttpBody for Messages {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let polled = Pin::new(&mut self.body).poll_frame(context);
+        if let Poll::Ready(Some(Ok(frame))) = &polled
+            && let Some(data) = frame.data_ref()
+            && let Err(refused) = self.pass(data)
+        {
+            return Poll::Ready(Some(Err(refused)));
+        }
+        polled
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+}
+
+/// An answer whose request is charged until it is over, and each of whose parts until the next is asked for.
+struct Answer {
+    body: Body,
+    account: Account,
+    place: Option<Arc<Place>>,
+    part: Option<(Charge, Option<DropGuard>)>,
+    _call: Charge,
+}
+
+impl HttpBody for Answer {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        // The part before has been taken, or this would not be asked for.
+        self.part = None;
+        let polled = Pin::new(&mut self.body).poll_frame(context);
+        if let Poll::Ready(Some(Ok(frame))) = &polled
+            && let Some(data) = frame.data_ref()
+        {
+            let charge = self.account.count(data.len() as u64);
+            let place = self.place.as_ref().filter(|_| data.len() > LARGE);
+            let watched = place.map(|place| watch(Arc::clone(place), data.len()));
+            self.part = Some((charge, watched));
+        }
+        polled
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// Ends a connection that does not take a part of an answer, unless the value is dropped before.
+fn watch(place: Arc<Place>, bytes: usize) -> DropGuard {
+    let taken = CancellationToken::new();
+    let guard = taken.clone().drop_guard();
+    let patience = TAKEN * u32::try_from(1 + (bytes >> 20)).unwrap_or(u32::MAX);
+    tokio::spawn(async move {
+        if tokio::time::timeout(patience, taken.cancelled())
+            .await
+            .is_err()
+        {
+            place.hang_up();
+        }
+    });
+    guard
+}

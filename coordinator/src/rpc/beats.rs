@@ -1,0 +1,256 @@
+//! Heartbeats are answered by their session, at once, for the leases that the actor last said are live: a lease must not run
+//! out because the actor waits for the catalog. The actor hears of them all the same, and what it answers counts.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    sync::{Mutex, MutexGuard},
+    time::{Duration, Instant},
+};
+
+use picofarm_proto::ids::LeaseRef;
+
+use crate::core::Say;
+
+/// For how long leases are prolonged without a word of the actor: this, or so many leases. Then the worker shall look for
+/// another coordinator.
+const SILENCE: Duration = Duration::from_secs(60);
+const LEASES: u32 = 4;
+
+/// A lease that the actor said is live.
+#[derive(Debug, Clone, Copy)]
+struct Live {
+    /// How many heartbeats the actor had been told of when it said so last.
+    told: u64,
+    /// Tasks whose reports were not answered; `None` = not known, and the next answer may be the last.
+    left: Option<u64>,
+}
+
+/// What one session knows of its leases.
+#[derive(Debug)]
+pub(super) struct Beats {
+    state: Mutex<State>,
+    silence: Duration,
+}
+
+#[derive(Debug)]
+struct State {
+    live: HashMap<LeaseRef, Live>,
+    /// Heartbeats that the actor was told of.
+    told: u64,
+    /// Those that it has not answered, with what was answered here.
+    open: VecDeque<(u64, Option<Vec<LeaseRef>>)>,
+    /// The worker has taken back what it asked for, and takes the answer to the next heartbeat that the actor is told of for
+    /// the end of what was granted before: number of that heartbeat.
+    withdrawn: Option<u64>,
+    /// When the actor last said anything.
+    heard: Instant,
+}
+
+impl Beats {
+    pub(super) fn new(lease_ms: u32) -> Self {
+        let lease = Duration::from_millis(lease_ms.into());
+        Self {
+            state: Mutex::new(State {
+                live: HashMap::new(),
+                told: 0,
+                open: VecDeque::new(),
+                withdrawn: None,
+                heard: Instant::now(),
+            }),
+            silence: SILENCE.max(lease * LEASES),
+        }
+    }
+
+    /// The answer to a heartbeat for these leases, if there are any and all of them are known to be live. Answers keep their
+    /// order: there is none while the actor owes one.
+    pub(super) fn answer(&self, leases: &[LeaseRef]) -> Option<Vec<LeaseRef>> {
+        let state = self.lock();
+        let known = leases.iter().all(|lease| state.live.contains_key(lease));
+        let owed = state.open.iter().any(|(_, answered)| answered.is_none());
+        let heard = state.heard.elapsed() < self.silence;
+        let free = !owed && state.withdrawn.is_none();
+        (known && heard && free && !leases.is_empty()).then(|| leases.to_vec())
+    }
+
+    /// The worker has taken back what it asked for.
+    pub(super) fn withdraw(&self) {
+        let mut state = self.lock();
+        state.withdrawn = Some(state.told + 1);
+    }
+
+    /// The actor is told of a heartbeat that was answered so here, or not at all.
+    pub(super) fn tell(&self, answered: Option<Vec<LeaseRef>>) {
+        let mut state = self.lock();
+        state.told += 1;
+        let told = state.told;
+        state.open.push_back((told, answered));
+    }
+
+    /// What the worker is to hear when the actor says this: each heartbeat has one answer.
+    pub(super) fn hear(&self, say: Say) -> Vec<Say> {
+        let mut state = self.lock();
+        state.heard = Instant::now();
+        match &say {
+            Say::Lease(lease) => {
+                let told = state.told;
+                let tasks = (lease.hi - lease.lo).saturating_sub(lease.skip.len() as u64);
+                let left = Some(tasks);
+                state.live.insert(lease.lease, Live { told, left });
+            }
+            Say::Revoke { lease, .. } => {
+                state.live.remove(lease);
+            }
+            Say::Renewed { leases, .. } => {
+                if let Some((told, answered)) = state.open.pop_front() {
+                    let instead = state.renewed(told, answered, leases);
+                    return instead.unwrap_or_else(|| vec![say]);
+                }
+            }
+            Say::Acknowledge { lease, .. } => {
+                let live = state.live.get_mut(lease);
+                let left = live.map(|live| {
+                    live.left = live.left.map(|left| left.saturating_sub(1));
+                    live.left.unwrap_or(0)
+                });
+                if left == Some(0) {
+                    state.live.remove(lease);
+                }
+            }
+            Say::Trim { lease, .. } => {
+                if let Some(live) = state.live.get_mut(lease) {
+                    live.left = None;
+                }
+            }
+            Say::Drain | Say::Replaced => {}
+        }
+        vec![say]
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().expect("no panic while locked")
+    }
+}
+
+impl State {
+    /// The actor answers a heartbeat with these leases. Where it was answered here, what the worker has to hear of it.
+    fn renewed(
+        &mut self,
+        told: u64,
+        answered: Option<Vec<LeaseRef>>,
+        leases: &[LeaseRef],
+    ) -> Option<Vec<Say>> {
+        if self.withdrawn.is_some_and(|at| at <= told) {
+            self.withdrawn = None;
+        }
+        let revoke = |lease: LeaseRef| Say::Revoke {
+            lease,
+            reason: "the lease is no longer live: it ran out or is finished".into(),
+        };
+        let instead = answered.map(|answered| {
+            let known = answered.into_iter().filter(|l| self.live.contains_key(l));
+            let lost = known.filter(|lease| !leases.contains(lease));
+            lost.map(revoke).collect()
+        });
+        // Those granted since the heartbeat was sent are not among its leases.
+        self.live
+            .retain(|lease, live| live.told >= told || leases.contains(lease));
+        for lease in leases {
+            let live = self.live.entry(*lease);
+            live.or_insert(Live { told, left: None }).told = told;
+        }
+        instead
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use picofarm_proto::ids::{Epoch, RangeId};
+    use uuid::Uuid;
+
+    use super::*;
+
+    fn lease(n: u128) -> LeaseRef {
+        LeaseRef {
+            range: RangeId::from_uuid(Uuid::from_u128(n)),
+            epoch: Epoch(1),
+        }
+    }
+
+    fn renewed(leases: &[LeaseRef]) -> Say {
+        Say::Renewed {
+            leases: leases.to_vec(),
+            ttl_ms: 1,
+        }
+    }
+
+    #[test]
+    fn only_what_the_actor_said_is_live_is_prolonged_and_each_heartbeat_has_one_answer() {
+        let beats = Beats::new(1_000);
+        let (a, b) = (lease(1), lease(2));
+        assert_eq!(beats.answer(&[a]), None, "the actor has not said so");
+        beats.tell(None);
+        assert_eq!(beats.answer(&[]), None, "the actor owes an answer");
+        assert_eq!(beats.hear(renewed(&[a])), [renewed(&[a])]);
+        assert_eq!(beats.answer(&[a]), Some(vec![a]));
+        assert_eq!(beats.answer(&[a, b]), None);
+        beats.tell(beats.answer(&[a]));
+        assert_eq!(beats.hear(renewed(&[a])), [], "the worker has heard it");
+        beats.tell(beats.answer(&[a]));
+        let heard = beats.hear(renewed(&[]));
+        assert!(
+            matches!(&heard[..], [Say::Revoke { lease, .. }] if *lease == a),
+            "the actor knows better: {heard:?}"
+        );
+        assert_eq!(beats.answer(&[a]), None);
+    }
+
+    #[test]
+    fn a_lease_whose_last_report_was_answered_is_not_prolonged() {
+        let beats = Beats::new(1_000);
+        let a = lease(1);
+        beats.tell(None);
+        beats.hear(renewed(&[a]));
+        assert_eq!(beats.answer(&[a]), Some(vec![a]));
+        beats.hear(Say::Acknowledge {
+            lease: a,
+            index: 0,
+            accepted: true,
+            reason: String::new(),
+        });
+        assert_eq!(beats.answer(&[a]), None, "how many are left is not known");
+    }
+
+    #[test]
+    fn the_answer_after_a_withdrawal_is_the_actors() {
+        let beats = Beats::new(1_000);
+        let a = lease(1);
+        beats.tell(None);
+        beats.hear(renewed(&[a]));
+        beats.tell(beats.answer(&[a]));
+        beats.withdraw();
+        assert_eq!(beats.answer(&[a]), None);
+        assert_eq!(beats.hear(renewed(&[a])), [], "this one was sent before it");
+        assert_eq!(beats.answer(&[a]), None);
+        beats.tell(None);
+        assert_eq!(beats.hear(renewed(&[a])), [renewed(&[a])]);
+        assert_eq!(beats.answer(&[a]), Some(vec![a]));
+    }
+
+    #[test]
+    fn a_revoked_lease_is_not_prolonged_and_a_silent_actor_prolongs_none() {
+        let mut beats = Beats::new(1_000);
+        let (a, b) = (lease(1), lease(2));
+        for one in [a, b] {
+            beats.tell(None);
+            beats.hear(renewed(&[one]));
+        }
+        assert_eq!(beats.answer(&[a]), None, "the worker named it no more");
+        let reason = String::new();
+        beats.hear(Say::Revoke { lease: b, reason });
+        assert_eq!(beats.answer(&[b]), None);
+        beats.tell(None);
+        beats.hear(renewed(&[a]));
+        beats.silence = Duration::ZERO;
+        assert_eq!(beats.answer(&[a]), None);
+    }
+}

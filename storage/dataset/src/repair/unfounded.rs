@@ -1,0 +1,67 @@
+//! Replacing a published scene whose manifest is not true: it names objects that are missing or have other bytes.
+//!
+//! A worker that makes up a manifest would otherwise hold its scene for ever, because objects are only created. Equal
+//! scenes never come here, and a scene whose objects all agree with its manifest is left alone.
+
+use crate::error::DatasetError;
+use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::repair::held::SMALL;
+use crate::scenes::dataset::Dataset;
+use crate::scenes::encode::EncodedScene;
+use crate::store::objects;
+
+impl Dataset {
+    /// Replaces what is stored of a scene by `scene`, if a manifest is stored that its objects contradict. Returns the new
+    /// manifest, or `None` if nothing was written.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn replace_unfounded(
+        &self,
+        scene: EncodedScene,
+    ) -> Result<Option<Manifest>, DatasetError> {
+        let EncodedScene { manifest, bytes } = scene;
+        let path = self.path(&Manifest::key(manifest.scene));
+        let Some(stored) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        let named = self.usable_manifest(&stored, manifest.scene, &self.shown(&path));
+        if let Ok(named) = &named
+            && self.is_founded(named).await?
+        {
+            return Ok(None);
+        }
+        tracing::error!(
+            manifest = self.shown(&path),
+            "the stored manifest does not describe the stored objects; the scene is replaced by the one made now"
+        );
+        for (object, bytes) in manifest.objects.iter().zip(bytes) {
+            let path = self.path(&object.key);
+            let there = objects::get(&*self.store, &path).await?;
+            if there.as_ref() != Some(&bytes) {
+                self.replace(&path, bytes).await?;
+            }
+        }
+        self.replace(&path, manifest.to_bytes().into()).await?;
+        Ok(Some(manifest))
+    }
+
+    /// Whether the objects of a scene have the bytes that its manifest names. Larger scenes are not read, and pass.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn agrees(&self, manifest: &Manifest) -> Result<bool, DatasetError> {
+        Ok(manifest.total_bytes() > SMALL || self.is_founded(manifest).await?)
+    }
+
+    /// Whether every object that a manifest names has the bytes that it names.
+    async fn is_founded(&self, manifest: &Manifest) -> Result<bool, DatasetError> {
+        for object in &manifest.objects {
+            let there = objects::get(&*self.store, &self.path(&object.key)).await?;
+            if there.is_none_or(|bytes| sha256_hex(&bytes) != object.sha256) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+}

@@ -1,0 +1,58 @@
+//! Whether a folder that a task is to write into is empty or of the task's own kind.
+
+use object_store::ObjectStore;
+use object_store::path::Path;
+
+use crate::error::DatasetError;
+use crate::store::objects::shown;
+
+/// The names directly below `prefix`, without hidden ones.
+pub(crate) async fn names(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+) -> Result<Vec<String>, DatasetError> {
+    let listed = store.list_with_delimiter(Some(prefix)).await;
+    let listed = listed.map_err(|e| DatasetError::store("list", shown(store, prefix), e))?;
+    let objects = listed.objects.iter().map(|object| &object.location);
+    let names = objects.chain(&listed.common_prefixes);
+    let names = names.filter_map(|path| path.filename().map(str::to_owned));
+    Ok(names.filter(|name| !name.starts_with('.')).collect())
+}
+
+/// Checks that everything directly below `prefix` has a name that the task itself gives, so that it writes into no data of
+/// others. Hidden names are ignored.
+///
+/// # Errors
+/// [`DatasetError::Invalid`] at `field` that names a foreign entry; [`DatasetError::Store`].
+pub async fn check_own_folder(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    field: &str,
+    is_own: impl Fn(&str) -> bool,
+) -> Result<(), DatasetError> {
+    match names(store, prefix)
+        .await?
+        .iter()
+        .find(|name| !is_own(name))
+    {
+        None => Ok(()),
+        Some(name) => Err(foreign(store, prefix, field, name)),
+    }
+}
+
+/// The error for a folder with an entry that the task does not write.
+pub(crate) fn foreign(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    field: &str,
+    name: &str,
+) -> DatasetError {
+    DatasetError::invalid(
+        field,
+        format!(
+            "{} has {name:?} in it, which is not of this kind; expected a new or empty folder, or one that the same kind of \
+             job has begun; choose another folder",
+            shown(store, prefix)
+        ),
+    )
+}

@@ -1,0 +1,168 @@
+//! A store's identity: a small object in its root with a random number, as restic's config and Ceph's fsid. A folder that
+//! is not mounted, or another store at the same place, has none or another one.
+//!
+//! Only a submission creates it, and only create-only: the submission is the first that uses a store, it knows for which
+//! job, and its person sees what it reports. A worker never does: one whose folder is not mounted could not tell that from
+//! a new store. The identity is no part of task keys or of published bytes.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use object_store::path::Path;
+use object_store::{Error, ObjectStore, ObjectStoreExt};
+use uuid::Uuid;
+
+use super::guard::Guarded;
+use super::objects;
+use crate::error::DatasetError;
+
+/// Its key in the store's root.
+pub(crate) const IDENTITY: &str = ".picofarm-store.json";
+/// The field that has the number.
+const FIELD: &str = "picofarm_store";
+/// How long a look at the identity of a store over a network counts. Folders are looked at before each write: there it costs
+/// next to nothing, and only folders are unmounted.
+pub(super) const FRESH: Duration = Duration::from_secs(10);
+
+/// A store that is not the expected one.
+#[derive(Debug)]
+pub(crate) struct Mismatch(String);
+
+impl fmt::Display for Mismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for Mismatch {}
+
+impl Mismatch {
+    /// That of an error of a store.
+    pub(crate) fn among<'a>(
+        chain: &[&'a (dyn std::error::Error + 'static)],
+    ) -> Option<&'a Mismatch> {
+        chain.iter().find_map(|e| e.downcast_ref())
+    }
+}
+
+impl From<Mismatch> for Error {
+    fn from(mismatch: Mismatch) -> Self {
+        Error::Generic {
+            store: "identity",
+            source: Box::new(mismatch),
+        }
+    }
+}
+
+fn key(prefix: &Path) -> Path {
+    prefix.clone().join(IDENTITY)
+}
+
+fn parse(bytes: &[u8]) -> Option<Uuid> {
+    let value: serde_json::Value = serde_json::from_slice(bytes).ok()?;
+    value[FIELD].as_str()?.parse().ok()
+}
+
+fn damaged(store: &dyn ObjectStore, prefix: &Path) -> DatasetError {
+    DatasetError::Damaged {
+        object: objects::shown(store, &key(prefix)),
+        what: format!(
+            "expected the store's identity, JSON with a UUID in {FIELD:?}; put it back from a copy"
+        ),
+    }
+}
+
+/// The identity of the store at `prefix`; `None` where it has none.
+///
+/// # Errors
+/// [`DatasetError::Damaged`] where its object cannot be read as one; [`DatasetError::Store`].
+pub async fn store_identity(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+) -> Result<Option<Uuid>, DatasetError> {
+    let Some(bytes) = objects::get(store, &key(prefix)).await? else {
+        return Ok(None);
+    };
+    let identity = parse(&bytes).ok_or_else(|| damaged(store, prefix))?;
+    Ok(Some(identity))
+}
+
+/// The identity of the store at `prefix`, which it is given if it has none. Of several that do this at a time, all get the
+/// same. For submissions only: see above.
+///
+/// # Errors
+/// As [`store_identity`].
+pub async fn identify_store(store: &dyn ObjectStore, prefix: &Path) -> Result<Uuid, DatasetError> {
+    if let Some(identity) = store_identity(store, prefix).await? {
+        return Ok(identity);
+    }
+    let identity = Uuid::new_v4();
+    let text = format!("{}\n", serde_json::json!({FIELD: identity.to_string()}));
+    if objects::create(store, &key(prefix), Bytes::from(text)).await? {
+        return Ok(identity);
+    }
+    // Another one was first.
+    let theirs = store_identity(store, prefix).await?;
+    theirs.ok_or_else(|| damaged(store, prefix))
+}
+
+/// The store at `prefix` for somebody who expects its identity: writes fail where it has none or another one, and so do
+/// reads of what is missing. A folder that is gone is not made again.
+pub fn expect_identity(
+    store: Arc<dyn ObjectStore>,
+    prefix: &Path,
+    identity: Uuid,
+) -> Arc<dyn ObjectStore> {
+    Arc::new(Guarded::new(store, prefix, identity))
+}
+
+/// Checks the identity of the store at `prefix`.
+///
+/// # Errors
+/// [`DatasetError::Store`] with the reason.
+pub async fn check_identity(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    identity: Uuid,
+) -> Result<(), DatasetError> {
+    let checked = check(store, prefix, identity).await;
+    checked.map_err(|e| DatasetError::store("use", objects::shown(store, prefix), e))
+}
+
+/// The same with an error of stores.
+pub(super) async fn check(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    expected: Uuid,
+) -> Result<(), Error> {
+    let (place, ask) = match objects::folder(store, prefix) {
+        Some(folder) => (format!("the folder {}", folder.display()), "is it mounted?"),
+        None => (
+            objects::shown(store, prefix),
+            "is this the right bucket, and are its objects all there?",
+        ),
+    };
+    let bytes = match store.get(&key(prefix)).await {
+        Ok(found) => found.bytes().await?,
+        Err(e @ Error::NotFound { .. }) if !super::failure::no_bucket(&e) => {
+            let what = format!("{place} has no store identity; expected {expected}; {ask}");
+            return Err(Mismatch(what).into());
+        }
+        Err(e) => return Err(e),
+    };
+    match parse(&bytes) {
+        Some(found) if found == expected => Ok(()),
+        Some(found) => {
+            let what =
+                format!("{place} has the store identity {found}; expected {expected}; {ask}");
+            Err(Mismatch(what).into())
+        }
+        None => {
+            let what =
+                format!("{place} has a store identity that cannot be read; expected {expected}");
+            Err(Mismatch(what).into())
+        }
+    }
+}

@@ -1,0 +1,228 @@
+//! What a result is worth, as one line: beside the answers that need no network, or beside a guess.
+
+use serde::Serialize;
+use serde_json::Value;
+
+/// Loss of a held-out ray of a reconstruction that stops half the light everywhere: what a guess has.
+pub const GUESS: f64 = std::f64::consts::LN_2;
+
+/// One line about a result.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Verdict {
+    /// Whether somebody should look before the result is used.
+    pub doubtful: bool,
+    /// The line.
+    pub text: String,
+}
+
+impl Verdict {
+    fn good(text: String) -> Self {
+        Self {
+            doubtful: false,
+            text,
+        }
+    }
+
+    fn doubtful(text: String) -> Self {
+        Self {
+            doubtful: true,
+            text,
+        }
+    }
+
+    /// Of an evaluation's figures (`mae_m`, or `iou`, and `baselines`), for a model that predicts `kind` (`tof`, `shadow`,
+    /// `specular`).
+    pub fn of_evaluation(kind: &str, metrics: &Value) -> Self {
+        let (name, figure) = match kind {
+            "tof" => ("mae_m", "depth MAE"),
+            _ => ("iou", "IoU"),
+        };
+        let less_is_better = kind == "tof";
+        let Some(own) = metrics[name].as_f64() else {
+            return Self::doubtful(format!("no figure: {name} is not a number"));
+        };
+        let shown = |x: f64| match less_is_better {
+            true => format!("{x:.4} m"),
+            false => format!("{x:.4}"),
+        };
+        let trivial = metrics["baselines"].as_object().into_iter().flatten();
+        let trivial = trivial.filter_map(|(answer, m)| Some((answer, m[name].as_f64()?)));
+        // Worst first, so that the best of equals is the first by name.
+        let best = trivial.min_by(|a, b| match less_is_better {
+            true => a.1.total_cmp(&b.1),
+            false => b.1.total_cmp(&a.1),
+        });
+        let Some((answer, best)) = best else {
+            return Self::doubtful(format!(
+                "{figure} {}, compared with nothing: no trivial answer was evaluated",
+                shown(own)
+            ));
+        };
+        let better = match less_is_better {
+            true => own < best,
+            false => own > best,
+        };
+        let answer = answer_name(kind, answer);
+        let beside = format!(
+            "{figure} {} against {} of {answer}",
+            shown(own),
+            shown(best)
+        );
+        match better {
+            true => Self::good(format!("better than every trivial answer: {beside}")),
+            false => Self::doubtful(format!("no better than a trivial answer: {beside}")),
+        }
+    }
+
+    /// Of a reconstruction's `metrics.json`.
+    pub fn of_reconstruction(metrics: &Value) -> Self {
+        let agreement = &metrics["agreement"];
+        let reasons = agreement["reasons"].as_array().into_iter().flatten();
+        let mut against: Vec<&str> = reasons.filter_map(Value::as_str).collect();
+        let loss = metrics["held_out_loss"].as_f64();
+        let worse = loss.filter(|loss| *loss > GUESS).map(|loss| {
+            format!("held-out loss {loss:.3}, worse than a guess ({GUESS:.3}): its shadows are not explained")
+        });
+        against.extend(worse.as_deref());
+        if !against.is_empty() {
+            return Self::doubtful(format!("do not trust it: {}", against.join("; ")));
+        }
+        let residual = agreement["time_residual_m"].as_f64();
+        let mut said = Vec::new();
+        said.extend(residual.map(|m| format!("times agree to {m:.4} m")));
+        said.extend(loss.map(|loss| format!("held-out loss {loss:.3} (a guess has {GUESS:.3})")));
+        match (said.is_empty(), agreement.is_null()) {
+            (false, _) => Self::good(said.join(", ")),
+            (true, false) => Self::good("its measurements agree".into()),
+            (true, true) => Self::doubtful("unknown: an older version made it".into()),
+        }
+    }
+
+    /// Of an imported scene, by what the check of its files found: of all, or a list with an entry for each capture.
+    pub fn of_import(check: &Value) -> Self {
+        let entries = match check {
+            Value::Array(entries) => &entries[..],
+            one => std::slice::from_ref(one),
+        };
+        let numbers = |way: &'static str| {
+            let all = entries.iter().filter_map(move |e| e.pointer(way));
+            all.filter_map(Value::as_f64)
+        };
+        let light = numbers("/energy_at_prediction").zip(numbers("/energy_around"));
+        let light = light.map(|(there, around)| there / around.max(f64::MIN_POSITIVE));
+        let light = light.reduce(f64::min).map(|times| {
+            format!("light where depth and spots predict it is {times:.1} times that around")
+        });
+        let paths = numbers("/two_bounce_paths/residual_m").chain(numbers("/spread_m"));
+        let paths = paths
+            .reduce(f64::max)
+            .map(|m| format!("two-bounce paths agree to {m:.4} m"));
+        let said: Vec<String> = light.into_iter().chain(paths).collect();
+        match said.is_empty() {
+            false => Self::good(said.join(", ")),
+            true => Self::doubtful("whether its files agree was not checked".into()),
+        }
+    }
+
+    /// Of predictions of a scene, by what their manifest says of their agreement; `None` where nothing could be compared.
+    pub fn of_agreement(agreement: &Value) -> Option<Self> {
+        let reasons = agreement["reasons"].as_array()?;
+        let reasons: Vec<&str> = reasons.iter().filter_map(Value::as_str).collect();
+        let off = agreement["spots_off_surface_m"].as_f64();
+        Some(match (&reasons[..], off) {
+            ([], Some(off)) => Self::good(format!("depth and spots agree to {off:.3} m")),
+            ([], None) => Self::good("nothing contradicts".into()),
+            (reasons, _) => Self::doubtful(format!("do not trust it: {}", reasons.join("; "))),
+        })
+    }
+}
+
+/// A trivial answer in words.
+fn answer_name<'a>(kind: &str, answer: &'a str) -> &'a str {
+    match (kind, answer) {
+        ("shadow", "all") => "\"all lit\"",
+        ("shadow", "none") => "\"none lit\"",
+        ("specular", "all") => "\"mirrors everywhere\"",
+        ("specular", "none") => "\"no mirror\"",
+        (_, "mean mask") => "the mean mask",
+        (_, "constant") => "the best constant depth",
+        (_, "peak") => "each histogram's peak",
+        (_, "median image") => "the median image",
+        (_, other) => other,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_shadow_network_that_loses_to_all_lit_is_doubtful() {
+        let metrics = |iou: f64| {
+            json!({"iou": iou, "mae": 0.2, "baselines": {
+                "all": {"iou": 0.71}, "mean mask": {"iou": 0.69}, "none": {"iou": 0.0},
+            }})
+        };
+        let lost = Verdict::of_evaluation("shadow", &metrics(0.62));
+        assert!(lost.doubtful);
+        assert_eq!(
+            lost.text,
+            "no better than a trivial answer: IoU 0.6200 against 0.7100 of \"all lit\""
+        );
+        let won = Verdict::of_evaluation("shadow", &metrics(0.8));
+        assert!(!won.doubtful);
+        assert!(
+            Verdict::of_evaluation("shadow", &metrics(0.71)).doubtful,
+            "a tie is no gain"
+        );
+    }
+
+    #[test]
+    fn depths_are_compared_by_their_error_and_null_is_no_figure() {
+        let metrics = json!({"mae_m": 0.3, "baselines": {"constant": {"mae_m": 0.9}, "peak": {"mae_m": 0.25}}});
+        let lost = Verdict::of_evaluation("tof", &metrics);
+        assert!(
+            lost.doubtful && lost.text.contains("0.2500 m of each histogram's peak"),
+            "{}",
+            lost.text
+        );
+        let null = Verdict::of_evaluation("tof", &json!({"mae_m": null}));
+        assert!(null.doubtful && null.text.contains("mae_m is not a number"));
+        assert!(Verdict::of_evaluation("tof", &json!({"mae_m": 0.1})).doubtful);
+    }
+
+    #[test]
+    fn an_import_states_its_weakest_capture_or_that_nothing_was_checked() {
+        let check = json!([
+            {"energy_at_prediction": 0.3, "energy_around": 0.1},
+            {"energy_at_prediction": 0.2, "energy_around": 0.1, "two_bounce_paths": {"residual_m": 0.01}},
+        ]);
+        assert_eq!(
+            Verdict::of_import(&check).text,
+            "light where depth and spots predict it is 2.0 times that around, two-bounce paths agree to 0.0100 m"
+        );
+        assert!(Verdict::of_import(&Value::Null).doubtful);
+    }
+
+    #[test]
+    fn a_reconstruction_is_held_against_a_guess_and_its_own_measurements() {
+        let good =
+            json!({"held_out_loss": 0.11, "agreement": {"time_residual_m": 0.009, "reasons": []}});
+        let good = Verdict::of_reconstruction(&good);
+        assert_eq!(
+            good.text,
+            "times agree to 0.0090 m, held-out loss 0.110 (a guess has 0.693)"
+        );
+        let blobs = json!({"held_out_loss": 1.68, "agreement": {"reasons": ["times are late"]}});
+        let blobs = Verdict::of_reconstruction(&blobs);
+        assert!(
+            blobs.doubtful
+                && blobs
+                    .text
+                    .contains("times are late; held-out loss 1.680, worse than a guess")
+        );
+        assert!(Verdict::of_reconstruction(&json!({})).doubtful);
+    }
+}

@@ -1,0 +1,188 @@
+//! The JSON of a glTF file, with what is legal in glTF and refused by the `gltf` crate put right,
+//! and what is not read left out.
+
+use std::collections::BTreeSet;
+
+use gltf::{
+    Gltf, Semantic,
+    json::{self, Index, validation::Checked},
+};
+use serde::Deserialize;
+
+use crate::import::quoted;
+
+/// Extensions that a file may require: those that are read, and looks that are noted where they are
+/// not.
+const REQUIRED: [&str; 5] = [
+    "KHR_texture_transform",
+    "KHR_lights_punctual",
+    "KHR_node_visibility",
+    "EXT_mesh_gpu_instancing",
+    "KHR_xmp_json_ld",
+];
+
+/// A parsed file.
+#[derive(Debug)]
+pub(in crate::import) struct Parsed {
+    pub(in crate::import) root: json::Root,
+    /// The binary chunk.
+    pub(super) blob: Option<Vec<u8>>,
+    /// Facts about the file that the document does not have.
+    pub(super) facts: Facts,
+}
+
+/// What was put right or left out.
+#[derive(Debug, Default)]
+pub(super) struct Facts {
+    /// The file has animations, which are not read.
+    pub(super) animated: bool,
+    /// Textures without a source.
+    pub(super) sourceless: BTreeSet<usize>,
+    /// Images that are neither a uri nor a view with a type.
+    pub(super) damaged_images: BTreeSet<usize>,
+    /// Translations of nodes in double precision.
+    pub(super) translations: Vec<Option<[f64; 3]>>,
+}
+
+/// Parses `.glb` or `.gltf` bytes; nothing is checked yet.
+///
+/// # Errors
+/// What the crate says.
+pub(in crate::import) fn parse(bytes: &[u8]) -> Result<Parsed, String> {
+    let mut facts = Facts::default();
+    let (root, blob) = match Gltf::from_slice_without_validation(bytes) {
+        Ok(file) => (file.document.into_json(), file.blob),
+        Err(why) => {
+            facts.animated = true;
+            mended(bytes).ok_or_else(|| why.to_string())?
+        }
+    };
+    Ok(Parsed { root, blob, facts })
+}
+
+/// The file without animations, which may have parts that the crate does not know, and with a list
+/// of nodes in every scene.
+fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
+    let glb = gltf::Glb::from_slice(bytes).ok();
+    let text = glb.as_ref().map_or(bytes, |glb| &glb.json);
+    let mut value: serde_json::Value = serde_json::from_slice(text).ok()?;
+    let root = value.as_object_mut()?;
+    root.remove("animations");
+    let scenes = root.get_mut("scenes").and_then(|s| s.as_array_mut());
+    for scene in scenes.into_iter().flatten() {
+        let nodes = scene.as_object_mut()?.entry("nodes");
+        nodes.or_insert_with(|| serde_json::Value::Array(Vec::new()));
+    }
+    let text = serde_json::to_vec(&value).ok()?;
+    let root = serde_json::from_slice(&text).ok()?;
+    Some((
+        root,
+        glb.and_then(|glb| glb.bin).map(|bin| bin.into_owned()),
+    ))
+}
+
+impl Parsed {
+    /// The checked document.
+    ///
+    /// # Errors
+    /// What is wrong with the file.
+    pub(super) fn document(
+        mut self,
+        bytes: &[u8],
+    ) -> Result<(gltf::Document, Option<Vec<u8>>, Facts), String> {
+        let (root, facts) = (&mut self.root, &mut self.facts);
+        for name in &root.extensions_required {
+            if !REQUIRED.contains(&name.as_str()) && !name.starts_with("KHR_materials_") {
+                return Err(format!(
+                    "extensionsRequired: {} is not supported; export the file without it",
+                    quoted(name)
+                ));
+            }
+        }
+        root.extensions_required.clear();
+        facts.animated = !root.animations.is_empty() || (facts.animated && has_animations(bytes));
+        root.animations.clear();
+        for (k, texture) in root.textures.iter_mut().enumerate() {
+            if texture.source.value() == u32::MAX as usize {
+                facts.sourceless.insert(k);
+                texture.source = Index::new(0);
+            }
+        }
+        if !facts.sourceless.is_empty() && root.images.is_empty() {
+            root.images.push(json::Image {
+                buffer_view: None,
+                mime_type: None,
+                name: None,
+                uri: None,
+                extensions: None,
+                extras: None,
+            });
+        }
+        let whole = |i: &json::Image| match i.buffer_view {
+            Some(_) => i.mime_type.is_some(),
+            None => i.uri.is_some(),
+        };
+        let images = root.images.iter().enumerate();
+        facts.damaged_images = images.filter(|(_, i)| !whole(i)).map(|(k, _)| k).collect();
+        facts.translations = translations(bytes);
+        positions(root)?;
+        let document = gltf::Document::from_json(self.root)
+            .map_err(|e| format!("is not readable glTF 2.0 ({e}); copy or export it again"))?;
+        Ok((document, self.blob, self.facts))
+    }
+}
+
+/// The crate relies on the accessors of positions before it checks them.
+fn positions(root: &json::Root) -> Result<(), String> {
+    let position = Checked::Valid(Semantic::Positions);
+    for (m, mesh) in root.meshes.iter().enumerate() {
+        for (p, primitive) in mesh.primitives.iter().enumerate() {
+            let accessor = primitive.attributes.get(&position);
+            if accessor.is_some_and(|a| a.value() >= root.accessors.len()) {
+                return Err(format!(
+                    "meshes[{m}].primitives[{p}].attributes.POSITION: no such accessor; export the file again"
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The text of the JSON.
+fn text(bytes: &[u8]) -> Vec<u8> {
+    match gltf::Glb::from_slice(bytes) {
+        Ok(glb) => glb.json.into_owned(),
+        Err(_) => bytes.to_vec(),
+    }
+}
+
+fn has_animations(bytes: &[u8]) -> bool {
+    #[derive(Deserialize)]
+    struct Root {
+        #[serde(default)]
+        animations: Vec<serde::de::IgnoredAny>,
+    }
+    serde_json::from_slice::<Root>(&text(bytes)).is_ok_and(|r| !r.animations.is_empty())
+}
+
+/// Where nodes lie in their parents, with all digits: the crate keeps single precision. Empty if a
+/// node has no such numbers.
+fn translations(bytes: &[u8]) -> Vec<Option<[f64; 3]>> {
+    #[derive(Deserialize)]
+    struct Root {
+        #[serde(default)]
+        nodes: Vec<Node>,
+    }
+    #[derive(Deserialize)]
+    struct Node {
+        translation: Option<[f64; 3]>,
+        matrix: Option<[f64; 16]>,
+    }
+    let place = |n: Node| match n.matrix {
+        Some(m) => Some([m[12], m[13], m[14]]),
+        None => n.translation,
+    };
+    serde_json::from_slice::<Root>(&text(bytes))
+        .map(|root| root.nodes.into_iter().map(place).collect())
+        .unwrap_or_default()
+}

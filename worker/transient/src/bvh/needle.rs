@@ -1,0 +1,113 @@
+//! Needles: triangles so long and thin that f32 does not say where along a ray they are.
+//!
+//! The barycentric coordinates of a hit are quotients of differences of products. Their relative error grows with how many times
+//! longer than wide a triangle is, and the error of t with it: of a strip of 1 mm × 3 m it is some tenths of a millimetre, many times
+//! what [`crate::world::lift`] moves a point off its surface. A ray that starts or ends on a needle would meet that needle, or the one
+//! beside it in the same plane. So t of needles is computed in f64, from the same vertices. Whether the ray passes inside of the
+//! edges is judged as for all triangles, so that none slips between two that share an edge.
+
+use picofarm_scene::Vec3;
+
+use super::Pack;
+
+/// Marks the index of a needle in a pack.
+const NEEDLE: u32 = 1 << 31;
+/// Length over width from which a triangle is a needle: below it the error of t is less than what points are lifted.
+const SLENDER: f64 = 16.0;
+
+/// The mark of a triangle in its pack: 0 where it is none.
+pub(super) fn mark(t: &[Vec3; 3]) -> u32 {
+    match is_needle(t) {
+        true => NEEDLE,
+        false => 0,
+    }
+}
+
+/// Whether a triangle is longer than [`SLENDER`] times its width.
+pub(crate) fn is_needle(t: &[Vec3; 3]) -> bool {
+    let [a, b, c] = t.map(wide);
+    let (e, f, g) = (minus(b, a), minus(c, a), minus(c, b));
+    let cross = [
+        e[1] * f[2] - e[2] * f[1],
+        e[2] * f[0] - e[0] * f[2],
+        e[0] * f[1] - e[1] * f[0],
+    ];
+    let longest2 = dot(e, e).max(dot(f, f)).max(dot(g, g));
+    // Twice the area is length times width.
+    longest2 > SLENDER * dot(cross, cross).sqrt()
+}
+
+pub(super) fn wide(p: Vec3) -> [f64; 3] {
+    [f64::from(p.x), f64::from(p.y), f64::from(p.z)]
+}
+
+fn minus(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+impl Pack {
+    /// The index of the triangle in a lane.
+    #[inline(always)]
+    pub(super) fn triangle(&self, lane: usize) -> u32 {
+        self.id[lane] & !NEEDLE
+    }
+
+    /// Which of some lanes hold needles.
+    #[inline(always)]
+    pub(super) fn needles(&self, mut lanes: u32) -> u32 {
+        let mut needles = 0;
+        while lanes != 0 {
+            let k = lanes.trailing_zeros() as usize & 7;
+            lanes &= lanes - 1;
+            needles |= (self.id[k] >> 31) << k;
+        }
+        needles
+    }
+
+    /// Whether a lane holds a needle.
+    #[inline(always)]
+    pub(super) fn is_needle(&self, lane: usize) -> bool {
+        self.id[lane] & NEEDLE != 0
+    }
+
+    /// How far along a ray the triangle in a lane is, in units of the direction; the ray passes inside of its edges. NaN where the
+    /// ray lies in its plane.
+    #[cold]
+    pub(super) fn exactly(&self, lane: usize, o: Vec3, d: Vec3) -> f32 {
+        let at = |v: usize| {
+            let [x, y, z] = [0, 1, 2].map(|k| self.vertex[3 * v + k][lane]);
+            Vec3::new(x, y, z)
+        };
+        along(&[at(0), at(1), at(2)], o, d)
+    }
+}
+
+/// [`Pack::exactly`] of a triangle.
+pub(super) fn along(t: &[Vec3; 3], o: Vec3, d: Vec3) -> f32 {
+    let (o, d) = (wide(o), wide(d));
+    let [a, b, c] = t.map(|v| minus(wide(v), o));
+    let (e, f) = (minus(b, a), minus(c, a));
+    let normal = [
+        e[1] * f[2] - e[2] * f[1],
+        e[2] * f[0] - e[0] * f[2],
+        e[0] * f[1] - e[1] * f[0],
+    ];
+    let plane = dot(normal, a) / dot(normal, d);
+    // Seen all but edge on, the plane is met far from where the ray passes the triangle.
+    let square = dot(d, d);
+    let ends = [a, b, c].map(|v| dot(v, d) / square);
+    let first = ends[0].min(ends[1]).min(ends[2]);
+    let last = ends[0].max(ends[1]).max(ends[2]);
+    match plane.is_nan() {
+        true => f32::NAN,
+        false => plane.clamp(first, last) as f32,
+    }
+}
+
+#[cfg(test)]
+#[path = "needle/tests.rs"]
+mod tests;
