@@ -8,7 +8,7 @@ exec python3 - <<'PYTHON'
 import pathlib, re, sys
 
 pages = [pathlib.Path(p) for p in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")]
-pages += sorted(pathlib.Path("docs").glob("*.md")) + sorted(pathlib.Path("deploy").rglob("*.md")) + [pathlib.Path("tests/peers/README.md")]
+pages += sorted(pathlib.Path("docs").rglob("*.md")) + sorted(pathlib.Path("deploy").rglob("*.md")) + [pathlib.Path("tests/peers/README.md")]
 
 def prose(page):
     return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
@@ -36,6 +36,13 @@ contents = pathlib.Path("docs/SUMMARY.md").read_text()
 for page in sorted(pathlib.Path("docs").glob("*.md")):
     if page.name != "SUMMARY.md" and f"({page.name})" not in contents:
         wrong.append(f"{page}: not in docs/SUMMARY.md")
+decisions = pathlib.Path("docs/decisions/README.md").read_text()
+for page in sorted(pathlib.Path("docs/decisions").glob("[0-9]*.md")):
+    if f"({page.name})" not in decisions:
+        wrong.append(f"{page}: not in docs/decisions/README.md")
+    words = len(page.read_text().split())
+    if words > 180:
+        wrong.append(f"{page}: {words} words; at most 180")
 lines = len(pathlib.Path("README.md").read_text().splitlines())
 if lines > 120:
     wrong.append(f"README.md: {lines} lines; at most 120")

@@ -351,7 +351,7 @@ fn workers_of_a_killed_coordinator_go_on_under_the_other_and_no_task_restarts() 
 }
 
 #[test]
-fn the_lease_of_a_killed_worker_is_soon_anothers_although_it_had_long_to_live() {
+fn the_lease_of_a_killed_worker_soon_belongs_to_another_although_it_had_long_to_live() {
     let Some(cluster) = Cluster::start("lost-worker", 1, 600.0) else {
         return;
     };

@@ -670,7 +670,7 @@ async fn two_instances_never_claim_the_same_task() {
 }
 
 #[tokio::test]
-async fn a_lost_instance_is_fenced_and_its_ranges_are_anothers() {
+async fn a_lost_instance_is_fenced_and_its_ranges_belong_to_another() {
     let Some((a, b, url)) = two().await else {
         return;
     };

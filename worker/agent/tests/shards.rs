@@ -83,7 +83,7 @@ async fn figures_are_the_same_to_the_bit_over_1_2_and_7_shards_in_any_order() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn shards_that_are_missing_damaged_or_anothers_are_made_up_for() {
+async fn shards_that_are_missing_damaged_or_of_another_scene_are_recomputed() {
     let place = Place::new().await;
     place.train_all().await;
     run(evaluation(&place, 1)).await.unwrap();
