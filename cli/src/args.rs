@@ -59,8 +59,11 @@ pub fn command() -> clap::Command {
 ///
 /// # Errors
 /// What is wrong with it, without the secrets that URLs in it may hold.
-pub fn parse(words: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Error> {
-    let mut command = command();
+pub fn parse(
+    words: impl IntoIterator<Item = OsString>,
+    version: &'static str,
+) -> Result<Cli, clap::Error> {
+    let mut command = command().long_version(version);
     let cli = command
         .try_get_matches_from_mut(words)
         .and_then(|mut given| Cli::from_arg_matches_mut(&mut given));

@@ -76,13 +76,13 @@ pub type Bench = for<'a> fn(
     Output,
 ) -> Pin<Box<dyn Future<Output = Result<()>> + Send + 'a>>;
 
-/// The whole program, from its command line to its exit code.
-pub fn run_program(bench: Option<Bench>) -> ExitCode {
+/// Runs the whole program, from its command line to its exit code. `version` is the text of `--version`.
+pub fn run_program(version: &'static str, bench: Option<Bench>) -> ExitCode {
     // One provider of cryptography for everything in this program that speaks TLS.
     rustls::crypto::ring::default_provider()
         .install_default()
         .expect("nothing has chosen one before main");
-    let cli = match args::parse(std::env::args_os()) {
+    let cli = match args::parse(std::env::args_os(), version) {
         Ok(cli) => cli,
         Err(asked) => return usage(&asked),
     };

@@ -10,7 +10,7 @@ if [ -z "$program" ]; then
   (cd "$here" && cargo build --release --features full)
   program=${CARGO_TARGET_DIR:-$here/../../target}/release/picofarm
 fi
-tag=${1:-picofarm:$("$program" --version | cut -d' ' -f2)}
+tag=${1:-picofarm:$("$program" -V | cut -d' ' -f2)}
 
 if [ -z "${BUILDER:-}" ]; then
   for tool in buildah podman docker; do

@@ -302,6 +302,7 @@ fn help_version_and_completions_are_there_for_every_shell() {
     let cli = Cli::new(scratch.path());
     let version = cli.run(&["--version"]).ok().stdout;
     assert!(version.starts_with("picofarm ") && version.contains(env!("CARGO_PKG_VERSION")));
+    assert!(version.contains("\nfeatures: "), "{version}");
     let help = cli.run(&["--help"]).ok().stdout;
     assert!(
         help.contains("Exit codes:") && help.contains("130"),

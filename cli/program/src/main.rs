@@ -7,11 +7,20 @@ use std::process::ExitCode;
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
+/// What `--version` prints: version, commit, and features.
+const VERSION: &str = concat!(
+    env!("CARGO_PKG_VERSION"),
+    " (",
+    env!("PICOFARM_COMMIT"),
+    ")\nfeatures: ",
+    env!("PICOFARM_FEATURES"),
+);
+
 fn main() -> ExitCode {
     #[cfg(feature = "bench")]
     let bench: Option<picofarm_cli::Bench> =
         Some(|command, settings, output| Box::pin(picofarm_perf::run(command, settings, output)));
     #[cfg(not(feature = "bench"))]
     let bench = None;
-    picofarm_cli::run_program(bench)
+    picofarm_cli::run_program(VERSION, bench)
 }
