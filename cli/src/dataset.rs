@@ -56,7 +56,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Picture { dataset, out, rows } => {
             std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
             if let Some(there) = reconstructions::find(&dataset).await? {
-                let sheet = out.join("contact-sheet.png");
+                let sheet = out.join(SHEET);
                 reconstructions::draw(&dataset, &there, rows, &sheet).await?;
                 output.result(&json!({"contact_sheet": sheet}), || {
                     sheet.display().to_string()
@@ -230,6 +230,9 @@ pub struct Drawn {
     pub flight: PathBuf,
 }
 
+/// File name of a contact sheet.
+pub const SHEET: &str = "contact-sheet.png";
+
 /// Draws the contact sheet of `scenes` and the first one's light in flight into `dir`.
 ///
 /// # Errors
@@ -242,7 +245,7 @@ pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
     };
     let dataset = open(place).await?;
     let drawn = Drawn {
-        sheet: dir.join("contact-sheet.png"),
+        sheet: dir.join(SHEET),
         flight: dir.join("light-in-flight.gif"),
     };
     let handle = tokio::runtime::Handle::current();

@@ -1,6 +1,7 @@
 //! `picofarm demo` and `picofarm up`: the whole farm on one machine.
 
 mod rooms;
+mod sheet;
 
 use std::{net::SocketAddr, path::Path};
 
@@ -17,6 +18,7 @@ use picofarm_settings::Gpus;
 use serde_json::json;
 
 use rooms::Rooms;
+use sheet::GrowingSheet;
 
 use crate::{
     args::{Demo, Up},
@@ -26,7 +28,7 @@ use crate::{
     follow::{Show, follow, verdict},
     jobfile,
     local::Local,
-    output::{Output, bytes},
+    output::{Output, bytes, program},
     reach::{self, Identity},
     roles::{self, Guarded},
     settings::Settings,
@@ -217,8 +219,15 @@ async fn render(
     } else {
         Show::Progress
     };
-    let status = follow(client, submitted.job, output, progress).await?;
-    Ok((place(&task), submitted.job, status))
+    let place = place(&task);
+    output.say(format!(
+        "pictures of finished rooms: {}",
+        asked.dir.join(dataset::SHEET).display()
+    ));
+    let sheet = GrowingSheet::start(place.clone(), task.scenes.count, asked.dir.to_owned());
+    let followed = follow(client, submitted.job, output, progress).await;
+    sheet.stop().await;
+    Ok((place, submitted.job, followed?))
 }
 
 async fn tell(
@@ -233,7 +242,7 @@ async fn tell(
     let report = dataset::verify::check(place).await?;
     let scenes: Vec<u64> = (0..args.scenes).collect();
     output.say("drawing …");
-    let pictures = dataset::draw(place, &scenes[..scenes.len().min(16)], dir).await?;
+    let pictures = dataset::draw(place, &scenes[..scenes.len().min(sheet::ROOMS)], dir).await?;
     let rooms = match args.reconstruct {
         true => Some(Rooms::of(place, dir).await?),
         false => None,
@@ -248,6 +257,7 @@ async fn tell(
     if let Some(rooms) = &rooms {
         summary["reconstructions"] = rooms.facts();
     }
+    let program = program();
     output.result(&summary, || {
         format!(
             "{} scenes, {} in {} objects, all verified\n\
@@ -256,10 +266,9 @@ async fn tell(
              light in flight  {}\n\
              {}\
              next:\n  \
-             picofarm dataset info {}\n  \
+             {program} dataset info {}\n  \
              {}\
-             python3 -c {}\n  \
-             picofarm job init && picofarm up\n",
+             {program} job init && {program} up\n",
             args.scenes,
             bytes(report.bytes),
             report.objects,
@@ -269,9 +278,6 @@ async fn tell(
             rooms.as_ref().map(Rooms::told).unwrap_or_default(),
             show::argument(place),
             rooms.as_ref().map(Rooms::next).unwrap_or_default(),
-            show::argument(&format!(
-                "import xarray; print(xarray.open_zarr({place:?}))"
-            )),
         )
     });
     Ok(())
@@ -313,8 +319,8 @@ pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
     .await?;
     output.result(&json!({"coordinator": farm.url, "workers": args.workers, "http": farm.http}), || {
         format!(
-            "coordinator at {} with {} worker(s); submit with `picofarm --coordinator {} job submit FILE`",
-            farm.url, args.workers, farm.url
+            "coordinator at {} with {} worker(s); submit with `{} --coordinator {} job submit FILE`",
+            farm.url, args.workers, program(), farm.url
         )
     });
     let lost = tokio::select! {

@@ -240,6 +240,16 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
+/// Returns the word that starts this program in the caller's shell: the path it was called by, such
+/// as `target/release/picofarm` under `cargo run`, or its name if the shell found it by `PATH`.
+pub fn program() -> String {
+    let called = std::env::args().next().unwrap_or_default();
+    match called.contains('/') {
+        true => show::argument(&called).to_string(),
+        false => "picofarm".to_owned(),
+    }
+}
+
 /// "512 B", "20.1 MB", "1.9 TB" (powers of ten).
 pub fn bytes(n: u64) -> String {
     let mut value = n as f64;

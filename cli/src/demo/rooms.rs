@@ -16,7 +16,7 @@ use crate::{
     dataset::reconstructions::{check, draw, opened},
     error::Result,
     jobfile,
-    output::bytes,
+    output::{bytes, program},
     settings::Settings,
 };
 
@@ -115,6 +115,7 @@ impl Rooms {
     /// What to do next.
     pub fn next(&self) -> String {
         let place = show::argument(&self.place);
-        format!("picofarm dataset info {place}\n  picofarm dataset report {place}\n  ")
+        let program = program();
+        format!("{program} dataset info {place}\n  {program} dataset report {place}\n  ")
     }
 }
