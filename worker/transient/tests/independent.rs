@@ -1,7 +1,7 @@
 //! The whole image's energy by exactly two bounces and by three and more, against an independent tracer in f64: furnished
 //! rooms among the scenes, spots beside and in near-mirrors; pixels that hold a spot and pixels that see a near-mirror by
 //! themselves. `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test independent -- --nocapture` measures
-//! with 32 times the paths: what docs/accuracy.md says. `PICOFARM_RUN=1` and so on are runs with other seeds.
+//! with 32 times the paths: the figures of docs/benchmarks.md. `PICOFARM_RUN=1` and so on are runs with other seeds.
 
 mod common;
 

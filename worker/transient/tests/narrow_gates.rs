@@ -142,7 +142,7 @@ fn narrow_gates_show_the_same_light_as_the_whole_gate() {
         };
         let (narrow, plain) = (found(&on), found(&off));
         let gain = plain / narrow;
-        // In larger rooms 1.3 to 2 (docs/accuracy.md); of a few bins in this small one it is known to
+        // In larger rooms 1.3 to 2; of a few bins in this small one it is known to
         // about a third from so few runs.
         assert!(gain > 0.65, "{bins} bins: variance changes by {gain}");
         let se = |r: &Rendered| r.split.as_ref().unwrap().multi_se.clone();
