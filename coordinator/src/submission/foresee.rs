@@ -22,7 +22,7 @@ const RULE: f64 = 4.0;
 const ROOM_CPU_S: f64 = 45.0;
 /// Paths per pixel that such a room takes to that error.
 const ROOM_PATHS: f64 = 8.0;
-/// Bytes of one bin at rest: 97,432 scenes of 256×256×637 take 1.78 TB (docs/storage.md).
+/// Bytes of one bin at rest: 97,432 scenes of 256×256×637 take 1.78 TB (docs/benchmarks.md).
 const BIN_BYTES: f64 = 0.44;
 
 /// Stages of recent jobs that did the same kind of work, the most similar first. At most [`SIMILAR`].
