@@ -112,7 +112,7 @@ fn masks_in_another_order_of_rows_columns_or_spots_are_refused() {
     }
 }
 
-/// What docs/integrity.md states of the errors that the check lets pass.
+/// What docs/exchange.md states of the errors that the check lets pass.
 #[test]
 fn the_check_tells_gates_and_fields_of_view_apart_from_a_small_error_on() {
     let folder = tempfile::tempdir().unwrap();
