@@ -352,7 +352,7 @@ def greatest(x):
 
 class Nlost(nn.Module):
     """Written from the paper and notes on its released code, whose names the parameters have, with PyTorch's own
-    three-dimensional convolutions; what is not as released is said in docs/models.md."""
+    three-dimensional convolutions; worker/model/src/net/nlost lists what is not as released."""
 
     def __init__(self, spec):
         super().__init__()

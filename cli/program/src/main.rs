@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 /// The system's allocator gives pages back that the next tensor of that size fetches again: with this one, a small network's
-/// step on the CPU takes 0.81 to 0.98 of the time (docs/models.md), and renders as long as before.
+/// step on the CPU takes 0.81 to 0.98 of the time, and renders as long as before.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 

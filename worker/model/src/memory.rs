@@ -2,7 +2,7 @@
 //!
 //! A step frees some hundred megabytes and asks for as many in the next. The allocator gives free memory back to the system after a
 //! second, page by page as it finds it, and the next tensor has each page cleared again: a quarter of the time of a SwinIR's step
-//! (docs/models.md). While a network is trained or asked, it keeps free memory for ten seconds. Not always: other tasks, which
+//! (measured). While a network is trained or asked, it keeps free memory for ten seconds. Not always: other tasks, which
 //! free what they do not need again, would hold a third more than they say.
 
 #![expect(

@@ -1,4 +1,4 @@
-//! The figures of docs/reconstruction.md on the networks: CPU-seconds of a step, and L1 of novel views against CPU-seconds.
+//! The figures of docs/benchmarks.md on the networks: CPU-seconds of a step, and L1 of novel views against CPU-seconds.
 //!
 //! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each stage at full size, and at
 //! smaller ones. `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy` fits PlatoNeRF's room

@@ -1,4 +1,4 @@
-//! The figures of docs/reconstruction.md: L1 of novel views against CPU-seconds.
+//! The figures of docs/benchmarks.md: L1 of novel views against CPU-seconds.
 //!
 //! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
 //! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered

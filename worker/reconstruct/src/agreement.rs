@@ -188,7 +188,7 @@ fn figures(measured: &Measured, depth: &Depth, times: Option<&Times>, masks: boo
 }
 
 /// Adds what follows from the figures. Thresholds lie between those of consistent rooms and of wrong input; the example
-/// `agreement` measures both, and docs/reconstruction.md has them.
+/// `agreement` measures both, and docs/benchmarks.md has the figures.
 fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
     let bin = measured.bin_width_m;
     let mut say = |refused: bool, text: String| {

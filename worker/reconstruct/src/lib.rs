@@ -2,8 +2,8 @@
 //! shadow masks, in seconds on a CPU.
 //!
 //! The problem is PlatoNeRF's (Klinghoffer et al., CVPR 2024); the method is not a network but a grid whose start comes in
-//! closed form and from carving. `docs/reconstruction.md` explains it and has the figures. This crate knows nothing of jobs
-//! or stores; files are the caller's.
+//! closed form and from carving. `closed_form`, `planes`, `start`, `carve` and `optimise` explain the steps in this order;
+//! `docs/benchmarks.md` has the figures. This crate knows nothing of jobs or stores; files are the caller's.
 
 mod agreement;
 pub mod baseline;
