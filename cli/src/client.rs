@@ -259,6 +259,15 @@ impl Client {
         required(reply.job, "job")?.try_into().map_err(unreadable)
     }
 
+    /// A job as it was submitted, with its lists of files.
+    pub async fn spec(&mut self, job: JobId) -> Result<JobSpec> {
+        let request = wire::GetJobSpecRequest {
+            job_id: job.to_string(),
+        };
+        let reply = call!(self, SUBMIT, get_job_spec, request);
+        required(reply.spec, "spec")?.try_into().map_err(unreadable)
+    }
+
     pub async fn retry(&mut self, job: JobId) -> Result<u64> {
         let request = wire::RetryJobRequest {
             job_id: job.to_string(),

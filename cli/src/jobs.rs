@@ -2,6 +2,7 @@
 
 mod dark;
 mod finish;
+mod retry;
 mod submit;
 mod verdicts;
 
@@ -169,11 +170,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         Job::Retry { job } => {
             let job = client.find(&job).await?;
-            let retried = client.retry(job).await?;
-            output.result(&json!({"job": job, "retried": retried}), || {
-                format!("{retried} dead tasks of job {job} are pending again")
-            });
-            Ok(())
+            retry::run(&mut client, job, output).await
         }
         Job::Explain { job, stage, task } => {
             let job = client.find(&job).await?;

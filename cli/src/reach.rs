@@ -7,7 +7,6 @@ use picofarm_dataset::{
     Dataset, DatasetError, check_writable, identify_store, open_store, store_identity,
 };
 use picofarm_proto::{
-    key::{stage_key, task_key},
     model::{JobPlan, JobSpec, StageSpec, kinds::Manifest},
     show,
 };
@@ -128,13 +127,13 @@ async fn scenes_of(
     let dataset = Dataset::open(store, prefix.join(dataset)).await?;
     let mut present = dataset.scenes_present().await?;
     present.retain(|scene| *scene < total);
-    let key = stage_key(stage);
     let step = present.len().div_ceil(LOOKED_AT).max(1);
     let (mut looked, mut equal) = (0, 0);
     for &scene in present.iter().step_by(step) {
         let manifest = dataset.manifest(scene).await?;
         looked += 1;
-        equal += u64::from(manifest.provenance.task_key == task_key(&key, scene).to_string());
+        let ours = stage.task.scene_key(scene).map(|key| key.to_string());
+        equal += u64::from(ours.is_some_and(|key| key == manifest.provenance.task_key));
     }
     Ok(Some((
         dataset.place(),

@@ -13,6 +13,7 @@ use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
     model::{JobState, JobStatus, bounds},
+    wire,
 };
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -100,6 +101,21 @@ impl Link {
         let mut overlay = self.ask(|reply| Command::Overlay(Some(id), reply)).await?;
         overlay.complete(&mut status);
         Ok(status)
+    }
+
+    /// A job as it was submitted.
+    async fn spec(&self, account: &Account, id: JobId) -> Result<wire::JobSpec, Status> {
+        let bytes = self.catalog.spec_bytes(Specs::Job(id)).await;
+        let bytes = bytes.map_err(broken)?;
+        let what = "reading the job's spec";
+        let charge = account.charge(what, stored_cost(bytes)).await?;
+        let read = self.read(move |catalog| async move {
+            // For as long as the spec is in memory, also where nobody waits for it any more.
+            let _charge = charge;
+            let record = catalog.job(id).await?;
+            Ok(record.map(|record| wire::JobSpec::from((*record.job.spec).clone())))
+        });
+        read.await?.ok_or_else(|| refused(Refusal::NoSuchJob(id)))
     }
 
     /// Where a job stands.

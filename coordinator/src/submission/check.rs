@@ -6,6 +6,7 @@ use picofarm_catalog::{Gone, Recorded, ResultSet, Run};
 use picofarm_proto::model::StageSpec;
 use sha2::{Digest, Sha256};
 
+use super::files::Elsewhere;
 use crate::stored::Found;
 
 /// Outputs of a stage that are all looked at; of more, those that were found before are sampled.
@@ -28,6 +29,8 @@ pub(crate) struct Findings {
     pub unseen: u64,
     /// Why some could not be looked at.
     pub why: Option<String>,
+    /// What is recorded of other jobs of the same files.
+    pub elsewhere: Elsewhere,
 }
 
 impl Findings {
@@ -58,6 +61,14 @@ impl Findings {
         };
         let mut words = Vec::new();
         let (recorded, place) = (self.recorded, &set.store);
+        let Elsewhere { scenes, job } = &self.elsewhere;
+        if *scenes > 0 && self.recorded < stage.tasks() {
+            let of = job.map_or_else(|| "an earlier job".into(), |id| format!("job {id}"));
+            words.push(format!(
+                "{scenes} of {} scenes were made by {of} of files with the same content: workers look at each, and take it over",
+                stage.tasks()
+            ));
+        }
         if !self.gone.is_empty() {
             let gone = self.gone.len();
             words.push(format!(
