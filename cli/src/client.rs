@@ -9,7 +9,7 @@ use picofarm_proto::{
     ids::JobId,
     model::{
         AuditEntry, ConnectedWorker, Event, JobPlan, JobSpec, JobState, JobStatus, JobSummary,
-        Reason, TaskExplanation,
+        Reason, SpecError, TaskExplanation,
     },
     wire::{self, jobs_client::JobsClient},
 };
@@ -80,11 +80,13 @@ fn refused(status: &Status) -> CliError {
         _ if lost_connection(status) => Code::Coordinator,
         _ => Code::Failed,
     };
+    let field = status.metadata().get(SpecError::HEADER);
     CliError {
         denied: matches!(
             status.code(),
             Grpc::Unauthenticated | Grpc::PermissionDenied
         ),
+        field: field.and_then(|field| Some(field.to_str().ok()?.to_owned())),
         ..CliError::new(code, status.message())
     }
 }

@@ -76,10 +76,11 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         Job::Init { .. } => Ok(()),
         Job::Plan { .. } => {
             let spec = spec.expect("read above");
-            let plan = client.plan(spec.clone()).await?;
+            let mut plan = client.plan(spec.clone()).await?;
             let twin = submit::twin(&mut client, &plan).await;
+            let notes = reach::there(&spec, &mut plan).await;
             output.result(&plan, || describe_plan(&plan) + &twin);
-            for line in reach::there(&spec, &plan).await {
+            for line in notes {
                 output.warn(format!("note: {line}"));
             }
             Ok(())

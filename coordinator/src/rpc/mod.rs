@@ -12,7 +12,7 @@ use picofarm_catalog::{Catalog, CatalogError, Specs};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
-    model::{JobState, JobStatus, bounds},
+    model::{JobState, JobStatus, SpecError, bounds},
     wire,
 };
 use tokio::sync::{mpsc, oneshot, watch};
@@ -132,7 +132,7 @@ pub(crate) fn refused(why: Refusal) -> Status {
     match why {
         Refusal::NoSuchJob(id) => no_such_job(id),
         Refusal::Denied(why) => Status::permission_denied(bounds::message(&why)),
-        Refusal::Spec(why) => Status::invalid_argument(bounds::message(&why.to_string())),
+        Refusal::Spec(why) => at_field(&why),
         Refusal::Content(why) => Status::invalid_argument(bounds::message(&format!(
             "the catalog cannot hold this: {why}"
         ))),
@@ -140,6 +140,16 @@ pub(crate) fn refused(why: Refusal) -> Status {
         Refusal::NotNow(why) => Status::failed_precondition(why),
         Refusal::Catalog(why) => Status::unavailable(why),
     }
+}
+
+/// The answer to a spec with a field that cannot be used, which it names apart from the words.
+fn at_field(why: &SpecError) -> Status {
+    let mut status = Status::invalid_argument(bounds::message(&why.to_string()));
+    // A name with characters that no header has is in the words alone.
+    if let Ok(field) = why.field.parse() {
+        status.metadata_mut().insert(SpecError::HEADER, field);
+    }
+    status
 }
 
 /// Why the catalog could not be read, as a caller hears it: what it refuses for its content is the caller's error.

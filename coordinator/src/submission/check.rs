@@ -7,7 +7,7 @@ use picofarm_proto::model::StageSpec;
 use sha2::{Digest, Sha256};
 
 use super::files::Elsewhere;
-use crate::stored::Found;
+use crate::{plan::Outputs, stored::Found};
 
 /// Outputs of a stage that are all looked at; of more, those that were found before are sampled.
 pub(crate) const ALL: usize = 1_000;
@@ -45,6 +45,15 @@ impl Findings {
         .collect()
     }
 
+    /// The same as a plan counts it.
+    pub(crate) fn outputs(&self) -> Outputs {
+        let lost = self.gone.len() + self.differ.len();
+        Outputs {
+            there: self.counts.clone(),
+            explained: lost as u64 + self.unseen + self.elsewhere.scenes,
+        }
+    }
+
     /// Whether a job that is done has lost results by what was found. `trusted`: who asks is who had the job run.
     pub(crate) fn lost(&self, tasks: u64, trusted: bool) -> bool {
         !self.gone.is_empty()
@@ -62,7 +71,7 @@ impl Findings {
         let mut words = Vec::new();
         let (recorded, place) = (self.recorded, &set.store);
         let Elsewhere { scenes, job } = &self.elsewhere;
-        if *scenes > 0 && self.recorded < stage.tasks() {
+        if *scenes > 0 {
             let of = job.map_or_else(|| "an earlier job".into(), |id| format!("job {id}"));
             words.push(format!(
                 "{scenes} of {} scenes were made by {of} of files with the same content: workers look at each, and take it over",

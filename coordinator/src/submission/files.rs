@@ -23,13 +23,16 @@ pub(crate) struct Elsewhere {
     pub job: Option<JobId>,
 }
 
-/// What is recorded of equal files.
-pub(super) fn elsewhere(listed: &[(Listed, Vec<Recorded>)]) -> Elsewhere {
+/// What is recorded of equal files, but for what is recorded of the stage itself.
+pub(super) fn elsewhere(listed: &[(Listed, Vec<Recorded>)], own: &[Recorded]) -> Elsewhere {
+    let own: BTreeSet<u64> = own.iter().map(|output| output.task).collect();
     let mut scenes = BTreeSet::new();
     let mut job = None;
     for (other, recorded) in listed {
         let equal = recorded.iter().map(|output| output.task);
-        let equal: Vec<u64> = equal.filter(|task| other.equal.contains(task)).collect();
+        let equal: Vec<u64> = equal
+            .filter(|task| other.equal.contains(task) && !own.contains(task))
+            .collect();
         if !equal.is_empty() {
             job = job.max(other.job.as_ref().map(|(id, _)| *id));
         }

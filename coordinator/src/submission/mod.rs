@@ -224,8 +224,9 @@ impl Submissions {
         }
         let mut findings = Vec::with_capacity(recorded.len());
         for (position, recorded) in recorded.into_iter().enumerate() {
+            let elsewhere = files::elsewhere(&listed[position], &recorded);
             let mut found = self.look(draft, position, recorded, until).await?;
-            found.elsewhere = files::elsewhere(&listed[position]);
+            found.elsewhere = elsewhere;
             findings.push(found);
         }
         let lost = latest.as_ref().is_some_and(|job| {

@@ -8,7 +8,7 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderTask, SpecError, TaskKind},
+    model::{RenderTask, SpecError, TaskKind, log::DARK},
     trace,
 };
 use picofarm_scene::{Camera, Scene};
@@ -133,7 +133,11 @@ fn make_by(
         "rendered"
     );
     for warning in &rendered.warnings {
-        warn!("{warning}");
+        let mark = match rendered.dark.as_ref() == Some(warning) {
+            true => DARK,
+            false => "",
+        };
+        warn!("{mark}{warning}");
     }
     let camera = &scene.camera;
     let spots: Vec<_> = rendered
