@@ -173,7 +173,7 @@ pub(crate) async fn grow(
     bytes: Bytes,
     counts_fewer: impl Fn(&[u8]) -> bool,
 ) -> Result<(), DatasetError> {
-    let mut before = None;
+    let (mut before, mut conditional) = (None, true);
     loop {
         let read = async {
             let result = store.get(path).await?;
@@ -181,7 +181,7 @@ pub(crate) async fn grow(
                 e_tag: result.meta.e_tag.clone(),
                 version: result.meta.version.clone(),
             };
-            Ok((result.bytes().await?, version))
+            Ok::<_, Error>((result.bytes().await?, version))
         };
         let (found, version) = match read.await {
             Ok(read) => read,
@@ -191,10 +191,13 @@ pub(crate) async fn grow(
         if !counts_fewer(&found) {
             return Ok(());
         }
+        if !conditional {
+            return overwrite(store, path, bytes).await;
+        }
         let options = PutOptions::from(PutMode::Update(version));
         match store.put_opts(path, bytes.clone().into(), options).await {
             Ok(_) => return Ok(()),
-            // Somebody was faster: each who was made it count more, so that this ends.
+            // Another was faster. Each replacement counts more than the one before, so that this ends.
             Err(Error::Precondition { .. } | Error::AlreadyExists { .. })
                 if before.as_ref() != Some(&found) =>
             {
@@ -203,7 +206,7 @@ pub(crate) async fn grow(
             // It cannot, or refuses what nobody has changed.
             Err(error) => {
                 tracing::debug!(object = %path, %error, "metadata are put without a condition");
-                return overwrite(store, path, bytes).await;
+                conditional = false;
             }
         }
     }
