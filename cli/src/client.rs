@@ -9,7 +9,7 @@ use picofarm_proto::{
     ids::JobId,
     model::{
         AuditEntry, ConnectedWorker, Event, JobPlan, JobSpec, JobState, JobStatus, JobSummary,
-        Reason, TaskExplanation,
+        Reason, SpecError, TaskExplanation,
     },
     wire::{self, jobs_client::JobsClient},
 };
@@ -80,11 +80,13 @@ fn refused(status: &Status) -> CliError {
         _ if lost_connection(status) => Code::Coordinator,
         _ => Code::Failed,
     };
+    let field = status.metadata().get(SpecError::HEADER);
     CliError {
         denied: matches!(
             status.code(),
             Grpc::Unauthenticated | Grpc::PermissionDenied
         ),
+        field: field.and_then(|field| Some(field.to_str().ok()?.to_owned())),
         ..CliError::new(code, status.message())
     }
 }
@@ -257,6 +259,15 @@ impl Client {
         };
         let reply = call!(self, ANSWER, cancel_job, request);
         required(reply.job, "job")?.try_into().map_err(unreadable)
+    }
+
+    /// A job as it was submitted, with its lists of files.
+    pub async fn spec(&mut self, job: JobId) -> Result<JobSpec> {
+        let request = wire::GetJobSpecRequest {
+            job_id: job.to_string(),
+        };
+        let reply = call!(self, SUBMIT, get_job_spec, request);
+        required(reply.spec, "spec")?.try_into().map_err(unreadable)
     }
 
     pub async fn retry(&mut self, job: JobId) -> Result<u64> {

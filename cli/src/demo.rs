@@ -24,7 +24,7 @@ use crate::{
     args::{Demo, Up},
     client::{Client, Submitted},
     dataset,
-    error::{Code, Result, io},
+    error::{CliError, Result, io},
     follow::{Show, follow, verdict},
     jobfile,
     local::Local,
@@ -98,6 +98,12 @@ async fn taken(task: &RenderTask) -> Result<bool> {
     Ok(recipes.iter().any(|recipe| *recipe != key))
 }
 
+/// Whether a job is refused for the data set that it names. Of several stages, the field begins with the stage's name.
+fn is_of_dataset(error: &CliError) -> bool {
+    let field = error.field.as_deref();
+    field.is_some_and(|field| field.ends_with("output.dataset"))
+}
+
 /// Submits the demo. Where its data set is another demo's, whose furniture, resolution, spots or samples were others, it
 /// gets one of its own, whose name is always the same for the same settings.
 async fn submit(
@@ -112,7 +118,7 @@ async fn submit(
         match client.submit(first.clone(), false).await {
             Ok(submitted) => return Ok((task, first, submitted)),
             // A job of other settings was to write there, and made nothing yet.
-            Err(e) if e.code == Code::Input && e.message.contains("output.dataset") => {}
+            Err(e) if is_of_dataset(&e) => {}
             Err(e) => return Err(e),
         }
     }

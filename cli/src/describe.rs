@@ -15,8 +15,9 @@ use crate::output::{bytes, duration, table};
 
 pub fn describe_plan(plan: &JobPlan) -> String {
     let mut text = format!(
-        "{} tasks: {} reuse, {} run\n",
-        plan.total, plan.reuse, plan.run
+        "{} tasks: {}\n",
+        plan.total,
+        parts(plan.reuse, plan.taken, plan.run)
     );
     let several = plan.stages.len() > 1;
     let groups = plan
@@ -30,11 +31,14 @@ pub fn describe_plan(plan: &JobPlan) -> String {
                 count => format!(", {count} stages"),
             };
             text += &format!(
-                "  {} ({}{many}): {} reuse, {} run\n",
+                "  {} ({}{many}): {}\n",
                 show::line(&together(&names)),
                 show::line(&stages[0].kind),
-                stages.iter().map(|stage| stage.reuse).sum::<u64>(),
-                stages.iter().map(|stage| stage.run).sum::<u64>(),
+                parts(
+                    stages.iter().map(|stage| stage.reuse).sum(),
+                    stages.iter().map(|stage| stage.taken).sum(),
+                    stages.iter().map(|stage| stage.run).sum(),
+                ),
             );
         }
         let indent = if several { "    " } else { "  " };
@@ -57,6 +61,14 @@ pub fn describe_plan(plan: &JobPlan) -> String {
         text += &format!("  warning: {}\n", show::line(warning));
     }
     text
+}
+
+/// What becomes of tasks, in numbers.
+fn parts(reuse: u64, taken: u64, run: u64) -> String {
+    match taken {
+        0 => format!("{reuse} reuse, {run} run"),
+        _ => format!("{reuse} reuse, {taken} taken over from the store, {run} run"),
+    }
 }
 
 /// How long the tasks of a group of stages take and how much they store, as far as it can be told.
@@ -332,6 +344,7 @@ mod tests {
             kind: "train".into(),
             total: 1,
             reuse,
+            taken: 0,
             run: 1 - reuse,
             memory_bytes,
             workers: 1,
@@ -353,6 +366,7 @@ mod tests {
             spec_hash: String::new(),
             total: 7,
             reuse: 3,
+            taken: 0,
             run: 4,
             existing_job: None,
             stages,

@@ -27,6 +27,8 @@ pub struct CliError {
     pub hint: Option<String>,
     /// Asking again would not help: whoever was asked does not let this caller in.
     pub denied: bool,
+    /// The field of a job at which the coordinator refuses it.
+    pub field: Option<String>,
 }
 
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
@@ -38,6 +40,7 @@ impl CliError {
             message: message.to_string(),
             hint: None,
             denied: false,
+            field: None,
         }
     }
 

@@ -2,6 +2,7 @@
 
 mod dark;
 mod finish;
+mod retry;
 mod submit;
 mod verdicts;
 
@@ -75,10 +76,11 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         Job::Init { .. } => Ok(()),
         Job::Plan { .. } => {
             let spec = spec.expect("read above");
-            let plan = client.plan(spec.clone()).await?;
+            let mut plan = client.plan(spec.clone()).await?;
             let twin = submit::twin(&mut client, &plan).await;
+            let notes = reach::there(&spec, &mut plan).await;
             output.result(&plan, || describe_plan(&plan) + &twin);
-            for line in reach::there(&spec, &plan).await {
+            for line in notes {
                 output.warn(format!("note: {line}"));
             }
             Ok(())
@@ -169,11 +171,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         Job::Retry { job } => {
             let job = client.find(&job).await?;
-            let retried = client.retry(job).await?;
-            output.result(&json!({"job": job, "retried": retried}), || {
-                format!("{retried} dead tasks of job {job} are pending again")
-            });
-            Ok(())
+            retry::run(&mut client, job, output).await
         }
         Job::Explain { job, stage, task } => {
             let job = client.find(&job).await?;

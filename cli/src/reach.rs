@@ -7,7 +7,6 @@ use picofarm_dataset::{
     Dataset, DatasetError, check_writable, identify_store, open_store, store_identity,
 };
 use picofarm_proto::{
-    key::{stage_key, task_key},
     model::{JobPlan, JobSpec, StageSpec, kinds::Manifest},
     show,
 };
@@ -91,26 +90,43 @@ async fn identity_of(place: &str, create: bool) -> Result<Option<String>, String
 /// Manifests of a data set that are read to see whether they are of these settings.
 const LOOKED_AT: usize = 8;
 
-/// A line for each stage whose scenes lie in its store although the coordinator knows nothing of them: workers take them.
-pub async fn there(spec: &JobSpec, plan: &JobPlan) -> Vec<String> {
-    let stages = spec.stages.iter().zip(&plan.stages);
+/// Counts in a plan the scenes that lie in their store although the coordinator knows nothing of them: workers take over those
+/// of exactly these settings. Gives a line for each stage of which only some of the scenes looked at are.
+pub async fn there(spec: &JobSpec, plan: &mut JobPlan) -> Vec<String> {
+    let stages = spec.stages.iter().zip(&mut plan.stages);
     let asked = stages
         .filter(|(stage, planned)| planned.run > 0 && !stage.force)
         .map(async |(stage, planned)| {
             let found = tokio::time::timeout(WITHIN, scenes_of(stage, planned.total)).await;
             // A store that cannot be read from here is a worker's to read.
             let (place, [there, looked, equal]) = found.ok()?.ok()??;
-            (there > planned.reuse && equal > 0).then(|| {
-                let name = show::line(&stage.name).into_owned();
-                let place = show::line(&place).into_owned();
-                format!(
-                    "{name}: {place} holds {there} of {} scenes, and {equal} of {looked} looked at are of exactly these \
-                     settings; the coordinator has no record of them, so workers look at each and take those that fit",
-                    planned.total
-                )
-            })
+            if there <= planned.reuse || equal == 0 {
+                return None;
+            }
+            let place = show::line(&place).into_owned();
+            let total = planned.total;
+            if equal < looked {
+                let name = show::line(&stage.name);
+                return Some(format!(
+                    "{name}: {place} holds {there} of {total} scenes, and {equal} of {looked} looked at are of exactly these \
+                     settings; the coordinator has no record of them, so workers look at each and take those that fit"
+                ));
+            }
+            planned.taken = (there - planned.reuse).min(planned.run);
+            planned.run -= planned.taken;
+            if planned.run == 0 {
+                // They told why tasks run.
+                planned.reasons.clear();
+            }
+            planned.reasons.push(format!(
+                "{place} holds {there} of {total} scenes, of exactly these settings by the {looked} looked at: workers look at \
+                 each, and take it over"
+            ));
+            None
         });
     let found = futures::future::join_all(asked).await;
+    plan.taken = plan.stages.iter().map(|stage| stage.taken).sum();
+    plan.run = plan.stages.iter().map(|stage| stage.run).sum();
     found.into_iter().flatten().collect()
 }
 
@@ -128,13 +144,13 @@ async fn scenes_of(
     let dataset = Dataset::open(store, prefix.join(dataset)).await?;
     let mut present = dataset.scenes_present().await?;
     present.retain(|scene| *scene < total);
-    let key = stage_key(stage);
     let step = present.len().div_ceil(LOOKED_AT).max(1);
     let (mut looked, mut equal) = (0, 0);
     for &scene in present.iter().step_by(step) {
         let manifest = dataset.manifest(scene).await?;
         looked += 1;
-        equal += u64::from(manifest.provenance.task_key == task_key(&key, scene).to_string());
+        let ours = stage.task.scene_key(scene).map(|key| key.to_string());
+        equal += u64::from(ours.is_some_and(|key| key == manifest.provenance.task_key));
     }
     Ok(Some((
         dataset.place(),

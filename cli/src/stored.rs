@@ -16,9 +16,9 @@ use object_store::{ObjectStore, path::Path};
 use picofarm_agent::StorePrefixes;
 use picofarm_coordinator::{Found, Stored};
 use picofarm_dataset::{DatasetError, Held, Holdings, PartName, check_identity, open_store};
-use picofarm_proto::{
-    key::task_key,
-    model::{StageSpec, kinds::Manifest},
+use picofarm_proto::model::{
+    StageSpec,
+    kinds::{Manifest, TaskKind},
 };
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
@@ -169,21 +169,21 @@ impl Question {
             Manifest::Scene { dataset } => Self::Scenes(dataset.to_owned(), results),
             Manifest::Part {
                 dataset,
-                joined_by,
+                whole,
                 division,
             } => {
-                let Some(stage) = joined_by else {
-                    return Err("its joining stage has no key".into());
-                };
                 let name = |(index, _): &(u64, [u8; 32])| {
                     let (scene, part) = division.split(*index);
-                    PartName {
+                    let key = whole.scene_key(scene)?;
+                    Some(PartName {
                         scene,
-                        task_key: task_key(&stage, scene).to_string(),
+                        task_key: key.to_string(),
                         part: (part, division.parts),
-                    }
+                    })
                 };
-                Self::Parts(dataset.to_owned(), results.iter().map(name).collect())
+                let names: Option<Vec<PartName>> = results.iter().map(name).collect();
+                let names = names.ok_or("the job lists no file for a scene of these parts")?;
+                Self::Parts(dataset.to_owned(), names)
             }
             Manifest::Gltf => Self::Gltf(results),
             Manifest::Model { name } => Self::Model(name.to_owned(), results),

@@ -15,13 +15,43 @@ mod task;
 
 pub use task::{committed, task};
 
+/// Why a worker may not run a job's tasks, in words.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Barred {
+    /// Their store cannot be used now.
+    Store(String),
+    /// Anything else.
+    Otherwise(String),
+}
+
+impl Barred {
+    /// The words.
+    pub fn words(&self) -> &str {
+        match self {
+            Self::Store(words) | Self::Otherwise(words) => words,
+        }
+    }
+}
+
+impl From<String> for Barred {
+    fn from(words: String) -> Self {
+        Self::Otherwise(words)
+    }
+}
+
+impl From<&str> for Barred {
+    fn from(words: &str) -> Self {
+        Self::Otherwise(words.to_owned())
+    }
+}
+
 /// A connected worker with regard to a job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
     /// Its name.
     pub name: String,
     /// Whether it may run the job's tasks, or why not.
-    pub may_run: Result<(), String>,
+    pub may_run: Result<(), Barred>,
     /// Bytes of memory that a task takes and that the worker has for it, where that is too little.
     pub lacks_memory: Option<(u64, u64)>,
     /// What a task is taken to need, milliseconds, where the worker ends before that.
@@ -369,14 +399,13 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         let memory = largest(&small);
         let mut whys: Vec<(&str, &str)> = others_say
             .iter()
-            .filter_map(|c| Some((c.may_run.as_ref().err()?.as_str(), c.name.as_str())))
+            .filter_map(|c| Some((c.may_run.as_ref().err()?.words(), c.name.as_str())))
             .collect();
         whys.sort_unstable();
         whys.dedup_by_key(|(why, _)| *why);
         let whys = whys.iter().map(|(why, name)| format!("{why} ({name})"));
         let whys: Vec<String> = memory.into_iter().chain(whys).collect();
-        let waits =
-            |c: &Candidate| matches!(&c.may_run, Err(why) if why.starts_with("waits for store "));
+        let waits = |c: &Candidate| matches!(c.may_run, Err(Barred::Store(_)));
         if facts.candidates.iter().any(waits) {
             let words = format!("{tasks} not begun: {}{others}", whys.join("; "));
             return reason("store", ready, words);

@@ -45,20 +45,30 @@ pub fn expand(
 /// Threads of the worker that a plan counts memory for; each keeps some megabytes of its own.
 const THREADS: u32 = 8;
 
-/// What submitting `spec` would do, given its hash, for each stage the outputs of exactly its settings, the job that has
-/// this spec, and recent jobs, latest first, to compare with.
+/// What is known of a stage's outputs.
+#[derive(Debug, Clone, Default)]
+pub struct Outputs {
+    /// Those of exactly its settings that count.
+    pub there: Vec<Run>,
+    /// How many others something is known of, which says why their tasks run.
+    pub explained: u64,
+}
+
+/// What submitting `spec` would do, given its hash, what is known of each stage's outputs, the job that has this spec, and
+/// recent jobs, latest first, to compare with.
 pub fn plan(
     spec: &JobSpec,
     hash: &str,
-    existing: &[Vec<Run>],
+    outputs: &[Outputs],
     existing_job: Option<JobId>,
     recent: &[Job],
 ) -> JobPlan {
     let mut stages = Vec::with_capacity(spec.stages.len());
-    for (position, (stage, existing)) in spec.stages.iter().zip(existing).enumerate() {
+    for (position, (stage, outputs)) in spec.stages.iter().zip(outputs).enumerate() {
         let memory = peak_bytes(&stage.task, &spec.known(position), THREADS);
         let total = stage.tasks();
-        let there: u64 = existing
+        let there: u64 = outputs
+            .there
             .iter()
             .map(|r| r.hi.min(total) - r.lo.min(total))
             .sum();
@@ -68,19 +78,21 @@ pub fn plan(
             kind: stage.task.kind().to_owned(),
             total,
             reuse,
+            taken: 0,
             run: total - reuse,
             memory_bytes: memory.unwrap_or(0),
             workers: 0,
             task_seconds: None,
             task_bytes: None,
             measured: false,
-            reasons: reasons(stage, total, there, recent),
+            reasons: reasons(stage, total, (there, outputs.explained), recent),
         });
     }
     JobPlan {
         spec_hash: hash.to_owned(),
         total: stages.iter().map(|s| s.total).sum(),
         reuse: stages.iter().map(|s| s.reuse).sum(),
+        taken: 0,
         run: stages.iter().map(|s| s.run).sum(),
         existing_job,
         stages,
@@ -88,8 +100,14 @@ pub fn plan(
     }
 }
 
-/// Why tasks of a stage run or do not, given how many outputs there are.
-fn reasons(stage: &StageSpec, total: u64, there: u64, recent: &[Job]) -> Vec<String> {
+/// Why tasks of a stage run or do not, given how many outputs there are, and of how many more it is known why they do not
+/// count.
+fn reasons(
+    stage: &StageSpec,
+    total: u64,
+    (there, explained): (u64, u64),
+    recent: &[Job],
+) -> Vec<String> {
     let mut reasons = Vec::new();
     if stage.force {
         let what = "all run: the stage is forced; each result must equal the one that exists";
@@ -100,8 +118,8 @@ fn reasons(stage: &StageSpec, total: u64, there: u64, recent: &[Job]) -> Vec<Str
             "{there} of {total} outputs exist for exactly these settings: reused"
         ));
     }
-    let run = total - there;
-    if run > 0 && there > 0 {
+    let run = (total - there).saturating_sub(explained);
+    if run > 0 && there + explained > 0 {
         reasons.push(format!("{run} run: their outputs do not exist yet"));
     } else if run > 0 {
         reasons.push(match kin(stage, recent) {

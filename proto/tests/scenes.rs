@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use picofarm_proto::{
-    key::{StageKey, stage_key},
-    model::{JobSpec, PrimitiveRooms, SceneKind, SceneSource, Spots, TaskSpec},
+    key::{StageKey, stage_key, task_key},
+    model::{JobSpec, PrimitiveRooms, SceneKind, SceneSource, Spots, StageSpec, TaskSpec},
     wire,
 };
 
@@ -134,4 +134,42 @@ fn networks_that_know_spots_by_number_are_refused_where_spots_are_at_random() {
         job("{ at = [[0.5, 0.5], [0.1, 0.2]] }", variant).unwrap();
     }
     job("{ random = 4 }", "concat").unwrap();
+}
+
+#[test]
+fn a_scene_of_a_file_is_named_by_its_own_file_and_position_and_by_no_other_file() {
+    let stage = |files: [&str; 3], more: &str| {
+        let listed: Vec<String> = files
+            .iter()
+            .map(|sha| {
+                format!(
+                    "{{ path = \"/{sha}.glb\", sha256 = \"{}\" }}",
+                    sha.repeat(64)
+                )
+            })
+            .collect();
+        let text = format!("kind = \"files\"\nfiles = [{}]\n{more}", listed.join(", "));
+        read(&text).unwrap().stages[0].clone()
+    };
+    let (before, after) = (stage(["a", "b", "c"], ""), stage(["a", "d", "c"], ""));
+    let keys = |stage: &StageSpec| [0, 1, 2].map(|i| stage.task.scene_key(i).unwrap());
+    let (were, are) = (keys(&before), keys(&after));
+    assert_ne!(stage_key(&before), stage_key(&after), "two sets of results");
+    assert_eq!((were[0], were[2]), (are[0], are[2]));
+    assert_ne!(were[1], are[1]);
+    assert_eq!(before.task.files_key(), after.task.files_key());
+    // The same content in another position has its own spots, and other settings make another scene.
+    assert_ne!(keys(&stage(["b", "b", "b"], ""))[0], were[1]);
+    let other = stage(["a", "b", "c"], "spots = 4");
+    assert_ne!(keys(&other), were);
+    assert_ne!(other.task.files_key(), before.task.files_key());
+    // A lease of one scene knows its key, and none of a scene that it does not list.
+    let leased = before.only(1, 2);
+    assert_eq!(leased.task.scene_key(1), Some(were[1]));
+    assert_eq!(leased.task.scene_key(0), None);
+    assert_eq!(leased.task.files_key(), before.task.files_key());
+    // Scenes that are made have the keys that they always had.
+    let made = read(ALL[0]).unwrap().stages[0].clone();
+    assert_eq!(made.task.scene_key(2), Some(task_key(&stage_key(&made), 2)));
+    assert_eq!(made.task.files_key(), None);
 }

@@ -67,6 +67,55 @@ fn a_deleted_store_and_a_deleted_scene_are_made_again_by_the_same_job_file() {
     worker.kill();
 }
 
+#[test]
+fn a_plan_counts_the_scenes_of_a_store_that_no_coordinator_has_recorded_and_workers_take_them_over()
+{
+    let before = Farm::start("unrecorded-before");
+    let job = Job::quick(&before.store(), 3);
+    let worker = before.worker("worker");
+    let id = before.submit(&job);
+    before.until_done_once(&job, &id);
+    worker.kill();
+    let whole = store::times(&job.place());
+
+    // Another farm, whose catalog is empty.
+    let farm = Farm::start("unrecorded");
+    let file = farm.scratch.join("job.toml");
+    job.write(&file);
+    let file = file.display().to_string();
+    let plan = farm.json(&["job", "plan", &file]);
+    let counts = ["reuse", "taken", "run"].map(|part| plan[part].as_u64().unwrap());
+    assert_eq!(counts, [0, 3, 0], "{plan}");
+    let said = reasons(&plan);
+    assert!(said.contains("holds 3 of 3 scenes"), "{said}");
+    assert!(
+        !said.contains("3 run") && !said.contains("not there"),
+        "{said}"
+    );
+    let said = farm.run(&["job", "plan", &file]).ok().stdout;
+    let first = "3 tasks: 0 reuse, 3 taken over from the store, 0 run";
+    assert_eq!(said.lines().next(), Some(first), "{said}");
+
+    // One more is rendered.
+    let more = Job {
+        count: Some(4),
+        ..job.clone()
+    };
+    more.write(&farm.scratch.join("job.toml"));
+    let plan = farm.json(&["job", "plan", &file]);
+    let counts = ["reuse", "taken", "run"].map(|part| plan[part].as_u64().unwrap());
+    assert_eq!(counts, [0, 3, 1], "{plan}");
+
+    job.write(&farm.scratch.join("job.toml"));
+    let submitted = farm.json(&["job", "submit", &file]);
+    let worker = farm.worker("worker");
+    let status = farm.until_ended(submitted["job"].as_str().unwrap());
+    assert_eq!(status["state"], "done", "{status}");
+    assert_eq!(status["tasks"]["reused"], 3, "{status}");
+    assert_eq!(store::times(&job.place()), whole);
+    worker.kill();
+}
+
 /// Takes a lease of a farm and reports a result that it has made up; returns the coordinator's answer.
 async fn lie(url: &str, renderer: &str) -> wire::Acknowledge {
     let hello = wire::Hello {

@@ -93,7 +93,7 @@ pub enum Job {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Make a job's dead tasks pending again
+    /// Make a job's dead tasks pending again; with corrected scene files, in a new job that takes over what is finished
     Retry {
         /// Job id, or the first letters of one
         job: String,

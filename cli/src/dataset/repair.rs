@@ -91,7 +91,7 @@ pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Re
     for problem in report.problems {
         match problem.scene {
             Some(scene) => broken.entry(scene).or_default().push(problem),
-            None if problem.hint().starts_with("dataset repair") => done.metadata.push(problem),
+            None if problem.repairable() => done.metadata.push(problem),
             None => done.left.push(problem),
         }
     }

@@ -1,5 +1,6 @@
 //! `picofarm dataset show`: where a scene came from.
 
+use picofarm_agent::repair::leads_to;
 use serde_json::{Value, json};
 
 use super::{failed, open, predictions};
@@ -107,13 +108,10 @@ async fn recipe(
 ) -> Result<Option<(String, Value)>> {
     let mut found = Vec::new();
     for key in dataset.recipe_keys().await.map_err(failed)? {
-        let stage = picofarm_proto::key::StageKey::parse(&key);
-        let fits =
-            stage.is_some_and(|s| picofarm_proto::key::task_key(&s, scene).to_string() == task_key);
         if let Some(recipe) = dataset.recipe(&key, scene).await.map_err(failed)? {
-            let reprocess = recipe.content["stage"]["kind"] == "reprocess";
-            if fits || reprocess {
-                found.push((recipe.place, recipe.content["stage"].clone()));
+            let stage = recipe.content["stage"].clone();
+            if leads_to(&recipe, scene, task_key) || stage["kind"] == "reprocess" {
+                found.push((recipe.place, stage));
             }
         }
     }

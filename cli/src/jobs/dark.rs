@@ -3,14 +3,15 @@
 use std::collections::BTreeSet;
 
 use picofarm_proto::{
-    model::{EventKind, JobStatus},
+    model::{
+        EventKind, JobStatus,
+        log::{DARK, marked},
+    },
     show,
 };
 
 use crate::client::{Client, Page};
 
-/// As the renderer says it.
-const EMPTY: &str = "the histogram is empty";
 /// Lines of history that are searched.
 const LINES: u32 = 10_000;
 
@@ -40,19 +41,20 @@ pub async fn warning(client: &mut Client, status: &JobStatus) -> Option<String> 
     let mut tasks = BTreeSet::new();
     let mut example = None;
     for event in &events {
-        if event.kind == EventKind::Log && event.message.contains(EMPTY) {
+        if event.kind == EventKind::Log
+            && let Some((_, why)) = marked(&event.message, DARK)
+        {
             tasks.insert((event.stage, event.task));
-            example.get_or_insert(event);
+            example.get_or_insert((event.task.unwrap_or_default(), why));
         }
     }
-    let example = example?;
-    let task = example.task.unwrap_or_default();
+    let (task, why) = example?;
     let all = match tasks.len() as u64 {
         all if all >= rendered => format!("all {rendered} scenes rendered are without light"),
         some => format!("{some} of {rendered} scenes rendered are without light"),
     };
     Some(format!(
         "warning: {all}, e.g. task {task}: {}",
-        show::line(&example.message)
+        show::line(why)
     ))
 }

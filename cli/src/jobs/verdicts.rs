@@ -3,7 +3,10 @@
 use std::collections::BTreeMap;
 
 use picofarm_proto::{
-    model::{Event, EventKind, JobStatus, log::VERDICT},
+    model::{
+        Event, EventKind, JobStatus,
+        log::{VERDICT, marked},
+    },
     show,
 };
 
@@ -45,13 +48,11 @@ fn told(status: &JobStatus, events: &[Event]) -> Vec<Line> {
     // By stage, then by task and text: a task that ran twice tells the same twice.
     let mut stages: BTreeMap<u32, BTreeMap<(u64, &str), bool>> = BTreeMap::new();
     for event in events.iter().filter(|e| e.kind == EventKind::Log) {
-        let said = event.message.split_once(": ");
-        let Some((level, rest)) = said else { continue };
-        let Some(text) = rest.strip_prefix(VERDICT) else {
+        let Some((warns, text)) = marked(&event.message, VERDICT) else {
             continue;
         };
         let lines = stages.entry(event.stage.unwrap_or_default()).or_default();
-        lines.insert((event.task.unwrap_or_default(), text), level == "warn");
+        lines.insert((event.task.unwrap_or_default(), text), warns);
     }
     let mut out = Vec::new();
     for (at, lines) in &stages {

@@ -113,6 +113,7 @@ pub const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/RetryJob", Needs::Role(Role::Submit)),
     ("/picofarm.v1.Jobs/ListJobs", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/GetJob", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/GetJobSpec", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/WatchJob", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ListEvents", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ExplainJob", Needs::Role(Role::View)),

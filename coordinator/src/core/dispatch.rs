@@ -9,7 +9,10 @@ use picofarm_proto::{
 };
 
 use super::{About, Core, Say, stores::store_of};
-use crate::{explain::span, transition::RangeEvent};
+use crate::{
+    explain::{Barred, span},
+    transition::RangeEvent,
+};
 
 /// Workers other than one that may run a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -88,9 +91,9 @@ impl Core {
         id: StageRef,
         worker: WorkerId,
         now_ms: i64,
-    ) -> Result<(), String> {
+    ) -> Result<(), Barred> {
         if let Some(why) = self.doubts.blocked(worker) {
-            return Err(why.to_owned());
+            return Err(why.into());
         }
         let entry = &self.stages[&id];
         entry.suits(id, &self.workers[&worker].abilities)?;
@@ -98,38 +101,37 @@ impl Core {
         self.away.may_use(store, worker, now_ms)?;
         let most = entry.job.spec.limits.max_workers;
         if most > 0 && !self.load.may_join(id.job, worker, most) {
-            return Err(format!(
+            return Err(Barred::from(format!(
                 "limits.max_workers = {most}, and so many work on the job"
-            ));
+            )));
         }
         if let Err((needs, left)) = self.has_time(id, worker, now_ms) {
-            return Err(format!(
+            return Err(Barred::from(format!(
                 "a task is taken to need {}, and the worker ends in {}",
                 span(needs),
                 span(left)
-            ));
+            )));
         }
         if let Some(ms) = self.sick.rests(worker, now_ms) {
-            return Err(format!(
+            return Err(Barred::from(format!(
                 "it failed, or gave back, one lease after another; it gets no tasks for another {}",
                 span(ms)
-            ));
+            )));
         }
         if self.sick.is_try(worker) && !self.workers[&worker].leases.is_empty() {
-            return Err(
-                "it failed, or gave back, one lease after another; one task is trying it now"
-                    .into(),
-            );
+            return Err(Barred::from(
+                "it failed, or gave back, one lease after another; one task is trying it now",
+            ));
         }
         match self.passed_over(id, worker, now_ms) {
             Some(0) => Err(
                 "tasks of the stage failed on it one after another; one task is trying it now"
                     .into(),
             ),
-            Some(ms) => Err(format!(
+            Some(ms) => Err(Barred::from(format!(
                 "tasks of the stage failed on it one after another; it is passed over for another {}",
                 span(ms)
-            )),
+            ))),
             None => Ok(()),
         }
     }

@@ -1,6 +1,6 @@
 //! Submission, the end of jobs, and what is known of them here.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use picofarm_catalog::{
     Job, JobRecord, NewEvent, Owner, Range, ResultSet, Run, Sight, StageRecord, Timing,
@@ -8,8 +8,8 @@ use picofarm_catalog::{
 use picofarm_proto::{
     ids::{JobId, RangeId, StageRef, WorkerId},
     model::{
-        EventKind, JobSpec, JobState, JobStatus, RunningTask, SpecError, StageSpec, StageState,
-        StageStatus,
+        EventKind, JobSpec, JobState, JobStatus, RunningTask, SceneFile, SpecError, StageSpec,
+        StageState, StageStatus,
     },
 };
 use uuid::Uuid;
@@ -32,9 +32,23 @@ pub(crate) struct Prepared {
     pub events: Vec<NewEvent>,
 }
 
+/// Another job's scenes of a list of files in the data set that a stage writes to. But for files whose content differs, they are
+/// the stage's own: workers take them over.
+#[derive(Debug, Clone)]
+pub(crate) struct Listed {
+    /// The other job, where the caller may see it.
+    pub job: Option<(JobId, String)>,
+    /// Where its outputs are recorded.
+    pub set: ResultSet,
+    /// Scenes that both make of the same content.
+    pub equal: BTreeSet<u64>,
+    /// Scenes whose file has another content now, with the file as it was.
+    pub changed: BTreeMap<u64, SceneFile>,
+}
+
 /// Checks that no job has put scenes of other settings into the data set that a stage names: their keys would be the
 /// same, their bytes not. `set` is where the stage writes, `others` are the jobs that write there; those that `sight` does
-/// not see are not named.
+/// not see are not named. Returns what jobs with the same settings and another list of files have to do there.
 ///
 /// # Errors
 /// [`SpecError`] at `output.dataset` that names the job and the first setting that differs.
@@ -43,7 +57,9 @@ pub(crate) fn place_is_free(
     set: &ResultSet,
     others: &[Job],
     sight: &Sight,
-) -> Result<(), SpecError> {
+) -> Result<Vec<Listed>, SpecError> {
+    let mut listed = Vec::new();
+    let files = stage.task.files_key();
     for other in others {
         for there in &other.spec.stages {
             let theirs = ResultSet::of(there);
@@ -52,7 +68,18 @@ pub(crate) fn place_is_free(
             {
                 continue;
             }
-            if !sight.sees(&Owner::from(other)) {
+            let seen = sight.sees(&Owner::from(other));
+            if files.is_some() && there.task.files_key() == files {
+                let (equal, changed) = compare_files(stage, there);
+                listed.push(Listed {
+                    job: seen.then(|| (other.id, other.spec.name.clone())),
+                    set: theirs,
+                    equal,
+                    changed,
+                });
+                continue;
+            }
+            if !seen {
                 return Err(SpecError::new(
                     "output.dataset",
                     format!(
@@ -72,7 +99,60 @@ pub(crate) fn place_is_free(
             ));
         }
     }
-    Ok(())
+    Ok(listed)
+}
+
+/// The scenes that two stages make of files of the same content, and those of which the first has another content than the
+/// second, with the second's files.
+fn compare_files(
+    stage: &StageSpec,
+    there: &StageSpec,
+) -> (BTreeSet<u64>, BTreeMap<u64, SceneFile>) {
+    let file = |stage: &StageSpec, scene| stage.task.scenes()?.kind.file(scene).cloned();
+    let (mut equal, mut changed) = (BTreeSet::new(), BTreeMap::new());
+    for scene in 0..stage.tasks().min(there.tasks()) {
+        match (file(stage, scene), file(there, scene)) {
+            (Some(is), Some(was)) if is.sha256 == was.sha256 => {
+                equal.insert(scene);
+            }
+            (Some(_), Some(was)) => {
+                changed.insert(scene, was);
+            }
+            _ => {}
+        }
+    }
+    (equal, changed)
+}
+
+/// Says that a scene of the data set was made of another content than its file has now.
+pub(crate) fn made_of_another(
+    stage: &StageSpec,
+    set: &ResultSet,
+    scene: u64,
+    listed: &Listed,
+) -> SpecError {
+    let field = format!("scenes.files[{scene}]");
+    let (Some(was), Some(is)) = (
+        listed.changed.get(&scene),
+        stage.task.scenes().and_then(|s| s.kind.file(scene)),
+    ) else {
+        unreachable!("both list a file for a scene that is compared");
+    };
+    let job = match &listed.job {
+        Some((id, name)) => format!("job {id} ({name:?})"),
+        None => "a job that you may not see".to_owned(),
+    };
+    let before = match (is.path == was.path, &listed.job) {
+        (true, _) => "an earlier content of this file".to_owned(),
+        (false, Some(_)) => was.path.clone(),
+        (false, None) => "another file".to_owned(),
+    };
+    let what = format!(
+        "{} has SHA-256 {}, but {job} made scene {scene} of {:?} in {} of {before} (SHA-256 {}), and a finished scene is not \
+         replaced; name another data set, or list the file as it was in this position",
+        is.path, is.sha256, set.dataset, set.store, was.sha256
+    );
+    SpecError::new(field, what)
 }
 
 /// Checks that a caller may run a stage again whose results exist: they are of the first job that has them. `others` are

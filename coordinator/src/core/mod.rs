@@ -49,8 +49,8 @@ pub(crate) use doubt::Reported;
 pub(crate) use facts::{JobLook, Look};
 pub(crate) use fits::{Fit, Fits};
 pub(crate) use jobs::{
-    Learnt, Overlay, Prepared, Timings, may_force, place_is_free, prepare, recorded_status,
-    stands_for,
+    Learnt, Listed, Overlay, Prepared, Timings, made_of_another, may_force, place_is_free, prepare,
+    recorded_status, stands_for,
 };
 
 /// Makes UUIDs; passed in, so that the core is deterministic.

@@ -9,7 +9,7 @@ use picofarm_proto::{
     model::TaskSpec,
 };
 
-use crate::budget::Backoff;
+use crate::{budget::Backoff, explain::Barred};
 
 /// Longest wait between tries of a store, milliseconds.
 const MOST_MS: u32 = 300_000;
@@ -133,7 +133,7 @@ impl Stores {
     ///
     /// # Errors
     /// Why not, and when it is tried again.
-    pub(super) fn may_use(&self, store: &str, worker: WorkerId, now_ms: i64) -> Result<(), String> {
+    pub(super) fn may_use(&self, store: &str, worker: WorkerId, now_ms: i64) -> Result<(), Barred> {
         let Some(row) = self.rows.get(store) else {
             return Ok(());
         };
@@ -151,7 +151,9 @@ impl Stores {
             return Ok(());
         };
         let why = own.map_or(&row.why, |own| &own.why);
-        Err(format!("waits for store {store}: {why}; {when}"))
+        Err(Barred::Store(format!(
+            "waits for store {store}: {why}; {when}"
+        )))
     }
 
     /// Whether a worker's lease that uses a store is a try of it: then it has one task.
@@ -235,7 +237,11 @@ mod tests {
             for w in 0..50 {
                 stores.failed(S, worker(w), "full", &backoff(), now);
             }
-            let why = stores.may_use(S, worker(99), now).unwrap_err();
+            let why = stores
+                .may_use(S, worker(99), now)
+                .unwrap_err()
+                .words()
+                .to_owned();
             assert!(why.contains(S) && why.contains("full") && why.contains("next try in"));
             let begun = now;
             while stores.may_use(S, worker(99), now).is_err() {
@@ -244,7 +250,11 @@ mod tests {
             waits.push(now - begun);
             assert!(stores.is_try(S, worker(99)));
             stores.begun(S, worker(99), range(1));
-            let why = stores.may_use(S, worker(98), now).unwrap_err();
+            let why = stores
+                .may_use(S, worker(98), now)
+                .unwrap_err()
+                .words()
+                .to_owned();
             assert!(why.contains("trying it now"), "{why}");
             stores.over(range(1));
         }
@@ -261,7 +271,11 @@ mod tests {
             stores.failed(S, worker(1), "wrong keys", &backoff(), now);
             assert_eq!(stores.may_use(S, worker(2), now), Ok(()));
             assert!(!stores.is_try(S, worker(2)));
-            let why = stores.may_use(S, worker(1), now).unwrap_err();
+            let why = stores
+                .may_use(S, worker(1), now)
+                .unwrap_err()
+                .words()
+                .to_owned();
             assert!(why.contains(S) && why.contains("wrong keys"), "{why}");
             // Others use it, or nobody does: it is the same.
             if now > 60_000 {

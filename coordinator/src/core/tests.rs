@@ -109,8 +109,13 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
         }
         let core = &world.instances[0].core;
         let why = core.look_at(world.jobs[0], None, None, world.now);
-        let why = why.candidates[0].may_run.clone().unwrap_err();
-        assert!(why.contains("reprocess"), "{why}");
+        let why = why.candidates[0]
+            .may_run
+            .clone()
+            .unwrap_err()
+            .words()
+            .to_owned();
+        assert!(why.words().contains("reprocess"), "{why}");
         able(&mut world, true);
         world.end().await;
     });

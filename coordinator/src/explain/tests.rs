@@ -608,3 +608,20 @@ fn tasks_under_suspicion_wait_for_an_empty_hand() {
     assert_eq!(code, "suspects");
     assert!(words.contains("nothing else in hand"), "{words}");
 }
+
+#[test]
+fn a_store_that_is_away_is_known_by_its_kind_and_not_by_words() {
+    let barred = |why: Barred| JobFacts {
+        candidates: vec![Candidate {
+            may_run: Err(why),
+            ..able("a")
+        }],
+        ..facts()
+    };
+    let away = barred(Barred::Store("/lab is full; next try in 3 s".into()));
+    let (code, words) = first(&away);
+    assert_eq!(code, "store");
+    assert!(words.contains("/lab is full"), "{words}");
+    let named = barred("waits for store keepers, as its name says".into());
+    assert_eq!(first(&named).0, "unable");
+}

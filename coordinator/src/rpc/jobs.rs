@@ -260,6 +260,17 @@ impl Jobs for JobsService {
         }))
     }
 
+    async fn get_job_spec(
+        &self,
+        request: Request<wire::GetJobSpecRequest>,
+    ) -> Result<Response<wire::GetJobSpecResponse>, Status> {
+        let (by, account) = (caller(&request), account(&request));
+        let id = job_id(&request.into_inner().job_id)?;
+        self.link.may_see(&by, id).await?;
+        let spec = Some(self.link.spec(&account, id).await?);
+        Ok(Response::new(wire::GetJobSpecResponse { spec }))
+    }
+
     type WatchJobStream =
         Pin<Box<dyn Stream<Item = Result<wire::WatchJobResponse, Status>> + Send>>;
 

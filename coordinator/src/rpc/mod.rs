@@ -12,7 +12,8 @@ use picofarm_catalog::{Catalog, CatalogError, Specs};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
-    model::{JobState, JobStatus, bounds},
+    model::{JobState, JobStatus, SpecError, bounds},
+    wire,
 };
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
@@ -102,6 +103,21 @@ impl Link {
         Ok(status)
     }
 
+    /// A job as it was submitted.
+    async fn spec(&self, account: &Account, id: JobId) -> Result<wire::JobSpec, Status> {
+        let bytes = self.catalog.spec_bytes(Specs::Job(id)).await;
+        let bytes = bytes.map_err(broken)?;
+        let what = "reading the job's spec";
+        let charge = account.charge(what, stored_cost(bytes)).await?;
+        let read = self.read(move |catalog| async move {
+            // For as long as the spec is in memory, also where nobody waits for it any more.
+            let _charge = charge;
+            let record = catalog.job(id).await?;
+            Ok(record.map(|record| wire::JobSpec::from((*record.job.spec).clone())))
+        });
+        read.await?.ok_or_else(|| refused(Refusal::NoSuchJob(id)))
+    }
+
     /// Where a job stands.
     pub(crate) async fn state(&self, id: JobId) -> Result<JobState, Status> {
         let state = self.catalog.state(id).await;
@@ -116,7 +132,7 @@ pub(crate) fn refused(why: Refusal) -> Status {
     match why {
         Refusal::NoSuchJob(id) => no_such_job(id),
         Refusal::Denied(why) => Status::permission_denied(bounds::message(&why)),
-        Refusal::Spec(why) => Status::invalid_argument(bounds::message(&why.to_string())),
+        Refusal::Spec(why) => at_field(&why),
         Refusal::Content(why) => Status::invalid_argument(bounds::message(&format!(
             "the catalog cannot hold this: {why}"
         ))),
@@ -124,6 +140,16 @@ pub(crate) fn refused(why: Refusal) -> Status {
         Refusal::NotNow(why) => Status::failed_precondition(why),
         Refusal::Catalog(why) => Status::unavailable(why),
     }
+}
+
+/// The answer to a spec with a field that cannot be used, which it names apart from the words.
+fn at_field(why: &SpecError) -> Status {
+    let mut status = Status::invalid_argument(bounds::message(&why.to_string()));
+    // A name with characters that no header has is in the words alone.
+    if let Ok(field) = why.field.parse() {
+        status.metadata_mut().insert(SpecError::HEADER, field);
+    }
+    status
 }
 
 /// Why the catalog could not be read, as a caller hears it: what it refuses for its content is the caller's error.

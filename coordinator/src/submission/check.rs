@@ -6,7 +6,8 @@ use picofarm_catalog::{Gone, Recorded, ResultSet, Run};
 use picofarm_proto::model::StageSpec;
 use sha2::{Digest, Sha256};
 
-use crate::stored::Found;
+use super::files::Elsewhere;
+use crate::{plan::Outputs, stored::Found};
 
 /// Outputs of a stage that are all looked at; of more, those that were found before are sampled.
 pub(crate) const ALL: usize = 1_000;
@@ -28,6 +29,8 @@ pub(crate) struct Findings {
     pub unseen: u64,
     /// Why some could not be looked at.
     pub why: Option<String>,
+    /// What is recorded of other jobs of the same files.
+    pub elsewhere: Elsewhere,
 }
 
 impl Findings {
@@ -40,6 +43,15 @@ impl Findings {
             manifest: output.manifest,
         })
         .collect()
+    }
+
+    /// The same as a plan counts it.
+    pub(crate) fn outputs(&self) -> Outputs {
+        let lost = self.gone.len() + self.differ.len();
+        Outputs {
+            there: self.counts.clone(),
+            explained: lost as u64 + self.unseen + self.elsewhere.scenes,
+        }
     }
 
     /// Whether a job that is done has lost results by what was found. `trusted`: who asks is who had the job run.
@@ -58,6 +70,14 @@ impl Findings {
         };
         let mut words = Vec::new();
         let (recorded, place) = (self.recorded, &set.store);
+        let Elsewhere { scenes, job } = &self.elsewhere;
+        if *scenes > 0 {
+            let of = job.map_or_else(|| "an earlier job".into(), |id| format!("job {id}"));
+            words.push(format!(
+                "{scenes} of {} scenes were made by {of} of files with the same content: workers look at each, and take it over",
+                stage.tasks()
+            ));
+        }
         if !self.gone.is_empty() {
             let gone = self.gone.len();
             words.push(format!(

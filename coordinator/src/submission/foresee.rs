@@ -247,6 +247,7 @@ mod tests {
             spec_hash: String::new(),
             total: 8,
             reuse: 8 - run,
+            taken: 0,
             run,
             existing_job: None,
             stages: vec![StagePlan {
@@ -254,6 +255,7 @@ mod tests {
                 kind: "render".into(),
                 total: 8,
                 reuse: 8 - run,
+                taken: 0,
                 run,
                 memory_bytes: 0,
                 workers: 0,

@@ -6,6 +6,7 @@
 
 mod check;
 mod draft;
+mod files;
 mod foresee;
 mod judge;
 mod look;
@@ -30,7 +31,7 @@ use crate::{
     actor::{Command, Refusal, Submitted},
     auth::{Caller, Visibility, not_yours},
     clock::Clock,
-    core::{Learnt, Prepared, Timings, may_force, place_is_free, prepare, stands_for},
+    core::{Learnt, Listed, Prepared, Timings, may_force, place_is_free, prepare, stands_for},
     lanes::Lanes,
     memory::{Charge, Memory, kept_cost},
     stored::{Found, Stored},
@@ -66,6 +67,8 @@ pub(crate) struct Submissions {
 struct Facts {
     /// By stage.
     recorded: Vec<Vec<Recorded>>,
+    /// By stage, of jobs with other lists of files; with the outputs that are recorded of them.
+    listed: Vec<Vec<(Listed, Vec<Recorded>)>>,
     latest: Option<Latest>,
     /// Normal forms of others' places that the caller may write into.
     permitted: Vec<String>,
@@ -211,13 +214,20 @@ impl Submissions {
             .await?;
         let Facts {
             recorded,
+            listed,
             latest,
             permitted,
         } = facts;
         let until = look::deadline();
+        for (position, listed) in listed.iter().enumerate() {
+            self.unchanged(draft, position, listed, until).await?;
+        }
         let mut findings = Vec::with_capacity(recorded.len());
         for (position, recorded) in recorded.into_iter().enumerate() {
-            findings.push(self.look(draft, position, recorded, until).await?);
+            let elsewhere = files::elsewhere(&listed[position], &recorded);
+            let mut found = self.look(draft, position, recorded, until).await?;
+            found.elsewhere = elsewhere;
+            findings.push(found);
         }
         let lost = latest.as_ref().is_some_and(|job| {
             let stages = draft.stages().iter().zip(&findings);
@@ -260,23 +270,30 @@ impl Submissions {
         let sight = by.sight(self.visibility);
         let permitted = self.permitted(draft, by).await?;
         let mut recorded = Vec::with_capacity(draft.stages().len());
+        let mut others_listed = Vec::with_capacity(draft.stages().len());
         for (stage, record) in draft.spec.stages.iter().zip(draft.stages()) {
             let set = &record.set;
             let writes = stage.task.writes().is_some();
+            let mut listed = Vec::new();
             if writes || stage.force {
                 let at = Specs::At(&set.store, &set.dataset);
                 let _charge = self.charge(draft, at).await?;
                 let others = catalog.jobs_at(&set.store, &set.dataset).await;
                 let others = others.map_err(broken)?;
                 if writes {
-                    place_is_free(stage, set, &others, &sight)
+                    let there = place_is_free(stage, set, &others, &sight)
                         .map_err(|why| Refusal::Spec(draft.spec.at(stage, why)))?;
+                    for other in there {
+                        let recorded = catalog.recorded(&other.set, record.tasks).await;
+                        listed.push((other, recorded.map_err(broken)?));
+                    }
                 }
                 if stage.force {
                     may_force(stage, set, &others, by, &sight).map_err(Refusal::Denied)?;
                 }
             }
             recorded.push(catalog.recorded(set, record.tasks).await.map_err(broken)?);
+            others_listed.push(listed);
         }
         let circle = self.visibility.circle(by, &draft.spec);
         let identity = draft.identity(&circle);
@@ -285,6 +302,7 @@ impl Submissions {
         let latest = latest.map_err(broken)?;
         Ok(Facts {
             recorded,
+            listed: others_listed,
             latest: latest.map(|job| Latest {
                 owner: Owner::from(&job),
                 id: job.id,

@@ -14,8 +14,8 @@ pub(super) fn plan(
     (existing_job, stands): (Option<JobId>, bool),
     recent: &[Job],
 ) -> JobPlan {
-    let counts: Vec<_> = findings.iter().map(|f| f.counts.clone()).collect();
-    let mut plan = plan::plan(&draft.spec, &draft.hash, &counts, existing_job, recent);
+    let outputs: Vec<_> = findings.iter().map(Findings::outputs).collect();
+    let mut plan = plan::plan(&draft.spec, &draft.hash, &outputs, existing_job, recent);
     let stages = plan.stages.iter_mut().zip(&draft.spec.stages);
     for ((planned, stage), (record, found)) in stages.zip(draft.stages().iter().zip(findings)) {
         let words = found.words(stage, &record.set);
@@ -28,11 +28,6 @@ pub(super) fn plan(
             )];
             planned.reasons.extend(words);
             continue;
-        }
-        // Why the rest runs is said by these words alone, where all of it was recorded.
-        let explained = found.recorded >= planned.total && !stage.force;
-        if explained && !words.is_empty() {
-            planned.reasons.retain(|reason| !reason.contains(" run: "));
         }
         planned.reasons.extend(words);
     }

@@ -48,7 +48,9 @@ fn standings(visibility: Visibility) -> impl Iterator<Item = Standing> {
 fn expected(method: &str, standing: Standing) -> Code {
     let (sees, changes) = (standing.sees, standing.changes);
     match method {
-        "GetJob" | "WatchJob" | "ListEvents" | "ExplainJob" if !sees => Code::NotFound,
+        "GetJob" | "GetJobSpec" | "WatchJob" | "ListEvents" | "ExplainJob" if !sees => {
+            Code::NotFound
+        }
         "CancelJob" | "PauseJob" | "ResumeJob" | "RetryJob" if !sees => Code::NotFound,
         "CancelJob" | "PauseJob" | "ResumeJob" | "RetryJob" if !changes => Code::PermissionDenied,
         // There is no worker.
@@ -90,6 +92,7 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
         "RetryJob" => code!(retry_job, wire::RetryJobRequest { job_id }),
         "ListJobs" => code!(list_jobs, wire::ListJobsRequest::default()),
         "GetJob" => code!(get_job, wire::GetJobRequest { job_id }),
+        "GetJobSpec" => code!(get_job_spec, wire::GetJobSpecRequest { job_id }),
         "WatchJob" => code!(watch_job, wire::WatchJobRequest { job_id }),
         "ListEvents" => code!(
             list_events,

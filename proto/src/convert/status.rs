@@ -273,6 +273,7 @@ impl TryFrom<wire::JobPlan> for JobPlan {
             spec_hash: w.spec_hash,
             total: w.total,
             reuse: w.reuse,
+            taken: 0,
             run: w.run,
             existing_job: match w.existing_job.as_str() {
                 "" => None,
@@ -286,6 +287,7 @@ impl TryFrom<wire::JobPlan> for JobPlan {
                     kind: s.kind,
                     total: s.total,
                     reuse: s.reuse,
+                    taken: 0,
                     run: s.run,
                     memory_bytes: s.memory_bytes,
                     workers: s.workers,

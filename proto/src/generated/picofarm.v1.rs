@@ -1231,6 +1231,16 @@ pub struct GetJobResponse {
     pub job: ::core::option::Option<JobStatus>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetJobSpecRequest {
+    #[prost(string, tag = "1")]
+    pub job_id: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetJobSpecResponse {
+    #[prost(message, optional, tag = "1")]
+    pub spec: ::core::option::Option<JobSpec>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct WatchJobRequest {
     #[prost(string, tag = "1")]
     pub job_id: ::prost::alloc::string::String,
@@ -1563,6 +1573,31 @@ pub mod jobs_client {
             req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Jobs", "GetJob"));
             self.inner.unary(req, path, codec).await
         }
+        /// The job as it was submitted, with its lists of files, which a status leaves out.
+        pub async fn get_job_spec(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetJobSpecRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetJobSpecResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::SmallCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/picofarm.v1.Jobs/GetJobSpec",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("picofarm.v1.Jobs", "GetJobSpec"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Status at once and after each change (at most a few a second), until the job ends.
         pub async fn watch_job(
             &mut self,
@@ -1852,6 +1887,14 @@ pub mod jobs_server {
             &self,
             request: tonic::Request<super::GetJobRequest>,
         ) -> std::result::Result<tonic::Response<super::GetJobResponse>, tonic::Status>;
+        /// The job as it was submitted, with its lists of files, which a status leaves out.
+        async fn get_job_spec(
+            &self,
+            request: tonic::Request<super::GetJobSpecRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetJobSpecResponse>,
+            tonic::Status,
+        >;
         /// Server streaming response type for the WatchJob method.
         type WatchJobStream: tonic::codegen::tokio_stream::Stream<
                 Item = std::result::Result<super::WatchJobResponse, tonic::Status>,
@@ -2211,6 +2254,49 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetJobSvc(inner);
+                        let codec = crate::codec::SmallCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/picofarm.v1.Jobs/GetJobSpec" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetJobSpecSvc<T: Jobs>(pub Arc<T>);
+                    impl<T: Jobs> tonic::server::UnaryService<super::GetJobSpecRequest>
+                    for GetJobSpecSvc<T> {
+                        type Response = super::GetJobSpecResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetJobSpecRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Jobs>::get_job_spec(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetJobSpecSvc(inner);
                         let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

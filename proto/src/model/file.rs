@@ -137,11 +137,8 @@ fn divided(written: Vec<StageSpec>) -> Vec<StageSpec> {
 fn parts_of(task: &TaskSpec) -> Option<(&'static str, TaskSpec)> {
     match task {
         TaskSpec::Render(task) if task.parts > 1 => {
-            let task = PartTask {
-                whole: task.clone(),
-                joined_by: String::new(),
-            };
-            Some(("parts", task.into()))
+            let whole = task.clone();
+            Some(("parts", PartTask { whole }.into()))
         }
         TaskSpec::Evaluate(task) if task.evaluate.shards > 1 => {
             let whole = task.clone();

@@ -16,6 +16,16 @@ pub const LINE_BYTES: usize = 2 << 10;
 /// How a task's line begins that states what its result is worth; `job watch` shows such lines when the job ends.
 pub const VERDICT: &str = "verdict: ";
 
+/// How a task's line begins that says why its scene is without light; where a job ends, such scenes are counted.
+pub const DARK: &str = "dark: ";
+
+/// What a line of a task's history says behind its level and one of these marks: whether it is a warning, and the rest.
+pub fn marked<'a>(message: &'a str, mark: &str) -> Option<(bool, &'a str)> {
+    let (level, rest) = message.split_once(": ")?;
+    let warns = level == LogLevel::Warn.name();
+    Some((warns, rest.strip_prefix(mark)?))
+}
+
 /// How grave a line is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogLevel {
@@ -27,13 +37,20 @@ pub enum LogLevel {
     Info,
 }
 
-impl fmt::Display for LogLevel {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
+impl LogLevel {
+    /// Its name, with which a line in a history begins.
+    pub fn name(self) -> &'static str {
+        match self {
             Self::Error => "error",
             Self::Warn => "warn",
             Self::Info => "info",
-        })
+        }
+    }
+}
+
+impl fmt::Display for LogLevel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
     }
 }
 

@@ -11,6 +11,9 @@ pub struct SpecError {
 }
 
 impl SpecError {
+    /// The header of a refusal that names the field, for programs: its words are for people.
+    pub const HEADER: &str = "picofarm-field";
+
     /// An error at `field`.
     pub fn new(field: impl Into<String>, what: impl Into<String>) -> Self {
         Self {

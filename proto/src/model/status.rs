@@ -173,6 +173,9 @@ pub struct JobPlan {
     pub total: u64,
     /// Tasks whose output exists.
     pub reuse: u64,
+    /// Tasks whose output lies in the store without a record of it: workers look at each, and take it over. The client counts
+    /// them, where it can read the store.
+    pub taken: u64,
     /// Tasks that will run.
     pub run: u64,
     /// The job that has this exact spec already.
@@ -229,6 +232,9 @@ pub struct StagePlan {
     pub total: u64,
     /// Tasks whose output exists.
     pub reuse: u64,
+    /// Tasks whose output lies in the store without a record of it: workers look at each, and take it over. The client counts
+    /// them, where it can read the store.
+    pub taken: u64,
     /// Tasks that will run.
     pub run: u64,
     /// About how much memory each takes; 0 = not known before a worker has seen what it reads.

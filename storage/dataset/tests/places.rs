@@ -3,7 +3,9 @@
 mod common;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
+use common::tricky::{Moment, Tricky};
 use common::*;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
@@ -89,6 +91,52 @@ async fn a_data_set_grows_but_never_shrinks() {
     assert_eq!(opened.spec().scenes, 9);
     assert_eq!(opened.scenes_present().await.unwrap(), [3, 8]);
     assert!(opened.verify(VerifyMode::Full).await.unwrap().is_sound());
+}
+
+#[tokio::test]
+async fn of_two_that_grow_a_data_set_at_a_time_the_larger_number_stays_in_any_order() {
+    let small = spec(Profile::default());
+    let prefix = Path::from("sets/a");
+    // How often has the first one looked at an object before the second one grows all of them?
+    for moment in 0..20 {
+        let memory = Arc::new(InMemory::new());
+        Dataset::create_or_open(memory.clone(), prefix.clone(), &small)
+            .await
+            .unwrap();
+        let puts = Arc::new(AtomicUsize::new(0));
+        let (below, at, seen) = (memory.clone(), prefix.clone(), puts.clone());
+        let tricky = Tricky::new(memory.clone()).acting(move |when, _| {
+            let (below, at, seen) = (below.clone(), at.clone(), seen.clone());
+            Box::pin(async move {
+                if when != Moment::BeforePut || seen.fetch_add(1, Ordering::Relaxed) != moment {
+                    return;
+                }
+                let larger = DatasetSpec {
+                    scenes: 20,
+                    ..small
+                };
+                Dataset::create_or_open(below, at, &larger).await.unwrap();
+            })
+        });
+        let some = DatasetSpec { scenes: 9, ..small };
+        Dataset::create_or_open(Arc::new(tricky), prefix.clone(), &some)
+            .await
+            .unwrap();
+        let opened = Dataset::create_or_open(memory.clone(), prefix.clone(), &small)
+            .await
+            .unwrap();
+        // Where the first was done by then, the second never began.
+        let expected = match puts.load(Ordering::Relaxed) > moment {
+            true => 20,
+            false => 9,
+        };
+        assert_eq!(opened.spec().scenes, expected, "{moment}");
+        assert!(moment > 0 || expected == 20);
+        assert!(
+            opened.verify(VerifyMode::Full).await.unwrap().is_sound(),
+            "{moment}"
+        );
+    }
 }
 
 #[tokio::test]

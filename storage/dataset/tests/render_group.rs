@@ -213,3 +213,18 @@ fn missing_damaged_and_foreign_parts_are_named() {
     let error = RenderGroup::open(&dir.join("a")).unwrap_err().to_string();
     assert!(error.contains("expected a group"), "{error}");
 }
+
+#[test]
+fn a_file_larger_than_it_may_be_is_refused_with_its_name_and_the_limit() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("huge");
+    std::fs::create_dir(&dir).unwrap();
+    // A file without content takes no room on the disk.
+    let file = std::fs::File::create(dir.join("zarr.json")).unwrap();
+    file.set_len((64 << 20) + 1).unwrap();
+    let said = RenderGroup::open(&dir).unwrap_err().to_string();
+    assert!(
+        said.contains("huge") && said.contains("zarr.json") && said.contains("67108864 bytes"),
+        "{said}"
+    );
+}

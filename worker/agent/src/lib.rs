@@ -12,7 +12,7 @@ mod run;
 pub use execute::{ImportFor, NotImported, imported, infer_version, model_version, report, takes};
 pub use execute::{
     SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version,
-    resolve, scene_size,
+    repin, resolve, scene_size,
 };
 pub use execute::{export, reconstruct, repair, reprocess, split};
 pub use picofarm_session::{

@@ -32,8 +32,7 @@ fn heavy(store: &Path) -> RenderTask {
 }
 
 fn parts_of(whole: RenderTask) -> StageSpec {
-    let joined_by = whole.stage_key().to_string();
-    StageSpec::new(TaskSpec::Part(PartTask { whole, joined_by }))
+    StageSpec::new(TaskSpec::Part(PartTask { whole }))
 }
 
 async fn run(stage: StageSpec, index: u64) -> Result<Output, TaskError> {

@@ -252,7 +252,7 @@ async fn a_changed_scene_file_fails_the_task_with_both_hashes() {
     let text = place.complaint(0).await;
     assert!(text.contains(&sha256(b"something else")), "{text}");
     assert!(
-        text.contains(&sha256(&primitive_glb(1))) && text.contains("submit the job again"),
+        text.contains(&sha256(&primitive_glb(1))) && text.contains("picofarm job retry"),
         "{text}"
     );
     assert!(text.starts_with("scenes.files[0]: "), "{text}");

@@ -116,6 +116,8 @@ pub struct Rendered {
     pub plan: Plan,
     /// Rays traced.
     pub rays: u64,
+    /// Why no light is in the image, where there is none: one of `warnings`.
+    pub dark: Option<String>,
     /// What somebody should know before trusting it: beams that meet nothing, an image without light. No part of what is
     /// stored: it says nothing that the stored data do not.
     pub warnings: Vec<String>,

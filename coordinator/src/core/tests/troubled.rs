@@ -54,7 +54,7 @@ fn tasks_that_fail_on_one_worker_alone_are_not_charged_with_it() {
             world.act(&Op::Pass(5)).await;
         }
         assert!((3..=20).contains(&failed), "{failed} failures");
-        let why = world.candidate(0).may_run.unwrap_err();
+        let why = world.candidate(0).may_run.unwrap_err().words().to_owned();
         assert!(why.contains("failed on it one after another"), "{why}");
         let core = &world.instances[0].core;
         let entry = core.stages.values().next().unwrap();
@@ -88,7 +88,7 @@ fn a_worker_that_gives_every_lease_back_gets_ever_fewer() {
         }
         // The longest rest of this world is a tenth of a second.
         assert!((5..=30).contains(&leases), "{leases}");
-        let why = world.candidate(0).may_run.unwrap_err();
+        let why = world.candidate(0).may_run.unwrap_err().words().to_owned();
         assert!(why.contains("gave back"), "{why}");
         world.close().await;
     });
@@ -117,7 +117,7 @@ fn a_task_that_took_longer_than_a_worker_has_left_waits_for_one_that_has_more() 
         assert!(world.workers[1].leases.is_empty(), "it would not end");
         let candidate = world.candidate(1);
         assert_eq!(candidate.lacks_time, Some(3_000));
-        let why = candidate.may_run.unwrap_err();
+        let why = candidate.may_run.unwrap_err().words().to_owned();
         assert!(why.contains("is taken to need 3 s"), "{why}");
         world.workers[2].ends_in_ms = Some(60_000);
         world.connect(2, 0).await;

@@ -8,7 +8,7 @@ use super::{
     fields::Fields,
     kind::{Declared, Manifest, Results, TaskKind},
     render::RenderSettings,
-    scenes::{SceneKind, SceneSource},
+    scenes::{FilesIn, SceneKind, SceneSource},
 };
 use crate::{
     model::{
@@ -105,7 +105,7 @@ impl TaskKind for GenerateTask {
     fn shaping(&self) -> Value {
         json!({
             "stage": "generate",
-            "scenes": self.scenes.shaping(),
+            "scenes": self.scenes.shaping(FilesIn::All),
             "seed": self.scenes.seed,
             "fov_deg": self.scenes.fov_deg,
             "spots": self.scenes.spots,
@@ -142,6 +142,10 @@ impl TaskKind for GenerateTask {
 
     fn scenes(&self) -> Option<&SceneSource> {
         Some(&self.scenes)
+    }
+
+    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
+        Some(&mut self.scenes)
     }
 
     fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {

@@ -4,9 +4,9 @@ use std::fmt;
 
 use serde_json::Value;
 
-use super::{division::Division, fields::Fields, scenes::SceneSource};
+use super::{division::Division, fields::Fields, render::RenderTask, scenes::SceneSource};
 use crate::{
-    key::hash::StageKey,
+    key::hash::{StageKey, TaskKey},
     model::{
         destination::Destination,
         memory::{Known, Network, Shape},
@@ -77,6 +77,17 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
     /// Everything that shapes its results but their number: what the key of its stage hashes.
     fn shaping(&self) -> Value;
 
+    /// Names the bytes of a scene that it makes, where they follow from its settings and the scene's own file alone: equal
+    /// keys, equal bytes, whichever other files a job lists. `None` where a scene is made of another, or is not listed.
+    fn scene_key(&self, _scene: u64) -> Option<TaskKey> {
+        None
+    }
+
+    /// The key of everything that shapes its scenes but the files that they are read from; `None` where they are none.
+    fn files_key(&self) -> Option<StageKey> {
+        None
+    }
+
     /// Where its tasks write, which decides whose that is. Without a default, so that no kind leaves it out.
     fn destination(&self) -> Destination<'_>;
 
@@ -126,6 +137,11 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
 
     /// Where scenes come from that are made or read as files.
     fn scenes(&self) -> Option<&SceneSource> {
+        None
+    }
+
+    /// The same, for files to be pinned anew.
+    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
         None
     }
 
@@ -260,8 +276,8 @@ pub enum Manifest<'a> {
     Part {
         /// Folder of the data set.
         dataset: &'a str,
-        /// The stage that joins the parts.
-        joined_by: Option<StageKey>,
+        /// The rendering that joins the parts.
+        whole: &'a RenderTask,
         /// How its tasks go over scenes.
         division: Division,
     },

@@ -11,7 +11,7 @@ use super::{
     scenes::SceneSource,
 };
 use crate::{
-    key::hash::StageKey,
+    key::hash::TaskKey,
     model::{
         destination::Destination,
         memory::{BASE, Known, LIGHT_PATHS},
@@ -25,8 +25,6 @@ pub struct PartTask {
     /// The rendering.
     #[serde(flatten)]
     pub whole: RenderTask,
-    /// Key of the stage that joins the parts, hexadecimal; filled in at submission.
-    pub joined_by: String,
 }
 
 impl PartTask {
@@ -45,8 +43,9 @@ impl Declared for PartTask {
     const WRITTEN: bool = false;
 
     fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        // Jobs in older catalogs have it: the key of the stage that joins the parts, which `whole` says too.
+        fields.optional::<String>("joined_by")?;
         Ok(Self {
-            joined_by: fields.or_default("joined_by")?,
             whole: RenderTask::read(fields)?,
         })
     }
@@ -55,7 +54,6 @@ impl Declared for PartTask {
         let each = self.division().tasks_per_scene();
         Some(Self {
             whole: self.whole.some(lo / each, hi.div_ceil(each)),
-            joined_by: self.joined_by.clone(),
         })
     }
 }
@@ -73,23 +71,17 @@ impl TaskKind for PartTask {
         self.whole.check()
     }
 
-    fn check_resolved(&self) -> Result<(), SpecError> {
-        if StageKey::parse(&self.joined_by) == Some(self.whole.stage_key()) {
-            return Ok(());
-        }
-        let what = format!(
-            "{:?} is not the key of such a render stage; the client must fill it in",
-            self.joined_by
-        );
-        Err(SpecError::new("joined_by", what))
-    }
-
     fn shaping(&self) -> Value {
         json!({
             "stage": "part",
             "whole": self.whole.stage_key().to_string(),
             "parts": self.whole.parts,
         })
+    }
+
+    /// That of the scene that the parts are joined to.
+    fn scene_key(&self, scene: u64) -> Option<TaskKey> {
+        self.whole.scene_key(scene)
     }
 
     fn destination(&self) -> Destination<'_> {
@@ -104,7 +96,7 @@ impl TaskKind for PartTask {
             folder: format!("{}/parts", whole.dataset),
             manifest: Manifest::Part {
                 dataset: &whole.dataset,
-                joined_by: StageKey::parse(&self.joined_by),
+                whole: &self.whole,
                 division: self.division(),
             },
         }
@@ -126,6 +118,10 @@ impl TaskKind for PartTask {
 
     fn scenes(&self) -> Option<&SceneSource> {
         Some(&self.whole.scenes)
+    }
+
+    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
+        Some(&mut self.whole.scenes)
     }
 
     fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {

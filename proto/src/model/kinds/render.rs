@@ -7,9 +7,10 @@ use serde_json::{Value, json};
 use super::{
     fields::Fields,
     kind::{Declared, Results, TaskKind},
+    scenes::FilesIn,
 };
 use crate::{
-    key::hash::StageKey,
+    key::hash::{StageKey, TaskKey, task_key},
     model::{
         destination::Destination,
         memory::{Known, LIGHT_PATHS, Rendering, Shape},
@@ -98,6 +99,20 @@ impl RenderTask {
     pub fn stage_key(&self) -> StageKey {
         StageKey::of(self.shaping())
     }
+
+    /// Everything that shapes the results. File scenes count by content and position, not by path; the place where results
+    /// go does not count, nor the number of parts.
+    fn described(&self, files: FilesIn<'_>) -> Value {
+        json!({
+            "task": "render",
+            "scenes": self.scenes.shaping(files),
+            "seed": self.scenes.seed,
+            "fov_deg": self.scenes.fov_deg,
+            "spots": self.scenes.spots,
+            "render": self.render,
+            "profile": self.output.profile,
+        })
+    }
 }
 
 impl Declared for RenderTask {
@@ -161,18 +176,24 @@ impl TaskKind for RenderTask {
         self.render.remarks(&self.scenes.kind)
     }
 
-    /// File scenes count by content and position, not by path; the place where results go does not count, nor the number
-    /// of parts.
     fn shaping(&self) -> Value {
-        json!({
-            "task": "render",
-            "scenes": self.scenes.shaping(),
-            "seed": self.scenes.seed,
-            "fov_deg": self.scenes.fov_deg,
-            "spots": self.scenes.spots,
-            "render": self.render,
-            "profile": self.output.profile,
-        })
+        self.described(FilesIn::All)
+    }
+
+    fn scene_key(&self, scene: u64) -> Option<TaskKey> {
+        let stage = match &self.scenes.kind {
+            SceneKind::Files { .. } => {
+                let own = self.scenes.kind.file(scene)?;
+                StageKey::of(self.described(FilesIn::One(own)))
+            }
+            _ => self.stage_key(),
+        };
+        Some(task_key(&stage, scene))
+    }
+
+    fn files_key(&self) -> Option<StageKey> {
+        let files = matches!(self.scenes.kind, SceneKind::Files { .. });
+        files.then(|| StageKey::of(self.described(FilesIn::None)))
     }
 
     fn destination(&self) -> Destination<'_> {
@@ -199,6 +220,10 @@ impl TaskKind for RenderTask {
 
     fn scenes(&self) -> Option<&SceneSource> {
         Some(&self.scenes)
+    }
+
+    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
+        Some(&mut self.scenes)
     }
 
     fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {

@@ -107,6 +107,17 @@ impl SceneKind {
     }
 }
 
+/// Which scene files a key counts, where scenes are files.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum FilesIn<'a> {
+    /// All of the job's: the key of a stage.
+    All,
+    /// A scene's own: the key of a scene, which the other files do not shape.
+    One(&'a SceneFile),
+    /// None: what the scenes of a list and of its corrected form have in common.
+    None,
+}
+
 /// A scene file, pinned by its content.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "SceneFileText")]
@@ -137,16 +148,16 @@ impl From<SceneFileText> for SceneFile {
 }
 
 impl SceneSource {
-    /// What shapes the scenes, but for seed, field of view and spots, as keys know it.
-    pub(super) fn shaping(&self) -> Value {
-        let mut value = self.kind_shaping();
+    /// What shapes the scenes, but for seed, field of view and spots, as keys know it. Files count by `files`.
+    pub(super) fn shaping(&self, files: FilesIn<'_>) -> Value {
+        let mut value = self.kind_shaping(files);
         if !is_centre(&self.laser_m) {
             value["laser_m"] = json!(self.laser_m);
         }
         value
     }
 
-    fn kind_shaping(&self) -> Value {
+    fn kind_shaping(&self, counted: FilesIn<'_>) -> Value {
         match &self.kind {
             SceneKind::Furnished {
                 assets,
@@ -154,10 +165,14 @@ impl SceneSource {
             } => json!({"kind": "furnished", "assets": assets, "min_specular": min_specular}),
             SceneKind::Primitive { rooms } if is_living(rooms) => json!({"kind": "primitive"}),
             SceneKind::Primitive { rooms } => json!({"kind": "primitive", "rooms": rooms}),
-            SceneKind::Files { files, .. } => json!({
-                "kind": "files",
-                "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
-            }),
+            SceneKind::Files { files, .. } => match counted {
+                FilesIn::All => json!({
+                    "kind": "files",
+                    "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
+                }),
+                FilesIn::One(file) => json!({"kind": "files", "sha256": file.sha256}),
+                FilesIn::None => json!({"kind": "files"}),
+            },
         }
     }
 

@@ -29,6 +29,14 @@ pub(crate) fn is_reconstructions(root: &Value) -> bool {
     root["attributes"]["picofarm"]["reconstructions"].is_u64()
 }
 
+/// Whether an array's metadata count fewer scenes.
+pub(crate) fn counts_fewer(stored: &[u8], scenes: u64) -> bool {
+    let stored: Value = serde_json::from_slice(stored).unwrap_or(Value::Null);
+    stored["shape"][0]
+        .as_u64()
+        .is_none_or(|there| there < scenes)
+}
+
 /// Writes an array's metadata while its group has no root; `metadata` says what they are for a number of scenes. What an
 /// interrupted creation left is adopted if it differs at most in that number.
 pub(crate) async fn create_metadata(
@@ -54,8 +62,8 @@ pub(crate) async fn create_metadata(
                 .into(),
         });
     }
-    if there < scenes {
-        objects::overwrite(store, path, pretty(&ours)).await?;
-    }
-    Ok(())
+    objects::grow(store, path, pretty(&ours), |stored| {
+        counts_fewer(stored, scenes)
+    })
+    .await
 }

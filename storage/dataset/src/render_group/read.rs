@@ -1,6 +1,7 @@
 //! Reading render groups back. Only what `write_render_group` wrote is read; every chunk must be there and whole.
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
@@ -16,6 +17,10 @@ use crate::scenes::read::Stored;
 const BATCH: u64 = 16;
 /// Most values of a chunk; more would be damaged metadata.
 const MAX_CHUNK: u64 = 1 << 28;
+/// Most bytes of a metadata file: attributes say how the render was made, which takes some kilobytes.
+const MAX_METADATA: u64 = 64 << 20;
+/// Most bytes of a coded chunk beyond those of its values: what does not compress grows by far less.
+const MAX_OVERHEAD: u64 = 1 << 20;
 
 /// A render group in a local folder.
 #[derive(Debug, Clone)]
@@ -105,6 +110,7 @@ impl RenderGroup {
             let path = folder.join(chunk_key(&at));
             fs::metadata(&path).map_err(|e| DatasetError::io("read", &path, e))?;
         }
+        let most = chunk.iter().product::<u64>() * size_of::<T>() as u64 + MAX_OVERHEAD;
         let codec = ChunkCodec::plain(&codecs(T::ELEMENT), &chunk, T::ELEMENT);
         let mut values = vec![T::zeroed(); shape.iter().product::<u64>() as usize];
         for first in (0..chunks).step_by(BATCH as usize) {
@@ -112,7 +118,7 @@ impl RenderGroup {
                 .into_par_iter()
                 .map(|at| {
                     let path = folder.join(chunk_key(&unravel(at, &grid)));
-                    let bytes = fs::read(&path).map_err(|e| DatasetError::io("read", &path, e))?;
+                    let bytes = bounded(&path, most)?;
                     codec
                         .decode(&bytes)
                         .map_err(|e| DatasetError::codec(path.display().to_string(), e))
@@ -131,8 +137,17 @@ impl RenderGroup {
     }
 }
 
+/// A file of at most so many bytes.
+fn bounded(path: &Path, most: u64) -> Result<Vec<u8>, DatasetError> {
+    let read = fs::File::open(path).and_then(|file| picofarm_files::read_bounded(file, most));
+    read.map_err(|e| match e.kind() {
+        ErrorKind::InvalidData => DatasetError::invalid(path.display().to_string(), e.to_string()),
+        _ => DatasetError::io("read", path, e),
+    })
+}
+
 fn metadata(path: &Path) -> Result<Value, DatasetError> {
-    let bytes = fs::read(path).map_err(|e| DatasetError::io("read", path, e))?;
+    let bytes = bounded(path, MAX_METADATA)?;
     serde_json::from_slice(&bytes).map_err(|e| {
         DatasetError::invalid(
             path.display().to_string(),

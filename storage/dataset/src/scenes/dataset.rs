@@ -10,7 +10,9 @@ use crate::coding::codec::ChunkCodec;
 use crate::coding::profile::decode_lines;
 use crate::error::DatasetError;
 use crate::layout::arrays::Layout;
-use crate::layout::group::{METADATA, create_metadata, is_predictions, is_reconstructions, pretty};
+use crate::layout::group::{
+    METADATA, counts_fewer, create_metadata, is_predictions, is_reconstructions, pretty,
+};
 use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
@@ -39,9 +41,11 @@ impl Dataset {
     ///
     /// The metadata are written create-only, the root last: a data set exists once its root `zarr.json` does.
     /// Where the stored number of scenes is smaller than `spec.scenes`, the data set grows: the first number of
-    /// every array's shape is replaced, the root's last. Where it is larger, the stored number stands. Let one
-    /// process at a time grow a data set: metadata are replaced without comparison (published scenes are never
-    /// touched, so the worst case is a number of scenes too small, which growing again repairs).
+    /// every array's shape is replaced, the root's last. Where it is larger, the stored number stands. Of several
+    /// processes that grow it at a time the largest number stays: each object is replaced only where it counts fewer
+    /// scenes, and in stores with conditional puts only if it is still the one that was looked at. A folder has no
+    /// such put: of two that replace an object within the same instant the smaller number may stay, until the next
+    /// scene of the larger one is made (published scenes are never touched).
     ///
     /// # Errors
     /// [`DatasetError::SpecMismatch`] names the first differing field and both values; [`DatasetError::Invalid`];
@@ -87,9 +91,17 @@ impl Dataset {
         for array in grown.arrays.iter() {
             let path = grown.metadata_path(&array.layout);
             let bytes = pretty(&array.layout.metadata(spec.scenes));
-            objects::overwrite(&*grown.store, &path, bytes).await?;
+            objects::grow(&*grown.store, &path, bytes, |stored| {
+                counts_fewer(stored, spec.scenes)
+            })
+            .await?;
         }
-        objects::overwrite(&*grown.store, &root, pretty(&root_metadata(spec, format))).await?;
+        let bytes = pretty(&root_metadata(spec, format));
+        let place = objects::shown(&*grown.store, &root);
+        objects::grow(&*grown.store, &root, bytes, |stored| {
+            parse_root(stored, &place).map_or(true, |(stored, _)| stored.scenes < spec.scenes)
+        })
+        .await?;
         Ok(grown)
     }
 

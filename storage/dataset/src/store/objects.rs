@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use object_store::path::Path;
-use object_store::{Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions};
+use object_store::{Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions, UpdateVersion};
 
 use crate::error::DatasetError;
 use crate::layout::manifest::sha256_hex;
@@ -162,6 +162,54 @@ pub(crate) async fn overwrite(
     put.await
         .map(drop)
         .map_err(|e| DatasetError::store("replace", shown(store, path), e))
+}
+
+/// Puts metadata that count more in place of those that `counts_fewer`; what counts as many or more stays. Of several that put
+/// at a time the one that counts most stays, whichever comes last: an object is replaced only if it is still the one that was
+/// looked at. A store that cannot put on that condition (a folder) is looked at right before.
+pub(crate) async fn grow(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+    counts_fewer: impl Fn(&[u8]) -> bool,
+) -> Result<(), DatasetError> {
+    let (mut before, mut conditional) = (None, true);
+    loop {
+        let read = async {
+            let result = store.get(path).await?;
+            let version = UpdateVersion {
+                e_tag: result.meta.e_tag.clone(),
+                version: result.meta.version.clone(),
+            };
+            Ok::<_, Error>((result.bytes().await?, version))
+        };
+        let (found, version) = match read.await {
+            Ok(read) => read,
+            Err(Error::NotFound { .. }) => return overwrite(store, path, bytes).await,
+            Err(e) => return Err(DatasetError::store("read", shown(store, path), e)),
+        };
+        if !counts_fewer(&found) {
+            return Ok(());
+        }
+        if !conditional {
+            return overwrite(store, path, bytes).await;
+        }
+        let options = PutOptions::from(PutMode::Update(version));
+        match store.put_opts(path, bytes.clone().into(), options).await {
+            Ok(_) => return Ok(()),
+            // Another was faster. Each replacement counts more than the one before, so that this ends.
+            Err(Error::Precondition { .. } | Error::AlreadyExists { .. })
+                if before.as_ref() != Some(&found) =>
+            {
+                before = Some(found);
+            }
+            // It cannot, or refuses what nobody has changed.
+            Err(error) => {
+                tracing::debug!(object = %path, %error, "metadata are put without a condition");
+                conditional = false;
+            }
+        }
+    }
 }
 
 /// The bytes; `None` where there is no such object.

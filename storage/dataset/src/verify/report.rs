@@ -117,6 +117,11 @@ impl fmt::Display for Fault {
 }
 
 impl Problem {
+    /// Whether `dataset repair` puts it right.
+    pub fn repairable(&self) -> bool {
+        !matches!(self.fault, Fault::Foreign | Fault::BadRecord(_))
+    }
+
     /// How it is repaired.
     pub fn hint(&self) -> &'static str {
         match (&self.fault, self.scene) {

@@ -33,4 +33,4 @@ pub use kinds::{
     train::{ImportFor, NotImported, imported, model_version, takes},
 };
 pub use memory::{SceneSize, check_memory, render_bytes, scene_size};
-pub use submission::{Submission, absolute};
+pub use submission::{Submission, absolute, repin};

@@ -177,18 +177,16 @@ impl Stores {
         Ok(())
     }
 
-    /// Stores a recipe where there is none yet. It is looked for with every scene: who deletes a data set while this worker
-    /// runs gets a whole one again.
+    /// Stores a recipe, under a key and for one scene or all, where there is none yet; `false` where there is one. It is looked
+    /// for with every scene: who deletes a data set while this worker runs gets a whole one again.
     pub(super) fn note_recipe(
         &self,
         dataset: &Dataset,
-        key: &str,
-        scene: Option<u64>,
+        (key, scene): (&str, Option<u64>),
         content: &serde_json::Value,
         control: &Control,
-    ) -> Result<(), TaskError> {
-        self.wait(control, dataset.create_recipe(key, scene, content))?;
-        Ok(())
+    ) -> Result<bool, TaskError> {
+        self.wait(control, dataset.create_recipe(key, scene, content))
     }
 
     /// A place to write to. The first use of a location proves that its store is safe.

@@ -1,20 +1,24 @@
 //! Recipes: beside the scenes of a data set stands how they are made, so that `dataset repair` can make one again. A
 //! recipe is the stage of the job, without its place and its number of scenes; the key that it is stored under follows
-//! from what it says (where scenes are files, from all of the job's files, while it names its own scene's alone).
+//! from what it says. Where scenes are files each has a recipe of its own, under a key that counts no file.
 
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
-    key::StageKey,
-    model::{OutputSettings, ReprocessTask, SceneKind, StageSpec, TaskSpec},
+    key::{StageKey, TaskKey, task_key},
+    model::{
+        OutputSettings, RenderTask, ReprocessTask, SceneKind, StageSpec, TaskSpec, kinds::TaskKind,
+    },
 };
 use serde_json::json;
 
 use super::{Control, Task, TaskError, output::Stores};
 
 /// The data set that the recipe lies in.
-const HERE: &str = "here";
+pub(super) const HERE: &str = "here";
 
-/// Stores the recipe of a rendering.
+/// Stores the recipe of a rendering. That of a scene file is stored under what all scenes of the list have in common, so that it
+/// has one name whichever other files a job lists. Where a recipe of the file's earlier content has that name, because its scene
+/// was begun and never published, this one is stored under the key of its stage.
 pub(super) fn note(
     stores: &Stores,
     dataset: &Dataset,
@@ -25,15 +29,26 @@ pub(super) fn note(
     let TaskSpec::Render(mut render) = only.task else {
         return Ok(());
     };
-    let own = match &render.scenes.kind {
-        SceneKind::Files { .. } => Some(task.index),
-        _ => None,
-    };
+    let files = render.files_key();
     render.scenes.count = 1;
     render.parts = 1;
     render.output = here(&render.output.profile);
     let content = content(TaskSpec::Render(render));
-    stores.note_recipe(dataset, &task.stage.to_string(), own, &content, control)
+    let note = |key: &StageKey, own| {
+        stores.note_recipe(dataset, (&key.to_string(), own), &content, control)
+    };
+    let Some(files) = files else {
+        return note(&task.stage, None).map(drop);
+    };
+    let own = Some(task.index);
+    if note(&files, own)? {
+        return Ok(());
+    }
+    let files = files.to_string();
+    match stores.wait(control, dataset.recipe(&files, task.index))? {
+        Some(there) if there.content != content => note(&task.stage, own).map(drop),
+        _ => Ok(()),
+    }
 }
 
 /// Stores the recipe of a reprocessing. A source in the same store is named without it, so that both can move together.
@@ -51,7 +66,9 @@ pub(super) fn note_reprocess(
     task.count = 1;
     task.output = here(&task.output.profile);
     let content = content(TaskSpec::Reprocess(task));
-    stores.note_recipe(dataset, &key.to_string(), None, &content, control)
+    stores
+        .note_recipe(dataset, (&key.to_string(), None), &content, control)
+        .map(drop)
 }
 
 fn content(task: TaskSpec) -> serde_json::Value {
@@ -64,6 +81,20 @@ fn here(profile: &str) -> OutputSettings {
         dataset: HERE.to_owned(),
         profile: profile.to_owned(),
     }
+}
+
+/// The key that a scene of a data set has, if a rendering made it. Scenes of files were once named by all files of their
+/// job, which only the key of the recipe's stage still tells.
+pub(super) fn made(
+    stage: &StageKey,
+    task: &RenderTask,
+    scene: u64,
+    made_by: &str,
+) -> Option<TaskKey> {
+    let own = task.scene_key(scene);
+    let earlier = Some(task_key(stage, scene)).filter(|_| task.files_key().is_some());
+    let keys = own.into_iter().chain(earlier);
+    { keys }.find(|key| key.to_string() == made_by)
 }
 
 /// The task that a recipe describes, in the data set `dataset` of `store`, and its key.
@@ -83,6 +114,7 @@ pub(super) fn read(
             render.output.store = store.to_owned();
             render.output.dataset = dataset.to_owned();
             match render.scenes.kind {
+                // It may have been stored under the key of its stage, which counts files that it does not name.
                 SceneKind::Files { .. } => key,
                 _ => render.stage_key(),
             }

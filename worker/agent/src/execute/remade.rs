@@ -1,9 +1,6 @@
 //! Scenes made again by the recipe beside their data set, to compare with what was found of them.
 
-use picofarm_proto::{
-    key::task_key,
-    model::{SourceSettings, TaskSpec},
-};
+use picofarm_proto::model::{SourceSettings, TaskSpec};
 use picofarm_scene::Scene;
 
 use super::{Context, Control, TaskError, recipe, reprocess::source_manifest, scenes};
@@ -33,7 +30,8 @@ pub(super) fn scene(
             };
             match recipe::read(&stored, &place.store, &place.dataset)? {
                 (stage, TaskSpec::Render(task))
-                    if task_key(&stage, index).to_string() == manifest.provenance.task_key =>
+                    if recipe::made(&stage, &task, index, &manifest.provenance.task_key)
+                        .is_some() =>
                 {
                     let side = task.render.resolution;
                     return scenes::scene(&task.scenes, side, index, context.scenes());

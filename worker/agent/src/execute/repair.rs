@@ -5,15 +5,15 @@
 use std::path::PathBuf;
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Restored,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Recipe, Restored,
     import::{Format, ImportOptions, Source, import_scene},
     open_store, remains, restore_root,
 };
 use picofarm_files::Opener;
 use picofarm_proto::{
-    key::{StageKey, TaskKey, stage_key, task_key},
+    key::{StageKey, TaskKey, stage_key},
     model::{
-        JobSpec, OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, StageSpec,
+        JobSpec, OutputSettings, RenderTask, ReprocessSettings, ReprocessTask, SourceSettings,
         TaskSpec,
     },
 };
@@ -47,10 +47,20 @@ pub struct Repairer {
     hints: Hints,
 }
 
+/// Whether the recipe of a rendering leads to the scene whose task has this key.
+pub fn leads_to(recipe: &Recipe, scene: u64, task_key: &str) -> bool {
+    match recipe::read(recipe, recipe::HERE, recipe::HERE) {
+        Ok((stage, TaskSpec::Render(task))) => {
+            recipe::made(&stage, &task, scene, task_key).is_some()
+        }
+        _ => false,
+    }
+}
+
 /// How a scene is made.
 #[derive(Debug)]
 enum Way {
-    Render(StageKey, Box<TaskSpec>),
+    Render(StageKey, Box<RenderTask>),
     Reprocess(Box<ReprocessTask>),
     Import(PathBuf),
 }
@@ -118,7 +128,7 @@ impl Repairer {
                 continue;
             };
             if let Some((scene, key)) = &left.scene {
-                let (_, ours) = self.keyed(Some(stage), task, *scene, control)?;
+                let (_, ours) = self.keyed(Some(stage), task, *scene, Some(key), control)?;
                 if ours.to_string() != *key {
                     continue;
                 }
@@ -205,9 +215,6 @@ impl Repairer {
         let (way, key) = self.way(dataset, scene, manifest, control)?;
         match way {
             Way::Render(_, task) => {
-                let TaskSpec::Render(task) = *task else {
-                    unreachable!("only renderings are ways of rendering");
-                };
                 let key = key.expect("a rendering has a key");
                 render::make(
                     dataset,
@@ -245,8 +252,9 @@ impl Repairer {
         }
         let mut found: Vec<(Way, TaskKey)> = Vec::new();
         let mut others: Vec<String> = Vec::new();
+        let made_by = manifest.map(|m| &*m.provenance.task_key);
         for (stage, task) in self.candidates(dataset, scene, manifest, control)? {
-            match self.keyed(stage, task, scene, control) {
+            match self.keyed(stage, task, scene, made_by, control) {
                 Ok((way, key)) if found.iter().all(|(_, k)| *k != key) => found.push((way, key)),
                 Ok(_) => {}
                 Err(TaskError::User(why) | TaskError::Damaged(why)) => others.push(why),
@@ -254,9 +262,8 @@ impl Repairer {
             }
         }
         let known = found.len();
-        if let Some(manifest) = manifest {
-            let key = &manifest.provenance.task_key;
-            found.retain(|(_, k)| k.to_string() == *key);
+        if let Some(key) = made_by {
+            found.retain(|(_, k)| k.to_string() == key);
         }
         if found.len() == 1 {
             let (way, key) = found.remove(0);
@@ -338,18 +345,22 @@ impl Repairer {
         }))
     }
 
-    /// A candidate with the key of its task for `scene`.
+    /// A candidate with the key of its task for `scene`; `made_by` is the key in the scene's manifest.
     fn keyed(
         &self,
         stage: Option<StageKey>,
         task: TaskSpec,
         scene: u64,
+        made_by: Option<&str>,
         control: &Control,
     ) -> Result<(Way, TaskKey), TaskError> {
         match task {
-            TaskSpec::Render(_) => {
-                let stage = stage.unwrap_or_else(|| stage_key(&StageSpec::new(task.clone())));
-                let key = task_key(&stage, scene);
+            TaskSpec::Render(task) => {
+                let stage = stage.unwrap_or_else(|| task.stage_key());
+                let key = match made_by.and_then(|key| recipe::made(&stage, &task, scene, key)) {
+                    Some(key) => key,
+                    None => render::scene_key(&task, scene)?,
+                };
                 Ok((Way::Render(stage, Box::new(task)), key))
             }
             TaskSpec::Reprocess(mut task) => {

@@ -88,14 +88,17 @@ pub(super) fn scene(
                 root: root.as_ref().map(PathBuf::from),
             };
             let at = format!("scenes.files[{index}]");
-            let file = source.kind.file(index).ok_or_else(|| {
-                TaskError::User(format!("{at}: the job lists no such file; submit it again"))
-            })?;
+            let file = source.kind.file(index).ok_or_else(|| not_listed(&at))?;
             let aim = Aim::of(&source.spots, seed)
                 .map_err(|what| TaskError::User(format!("scenes.spots: {what}")))?;
             read(file, &at, (&aim, side), &bounds)
         }
     }
+}
+
+/// A lease brings the files of its own tasks.
+pub(super) fn not_listed(at: &str) -> TaskError {
+    TaskError::User(format!("{at}: the job lists no such file; submit it again"))
 }
 
 fn library<'a>(
@@ -124,8 +127,8 @@ fn read(
     let found = import::fingerprint(path, bounds).map_err(|e| named(at, e))?;
     if found != file.sha256 {
         return Err(TaskError::User(format!(
-            "{at}: {} has SHA-256 {found}, but the job was submitted with {}; put the old file back, or submit \
-             the job again to use the new one",
+            "{at}: {} has SHA-256 {found}, but the job was submitted with {}; put the old file back, or use the new one: \
+             `picofarm job retry` makes a new job of it, which takes over the scenes that are finished",
             file.path, file.sha256
         )));
     }

@@ -60,10 +60,7 @@ impl Submission<'_> {
         if let Some(root) = root {
             *root = self.path("scenes.root", root)?.display().to_string();
         }
-        let bounds = Bounds {
-            root: root.as_ref().map(PathBuf::from),
-            ..Bounds::default()
-        };
+        let bounds = within(root.as_deref());
         for (i, file) in files.iter_mut().enumerate() {
             let field = format!("scenes.files[{i}]");
             let path = self.path(&field, &file.path)?;
@@ -82,6 +79,34 @@ impl Submission<'_> {
         }
         Ok(())
     }
+}
+
+fn within(root: Option<&str>) -> Bounds {
+    Bounds {
+        root: root.map(PathBuf::from),
+        ..Bounds::default()
+    }
+}
+
+/// Pins scene files by the content that they have now. Returns the positions of those that had another one.
+///
+/// # Errors
+/// A file that cannot be read on this machine.
+pub fn repin(source: &mut SceneSource) -> Result<Vec<usize>, SpecError> {
+    let SceneKind::Files { files, root, .. } = &mut source.kind else {
+        return Ok(Vec::new());
+    };
+    let bounds = within(root.as_deref());
+    let mut changed = Vec::new();
+    for (i, file) in files.iter_mut().enumerate() {
+        let hash = fingerprint(Path::new(&file.path), &bounds)
+            .map_err(|e| SpecError::new(format!("scenes.files[{i}]"), e.to_string()))?;
+        if file.sha256 != hash {
+            file.sha256 = hash;
+            changed.push(i);
+        }
+    }
+    Ok(changed)
 }
 
 /// The place that `path` means in `base`, without `.` and `..`: what they mean in a shell. (Jobs on the wire must name

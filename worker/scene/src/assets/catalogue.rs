@@ -1,7 +1,7 @@
 //! Sweet Home 3D furniture libraries (`.sh3f`): the Java-properties catalogue inside each zip.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     fs::File,
     io::BufReader,
     path::{Path, PathBuf},
@@ -121,12 +121,14 @@ impl Archive {
         let properties = properties(&text);
         let get = |key: &str| properties.get(key).map(String::as_str);
         let version = get("version").unwrap_or("unknown").to_owned();
-        let count = properties
+        // The numbers that occur: the largest may be any, and says nothing of how many there are.
+        let numbers: BTreeSet<u32> = properties
             .keys()
-            .filter_map(|k| k.strip_prefix("model#")?.parse::<u32>().ok())
-            .max()
-            .unwrap_or(0);
-        let items = (1..=count)
+            .filter_map(|k| k.strip_prefix("model#")?.parse().ok())
+            .filter(|n| *n > 0)
+            .collect();
+        let items = numbers
+            .into_iter()
             .filter_map(|n| {
                 item(
                     &|key| get(&format!("{key}#{n}")),
@@ -275,5 +277,20 @@ mod tests {
         );
         assert!((item.size[1] - 1.05).abs() < 1e-6 && item.rotation.is_some());
         assert!(item.attribution.contains("Absfrm") && item.attribution.contains("CC0"));
+    }
+
+    #[test]
+    fn a_catalogue_whose_numbers_are_huge_has_as_many_items_as_it_lists() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("huge.sh3f");
+        let mut zip = zip::ZipWriter::new(File::create(&path).unwrap());
+        let plain = zip::write::SimpleFileOptions::default()
+            .compression_method(zip::CompressionMethod::Stored);
+        zip.start_file(CATALOGUE, plain).unwrap();
+        let text = "license=Public domain\nmodel#4294967295=a.obj\nmodel#0=b.obj\n";
+        std::io::Write::write_all(&mut zip, text.as_bytes()).unwrap();
+        zip.finish().unwrap();
+        let catalogue = Archive::open(&path).unwrap().catalogue(1 << 20).unwrap();
+        assert!(catalogue.items.is_empty());
     }
 }

@@ -228,11 +228,10 @@ impl Ready<'_> {
         warnings
     }
 
-    /// The same of a finished image, whose light is known.
-    fn warnings(&self, truth: &GroundTruth, inside: f64, outside: f64) -> Vec<String> {
-        let mut warnings = warn::beams(self.spots);
+    /// Why a finished image is without light, if it is: `inside` the gate there is so much, and `outside` of it.
+    fn dark(&self, truth: &GroundTruth, inside: f64, outside: f64) -> Option<String> {
         if inside > 0.0 {
-            return warnings;
+            return None;
         }
         let walk = &self.frame.walk;
         let pixels = self.centres.hits.len();
@@ -240,8 +239,7 @@ impl Ready<'_> {
         let lit = warn::arrivals(walk.world, self.middles, self.centres, seen);
         let any = warn::arrivals(walk.world, self.middles, self.centres, |_, _| true);
         let gate = &self.settings.gate;
-        warnings.push(warn::empty(gate, self.spots, (lit, any), outside > 0.0));
-        warnings
+        Some(warn::empty(gate, self.spots, (lit, any), outside > 0.0))
     }
 
     /// The result: the image with what was drawn into it and with the one-bounce peaks.
@@ -289,9 +287,12 @@ impl Ready<'_> {
             0.0
         };
         let (groups, others) = by_wavelength(settings, image.groups);
-        let mut warnings = self.warnings(&truth, inside, overflow.energy);
+        let dark = self.dark(&truth, inside, overflow.energy);
+        let mut warnings = warn::beams(self.spots);
+        warnings.extend(dark.clone());
         warnings.extend(warn::tails(&error));
         Ok(Rendered {
+            dark,
             warnings,
             width: frame.width,
             height: frame.height,

@@ -3,7 +3,7 @@
 
 use picofarm_dataset::{Dataset, PartName};
 use picofarm_proto::{
-    key::{StageKey, TaskKey, task_key},
+    key::TaskKey,
     model::{PartTask, RenderTask, SpecError},
     trace,
 };
@@ -15,7 +15,7 @@ use tracing::{debug_span, info, warn};
 use crate::execute::{
     Context, Control, Output, RunTask, Submission, Task, TaskError,
     output::Stores,
-    render::{Watched, of_render, prepare, renderer_version},
+    render::{Watched, of_render, prepare, renderer_version, scene_key},
 };
 
 impl RunTask for PartTask {
@@ -26,15 +26,8 @@ impl RunTask for PartTask {
     /// Renders the part that task `task.index` is, unless it or its whole scene is there.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, with, spec) = (&context.stores, context.scenes(), self);
-        let Some(stage) = StageKey::parse(&spec.joined_by) else {
-            let what = format!(
-                "joined_by: {:?} is no key; submit the job again",
-                spec.joined_by
-            );
-            return Err(TaskError::User(what));
-        };
         let (scene, index) = spec.division().split(task.index);
-        let key = task_key(&stage, scene);
+        let key = scene_key(&spec.whole, scene)?;
         let dataset = stores.open(&spec.whole, control)?;
         let done = |bytes, adopted| {
             Ok(Output {
@@ -68,9 +61,7 @@ impl RunTask for PartTask {
     }
 
     fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
-        self.whole.resolve(here)?;
-        self.joined_by = self.whole.stage_key().to_string();
-        Ok(())
+        self.whole.resolve(here)
     }
 }
 

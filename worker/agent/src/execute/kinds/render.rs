@@ -8,7 +8,7 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderTask, SpecError, TaskKind},
+    model::{RenderTask, SpecError, TaskKind, log::DARK},
     trace,
 };
 use picofarm_scene::{Camera, Scene};
@@ -48,7 +48,7 @@ impl RunTask for RenderTask {
     /// Renders scene `task.index` of the job into its data set.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, with, spec) = (&context.stores, context.scenes(), self);
-        let key = task.key();
+        let key = scene_key(spec, task.index)?;
         let dataset = stores.open(spec, control)?;
         if !task.spec.force
             && let Some(manifest) = stores.finished(&dataset, task.index, &key, control)?
@@ -59,9 +59,10 @@ impl RunTask for RenderTask {
                 adopted: true,
             });
         }
-        recipe::note(stores, &dataset, task, control)?;
         let render = |scene: &Scene, settings: &Settings| {
             stores.check_render(settings, scene)?;
+            // Not before the scene is there: a file that cannot be read leaves no recipe beside its corrected form's.
+            recipe::note(stores, &dataset, task, control)?;
             if spec.parts > 1 {
                 let parts = Parts::new(stores, &dataset, spec, task.index, key);
                 return parts.join(scene, settings, control);
@@ -87,6 +88,12 @@ impl RunTask for RenderTask {
         here.profile(&self.output.profile)?;
         here.scenes(&mut self.scenes)
     }
+}
+
+/// Names the bytes of scene `index`.
+pub(in crate::execute) fn scene_key(spec: &RenderTask, index: u64) -> Result<TaskKey, TaskError> {
+    let key = spec.scene_key(index);
+    key.ok_or_else(|| scenes::not_listed(&format!("scenes.files[{index}]")))
 }
 
 /// Scene `index` rendered in one piece and coded for the data set; `key` is its task's.
@@ -126,7 +133,11 @@ fn make_by(
         "rendered"
     );
     for warning in &rendered.warnings {
-        warn!("{warning}");
+        let mark = match rendered.dark.as_ref() == Some(warning) {
+            true => DARK,
+            false => "",
+        };
+        warn!("{mark}{warning}");
     }
     let camera = &scene.camera;
     let spots: Vec<_> = rendered
