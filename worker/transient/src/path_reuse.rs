@@ -304,9 +304,15 @@ impl Sharing {
                 false => 1,
             };
             let begin = |j: u32| {
-                let path = tile.pass * u64::from(paths) + u64::from(j);
+                let (stream, path) = match j.checked_sub(1) {
+                    None => (Stream::Place, tile.pass),
+                    Some(j) => {
+                        let before = tile.pass * u64::from(paths - 1);
+                        (Stream::MirrorPlace, before + u64::from(j))
+                    }
+                };
                 walk.world
-                    .camera_ray((row, col), place(tile.seed, index, path))
+                    .camera_ray((row, col), place(tile.seed, stream, index, path))
             };
             let share = |j: u32| Share {
                 spots: 1.0 / paths as f32,

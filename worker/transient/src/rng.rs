@@ -26,8 +26,11 @@ pub(crate) enum Stream {
     /// Light paths by way of glass, and camera paths.
     Glass = 8,
     ByGlass = 9,
-    /// Where in a pixel its camera paths begin.
+    /// Where in a pixel its camera paths begin: those to gather points, those by near-mirrors alone, and
+    /// those by glass. Of one sequence for all, each would have a part that is spread less evenly.
     Place = 10,
+    MirrorPlace = 11,
+    GlassPlace = 12,
     /// How far camera and light reach.
     Extent = 6,
 }

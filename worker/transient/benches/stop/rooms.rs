@@ -28,6 +28,7 @@ pub fn run(library: &str, folder: Option<&String>, (count, pixels): (u32, u32), 
         spots: Spots::Grid(SPOTS),
         width: pixels,
         height: pixels,
+        assets: library.name().into(),
         ..FurnishedSettings::default()
     };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
