@@ -26,11 +26,9 @@ pub(crate) enum Stream {
     /// Light paths by way of glass, and camera paths.
     Glass = 8,
     ByGlass = 9,
-    /// Where in a pixel its camera paths begin: those to gather points, those by near-mirrors alone, and
-    /// those by glass. Of one sequence for all, each would have a part that is spread less evenly.
+    /// Where in a pixel its camera paths begin, and those by glass.
     Place = 10,
-    MirrorPlace = 11,
-    GlassPlace = 12,
+    GlassPlace = 11,
     /// How far camera and light reach.
     Extent = 6,
 }

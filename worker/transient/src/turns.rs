@@ -207,7 +207,7 @@ mod tests {
             place(1, Stream::Place, 0, 0),
             place(1, Stream::Place, 1, 0),
             place(2, Stream::Place, 0, 0),
-            place(1, Stream::MirrorPlace, 0, 0),
+            place(1, Stream::GlassPlace, 0, 0),
         ];
         for (i, a) in all.iter().enumerate() {
             assert!(all[..i].iter().all(|b| a != b), "{all:?}");
