@@ -1,5 +1,6 @@
 //! The driver: a whole render with its stopping rule, and the forecast of one.
 
+mod dark;
 mod draws;
 mod error;
 mod forecast;
