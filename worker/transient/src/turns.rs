@@ -29,24 +29,25 @@ fn r2(start: (u32, u32), k: u64) -> (f32, f32) {
     (turn(start.0, STEPS.0), turn(start.1, STEPS.1))
 }
 
-/// Quarters within quarters that paths of a pixel take in turn; within the smallest, places are random.
-const QUARTERS: u32 = 8;
+/// Quarters within quarters that paths of a pixel take in turn; within the smallest, places are random. With
+/// eight, what is seen in two mirrors erred by 0.83 of what the spread of passes states.
+const QUARTERS: u32 = 3;
 
 /// Where in a pixel path `k` of those that `stream` is for begins, over all passes: spread evenly, because
 /// much of the light in a bin depends on it.
 ///
 /// Four paths in a row take the quarters of the pixel in random order, sixteen the quarters of those, and
-/// so on: nested scrambling of the van der Corput sequence in base 4 (Owen 1995), laid along a Z. Passes
-/// are never more alike than random ones would be, whatever is seen, so that their spread states no less
-/// than the error of their mean. Sequences with a step, such as R₂, agree from pass to pass where what a
-/// pixel sees repeats itself at that step.
+/// 64 once more: nested scrambling of the van der Corput sequence in base 4 (Owen 1995), laid along a Z and
+/// begun anew every 64 paths. Passes are never more alike than random ones would be, whatever is seen, so
+/// that their spread states no less than the error of their mean. Sequences with a step, such as R₂, agree
+/// from pass to pass where what a pixel sees repeats itself at that step.
 #[inline]
 pub(crate) fn place(seed: u64, stream: Stream, pixel: u64, k: u64) -> (f32, f32) {
     let mut rng = Rng::new(seed, stream, pixel, k);
     let random = |rng: &mut Rng| rng.next_u32() >> (8 + QUARTERS);
     let (mut x, mut y) = (random(&mut rng), random(&mut rng));
-    // The digits of `k` in base 4, from the last one on, after a one.
-    let mut path = 1;
+    // Which 64 paths, a one, and the digits of `k` in base 4 from the last one on.
+    let mut path = (k >> (2 * QUARTERS)) << 8 | 1;
     for level in 0..QUARTERS {
         let digit = (k >> (2 * level)) & 3;
         let turn = Rng::new(seed, stream, pixel, !path).next_u32();
@@ -123,7 +124,7 @@ mod tests {
     proptest! {
         #[test]
         fn paths_take_every_part_of_a_pixel_before_they_take_one_again(
-            seed in any::<u64>(), pixel in 0u64..1 << 24, block in 0u64..1 << 30, level in 0u32..5,
+            seed in any::<u64>(), pixel in 0u64..1 << 24, block in 0u64..1 << 30, level in 0u32..=3,
         ) {
             let (count, side) = (1u64 << (2 * level), 1usize << level);
             let mut taken = vec![false; count as usize];
