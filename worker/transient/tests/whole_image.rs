@@ -46,16 +46,19 @@ fn true_over_stated(name: &str) -> f64 {
 
 #[test]
 fn the_error_of_the_whole_image_holds_behind_doors_and_slats_and_over_fine_squares() {
-    // 40 seeds know the scatter to 11 %.
-    for name in [
+    let rooms = [
         "door",
         "lit-by-door",
         "blinds",
         "squares",
         "squares-4",
         "squares-7",
-    ] {
-        let ratio = true_over_stated(name);
-        assert!((0.8..1.2).contains(&ratio), "{name}: {ratio}");
+    ];
+    let ratios = rooms.map(true_over_stated);
+    // 40 seeds know the scatter to 11 %, those of six rooms to 5 %.
+    for (name, ratio) in rooms.iter().zip(ratios) {
+        assert!((0.67..1.33).contains(&ratio), "{name}: {ratio}");
     }
+    let all = (ratios.iter().map(|r| r * r).sum::<f64>() / rooms.len() as f64).sqrt();
+    assert!((0.85..1.2).contains(&all), "{all}");
 }
