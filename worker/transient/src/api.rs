@@ -6,7 +6,7 @@ pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelengths};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-20";
+pub const RENDERER_VERSION: &str = "transient-21";
 
 /// Settings of one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -222,6 +222,14 @@ pub(crate) struct Emitters {
 }
 
 impl Emitters {
+    /// No source.
+    pub fn none() -> Self {
+        Self {
+            rays: std::iter::once(0..0).collect(),
+            ..Self::default()
+        }
+    }
+
     pub fn new(scene: &Scene, world: &World, spots: &[Option<Spot>]) -> Result<Self, RenderError> {
         let mut stack = world.bvh.stack();
         let mut all = Self::default();

@@ -304,9 +304,11 @@ impl Sharing {
                 false => 1,
             };
             let begin = |j: u32| {
-                let path = tile.pass * u64::from(paths) + u64::from(j);
-                walk.world
-                    .camera_ray((row, col), place(tile.seed, index, path))
+                // Each pass takes every part of the pixel, and its first path another one in each.
+                let (j, paths) = (u64::from(j), u64::from(paths));
+                let path = tile.pass * paths + (j + tile.pass) % paths;
+                let place = place(tile.seed, Stream::Place, index, path);
+                walk.world.camera_ray((row, col), place)
             };
             let share = |j: u32| Share {
                 spots: 1.0 / paths as f32,

@@ -1,5 +1,6 @@
 //! The driver: a whole render with its stopping rule, and the forecast of one.
 
+mod dark;
 mod draws;
 mod error;
 mod forecast;
@@ -17,7 +18,7 @@ use picofarm_scene::Scene;
 
 use self::{
     error::{Errors, passes_for},
-    image::{Image, Watch},
+    image::{Image, Round, Watch},
     ready::{Ready, prepare},
     splat::{Sources, Splats},
 };
@@ -33,19 +34,15 @@ use crate::{
 
 /// Most passes that [`Budget::Error`] spends.
 const MAX_PASSES: u32 = 1 << 16;
-/// Passes of its first round, enough for an error estimate that means something: with 8 large images of many spots came to 6 to
-/// 9 % where 10 % were asked for.
-const FIRST_PASSES: u32 = 4;
-/// Least passes of a later one: how far a single pass is off nothing tells.
-const LEAST_ROUND: u32 = 2;
+/// Passes of its first round, the fewest that tell how far they scatter: with 4 large images of many spots
+/// came to 6.8 to 8.6 % where 10 % were asked for.
+const FIRST_PASSES: u32 = 2;
 /// Share of the progress that the first round counts for.
 const FIRST_SHARE: f32 = 0.3;
 /// How much longer than all before it a round of a render that is bound in time may be: each tells how long the next will take.
 const GROWTH: u32 = 3;
 /// Share of the time left that a round is made for.
 const TIMED: f64 = 0.85;
-/// Aimed at, as a share of the error asked for, since the estimate is itself an estimate.
-const GOAL: f32 = 0.98;
 
 /// Renders a scene. Runs on the caller's rayon pool; the result is bit-identical for any number of
 /// threads, and on any machine.
@@ -64,7 +61,7 @@ pub fn render(
 }
 
 /// Renders as many passes as time allows: `left` says how many seconds are left, and is asked between rounds. The budget of
-/// `settings` bounds it as well: it ends where the error is reached, or after so many samples. It makes 4 passes even
+/// `settings` bounds it as well: it ends where the error is reached, or after so many samples. It makes 2 passes even
 /// where time is too short for them. How many passes there are depends on the machine and its load, so the same call gives
 /// other bytes each time; [`render`] with the samples that [`crate::ErrorEstimate::samples`] states comes near to it.
 ///
@@ -113,9 +110,12 @@ fn whole(
         Some(_) => ready.first_passes().min(FIRST_PASSES),
         None => ready.first_passes(),
     };
-    let mut wave = passes;
-    let (mut rays, mut done) = (0, 0.0);
     let budget = ready.settings.budget;
+    let mut wave = Round {
+        more: matches!(budget, Budget::Error(_)) || left.is_some(),
+        ..Round::only(passes)
+    };
+    let (mut rays, mut done) = (0, 0.0);
     let error = loop {
         let began = left.map(|left| left());
         let until = match budget {
@@ -129,7 +129,10 @@ fn whole(
         let errors = match &mut splats {
             None => image.errors(),
             Some((sources, splats)) => {
-                let wave = if walks { wave } else { ready.splat_passes(0) };
+                let wave = match walks {
+                    true => wave.passes,
+                    false => ready.splat_passes(0),
+                };
                 rays += splats.round((frame, sources), wave, &watch)?;
                 splats.errors(frame, &image, stop)?
             }
@@ -148,19 +151,24 @@ fn whole(
                 Budget::Error(_) => MAX_PASSES - spent,
                 Budget::Samples(n) => n - spent,
             };
-            let next = in_time((began, left()), wave).min(GROWTH * spent).min(most);
-            if next < LEAST_ROUND.min(most) {
+            let next = in_time((began, left()), wave.passes);
+            let next = next.min(GROWTH * spent).min(most);
+            if next == 0 {
                 break error;
             }
-            // Nor is a last one left over.
-            wave = if most - next == 1 { most } else { next };
+            wave = Round {
+                passes: next,
+                two: next >= spent,
+                more: true,
+            };
             continue;
         }
         let Budget::Error(target) = budget else {
             break error;
         };
         let target = target as f32;
-        wave = further(&errors, frame.sampling, target, stop)?;
+        let strata_cost = |n| image.strata_cost(frame.sampling, n);
+        wave = further(&errors, (frame.sampling, &strata_cost), target, stop)?;
     };
     let plan = ready.plan(passes);
     let splats = splats.map(|(_, splats)| splats);
@@ -174,24 +182,33 @@ fn in_time((began, left): (f64, f64), round: u32) -> u32 {
     (TIMED * left / each) as u32
 }
 
-/// How many more passes the median error of the image needs to reach `target`. All tiles get as many: to give those with larger
-/// errors more, up to twice as many, took up to a half more time to the same median, and as long to the same 95th percentile.
+/// What more the median error of the image needs to reach `target`: passes, and two bounces sampled again where
+/// that takes fewer rays. All tiles get as many passes: to give those with larger errors more, up to twice as
+/// many, took up to a half more time to the same median, and as long to the same 95th percentile.
 fn further(
     errors: &Errors,
-    sampling: &Sampling,
+    (sampling, strata_cost): (&Sampling, &dyn Fn(u32) -> u32),
     target: f32,
     stop: Stop,
-) -> Result<u32, RenderError> {
+) -> Result<Round, RenderError> {
     let spent = errors.samples;
-    let two = |n| match stop.asked() {
-        // Whatever comes out of it is not used.
-        true => 0.0,
-        false if n == spent => errors.two_unit,
-        false => sampling.joined((spent, errors.two_unit), n - spent),
+    let target = target / errors.likely(0.5) as f32;
+    let passes = |two: bool| {
+        let unit = |n: u32| match stop.asked() {
+            // Whatever comes out of it is not used.
+            true => 0.0,
+            false if n == spent || !two => errors.two_unit,
+            false => sampling.joined(errors.two_unit, n - spent),
+        };
+        let range = ((spent + 1).min(MAX_PASSES), MAX_PASSES);
+        passes_for(&errors.stats, spent, target, range, unit) - spent
     };
-    let target = GOAL * target / errors.likely(0.5) as f32;
-    let range = ((spent + LEAST_ROUND).min(MAX_PASSES), MAX_PASSES);
-    let all = passes_for(&errors.stats, spent, target, range, two);
+    let (alone, again) = (passes(false), passes(true));
     stop.check()?;
-    Ok(all - spent)
+    let two = again.saturating_add(strata_cost(again)) < alone;
+    Ok(Round {
+        passes: if two { again } else { alone },
+        two,
+        more: true,
+    })
 }

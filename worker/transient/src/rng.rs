@@ -26,8 +26,9 @@ pub(crate) enum Stream {
     /// Light paths by way of glass, and camera paths.
     Glass = 8,
     ByGlass = 9,
-    /// Where in a pixel its camera paths begin.
+    /// Where in a pixel its camera paths begin, and those by glass.
     Place = 10,
+    GlassPlace = 11,
     /// How far camera and light reach.
     Extent = 6,
 }

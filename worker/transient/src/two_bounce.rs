@@ -91,11 +91,18 @@ impl Sampling {
         1.0 / (side * side * side)
     }
 
-    /// The same after a round of `wave` passes, where it was `before` after so many passes of earlier rounds: each round has
-    /// strata of its own, and weighs as many as it has passes.
-    pub fn joined(&self, (passes, before): (u32, f64), wave: u32) -> f64 {
-        let share = f64::from(wave) / f64::from((passes + wave).max(1));
-        before * (1.0 - share).powi(2) + self.variance(wave) * share.powi(2)
+    /// The weight of strata of `wave` passes beside earlier ones, whose variance is `before`, 0 where there
+    /// are none: the less they scatter, the more they weigh.
+    pub fn weight(&self, before: f64, wave: u32) -> f64 {
+        match before > 0.0 {
+            true => before / (before + self.variance(wave)),
+            false => 1.0,
+        }
+    }
+
+    /// The variance of both together.
+    pub fn joined(&self, before: f64, wave: u32) -> f64 {
+        self.weight(before, wave) * self.variance(wave)
     }
 }
 
@@ -266,18 +273,18 @@ mod tests {
     }
 
     #[test]
-    fn rounds_of_strata_join_by_their_passes() {
+    fn rounds_of_strata_weigh_as_much_as_they_know() {
         let sampling = Sampling {
             base: 4.0,
             refined: vec![],
         };
-        let one = sampling.joined((0, 0.0), 64);
+        let one = sampling.joined(0.0, 64);
         assert_eq!(one, sampling.variance(64));
-        let two = sampling.joined((64, one), 64);
+        let two = sampling.joined(one, 64);
         assert!((two / one - 0.5).abs() < 1e-12, "{two} {one}");
-        // A few passes more bring few strata, which weigh little.
-        let more = sampling.joined((64, one), 4);
-        assert!(more < one, "{more} {one}");
+        // Few passes bring few strata, which weigh less.
+        let more = sampling.joined(one, 4);
+        assert!(more < one && more > 0.7 * one, "{more} {one}");
         assert_eq!(sampling.sides(1), sampling.sides(8));
     }
 }

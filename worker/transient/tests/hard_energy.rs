@@ -84,7 +84,7 @@ fn a_closed_white_room_keeps_all_energy_at_every_bounce() {
     for (point, longest, most) in [(v(0.4, 0.3, -1.5), 5, 0.01), (v(0.97, 0.3, -1.5), 4, 0.06)] {
         let mut s = scene(room(low, high, &grey(1.0)), 8, &[]);
         s.laser.beams.push(beam_to(point, v(0.0, 0.0, 1.0), 1));
-        for (k, (flux, se)) in each(&fluxes(&s, &views, longest, 112)).iter().enumerate() {
+        for (k, (flux, se)) in each(&fluxes(&s, &views, longest, 128)).iter().enumerate() {
             near(&format!("bounce {}", k + 2), *flux, 1.0, 0.003, *se);
             assert!(*se < most, "{se}");
         }

@@ -201,6 +201,52 @@ fn a_gate_beyond_all_light_stays_dark_and_takes_fewer_rays() {
 }
 
 #[test]
+fn a_gate_that_no_light_can_reach_takes_no_ray() {
+    let s = stage(16);
+    let run = |gate: Gate, max_bounces| {
+        let set = Settings {
+            gate,
+            max_bounces,
+            one_bounce: true,
+            ..settings(Budget::Samples(4))
+        };
+        render(&s, &set, &Quiet).unwrap()
+    };
+    let from = |start_m, bins| Gate {
+        start_m,
+        bin_width_m: 0.0384,
+        bins,
+    };
+    let dark = |r: &Rendered| {
+        let said = r.plan.approximations.iter();
+        said.filter(|x| x.contains("none is looked for")).count() == 1
+    };
+    // The room is 6.9 m from corner to corner: 20 bounces are over after 150 m.
+    for (gate, most) in [(from(0.0, 4), None), (from(150.0, 4), Some(20))] {
+        let r = run(gate, most);
+        assert!(dark(&r) && energy(&r.transient) == 0.0, "{:?}", r.plan);
+        // The picture and the masks alone, as where nothing but one bounce is asked for.
+        assert_eq!(r.rays, run(gate, Some(1)).rays);
+        assert!(r.overflow.energy > 0.0 && r.overflow.share == 1.0);
+        assert!(
+            r.warnings.iter().any(|w| w.contains("empty")),
+            "{:?}",
+            r.warnings
+        );
+    }
+    // Up to the bin of the first light, and one before.
+    let whole = run(from(0.0, 400), None);
+    let bins = whole.transient.chunks(400);
+    let first = bins.filter_map(|h| h.iter().position(|&x| x > 0.0)).min();
+    let first = first.unwrap() as u32;
+    let (before, with) = (
+        run(from(0.0, first - 1), None),
+        run(from(0.0, first + 1), None),
+    );
+    assert!(dark(&before) && !dark(&with) && energy(&with.transient) > 0.0);
+}
+
+#[test]
 fn the_renderer_looks_in_shells_where_the_gate_is_narrow_and_says_so() {
     let s = stage(8);
     let says = |r: &Rendered| {

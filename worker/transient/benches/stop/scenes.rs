@@ -1,7 +1,8 @@
 //! Scenes that are hard to sample: near-mirrors, glossy and mixed surfaces, spots in far corners.
 
 use picofarm_scene::{
-    AssetLibrary, Bsdf, Distribution, Lobe, Material, Object, Part, Parts, Scene, Vec3,
+    AssetLibrary, Bsdf, Distribution, Lobe, Material, Object, Part, Parts, Scene, Texture, Vec3,
+    Wrap,
     furnished::{self, FurnishedSettings},
     primitive,
 };
@@ -52,6 +53,24 @@ fn flaked() -> Material {
             parts: Parts::of(&parts).expect("three parts"),
         },
         ..grey(0.5)
+    }
+}
+
+/// A wall with black and white squares.
+fn squared(wall: &Object, size: f32) -> Object {
+    let texels = vec![[20; 3], [235; 3], [235; 3], [20; 3]];
+    let texture = Texture::new("squares", 2, 2, texels, Wrap::Repeat).expect("four texels");
+    let mut mesh = (*wall.mesh).clone();
+    let [corner, right, _, up] = [0, 1, 2, 3].map(|k| mesh.positions[k]);
+    let times = |side: Vec3| side.length() / (2.0 * size);
+    let (x, y) = (times(right - corner), times(up - corner));
+    mesh.uv = vec![[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]];
+    for m in &mut mesh.materials {
+        m.texture = Some(texture.clone().into());
+    }
+    Object {
+        mesh: mesh.into(),
+        ..wall.clone()
     }
 }
 
@@ -213,7 +232,45 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     bodies.push(sphere(v(0.5, 0.3, -2.8), 0.35, 3, liquid));
     let furnished = |seed| furnished::generate(seed, &furniture, &library).expect("sound settings");
 
+    // Two rooms with an open door between them, light through slats, and walls of fine squares.
+    let partition = |low: f32, high: f32| {
+        quad(
+            v(low, -1.5, -2.4),
+            v(high - low, 0.0, 0.0),
+            v(0.0, 3.0, 0.0),
+            grey(0.6),
+        )
+    };
+    let mut door = walls();
+    door.extend([partition(-2.0, -0.35), partition(0.35, 2.0)]);
+    let through = [v(0.2, 0.1, -3.0), v(-0.25, 0.2, -3.9), v(0.1, -0.3, -3.5)];
+    let mut blinds = walls();
+    blinds.extend((0..40).map(|k| {
+        let foot = v(-2.0, -1.5 + 0.075 * k as f32, -2.6);
+        quad(foot, v(4.0, 0.0, 0.0), v(0.0, 0.03, 0.05), grey(0.6))
+    }));
+    // The laser stands in the other room.
+    let lit_by_door = |width: f32, spots: &[Vec3]| {
+        let mut objects = walls();
+        objects.extend([partition(-2.0, -width), partition(width, 2.0)]);
+        let mut scene = scene(objects, pixels, spots);
+        scene.laser.origin = v(1.2, 0.2, -3.2);
+        scene
+    };
+    let aside = [v(0.8, 0.1, -0.3), v(0.5, -0.6, -0.4), v(0.6, 0.7, 0.1)];
+    let squares = |side: f32| {
+        let all = walls().iter().map(|wall| squared(wall, side)).collect();
+        scene(all, pixels, &BEAMS)
+    };
+
     let mut all: Vec<(String, Scene)> = [
+        ("door", scene(door, pixels, &through)),
+        ("lit-by-door", lit_by_door(0.35, &aside)),
+        ("ajar", lit_by_door(0.06, &aside[..1])),
+        ("blinds", scene(blinds, pixels, &BEAMS)),
+        ("squares", squares(0.02)),
+        ("squares-4", squares(0.042)),
+        ("squares-7", squares(0.024)),
         ("everything", scene(everything, pixels, &BEAMS)),
         ("coated", scene(coated, pixels, &BEAMS)),
         ("angled", scene(angled, pixels, &BEAMS)),

@@ -31,7 +31,7 @@ pub(super) struct Phases {
 impl Phases {
     /// Those of so many passes; `None` where a phase has none.
     pub fn of(passes: u32) -> Option<Self> {
-        if (passes as usize) < PHASES {
+        if !are_drawn(passes) {
             return None;
         }
         // Means over the passes of each phase. Of n passes, a phase has n/8 or one more.
@@ -49,15 +49,25 @@ impl Phases {
         pass as usize % PHASES
     }
 
-    /// Adds a bin with such sums to a pixel's draws; `other` is a draw of what else errs in it.
-    pub fn add(&self, sums: Sums, other: f64, draw: &mut Draw) {
+    /// Adds a bin with such sums to a pixel's draws.
+    pub fn add(&self, sums: Sums, draw: &mut Draw) {
         let mean = |phase: usize| f64::from(sums[phase]) * self.weights[phase];
         let means: [f64; PHASES] = std::array::from_fn(mean);
         for (k, square) in draw.iter_mut().enumerate() {
             let signed = means.iter().enumerate().map(|(j, m)| sign(k, j) * m);
-            *square += (signed.sum::<f64>() + other).powi(2);
+            *square += signed.sum::<f64>().powi(2);
         }
     }
+}
+
+/// A draw of the error of two parts that err independently: on average their squares add up.
+pub(super) fn joined(draw: Draw, other: f64) -> Draw {
+    draw.map(|square| square + other)
+}
+
+/// Whether so many passes have draws of their own.
+pub(super) fn are_drawn(passes: u32) -> bool {
+    passes as usize >= PHASES
 }
 
 /// A draw from a pixel's variance alone.
@@ -146,25 +156,31 @@ impl Watched {
         }
     }
 
-    /// Draws of the watched pixels' errors after so many passes. With fewer than eight of them the 3+ part's variance, which
-    /// `multi_variance` says by pixel of the region, stands in their place.
+    /// Draws of the errors of the watched pixels' 3+ part after so many passes. With fewer than eight of
+    /// them its variance, which `multi_variance` says by pixel of the region, stands in their place.
     pub fn draws(&self, passes: u32, multi_variance: impl Fn(usize) -> f64) -> Vec<Draw> {
-        let inside = 1..self.slots.max(2) - 1;
         let phases = Phases::of(passes);
         let pixels = self.pixels.iter().enumerate();
         let each = pixels.map(|(place, &k)| {
-            let two = &self.two[place * self.slots..][..self.slots];
             let Some(phases) = &phases else {
-                let two = two[inside.clone()].iter();
-                let two: f64 = two.map(|&x| f64::from(x).powi(2)).sum();
-                return of_variance(two + multi_variance(k));
+                return of_variance(multi_variance(k));
             };
             let mut draw = Draw::default();
-            for slot in inside.clone() {
+            for slot in 1..self.slots.max(2) - 1 {
                 let sum = |phase: usize| self.sums[(place * PHASES + phase) * self.slots + slot];
-                phases.add(std::array::from_fn(sum), f64::from(two[slot]), &mut draw);
+                phases.add(std::array::from_fn(sum), &mut draw);
             }
             draw
+        });
+        each.collect()
+    }
+
+    /// ‖draw of the two-bounce part's error‖² of the watched pixels.
+    pub fn two_draws(&self) -> Vec<f64> {
+        let slots = self.slots.max(1);
+        let each = self.two.chunks(slots).map(|two| {
+            let inside = &two[1..slots.max(2) - 1];
+            inside.iter().map(|&x| f64::from(x).powi(2)).sum()
         });
         each.collect()
     }

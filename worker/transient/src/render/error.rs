@@ -218,6 +218,22 @@ impl Spread {
         }
     }
 
+    /// That of the mean over `n` passes, which it is of, and over `m` more, which `other` is of. The means
+    /// over both tell how far they scatter as well as the passes of each do.
+    pub fn joined(self, (n, mean): (f64, f64), other: Self, (m, other_mean): (f64, f64)) -> Self {
+        if n == 0.0 || m == 0.0 {
+            return if n == 0.0 { other } else { self };
+        }
+        let difference2 = (mean - other_mean).powi(2);
+        // A single pass has no scatter of its own.
+        let of = |s: Self, n: f64| if n > 1.0 { s.of_variance } else { 0.0 };
+        let part = |s: Self, k: f64| of(s, k) * (k / (n + m)).powi(4);
+        Self {
+            variance: joined_variance((n, m), (self.variance, other.variance), difference2),
+            of_variance: part(self, n) + part(other, m),
+        }
+    }
+
     /// Relative standard error of the variance.
     fn uncertainty(self) -> f64 {
         match self.variance > 0.0 {
@@ -225,6 +241,18 @@ impl Spread {
             false => 0.0,
         }
     }
+}
+
+/// Variance of the mean of `n` and `m` passes together: `variances` of the mean of each, and the squared
+/// difference of these means (Chan, Golub and LeVeque 1979). A single pass has no variance of its own.
+pub(super) fn joined_variance((n, m): (f64, f64), variances: (f64, f64), difference2: f64) -> f64 {
+    if n == 0.0 || m == 0.0 {
+        return if n == 0.0 { variances.1 } else { variances.0 };
+    }
+    let scatter = |n: f64, variance: f64| variance * n * (n - 1.0);
+    let within = scatter(n, variances.0) + scatter(m, variances.1);
+    let all = n + m;
+    (within + difference2 * n * m / all) / (all * (all - 1.0))
 }
 
 /// The errors of a whole image.

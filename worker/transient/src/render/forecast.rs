@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    FIRST_PASSES, GOAL, MAX_PASSES,
-    draws::{Draw, likely},
+    FIRST_PASSES, MAX_PASSES,
+    draws::{Draw, joined, likely},
     error::{Stat, median_after, passes_for, relative_median},
     image::{Watch, tile_side},
     layer::Layer,
@@ -81,7 +81,7 @@ pub(super) fn forecast(
         Budget::Error(target) => {
             let target = (target / likely) as f32;
             let range = (FIRST_PASSES, MAX_PASSES);
-            let n = passes_for(&stats, PASSES, GOAL * target, range, two);
+            let n = passes_for(&stats, PASSES, target, range, two);
             (n, median_after(&stats, PASSES, n, &two))
         }
     };
@@ -168,6 +168,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
     let order = Order {
         first: u32::MAX - PASSES,
         count: passes,
+        two: true,
     };
     let found: Vec<Looked> = regions
         .par_iter()
@@ -187,10 +188,13 @@ fn look(frame: &Frame, passes: u32) -> Found {
                     };
                     slots.clone().map(h).collect::<Vec<f32>>()
                 });
+                let of_two = renderer.done.two_draws();
+                let draws = renderer.done.draws().into_iter().zip(of_two);
+                let draws = draws.map(|(draw, of_two)| joined(draw, of_two));
                 Looked {
                     light: light.collect(),
                     stats: stats.collect(),
-                    draws: pixels.zip(renderer.done.draws()).collect(),
+                    draws: pixels.zip(draws).collect(),
                     rays: renderer.done.rays,
                 }
             },

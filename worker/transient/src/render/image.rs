@@ -13,11 +13,14 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     draws::{self, Draw},
-    error::{Errors, Spread, Stat},
+    error::{Errors, Spread, Stat, joined_variance},
     region::Region,
     tile::{Done, Frame, Order, TileRenderer},
 };
-use crate::api::{Progress, RenderError};
+use crate::{
+    api::{Progress, RenderError},
+    two_bounce::Sampling,
+};
 
 /// Side of a tile in pixels: of a large image, and of a small one or one with many histograms a pixel.
 /// A larger tile cuts fewer of the squares that share vertices at its edges, and takes more memory.
@@ -53,12 +56,53 @@ pub(super) struct Image {
     pub passes: u32,
     /// What the two-bounce variance is in proportion to after them, see [`crate::two_bounce::Sampling::variance`].
     two_unit: f64,
-    tile_spread: Vec<Spread>,
-    tile_overflow: Vec<f64>,
-    /// Draws of the errors of each tile's watched pixels.
-    tile_draws: Vec<Vec<Draw>>,
+    of_tiles: Vec<OfTile>,
+    /// The two-bounce part of each tile where later rounds need it: place among the slots of all channels
+    /// of its pixels, and value.
+    tile_two: Vec<Vec<(u32, f32)>>,
+    /// Rays of the last strata of two bounces, the passes that these were made for, and rays of all passes.
+    two_rays: u64,
+    strata_for: u32,
+    multi_rays: u64,
     width: usize,
     bins: usize,
+}
+
+/// What is known of a tile beyond its pixels' light.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+struct OfTile {
+    /// Energy of three bounces and more, and its spread.
+    multi: f64,
+    spread: Spread,
+    /// Variance of the energy of two bounces.
+    two_variance: f64,
+    /// Energy outside the gate, of two bounces and of more.
+    overflow: (f64, f64),
+    /// Draws of the errors of the watched pixels, of three bounces and more and of two.
+    draws: Vec<Draw>,
+    two_draws: Vec<f64>,
+}
+
+/// What a round does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Round {
+    /// Passes.
+    pub passes: u32,
+    /// The two-bounce part is sampled as well; else it stays what it is.
+    pub two: bool,
+    /// More rounds may come.
+    pub more: bool,
+}
+
+impl Round {
+    /// The only round of a render.
+    pub fn only(passes: u32) -> Self {
+        Self {
+            passes,
+            two: true,
+            more: false,
+        }
+    }
 }
 
 /// A range of tiles taken out of an image.
@@ -67,8 +111,7 @@ pub(super) struct Slice {
     /// The planes of [`Image::planes`], pixels in the order of the tiles.
     planes: Vec<Vec<f32>>,
     stats: Vec<Stat>,
-    /// Spread, overflow and draws of errors of each tile.
-    tiles: Vec<(Spread, f64, Vec<Draw>)>,
+    tiles: Vec<OfTile>,
     /// Passes over them.
     passes: u32,
 }
@@ -195,9 +238,11 @@ impl Image {
             overflow: 0.0,
             passes: 0,
             two_unit: 0.0,
-            tile_spread: vec![Spread::default(); tiles.len()],
-            tile_overflow: vec![0.0; tiles.len()],
-            tile_draws: vec![vec![]; tiles.len()],
+            of_tiles: vec![OfTile::default(); tiles.len()],
+            tile_two: vec![vec![]; tiles.len()],
+            two_rays: 0,
+            strata_for: 0,
+            multi_rays: 0,
             tiles,
             width: width as usize,
             bins,
@@ -209,14 +254,25 @@ impl Image {
         self.tiles.len()
     }
 
+    /// How many passes sampling two bounces takes as many rays as, in a round of so many.
+    pub fn strata_cost(&self, sampling: &Sampling, passes: u32) -> u32 {
+        let side = |n: u32| f64::from(sampling.sides(n).0);
+        let more = (side(passes) / side(self.strata_for)).powi(2);
+        let of_pass = self.multi_rays as f64 / f64::from(self.passes.max(1));
+        // Casting saturates.
+        (more * self.two_rays as f64 / of_pass.max(1.0)).round() as u32
+    }
+
     /// The errors of what was found so far.
     pub fn errors(&self) -> Errors {
-        let tiles = self.tiles.iter().zip(&self.tile_draws);
-        let watched = tiles.flat_map(|(region, draws)| {
+        let tiles = self.tiles.iter().zip(&self.of_tiles);
+        let watched = tiles.flat_map(|(region, of)| {
+            let draws = of.draws.iter().zip(&of.two_draws);
+            let draws = draws.map(|(draw, two)| draws::joined(*draw, *two));
             draws::watched(region).zip(draws).map(move |(k, draw)| {
                 let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
                 let (row, col) = (region.row + row, region.col + col);
-                (row as usize * self.width + col as usize, *draw)
+                (row as usize * self.width + col as usize, draw)
             })
         });
         Errors {
@@ -268,14 +324,10 @@ impl Image {
         let stats = runs
             .iter()
             .flat_map(|&(first, count)| &self.stats[first..first + count]);
-        let tile = |t: usize| {
-            let draws = self.tile_draws[t].clone();
-            (self.tile_spread[t], self.tile_overflow[t], draws)
-        };
         Slice {
             planes,
             stats: stats.copied().collect(),
-            tiles: range.map(tile).collect(),
+            tiles: self.of_tiles[range].to_vec(),
             passes: self.passes,
         }
     }
@@ -285,7 +337,10 @@ impl Image {
         let (runs, bins) = (self.runs(range.clone()), self.bins);
         let pixels: usize = runs.iter().map(|(_, count)| count).sum();
         let mut tiles = self.tiles[range.clone()].iter().zip(&slice.tiles);
-        let watched = tiles.all(|(region, of)| of.2.len() == draws::count(region));
+        let watched = tiles.all(|(region, of)| {
+            let count = draws::count(region);
+            of.draws.len() == count && of.two_draws.len() == count
+        });
         let planes = self.planes();
         if slice.tiles.len() != range.len()
             || !watched
@@ -309,32 +364,33 @@ impl Image {
             from = rest;
         }
         self.passes = slice.passes;
-        for (t, (spread, overflow, draws)) in range.zip(&slice.tiles) {
-            self.tile_spread[t] = *spread;
-            self.tile_overflow[t] = *overflow;
-            self.tile_draws[t].clone_from(draws);
-        }
+        self.of_tiles[range].clone_from_slice(&slice.tiles);
         true
     }
 
-    /// `wave` more passes over a range of the tiles. Returns the rays traced.
+    /// One more round over a range of the tiles. Returns the rays traced.
     pub fn round(
         &mut self,
         frame: &Frame,
         range: Range<usize>,
-        wave: u32,
+        round: Round,
         watch: &Watch,
     ) -> Result<u64, RenderError> {
         let tiles = self.tiles.clone();
         let count = range.len();
         let order = Order {
             first: self.passes,
-            count: wave,
+            count: round.passes,
+            two: round.two,
+        };
+        let two = match round.two {
+            true => frame.sampling.weight(self.two_unit, round.passes),
+            false => 0.0,
         };
         let image = Mutex::new(&mut *self);
         // As many as threads, for the whole round: their buffers are large, and new memory is dear.
         let idle: Mutex<Vec<TileRenderer>> = Mutex::default();
-        let rays: Vec<Option<u64>> = range
+        let rays: Vec<Option<(u64, u64)>> = range
             .into_par_iter()
             .map(|t| {
                 if watch.stopped.load(Ordering::Relaxed) {
@@ -343,96 +399,180 @@ impl Image {
                 let known = lock(&idle).pop();
                 let mut renderer = known.unwrap_or_else(|| TileRenderer::new(frame));
                 renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
-                lock(&image).join(frame, t, &renderer.done);
+                lock(&image).join(frame, (t, two, round.more), &renderer.done);
                 watch.tiles.fetch_add(1, Ordering::Relaxed);
-                let rays = renderer.done.rays;
+                let rays = (renderer.done.rays, renderer.done.two_rays);
                 lock(&idle).push(renderer);
                 Some(rays)
             })
             .collect();
-        let mut all = 0;
+        let (mut all, mut of_two) = (0, 0);
         for r in rays {
-            all += r.ok_or(RenderError::Stopped)?;
+            let (traced, two) = r.ok_or(RenderError::Stopped)?;
+            all += traced;
+            of_two += two;
         }
-        self.two_unit = frame.sampling.joined((self.passes, self.two_unit), wave);
-        self.passes += wave;
+        self.multi_rays += all - of_two;
+        if round.two {
+            (self.two_rays, self.strata_for) = (of_two, round.passes);
+            self.two_unit = frame.sampling.joined(self.two_unit, round.passes);
+        }
+        self.passes += round.passes;
         self.total();
         Ok(all)
     }
 
     /// Sums over the tiles, in their order.
     pub fn total(&mut self) {
-        let each = self.tile_spread.iter();
-        self.total_spread = each.fold(Spread::default(), |all, &s| all.plus(s));
-        self.overflow = self.tile_overflow.iter().sum();
+        let each = self.of_tiles.iter().map(|of| {
+            let two = Spread {
+                variance: of.two_variance,
+                of_variance: 0.0,
+            };
+            of.spread.plus(two)
+        });
+        self.total_spread = each.fold(Spread::default(), Spread::plus);
+        let outside = self.of_tiles.iter().map(|of| of.overflow.0 + of.overflow.1);
+        self.overflow = outside.sum();
     }
 
-    /// Joins a tile's new passes to its earlier ones, each weighed by its passes.
-    fn join(&mut self, frame: &Frame, t: usize, done: &Done) {
+    /// Joins a tile's new passes to its earlier ones, each weighed by its passes. `two` is the weight of its
+    /// new two-bounce part, 0 where there is none; `more` rounds may come.
+    fn join(&mut self, frame: &Frame, (t, two, more): (usize, f64, bool), done: &Done) {
         let (film, region, bins) = (frame.film, self.tiles[t], self.bins);
-        let spent = f64::from(self.passes);
-        let new = if spent == 0.0 {
-            1.0
-        } else {
-            f64::from(done.passes) / (spent + f64::from(done.passes))
+        let (spent, added) = (f64::from(self.passes), f64::from(done.passes));
+        let b = match spent == 0.0 {
+            true => 1.0,
+            false => added / (spent + added),
         };
-        let (a, b) = (1.0 - new, new);
+        let (a, stays) = (1.0 - b, 1.0 - two);
         // Render units → metres: every path has one 1/d² left over.
         let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
         let unit2 = unit * unit;
-        let blend = |old: f64, x: f64| old * a * a + x * b * b;
+        let blend = |(a, b): (f64, f64), old: f64, x: f64| old * a * a + x * b * b;
+        // Of a single pass nothing tells how far it is off: it errs as those before it do.
+        let alone = spent > 0.0 && done.passes == 1;
+        let multi = |old: f64, x: f64| match alone {
+            true => old * a,
+            false => blend((a, b), old, x),
+        };
+        let before = dense(&self.tile_two[t], region.pixels() * film.pixel());
+        let mut after = before.clone();
+        if two > 0.0 {
+            for (after, new) in after.iter_mut().zip(done.two()) {
+                *after = (f64::from(*after) * stays + f64::from(*new) * two) as f32;
+            }
+        }
+        // Both parts of a slot from what they were together.
+        let joined = |old: f32, at: usize, x: f64| {
+            let (before, after) = (f64::from(before[at]) * unit, f64::from(after[at]) * unit);
+            // What is left of rounding is no light.
+            let old = (f64::from(old) - before).max(0.0);
+            let x = x * unit;
+            ((after + old * a + x * b) as f32, x - old)
+        };
         for k in 0..region.pixels() {
             let row = region.row as usize + k / region.cols as usize;
             let col = region.col as usize + k % region.cols as usize;
             let pixel = row * self.width + col;
             let mut stat = Stat::default();
+            let mut difference2 = 0.0;
             for bin in 0..bins {
                 let m = done.moments(film, k, bin + 1);
                 let at = pixel * bins + bin;
-                let old = f64::from(self.transient[at]) * a;
-                let h = (old + (m.two + m.multi) * unit * b) as f32;
+                let place = k * film.pixel() + bin + 1;
+                let (h, difference) = joined(self.transient[at], place, m.multi);
                 self.transient[at] = h;
                 stat.norm2 += f64::from(h) * f64::from(h);
                 stat.total += f64::from(h);
+                difference2 += difference * difference;
                 if let Some(s) = &mut self.split {
-                    let mean = |old: f32, x: f64| (f64::from(old) * a + x * unit * b) as f32;
-                    let error = |old: f32, x: f64| {
-                        let old = f64::from(old);
-                        blend(old * old, x * unit2).sqrt() as f32
+                    let root = |variance: f64| variance.sqrt() as f32;
+                    let square = |x: f32| f64::from(x) * f64::from(x);
+                    let mean = |(a, b): (f64, f64), old: f32, x: f64| {
+                        (f64::from(old) * a + x * unit * b) as f32
                     };
-                    s.two[at] = mean(s.two[at], m.two);
-                    s.two_se[at] = error(s.two_se[at], m.two_variance);
-                    s.two_noise[at] = mean(s.two_noise[at], done.two_noise(film, k, bin + 1));
-                    s.multi[at] = mean(s.multi[at], m.multi);
-                    s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
-                    s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
+                    let of_two = (stays, two);
+                    s.two[at] = mean((0.0, 1.0), 0.0, f64::from(after[place]));
+                    let variance = blend(of_two, square(s.two_se[at]), m.two_variance * unit2);
+                    s.two_se[at] = root(variance);
+                    let noise = done.two_noise(film, k, bin + 1);
+                    s.two_noise[at] = mean(of_two, s.two_noise[at], noise);
+                    s.multi[at] = mean((a, b), s.multi[at], m.multi);
+                    s.multi_noise[at] = match alone {
+                        true => (f64::from(s.multi_noise[at]) * a.sqrt()) as f32,
+                        false => mean((a, b), s.multi_noise[at], done.noise(film, k, bin + 1)),
+                    };
+                    let old = square(s.multi_se[at]);
+                    s.multi_se[at] = root(multi(old, m.multi_variance * unit2));
                 }
             }
             for (g, group) in self.groups.iter_mut().enumerate() {
                 for bin in 0..bins {
-                    let h = &mut group[pixel * bins + bin];
-                    let x = done.value(film, k, g + 1, bin + 1);
-                    *h = (f64::from(*h) * a + x * unit * b) as f32;
+                    let at = pixel * bins + bin;
+                    let place = k * film.pixel() + (g + 1) * film.slots + bin + 1;
+                    let x = done.multi(film, k, g + 1, bin + 1);
+                    group[at] = joined(group[at], place, x).0;
                 }
             }
-            (stat.two_variance, stat.multi_variance) = done.pixel_variance(k);
+            let (two_variance, multi_variance) = done.pixel_variance(k);
             let old = self.stats[pixel];
+            let variances = (old.multi_variance, multi_variance * unit2);
             self.stats[pixel] = Stat {
-                two_variance: blend(old.two_variance, stat.two_variance * unit2),
-                multi_variance: blend(old.multi_variance, stat.multi_variance * unit2),
+                two_variance: blend((stays, two), old.two_variance, two_variance * unit2),
+                multi_variance: joined_variance((spent, added), variances, difference2),
                 ..stat
             };
         }
-        // Errors of rounds are independent: on average their squares add up.
-        let draws = &mut self.tile_draws[t];
-        draws.resize(draws::count(&region), Draw::default());
-        for (old, new) in draws.iter_mut().zip(done.draws()) {
-            for (old, new) in old.iter_mut().zip(new) {
-                *old = blend(*old, new * unit2);
+        // Errors of rounds are independent: on average their squares add up. Of few passes their variance
+        // stands for draws.
+        let of = &mut self.of_tiles[t];
+        of.draws.resize(draws::count(&region), Draw::default());
+        of.two_draws.resize(of.draws.len(), 0.0);
+        let pixels = draws::watched(&region).map(|k| {
+            let (row, col) = (k / region.cols as usize, k % region.cols as usize);
+            (region.row as usize + row) * self.width + region.col as usize + col
+        });
+        for ((draw, new), pixel) in of.draws.iter_mut().zip(done.draws()).zip(pixels) {
+            if draws::are_drawn(done.passes) {
+                for (old, new) in draw.iter_mut().zip(new) {
+                    *old = blend((a, b), *old, new * unit2);
+                }
+            } else if draws::are_drawn(self.passes) {
+                draw.iter_mut().for_each(|old| *old *= a);
+            } else {
+                *draw = draws::of_variance(self.stats[pixel].multi_variance);
             }
         }
-        let before = self.tile_spread[t].scaled(a);
-        self.tile_spread[t] = before.plus(done.total_spread().scaled(unit * b));
-        self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
+        for (old, new) in of.two_draws.iter_mut().zip(done.two_draws()) {
+            *old = blend((stays, two), *old, new * unit2);
+        }
+        let (energy, spread) = done.multi_energy();
+        let (energy, spread) = (energy * unit, spread.scaled(unit));
+        of.spread = of.spread.joined((spent, of.multi), spread, (added, energy));
+        of.multi = of.multi * a + energy * b;
+        let two_variance = done.two_energy_variance() * unit2;
+        of.two_variance = blend((stays, two), of.two_variance, two_variance);
+        let outside = done.overflow(film);
+        of.overflow.0 = of.overflow.0 * stays + outside.0 * unit * two;
+        of.overflow.1 = of.overflow.1 * a + outside.1 * unit * b;
+        if two > 0.0 && more {
+            self.tile_two[t] = sparse(&after);
+        }
     }
+}
+
+/// The values that are not 0, with their places.
+fn sparse(values: &[f32]) -> Vec<(u32, f32)> {
+    let each = (0u32..).zip(values.iter().copied());
+    each.filter(|(_, v)| *v != 0.0).collect()
+}
+
+/// All of `count` values.
+fn dense(values: &[(u32, f32)], count: usize) -> Vec<f32> {
+    let mut all = vec![0.0; count];
+    for &(at, v) in values {
+        all[at as usize] = v;
+    }
+    all
 }

@@ -349,7 +349,7 @@ fn drawn(phases: &Phases, (slots, sums): (&[u32], &[Sums]), inside: &Range<u32>)
     let mut draw = Draw::default();
     let each = slots.iter().zip(sums);
     for (_, sums) in each.filter(|(slot, _)| inside.contains(slot)) {
-        phases.add(*sums, 0.0, &mut draw);
+        phases.add(*sums, &mut draw);
     }
     draw
 }

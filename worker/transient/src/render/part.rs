@@ -12,7 +12,7 @@ use picofarm_scene::Scene;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    image::{Image, Slice, Watch},
+    image::{Image, Round, Slice, Watch},
     ready::{Ready, prepare},
     splat::{Sources, Splats},
 };
@@ -142,7 +142,7 @@ pub fn render_part(
         let (found, rays) = if index < of {
             let mut image = Image::new(frame)?;
             let range = which.range(image.tiles());
-            let rays = image.round(frame, range.clone(), shape.passes, &watch)?;
+            let rays = image.round(frame, range.clone(), Round::only(shape.passes), &watch)?;
             (Found::Tiles(image.take(range)), rays)
         } else if let Some(sources) = Sources::of(frame) {
             let mut splats = Splats::new(frame);

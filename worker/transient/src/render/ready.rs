@@ -3,7 +3,9 @@
 
 use picofarm_scene::{Scene, Spot};
 
-use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame, warn};
+use super::{
+    FIRST_PASSES, MAX_PASSES, dark::is_dark, image::Image, splat::Splats, tile::Frame, warn,
+};
 use crate::{
     api::{
         AtWavelength, Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered,
@@ -42,6 +44,9 @@ pub(super) struct Ready<'a> {
     pub frame: Frame<'a>,
     centres: &'a Centres,
     spots: &'a [Option<Spot>],
+    /// All sources, where `frame` has none because none of their light comes into the gate.
+    sources: &'a Emitters,
+    is_dark: bool,
     /// The spots as sources: those that light the image unless the beams have a width.
     middles: &'a Emitters,
 }
@@ -64,16 +69,20 @@ pub(super) fn prepare<R>(
     let wide = wide
         .map(|width| Emitters::widened(scene, &world, width))
         .transpose()?;
-    let emitters = wide.as_ref().unwrap_or(&middles);
-    if emitters.list.len() > MOST_SPOTS {
+    let sources = wide.as_ref().unwrap_or(&middles);
+    if sources.list.len() > MOST_SPOTS {
         return Err(RenderError::Invalid {
             field: "laser.beams".into(),
             what: format!(
                 "make {} point sources, expected at most {MOST_SPOTS}; use fewer beams, or beam.points",
-                emitters.list.len()
+                sources.list.len()
             ),
         });
     }
+    let max_bounces = settings.max_bounces.unwrap_or(u32::MAX);
+    let is_dark = is_dark(&world, sources, &settings.gate, max_bounces);
+    let none = Emitters::none();
+    let emitters = if is_dark { &none } else { sources };
     let mirrors = if settings.strategy.mirror_images.unwrap_or(true) {
         Mirrors::find(&world, emitters, stop)
     } else {
@@ -82,7 +91,7 @@ pub(super) fn prepare<R>(
     let centres = truth::centres(&world, stop)?;
     let sampling = Sampling::plan(&world, emitters, &centres, stop);
     stop.check()?;
-    let of_spot = groups_of(settings, emitters, spots.len())?;
+    let of_spot = groups_of(settings, sources, spots.len())?;
     let channels = (settings.groups.len(), wavelengths.len());
     let film = Film::new(&settings.gate, channels, of_spot);
     // Sums over light paths count a pixel's slots in 32 bits.
@@ -108,7 +117,7 @@ pub(super) fn prepare<R>(
         emitters,
         mirrors: &mirrors,
         gate: &settings.gate,
-        max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
+        max_bounces,
         lights: strategy.light_vertices.unwrap_or(true),
         caustics: None,
         reflectors: None,
@@ -164,6 +173,8 @@ pub(super) fn prepare<R>(
         frame,
         centres: &centres,
         spots: &spots,
+        sources,
+        is_dark,
         middles: &middles,
     })
 }
@@ -192,7 +203,14 @@ impl Ready<'_> {
     /// What the renderer decides to do, beginning with so many passes.
     pub fn plan(&self, passes: u32) -> Plan {
         let sampling = (self.frame.sampling, passes);
-        decide(self.scene, self.settings, &self.frame.walk, sampling)
+        let mut plan = decide(self.scene, self.settings, &self.frame.walk, sampling);
+        if self.is_dark {
+            plan.approximations.push(
+                "no light of two bounces and more reaches the gate: none is looked for, and the overflow has one bounce alone"
+                    .into(),
+            );
+        }
+        plan
     }
 
     /// The ground truth, and the rays it took.
@@ -228,8 +246,9 @@ impl Ready<'_> {
         warnings
     }
 
-    /// Why a finished image is without light, if it is: `inside` the gate there is so much, and `outside` of it.
-    fn dark(&self, truth: &GroundTruth, inside: f64, outside: f64) -> Option<String> {
+    /// Returns the reason for a finished image without light, if it has none: `inside` is its energy, and
+    /// `outside` is whether light arrives outside the gate.
+    fn dark(&self, truth: &GroundTruth, inside: f64, outside: bool) -> Option<String> {
         if inside > 0.0 {
             return None;
         }
@@ -239,7 +258,7 @@ impl Ready<'_> {
         let lit = warn::arrivals(walk.world, self.middles, self.centres, seen);
         let any = warn::arrivals(walk.world, self.middles, self.centres, |_, _| true);
         let gate = &self.settings.gate;
-        Some(warn::empty(gate, self.spots, (lit, any), outside > 0.0))
+        Some(warn::empty(gate, self.spots, (lit, any), outside))
     }
 
     /// The result: the image with what was drawn into it and with the one-bounce peaks.
@@ -264,7 +283,7 @@ impl Ready<'_> {
         };
         if settings.one_bounce && walk.max_bounces >= 1 {
             let mut stack = walk.world.bvh.stack();
-            let peaks = one_bounce::peaks(walk.world, &mut stack, walk.emitters);
+            let peaks = one_bounce::peaks(walk.world, &mut stack, self.sources);
             for peak in &peaks {
                 let gate = &settings.gate;
                 if !one_bounce::add(peak, 0, gate, &mut image.transient) {
@@ -287,7 +306,8 @@ impl Ready<'_> {
             0.0
         };
         let (groups, others) = by_wavelength(settings, image.groups);
-        let dark = self.dark(&truth, inside, overflow.energy);
+        let outside = self.is_dark || overflow.energy > 0.0;
+        let dark = self.dark(&truth, inside, outside);
         let mut warnings = warn::beams(self.spots);
         warnings.extend(dark.clone());
         warnings.extend(warn::tails(&error));

@@ -210,7 +210,7 @@ impl<'a> Sources<'a> {
             let Some(first) = own.next() else { return };
             glass.lay(walk, LAID, &mut rng, buffers);
             for pixel in std::iter::once(first).chain(own) {
-                let place = place(frame.seed, u64::from(pixel), pass);
+                let place = place(frame.seed, Stream::GlassPlace, u64::from(pixel), pass);
                 let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
                 let within = (walk, frame.film, photons);
                 glass.look(within, (pixel, ray), &mut rng, buffers, found);

@@ -34,6 +34,8 @@ pub(super) struct Frame<'a> {
 pub(super) struct Order {
     pub first: u32,
     pub count: u32,
+    /// The two-bounce part is sampled; else it is empty.
+    pub two: bool,
 }
 
 /// Renders one tile after another in buffers that it keeps: one for each thread.
@@ -76,7 +78,9 @@ pub(super) struct Done {
     all: Vec<f64>,
     pooling: Pool,
     pub passes: u32,
+    /// All rays, and those of two bounces.
     pub rays: u64,
+    pub two_rays: u64,
 }
 
 /// What a tile tells of one channel-0 slot of one pixel.
@@ -198,10 +202,15 @@ impl Done {
         self.pixel_variance[k]
     }
 
-    /// Draws of the errors of the watched pixels.
+    /// Draws of the errors of the watched pixels' 3+ part.
     pub fn draws(&self) -> Vec<Draw> {
         self.watched
             .draws(self.passes, |k| self.pixel_variance[k].1)
+    }
+
+    /// ‖draw of the error of their two-bounce part‖².
+    pub fn two_draws(&self) -> Vec<f64> {
+        self.watched.two_draws()
     }
 
     /// Which pixels those are.
@@ -209,28 +218,42 @@ impl Done {
         self.watched.pixels()
     }
 
-    /// Spread of the tile's whole energy. Pixels that share vertices err together, so this is not the
-    /// sum of theirs.
-    pub fn total_spread(&self) -> Spread {
-        Spread::of(&self.all).plus(Spread {
-            variance: self.two_total_variance.iter().sum(),
-            of_variance: 0.0,
-        })
+    /// The tile's energy of three bounces and more, and its spread. Pixels that share vertices err
+    /// together, so this is not the sum of theirs.
+    pub fn multi_energy(&self) -> (f64, Spread) {
+        let n = f64::from(self.passes.max(1));
+        (self.all.iter().sum::<f64>() / n, Spread::of(&self.all))
     }
 
-    /// Energy outside the gate.
-    pub fn overflow(&self, film: &Film) -> f64 {
-        let mut all = Overflow::default();
+    /// Variance of the tile's energy of two bounces.
+    pub fn two_energy_variance(&self) -> f64 {
+        self.two_total_variance.iter().sum()
+    }
+
+    /// Energy of two bounces outside the gate, and of more.
+    pub fn overflow(&self, film: &Film) -> (f64, f64) {
+        let (mut two, mut multi) = (Overflow::default(), Overflow::default());
         let n = f64::from(self.passes.max(1));
-        for (sum, two) in self
+        for (sum, of_two) in self
             .sum
             .chunks(film.pixel())
             .zip(self.two.chunks(film.pixel()))
         {
-            all.take(film, sum, 1.0 / n);
-            all.take(film, two, 1.0);
+            multi.take(film, sum, 1.0 / n);
+            two.take(film, of_two, 1.0);
         }
-        all.energy
+        (two.energy, multi.energy)
+    }
+
+    /// The two-bounce means of all slots of pixel after pixel.
+    pub fn two(&self) -> &[f32] {
+        &self.two
+    }
+
+    /// The 3+ mean of any channel's slot of pixel `k`.
+    pub fn multi(&self, film: &Film, k: usize, channel: usize, slot: usize) -> f64 {
+        let at = k * film.pixel() + channel * film.slots + slot;
+        f64::from(self.sum[at]) / f64::from(self.passes.max(1))
     }
 }
 
@@ -260,7 +283,10 @@ impl TileRenderer {
         let rays = self.scratch.stack.rays;
         self.done.reset(frame.film, region, frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
-        self.two(frame, region, order, go_on)?;
+        if order.two {
+            self.two(frame, region, order, go_on)?;
+        }
+        self.done.two_rays = self.scratch.stack.rays - rays;
         while self.done.passes < order.count {
             if !go_on(self.done.passes as f32 / order.count as f32) {
                 return None;

@@ -121,6 +121,7 @@ fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> Fou
     let order = Order {
         first,
         count: passes,
+        two: true,
     };
     let mut renderer = TileRenderer::new(frame);
     renderer
