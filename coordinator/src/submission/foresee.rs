@@ -19,9 +19,9 @@ const SCALED: f64 = 3.0;
 /// Uncertainty of a rule of thumb.
 const RULE: f64 = 4.0;
 /// CPU-seconds of a furnished room of 256×256 pixels and 25 spots to an error of 10 % (docs/benchmarks.md).
-const ROOM_CPU_S: f64 = 45.0;
+const ROOM_CPU_S: f64 = 24.0;
 /// Paths per pixel that such a room takes to that error.
-const ROOM_PATHS: f64 = 8.0;
+const ROOM_PATHS: f64 = 6.0;
 /// Bytes of one bin at rest: 97,432 scenes of 256×256×637 take 1.78 TB (docs/benchmarks.md).
 const BIN_BYTES: f64 = 0.44;
 
