@@ -1,6 +1,7 @@
 //! The command line: one definition feeds the parser, the help, and the completions.
 
 mod data;
+mod demultiplex;
 mod guard;
 mod integrity;
 mod job;
@@ -22,6 +23,7 @@ pub use data::{
     BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
     SensorArgs,
 };
+pub use demultiplex::{Demultiplex, PlacesArg};
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind, ListedState};
@@ -175,6 +177,8 @@ pub enum Command {
     Scene(Scene),
     /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm: mesh, density and errors
     Reconstruct(Reconstruct),
+    /// Take one flash apart by physics: depth, and which pixels each spot lights, from the histogram of all spots at once
+    Demultiplex(Demultiplex),
     /// Say who may use a coordinator
     #[command(subcommand)]
     Token(Token),

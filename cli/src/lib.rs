@@ -12,6 +12,7 @@ pub mod choices;
 pub mod client;
 pub mod dataset;
 mod demo;
+mod demultiplex;
 mod describe;
 mod doctor;
 pub mod ends;
@@ -185,6 +186,7 @@ async fn run(
         Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Reconstruct(args) => reconstruct::run(args, output).await,
+        Command::Demultiplex(args) => demultiplex::run(args, output).await,
         Command::Token(command) => token::run(command, resolved, output).await,
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,

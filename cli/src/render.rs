@@ -447,6 +447,9 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
         dimension_names: &["row", "column", "bin"],
         data,
     };
+    let masks = [scene.laser.beams.len() as u64, h, w];
+    let flags = |all: &[u8]| all.iter().map(|x| f32::from(*x)).collect::<Vec<_>>();
+    let (specular, visibility) = (flags(&r.truth.specular), flags(&r.truth.visibility));
     let mut arrays = vec![
         histogram("transient", &r.transient),
         RenderArray {
@@ -455,7 +458,21 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
             dimension_names: &["row", "column"],
             data: &r.truth.depth,
         },
+        RenderArray {
+            name: "specular",
+            shape: &cube[..2],
+            dimension_names: &["row", "column"],
+            data: &specular,
+        },
     ];
+    if !visibility.is_empty() {
+        arrays.push(RenderArray {
+            name: "visibility",
+            shape: &masks,
+            dimension_names: &["spot", "row", "column"],
+            data: &visibility,
+        });
+    }
     for b in beside {
         arrays.push(match b.per_spot {
             false => histogram(&b.array, &b.data),
@@ -496,6 +513,8 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
         "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; two_noise, multi_noise: draws of the errors of two and multi; the square of their sum over any pixels and bins estimates that sum's variance",
+        "specular": "1 where the first surface is a mirror",
+        "visibility": "1 where the spot of a beam lights what a pixel's middle sees",
         "subsets": beams,
         "gate": r.gate,
         "settings": settings,
@@ -511,7 +530,10 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
         attributes["wavelengths_nm"] = json!(wavelengths);
     }
     let attributes = attributes.as_object().expect("written as an object");
-    for array in arrays.iter().filter(|array| array.name != "depth") {
+    for array in arrays
+        .iter()
+        .filter(|array| array.dimension_names.contains(&"bin"))
+    {
         if let Some(at) = array.data.iter().position(|x| !x.is_finite()) {
             let (x, bins) = (array.data[at], r.gate.bins as usize);
             let what = format!(

@@ -1,0 +1,26 @@
+//! The arguments of `demultiplex`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+#[derive(Args)]
+pub struct Demultiplex {
+    /// A Zarr group that `picofarm scene render` or `picofarm scene sense` wrote; it is only read
+    pub render: PathBuf,
+    /// Folder for the new Zarr group and picture.png (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Where the places of the spots come from: the calibration in RENDER, or each beam's own one-bounce return
+    #[arg(long, value_enum, default_value_t = PlacesArg::Given)]
+    pub places: PlacesArg,
+    /// Threads [default: all cores]
+    #[arg(long, value_parser = super::ranges::threads)]
+    pub threads: Option<usize>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum PlacesArg {
+    Given,
+    Returns,
+}

@@ -1,0 +1,105 @@
+//! One flash taken apart by `picofarm demultiplex`: what is written, what is said, and what is refused.
+
+use std::{path::Path, sync::Arc};
+
+use picofarm_tests::{Cli, Scratch};
+use zarrs::{array::Array, filesystem::FilesystemStore};
+
+const SIDE: u64 = 48;
+
+fn array(group: &Path, name: &str) -> (Vec<u64>, Vec<f32>) {
+    let store = Arc::new(FilesystemStore::new(group).unwrap());
+    let array = Array::open(store, &format!("/{name}")).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let data = array.retrieve_array_subset(&array.subset_all()).unwrap();
+    (array.shape().to_vec(), data)
+}
+
+fn rendered(cli: &Cli) {
+    let room = [
+        "--kind",
+        "furnished",
+        "--assets",
+        "parametric",
+        "--seed",
+        "92001",
+    ];
+    cli.run(&[&["scene", "generate", "--out", "room.glb"][..], &room].concat())
+        .ok();
+    let size = ["--resolution", "48", "--samples", "8"];
+    cli.run(
+        &[
+            &["scene", "render", "room.glb", "--out", "render"][..],
+            &size,
+        ]
+        .concat(),
+    )
+    .ok();
+}
+
+#[test]
+fn a_rendered_flash_comes_apart_the_same_on_any_number_of_threads() {
+    let scratch = Scratch::new("demultiplex");
+    let cli = Cli::new(scratch.path());
+    rendered(&cli);
+    let apart = |threads: &str, out: &str| {
+        cli.json(&["demultiplex", "render", "--out", out, "--threads", threads])
+    };
+    let said = apart("1", "one");
+    let number = |path: &str| said.pointer(path).and_then(|x| x.as_f64()).unwrap();
+    assert!(number("/depth/median_m") < 0.02, "{said}");
+    assert!(
+        number("/masks/iou") > number("/masks/all_lit_iou"),
+        "{said}"
+    );
+    let one = scratch.join("one");
+    let (shape, depth) = array(&one, "depth");
+    assert_eq!(shape, [SIDE, SIDE]);
+    assert!(depth.iter().all(|z| *z > 0.0 && z.is_finite()));
+    let (shape, lit) = array(&one, "lit");
+    assert_eq!(shape, [25, SIDE, SIDE]);
+    assert!(lit.iter().all(|p| (0.0..=1.0).contains(p)));
+    assert!(one.join("picture.png").is_file());
+    apart("2", "two");
+    for name in ["depth", "lit", "ground", "albedo", "confidence"] {
+        assert!(
+            array(&one, name).1 == array(&scratch.join("two"), name).1,
+            "{name}"
+        );
+    }
+}
+
+#[test]
+fn spots_are_found_by_their_returns_and_a_sensors_counts_will_do() {
+    let scratch = Scratch::new("demultiplex-counts");
+    let cli = Cli::new(scratch.path());
+    rendered(&cli);
+    let returns = ["--places", "returns"];
+    let said = cli.json(&[&["demultiplex", "render", "--out", "found"][..], &returns].concat());
+    let median = said["depth"]["median_m"].as_f64().unwrap();
+    assert!(median < 0.04, "{said}");
+    let photons = ["--peak-photons", "400", "--out", "counts"];
+    cli.run(&[&["scene", "sense", "render"][..], &photons].concat())
+        .ok();
+    let text = cli
+        .run(&["demultiplex", "counts", "--out", "seen"])
+        .ok()
+        .stdout;
+    assert!(text.contains("masks of 25 spots"), "{text}");
+    // A sensor's counts come without a truth to compare with.
+    assert!(!text.contains("MAE"), "{text}");
+}
+
+#[test]
+fn what_is_no_flash_is_refused_by_name() {
+    let scratch = Scratch::new("demultiplex-refused");
+    let cli = Cli::new(scratch.path());
+    rendered(&cli);
+    let refused = |render: &str, out: &str, parts: &[&str]| {
+        cli.run(&["demultiplex", render, "--out", out])
+            .fails(3, parts);
+    };
+    refused("absent", "a", &["absent", "scene render"]);
+    cli.run(&["demultiplex", "render", "--out", "done"]).ok();
+    refused("done", "b", &["done/zarr.json", "attributes.spots"]);
+    refused("render", "done", &["not empty"]);
+}

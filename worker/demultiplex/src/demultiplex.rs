@@ -1,0 +1,266 @@
+//! The method from end to end: depth, shadows, and depth again without the spots that are in shadow.
+
+use picofarm_scene::Vec3;
+use picofarm_settings::Gate;
+
+use crate::{
+    Capture, DemultiplexError, Ground, Place, Settings,
+    fill::fill,
+    geometry::{Rays, Source, normals, places},
+    light::Light,
+    matching,
+    planes::{Judge, Slants},
+    shadows::shadows,
+    sweep::{Known, Volume, sweep},
+};
+
+/// Half width of the neighbourhood that a normal follows from, pixels.
+const NEAR: usize = 2;
+/// Share of depth beyond which a neighbour is another surface.
+const LEAP: f32 = 0.04;
+
+/// The same around spots, at least.
+const SPOT: usize = 3;
+/// Share of a spot's range within which what is seen belongs to its surface.
+const FLAT: f32 = 0.004;
+
+/// What one flash holds. Images are row-major `[row][column]`; those over spots are `[spot][row][column]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Demultiplexed {
+    /// Places of the spots, world axes; `None` where a beam has no return. Such a spot lights nothing.
+    pub places: Vec<Option<Place>>,
+    /// z-depth, metres.
+    pub depth_m: Vec<f32>,
+    /// How well the histogram speaks for the depth, 0 to 1.
+    pub confidence: Vec<f32>,
+    /// Unit normals, world axes; zero where unknown.
+    pub normals: Vec<Vec3>,
+    /// Probability that a spot lights what a pixel sees.
+    pub lit: Vec<f32>,
+    /// What that rests on.
+    pub ground: Vec<Ground>,
+    /// Albedo relative to the median pixel's.
+    pub albedo: Vec<f32>,
+    /// 1 where a mirror is seen; `None`: this version does not look for mirrors.
+    pub mirror: Option<Vec<u8>>,
+}
+
+impl Demultiplexed {
+    /// 1 = lit: probabilities of a half and more.
+    pub fn mask(&self) -> Vec<u8> {
+        self.lit.iter().map(|p| u8::from(*p >= 0.5)).collect()
+    }
+}
+
+/// Takes one flash apart. The same bytes on any number of threads.
+///
+/// # Errors
+/// [`DemultiplexError`] names the argument that cannot be used.
+pub fn demultiplex(
+    capture: &Capture,
+    settings: &Settings,
+) -> Result<Demultiplexed, DemultiplexError> {
+    take_apart(capture, settings, None)
+}
+
+/// The same where z-depths are known already, metres, `[row][column]`: only shadows and albedo are found.
+///
+/// # Errors
+/// [`DemultiplexError`] names the argument that cannot be used.
+pub fn shadows_at(
+    capture: &Capture,
+    depth_m: &[f32],
+    settings: &Settings,
+) -> Result<Demultiplexed, DemultiplexError> {
+    let pixels = capture.pixels();
+    if depth_m.len() != pixels || depth_m.iter().any(|z| !z.is_finite()) {
+        let what = format!("expected {pixels} finite values, one for each pixel");
+        return Err(DemultiplexError::invalid("depth_m", what));
+    }
+    take_apart(capture, settings, Some(depth_m))
+}
+
+fn take_apart(
+    capture: &Capture,
+    settings: &Settings,
+    known_depth: Option<&[f32]>,
+) -> Result<Demultiplexed, DemultiplexError> {
+    capture.check()?;
+    let camera = capture.camera;
+    let rays = Rays::new(camera.intrinsics);
+    let places = places(capture);
+    let mut sources: Vec<Source> = places
+        .iter()
+        .enumerate()
+        .filter_map(|(beam, place)| {
+            let place = (*place)?;
+            Some(Source::new(
+                beam,
+                camera.to_camera(place.point),
+                place.path_m,
+            ))
+        })
+        .collect();
+    if sources.is_empty() {
+        return Err(DemultiplexError::NoReturn {
+            count: capture.spots.len(),
+        });
+    }
+    let bins = capture.gate.bins as usize;
+    // In units of the brightest bin, so that no unit overflows; negative values are no light.
+    let brightest = capture.histogram.iter().copied().fold(0.0f32, f32::max);
+    let share = |x: &f32| match brightest > 0.0 {
+        true => (x / brightest).max(0.0),
+        false => 0.0,
+    };
+    let merged = merged(&capture.gate, settings);
+    let per = (merged.bin_width_m / capture.gate.bin_width_m).round() as usize;
+    let histogram: Vec<f32> = capture
+        .histogram
+        .chunks(bins)
+        .flat_map(|h| h.chunks_exact(per))
+        .map(|part| part.iter().map(share).sum())
+        .collect();
+    let (gate, bins) = (&merged, merged.bins as usize);
+    let sum = |h: &[f32]| h.iter().sum::<f32>();
+    let intensity: Vec<f32> = histogram.chunks(bins).map(sum).collect();
+    let log: Vec<f32> = intensity.iter().map(|x| libm::logf(x.max(1e-30))).collect();
+    let edges = matching::edges(&rays, &intensity);
+    let (mut depth, mut confidence, mut near) = (Vec::new(), Vec::new(), Vec::new());
+    let mut lit: Vec<f32> = Vec::new();
+    let mut found = None;
+    for round in 0..settings.rounds.max(1) {
+        let known = Known {
+            normals: &near,
+            lit: &lit,
+        };
+        let volume = sweep(&histogram, gate, &rays, &sources, known, settings);
+        let judge = Judge {
+            rays: &rays,
+            volume: &volume,
+            log: &log,
+            settings,
+        };
+        (depth, confidence) = match known_depth {
+            Some(known) => (known.to_vec(), vec![1.0; rays.len()]),
+            None => {
+                let first = first_depth(&rays, &volume, &edges, settings);
+                let mut slants = judge.planes(&first);
+                fill(&rays, &log, &sources, settings.weak_score, &mut slants);
+                finish(&rays, &slants)
+            }
+        };
+        near = normals(&rays, &depth, NEAR, LEAP);
+        for s in &mut sources {
+            s.normal = spot_normal(&rays, &depth, &near, s);
+        }
+        let light = Light {
+            histogram: &histogram,
+            gate,
+            rays: &rays,
+            sources: &sources,
+            settings,
+        };
+        let range: Vec<f32> = (0..rays.len()).map(|p| depth[p] * rays.slant[p]).collect();
+        let (shares, albedo) = light.shares(&range, &near);
+        let shadows = shadows(&rays, &depth, &sources, &shares);
+        if round + 1 < settings.rounds {
+            let n = sources.len();
+            lit = (0..rays.len() * n)
+                .map(|q| (shadows.lit[(q % n) * rays.len() + q / n]).max(0.1))
+                .collect();
+        }
+        found = Some((shadows, albedo));
+    }
+    let (shadows, albedo) = found.expect("there is at least one round");
+    let pixels = rays.len();
+    let mut all = vec![0.0; capture.spots.len() * pixels];
+    let mut ground = vec![Ground::Geometry; capture.spots.len() * pixels];
+    for (i, s) in sources.iter().enumerate() {
+        all[s.beam * pixels..][..pixels].copy_from_slice(&shadows.lit[i * pixels..][..pixels]);
+        ground[s.beam * pixels..][..pixels]
+            .copy_from_slice(&shadows.ground[i * pixels..][..pixels]);
+    }
+    let world = |n: &Vec3| camera.right * n.x + camera.down * n.y + camera.forward * n.z;
+    Ok(Demultiplexed {
+        places,
+        depth_m: depth,
+        confidence,
+        normals: near.iter().map(world).collect(),
+        lit: all,
+        ground,
+        albedo: relative(albedo),
+        mirror: None,
+    })
+}
+
+/// The gate with bins summed that are narrower than they need be; those left over at its end are dropped.
+fn merged(gate: &Gate, settings: &Settings) -> Gate {
+    // A width that divides it does so in spite of rounding.
+    let per = (settings.finest_m / gate.bin_width_m + 1e-6).floor() as u32;
+    let per = per.min(gate.bins / 3).max(1);
+    Gate {
+        start_m: gate.start_m,
+        bin_width_m: gate.bin_width_m * f64::from(per),
+        bins: gate.bins / per,
+    }
+}
+
+/// z-depths by semi-global matching.
+fn first_depth(rays: &Rays, volume: &Volume, edges: &[f32], settings: &Settings) -> Vec<f32> {
+    let best = matching::best(rays, volume, edges, settings);
+    let range = best.iter().map(|k| volume.ranges.at(*k));
+    range.zip(&rays.slant).map(|(r, slant)| r / slant).collect()
+}
+
+/// z-depths of planes.
+fn finish(rays: &Rays, slants: &Slants) -> (Vec<f32>, Vec<f32>) {
+    let depth = (0..rays.len()).map(|p| slants.depth(rays, p)).collect();
+    let confidence = slants.score.iter().map(|s| s.clamp(0.0, 1.0)).collect();
+    (depth, confidence)
+}
+
+/// Normal of the surface that a spot is on: of the planes seen around it the one, moved to the spot, to which most of what is
+/// seen around belongs.
+fn spot_normal(rays: &Rays, depth: &[f32], normals: &[Vec3], source: &Source) -> Vec3 {
+    let Some(p) = rays.pixel_of(source.point) else {
+        return Vec3::ZERO;
+    };
+    let (column, row) = (p % rays.width, p / rays.width);
+    let reach = SPOT.max(rays.width / 24);
+    let near: Vec<usize> = (row.saturating_sub(reach)..(row + reach + 1).min(rays.height))
+        .flat_map(|v| {
+            let columns = column.saturating_sub(reach)..(column + reach + 1).min(rays.width);
+            columns.map(move |u| v * rays.width + u)
+        })
+        .collect();
+    let thick = FLAT * source.point.length();
+    let support = |normal: Vec3| {
+        let off = |q: &&usize| {
+            let x = rays.unit[**q] * (depth[**q] * rays.slant[**q]);
+            normal.dot(x - source.point).abs() < thick
+        };
+        near.iter().filter(off).count()
+    };
+    let mut best = (Vec3::ZERO, 0);
+    for q in &near {
+        let normal = normals[*q];
+        let count = if normal == Vec3::ZERO {
+            0
+        } else {
+            support(normal)
+        };
+        if count > best.1 {
+            best = (normal, count);
+        }
+    }
+    best.0
+}
+
+/// Over the median.
+fn relative(albedo: Vec<f32>) -> Vec<f32> {
+    let mut sorted = albedo.clone();
+    sorted.sort_by(f32::total_cmp);
+    let median = sorted[sorted.len() / 2].max(f32::MIN_POSITIVE);
+    albedo.into_iter().map(|a| (a / median).min(1e6)).collect()
+}

@@ -1,0 +1,28 @@
+//! One flash taken apart by physics: from a multiplexed histogram, in which the light of all spots is added up, to the depth
+//! of each pixel and to which spots light it. Nothing is learnt; every two-bounce time follows from geometry.
+//!
+//! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or files.
+
+mod capture;
+mod demultiplex;
+mod error;
+mod fill;
+mod geometry;
+mod light;
+mod matching;
+mod peaks;
+mod planes;
+pub mod score;
+mod settings;
+mod shadows;
+mod sweep;
+
+pub use capture::{Capture, Place, Spot};
+pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
+pub use error::DemultiplexError;
+pub use score::{DepthScore, MaskScore, Truth};
+pub use settings::Settings;
+pub use shadows::Ground;
+
+/// Version of the method: changes whenever any bit of a result may change.
+pub const VERSION: &str = "demultiplex-1";
