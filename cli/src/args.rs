@@ -25,12 +25,12 @@ pub use data::{
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind, ListedState};
-pub use model::{Model, ModelFormat};
+pub use model::Model;
 pub use network::{BenchModel, Kind, Learns, Numbers};
 pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use secrets::without_secrets;
-pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepFormat, SweepRun, WhichSweep};
+pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]

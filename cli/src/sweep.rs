@@ -15,7 +15,7 @@ use serde_json::json;
 
 use self::records::{Records, loss, read};
 use crate::{
-    args::{Sweep as Command, SweepFormat, WhichSweep},
+    args::{Sweep as Command, WhichSweep},
     error::{CliError, Code, Result, io},
     output::{Output, table},
     settings::Settings,
@@ -28,27 +28,8 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Importance(which) => importance::run(&read(&which).await?, output)?,
         Command::Compare { store, names } => compare::run(&store, &names, output).await?,
         Command::Report { which, out } => report(&read(&which).await?, &out, output)?,
-        Command::Export {
-            which,
-            format,
-            out,
-            curves,
-        } => {
-            let records = read(&which).await?;
-            match format {
-                SweepFormat::Csv => {
-                    let out = out.unwrap_or_else(|| "sweep.csv".into());
-                    export::as_csv(&records, &out, curves, output)?;
-                }
-                SweepFormat::Tensorboard => {
-                    if curves {
-                        let what = "--curves: belongs to --format csv; event files always have every epoch";
-                        return Err(CliError::input(what).hint("leave it away"));
-                    }
-                    let out = out.unwrap_or_else(|| "sweep-tensorboard".into());
-                    export::as_tensorboard(&records, &out, output)?;
-                }
-            }
+        Command::Export { which, out, curves } => {
+            export::run(&read(&which).await?.sweep()?, &out, curves, output)?
         }
         Command::Extend(args) => extend::run(args, settings, output).await?,
         Command::Run(args) => extend::rounds(args, settings, output).await?,
