@@ -4,7 +4,6 @@ mod compare;
 mod export;
 mod extend;
 mod file;
-mod importance;
 mod records;
 
 use std::{fs, path::Path, time::SystemTime};
@@ -25,7 +24,6 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
     match command {
         Command::Status(which) => status(&read(&which).await?.sweep()?, output),
         Command::Best(which) => best(&which, &read(&which).await?.sweep()?, output)?,
-        Command::Importance(which) => importance::run(&read(&which).await?, output)?,
         Command::Compare { store, names } => compare::run(&store, &names, output).await?,
         Command::Report { which, out } => report(&read(&which).await?, &out, output)?,
         Command::Export { which, out, curves } => {
@@ -83,11 +81,8 @@ fn best(which: &WhichSweep, sweep: &Sweep, output: Output) -> Result<()> {
 
 fn report(records: &Records, out: &Path, output: Output) -> Result<()> {
     let date = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
-    let (importance, importance_note) = importance::weights(records)?;
     let sweep = Sweep {
         date: date[..10].to_owned(),
-        importance,
-        importance_note,
         ..records.sweep()?
     };
     let beside = out.with_extension("json");

@@ -37,8 +37,6 @@ pub enum Sweep {
         #[arg(long)]
         curves: bool,
     },
-    /// Say how much each parameter mattered (PED-ANOVA), and how likely that is chance
-    Importance(WhichSweep),
     /// Compare sweeps: the best of each, how its trials ended, and the least error by epochs spent
     Compare {
         /// Folder or URL of the store
