@@ -506,7 +506,7 @@ pub enum Bench {
     Queue(BenchQueue),
     /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot, gc
     Dataset(BenchDataset),
-    /// Measure storage on scenes of this renderer: size, error and speed of all profiles beside other formats, and reading
+    /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of reading
     Store(BenchStore),
     /// Measure a training step of a network on the CPU, beside other forms and other programs
     Model(BenchModel),
