@@ -187,7 +187,7 @@ async fn nothing_damaged_missing_or_oversized_is_exported() {
     assert!(error.contains("source/depth/c/4/0/0"), "{error}");
     let each = DatasetSpec {
         per_spot: true,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         ..spec(Profile::default())
     };

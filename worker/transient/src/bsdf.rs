@@ -41,9 +41,8 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Which ratios it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = ones. Of several
-    /// parts: which they are.
-    spectrum_row: u16,
+    /// Of several parts, their index; of others 0.
+    index: u16,
     /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. Several parts: the factor of all. 0 = black.
     strength: f32,
     /// Roughness of a conductor; of others 0. Of several parts that of the roughest near-mirror, or else of the smoothest conductor,
@@ -75,7 +74,7 @@ impl Surface {
                     SPECULAR,
                 )
                 | flag(ggx && kind != Kind::Lambertian, GGX),
-            spectrum_row: 0,
+            index: 0,
             strength,
             alpha,
             base,
@@ -121,18 +120,17 @@ impl Surface {
             .or_else(|| lit().map(Surface::alpha).reduce(f32::min));
         let black = parts.iter().all(Surface::is_black);
         Self {
-            spectrum_row: index,
+            index,
             strength: if black { 0.0 } else { 1.0 },
             alpha: alpha.unwrap_or(1.0),
             ..Self::new(m)
         }
     }
 
-    /// A mix of this conductor and a Lambertian `base` (ρ/π times its share), with the ratios of a row and of the one behind it.
-    pub fn mixed_with(self, base: f32, spectrum_row: u16) -> Self {
+    /// A mix of this conductor and a Lambertian `base` (ρ/π times its share).
+    pub fn mixed_with(self, base: f32) -> Self {
         Self {
             kind: Kind::Mixed,
-            spectrum_row,
             base,
             ..self
         }
@@ -145,7 +143,6 @@ impl Surface {
         let all = 1.0 / (self.strength + base * PI);
         Self {
             kind: Kind::Mixed,
-            spectrum_row: 0,
             strength: self.strength * all,
             base: base * all,
             ..self
@@ -155,7 +152,7 @@ impl Surface {
     /// True for several parts; which of them and times what.
     #[inline(always)]
     pub fn parts_of_several(&self) -> Option<(usize, f32)> {
-        (self.kind == Kind::Several).then_some((usize::from(self.spectrum_row), self.strength))
+        (self.kind == Kind::Several).then_some((usize::from(self.index), self.strength))
     }
 
     /// Share of light that it sends on, as far as masking lets it.
@@ -165,30 +162,6 @@ impl Surface {
             Kind::Lambertian => self.strength * PI,
             _ => self.strength + self.base * PI,
         }
-    }
-
-    /// The same surface with the ratios of a row and the one behind it: the Lambertian part's, and the conductor's.
-    pub fn with_spectrum(self, row: u16) -> Self {
-        let spectrum_row = match self.kind {
-            Kind::Conductor => row + 1,
-            Kind::Lambertian | Kind::Mixed | Kind::Several => row,
-        };
-        Self {
-            spectrum_row,
-            ..self
-        }
-    }
-
-    /// Which ratios it has; 0 = ones.
-    #[inline(always)]
-    pub fn spectrum_row(&self) -> u16 {
-        self.spectrum_row
-    }
-
-    /// Which ratios the conductor of a mix has.
-    #[inline(always)]
-    fn gloss_spectrum(&self) -> u16 {
-        self.spectrum_row + u16::from(self.spectrum_row != 0)
     }
 
     /// Scatters from both sides.
@@ -235,7 +208,7 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            spectrum_row: 0,
+            index: 0,
             strength: 1.0 / PI,
             alpha: 0.0,
             base: 0.0,
@@ -314,7 +287,6 @@ impl Surface {
             return Self {
                 kind: Kind::Conductor,
                 flags: self.flags & !SPECULAR | if mirror { SPECULAR } else { 0 },
-                spectrum_row: self.gloss_spectrum(),
                 strength: total,
                 base: 0.0,
                 ..*self
@@ -323,7 +295,7 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            spectrum_row: self.spectrum_row,
+            index: 0,
             strength: total / PI,
             alpha: 0.0,
             base: 0.0,
@@ -336,7 +308,6 @@ impl Surface {
         match self.kind {
             Kind::Mixed => Self {
                 kind: Kind::Conductor,
-                spectrum_row: self.gloss_spectrum(),
                 base: 0.0,
                 ..self
             },
@@ -448,16 +419,6 @@ impl Surface {
         let cos2 = along2 / square;
         let lobe = exp_minus(x) / (cos2 * cos2);
         if lobe > 0.0 { lobe } else { 0.0 }
-    }
-
-    /// [`Surface::scatter`] of a mix by its parts: the Lambertian one's, and the conductor's.
-    #[inline]
-    pub fn parts(&self, n: Vec3, i: Vec3, o: Vec3) -> (f32, f32) {
-        let co = n.dot(o);
-        if !(n.dot(i) > 0.0 && co > 0.0) {
-            return (0.0, 0.0);
-        }
-        (self.base * co, self.gloss().scatter(n, i, o))
     }
 
     /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none leaves.

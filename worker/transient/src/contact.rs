@@ -29,7 +29,6 @@ use crate::{
     emitter::{Emitter, Emitters},
     light_vertices::{ALONE, LightVertex, LightVertices},
     rng::Rng,
-    spectra::times,
     turns::Turns,
     world::{Hit, World, lift},
 };
@@ -193,7 +192,6 @@ impl Contacts {
             return;
         };
         flux /= turns.count();
-        let mut ratios = e.ratios(world, w);
         let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
         // Within the zones, and what the vertex before was.
         let (mut inside, mut specular) = (true, false);
@@ -226,7 +224,6 @@ impl Contacts {
                     hit,
                     back: -w,
                     flux,
-                    ratios,
                     density: ALONE,
                     path_m,
                     spot,
@@ -246,7 +243,6 @@ impl Contacts {
                 weight /= survive;
             }
             flux *= weight;
-            ratios = times(ratios, world.ratios(&hit, -w, next));
             specular = hit.surface.specular();
             if specular && alpha == 0.0 {
                 alpha = hit.surface.alpha();

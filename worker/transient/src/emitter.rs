@@ -13,7 +13,6 @@ use crate::{
     contact,
     lanes::{Column, SIDE, Wide, put, widest},
     lobes::{Lobes, Seen},
-    spectra::{ONES, Ratios, times},
     world::{World, lift},
 };
 
@@ -34,8 +33,6 @@ pub(crate) struct Emitter {
     pub surface: Surface,
     /// It is not the beam's own spot: glass turned that light aside.
     pub aside: bool,
-    /// Ratios of the texture there.
-    ratios: Ratios,
 }
 
 impl Emitter {
@@ -58,12 +55,6 @@ impl Emitter {
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
         };
-        let ratios = match &beneath {
-            Some(h) if material == world.surface[h.triangle as usize] => {
-                world.texel_ratios(h.triangle, h.p)
-            }
-            _ => ONES,
-        };
         let surface = match share == 1.0 {
             true => surface,
             false => surface.scaled(share),
@@ -76,7 +67,6 @@ impl Emitter {
             path_m: f64::from(spot.path_m),
             surface,
             aside: false,
-            ratios,
         }
     }
 
@@ -84,18 +74,6 @@ impl Emitter {
     #[inline]
     pub fn intensity(&self, w: Vec3) -> f32 {
         self.surface.scatter(self.n, self.back, w)
-    }
-
-    /// The ratios of that.
-    #[inline(always)]
-    pub fn ratios(&self, world: &World, w: Vec3) -> Ratios {
-        match world.is_spectral() {
-            false => ONES,
-            true => times(
-                self.ratios,
-                world.surface_ratios(&self.surface, self.n, self.back, w),
-            ),
-        }
     }
 }
 

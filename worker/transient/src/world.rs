@@ -14,7 +14,7 @@ use crate::{
     fresnel::Body,
     glass::{Crossing, Panes},
     rng::Rng,
-    spectra::{Builder, ONES, Ratios, Spectra, times},
+    spectra::{Builder, Texels},
 };
 
 /// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
@@ -67,8 +67,8 @@ pub(crate) struct World {
     pub panes: Option<Panes>,
     /// Bodies of glass by surface index; empty without any.
     bodies: Vec<Option<Body>>,
-    /// By what surfaces multiply ratios, where wavelengths are asked for.
-    spectra: Option<Spectra>,
+    /// What texels do to surfaces at the wavelength asked for, by surface index; empty without one.
+    texels: Vec<Option<Texels>>,
 }
 
 /// A point on a surface, seen from somewhere.
@@ -152,20 +152,20 @@ impl World {
     /// # Errors
     /// [`RenderError::Invalid`] where the scene is too wide or too small for f32 throughout.
     pub fn new(scene: &Scene, horizon_m: f64, stop: Stop) -> Result<Self, RenderError> {
-        Self::at(scene, &[], horizon_m, stop)
+        Self::at(scene, None, horizon_m, stop)
     }
 
-    /// The same at some wavelengths, nanometres; at the one that the scene's reflectances are of where there are none.
+    /// The same at a wavelength, nanometres; without one, at that of the scene's reflectances.
     ///
     /// # Errors
-    /// Those of [`World::new`], and [`RenderError::Invalid`] where there are too many spectra.
+    /// Those of [`World::new`].
     pub fn at(
         scene: &Scene,
-        wavelengths_nm: &[f64],
+        wavelength_nm: Option<f64>,
         horizon_m: f64,
         stop: Stop,
     ) -> Result<Self, RenderError> {
-        let mut spectra = Builder::new(wavelengths_nm);
+        let mut spectra = Builder::new(wavelength_nm);
         let mut several = vec![];
         let origin = scene.camera.origin;
         let centre = wide(origin);
@@ -286,64 +286,8 @@ impl World {
                 true => bodies,
                 false => vec![],
             },
-            spectra: spectra.done(),
+            texels: spectra.texels,
         })
-    }
-
-    /// Whether several wavelengths are asked for.
-    #[inline(always)]
-    pub fn is_spectral(&self) -> bool {
-        self.spectra.as_ref().is_some_and(Spectra::is_spectral)
-    }
-
-    /// The ratios with which light scatters at a hit from `i` to `o`.
-    #[inline(always)]
-    pub fn ratios(&self, h: &Hit, i: Vec3, o: Vec3) -> Ratios {
-        match &self.spectra {
-            Some(spectra) if spectra.is_spectral() => self.ratios_of(spectra, h, i, o),
-            _ => ONES,
-        }
-    }
-
-    fn ratios_of(&self, spectra: &Spectra, h: &Hit, i: Vec3, o: Vec3) -> Ratios {
-        // White surfaces stand for others.
-        if h.surface.spectrum_row() == 0 {
-            return ONES;
-        }
-        times(
-            spectra.scattered(&h.surface, h.n, i, o),
-            self.texel_ratios(h.triangle, h.p),
-        )
-    }
-
-    /// The ratios of the Lambertian part and of the conductor of a mix; of other surfaces twice their own.
-    pub fn lobe_ratios(&self, h: &Hit) -> [Ratios; 2] {
-        match &self.spectra {
-            Some(spectra) if spectra.is_spectral() && h.surface.spectrum_row() != 0 => {
-                let texel = self.texel_ratios(h.triangle, h.p);
-                spectra.lobes(&h.surface).map(|of| times(of, texel))
-            }
-            _ => [ONES; 2],
-        }
-    }
-
-    /// The ratios with which a surface scatters from `i` to `o`, without its texture.
-    #[inline(always)]
-    pub fn surface_ratios(&self, surface: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Ratios {
-        match &self.spectra {
-            None => ONES,
-            Some(spectra) => spectra.scattered(surface, n, i, o),
-        }
-    }
-
-    /// The ratios of a texture at a point of a triangle.
-    pub fn texel_ratios(&self, triangle: u32, p: Vec3) -> Ratios {
-        match (&self.spectra, self.texel(triangle, p)) {
-            (Some(spectra), Some(texel)) => {
-                spectra.texel(self.surface[triangle as usize] as usize, texel)
-            }
-            _ => ONES,
-        }
     }
 
     /// The body of glass that a triangle bounds.
@@ -527,9 +471,9 @@ impl World {
         let geometric = self.normals[i];
         let mut surface = self.surfaces[self.surface[i] as usize];
         if let Some(texel) = self.texel(id, p) {
-            let factor = match &self.spectra {
+            let factor = match self.texels.get(self.surface[i] as usize) {
                 None => (texel[0] + texel[1] + texel[2]) / 3.0,
-                Some(spectra) => spectra.brightest(self.surface[i] as usize, texel),
+                Some(texels) => texels.as_ref().map_or(1.0, |t| t.factor(texel)),
             };
             surface = surface.scaled(factor);
         }

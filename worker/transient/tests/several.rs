@@ -5,11 +5,11 @@ mod common;
 #[allow(dead_code, reason = "a bench uses the others")]
 mod scenes;
 
-use std::{slice::from_ref, sync::Arc};
+use std::sync::Arc;
 
 use common::{energy, grey, near, ok, quad, room, scene, settings, two_only, v};
 use picofarm_scene::{Bsdf, Distribution, Lobe, Material, Part, Parts, Scene, SpectrumPoint};
-use picofarm_transient::{Budget, Gate, Rendered, Settings, Strategy, Wavelengths};
+use picofarm_transient::{Budget, Gate, Rendered, Settings, Strategy, Wavelength};
 
 fn several(parts: &[(f32, Lobe)]) -> Bsdf {
     let parts: Vec<Part> = parts
@@ -237,32 +237,29 @@ fn two_near_mirrors_in_one_surface_reflect_as_each_does_by_its_share() {
 
 #[test]
 fn each_part_has_its_reflectance_at_each_wavelength() {
-    let nm = [905.0, 532.0];
+    let row = |nm: f32, reflectance, specular| SpectrumPoint {
+        nm,
+        reflectance,
+        specular_reflectance: Some(specular),
+    };
+    let spectrum = vec![row(532.0, 0.3, 0.9), row(905.0, 0.7, 0.4)];
     let mut s = scene_of("everything");
     each_material(&mut s, |m| {
-        let row = |nm: f64, reflectance, specular| SpectrumPoint {
-            nm: nm as f32,
-            reflectance,
-            specular_reflectance: Some(specular),
-        };
         m.bsdf = said_otherwise(m.bsdf);
-        m.spectrum = vec![row(nm[1], 0.3, 0.9), row(nm[0], 0.7, 0.4)];
+        m.spectrum = spectrum.clone();
     });
-    let at = |nm: &[f64], seed| {
-        let set = Settings {
-            seed,
-            wavelengths_nm: Wavelengths::of(nm).unwrap(),
-            ..settings(Budget::Samples(256))
-        };
-        ok(&s, &set)
+    let at = |nm: f64, seed| Settings {
+        seed,
+        wavelengths_nm: Wavelength::of(&[nm]).unwrap(),
+        ..settings(Budget::Samples(256))
     };
-    let both = at(&nm, 1);
-    same("905 nm", (from_ref(&both), &[at(&nm[..1], 5)]));
-    let other = Rendered {
-        transient: both.others[0].transient.clone(),
-        ..both
-    };
-    same("532 nm", (from_ref(&other), &[at(&nm[1..], 6)]));
+    // Said as mixes, with one spectrum for each part.
+    let mut mixed = scene_of("everything");
+    each_material(&mut mixed, |m| m.spectrum = spectrum.clone());
+    for nm in [905.0, 532.0] {
+        let found = ok(&s, &at(nm, 1));
+        same(&format!("{nm} nm"), (&[found], &[ok(&mixed, &at(nm, 5))]));
+    }
 }
 
 #[test]

@@ -12,7 +12,7 @@ use serde::Serialize;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
-use picofarm_dataset::{CodedImage, DatasetSpec, Profile, Subsets, TransientCodec, Wavelengths};
+use picofarm_dataset::{CodedImage, DatasetSpec, Profile, Subsets, TransientCodec, Wavelength};
 
 use picofarm_cli::{
     args::BenchStore,
@@ -132,7 +132,7 @@ fn codecs(spec: &DatasetSpec) -> Result<Vec<(&'static str, TransientCodec)>> {
         let spec = DatasetSpec {
             profile,
             per_spot: false,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
             two_bounce: false,
             subsets: Subsets::NONE,
             ..*spec

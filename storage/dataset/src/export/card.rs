@@ -265,9 +265,6 @@ fn about(quantity: Quantity) -> &'static str {
         Quantity::Transient4 => "h of the 4 spots of the 10x10 grid at rows and columns 2 and 7",
         Quantity::Transient25 => "h of the 25 spots of the 10x10 grid at even rows and odd columns",
         Quantity::TransientSpots => "h of each spot alone [spot][row][column][bin]",
-        Quantity::TransientWavelengths => {
-            "h at the wavelengths after the main one [wavelength][row][column][bin]"
-        }
         Quantity::Intensity => "sum of h over the bins, before coding",
         Quantity::Depth => "z-depth, metres; 0 = nothing",
         Quantity::Range => "distance along the ray, metres; 0 = nothing",

@@ -8,7 +8,6 @@ use crate::{
     fresnel::{Body, split},
     glass::Crossing,
     rng::Rng,
-    spectra::{Ratios, times},
     world::{Hit, World, lift},
 };
 
@@ -110,9 +109,8 @@ impl Ray {
 /// What a path has come to.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Carried {
-    /// What is left of radiance or flux, and its ratios.
+    /// What is left of radiance or flux.
     pub weight: f32,
-    pub ratios: Ratios,
     /// Optical path, metres.
     pub length_m: f64,
     pub bounces: u32,
@@ -234,7 +232,6 @@ pub(super) fn arrive(
         back: -ray.w,
         path: Carried {
             weight: path.weight * ray.weight,
-            ratios: path.ratios,
             length_m: path.length_m + ray.length_m,
             bounces: path.bounces + 1 + ray.reflections,
         },
@@ -250,7 +247,6 @@ impl Point {
     /// of a weight does.
     pub fn scatter(
         &self,
-        world: &World,
         survive: impl Fn(f32) -> f32,
         rng: &mut Rng,
     ) -> Option<(Carried, Ray)> {
@@ -260,7 +256,7 @@ impl Point {
         if chance < 1.0 && rng.uniform() >= chance {
             return None;
         }
-        Some(self.onward(world, (w, weight / chance), false))
+        Some(self.onward((w, weight / chance), false))
     }
 
     /// Radiance goes on by the surface's scattering or to where glass is. What the path carries then, the ray, and what is left of
@@ -268,7 +264,7 @@ impl Point {
     /// goes by that.
     pub fn seek(
         &self,
-        (world, aim): (&World, &Aim),
+        aim: &Aim,
         left: f32,
         rng: &mut Rng,
     ) -> Option<(Carried, Ray, f32)> {
@@ -284,15 +280,14 @@ impl Point {
         if rng.uniform() >= chance {
             return None;
         }
-        let (path, ray) = self.onward(world, (w, weight / chance), true);
+        let (path, ray) = self.onward((w, weight / chance), true);
         Some((path, ray, left * own / chance))
     }
 
-    fn onward(&self, world: &World, (w, weight): (Vec3, f32), radiance: bool) -> (Carried, Ray) {
+    fn onward(&self, (w, weight): (Vec3, f32), radiance: bool) -> (Carried, Ray) {
         let h = &self.hit;
         let path = Carried {
             weight: self.path.weight * weight,
-            ratios: times(self.path.ratios, world.ratios(h, self.back, w)),
             ..self.path
         };
         let from = lift(h.p, h.n);

@@ -9,7 +9,6 @@ use crate::{
     film::Film,
     rng::Rng,
     sink::{PixelSink, Place, Sink, Way},
-    spectra::{Light, ONES, times},
     turns::Turns,
     vertex::{Sight, Vertex},
     walk::{ALL, Lights, Scratch, Step, Walk},
@@ -105,19 +104,7 @@ impl Sharing {
                 if walk.window.is_none_or(|w| w.holds(path)) {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
                     let spot = film.tag(y.spot, Place::Gather, Way::Zone);
-                    let light = Light {
-                        value: self.weight[i] * through,
-                        ratios: match film.spectral {
-                            false => ONES,
-                            true => {
-                                let w = (y.hit.p - v.hit.p).normalized();
-                                let here = times(v.ratios, walk.world.ratios(&v.hit, v.wo, w));
-                                let there = walk.world.ratios(&y.hit, y.back, -w);
-                                times(here, times(y.ratios, there))
-                            }
-                        },
-                    };
-                    film.add(pixel, film.slot(path), light, spot);
+                    film.add(pixel, film.slot(path), self.weight[i] * through, spot);
                 }
             }
         }
@@ -424,7 +411,6 @@ fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
         hit,
         wo: -hit.p / range,
         beta: hit.through,
-        ratios: ONES,
         length_m: world.metres(range),
         bounce: 1,
         sight: Sight::FIRST,
