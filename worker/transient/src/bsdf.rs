@@ -22,9 +22,6 @@ enum Kind {
     Conductor,
     /// A Lambertian beside a rough conductor.
     Mixed,
-    /// Any number of both, which the world knows. Nothing scatters by it before it is settled on one of them: on a conductor, or on
-    /// a mix of one with all Lambertians.
-    Several,
 }
 
 /// Flags of a surface, one bit each.
@@ -41,12 +38,9 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Of several parts, their index; of others 0.
-    index: u16,
-    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. Several parts: the factor of all. 0 = black.
+    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
     strength: f32,
-    /// Roughness of a conductor; of others 0. Of several parts that of the roughest near-mirror, or else of the smoothest conductor,
-    /// or else 1.
+    /// Roughness of a conductor; of others 0.
     alpha: f32,
     /// Lambertian part ρ/π of a mix times its share; of others 0.
     base: f32,
@@ -60,10 +54,7 @@ impl Surface {
             Bsdf::RoughConductor { distribution, .. } | Bsdf::Mixed { distribution, .. } => {
                 distribution == Distribution::Ggx
             }
-            Bsdf::Diffuse { .. }
-            | Bsdf::Several { .. }
-            | Bsdf::ThinDielectric { .. }
-            | Bsdf::Dielectric { .. } => false,
+            Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => false,
         };
         let flag = |set: bool, flag: u8| if set { flag } else { 0 };
         let of = |kind, strength, alpha, base| Self {
@@ -74,7 +65,6 @@ impl Surface {
                     SPECULAR,
                 )
                 | flag(ggx && kind != Kind::Lambertian, GGX),
-            index: 0,
             strength,
             alpha,
             base,
@@ -102,37 +92,10 @@ impl Surface {
                     of(Kind::Mixed, strength, alpha, base)
                 }
             }
-            // Made of its parts by `several`.
-            Bsdf::Several { .. } => of(Kind::Several, 0.0, 1.0, 0.0),
             // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see `by_glass`).
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
                 of(Kind::Lambertian, 0.0, 0.0, 0.0)
             }
-        }
-    }
-
-    /// A material of several parts, given as surfaces times their shares, which are found by `index`.
-    pub fn several(m: &Material, parts: &[Surface], index: u16) -> Self {
-        let lit = || parts.iter().filter(|p| !p.is_black() && !p.diffuse());
-        let mirrors = lit().filter(|p| !p.is_rough()).map(Surface::alpha);
-        let alpha = mirrors
-            .reduce(f32::max)
-            .or_else(|| lit().map(Surface::alpha).reduce(f32::min));
-        let black = parts.iter().all(Surface::is_black);
-        Self {
-            index,
-            strength: if black { 0.0 } else { 1.0 },
-            alpha: alpha.unwrap_or(1.0),
-            ..Self::new(m)
-        }
-    }
-
-    /// A mix of this conductor and a Lambertian `base` (ρ/π times its share).
-    pub fn mixed_with(self, base: f32) -> Self {
-        Self {
-            kind: Kind::Mixed,
-            base,
-            ..self
         }
     }
 
@@ -147,12 +110,6 @@ impl Surface {
             base: base * all,
             ..self
         }
-    }
-
-    /// True for several parts; which of them and times what.
-    #[inline(always)]
-    pub fn parts_of_several(&self) -> Option<(usize, f32)> {
-        (self.kind == Kind::Several).then_some((usize::from(self.index), self.strength))
     }
 
     /// Share of light that it sends on, as far as masking lets it.
@@ -208,7 +165,6 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            index: 0,
             strength: 1.0 / PI,
             alpha: 0.0,
             base: 0.0,
@@ -233,12 +189,11 @@ impl Surface {
         matches!(self.kind, Kind::Mixed)
     }
 
-    /// True for a mix and for several parts of which a path must settle on one: all but a mix whose vertices pixels share. Its
+    /// True for a mix of which a path must settle on one part: all but those whose vertices pixels share. Their
     /// lobes are both wide, so that a vertex can scatter by both.
     #[inline(always)]
     pub fn is_open(&self) -> bool {
         match self.kind {
-            Kind::Several => true,
             Kind::Mixed => !self.is_shared(),
             Kind::Lambertian | Kind::Conductor => false,
         }
@@ -295,7 +250,6 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            index: 0,
             strength: total / PI,
             alpha: 0.0,
             base: 0.0,
@@ -311,7 +265,7 @@ impl Surface {
                 base: 0.0,
                 ..self
             },
-            Kind::Lambertian | Kind::Conductor | Kind::Several => self,
+            Kind::Lambertian | Kind::Conductor => self,
         }
     }
 
@@ -350,7 +304,6 @@ impl Surface {
         let lit = c > 0.0 && !self.is_black();
         let alpha2 = self.alpha * self.alpha;
         match self.kind {
-            Kind::Several => Lobe::BLACK,
             _ if !lit => Lobe::BLACK,
             Kind::Lambertian => Lobe {
                 lambertian: self.strength,

@@ -193,7 +193,7 @@ impl Caustics {
             let Some(mut next) = world.closest(stack, lift(hit.p, hit.n), w) else {
                 return;
             };
-            next.choose_lobe(world, rng);
+            next.choose_lobe(rng);
             path_m += world.metres((next.p - hit.p).length());
             flux *= next.through;
             let before = hit.surface.specular();
@@ -267,7 +267,7 @@ impl Caustics {
             (spot, world.closest(stack, emitters.lifted[spot], w)?)
         };
         let k = self.place[hit.triangle as usize];
-        hit.choose_lobe(world, rng);
+        hit.choose_lobe(rng);
         if k == NONE || !hit.surface.specular() || hit.surface.is_black() {
             return None;
         }

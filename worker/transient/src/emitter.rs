@@ -180,7 +180,7 @@ impl<'a> Wide for Irradiance<'a> {
     }
 }
 
-/// All spots that exist, as sources; of beams with a width several for each, and of surfaces of several parts one for each part.
+/// All spots that exist, as sources; of beams with a width several for each.
 #[derive(Debug, Default)]
 pub(crate) struct Emitters {
     /// The sources.
@@ -245,7 +245,7 @@ impl Emitters {
             let through = through(world, &mut stack, direction, spot);
             let of_beam = (beam, through);
             let source = Emitter::new(world, &mut stack, of_beam, spot, surface);
-            all.push(world, source);
+            all.push(source);
             let way = (world.laser, direction);
             all.push_branches(world, &mut stack, (beam, 1.0), way);
         }
@@ -285,7 +285,7 @@ impl Emitters {
                     let surface = world.first_surface[spot.object as usize] + spot.material;
                     let of_beam = (beam, through / width.points as f32);
                     let source = Emitter::new(world, &mut stack, of_beam, &spot, surface);
-                    all.push(world, source);
+                    all.push(source);
                 }
                 all.push_branches(world, &mut stack, (beam, share), (start, ray.direction));
             }
@@ -306,30 +306,15 @@ impl Emitters {
             let surface = world.first_surface[spot.object as usize] + spot.material;
             let of_beam = (beam, share * of_ray);
             let source = Emitter::new(world, stack, of_beam, &spot, surface);
-            self.push(
-                world,
-                Emitter {
-                    aside: true,
-                    ..source
-                },
-            );
+            self.push(Emitter {
+                aside: true,
+                ..source
+            });
         }
     }
 
-    /// Adds a source; one for each part of a surface of several.
-    fn push(&mut self, world: &World, e: Emitter) {
-        match e.surface.parts_of_several() {
-            None => self.push_one(e),
-            Some((index, factor)) => {
-                for part in &world.several[index] {
-                    let surface = part.scaled(factor);
-                    self.push_one(Emitter { surface, ..e });
-                }
-            }
-        }
-    }
-
-    fn push_one(&mut self, e: Emitter) {
+    /// Adds a source.
+    fn push(&mut self, e: Emitter) {
         let index = self.list.len();
         let strength = if e.surface.diffuse() {
             e.surface.lambertian()

@@ -81,7 +81,7 @@ impl LightVertices {
             if contacts.is_some_and(|c| c.own(world, spot, &hit)) {
                 continue;
             }
-            hit.choose_lobe(world, rng);
+            hit.choose_lobe(rng);
             if weight == 0.0 || hit.surface.specular() || hit.surface.is_black() {
                 continue;
             }

@@ -156,10 +156,7 @@ impl Strata {
             let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
             let b = (2 * (block / (side / 2)) + corner / 2) as f32 + rng.uniform();
             let d = world.camera_ray((row, col), (a / side as f32, b / side as f32));
-            let mut hit = world.closest(&mut scratch.stack, Vec3::ZERO, d);
-            if let Some(h) = &mut hit {
-                h.choose_part(world, rng);
-            }
+            let hit = world.closest(&mut scratch.stack, Vec3::ZERO, d);
             let hit = hit.filter(|h| !h.surface.is_black());
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();

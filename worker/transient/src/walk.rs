@@ -246,7 +246,7 @@ impl Walk<'_> {
             weight /= survive;
         }
         let (step, mut next) = self.follow(v, (w, weight, pdf), aims, stack)?;
-        next.hit.choose_lobe(self.world, rng);
+        next.hit.choose_lobe(rng);
         Some((step, next))
     }
 

@@ -14,7 +14,7 @@ use crate::{
     fresnel::Body,
     glass::{Crossing, Panes},
     rng::Rng,
-    spectra::{Builder, Texels},
+    spectra::{self, Texels},
 };
 
 /// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
@@ -40,8 +40,6 @@ pub(crate) struct World {
     pub object: Vec<u32>,
     /// Scattering by surface index.
     pub surfaces: Vec<Surface>,
-    /// Parts of the surfaces of several, each times its share.
-    pub several: Vec<Vec<Surface>>,
     /// Index into `surfaces` of every object's first material.
     pub first_surface: Vec<u32>,
     /// Material index in its mesh, by surface index.
@@ -86,63 +84,19 @@ pub(crate) struct Hit {
     pub through: f32,
 }
 
-/// Parts that bring less than this share of the light count as black: what their chance divides would leave f32.
-const LEAST_PART: f32 = 1e-9;
-
-/// One of several surfaces, drawn by their albedos and divided by its chance; a black one where all are.
-fn drawn<'a>(all: impl Iterator<Item = &'a Surface> + Clone, u: f32) -> Surface {
-    let total: f32 = all.clone().map(Surface::albedo).sum();
-    let (mut left, mut last) = (u * total, None);
-    for s in all.filter(|s| s.albedo() > LEAST_PART * total) {
-        last = Some(s);
-        left -= s.albedo();
-        if left < 0.0 {
-            break;
-        }
-    }
-    match last {
-        Some(s) => s.scaled(total / s.albedo()),
-        None => Surface::new(&Material::diffuse("black", [0.0; 3])),
-    }
-}
-
 impl Hit {
-    /// Settles a surface of several lobes on one of them where one is too narrow for pixels to share its vertices, so that each path
-    /// is of one kind: by way of a near-mirror's lobe, or of others. A mix of wide lobes stays: its vertices scatter by both.
+    /// Settles a mix on one of its parts where one is too narrow for pixels to share its vertices, so that each path is of one
+    /// kind: by way of a near-mirror's lobe, or of others. A mix of wide lobes stays: its vertices scatter by both.
     #[inline(always)]
-    pub fn choose_lobe(&mut self, world: &World, rng: &mut Rng) {
+    pub fn choose_lobe(&mut self, rng: &mut Rng) {
         if self.surface.is_open() {
-            self.settle(world, rng);
+            self.settle(rng);
         }
     }
 
     #[cold]
-    fn settle(&mut self, world: &World, rng: &mut Rng) {
-        self.choose_part(world, rng);
-        if self.surface.is_open() {
-            self.surface = self.surface.lobe(rng.uniform());
-        }
-    }
-
-    /// Settles a surface of several parts on one of them, and leaves a mix of two as it is.
-    #[inline]
-    pub fn choose_part(&mut self, world: &World, rng: &mut Rng) {
-        if let Some((index, factor)) = self.surface.parts_of_several() {
-            let all = world.several[index].iter();
-            self.surface = drawn(all, rng.uniform()).scaled(factor);
-        }
-    }
-
-    /// The near-mirror of its surface: the conductor of a mix, or one of the near-mirrors among several parts, drawn.
-    #[inline]
-    pub fn mirror(&self, world: &World, rng: &mut Rng) -> Surface {
-        match self.surface.parts_of_several() {
-            None => self.surface.gloss(),
-            Some((index, factor)) => {
-                let near = world.several[index].iter().filter(|s| s.specular());
-                drawn(near, rng.uniform()).scaled(factor)
-            }
-        }
+    fn settle(&mut self, rng: &mut Rng) {
+        self.surface = self.surface.lobe(rng.uniform());
     }
 }
 
@@ -165,8 +119,7 @@ impl World {
         horizon_m: f64,
         stop: Stop,
     ) -> Result<Self, RenderError> {
-        let mut spectra = Builder::new(wavelength_nm);
-        let mut several = vec![];
+        let mut texels = vec![];
         let origin = scene.camera.origin;
         let centre = wide(origin);
         let count: usize = scene.objects.iter().map(|o| o.mesh.triangles.len()).sum();
@@ -187,7 +140,14 @@ impl World {
             let first = surfaces.len() as u32;
             first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
-                surfaces.push(spectra.surface(m, &mut several)?);
+                surfaces.push(match wavelength_nm {
+                    None => Surface::new(m),
+                    Some(nm) => {
+                        let (surface, of_texels) = spectra::at(m, nm);
+                        texels.push(of_texels);
+                        surface
+                    }
+                });
                 bodies.push(Body::new(m));
                 material.push(k as u32);
                 rgb.push(m.rgb);
@@ -269,7 +229,6 @@ impl World {
             surface,
             object,
             surfaces,
-            several,
             first_surface,
             material,
             rgb,
@@ -286,7 +245,7 @@ impl World {
                 true => bodies,
                 false => vec![],
             },
-            texels: spectra.texels,
+            texels,
         })
     }
 

@@ -5,8 +5,8 @@ mod common;
 
 use common::{Quiet, object};
 use picofarm_scene::{
-    Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Lobe, Material, Object, Part, Parts,
-    Provenance, Scene, SpectrumPoint, Spot, Vec3,
+    Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Material, Object, Provenance, Scene,
+    SpectrumPoint, Spot, Vec3,
 };
 use picofarm_transient::{
     BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, Wavelength, render,
@@ -54,26 +54,6 @@ fn unit() -> impl Draw<Value = Vec3> {
     ]
 }
 
-/// Parts of equal shares.
-fn several(parts: Vec<(f32, f32, Distribution, bool)>) -> Bsdf {
-    let weight = 1.0 / parts.len() as f32;
-    let part = |(reflectance, alpha, distribution, smooth)| Part {
-        weight,
-        lobe: match smooth {
-            true => Lobe::RoughConductor {
-                alpha,
-                distribution,
-                reflectance,
-            },
-            false => Lobe::Diffuse { reflectance },
-        },
-    };
-    let parts: Vec<Part> = parts.into_iter().map(part).collect();
-    Bsdf::Several {
-        parts: Parts::of(&parts).unwrap(),
-    }
-}
-
 fn material() -> impl Draw<Value = Material> {
     let share = || prop_oneof![Just(0.0f32), Just(1.0), 0.0f32..=1.0];
     let alpha = || prop_oneof![Just(1e-3f32), Just(1.0), Just(0.01), 1e-3f32..=1.0];
@@ -88,7 +68,6 @@ fn material() -> impl Draw<Value = Material> {
                 reflectance, alpha, distribution, specular_reflectance, weight,
             }
         ),
-        1 => proptest::collection::vec((share(), alpha(), kind(), any::<bool>()), 1..5).prop_map(several),
     ];
     let point = (450.0f32..1000.0, share()).prop_map(|(nm, reflectance)| SpectrumPoint {
         nm,

@@ -63,7 +63,7 @@ fn alone(scene: &Scene, nm: f64) -> Scene {
                 specular_reflectance,
                 ..
             } => (*reflectance, *specular_reflectance) = (at.lambertian, at.conductor),
-            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {}
+            Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {}
         }
         m.spectrum = vec![];
     });

@@ -167,7 +167,7 @@ fn straight(
         out,
     };
     let mut hit = point.hit;
-    hit.choose_lobe(walk.world, rng);
+    hit.choose_lobe(rng);
     let vertex = Vertex {
         hit,
         wo: point.back,

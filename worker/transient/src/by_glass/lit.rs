@@ -142,8 +142,7 @@ impl Lit {
                 let at = (f64::from(j - half) + f64::from(rng.uniform())) / f64::from(half);
                 areas.draw(world, at, rng)
             };
-            let Some(mut hit) = hit else { continue };
-            hit.choose_part(world, rng);
+            let Some(hit) = hit else { continue };
             if Self::may_hold(&walk, &hit) {
                 let even = 0.5 * f64::from(half) / areas.whole();
                 let density = (half as f32 / spots as f32, even as f32);

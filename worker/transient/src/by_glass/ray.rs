@@ -224,8 +224,7 @@ pub(super) fn arrive(
     rng: &mut Rng,
     tools: (&mut Stack, &mut Vec<Crossing>),
 ) -> Option<Point> {
-    let (ray, mut hit) = follow(world, ray, seek, rng, tools)?;
-    hit.choose_part(world, rng);
+    let (ray, hit) = follow(world, ray, seek, rng, tools)?;
     let once = ray.last.filter(|_| ray.turns == 1);
     Some(Point {
         hit,
@@ -245,11 +244,7 @@ pub(super) fn arrive(
 impl Point {
     /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive` says with which chance a step
     /// of a weight does.
-    pub fn scatter(
-        &self,
-        survive: impl Fn(f32) -> f32,
-        rng: &mut Rng,
-    ) -> Option<(Carried, Ray)> {
+    pub fn scatter(&self, survive: impl Fn(f32) -> f32, rng: &mut Rng) -> Option<(Carried, Ray)> {
         let h = &self.hit;
         let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
         let chance = survive(weight);
@@ -262,12 +257,7 @@ impl Point {
     /// Radiance goes on by the surface's scattering or to where glass is. What the path carries then, the ray, and what is left of
     /// `left`: what it would carry by scattering alone, since how narrow the cones are says nothing of what lies in them. Roulette
     /// goes by that.
-    pub fn seek(
-        &self,
-        aim: &Aim,
-        left: f32,
-        rng: &mut Rng,
-    ) -> Option<(Carried, Ray, f32)> {
+    pub fn seek(&self, aim: &Aim, left: f32, rng: &mut Rng) -> Option<(Carried, Ray, f32)> {
         let h = &self.hit;
         let (w, weight, own) = match aim.from(h) {
             Some(cones) => cones.sample(h, self.back, rng)?,

@@ -158,7 +158,7 @@ impl Sharing {
             else {
                 continue;
             };
-            next.hit.choose_lobe(walk.world, rng);
+            next.hit.choose_lobe(rng);
             if next.hit.surface.is_black() {
                 continue;
             }
@@ -226,7 +226,7 @@ impl Sharing {
             if next.hit.triangle != triangle {
                 continue;
             }
-            next.hit.choose_lobe(walk.world, rng);
+            next.hit.choose_lobe(rng);
             if !next.hit.surface.specular() || next.hit.surface.is_black() {
                 continue;
             }
@@ -266,7 +266,7 @@ impl Sharing {
             if walk.is_own(spot, &hit) {
                 continue;
             }
-            hit.choose_lobe(walk.world, rng);
+            hit.choose_lobe(rng);
             self.shared.extend(Shared::new(hit));
         }
     }
@@ -287,7 +287,7 @@ impl Sharing {
             let Some(mut hit) = self.shells.draw(place, at, rng) else {
                 continue;
             };
-            hit.choose_lobe(walk.world, rng);
+            hit.choose_lobe(rng);
             self.shared.extend(Shared::new(hit));
         }
     }
@@ -344,7 +344,7 @@ pub(super) fn gather_point(
 ) -> Option<Vertex> {
     let mut vertex = first(walk, ray, scratch)?;
     loop {
-        vertex.hit.choose_lobe(walk.world, rng);
+        vertex.hit.choose_lobe(rng);
         if vertex.bounce > 1 {
             sink.factor = if vertex.hit.surface.specular() {
                 share.spots
@@ -382,7 +382,7 @@ pub(super) fn only_mirrors(
     };
     sink.factor = share.spots;
     loop {
-        vertex.hit.choose_lobe(walk.world, rng);
+        vertex.hit.choose_lobe(rng);
         if !vertex.hit.surface.specular() {
             return;
         }

@@ -171,7 +171,7 @@ impl Walk<'_> {
         let leg = m.p - h.p;
         let w = leg.normalized();
         let e = &self.emitters.list[aim.spot];
-        let near = m.mirror(self.world, rng);
+        let near = m.surface.gloss();
         let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &near);
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
