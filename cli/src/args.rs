@@ -27,12 +27,12 @@ pub use demultiplex::{Demultiplex, PlacesArg};
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind, ListedState};
-pub use model::{Model, ModelFormat};
+pub use model::Model;
 pub use network::{BenchModel, Kind, Learns, Numbers};
 pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use secrets::without_secrets;
-pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepFormat, SweepRun, WhichSweep};
+pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]
@@ -513,7 +513,7 @@ pub enum Bench {
     Queue(BenchQueue),
     /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot, gc
     Dataset(BenchDataset),
-    /// Measure storage on scenes of this renderer: size, error and speed of all profiles beside other formats, and reading
+    /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of reading
     Store(BenchStore),
     /// Measure a training step of a network on the CPU, beside other forms and other programs
     Model(BenchModel),

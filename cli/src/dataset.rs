@@ -130,18 +130,8 @@ fn further(info: &Summary) -> String {
     if !alone.is_empty() {
         text += &format!("transients also of the spots: {}\n", alone.join(", "));
     }
-    let nm: Vec<String> = info
-        .spec
-        .wavelengths_nm
-        .nm()
-        .iter()
-        .map(f64::to_string)
-        .collect();
-    if !nm.is_empty() {
-        text += &format!(
-            "wavelengths {} nm, the first is that of transient\n",
-            nm.join(", ")
-        );
+    if let Some(nm) = info.spec.wavelengths_nm.nm() {
+        text += &format!("wavelength {nm} nm\n");
     }
     if let Some(noise) = info.noise {
         text += &format!(

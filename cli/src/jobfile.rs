@@ -283,19 +283,15 @@ mod tests {
             .replace("# strategy", "strategy")
             .replace("# beam =", "beam =")
             .replace("# fill_factor =", "fill_factor =");
-        let coloured = text.replace("# wavelengths_nm", "wavelengths_nm");
-        let refused = read(&written(dir.path(), &coloured), dir.path()).unwrap_err();
+        let text = text.replace("# wavelengths_nm", "wavelengths_nm");
+        let several = text.replace("[905]", "[905, 532]");
+        let refused = read(&written(dir.path(), &several), dir.path()).unwrap_err();
+        let expected = "render.wavelengths_nm";
+        let message = &refused.message;
         assert!(
-            refused.message.contains("render.wavelengths_nm"),
-            "{}",
-            refused.message
+            message.contains(expected) && message.contains("has 2, expected one"),
+            "{message}"
         );
-        let alone = template(JobKind::Primitive).replace("# wavelengths_nm", "wavelengths_nm");
-        let spec = read(&written(dir.path(), &alone), dir.path()).unwrap();
-        let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
-            unreachable!("the template renders");
-        };
-        assert_eq!(render.wavelengths_nm.nm(), [905.0, 532.0]);
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
         let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
             unreachable!("the template renders");

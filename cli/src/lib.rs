@@ -44,8 +44,6 @@ mod stored;
 mod sweep;
 mod tail;
 mod template;
-#[cfg(feature = "networks")]
-mod tensorboard;
 mod token;
 #[cfg(feature = "traces")]
 mod traces;

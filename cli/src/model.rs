@@ -4,8 +4,6 @@ mod care;
 #[cfg(feature = "networks")]
 mod devices;
 #[cfg(feature = "networks")]
-mod epochs;
-#[cfg(feature = "networks")]
 mod import;
 #[cfg(feature = "networks")]
 mod report;
@@ -22,7 +20,7 @@ use serde_json::{Value, json};
 #[cfg(not(feature = "networks"))]
 use crate::error::not_built;
 use crate::{
-    args::{Model as Command, ModelFormat},
+    args::Model as Command,
     dataset::failed,
     error::{CliError, Result, io},
     output::{Output, bytes, table},
@@ -39,26 +37,9 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
         #[cfg(feature = "networks")]
         Command::Devices => devices::run(output),
         Command::Show { store, name } => show(&store, &name, output).await,
-        Command::Export {
-            store,
-            name,
-            format: ModelFormat::Safetensors,
-            out,
-        } => {
+        Command::Export { store, name, out } => {
             let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());
             export(&store, &name, &out, output).await
-        }
-        #[cfg(not(feature = "networks"))]
-        Command::Export { .. } => Err(not_built("networks", "event files of TensorBoard")),
-        #[cfg(feature = "networks")]
-        Command::Export {
-            store,
-            name,
-            format: ModelFormat::Tensorboard,
-            out,
-        } => {
-            let out = out.unwrap_or_else(|| "tensorboard".into());
-            epochs::run(&store, &name, &out, output).await
         }
         #[cfg(not(feature = "networks"))]
         Command::Import { .. } => Err(not_built("networks", "imports of models")),

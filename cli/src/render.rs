@@ -20,7 +20,7 @@ use picofarm_scene::{
     import::{self, ImportOptions},
 };
 use picofarm_transient::{
-    Budget, ClassVariance, Forecast, Progress, RenderError, Rendered, Settings, Wavelengths,
+    Budget, ClassVariance, Forecast, Progress, RenderError, Rendered, Settings, Wavelength,
 };
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -82,7 +82,7 @@ impl Order {
             max_bounces: args.max_bounces.unwrap_or(0),
             beam: args.beam.width(),
             fill_factor: args.fill_factor.unwrap_or(1.0),
-            wavelengths_nm: Wavelengths::of(&args.wavelengths_nm)
+            wavelengths_nm: Wavelength::of(&args.wavelengths_nm)
                 .map_err(|(at, what)| CliError::input(format!("--wavelengths-nm{at}: {what}")))?,
             ..RenderSettings::default()
         };
@@ -97,13 +97,6 @@ impl Order {
             *i = i.resized(px, px);
         }
         let wanted = groups::wanted(&args.groups, &args.group, scene.laser.beams.len())?;
-        for nm in asked.wavelengths_nm.others() {
-            let name = at_wavelength("transient", *nm);
-            if wanted.iter().any(|w| w.array == name) {
-                let what = format!("two histograms would be called {name}");
-                return Err(CliError::input(what).hint("give that --group another name"));
-            }
-        }
         let settings = Settings {
             gate: asked.gate(),
             budget: asked.budget,
@@ -379,52 +372,27 @@ pub fn free_folder(out: &Path) -> Result<()> {
 struct Beside {
     array: String,
     per_spot: bool,
-    nm: Option<f64>,
     data: Vec<f32>,
 }
 
-/// The name of an array at a wavelength.
-fn at_wavelength(array: &str, nm: f64) -> String {
-    format!("{array}_{}nm", nm.to_string().replace('.', "_"))
-}
-
-/// Takes the groups and the other wavelengths out of the render, one run of values for each array. Each group is let go as soon as
-/// it is copied, so that histograms of a hundred spots never lie in memory twice.
+/// Takes the groups out of the render, one run of values for each array. Each group is let go as soon as it is copied, so that
+/// histograms of a hundred spots never lie in memory twice.
 fn beside(rendered: &mut Rendered, order: &Order) -> Vec<Beside> {
     let one = rendered.transient.len();
-    let subsets = |groups: Vec<Vec<f32>>, nm: Option<f64>| {
-        let mut groups = groups.into_iter();
-        let join = move |wanted: &Wanted| Beside {
-            array: match nm {
-                None => wanted.array.clone(),
-                Some(nm) => at_wavelength(&wanted.array, nm),
-            },
-            per_spot: wanted.per_spot,
-            nm,
-            data: if wanted.per_spot {
-                let count = wanted.groups.len();
-                let mut all = Vec::with_capacity(count * one);
-                groups.by_ref().take(count).for_each(|g| all.extend(g));
-                all
-            } else {
-                groups.next().unwrap_or_default()
-            },
-        };
-        order.wanted.iter().map(join).collect::<Vec<_>>()
+    let mut groups = std::mem::take(&mut rendered.groups).into_iter();
+    let join = move |wanted: &Wanted| Beside {
+        array: wanted.array.clone(),
+        per_spot: wanted.per_spot,
+        data: if wanted.per_spot {
+            let count = wanted.groups.len();
+            let mut all = Vec::with_capacity(count * one);
+            groups.by_ref().take(count).for_each(|g| all.extend(g));
+            all
+        } else {
+            groups.next().unwrap_or_default()
+        },
     };
-    let main = order.settings.wavelengths_nm.nm().first().copied();
-    let mut all = subsets(std::mem::take(&mut rendered.groups), None);
-    all.iter_mut().for_each(|b| b.nm = main);
-    for other in std::mem::take(&mut rendered.others) {
-        all.push(Beside {
-            array: at_wavelength("transient", other.nm),
-            per_spot: false,
-            nm: Some(other.nm),
-            data: other.transient,
-        });
-        all.extend(subsets(other.groups, Some(other.nm)));
-    }
-    all
+    order.wanted.iter().map(join).collect()
 }
 
 fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<()> {
@@ -498,15 +466,17 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
         .iter()
         .map(|w| (w.array.clone(), json!(w.groups.concat())))
         .collect();
-    let main = settings.wavelengths_nm.nm().first();
-    let wavelengths: serde_json::Map<_, _> = main
-        .map(|nm| ("transient".to_owned(), json!(nm)))
+    let arrays_of_all = beside.iter().map(|b| b.array.clone());
+    let wavelengths: serde_json::Map<_, _> = settings
+        .wavelengths_nm
+        .nm()
         .into_iter()
-        .chain(
-            beside
-                .iter()
-                .filter_map(|b| Some((b.array.clone(), json!(b.nm?)))),
-        )
+        .flat_map(|nm| {
+            let names = ["transient".to_owned()].into_iter();
+            names
+                .chain(arrays_of_all.clone())
+                .map(move |name| (name, json!(nm)))
+        })
         .collect();
     let mut attributes = json!({
         "scene": scene.name,

@@ -4,7 +4,6 @@ mod compare;
 mod export;
 mod extend;
 mod file;
-mod importance;
 mod records;
 
 use std::{fs, path::Path, time::SystemTime};
@@ -15,7 +14,7 @@ use serde_json::json;
 
 use self::records::{Records, loss, read};
 use crate::{
-    args::{Sweep as Command, SweepFormat, WhichSweep},
+    args::{Sweep as Command, WhichSweep},
     error::{CliError, Code, Result, io},
     output::{Output, table},
     settings::Settings,
@@ -25,30 +24,10 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
     match command {
         Command::Status(which) => status(&read(&which).await?.sweep()?, output),
         Command::Best(which) => best(&which, &read(&which).await?.sweep()?, output)?,
-        Command::Importance(which) => importance::run(&read(&which).await?, output)?,
         Command::Compare { store, names } => compare::run(&store, &names, output).await?,
         Command::Report { which, out } => report(&read(&which).await?, &out, output)?,
-        Command::Export {
-            which,
-            format,
-            out,
-            curves,
-        } => {
-            let records = read(&which).await?;
-            match format {
-                SweepFormat::Csv => {
-                    let out = out.unwrap_or_else(|| "sweep.csv".into());
-                    export::as_csv(&records, &out, curves, output)?;
-                }
-                SweepFormat::Tensorboard => {
-                    if curves {
-                        let what = "--curves: belongs to --format csv; event files always have every epoch";
-                        return Err(CliError::input(what).hint("leave it away"));
-                    }
-                    let out = out.unwrap_or_else(|| "sweep-tensorboard".into());
-                    export::as_tensorboard(&records, &out, output)?;
-                }
-            }
+        Command::Export { which, out, curves } => {
+            export::run(&read(&which).await?.sweep()?, &out, curves, output)?
         }
         Command::Extend(args) => extend::run(args, settings, output).await?,
         Command::Run(args) => extend::rounds(args, settings, output).await?,
@@ -102,11 +81,8 @@ fn best(which: &WhichSweep, sweep: &Sweep, output: Output) -> Result<()> {
 
 fn report(records: &Records, out: &Path, output: Output) -> Result<()> {
     let date = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
-    let (importance, importance_note) = importance::weights(records)?;
     let sweep = Sweep {
         date: date[..10].to_owned(),
-        importance,
-        importance_note,
         ..records.sweep()?
     };
     let beside = out.with_extension("json");

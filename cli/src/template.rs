@@ -64,7 +64,7 @@ pub fn template(kind: JobKind) -> String {
          # strategy = {{ path_reuse = 1, mirror_images = false }}  # ways of finding light, chosen by hand\n\
          # beam = {{ diameter_mm = 4, divergence_mrad = 1 }}  # width of the laser's beams (1/e²); without it none\n\
          # fill_factor = 0.3       # share of each pixel's area that is sensitive\n\
-         # wavelengths_nm = [905, 532]  # of the laser, up to 4 in one pass; the first is that of the transient\n\n\
+         # wavelengths_nm = [905]  # of the laser; without it, the one that the scenes' reflectances are of\n\n\
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\

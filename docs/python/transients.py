@@ -66,12 +66,11 @@ class Transients:
     scenes     indices; without them and without a split all that are published
     split      "train", "validation" or "test" of the split that `picofarm dataset split` recorded
     split_name, split_version   which split; its newest version if none is named
-    histogram  "transient", or "transient_4", "transient_25", "transient_spots", "transient_wavelengths" where the data set has them
+    histogram  "transient", or "transient_4", "transient_25", "transient_spots" where the data set has them
     crop       (row, column, height, width) in pixels; the intrinsics are shifted with it
     bins       (first, end); all without it
     arrays     what to read of each scene, beside its index and `scale` (photons per unit of the histogram):
-               transient    float32 [row][column][bin]; [spot][row][column][bin] of transient_spots,
-                            [wavelength][row][column][bin] of transient_wavelengths (its attribute wavelengths_nm names them)
+               transient    float32 [row][column][bin]; [spot][row][column][bin] of transient_spots
                depth        float32 [row][column], z-depth in metres, 0 = nothing there
                visibility   uint8 [spot][row][column], 1 = the spot lights what the pixel sees
                specular     uint8 [row][column], 1 = a mirror

@@ -1,13 +1,10 @@
-"""The searches of cli/search beside Optuna's: search_optuna.py [importance | search]; needs optuna.
+"""Optuna's searches for comparison with cli/search: search_optuna.py; needs optuna.
 
-importance: PED-ANOVA's shares of the trials of cli/search/tests/importance.rs, drawn here by the same hashes.
-search: what TPESampler(multivariate) and RandomSampler find of the functions of cli/search/tests/objectives.rs, with 60
+Prints what TPESampler(multivariate) and RandomSampler find of the functions of cli/search/tests/objectives.rs, with 60
 trials in rounds of 6 and 24 seeds: medians of the least values."""
 
-import hashlib
 import math
 import statistics
-import sys
 import warnings
 
 import optuna
@@ -15,48 +12,6 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 warnings.simplefilter("ignore")
-
-
-def bits(seed, trial, name):
-    text = b"trial" + seed.to_bytes(8, "little") + trial.to_bytes(8, "little") + name.encode()
-    return int.from_bytes(hashlib.sha256(text).digest()[:8], "little")
-
-
-def draw(space, seed, trial):
-    values = {}
-    for name, of in space.items():
-        number = bits(seed, trial, name)
-        share = (number >> 11) / (1 << 53)
-        if isinstance(of, IntDistribution):
-            values[name] = of.low + (number * (of.high - of.low + 1) >> 64)
-        else:
-            low, high = (math.log(of.low), math.log(of.high)) if of.log else (of.low, of.high)
-            value = low + share * (high - low)
-            value = float(f"{math.exp(value) if of.log else value:.3e}")
-            values[name] = min(max(value, of.low), of.high)
-    return values
-
-
-def importance():
-    space = {
-        "x": FloatDistribution(0, 1),
-        "y": FloatDistribution(1e-3, 1, log=True),
-        "z": IntDistribution(0, 30),
-    }
-
-    def weighs(values):
-        y = (math.log10(values["y"]) + 3) / 3
-        return (values["x"] - 0.3) ** 2 + 0.1 * (y - 0.6) ** 2
-
-    for trials, seed in [(300, 1), (300, 2), (100, 1), (50, 3)]:
-        study = optuna.create_study()
-        for trial in range(trials):
-            values = draw(space, seed, trial)
-            study.add_trial(optuna.trial.create_trial(params=values, distributions=space, value=weighs(values)))
-        found = optuna.importance.get_param_importances(
-            study, evaluator=optuna.importance.PedAnovaImportanceEvaluator()
-        )
-        print(f"{trials} trials, seed {seed}:", {name: round(share, 4) for name, share in sorted(found.items())})
 
 
 def decades(x, by):
@@ -111,24 +66,20 @@ OBJECTIVES = {
 }
 
 
-def search():
-    samplers = {
-        "tpe": lambda seed: optuna.samplers.TPESampler(multivariate=True, constant_liar=True, seed=seed),
-        "random": lambda seed: optuna.samplers.RandomSampler(seed=seed),
-    }
-    for name, (space, objective) in OBJECTIVES.items():
-        medians = {}
-        for sampler, make in samplers.items():
-            least = []
-            for seed in range(24):
-                study = optuna.create_study(sampler=make(seed))
-                for _ in range(10):
-                    for trial in [study.ask(space) for _ in range(6)]:
-                        study.tell(trial, objective(trial.params))
-                least.append(study.best_value)
-            medians[sampler] = round(statistics.median(least), 4)
-        print(f"{name}: {medians}", flush=True)
-
-
 print(f"optuna {optuna.__version__}")
-{"importance": importance, "search": search}[sys.argv[1] if len(sys.argv) > 1 else "importance"]()
+samplers = {
+    "tpe": lambda seed: optuna.samplers.TPESampler(multivariate=True, constant_liar=True, seed=seed),
+    "random": lambda seed: optuna.samplers.RandomSampler(seed=seed),
+}
+for name, (space, objective) in OBJECTIVES.items():
+    medians = {}
+    for sampler, make in samplers.items():
+        least = []
+        for seed in range(24):
+            study = optuna.create_study(sampler=make(seed))
+            for _ in range(10):
+                for trial in [study.ask(space) for _ in range(6)]:
+                    study.tell(trial, objective(trial.params))
+            least.append(study.best_value)
+        medians[sampler] = round(statistics.median(least), 4)
+    print(f"{name}: {medians}", flush=True)

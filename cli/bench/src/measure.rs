@@ -6,9 +6,7 @@ use std::{
 };
 
 use picofarm_scene::Scene;
-use picofarm_transient::{
-    Budget, Progress, RenderError, Rendered, Settings, Strategy, Wavelengths,
-};
+use picofarm_transient::{Budget, Progress, RenderError, Rendered, Settings, Strategy, Wavelength};
 use rustix::time::{ClockId, clock_gettime};
 use tokio_util::sync::CancellationToken;
 
@@ -49,7 +47,7 @@ pub fn settings(args: &BenchRender, budget: Budget, seed: u64) -> Settings {
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
     }
 }
 

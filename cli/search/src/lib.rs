@@ -1,4 +1,4 @@
-//! What trials of a sweep teach: which values to try next ([`tpe`]), and which parameters matter ([`importance`]).
+//! Which values a sweep should try next ([`tpe`]).
 //!
 //! Pure functions of what trials have found: the same records give the same answers, on every machine. Randomness is
 //! SHA-256 of a seed and of what is drawn.
@@ -7,7 +7,6 @@
 //! of random numbers of their own or a study that must hear of each trial as it goes, and use the platform's logarithm.
 //! Here proposals must follow from records in a store alone, in rounds of any number, to the same digits everywhere.
 
-pub mod importance;
 mod parzen;
 pub mod tpe;
 

@@ -27,7 +27,7 @@ pub(crate) struct Mixture<'a> {
 
 /// Where a value lies in its domain.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Place {
+enum Place {
     /// A share of an interval, and half of a step's width: 0 where there are no steps.
     At(f64, f64),
     /// The position in a list.
@@ -36,7 +36,7 @@ pub(crate) enum Place {
 
 impl Place {
     /// Where a value lies; `None` for one that cannot.
-    pub(crate) fn of(domain: &Domain, value: &Value) -> Option<Self> {
+    fn of(domain: &Domain, value: &Value) -> Option<Self> {
         match domain {
             Domain::OneOf(_) => domain.position(value).map(Self::Number),
             Domain::Within(interval) => {
@@ -178,7 +178,7 @@ fn at_share(weights: impl Iterator<Item = f64>, mut share: f64) -> usize {
 }
 
 /// The share of a standard normal distribution that lies below x.
-pub(crate) fn normal_below(x: f64) -> f64 {
+fn normal_below(x: f64) -> f64 {
     0.5 * libm::erfc(-x * FRAC_1_SQRT_2)
 }
 

@@ -108,15 +108,9 @@ pub struct BenchStore {
     /// Render into this folder and keep it: the next run with it renders nothing [default: a folder that is removed after]
     #[arg(long, value_name = "DIR")]
     pub keep: Option<PathBuf>,
-    /// Only ways of storing whose name contains one of these texts
-    #[arg(long, value_delimiter = ',', value_name = "TEXT,…")]
-    pub only: Vec<String>,
     /// Leave out how fast scenes are read
     #[arg(long)]
     pub no_reading: bool,
-    /// Draw size against error into this PNG
-    #[arg(long, value_name = "FILE")]
-    pub plot: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -152,8 +146,7 @@ pub struct DatasetExport {
     /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
     #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
     pub scenes: Option<Scenes>,
-    /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves; webdataset makes tar
-    /// files of 8 scenes; hdf5 a file a scene
+    /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves
     #[arg(long, default_value = "zarr", value_name = "NAME", value_parser = ExportFormat::parse)]
     pub format: ExportFormat,
 }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Subcommand, ValueEnum};
+use clap::Subcommand;
 
 const IMPORT_HELP: &str = "\
 The network of the settings must have the file's tensors, each in its shape; what does not fit is named, and nothing is
@@ -37,18 +37,15 @@ pub enum Model {
         /// Name of the model
         name: String,
     },
-    /// Write a model's weights to a file (safetensors), which PyTorch reads too, or its epochs for TensorBoard
+    /// Write a model's weights to a file (safetensors), which PyTorch reads too
     Export {
         /// Folder or URL of the store
         #[arg(value_parser = crate::paths::place)]
         store: String,
         /// Name of the model
         name: String,
-        /// What to write
-        #[arg(long, value_enum, default_value_t = ModelFormat::Safetensors)]
-        format: ModelFormat,
-        /// Where to write it; for tensorboard, a folder that gets one for each model [default: NAME.safetensors; tensorboard]
-        #[arg(long, value_name = "PATH")]
+        /// The file to write [default: NAME.safetensors]
+        #[arg(long, value_name = "FILE")]
         out: Option<PathBuf>,
     },
     /// Take a network that was trained elsewhere into a store: weights by PyTorch's names, as safetensors
@@ -118,13 +115,4 @@ pub enum Model {
         #[arg(long, default_value_t = 2, value_parser = super::ranges::pictures)]
         pictures: usize,
     },
-}
-
-/// What `model export` writes.
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum ModelFormat {
-    /// Its weights
-    Safetensors,
-    /// TensorBoard's event file: loss, rate and validation of each epoch
-    Tensorboard,
 }

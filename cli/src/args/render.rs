@@ -65,9 +65,8 @@ pub struct RenderArgs {
     /// Share of each pixel's area that is sensitive, a square in its middle [default: 1]
     #[arg(long, value_name = "SHARE")]
     pub fill_factor: Option<f64>,
-    /// Wavelengths of the laser, nanometres, up to 4 in one pass. The first is that of array transient; the others' are called
-    /// transient_532nm and so on [default: the one that the scene's reflectances are of]
-    #[arg(long, value_delimiter = ',', value_name = "NM,…")]
+    /// Wavelength of the laser, nanometres [default: the one that the scene's reflectances are of]
+    #[arg(long, value_delimiter = ',', value_name = "NM")]
     pub wavelengths_nm: Vec<f64>,
     /// Threads [default: all cores]
     #[arg(long, value_parser = super::ranges::threads)]

@@ -26,22 +26,17 @@ pub enum Sweep {
         #[arg(long, value_name = "FILE", default_value = "sweep.html")]
         out: PathBuf,
     },
-    /// Write the trials as CSV (a row for each, or for each epoch of each), or as TensorBoard's event files (a run for each)
+    /// Write the trials as CSV: a row for each, or for each epoch of each
     Export {
         #[command(flatten)]
         which: WhichSweep,
-        /// In which format
-        #[arg(long, value_enum, default_value_t = SweepFormat::Csv)]
-        format: SweepFormat,
-        /// The file to write; for tensorboard, a folder [default: sweep.csv; sweep-tensorboard]
-        #[arg(long, value_name = "PATH")]
-        out: Option<PathBuf>,
+        /// The file to write
+        #[arg(long, value_name = "FILE", default_value = "sweep.csv")]
+        out: PathBuf,
         /// A row for each epoch of trials that ended: loss, rate and validation along the training
         #[arg(long)]
         curves: bool,
     },
-    /// Say how much each parameter mattered (PED-ANOVA), and how likely that is chance
-    Importance(WhichSweep),
     /// Compare sweeps: the best of each, how its trials ended, and the least error by epochs spent
     Compare {
         /// Folder or URL of the store
@@ -69,15 +64,6 @@ pub struct WhichSweep {
     /// Which sweep of that name, where there are several: the first digits of its id
     #[arg(long, value_name = "ID", default_value = "")]
     pub id: String,
-}
-
-/// Formats of `sweep export`.
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum SweepFormat {
-    /// A table
-    Csv,
-    /// TensorBoard's event files, with what its HPARAMS tab shows
-    Tensorboard,
 }
 
 /// Who chooses values.

@@ -1,22 +1,17 @@
-//! `picofarm sweep export`: trials for other people's tools, as CSV or as TensorBoard's event files.
+//! `picofarm sweep export`: trials as CSV.
 
 use std::{fs, path::Path};
 
-use picofarm_dataset::TrialEnd;
 use picofarm_model::report::trials::{Sweep, Tried, Value};
-use picofarm_proto::model::{Domain, Interval};
 use serde_json::json;
 
-use super::records::Records;
 use crate::{
     error::{Result, io},
     output::Output,
-    tensorboard::{Ended, Parameter, Run},
 };
 
 /// Writes a row for each trial or, with `curves`, for each epoch of each.
-pub fn as_csv(records: &Records, out: &Path, curves: bool, output: Output) -> Result<()> {
-    let sweep = &records.sweep()?;
+pub fn run(sweep: &Sweep, out: &Path, curves: bool, output: Output) -> Result<()> {
     let rows = match curves {
         true => epochs(sweep),
         false => trials(sweep),
@@ -28,52 +23,6 @@ pub fn as_csv(records: &Records, out: &Path, curves: bool, output: Output) -> Re
         format!("{} rows in {}\n", rows.len() - 1, out.display())
     });
     Ok(())
-}
-
-/// Writes a folder for each trial that has ended, and beside them what the HPARAMS tab needs.
-pub fn as_tensorboard(records: &Records, out: &Path, output: Output) -> Result<()> {
-    let mut all = Run::default();
-    let space = records.space()?;
-    let parameters: Vec<Parameter> = space.into_iter().map(parameter).collect();
-    all.experiment(&parameters, ("error", records.error()));
-    all.write(out)?;
-    for trial in &records.ended {
-        let mut run = Run::default();
-        let ended = match trial.end {
-            TrialEnd::Finished | TrialEnd::Pruned => Ended::Well,
-            TrialEnd::Diverged(_) => Ended::Badly,
-        };
-        run.trial(&trial.model, trial.values.iter(), ended);
-        trial.history.iter().for_each(|line| run.line(line));
-        let last = trial.history.last().and_then(|line| line["step"].as_i64());
-        if let Some(loss) = trial.loss {
-            run.scalar(last.unwrap_or(0), "error", loss);
-        }
-        run.write(&out.join(&trial.model))?;
-    }
-    let facts = json!({"tensorboard": out, "runs": records.ended.len()});
-    output.result(&facts, || {
-        format!(
-            "{} runs in {}\nlook at them with: tensorboard --logdir {}\n",
-            records.ended.len(),
-            out.display(),
-            picofarm_proto::show::argument(&out.display().to_string())
-        )
-    });
-    Ok(())
-}
-
-fn parameter((name, domain): (String, Domain)) -> Parameter {
-    let (interval, listed) = match domain {
-        Domain::OneOf(list) => (None, list),
-        Domain::Within(Interval::Range(ends) | Interval::Log(ends)) => (Some(ends), Vec::new()),
-        Domain::Within(Interval::Int(ends)) => (Some(ends.map(|n| n as f64)), Vec::new()),
-    };
-    Parameter {
-        name,
-        interval,
-        listed,
-    }
 }
 
 /// A row for each trial.

@@ -7,8 +7,7 @@ use picofarm_model::{
     report::trials::{End, Sweep, Tried as Row, Value as Shown, error_name},
     train::Line,
 };
-use picofarm_proto::model::{Domain, Interval};
-use picofarm_search::{Outcome, Space, Tried};
+use picofarm_search::Outcome;
 use serde_json::Value;
 
 use crate::{
@@ -97,73 +96,6 @@ impl Records {
             trials: all.into_values().collect(),
             ..Sweep::default()
         })
-    }
-
-    /// For searches: those that have ended.
-    pub fn tried(&self) -> Vec<Tried> {
-        let tried = |trial: &TrialRecord| Tried {
-            values: trial.values.clone(),
-            outcome: outcome(trial),
-        };
-        self.ended.iter().map(tried).collect()
-    }
-
-    /// The values that parameters may have: as the job file says, or where it lists values alone, those that were tried.
-    ///
-    /// # Errors
-    /// A record that holds no such thing.
-    pub fn space(&self) -> Result<Space> {
-        let Some(first) = self.ended.first() else {
-            return Ok(Space::new());
-        };
-        let damaged = |name: &str, e| {
-            let what = format!("trial {}: over.{name}: {e}", first.index);
-            CliError::new(Code::Damaged, what)
-        };
-        if first.over.is_empty() {
-            let names = first.values.keys();
-            return Ok(names
-                .map(|name| (name.clone(), self.tried_of(name)))
-                .collect());
-        }
-        first
-            .over
-            .iter()
-            .map(
-                |(name, domain)| match serde_json::from_value(domain.clone()) {
-                    Ok(domain) => Ok((name.clone(), domain)),
-                    Err(e) => Err(damaged(name, e)),
-                },
-            )
-            .collect()
-    }
-
-    /// A parameter's values that were tried: numbers as an interval, anything else as a list.
-    fn tried_of(&self, name: &str) -> Domain {
-        let values: Vec<&Value> = self
-            .ended
-            .iter()
-            .filter_map(|t| t.values.get(name))
-            .collect();
-        let numbers: Option<Vec<f64>> = values.iter().map(|value| value.as_f64()).collect();
-        if let Some(numbers) = numbers {
-            let low = numbers.iter().copied().fold(f64::INFINITY, f64::min);
-            let high = numbers.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            if low < high {
-                // Over more than a decade, magnitudes count.
-                return Domain::Within(match low > 0.0 && high > 10.0 * low {
-                    true => Interval::Log([low, high]),
-                    false => Interval::Range([low, high]),
-                });
-            }
-        }
-        let mut list: Vec<Value> = Vec::new();
-        for value in values {
-            if !list.contains(value) {
-                list.push(value.clone());
-            }
-        }
-        Domain::OneOf(list)
     }
 }
 
@@ -279,29 +211,6 @@ pub mod tests {
             ended,
             rungs: Vec::new(),
         }
-    }
-
-    #[test]
-    fn a_space_that_no_job_file_says_is_that_of_the_values_tried() {
-        let mut records = records(vec![
-            record(0, 1e-3, TrialEnd::Finished, &[0.5]),
-            record(1, 1e-1, TrialEnd::Pruned, &[0.6]),
-        ]);
-        assert_eq!(
-            records.space().unwrap()["lr"],
-            Domain::Within(Interval::Log([1e-4, 1e-1]))
-        );
-        for (trial, (width, kind)) in records.ended.iter_mut().zip([(8, "a"), (16, "b")]) {
-            trial.over.clear();
-            trial.values.insert("width".into(), json!(width));
-            trial.values.insert("kind".into(), json!(kind));
-            trial.values.insert("same".into(), json!(2));
-        }
-        let space = records.space().unwrap();
-        assert_eq!(space["lr"], Domain::Within(Interval::Log([1e-3, 1e-1])));
-        assert_eq!(space["width"], Domain::Within(Interval::Range([8.0, 16.0])));
-        assert_eq!(space["kind"], Domain::OneOf(vec![json!("a"), json!("b")]));
-        assert_eq!(space["same"], Domain::OneOf(vec![json!(2)]));
     }
 
     #[test]

@@ -21,4 +21,4 @@ pub use render::{BeamWidth, Budget, Choice, Strategy};
 pub use rooms::{MirrorWall, PrimitiveRooms, Sizes};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
 pub use spots::Spots;
-pub use wavelengths::{MAX_WAVELENGTHS, WAVELENGTHS_NM, Wavelengths};
+pub use wavelengths::{WAVELENGTHS_NM, Wavelength};

@@ -1,87 +1,54 @@
-//! The wavelengths that a render is made at.
+//! The wavelength that a render is made at.
 
 use serde::{Deserialize, Serialize};
-
-/// Most wavelengths of a render.
-pub const MAX_WAVELENGTHS: usize = 4;
 
 /// Shortest and longest wavelength of a render or of a material's spectrum, nanometres.
 pub const WAVELENGTHS_NM: (f64, f64) = (200.0, 20_000.0);
 
-/// Wavelengths of a laser, nanometres: none, or up to [`MAX_WAVELENGTHS`] that differ and lie in [`WAVELENGTHS_NM`]. The first is the
-/// main one.
-#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
+/// The laser's wavelength, nanometres, within [`WAVELENGTHS_NM`]; or none. It is written as a list.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
-pub struct Wavelengths {
-    nm: [f64; MAX_WAVELENGTHS],
-    count: usize,
-}
+pub struct Wavelength(Option<f64>);
 
-impl Wavelengths {
+impl Wavelength {
     /// None: materials reflect as at the laser's own wavelength, whichever that is.
-    pub const NONE: Self = Self {
-        nm: [0.0; MAX_WAVELENGTHS],
-        count: 0,
-    };
+    pub const NONE: Self = Self(None);
 
-    /// These, in nanometres.
+    /// The wavelength of a list of one or none.
     ///
     /// # Errors
-    /// Which of them, as `[2]` (empty where all of them are meant), and what was expected.
+    /// Which of them, as `[0]` (empty where all of them are meant), and what was expected.
     pub fn of(nm: &[f64]) -> Result<Self, (String, String)> {
-        let mut all = Self::NONE;
-        if nm.len() > MAX_WAVELENGTHS {
-            let what = format!("has {}, expected at most {MAX_WAVELENGTHS}", nm.len());
-            return Err((String::new(), what));
-        }
         let (least, most) = WAVELENGTHS_NM;
-        for (k, &x) in nm.iter().enumerate() {
-            let fail = |what: String| Err((format!("[{k}]"), what));
-            if !(least..=most).contains(&x) {
-                return fail(format!(
-                    "is {x}, expected {least} to {most} nm, such as 905"
-                ));
-            }
-            if all.nm().contains(&x) {
-                return fail(format!("is {x}, which is there already; name each once"));
-            }
-            all.nm[k] = x;
-            all.count += 1;
-        }
-        Ok(all)
-    }
-
-    /// All of them, nanometres.
-    pub fn nm(&self) -> &[f64] {
-        &self.nm[..self.count]
-    }
-
-    /// Those after the main one.
-    pub fn others(&self) -> &[f64] {
-        self.nm().get(1..).unwrap_or_default()
-    }
-
-    /// The main one alone.
-    pub fn main(&self) -> Self {
-        Self {
-            nm: self.nm,
-            count: self.count.min(1),
+        match *nm {
+            [] => Ok(Self::NONE),
+            [x] if (least..=most).contains(&x) => Ok(Self(Some(x))),
+            [x] => Err((
+                "[0]".into(),
+                format!("is {x}, expected {least} to {most} nm, such as 905"),
+            )),
+            _ => Err((
+                String::new(),
+                format!(
+                    "has {}, expected one; give each wavelength a render or a stage and data set of its own",
+                    nm.len()
+                ),
+            )),
         }
     }
 
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.count == 0
+    /// Nanometres.
+    pub fn nm(&self) -> Option<f64> {
+        self.0
+    }
+
+    /// Whether there is none.
+    pub fn is_none(&self) -> bool {
+        self.0.is_none()
     }
 }
 
-impl PartialEq for Wavelengths {
-    fn eq(&self, other: &Self) -> bool {
-        self.nm() == other.nm()
-    }
-}
-
-impl TryFrom<Vec<f64>> for Wavelengths {
+impl TryFrom<Vec<f64>> for Wavelength {
     type Error = String;
 
     fn try_from(nm: Vec<f64>) -> Result<Self, String> {
@@ -89,9 +56,9 @@ impl TryFrom<Vec<f64>> for Wavelengths {
     }
 }
 
-impl From<Wavelengths> for Vec<f64> {
-    fn from(all: Wavelengths) -> Self {
-        all.nm().to_vec()
+impl From<Wavelength> for Vec<f64> {
+    fn from(wavelength: Wavelength) -> Self {
+        wavelength.0.into_iter().collect()
     }
 }
 
@@ -100,30 +67,33 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wavelengths_no_laser_has_too_many_and_the_same_twice_are_refused_by_their_place() {
-        let of = |nm: &[f64]| Wavelengths::of(nm).map(drop).map_err(|(at, _)| at);
-        assert_eq!(of(&[]), Ok(()));
-        assert_eq!(of(&[905.0, 532.0, 1550.0, 450.0]), Ok(()));
-        assert_eq!(of(&[905.0, 0.532]), Err("[1]".into()));
-        assert_eq!(of(&[f64::NAN]), Err("[0]".into()));
-        assert_eq!(of(&[905.0, 532.0, 905.0]), Err("[2]".into()));
-        assert_eq!(of(&[400.0, 500.0, 600.0, 700.0, 800.0]), Err(String::new()));
+    fn wavelengths_that_no_laser_has_and_more_than_one_are_refused() {
+        let of = |nm: &[f64]| Wavelength::of(nm).map(|w| w.nm());
+        assert_eq!(of(&[]), Ok(None));
+        assert_eq!(of(&[905.0]), Ok(Some(905.0)));
+        assert_eq!(of(&[0.532]).unwrap_err().0, "[0]");
+        assert_eq!(of(&[f64::NAN]).unwrap_err().0, "[0]");
+        let (at, what) = of(&[905.0, 532.0]).unwrap_err();
+        assert_eq!(at, "");
+        assert!(what.starts_with("has 2, expected one; "), "{what}");
     }
 
     #[test]
-    fn they_are_written_as_a_list_and_read_back() {
-        let all = Wavelengths::of(&[905.0, 532.5]).unwrap();
-        let text = serde_json::to_string(&all).unwrap();
-        assert_eq!(text, "[905.0,532.5]");
-        assert_eq!(serde_json::from_str::<Wavelengths>(&text).unwrap(), all);
+    fn it_is_written_as_a_list_and_read_back() {
+        let wavelength = Wavelength::of(&[532.5]).unwrap();
+        let text = serde_json::to_string(&wavelength).unwrap();
+        assert_eq!(text, "[532.5]");
         assert_eq!(
-            (all.others(), Wavelengths::NONE.others()),
-            (&[532.5][..], &[][..])
+            serde_json::from_str::<Wavelength>(&text).unwrap(),
+            wavelength
         );
-        let wrong = serde_json::from_str::<Wavelengths>("[905, 0.5]").unwrap_err();
-        assert!(
-            wrong.to_string().contains("wavelengths_nm[1] is 0.5"),
-            "{wrong}"
-        );
+        assert_eq!(serde_json::to_string(&Wavelength::NONE).unwrap(), "[]");
+        for (text, expected) in [
+            ("[0.5]", "wavelengths_nm[0] is 0.5"),
+            ("[905, 532]", "wavelengths_nm has 2"),
+        ] {
+            let wrong = serde_json::from_str::<Wavelength>(text).unwrap_err();
+            assert!(wrong.to_string().contains(expected), "{wrong}");
+        }
     }
 }

@@ -38,7 +38,7 @@ pub use layout::manifest::{
 };
 pub use layout::quantity::Quantity;
 pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
-pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelengths};
+pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelength};
 pub use models::{
     Dependents, DepthsUsed, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest,
     ModelRepair, Models, NewModel, Promoted, Published, Removed, Rung, ShardName, SplitUsed,

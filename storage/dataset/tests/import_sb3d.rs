@@ -25,7 +25,7 @@ async fn source(room: &Room) -> Dataset {
         spots: 100,
         subsets: Subsets::of(&[4, 25]).unwrap(),
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         gate: Gate {
             start_m: room.gate[0],

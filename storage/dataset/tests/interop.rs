@@ -44,7 +44,7 @@ async fn zarr_python_and_xarray_read_the_same_values() {
         std::fs::create_dir(&expected).unwrap();
         let spec = DatasetSpec {
             per_spot: true,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
             two_bounce: false,
             ..spec(profile)
         };

@@ -27,7 +27,7 @@ fn old_spec(profile: Profile) -> DatasetSpec {
         height: 9,
         width: 10,
         per_spot: matches!(profile, Profile::SqrtU16 { .. }),
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         ..spec(profile)
     }

@@ -15,7 +15,7 @@ fn rich(profile: Profile) -> DatasetSpec {
         spots: 100,
         subsets: Subsets::of(&[25, 4]).unwrap(),
         per_spot: true,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         gate: Gate {
             bins: 8,
@@ -145,7 +145,7 @@ async fn a_data_set_with_other_subsets_is_another_data_set_and_the_field_is_name
     assert!(text.contains("subsets = [4, 25], but [4]"), "{text}");
     let without = DatasetSpec {
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         ..spec
     };

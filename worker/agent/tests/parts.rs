@@ -16,7 +16,7 @@ use picofarm_proto::{
     key::stage_key,
     model::{Budget, PartTask, RenderTask, StageSpec, TaskSpec},
 };
-use picofarm_settings::Wavelengths;
+use picofarm_settings::Wavelength;
 use tokio::runtime::Handle;
 use uuid::Uuid;
 
@@ -27,7 +27,7 @@ fn heavy(store: &Path) -> RenderTask {
     spec.render.resolution = 40;
     spec.render.budget = Budget::Samples(3);
     spec.render.max_bounces = 0;
-    spec.render.wavelengths_nm = Wavelengths::of(&[611.4, 464.3]).unwrap();
+    spec.render.wavelengths_nm = Wavelength::of(&[611.4]).unwrap();
     spec
 }
 

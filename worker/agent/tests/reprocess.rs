@@ -215,7 +215,7 @@ fn spec(spots: u32) -> DatasetSpec {
         spots,
         subsets: Subsets::NONE,
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         gate: Gate {
             start_m: 0.9,
@@ -437,7 +437,7 @@ async fn chosen_spots_are_summed_and_only_theirs_is_the_truth() {
     let mut place = Place::new(ideal());
     let hundred = DatasetSpec {
         per_spot: true,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         subsets: Subsets::of(&[4]).unwrap(),
         ..spec(100)

@@ -71,17 +71,12 @@ pub(crate) struct NodeExtras {
     pub(crate) laser_directions: Option<Vec<Vec3>>,
 }
 
-/// Metalness and roughness by which other programs know a BSDF: roughness = √α. Of several parts it is the conductors' share and
-/// the root of their mean α by share.
+/// Metalness and roughness by which other programs know a BSDF: roughness = √α.
 pub(crate) fn metallic_roughness(material: &Material) -> (f32, f32) {
     match material.bsdf {
         Bsdf::Diffuse { .. } => (0.0, 1.0),
         Bsdf::RoughConductor { alpha, .. } => (1.0, alpha.sqrt()),
         Bsdf::Mixed { alpha, weight, .. } => (weight, alpha.sqrt()),
-        Bsdf::Several { parts } => {
-            let (share, alpha) = parts.conductors();
-            (share, alpha.sqrt())
-        }
         Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => (0.0, 0.0),
     }
 }

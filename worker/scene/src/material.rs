@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Parts, SpectrumPoint, Texture};
+use crate::{SpectrumPoint, Texture};
 
 /// Microfacet normal distribution of a rough conductor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,11 +49,6 @@ pub enum Bsdf {
         /// Share of the conductor, in [0, 1].
         weight: f32,
     },
-    /// Any number of Lambertians and rough conductors side by side (nested `blendbsdf` in Mitsuba): f = Σ weight · f of the part.
-    Several {
-        /// The parts.
-        parts: Parts,
-    },
     /// Thin glass: a pane. Light goes straight on through it, or is reflected as by a plane mirror. A pane lets through
     /// T = τ · ½ Σ (1 − r)/(1 + r) and reflects R = ½ Σ (r + τ² r (1 − r)/(1 + r)). The sums are over the two polarisations, r is
     /// Fresnel's reflectance of one face at the light's angle and τ the `transmittance`: unpolarised light, reflected to and fro
@@ -91,7 +86,6 @@ impl Bsdf {
             Bsdf::Diffuse { .. } => "diffuse",
             Bsdf::RoughConductor { .. } => "rough_conductor",
             Bsdf::Mixed { .. } => "mixed",
-            Bsdf::Several { .. } => "several",
             Bsdf::ThinDielectric { .. } => "thin_dielectric",
             Bsdf::Dielectric { .. } => "dielectric",
         }
@@ -124,9 +118,6 @@ impl Bsdf {
                 distribution,
                 specular_reflectance: specular_reflectance * factor,
                 weight,
-            },
-            Bsdf::Several { parts } => Bsdf::Several {
-                parts: parts.scaled(factor),
             },
             glass @ (Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. }) => glass,
         }
@@ -239,7 +230,7 @@ impl Material {
     }
 
     /// True for surfaces in the specular mask, at which beams are not spots but fold: bodies of glass, and rough conductors with
-    /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix or of several parts. A mix below that scatters enough by its
+    /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix. A mix below that scatters enough by its
     /// Lambertian part to make a spot.
     pub fn is_specular(&self) -> bool {
         match self.bsdf {
@@ -247,7 +238,6 @@ impl Material {
             Bsdf::Dielectric { .. } => true,
             Bsdf::RoughConductor { alpha, .. } => alpha <= Self::SPECULAR_ALPHA,
             Bsdf::Mixed { alpha, weight, .. } => weight >= 0.5 && alpha <= Self::SPECULAR_ALPHA,
-            Bsdf::Several { parts } => parts.mirror() >= 0.5,
         }
     }
 
@@ -313,7 +303,6 @@ impl Material {
                 unit("specular_reflectance", specular_reflectance)?;
                 unit("weight", weight)?;
             }
-            Bsdf::Several { parts } => parts.check()?,
             Bsdf::ThinDielectric {
                 ior, transmittance, ..
             }

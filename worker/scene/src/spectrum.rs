@@ -3,7 +3,7 @@
 use picofarm_settings::WAVELENGTHS_NM;
 use serde::{Deserialize, Serialize};
 
-use crate::{Bsdf, Lobe, Material, Part};
+use crate::{Bsdf, Material};
 
 /// What a material reflects at one wavelength; between two of them reflectances are interpolated linearly, beyond the last
 /// ones they stay.
@@ -14,7 +14,7 @@ pub struct SpectrumPoint {
     pub nm: f32,
     /// Reflectance of the Lambertian part, or of a conductor alone, in [0, 1].
     pub reflectance: f32,
-    /// Reflectance of the conductors of a mix or of several parts, in [0, 1]; without it that of the material's [`Bsdf`]. Other
+    /// Reflectance of the conductor of a mix, in [0, 1]; without it that of the material's [`Bsdf`]. Other
     /// materials have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub specular_reflectance: Option<f32>,
@@ -50,7 +50,7 @@ fn of_colour(nm: f32) -> Option<[f32; 3]> {
 }
 
 impl Material {
-    /// What it reflects at a wavelength; of several parts see [`Material::part`]. Where it states no [`Material::spectrum`], its colour stands for it from 400 to 700 nm: reflectances
+    /// What it reflects at a wavelength. Where it states no [`Material::spectrum`], its colour stands for it from 400 to 700 nm: reflectances
     /// are those of its BSDF times the colour there over the mean of the colour's three channels. Outside they are those of its BSDF.
     pub fn at(&self, nm: f32) -> AtWavelength {
         let plain = match self.bsdf {
@@ -61,9 +61,7 @@ impl Material {
                 specular_reflectance,
                 ..
             } => [reflectance, specular_reflectance],
-            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
-                [0.0, 0.0]
-            }
+            Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => [0.0, 0.0],
         };
         let grey = [1.0 / 3.0; 3];
         let of = |[lambertian, conductor]: [f32; 2], texel| AtWavelength {
@@ -90,22 +88,6 @@ impl Material {
                 let factor = texel.iter().sum::<f32>();
                 of(plain.map(|r| (r * factor).min(1.0)), grey)
             }
-        }
-    }
-
-    /// One of its several parts as a material of its own. What its spectrum says of conductors holds for each of them.
-    pub fn part(&self, part: &Part) -> Self {
-        let mut spectrum = self.spectrum.clone();
-        for row in &mut spectrum {
-            let specular = row.specular_reflectance.take();
-            if let Lobe::RoughConductor { reflectance, .. } = part.lobe {
-                row.reflectance = specular.unwrap_or(reflectance);
-            }
-        }
-        Self {
-            bsdf: part.lobe.bsdf(),
-            spectrum,
-            ..self.clone()
         }
     }
 
@@ -171,8 +153,8 @@ pub(crate) fn check_points(rows: &[SpectrumPoint], bsdf: Option<Bsdf>) -> Result
         }
         match (p.specular_reflectance, bsdf) {
             (None, _) => {}
-            (Some(r), Some(Bsdf::Mixed { .. } | Bsdf::Several { .. })) if unit.contains(&r) => {}
-            (Some(r), Some(Bsdf::Mixed { .. } | Bsdf::Several { .. })) => {
+            (Some(r), Some(Bsdf::Mixed { .. })) if unit.contains(&r) => {}
+            (Some(r), Some(Bsdf::Mixed { .. })) => {
                 return fail(format!("specular_reflectance = {r} lies outside [0, 1]"));
             }
             (Some(_), _) => {

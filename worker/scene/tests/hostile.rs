@@ -3,10 +3,7 @@
 #[allow(dead_code)]
 mod common;
 
-use std::{
-    path::Path,
-    sync::{Arc, OnceLock},
-};
+use std::{path::Path, sync::OnceLock};
 
 use picofarm_scene::{
     Aim, export,
@@ -157,12 +154,10 @@ const FILES: [&str; 7] = [
     "part.obj",
 ];
 
-/// A Lambertian, mixes and a material of several parts, with textures and spectra. Small, so that damage hits what matters.
+/// A Lambertian and mixes, with textures and spectra. Small, so that damage hits what matters.
 fn room() -> picofarm_scene::Scene {
     let mut scene = common::spectral_room();
     scene.objects.truncate(4);
-    let several = common::parted_room().objects[1].mesh.materials[0].clone();
-    Arc::make_mut(&mut scene.objects[3].mesh).materials[0] = several;
     scene
 }
 

@@ -1,11 +1,7 @@
 //! Blends of blends in Mitsuba scenes are read or refused by element.
 
-#[allow(dead_code)]
-mod common;
-
-use common::{alike, conductor, lambertian, parts};
 use picofarm_scene::{
-    Bsdf, Distribution, Lobe, Material, Part, Scene, SceneError, SpectrumPoint, import::read_scene,
+    Bsdf, Distribution, Material, Scene, SceneError, SpectrumPoint, import::read_scene,
 };
 use proptest::prelude::*;
 
@@ -84,47 +80,65 @@ fn textured(bsdf: &str, file: &str) -> String {
     )
 }
 
+/// Reflectances of the Lambertian and of the conductor, roughness, and share of the conductor.
+fn mixed(m: &Material) -> [f32; 4] {
+    match m.bsdf {
+        Bsdf::Mixed {
+            reflectance,
+            alpha,
+            specular_reflectance,
+            weight,
+            ..
+        } => [reflectance, specular_reflectance, alpha, weight],
+        other => panic!("expected a mix, found {other:?}"),
+    }
+}
+
+fn alike(found: &[f32], expected: &[f32]) {
+    let close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
+    assert!(
+        found.iter().zip(expected).all(close),
+        "{found:?} {expected:?}"
+    );
+}
+
 #[test]
 fn a_blend_of_blends_has_the_shares_of_their_products() {
     let inner = blend(0.25, &metal(0.2, "0.9"), &diffuse("0.2 0.4 0.6"));
     let outer = blend(
         0.5,
         &diffuse("0.5"),
-        &blend(0.5, &inner, &metal(0.05, "0.6")),
+        &blend(0.5, &inner, &metal(0.2, "0.6")),
     );
     let both = format!("<bsdf type=\"twosided\">{outer}</bsdf>");
     for (bsdf, two_sided) in [(outer, false), (both, true)] {
         let m = material(&named(&bsdf));
-        let expected = [
-            lambertian(0.5, 0.5),
-            conductor(0.1875, 0.2, 0.9),
-            lambertian(0.0625, 0.4),
-            conductor(0.25, 0.05, 0.6),
-        ];
-        alike(&parts(&m), &expected);
+        // Shares: 0.5 and 0.0625 of Lambertians, 0.1875 and 0.25 of conductors.
+        let lambertian = (0.5 * 0.5 + 0.0625 * 0.4) / 0.5625;
+        let conductor = (0.1875 * 0.9 + 0.25 * 0.6) / 0.4375;
+        alike(&mixed(&m), &[lambertian, conductor, 0.2, 0.4375]);
         assert_eq!(m.two_sided, two_sided);
-        let all: f32 = expected
-            .iter()
-            .map(|p| p.weight * p.lobe.reflectance())
-            .sum();
-        assert!((m.rgb.iter().sum::<f32>() / 3.0 - all).abs() < 1e-6);
-        assert!(
-            (m.rgb[2] - m.rgb[0] - 0.0625 * 0.4).abs() < 1e-6,
-            "{:?}",
-            m.rgb
-        );
+        let all = 0.5625 * lambertian + 0.4375 * conductor;
+        alike(&[m.rgb.iter().sum::<f32>() / 3.0], &[all]);
+        alike(&[m.rgb[2] - m.rgb[0]], &[0.0625 * 0.4]);
     }
 }
 
 #[test]
-fn two_lambertians_and_two_conductors_are_read_too() {
+fn parts_that_differ_in_colour_alone_are_one_of_their_mean() {
     let m = material(&named(&blend(0.25, &diffuse("0.2"), &diffuse("0.6"))));
-    alike(&parts(&m), &[lambertian(0.75, 0.2), lambertian(0.25, 0.6)]);
-    let m = material(&named(&blend(0.25, &metal(0.1, "0.8"), &metal(0.4, "0.8"))));
-    alike(
-        &parts(&m),
-        &[conductor(0.75, 0.1, 0.8), conductor(0.25, 0.4, 0.8)],
-    );
+    let Bsdf::Diffuse { reflectance } = m.bsdf else {
+        panic!("{:?}", m.bsdf);
+    };
+    alike(&[reflectance], &[0.3]);
+    let m = material(&named(&blend(0.25, &metal(0.1, "0.8"), &metal(0.1, "0.4"))));
+    let Bsdf::RoughConductor {
+        alpha, reflectance, ..
+    } = m.bsdf
+    else {
+        panic!("{:?}", m.bsdf);
+    };
+    alike(&[alpha, reflectance], &[0.1, 0.7]);
 }
 
 #[test]
@@ -180,23 +194,17 @@ fn what_differs_in_hue_or_sides_is_noted() {
 }
 
 #[test]
-fn one_bitmap_scales_all_parts() {
+fn one_bitmap_scales_both_parts() {
     let d = textured(&diffuse("1"), "a.png");
-    let metals = [0.1, 0.4].map(|alpha| textured(&metal(alpha, "1"), "a.png"));
-    let tree = blend(0.5, &d, &blend(0.5, &metals[0], &metals[1]));
-    let expected = [
-        lambertian(0.5, 1.0),
-        conductor(0.25, 0.1, 1.0),
-        conductor(0.25, 0.4, 1.0),
-    ];
-    alike(&parts(&material(&named(&tree))), &expected);
+    let c = textured(&metal(0.1, "1"), "a.png");
+    let tree = blend(0.5, &d, &blend(0.5, &d, &c));
+    let m = material(&named(&tree));
+    alike(&mixed(&m), &[1.0, 1.0, 0.1, 0.25]);
+    assert!(m.texture.is_some());
     // What is black has no texture to scale.
-    let dark = blend(0.5, &tree, &diffuse("0"));
-    let halved = expected.map(|p| Part {
-        weight: p.weight / 2.0,
-        ..p
-    });
-    alike(&parts(&material(&named(&dark))), &halved);
+    let m = material(&named(&blend(0.5, &tree, &diffuse("0"))));
+    alike(&mixed(&m), &[0.375 / 0.875, 1.0, 0.1, 0.125]);
+    assert!(m.texture.is_some());
 }
 
 fn row(nm: f32, reflectance: f32, specular: Option<f32>) -> SpectrumPoint {
@@ -236,62 +244,33 @@ fn lambertians_of_several_spectra_are_one_of_their_mean() {
 }
 
 #[test]
-fn several_parts_have_one_spectrum_of_lambertians_and_one_of_conductors() {
+fn a_mix_has_the_mean_spectrum_of_its_lambertians_and_of_its_conductors() {
     let d = by_wavelength(&diffuse(""), "400:0, 600:0.5");
-    let c = |alpha, values: &str| by_wavelength(&metal(alpha, ""), values);
-    let two = |values: &str| blend(0.5, &c(0.1, values), &c(0.4, values));
-    let m = material(&named(&blend(0.5, &d, &two("500:0.25"))));
+    let c = |values: &str| by_wavelength(&metal(0.1, ""), values);
+    let two = blend(0.5, &c("500:0.25"), &c("500:0.75"));
+    let m = material(&named(&blend(0.5, &d, &two)));
     let expected = [
-        row(400.0, 0.0, Some(0.25)),
-        row(500.0, 0.25, Some(0.25)),
-        row(600.0, 0.5, Some(0.25)),
+        row(400.0, 0.0, Some(0.5)),
+        row(500.0, 0.25, Some(0.5)),
+        row(600.0, 0.5, Some(0.5)),
     ];
     assert_eq!(m.spectrum, expected);
-    for (part, r) in parts(&m).iter().zip([0.25, 0.25, 0.25]) {
-        let at = m.part(part).at(500.0);
-        assert_eq!(at.lambertian + at.conductor, r);
-    }
-    let m = material(&named(&two("500:0.25, 600:0.75")));
-    assert_eq!(parts(&m).len(), 2);
-    assert!(
-        parts(&m)
-            .iter()
-            .all(|p| m.part(p).at(550.0).conductor == 0.5)
-    );
-    // Conductors without spectra keep what they reflect.
-    let m = material(&named(&blend(
-        0.5,
-        &d,
-        &blend(0.5, &metal(0.1, "0.8"), &metal(0.4, "0.6")),
-    )));
-    let at: Vec<f32> = parts(&m)
-        .iter()
-        .map(|p| m.part(p).at(600.0))
-        .map(|a| a.lambertian + a.conductor)
-        .collect();
-    assert_eq!(at, [0.5, 0.8, 0.6]);
+    let at = m.at(600.0);
+    assert_eq!((at.lambertian, at.conductor), (0.5, 0.5));
 }
 
 #[test]
 fn blends_that_cannot_be_are_refused_by_element() {
-    let nine = (0..9).fold(diffuse("0"), |tree, k| match k % 2 {
-        0 => blend(0.5, &metal(0.1 + 0.05 * k as f32, "1"), &tree),
-        _ => tree,
-    });
-    let nine = blend(
-        0.5,
-        &nine,
-        &(1..5).fold(diffuse("0"), |tree, k| {
-            blend(0.5, &diffuse(&format!("0.{k}")), &tree)
-        }),
-    );
     let deep = (0..9).fold(diffuse("0.5"), |tree, _| blend(0.5, &tree, &diffuse("0.2")));
-    let c = |alpha, values: &str| by_wavelength(&metal(alpha, ""), values);
     let picture = textured(&diffuse("1"), "a.png");
     for (bsdf, expected) in [
         (
-            nine,
-            "line 7, <bsdf type=\"blendbsdf\">: has 9 different parts, expected 8 at most",
+            blend(
+                0.5,
+                &metal(0.1, "1"),
+                &blend(0.5, &diffuse("1"), &metal(0.4, "1")),
+            ),
+            "has conductors of alpha 0.1 (ggx), alpha 0.4 (ggx), expected one roughness",
         ),
         (deep, "nested deeper than 8"),
         (
@@ -323,14 +302,6 @@ fn blends_that_cannot_be_are_refused_by_element() {
             "give all the same bitmap",
         ),
         (
-            blend(0.5, &c(0.1, "500:0.5"), &c(0.2, "500:0.6")),
-            "give all the same <spectrum>, or none",
-        ),
-        (
-            blend(0.5, &c(0.1, "500:0.5"), &metal(0.2, "0.5")),
-            "conductors of one blend differ in their spectra",
-        ),
-        (
             blend(0.5, "<ref id=\"m\"/>", &diffuse("0.5")),
             "nested deeper than 8",
         ),
@@ -343,7 +314,7 @@ fn blends_that_cannot_be_are_refused_by_element() {
     }
 }
 
-/// A tree of blends over leaves that are told apart by their number.
+/// A tree of blends over Lambertians and conductors of one roughness.
 #[derive(Debug, Clone)]
 enum Tree {
     Leaf(bool),
@@ -359,20 +330,16 @@ fn tree() -> impl Strategy<Value = Tree> {
 }
 
 impl Tree {
-    /// Its text; its leaves with their shares are added to `leaves`.
-    fn text(&self, share: f64, leaves: &mut Vec<Part>) -> String {
+    /// Its text; its leaves' shares, and whether they are conductors, are added to `leaves`.
+    fn text(&self, share: f64, leaves: &mut Vec<(f64, bool, f64)>) -> String {
         match self {
             Tree::Leaf(is_metal) => {
                 let number = 0.1 + 0.02 * leaves.len() as f32;
-                let (part, text) = match is_metal {
-                    true => (conductor(share as f32, number, 0.5), metal(number, "0.5")),
-                    false => (
-                        lambertian(share as f32, number),
-                        diffuse(&number.to_string()),
-                    ),
-                };
-                leaves.push(part);
-                text
+                leaves.push((share, *is_metal, f64::from(number)));
+                match is_metal {
+                    true => metal(0.3, &number.to_string()),
+                    false => diffuse(&number.to_string()),
+                }
             }
             Tree::Blend(weight, a, b) => {
                 let w = f64::from(*weight);
@@ -385,36 +352,27 @@ impl Tree {
 
 proptest! {
     #[test]
-    fn shares_are_the_products_of_weights_and_sum_to_1(tree in tree()) {
+    fn a_part_reflects_what_its_leaves_do_together(tree in tree()) {
         let mut leaves = Vec::new();
         let text = named(&tree.text(1.0, &mut leaves));
-        leaves.retain(|p| p.weight > 0.0);
-        let read = read(&text);
-        if leaves.len() > 8 {
-            let error = read.expect_err("too many parts").to_string();
-            prop_assert!(error.contains("different parts, expected 8 at most"), "{}", error);
-            return Ok(());
-        }
-        let scene = read.expect("reads");
+        let scene = read(&text).expect("reads");
         let m = material_of(&scene);
-        let found = match m.bsdf {
-            Bsdf::Several { parts } => parts.list().to_vec(),
-            Bsdf::Mixed { reflectance, alpha, specular_reflectance, weight, .. } => {
-                let mut two = vec![lambertian(1.0 - weight, reflectance), conductor(weight, alpha, specular_reflectance)];
-                two.retain(|p| p.weight > 0.0);
-                if leaves.first().is_some_and(|p| matches!(p.lobe, Lobe::RoughConductor { .. })) {
-                    two.reverse();
-                }
-                two
+        let (lambertian, conductor) = match m.bsdf {
+            Bsdf::Mixed { reflectance, specular_reflectance, weight, .. } => {
+                ((1.0 - weight) * reflectance, weight * specular_reflectance)
             }
-            Bsdf::Diffuse { reflectance } => vec![lambertian(1.0, reflectance)],
-            Bsdf::RoughConductor { alpha, reflectance, .. } => vec![conductor(1.0, alpha, reflectance)],
+            Bsdf::Diffuse { reflectance } => (reflectance, 0.0),
+            Bsdf::RoughConductor { reflectance, .. } => (0.0, reflectance),
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => unreachable!("no leaf is glass"),
         };
-        alike(&found, &leaves);
-        let sum: f32 = found.iter().map(|p| p.weight).sum();
-        prop_assert!((sum - 1.0).abs() < 1e-5);
-        let albedo: f32 = found.iter().map(|p| p.weight * p.lobe.reflectance()).sum();
-        prop_assert!(m.rgb.iter().all(|c| (c - albedo).abs() < 1e-5));
+        let expected = |metal: bool| -> f64 {
+            let of = leaves.iter().filter(|l| l.1 == metal);
+            of.map(|l| l.0 * l.2).sum()
+        };
+        for (found, metal) in [(lambertian, false), (conductor, true)] {
+            let expected = expected(metal);
+            prop_assert!((f64::from(found) - expected).abs() < 1e-5, "{} {}", found, expected);
+        }
+        prop_assert!(m.rgb.iter().all(|c| (c - lambertian - conductor).abs() < 1e-5));
     }
 }

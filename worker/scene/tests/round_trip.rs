@@ -34,11 +34,6 @@ fn spectra_read_back_exactly() {
 }
 
 #[test]
-fn materials_of_several_parts_read_back_exactly() {
-    comes_back(common::parted_room());
-}
-
-#[test]
 fn files_of_scenes_without_spectra_do_not_mention_them() {
     let bytes = export::glb_bytes(&common::textured_room()).expect("valid");
     let word = b"spectrum";
@@ -163,47 +158,6 @@ fn a_roughness_edited_elsewhere_drops_the_spectrum_with_a_note() {
     assert_eq!(kept(&back), kept(&scene) - 1);
 }
 
-#[test]
-fn other_programs_see_the_share_and_the_mean_roughness_of_several_conductors() {
-    let scene = common::parted_room();
-    let bytes = export::glb_bytes(&scene).expect("valid");
-    let document = gltf::Gltf::from_slice(&bytes).expect("standard glTF");
-    let factors = |k: usize| {
-        let mesh = document.meshes().find(|m| m.index() == k).expect("a mesh");
-        let material = mesh.primitives().next().expect("facets").material();
-        let pbr = material.pbr_metallic_roughness();
-        (pbr.metallic_factor(), pbr.roughness_factor())
-    };
-    let close = |(a, b): (f32, f32), metal: f32, alpha: f32| {
-        assert!(
-            (a - metal).abs() < 1e-6 && (b - alpha.sqrt()).abs() < 1e-6,
-            "{a} {b}"
-        );
-    };
-    close(factors(0), 0.5, 0.275);
-    close(factors(1), 0.4, (0.3 * 0.2 + 0.1 * 0.02) / 0.4);
-    close(factors(3), 0.0, 1.0);
-}
-
-#[test]
-fn shares_whose_rounded_sum_exceeds_1_are_metal_and_no_more() {
-    let mut scene = scene();
-    let mesh = std::sync::Arc::make_mut(&mut scene.objects[0].mesh);
-    let weights = [0.8, 0.1, 0.1 + 2e-7];
-    assert!(weights.iter().sum::<f32>() > 1.0);
-    let parts = weights.map(|w| common::conductor(w, 1.0, 0.5));
-    let parts = picofarm_scene::Parts::of(&parts).expect("three");
-    mesh.materials[0].bsdf = Bsdf::Several { parts };
-    let bytes = export::glb_bytes(&scene).expect("valid");
-    let document = gltf::Gltf::from_slice(&bytes).expect("standard glTF");
-    let pbr = document.materials().map(|m| m.pbr_metallic_roughness());
-    assert!(
-        pbr.clone()
-            .all(|p| p.metallic_factor() <= 1.0 && p.roughness_factor() <= 1.0)
-    );
-    comes_back(scene);
-}
-
 /// The scene as a file in which another program set a factor of one mesh's first material.
 fn with_factor(scene: &Scene, mesh: usize, factor: &str, value: f32) -> Vec<u8> {
     let bytes = export::glb_bytes(scene).expect("valid");
@@ -225,23 +179,37 @@ fn with_factor(scene: &Scene, mesh: usize, factor: &str, value: f32) -> Vec<u8> 
 }
 
 #[test]
-fn several_parts_edited_elsewhere_become_what_the_standard_factors_say() {
-    let scene = common::parted_room();
+fn a_mix_edited_elsewhere_becomes_what_the_standard_factors_say() {
+    let scene = common::spectral_room();
     for (factor, new) in [("metallicFactor", 0.9), ("roughnessFactor", 0.125)] {
         let back = read_bytes(&with_factor(&scene, 1, factor, new));
         let [before, after] = [&scene, &back].map(|s| s.objects[1].mesh.materials[0].clone());
-        assert!(matches!(before.bsdf, Bsdf::Several { .. }));
+        assert!(matches!(before.bsdf, Bsdf::Mixed { .. }));
         assert!(matches!(after.bsdf, Bsdf::Mixed { .. }), "{:?}", after.bsdf);
+        assert_ne!(before.bsdf, after.bsdf);
         assert_eq!(after.spectrum, []);
         let notes = &back.provenance.notes;
         assert!(
             notes.contains_key("import.materials") && notes.contains_key("import.spectra.edited")
         );
-        let others = |s: &Scene| {
-            let all = s.objects.iter().flat_map(|o| &o.mesh.materials);
-            all.filter(|m| matches!(m.bsdf, Bsdf::Several { .. }))
-                .count()
-        };
-        assert_eq!(others(&back), others(&scene) - 1);
     }
+}
+
+#[test]
+fn a_material_of_several_parts_is_refused_by_its_place() {
+    let bytes = export::glb_bytes(&common::spectral_room()).expect("valid");
+    // Of the same length, so that the file stays whole.
+    let (ours, several) = (&b"\"type\":\"mixed\""[..], &b"\"type\":\"sever\""[..]);
+    let at = bytes.windows(ours.len()).position(|w| w == ours);
+    let at = at.expect("a mix");
+    let mut bytes = bytes;
+    bytes[at..at + ours.len()].copy_from_slice(several);
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("old.glb");
+    std::fs::write(&path, bytes).expect("writes");
+    let error = read_scene(&path).expect_err("no such kind").to_string();
+    assert!(
+        error.contains("materials[") && error.contains("expected one of `diffuse`"),
+        "{error}"
+    );
 }

@@ -19,7 +19,7 @@ mod scenes;
 
 use common::{Quiet, settings};
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Rendered, Settings, Wavelengths, plan, render, variance};
+use picofarm_transient::{Budget, Rendered, Settings, plan, render, variance};
 
 const BINS: usize = 637;
 
@@ -120,11 +120,6 @@ fn main() {
             }
             continue;
         }
-        if args.get(3).is_some_and(|a| a == "wavelengths") {
-            println!("{name}:");
-            wavelengths(&scene, seeds);
-            continue;
-        }
         let budget = match asked[0] > 0.0 {
             true => Budget::Error(asked[0]),
             false => Budget::Samples(64),
@@ -182,56 +177,6 @@ fn main() {
             stopped(&scene, asked, seeds, &truth);
         }
     }
-}
-
-/// Error and CPU seconds of three wavelengths in one pass, and of each alone, after so many paths.
-fn wavelengths(scene: &Scene, seeds: u32) {
-    const NM: [f64; 3] = [611.4, 549.1, 464.3];
-    const PASSES: u32 = 64;
-    let at = |nm: &[f64], passes, seed| {
-        let set = Settings {
-            seed,
-            split: false,
-            wavelengths_nm: Wavelengths::of(nm).expect("three that differ"),
-            ..settings(Budget::Samples(passes))
-        };
-        let before = cpu_seconds();
-        let r = render(scene, &set, &Quiet).expect("the scene is sound");
-        (r, cpu_seconds() - before)
-    };
-    let truths = NM.map(|nm| {
-        let mean = at(&[nm], 32 * PASSES, 1_000_000).0.transient;
-        Truth {
-            noise: vec![0.0; mean.len() / BINS],
-            mean: mean.into_iter().map(f64::from).collect(),
-        }
-    });
-    let n = f64::from(seeds);
-    let (mut together, mut alone) = ([0.0; 4], [[0.0; 2]; 3]);
-    for seed in 0..u64::from(seeds) {
-        let (r, cpu_s) = at(&NM, PASSES, seed);
-        together[3] += cpu_s / n;
-        let all = std::iter::once(&r.transient).chain(r.others.iter().map(|o| &o.transient));
-        for (k, h) in all.enumerate() {
-            together[k] += deviation(h, &truths[k])[0] / n;
-            let (one, cpu_s) = at(&NM[k..=k], PASSES, seed);
-            alone[k][0] += deviation(&one.transient, &truths[k])[0] / n;
-            alone[k][1] += cpu_s / n;
-        }
-    }
-    for (k, nm) in NM.iter().enumerate() {
-        println!(
-            "    {nm} nm: {:.2} % in one pass, {:.2} % alone in {:.2} CPU s",
-            100.0 * together[k],
-            100.0 * alone[k][0],
-            alone[k][1]
-        );
-    }
-    let apart: f64 = alone.iter().map(|a| a[1]).sum();
-    println!(
-        "    one pass: {:.2} CPU s; three apart {:.2}",
-        together[3], apart
-    );
 }
 
 /// Variance by class of paths.

@@ -2,7 +2,7 @@
 //! are `[row][column][bin]`; per-spot images are `[spot][row][column]`.
 
 use picofarm_scene::Spot;
-pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelengths};
+pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelength};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
@@ -37,10 +37,9 @@ pub struct Settings {
     /// ground truth is that of pixels' middles all the same.
     #[serde(default = "whole", skip_serializing_if = "is_whole")]
     pub fill_factor: f64,
-    /// Wavelengths of the laser. The first is the main one, of which [`Rendered::transient`], its parts, groups and errors are; the
-    /// others' histograms come from the same pass. Without any, materials reflect what their [`picofarm_scene::Bsdf`] says.
-    #[serde(default, skip_serializing_if = "Wavelengths::is_empty")]
-    pub wavelengths_nm: Wavelengths,
+    /// Wavelength of the laser. Without one, materials reflect what their [`picofarm_scene::Bsdf`] says.
+    #[serde(default, skip_serializing_if = "Wavelength::is_none")]
+    pub wavelengths_nm: Wavelength,
 }
 
 fn whole() -> f64 {
@@ -102,8 +101,6 @@ pub struct Rendered {
     pub split: Option<Split>,
     /// The histograms of [`Settings::groups`], each as `transient`.
     pub groups: Vec<Vec<f32>>,
-    /// Those of the wavelengths after the first, in their order.
-    pub others: Vec<AtWavelength>,
     /// Ground truth from the same rays.
     pub truth: GroundTruth,
     /// The spots, world space, in the order of the scene's beams; `None` where a beam meets nothing.
@@ -121,17 +118,6 @@ pub struct Rendered {
     /// What somebody should know before trusting it: beams that meet nothing, an image without light. No part of what is
     /// stored: it says nothing that the stored data do not.
     pub warnings: Vec<String>,
-}
-
-/// The histograms of a wavelength that is not the main one.
-#[derive(Debug, Clone)]
-pub struct AtWavelength {
-    /// The wavelength, nanometres.
-    pub nm: f64,
-    /// As [`Rendered::transient`].
-    pub transient: Vec<f32>,
-    /// As [`Rendered::groups`].
-    pub groups: Vec<Vec<f32>>,
 }
 
 /// The exactly-two-bounce part and the 3+ part with standard errors, each `[row][col][bin]`.

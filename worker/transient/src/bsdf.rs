@@ -22,9 +22,6 @@ enum Kind {
     Conductor,
     /// A Lambertian beside a rough conductor.
     Mixed,
-    /// Any number of both, which the world knows. Nothing scatters by it before it is settled on one of them: on a conductor, or on
-    /// a mix of one with all Lambertians.
-    Several,
 }
 
 /// Flags of a surface, one bit each.
@@ -41,13 +38,9 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Which ratios it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = ones. Of several
-    /// parts: which they are.
-    spectrum_row: u16,
-    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. Several parts: the factor of all. 0 = black.
+    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
     strength: f32,
-    /// Roughness of a conductor; of others 0. Of several parts that of the roughest near-mirror, or else of the smoothest conductor,
-    /// or else 1.
+    /// Roughness of a conductor; of others 0.
     alpha: f32,
     /// Lambertian part ρ/π of a mix times its share; of others 0.
     base: f32,
@@ -61,10 +54,7 @@ impl Surface {
             Bsdf::RoughConductor { distribution, .. } | Bsdf::Mixed { distribution, .. } => {
                 distribution == Distribution::Ggx
             }
-            Bsdf::Diffuse { .. }
-            | Bsdf::Several { .. }
-            | Bsdf::ThinDielectric { .. }
-            | Bsdf::Dielectric { .. } => false,
+            Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => false,
         };
         let flag = |set: bool, flag: u8| if set { flag } else { 0 };
         let of = |kind, strength, alpha, base| Self {
@@ -75,7 +65,6 @@ impl Surface {
                     SPECULAR,
                 )
                 | flag(ggx && kind != Kind::Lambertian, GGX),
-            spectrum_row: 0,
             strength,
             alpha,
             base,
@@ -103,38 +92,10 @@ impl Surface {
                     of(Kind::Mixed, strength, alpha, base)
                 }
             }
-            // Made of its parts by `several`.
-            Bsdf::Several { .. } => of(Kind::Several, 0.0, 1.0, 0.0),
             // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see `by_glass`).
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
                 of(Kind::Lambertian, 0.0, 0.0, 0.0)
             }
-        }
-    }
-
-    /// A material of several parts, given as surfaces times their shares, which are found by `index`.
-    pub fn several(m: &Material, parts: &[Surface], index: u16) -> Self {
-        let lit = || parts.iter().filter(|p| !p.is_black() && !p.diffuse());
-        let mirrors = lit().filter(|p| !p.is_rough()).map(Surface::alpha);
-        let alpha = mirrors
-            .reduce(f32::max)
-            .or_else(|| lit().map(Surface::alpha).reduce(f32::min));
-        let black = parts.iter().all(Surface::is_black);
-        Self {
-            spectrum_row: index,
-            strength: if black { 0.0 } else { 1.0 },
-            alpha: alpha.unwrap_or(1.0),
-            ..Self::new(m)
-        }
-    }
-
-    /// A mix of this conductor and a Lambertian `base` (ρ/π times its share), with the ratios of a row and of the one behind it.
-    pub fn mixed_with(self, base: f32, spectrum_row: u16) -> Self {
-        Self {
-            kind: Kind::Mixed,
-            spectrum_row,
-            base,
-            ..self
         }
     }
 
@@ -145,17 +106,10 @@ impl Surface {
         let all = 1.0 / (self.strength + base * PI);
         Self {
             kind: Kind::Mixed,
-            spectrum_row: 0,
             strength: self.strength * all,
             base: base * all,
             ..self
         }
-    }
-
-    /// True for several parts; which of them and times what.
-    #[inline(always)]
-    pub fn parts_of_several(&self) -> Option<(usize, f32)> {
-        (self.kind == Kind::Several).then_some((usize::from(self.spectrum_row), self.strength))
     }
 
     /// Share of light that it sends on, as far as masking lets it.
@@ -165,30 +119,6 @@ impl Surface {
             Kind::Lambertian => self.strength * PI,
             _ => self.strength + self.base * PI,
         }
-    }
-
-    /// The same surface with the ratios of a row and the one behind it: the Lambertian part's, and the conductor's.
-    pub fn with_spectrum(self, row: u16) -> Self {
-        let spectrum_row = match self.kind {
-            Kind::Conductor => row + 1,
-            Kind::Lambertian | Kind::Mixed | Kind::Several => row,
-        };
-        Self {
-            spectrum_row,
-            ..self
-        }
-    }
-
-    /// Which ratios it has; 0 = ones.
-    #[inline(always)]
-    pub fn spectrum_row(&self) -> u16 {
-        self.spectrum_row
-    }
-
-    /// Which ratios the conductor of a mix has.
-    #[inline(always)]
-    fn gloss_spectrum(&self) -> u16 {
-        self.spectrum_row + u16::from(self.spectrum_row != 0)
     }
 
     /// Scatters from both sides.
@@ -235,7 +165,6 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            spectrum_row: 0,
             strength: 1.0 / PI,
             alpha: 0.0,
             base: 0.0,
@@ -260,12 +189,11 @@ impl Surface {
         matches!(self.kind, Kind::Mixed)
     }
 
-    /// True for a mix and for several parts of which a path must settle on one: all but a mix whose vertices pixels share. Its
+    /// True for a mix of which a path must settle on one part: all but those whose vertices pixels share. Their
     /// lobes are both wide, so that a vertex can scatter by both.
     #[inline(always)]
     pub fn is_open(&self) -> bool {
         match self.kind {
-            Kind::Several => true,
             Kind::Mixed => !self.is_shared(),
             Kind::Lambertian | Kind::Conductor => false,
         }
@@ -314,7 +242,6 @@ impl Surface {
             return Self {
                 kind: Kind::Conductor,
                 flags: self.flags & !SPECULAR | if mirror { SPECULAR } else { 0 },
-                spectrum_row: self.gloss_spectrum(),
                 strength: total,
                 base: 0.0,
                 ..*self
@@ -323,7 +250,6 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            spectrum_row: self.spectrum_row,
             strength: total / PI,
             alpha: 0.0,
             base: 0.0,
@@ -336,11 +262,10 @@ impl Surface {
         match self.kind {
             Kind::Mixed => Self {
                 kind: Kind::Conductor,
-                spectrum_row: self.gloss_spectrum(),
                 base: 0.0,
                 ..self
             },
-            Kind::Lambertian | Kind::Conductor | Kind::Several => self,
+            Kind::Lambertian | Kind::Conductor => self,
         }
     }
 
@@ -379,7 +304,6 @@ impl Surface {
         let lit = c > 0.0 && !self.is_black();
         let alpha2 = self.alpha * self.alpha;
         match self.kind {
-            Kind::Several => Lobe::BLACK,
             _ if !lit => Lobe::BLACK,
             Kind::Lambertian => Lobe {
                 lambertian: self.strength,
@@ -448,16 +372,6 @@ impl Surface {
         let cos2 = along2 / square;
         let lobe = exp_minus(x) / (cos2 * cos2);
         if lobe > 0.0 { lobe } else { 0.0 }
-    }
-
-    /// [`Surface::scatter`] of a mix by its parts: the Lambertian one's, and the conductor's.
-    #[inline]
-    pub fn parts(&self, n: Vec3, i: Vec3, o: Vec3) -> (f32, f32) {
-        let co = n.dot(o);
-        if !(n.dot(i) > 0.0 && co > 0.0) {
-            return (0.0, 0.0);
-        }
-        (self.base * co, self.gloss().scatter(n, i, o))
     }
 
     /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none leaves.

@@ -34,7 +34,6 @@ use crate::{
     mirror_images::Mirrors,
     rng::{Rng, Stream},
     sink::Technique,
-    spectra::{Ratios, times},
     targets::{Drawn, Target, Targets},
     world::{Hit, World, lift},
 };
@@ -84,8 +83,6 @@ pub(crate) struct Splat {
     pub slot: u32,
     /// Emitter.
     pub spot: u16,
-    /// Of which wavelength.
-    pub wavelength: u8,
     /// Radiance averaged over the pixel, render units.
     pub value: f32,
     /// Bounces of the whole path.
@@ -106,7 +103,6 @@ struct Start {
     hit: Hit,
     back: Vec3,
     flux: f32,
-    ratios: Ratios,
     path_m: f64,
 }
 
@@ -175,7 +171,6 @@ impl Caustics {
             mut hit,
             back: mut wo,
             mut flux,
-            mut ratios,
             mut path_m,
         } = start;
         let images = within.emitters.columns.strength[spot] > 0.0;
@@ -195,11 +190,10 @@ impl Caustics {
                 weight /= survive;
             }
             flux *= weight;
-            ratios = times(ratios, world.ratios(&hit, wo, w));
             let Some(mut next) = world.closest(stack, lift(hit.p, hit.n), w) else {
                 return;
             };
-            next.choose_lobe(world, rng);
+            next.choose_lobe(rng);
             path_m += world.metres((next.p - hit.p).length());
             flux *= next.through;
             let before = hit.surface.specular();
@@ -221,7 +215,6 @@ impl Caustics {
                 hit,
                 back: wo,
                 flux,
-                ratios,
                 density: ALONE,
                 path_m,
                 spot,
@@ -274,7 +267,7 @@ impl Caustics {
             (spot, world.closest(stack, emitters.lifted[spot], w)?)
         };
         let k = self.place[hit.triangle as usize];
-        hit.choose_lobe(world, rng);
+        hit.choose_lobe(rng);
         if k == NONE || !hit.surface.specular() || hit.surface.is_black() {
             return None;
         }
@@ -293,7 +286,6 @@ impl Caustics {
             hit,
             back: -w,
             flux,
-            ratios: e.ratios(world, w),
             path_m: e.path_m + world.metres(d),
         })
     }
@@ -315,32 +307,13 @@ impl Caustics {
 }
 
 /// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I at
-/// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance. One for each wavelength
-/// that has channels of its own; none where the camera sees nothing of it.
-pub(crate) fn splat<'a>(
-    (world, film): (&World, &'a Film),
-    (z, technique): (&LightVertex, Technique),
-    stack: &mut Stack,
-) -> impl Iterator<Item = Splat> + use<'a> {
-    let seen = seen((world, film), (z, technique), stack).into_iter();
-    seen.flat_map(|(splat, ratios)| {
-        (0u8..)
-            .zip(ratios)
-            .take(film.wavelengths)
-            .map(move |(wavelength, ratios)| Splat {
-                wavelength,
-                value: splat.value * ratios,
-                ..splat
-            })
-    })
-}
-
-/// The light of all wavelengths.
-fn seen(
+/// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance. None where the
+/// camera sees nothing of it.
+pub(crate) fn splat(
     (world, film): (&World, &Film),
     (z, technique): (&LightVertex, Technique),
     stack: &mut Stack,
-) -> Option<(Splat, Ratios)> {
+) -> Option<Splat> {
     let i = &world.camera.intrinsics;
     let p = z.hit.p;
     let q = world.camera.direction_to_camera(p);
@@ -357,14 +330,12 @@ fn seen(
     let cos = q.z / d;
     let area = world.sensitive * world.sensitive;
     let value = intensity * seen * i.fx * i.fy / (d * d * cos * cos * cos) / area;
-    let splat = Splat {
+    Some(Splat {
         pixel: pixel as u32,
         slot: film.slot(z.path_m + world.metres(d)) as u32,
         spot: z.spot as u16,
-        wavelength: 0,
         value,
         bounces: z.bounces,
         technique,
-    };
-    Some((splat, times(z.ratios, world.ratios(&z.hit, z.back, -p / d))))
+    })
 }

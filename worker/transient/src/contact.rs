@@ -29,7 +29,6 @@ use crate::{
     emitter::{Emitter, Emitters},
     light_vertices::{ALONE, LightVertex, LightVertices},
     rng::Rng,
-    spectra::times,
     turns::Turns,
     world::{Hit, World, lift},
 };
@@ -127,7 +126,7 @@ impl Contacts {
         self.zones.len() as u32
     }
 
-    /// How many spots have one, those of surfaces of several parts counted once.
+    /// How many spots have one, those at one place counted once.
     pub fn spots(&self) -> usize {
         places(self.zones.iter().map(|z| z.centre))
     }
@@ -193,7 +192,6 @@ impl Contacts {
             return;
         };
         flux /= turns.count();
-        let mut ratios = e.ratios(world, w);
         let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
         // Within the zones, and what the vertex before was.
         let (mut inside, mut specular) = (true, false);
@@ -207,7 +205,7 @@ impl Contacts {
                 2 if !self.own(world, spot, &hit) => return,
                 _ => inside && self.near(world, &hit),
             };
-            hit.choose_lobe(world, rng);
+            hit.choose_lobe(rng);
             path_m += world.metres((hit.p - from).length());
             flux *= hit.through;
             if flux == 0.0 || hit.surface.is_black() || path_m > within.gate.end_m() {
@@ -226,7 +224,6 @@ impl Contacts {
                     hit,
                     back: -w,
                     flux,
-                    ratios,
                     density: ALONE,
                     path_m,
                     spot,
@@ -246,7 +243,6 @@ impl Contacts {
                 weight /= survive;
             }
             flux *= weight;
-            ratios = times(ratios, world.ratios(&hit, -w, next));
             specular = hit.surface.specular();
             if specular && alpha == 0.0 {
                 alpha = hit.surface.alpha();
@@ -282,7 +278,7 @@ pub(crate) fn many(emitters: &Emitters) -> bool {
     places(emitters.list.iter().map(|e| e.p)) as f32 > FEW
 }
 
-/// How many places sources have: those of a surface of several parts share one.
+/// How many places sources have.
 fn places(sources: impl Iterator<Item = Vec3>) -> usize {
     let bits = |p: Vec3| [p.x, p.y, p.z].map(f32::to_bits);
     sources.map(bits).collect::<HashSet<_>>().len()

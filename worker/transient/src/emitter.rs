@@ -13,7 +13,6 @@ use crate::{
     contact,
     lanes::{Column, SIDE, Wide, put, widest},
     lobes::{Lobes, Seen},
-    spectra::{ONES, Ratios, times},
     world::{World, lift},
 };
 
@@ -34,8 +33,6 @@ pub(crate) struct Emitter {
     pub surface: Surface,
     /// It is not the beam's own spot: glass turned that light aside.
     pub aside: bool,
-    /// Ratios of the texture there.
-    ratios: Ratios,
 }
 
 impl Emitter {
@@ -58,12 +55,6 @@ impl Emitter {
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
         };
-        let ratios = match &beneath {
-            Some(h) if material == world.surface[h.triangle as usize] => {
-                world.texel_ratios(h.triangle, h.p)
-            }
-            _ => ONES,
-        };
         let surface = match share == 1.0 {
             true => surface,
             false => surface.scaled(share),
@@ -76,7 +67,6 @@ impl Emitter {
             path_m: f64::from(spot.path_m),
             surface,
             aside: false,
-            ratios,
         }
     }
 
@@ -84,18 +74,6 @@ impl Emitter {
     #[inline]
     pub fn intensity(&self, w: Vec3) -> f32 {
         self.surface.scatter(self.n, self.back, w)
-    }
-
-    /// The ratios of that.
-    #[inline(always)]
-    pub fn ratios(&self, world: &World, w: Vec3) -> Ratios {
-        match world.is_spectral() {
-            false => ONES,
-            true => times(
-                self.ratios,
-                world.surface_ratios(&self.surface, self.n, self.back, w),
-            ),
-        }
     }
 }
 
@@ -202,7 +180,7 @@ impl<'a> Wide for Irradiance<'a> {
     }
 }
 
-/// All spots that exist, as sources; of beams with a width several for each, and of surfaces of several parts one for each part.
+/// All spots that exist, as sources; of beams with a width several for each.
 #[derive(Debug, Default)]
 pub(crate) struct Emitters {
     /// The sources.
@@ -275,7 +253,7 @@ impl Emitters {
             let through = through(world, &mut stack, direction, spot);
             let of_beam = (beam, through);
             let source = Emitter::new(world, &mut stack, of_beam, spot, surface);
-            all.push(world, source);
+            all.push(source);
             let way = (world.laser, direction);
             all.push_branches(world, &mut stack, (beam, 1.0), way);
         }
@@ -315,7 +293,7 @@ impl Emitters {
                     let surface = world.first_surface[spot.object as usize] + spot.material;
                     let of_beam = (beam, through / width.points as f32);
                     let source = Emitter::new(world, &mut stack, of_beam, &spot, surface);
-                    all.push(world, source);
+                    all.push(source);
                 }
                 all.push_branches(world, &mut stack, (beam, share), (start, ray.direction));
             }
@@ -336,30 +314,15 @@ impl Emitters {
             let surface = world.first_surface[spot.object as usize] + spot.material;
             let of_beam = (beam, share * of_ray);
             let source = Emitter::new(world, stack, of_beam, &spot, surface);
-            self.push(
-                world,
-                Emitter {
-                    aside: true,
-                    ..source
-                },
-            );
+            self.push(Emitter {
+                aside: true,
+                ..source
+            });
         }
     }
 
-    /// Adds a source; one for each part of a surface of several.
-    fn push(&mut self, world: &World, e: Emitter) {
-        match e.surface.parts_of_several() {
-            None => self.push_one(e),
-            Some((index, factor)) => {
-                for part in &world.several[index] {
-                    let surface = part.scaled(factor);
-                    self.push_one(Emitter { surface, ..e });
-                }
-            }
-        }
-    }
-
-    fn push_one(&mut self, e: Emitter) {
+    /// Adds a source.
+    fn push(&mut self, e: Emitter) {
         let index = self.list.len();
         let strength = if e.surface.diffuse() {
             e.surface.lambertian()

@@ -3,13 +3,11 @@
 use crate::{
     api::{Gate, Overflow},
     sink::{CLASSES, Place, Way, class},
-    spectra::Light,
 };
 
 /// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
 /// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
-/// what comes before the gate and one behind for what comes after. Where several wavelengths are asked for, all channels of the
-/// first come before all of the next.
+/// what comes before the gate and one behind for what comes after.
 #[derive(Debug)]
 pub(crate) struct Film {
     pub gate: Gate,
@@ -17,10 +15,6 @@ pub(crate) struct Film {
     pub slots: usize,
     /// Channels of a pixel.
     pub channels: usize,
-    /// Wavelengths that have channels of their own, 1 or more.
-    pub wavelengths: usize,
-    /// There are several wavelengths in the scene.
-    pub spectral: bool,
     /// Channels beyond 0 that a spot counts in, by emitter.
     pub of_spot: Vec<Vec<u16>>,
     /// Channels beyond 0 are classes of paths in place of groups of spots.
@@ -28,29 +22,23 @@ pub(crate) struct Film {
 }
 
 impl Film {
-    /// A film for a gate, so many groups and wavelengths (none stands for one), and the groups that each emitter belongs to.
-    pub fn new(gate: &Gate, (groups, wavelengths): (usize, usize), of_spot: Vec<Vec<u16>>) -> Self {
-        // One has the reflectances of the paths themselves.
-        let spectral = wavelengths > 1;
-        let wavelengths = wavelengths.max(1);
+    /// A film for a gate, so many groups, and the groups that each emitter belongs to.
+    pub fn new(gate: &Gate, groups: usize, of_spot: Vec<Vec<u16>>) -> Self {
         Self {
             gate: *gate,
             slots: gate.bins as usize + 2,
-            channels: (1 + groups) * wavelengths,
-            wavelengths,
-            spectral,
+            channels: 1 + groups,
             of_spot,
             by_class: false,
         }
     }
 
-    /// A film that has a channel for each class of paths, at the first wavelength.
-    pub fn by_class(gate: &Gate, spectral: bool) -> Self {
+    /// A film that has a channel for each class of paths.
+    pub fn by_class(gate: &Gate) -> Self {
         let of_class = (0..CLASSES).map(|c| vec![1 + c as u16]).collect();
         Self {
             by_class: true,
-            spectral,
-            ..Self::new(gate, (CLASSES, 1), of_class)
+            ..Self::new(gate, CLASSES, of_class)
         }
     }
 
@@ -83,44 +71,22 @@ impl Film {
 
     /// Adds light to a pixel's channels.
     #[inline]
-    pub fn add(&self, pixel: &mut [f32], slot: usize, light: Light, spot: usize) {
-        pixel[slot] += light.value * light.ratios[0];
+    pub fn add(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
+        pixel[slot] += value;
         if self.channels > 1 {
-            for wavelength in 1..self.wavelengths {
-                let first = self.first_channel(wavelength);
-                pixel[first * self.slots + slot] += light.value * light.ratios[wavelength];
-            }
-            self.add_to_groups(pixel, slot, &light, spot);
+            self.add_to_groups(pixel, slot, value, spot);
         }
     }
 
     /// Adds light to the channels of groups alone.
     #[inline]
-    pub fn add_to_groups(&self, pixel: &mut [f32], slot: usize, light: &Light, spot: usize) {
-        if self.channels == self.wavelengths {
+    pub fn add_to_groups(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
+        if self.channels == 1 {
             return;
         }
-        for wavelength in 0..self.wavelengths {
-            let value = light.value * light.ratios[wavelength];
-            for channel in self.groups_of(wavelength, spot) {
-                pixel[channel * self.slots + slot] += value;
-            }
+        for &channel in &self.of_spot[spot] {
+            pixel[usize::from(channel) * self.slots + slot] += value;
         }
-    }
-
-    /// The channel of all spots at a wavelength.
-    #[inline(always)]
-    pub fn first_channel(&self, wavelength: usize) -> usize {
-        wavelength * (self.channels / self.wavelengths)
-    }
-
-    /// The channels of the groups that a spot counts in, at a wavelength.
-    #[inline(always)]
-    pub fn groups_of(&self, wavelength: usize, spot: usize) -> impl Iterator<Item = usize> {
-        let first = self.first_channel(wavelength);
-        self.of_spot[spot]
-            .iter()
-            .map(move |&c| first + usize::from(c))
     }
 }
 
@@ -166,22 +132,18 @@ impl Blocks {
 
     /// Adds the contribution of a sample that is its stratum's only one.
     #[inline]
-    pub fn add(&mut self, film: &Film, slot: usize, light: Light, spot: usize) {
-        film.add(&mut self.sum, slot, light, spot);
+    pub fn add(&mut self, film: &Film, slot: usize, value: f32, spot: usize) {
+        film.add(&mut self.sum, slot, value, spot);
     }
 
     /// Adds that of one of a stratum's two samples; `sign` tells which.
     #[inline]
-    pub fn add_half(&mut self, film: &Film, slot: usize, light: Light, sign: f32, spot: usize) {
-        let half = Light {
-            value: 0.5 * light.value,
-            ..light
-        };
-        film.add(&mut self.sum, slot, half, spot);
+    pub fn add_half(&mut self, film: &Film, slot: usize, value: f32, sign: f32, spot: usize) {
+        film.add(&mut self.sum, slot, 0.5 * value, spot);
         if self.contrast[slot] == 0.0 {
             self.touched.push(slot as u32);
         }
-        self.contrast[slot] += sign * CONTRAST * (light.value * light.ratios[0]);
+        self.contrast[slot] += sign * CONTRAST * value;
     }
 
     /// Ends a block; `sign` is the one that its contrast counts with in `noise`.
@@ -223,7 +185,7 @@ mod tests {
         assert_eq!(g.bin(2.0), None);
         assert_eq!(g.bin(0.999), None);
         assert_eq!(g.bin(f64::NAN), None);
-        let film = Film::new(&g, (0, 0), vec![]);
+        let film = Film::new(&g, 0, vec![]);
         let slots: Vec<usize> = [0.999, 1.0, 1.25, 1.2499999, 1.9999999, 2.0]
             .map(|l| film.slot(l))
             .into();

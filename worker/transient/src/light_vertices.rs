@@ -13,7 +13,6 @@ use crate::{
     emitter::{Columns, Emitters},
     lobes::{Lobes, Seen},
     rng::Rng,
-    spectra::Ratios,
     world::{Hit, World, lift},
 };
 
@@ -25,8 +24,6 @@ pub(crate) struct LightVertex {
     pub back: Vec3,
     /// Flux that arrives, divided by the number of vertices drawn.
     pub flux: f32,
-    /// Ratios of that flux.
-    pub ratios: Ratios,
     /// Density per area of drawing it, times the weight of this technique in MIS.
     pub density: f32,
     /// Optical path from the laser, metres.
@@ -84,7 +81,7 @@ impl LightVertices {
             if contacts.is_some_and(|c| c.own(world, spot, &hit)) {
                 continue;
             }
-            hit.choose_lobe(world, rng);
+            hit.choose_lobe(rng);
             if weight == 0.0 || hit.surface.specular() || hit.surface.is_black() {
                 continue;
             }
@@ -95,7 +92,6 @@ impl LightVertices {
                 hit,
                 back: -w,
                 flux,
-                ratios: e.ratios(world, w),
                 density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
                 path_m: e.path_m + world.metres(d2.sqrt()),
                 spot,

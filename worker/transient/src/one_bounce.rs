@@ -1,6 +1,6 @@
 //! Exactly one bounce: laser → spot → camera, a point of light in one pixel and one bin.
 
-use crate::{api::Gate, bvh::Stack, emitter::Emitters, spectra::Light, world::World};
+use crate::{api::Gate, bvh::Stack, emitter::Emitters, world::World};
 
 /// One spot seen directly.
 #[derive(Debug, Clone, Copy)]
@@ -12,7 +12,7 @@ pub(crate) struct Peak {
     /// Optical path, metres.
     pub path_m: f64,
     /// Radiance averaged over the pixel, 1/(m² sr).
-    pub light: Light,
+    pub value: f32,
 }
 
 /// The peaks of all spots that the camera sees. A spot of intensity I at distance d and angle θ from the
@@ -43,21 +43,17 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
             spot,
             pixel,
             path_m: e.path_m + metres,
-            light: Light {
-                value: value as f32,
-                ratios: e.ratios(world, -e.p / d),
-            },
+            value: value as f32,
         });
     }
     peaks
 }
 
-/// Adds a peak to a histogram of one wavelength; returns false where it lies outside the gate.
-pub(crate) fn add(p: &Peak, wavelength: usize, gate: &Gate, transient: &mut [f32]) -> bool {
+/// Adds a peak to a histogram; returns false where it lies outside the gate.
+pub(crate) fn add(p: &Peak, gate: &Gate, transient: &mut [f32]) -> bool {
     let bin = gate.bin(p.path_m);
     if let Some(b) = bin {
-        let value = p.light.value * p.light.ratios[wavelength];
-        transient[p.pixel * gate.bins as usize + b as usize] += value;
+        transient[p.pixel * gate.bins as usize + b as usize] += p.value;
     }
     bin.is_some()
 }

@@ -18,7 +18,6 @@ mod candidates;
 mod draw;
 mod effort;
 mod gloss;
-mod spectral;
 mod spread;
 mod weigh;
 
@@ -46,7 +45,6 @@ use crate::{
     rng::{Rng, Stream},
     segments::Segments,
     sink::{PixelSink, Place, Sink, Way},
-    spectra::{Light, ONES, Ratios},
     turns::place,
     vertex::Vertex,
     walk::{Scratch, Walk},
@@ -142,8 +140,6 @@ struct Arrivals {
     bounces: Vec<u8>,
     /// Unit direction from which it arrives at a rough vertex; of others anything.
     from: Vec<Vec3>,
-    /// Value by wavelength; empty where there are not several.
-    light: Vec<Ratios>,
 }
 
 impl Arrivals {
@@ -153,7 +149,6 @@ impl Arrivals {
         self.spot.clear();
         self.bounces.clear();
         self.from.clear();
-        self.light.clear();
     }
 
     /// Fills the last group up; returns how many there are.
@@ -164,9 +159,6 @@ impl Arrivals {
         self.spot.resize(whole, 0);
         self.bounces.resize(whole, 0);
         self.from.resize(whole, Vec3::ZERO);
-        if !self.light.is_empty() {
-            self.light.resize(whole, [0.0; ONES.len()]);
-        }
         whole
     }
 }
@@ -190,16 +182,12 @@ struct ArrivalSink<'a> {
 
 impl Sink for ArrivalSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, way: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way) {
         let spot = self.film.tag(spot, self.place, way);
         let list = &mut *self.list;
         list.bins
             .push(((path_m - self.base_m) * self.per_metre) as f32);
-        let value = self.factor * self.share * light.value;
-        list.value.push(value);
-        if self.film.spectral {
-            list.light.push(light.ratios.map(|t| value * t));
-        }
+        list.value.push(self.factor * self.share * value);
         list.spot.push(spot as u16);
         list.bounces.push(bounces.min(255) as u8);
         list.from.push(self.from);

@@ -32,10 +32,8 @@ pub(crate) fn plan(
                 .into(),
         );
     }
-    if !settings.wavelengths_nm.is_empty() {
-        let nm = settings.wavelengths_nm.nm().iter();
-        let all: Vec<String> = nm.map(f64::to_string).collect();
-        strategies.push(format!("wavelengths: {} nm, in one pass", all.join(", ")));
+    if let Some(nm) = settings.wavelengths_nm.nm() {
+        strategies.push(format!("wavelengths: {nm} nm, in one pass"));
         let (coloured, materials) = colours(scene);
         if coloured > 0 {
             approximations.push(format!(

@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::{film::Film, spectra::Light};
+use crate::film::Film;
 
 /// Where on its path from the camera a contribution was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,9 +114,9 @@ pub(crate) const TECHNIQUES: [&str; 9] = [
     "spot seen in a pane",
 ];
 
-/// Takes what a walk finds: optical path in metres, light, spot, bounces of the whole path, and how it was found.
+/// Takes what a walk finds: optical path in metres, radiance, spot, bounces of the whole path, and how it was found.
 pub(crate) trait Sink {
-    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, way: Way);
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way);
 
     /// Where contributions are found from now on.
     fn at(&mut self, place: Place);
@@ -138,14 +138,10 @@ pub(crate) struct PixelSink<'a> {
 
 impl Sink for PixelSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, light: Light, spot: usize, _bounces: u32, way: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32, way: Way) {
         let slot = self.film.slot(path_m);
         let spot = self.film.tag(spot, self.place, way);
-        let light = Light {
-            value: self.factor * light.value,
-            ..light
-        };
-        self.film.add(self.pixel, slot, light, spot);
+        self.film.add(self.pixel, slot, self.factor * value, spot);
     }
 
     #[inline]

@@ -1,240 +1,40 @@
-//! Several wavelengths in one pass.
-//!
-//! Where light goes does not depend on its wavelength, only how much of it goes on. So paths are drawn once, by the greatest
-//! reflectance that each lobe has among the wavelengths, and carry *ratios*: for each wavelength the product over the
-//! path's vertices of the reflectance there over that greatest one. A ratio is never above 1, so that no wavelength gets rarer and
-//! brighter paths than the brightest one has. A contribution of value v counts v times its ratio in each wavelength's histogram.
-//!
-//! The first wavelength is the main one, whose errors are stated. With one or none all ratios are 1 and nobody multiplies by them.
+//! Surfaces at the laser's wavelength.
 
-use std::collections::HashMap;
+use picofarm_scene::{Bsdf, Material};
 
-use picofarm_scene::{AtWavelength, Bsdf, Material, Vec3};
-use picofarm_settings::MAX_WAVELENGTHS;
-
-use crate::{api::RenderError, bsdf::Surface};
-
-/// By wavelength; those beyond the render's own are 1.
-pub(crate) type Ratios = [f32; MAX_WAVELENGTHS];
-
-/// Every wavelength alike.
-pub(crate) const ONES: Ratios = [1.0; MAX_WAVELENGTHS];
-
-/// Light of all wavelengths: of each `value` times its ratio.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Light {
-    pub value: f32,
-    pub ratios: Ratios,
-}
-
-/// The ratios of a path of two parts.
-#[inline(always)]
-pub(crate) fn times(a: Ratios, b: Ratios) -> Ratios {
-    std::array::from_fn(|k| a[k] * b[k])
-}
-
-/// The ratios of light of which the Lambertian part and the conductor of a mix send so much.
-#[inline(always)]
-pub(crate) fn mix((lambertian, conductor): (f32, f32), of: &[Ratios; 2]) -> Ratios {
-    let whole = lambertian + conductor;
-    if whole <= 0.0 {
-        return ONES;
-    }
-    std::array::from_fn(|k| (lambertian * of[0][k] + conductor * of[1][k]) / whole)
-}
-
-/// By what surfaces multiply ratios.
-#[derive(Debug)]
-pub(crate) struct Spectra {
-    /// By [`Surface::spectrum_row`]; the first holds ones.
-    rows: Vec<Ratios>,
-    /// What texels do, by surface index; `None` without a texture.
-    texels: Vec<Option<Texels>>,
-    /// How many wavelengths there are.
-    count: usize,
-}
+use crate::bsdf::Surface;
 
 /// What a texel does to a surface's reflectances.
 #[derive(Debug, Clone, Copy)]
-struct Texels {
-    /// Shares of the texel's red, green and blue, by wavelength.
-    shares: [[f32; 3]; MAX_WAVELENGTHS],
+pub(crate) struct Texels {
+    /// Shares of the texel's red, green and blue.
+    shares: [f32; 3],
     /// Most that it may multiply by: no surface gives more than it gets.
     most: f32,
 }
 
 impl Texels {
-    /// Factors by wavelength, and the greatest.
-    fn factors(&self, texel: [f32; 3], count: usize) -> (Ratios, f32) {
-        let mut factors = ONES;
-        let mut greatest = 0.0f32;
-        for (factor, shares) in factors.iter_mut().zip(&self.shares).take(count) {
-            let sum = shares[0] * texel[0] + shares[1] * texel[1] + shares[2] * texel[2];
-            *factor = sum.min(self.most);
-            greatest = greatest.max(*factor);
-        }
-        (factors, greatest)
+    /// The factor of a texel.
+    #[inline]
+    pub fn factor(&self, texel: [f32; 3]) -> f32 {
+        let shares = &self.shares;
+        let sum = shares[0] * texel[0] + shares[1] * texel[1] + shares[2] * texel[2];
+        sum.min(self.most)
     }
 }
 
-/// Collects what [`Spectra`] holds while surfaces are made.
-pub(crate) struct Builder<'a> {
-    wavelengths_nm: &'a [f64],
-    rows: Vec<Ratios>,
-    known: HashMap<[u32; 2 * MAX_WAVELENGTHS], u16>,
-    texels: Vec<Option<Texels>>,
-}
-
-impl<'a> Builder<'a> {
-    pub fn new(wavelengths_nm: &'a [f64]) -> Self {
-        Self {
-            wavelengths_nm,
-            rows: vec![ONES],
-            known: HashMap::new(),
-            texels: vec![],
-        }
-    }
-
-    /// The next surface. Parts of a material of several are added to `several`.
-    ///
-    /// # Errors
-    /// [`RenderError::Invalid`] where materials have more spectra, or more materials several parts, than can be told apart.
-    pub fn surface(
-        &mut self,
-        m: &Material,
-        several: &mut Vec<Vec<Surface>>,
-    ) -> Result<Surface, RenderError> {
-        let Bsdf::Several { parts } = m.bsdf else {
-            let (surface, texels) = self.part(m)?;
-            self.texels.push(texels);
-            return Ok(surface);
-        };
-        let (mut all, mut of_all): (Vec<Surface>, Option<Texels>) = (vec![], None);
-        for part in parts.list() {
-            let (surface, texels) = self.part(&m.part(part))?;
-            all.push(surface.scaled(part.weight));
-            of_all = match (of_all, texels) {
-                (Some(a), Some(b)) if a.most <= b.most => Some(a),
-                (_, texels) => texels,
-            };
-        }
-        self.texels.push(of_all);
-        let index = u16::try_from(several.len()).map_err(|_| RenderError::Invalid {
-            field: "objects".into(),
-            what: "have more than 65,536 materials of several parts; let meshes share them".into(),
-        })?;
-        let all = self.joined(all)?;
-        let surface = Surface::several(m, &all, index);
-        several.push(all);
-        Ok(surface)
-    }
-
-    /// Parts of which few remain to choose from: the Lambertians are one, and beside each conductor whose vertices pixels share, in
-    /// proportion to what it reflects.
-    fn joined(&mut self, parts: Vec<Surface>) -> Result<Vec<Surface>, RenderError> {
-        let (lambertians, conductors): (Vec<Surface>, Vec<Surface>) = parts
-            .into_iter()
-            .filter(|s| !s.is_black())
-            .partition(Surface::diffuse);
-        let (wide, mut all): (Vec<Surface>, Vec<Surface>) =
-            conductors.into_iter().partition(Surface::is_shared);
-        let Some(first) = lambertians.first() else {
-            all.extend(wide);
-            return Ok(all);
-        };
-        let mut sums = [0.0; MAX_WAVELENGTHS];
-        for s in &lambertians {
-            let ratios = &self.rows[usize::from(s.spectrum_row())];
-            for (sum, ratio) in sums.iter_mut().zip(ratios) {
-                *sum += s.lambertian() * ratio;
-            }
-        }
-        let count = self.wavelengths_nm.len().max(1);
-        let (base, ratios) = greatest(sums.into_iter().take(count));
-        if wide.is_empty() {
-            let lambertian = first.scaled(base / first.lambertian());
-            all.push(lambertian.with_spectrum(self.row(ratios, ONES)?));
-            return Ok(all);
-        }
-        let reflected: f32 = wide.iter().map(Surface::albedo).sum();
-        for s in wide {
-            let conductor = self.rows[usize::from(s.spectrum_row())];
-            let row = self.row(ratios, conductor)?;
-            all.push(s.mixed_with(base * s.albedo() / reflected, row));
-        }
-        Ok(all)
-    }
-
-    /// A material of one part, or a mix; and what a texel does to it.
-    fn part(&mut self, m: &Material) -> Result<(Surface, Option<Texels>), RenderError> {
-        if self.wavelengths_nm.is_empty() {
-            return Ok((Surface::new(m), None));
-        }
-        let at: Vec<AtWavelength> = self
-            .wavelengths_nm
-            .iter()
-            .map(|&nm| m.at(nm as f32))
-            .collect();
-        let (lambertian, first) = greatest(at.iter().map(|a| a.lambertian));
-        let (conductor, second) = greatest(at.iter().map(|a| a.conductor));
-        let texels = m.texture.is_some().then(|| {
-            let mut shares = [[0.0; 3]; MAX_WAVELENGTHS];
-            for (to, from) in shares.iter_mut().zip(&at) {
-                *to = from.texel;
-            }
-            let most = 1.0 / lambertian.max(conductor).max(f32::MIN_POSITIVE);
-            Texels { shares, most }
-        });
-        let brightest = Material {
-            bsdf: with(m.bsdf, (lambertian, conductor)),
-            ..m.clone()
-        };
-        let row = self.row(first, second)?;
-        Ok((Surface::new(&brightest).with_spectrum(row), texels))
-    }
-
-    /// Where the ratios of two lobes lie; with the ones where no wavelengths are asked for.
-    fn row(&mut self, lambertian: Ratios, conductor: Ratios) -> Result<u16, RenderError> {
-        if self.wavelengths_nm.is_empty() {
-            return Ok(0);
-        }
-        let mut bits = [0u32; 2 * MAX_WAVELENGTHS];
-        for (bits, x) in bits.iter_mut().zip(lambertian.iter().chain(&conductor)) {
-            *bits = x.to_bits();
-        }
-        if let Some(&row) = self.known.get(&bits) {
-            return Ok(row);
-        }
-        let row = u16::try_from(self.rows.len() + 1).map_err(|_| RenderError::Invalid {
-            field: "wavelengths_nm".into(),
-            what: "the scene's materials have more than 32,767 different spectra; make some of them alike".into(),
-        })? - 1;
-        self.rows.extend([lambertian, conductor]);
-        self.known.insert(bits, row);
-        Ok(row)
-    }
-
-    /// `None` where no wavelengths are asked for.
-    pub fn done(self) -> Option<Spectra> {
-        let count = self.wavelengths_nm.len();
-        (count > 0).then_some(Spectra {
-            rows: self.rows,
-            texels: self.texels,
-            count,
-        })
-    }
-}
-
-/// The greatest of the reflectances, and each as a share of it.
-fn greatest(all: impl Iterator<Item = f32> + Clone) -> (f32, Ratios) {
-    let most = all.clone().fold(0.0f32, f32::max);
-    let mut ratios = ONES;
-    if most > 0.0 {
-        for (to, r) in ratios.iter_mut().zip(all) {
-            *to = r / most;
-        }
-    }
-    (most, ratios)
+/// A material's surface at a wavelength, nanometres, and what a texel does to it.
+pub(crate) fn at(m: &Material, nm: f64) -> (Surface, Option<Texels>) {
+    let at = m.at(nm as f32);
+    let texels = m.texture.is_some().then(|| Texels {
+        shares: at.texel,
+        most: 1.0 / at.lambertian.max(at.conductor).max(f32::MIN_POSITIVE),
+    });
+    let there = Material {
+        bsdf: with(m.bsdf, (at.lambertian, at.conductor)),
+        ..m.clone()
+    };
+    (Surface::new(&there), texels)
 }
 
 /// The same kind of surface with other reflectances.
@@ -264,60 +64,6 @@ fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
             specular_reflectance: conductor,
             weight,
         },
-        other @ (Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. }) => {
-            other
-        }
-    }
-}
-
-impl Spectra {
-    /// Whether ratios differ from 1: with one wavelength all light is of that.
-    #[inline(always)]
-    pub fn is_spectral(&self) -> bool {
-        self.count > 1
-    }
-
-    /// The ratios with which a surface scatters from `i` to `o`, without its texture.
-    #[inline]
-    pub fn scattered(&self, s: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Ratios {
-        let row = usize::from(s.spectrum_row());
-        if !s.is_mixed() || row == 0 {
-            return self.rows[row];
-        }
-        mix(s.parts(n, i, o), &[self.rows[row], self.rows[row + 1]])
-    }
-
-    /// The ratios of the Lambertian part and of the conductor of a mix; of other surfaces twice their own.
-    pub fn lobes(&self, s: &Surface) -> [Ratios; 2] {
-        let row = usize::from(s.spectrum_row());
-        let second = row + usize::from(s.is_mixed() && row != 0);
-        [self.rows[row], self.rows[second]]
-    }
-
-    /// The factor of the brightest wavelength's reflectances at a texel of a surface.
-    #[inline]
-    pub fn brightest(&self, surface: usize, texel: [f32; 3]) -> f32 {
-        match &self.texels[surface] {
-            Some(texels) => texels.factors(texel, self.count).1,
-            None => 1.0,
-        }
-    }
-
-    /// The ratios of a texel of a surface.
-    #[inline]
-    pub fn texel(&self, surface: usize, texel: [f32; 3]) -> Ratios {
-        match &self.texels[surface] {
-            Some(texels) => match texels.factors(texel, self.count) {
-                (_, 0.0) => ONES,
-                (factors, most) => {
-                    let mut ratios = ONES;
-                    for (to, f) in ratios.iter_mut().zip(factors).take(self.count) {
-                        *to = f / most;
-                    }
-                    ratios
-                }
-            },
-            None => ONES,
-        }
+        glass @ (Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. }) => glass,
     }
 }

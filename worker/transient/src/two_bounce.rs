@@ -10,7 +10,6 @@ use crate::{
     lobes::Seen,
     rng::Rng,
     segments::Segments,
-    spectra::{Light, ONES, times},
     truth::Centres,
     walk::{Scratch, Walk},
     world::{Hit, World, lift},
@@ -164,10 +163,7 @@ impl Strata {
             let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
             let b = (2 * (block / (side / 2)) + corner / 2) as f32 + rng.uniform();
             let d = world.camera_ray((row, col), (a / side as f32, b / side as f32));
-            let mut hit = world.closest(&mut scratch.stack, Vec3::ZERO, d);
-            if let Some(h) = &mut hit {
-                h.choose_part(world, rng);
-            }
+            let hit = world.closest(&mut scratch.stack, Vec3::ZERO, d);
             let hit = hit.filter(|h| !h.surface.is_black());
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();
@@ -219,30 +215,20 @@ impl Strata {
             let row = &self.found[sample * spots..(sample + 1) * spots];
             let lit = row.iter().enumerate().filter(|(_, f)| f.1 > 0.0);
             let start = ray(sample).start;
-            let hit = &self.hits[sample];
-            lit.map(move |(k, &(slot, value))| {
-                let mut ratios = ONES;
-                if let Some(h) = hit.as_ref().filter(|_| film.spectral) {
-                    let e = &emitters.list[start + k];
-                    let w = (e.p - h.p).normalized();
-                    let here = world.ratios(h, -h.p.normalized(), w);
-                    ratios = times(here, e.ratios(world, -w));
-                }
-                (start + k, slot as usize, Light { value, ratios })
-            })
+            lit.map(move |(k, &(slot, value))| (start + k, slot as usize, value))
         };
         for (block, &twice) in self.twice.iter().enumerate() {
             for corner in 0..4 {
                 let half = corner == twice as usize;
-                for (spot, slot, light) in found(4 * block + corner) {
+                for (spot, slot, value) in found(4 * block + corner) {
                     match half {
-                        true => blocks.add_half(film, slot, light, 1.0, spot),
-                        false => blocks.add(film, slot, light, spot),
+                        true => blocks.add_half(film, slot, value, 1.0, spot),
+                        false => blocks.add(film, slot, value, spot),
                     }
                 }
             }
-            for (spot, slot, light) in found(count + block) {
-                blocks.add_half(film, slot, light, -1.0, spot);
+            for (spot, slot, value) in found(count + block) {
+                blocks.add_half(film, slot, value, -1.0, spot);
             }
             blocks.finish(if rng.uniform() < 0.5 { 1.0 } else { -1.0 });
         }

@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::{caustic, spectra::Ratios, world::Hit};
+use crate::{caustic, world::Hit};
 
 /// A vertex of a path from the camera.
 #[derive(Debug, Clone, Copy)]
@@ -12,8 +12,6 @@ pub(crate) struct Vertex {
     pub wo: Vec3,
     /// Product of scattering and sampling weights up to here.
     pub beta: f32,
-    /// Ratios of that product.
-    pub ratios: Ratios,
     /// Optical path from where the walk is counted, metres.
     pub length_m: f64,
     /// Bounces up to and with this vertex.

@@ -21,7 +21,6 @@ use crate::{
     reflectors::Reflectors,
     rng::Rng,
     sink::Sink,
-    spectra::times,
     vertex::Vertex,
     world::{Hit, World, lift},
 };
@@ -247,7 +246,7 @@ impl Walk<'_> {
             weight /= survive;
         }
         let (step, mut next) = self.follow(v, (w, weight, pdf), aims, stack)?;
-        next.hit.choose_lobe(self.world, rng);
+        next.hit.choose_lobe(rng);
         Some((step, next))
     }
 
@@ -271,7 +270,6 @@ impl Walk<'_> {
             hit,
             wo: -w,
             beta: v.beta * weight * hit.through,
-            ratios: times(v.ratios, self.world.ratios(&h, v.wo, w)),
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
             sight: v.next(),

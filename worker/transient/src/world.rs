@@ -14,7 +14,7 @@ use crate::{
     fresnel::Body,
     glass::{Crossing, Panes},
     rng::Rng,
-    spectra::{Builder, ONES, Ratios, Spectra, times},
+    spectra::{self, Texels},
 };
 
 /// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
@@ -40,8 +40,6 @@ pub(crate) struct World {
     pub object: Vec<u32>,
     /// Scattering by surface index.
     pub surfaces: Vec<Surface>,
-    /// Parts of the surfaces of several, each times its share.
-    pub several: Vec<Vec<Surface>>,
     /// Index into `surfaces` of every object's first material.
     pub first_surface: Vec<u32>,
     /// Material index in its mesh, by surface index.
@@ -67,8 +65,8 @@ pub(crate) struct World {
     pub panes: Option<Panes>,
     /// Bodies of glass by surface index; empty without any.
     bodies: Vec<Option<Body>>,
-    /// By what surfaces multiply ratios, where wavelengths are asked for.
-    spectra: Option<Spectra>,
+    /// What texels do to surfaces at the wavelength asked for, by surface index; empty without one.
+    texels: Vec<Option<Texels>>,
 }
 
 /// A point on a surface, seen from somewhere.
@@ -86,63 +84,19 @@ pub(crate) struct Hit {
     pub through: f32,
 }
 
-/// Parts that bring less than this share of the light count as black: what their chance divides would leave f32.
-const LEAST_PART: f32 = 1e-9;
-
-/// One of several surfaces, drawn by their albedos and divided by its chance; a black one where all are.
-fn drawn<'a>(all: impl Iterator<Item = &'a Surface> + Clone, u: f32) -> Surface {
-    let total: f32 = all.clone().map(Surface::albedo).sum();
-    let (mut left, mut last) = (u * total, None);
-    for s in all.filter(|s| s.albedo() > LEAST_PART * total) {
-        last = Some(s);
-        left -= s.albedo();
-        if left < 0.0 {
-            break;
-        }
-    }
-    match last {
-        Some(s) => s.scaled(total / s.albedo()),
-        None => Surface::new(&Material::diffuse("black", [0.0; 3])),
-    }
-}
-
 impl Hit {
-    /// Settles a surface of several lobes on one of them where one is too narrow for pixels to share its vertices, so that each path
-    /// is of one kind: by way of a near-mirror's lobe, or of others. A mix of wide lobes stays: its vertices scatter by both.
+    /// Settles a mix on one of its parts where one is too narrow for pixels to share its vertices, so that each path is of one
+    /// kind: by way of a near-mirror's lobe, or of others. A mix of wide lobes stays: its vertices scatter by both.
     #[inline(always)]
-    pub fn choose_lobe(&mut self, world: &World, rng: &mut Rng) {
+    pub fn choose_lobe(&mut self, rng: &mut Rng) {
         if self.surface.is_open() {
-            self.settle(world, rng);
+            self.settle(rng);
         }
     }
 
     #[cold]
-    fn settle(&mut self, world: &World, rng: &mut Rng) {
-        self.choose_part(world, rng);
-        if self.surface.is_open() {
-            self.surface = self.surface.lobe(rng.uniform());
-        }
-    }
-
-    /// Settles a surface of several parts on one of them, and leaves a mix of two as it is.
-    #[inline]
-    pub fn choose_part(&mut self, world: &World, rng: &mut Rng) {
-        if let Some((index, factor)) = self.surface.parts_of_several() {
-            let all = world.several[index].iter();
-            self.surface = drawn(all, rng.uniform()).scaled(factor);
-        }
-    }
-
-    /// The near-mirror of its surface: the conductor of a mix, or one of the near-mirrors among several parts, drawn.
-    #[inline]
-    pub fn mirror(&self, world: &World, rng: &mut Rng) -> Surface {
-        match self.surface.parts_of_several() {
-            None => self.surface.gloss(),
-            Some((index, factor)) => {
-                let near = world.several[index].iter().filter(|s| s.specular());
-                drawn(near, rng.uniform()).scaled(factor)
-            }
-        }
+    fn settle(&mut self, rng: &mut Rng) {
+        self.surface = self.surface.lobe(rng.uniform());
     }
 }
 
@@ -152,21 +106,20 @@ impl World {
     /// # Errors
     /// [`RenderError::Invalid`] where the scene is too wide or too small for f32 throughout.
     pub fn new(scene: &Scene, horizon_m: f64, stop: Stop) -> Result<Self, RenderError> {
-        Self::at(scene, &[], horizon_m, stop)
+        Self::at(scene, None, horizon_m, stop)
     }
 
-    /// The same at some wavelengths, nanometres; at the one that the scene's reflectances are of where there are none.
+    /// The same at a wavelength, nanometres; without one, at that of the scene's reflectances.
     ///
     /// # Errors
-    /// Those of [`World::new`], and [`RenderError::Invalid`] where there are too many spectra.
+    /// Those of [`World::new`].
     pub fn at(
         scene: &Scene,
-        wavelengths_nm: &[f64],
+        wavelength_nm: Option<f64>,
         horizon_m: f64,
         stop: Stop,
     ) -> Result<Self, RenderError> {
-        let mut spectra = Builder::new(wavelengths_nm);
-        let mut several = vec![];
+        let mut texels = vec![];
         let origin = scene.camera.origin;
         let centre = wide(origin);
         let count: usize = scene.objects.iter().map(|o| o.mesh.triangles.len()).sum();
@@ -187,7 +140,14 @@ impl World {
             let first = surfaces.len() as u32;
             first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
-                surfaces.push(spectra.surface(m, &mut several)?);
+                surfaces.push(match wavelength_nm {
+                    None => Surface::new(m),
+                    Some(nm) => {
+                        let (surface, of_texels) = spectra::at(m, nm);
+                        texels.push(of_texels);
+                        surface
+                    }
+                });
                 bodies.push(Body::new(m));
                 material.push(k as u32);
                 rgb.push(m.rgb);
@@ -269,7 +229,6 @@ impl World {
             surface,
             object,
             surfaces,
-            several,
             first_surface,
             material,
             rgb,
@@ -286,64 +245,8 @@ impl World {
                 true => bodies,
                 false => vec![],
             },
-            spectra: spectra.done(),
+            texels,
         })
-    }
-
-    /// Whether several wavelengths are asked for.
-    #[inline(always)]
-    pub fn is_spectral(&self) -> bool {
-        self.spectra.as_ref().is_some_and(Spectra::is_spectral)
-    }
-
-    /// The ratios with which light scatters at a hit from `i` to `o`.
-    #[inline(always)]
-    pub fn ratios(&self, h: &Hit, i: Vec3, o: Vec3) -> Ratios {
-        match &self.spectra {
-            Some(spectra) if spectra.is_spectral() => self.ratios_of(spectra, h, i, o),
-            _ => ONES,
-        }
-    }
-
-    fn ratios_of(&self, spectra: &Spectra, h: &Hit, i: Vec3, o: Vec3) -> Ratios {
-        // White surfaces stand for others.
-        if h.surface.spectrum_row() == 0 {
-            return ONES;
-        }
-        times(
-            spectra.scattered(&h.surface, h.n, i, o),
-            self.texel_ratios(h.triangle, h.p),
-        )
-    }
-
-    /// The ratios of the Lambertian part and of the conductor of a mix; of other surfaces twice their own.
-    pub fn lobe_ratios(&self, h: &Hit) -> [Ratios; 2] {
-        match &self.spectra {
-            Some(spectra) if spectra.is_spectral() && h.surface.spectrum_row() != 0 => {
-                let texel = self.texel_ratios(h.triangle, h.p);
-                spectra.lobes(&h.surface).map(|of| times(of, texel))
-            }
-            _ => [ONES; 2],
-        }
-    }
-
-    /// The ratios with which a surface scatters from `i` to `o`, without its texture.
-    #[inline(always)]
-    pub fn surface_ratios(&self, surface: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Ratios {
-        match &self.spectra {
-            None => ONES,
-            Some(spectra) => spectra.scattered(surface, n, i, o),
-        }
-    }
-
-    /// The ratios of a texture at a point of a triangle.
-    pub fn texel_ratios(&self, triangle: u32, p: Vec3) -> Ratios {
-        match (&self.spectra, self.texel(triangle, p)) {
-            (Some(spectra), Some(texel)) => {
-                spectra.texel(self.surface[triangle as usize] as usize, texel)
-            }
-            _ => ONES,
-        }
     }
 
     /// The body of glass that a triangle bounds.
@@ -527,9 +430,9 @@ impl World {
         let geometric = self.normals[i];
         let mut surface = self.surfaces[self.surface[i] as usize];
         if let Some(texel) = self.texel(id, p) {
-            let factor = match &self.spectra {
+            let factor = match self.texels.get(self.surface[i] as usize) {
                 None => (texel[0] + texel[1] + texel[2]) / 3.0,
-                Some(spectra) => spectra.brightest(self.surface[i] as usize, texel),
+                Some(texels) => texels.as_ref().map_or(1.0, |t| t.factor(texel)),
             };
             surface = surface.scaled(factor);
         }

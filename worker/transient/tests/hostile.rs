@@ -5,11 +5,11 @@ mod common;
 
 use common::{Quiet, object};
 use picofarm_scene::{
-    Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Lobe, Material, Object, Part, Parts,
-    Provenance, Scene, SpectrumPoint, Spot, Vec3,
+    Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Material, Object, Provenance, Scene,
+    SpectrumPoint, Spot, Vec3,
 };
 use picofarm_transient::{
-    BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, Wavelengths, render,
+    BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, Wavelength, render,
 };
 use proptest::{prelude::*, strategy::Strategy as Draw};
 
@@ -54,26 +54,6 @@ fn unit() -> impl Draw<Value = Vec3> {
     ]
 }
 
-/// Parts of equal shares.
-fn several(parts: Vec<(f32, f32, Distribution, bool)>) -> Bsdf {
-    let weight = 1.0 / parts.len() as f32;
-    let part = |(reflectance, alpha, distribution, smooth)| Part {
-        weight,
-        lobe: match smooth {
-            true => Lobe::RoughConductor {
-                alpha,
-                distribution,
-                reflectance,
-            },
-            false => Lobe::Diffuse { reflectance },
-        },
-    };
-    let parts: Vec<Part> = parts.into_iter().map(part).collect();
-    Bsdf::Several {
-        parts: Parts::of(&parts).unwrap(),
-    }
-}
-
 fn material() -> impl Draw<Value = Material> {
     let share = || prop_oneof![Just(0.0f32), Just(1.0), 0.0f32..=1.0];
     let alpha = || prop_oneof![Just(1e-3f32), Just(1.0), Just(0.01), 1e-3f32..=1.0];
@@ -88,7 +68,6 @@ fn material() -> impl Draw<Value = Material> {
                 reflectance, alpha, distribution, specular_reflectance, weight,
             }
         ),
-        1 => proptest::collection::vec((share(), alpha(), kind(), any::<bool>()), 1..5).prop_map(several),
     ];
     let point = (450.0f32..1000.0, share()).prop_map(|(nm, reflectance)| SpectrumPoint {
         nm,
@@ -258,10 +237,9 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
         prop_oneof![3 => Just(1.0), 3 => 0.01f64..1.0, 1 => Just(1e-6), 1 => Just(0.0)];
     let wavelength = 250.0f64..2000.0;
     let wavelengths = prop_oneof![
-        2 => Just(vec![]),
-        1 => proptest::collection::vec(wavelength, 1..4),
-    ]
-    .prop_filter_map("each once", |nm| Wavelengths::of(&nm).ok());
+        2 => Just(Wavelength::NONE),
+        1 => wavelength.prop_map(|nm| Wavelength::of(&[nm]).unwrap()),
+    ];
     (
         start,
         width,
@@ -324,7 +302,6 @@ fn sane(r: &Rendered) -> Result<(), TestCaseError> {
         ("range", &r.truth.range),
         ("rgb", &r.truth.rgb),
     ];
-    amounts.extend(r.others.iter().map(|o| ("others", &o.transient)));
     let mut signed = vec![("normal", &r.truth.normal)];
     if let Some(s) = &r.split {
         amounts.extend([

@@ -10,7 +10,7 @@ use common::{
     light::{Start, Tracer},
     near, ok, quad, room, scene, settings, sphere, v,
 };
-use picofarm_scene::{Bsdf, Distribution, Lobe, Material, Object, Part, Parts, Scene};
+use picofarm_scene::{Bsdf, Distribution, Material, Object, Scene};
 use picofarm_transient::{Budget, Gate, Settings};
 
 fn conductor(alpha: f32) -> Material {
@@ -32,28 +32,6 @@ fn mixed(alpha: f32) -> Material {
             distribution: Distribution::Ggx,
             specular_reflectance: 0.8,
             weight: 0.4,
-        },
-        ..grey(0.5)
-    }
-}
-
-/// Paint with a coat and flakes: a Lambertian and conductors of two kinds, with a black rest.
-fn flaked() -> Material {
-    let part = |weight, lobe| Part { weight, lobe };
-    let metal = |alpha, distribution| Lobe::RoughConductor {
-        alpha,
-        distribution,
-        reflectance: 0.9,
-    };
-    let parts = [
-        part(0.4, Lobe::Diffuse { reflectance: 0.8 }),
-        part(0.2, metal(0.4, Distribution::Beckmann)),
-        part(0.2, metal(0.2, Distribution::Ggx)),
-        part(0.1, Lobe::Diffuse { reflectance: 0.2 }),
-    ];
-    Material {
-        bsdf: Bsdf::Several {
-            parts: Parts::of(&parts).unwrap(),
         },
         ..grey(0.5)
     }
@@ -128,11 +106,6 @@ fn smoother_walls_have_the_energy_of_an_independent_tracer() {
 #[test]
 fn mixed_walls_have_the_energy_of_an_independent_tracer() {
     agrees("mixed walls", walls(&mixed(0.2)), (384, 150_000));
-}
-
-#[test]
-fn walls_of_several_parts_have_the_energy_of_an_independent_tracer() {
-    agrees("walls of several parts", walls(&flaked()), (384, 150_000));
 }
 
 #[test]

@@ -8,7 +8,7 @@ use picofarm_scene::{
 };
 use picofarm_settings::Spots;
 use picofarm_transient::{
-    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, Wavelengths, render,
+    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, Wavelength, render,
     render_within,
 };
 
@@ -57,7 +57,7 @@ fn settings(budget: Budget) -> Settings {
         },
         beam: None,
         fill_factor: 1.0,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
     }
 }
 

@@ -9,7 +9,7 @@ use std::{
 
 use picofarm_dataset::{
     Dataset, DatasetSpec, Gate, Intrinsics, Manifest, Profile, Provenance, SceneRecord, Subsets,
-    Wavelengths, open_store,
+    Wavelength, open_store,
 };
 
 use picofarm_cli::{
@@ -36,7 +36,7 @@ impl Simulated {
             spots: 1,
             subsets: Subsets::NONE,
             per_spot: false,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
             two_bounce: false,
             gate: Gate {
                 start_m: 1.0,

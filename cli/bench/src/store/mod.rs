@@ -1,21 +1,18 @@
-//! `picofarm bench store`: what each way of storing histograms costs and loses, on scenes of this renderer, and how
-//! fast they are read again.
+//! `picofarm bench store`: size, error and speed of each storage profile, on scenes of this renderer, and how fast they
+//! are read again.
 
-mod chain;
 mod counting;
 mod cpu;
-mod foreign;
-mod method;
-mod plot;
 mod reading;
 mod report;
 mod sample;
 mod scenes;
-mod variant;
 
 use serde::Serialize;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
+
+use picofarm_dataset::{CodedImage, DatasetSpec, Profile, Subsets, TransientCodec, Wavelength};
 
 use picofarm_cli::{
     args::BenchStore,
@@ -26,7 +23,6 @@ use picofarm_cli::{
     signals,
 };
 
-use method::{Kind, Method};
 use reading::Reading;
 use sample::{Loss, Sample};
 
@@ -66,11 +62,10 @@ struct Scene {
     arrivals: f64,
 }
 
-/// One way, over all scenes.
+/// One profile, over all scenes.
 #[derive(Debug, Serialize)]
 struct Row {
-    name: String,
-    kind: Kind,
+    name: &'static str,
     /// Megabytes a scene of 256×256×637, in proportion.
     mb_a_scene: f64,
     /// Terabytes of 97,432 of them.
@@ -97,10 +92,10 @@ pub async fn run(
     let dir = dir.unwrap_or_else(|| scratch.path().join("farm"));
     let source = scenes::source(&args, &dir, settings, output, stop).await?;
     let samples = scenes::samples(&source, args.scenes).await?;
-    let methods = method::all(source.spec(), &args.only)?;
+    let codecs = codecs(source.spec())?;
     let (stop, runtime) = (stop.clone(), Handle::current());
     let work = move || -> Result<Report> {
-        let rows = rows(&methods, &samples, output, &stop)?;
+        let rows = rows(&codecs, &samples, output, &stop)?;
         let cores = roles::cores();
         let mut threads = vec![1, 2.min(cores), cores];
         threads.dedup();
@@ -115,17 +110,12 @@ pub async fn run(
                 )?)
             }
         };
-        let report = Report {
+        Ok(Report {
             machine: machine(cores),
             scenes: samples.iter().map(scene).collect(),
             rows,
             reading,
-        };
-        if let Some(path) = &args.plot {
-            plot::draw(&report, path)?;
-            output.say(format!("drew {}", path.display()));
-        }
-        Ok(report)
+        })
     };
     let done = tokio::task::spawn_blocking(work).await;
     let report =
@@ -134,8 +124,28 @@ pub async fn run(
     Ok(())
 }
 
+/// The profiles that keep h, by name, for images of the data set's size. `counts-u16` stores draws of photons, which have
+/// no error of coding.
+fn codecs(spec: &DatasetSpec) -> Result<Vec<(&'static str, TransientCodec)>> {
+    let codec = |name| {
+        let profile = Profile::parse(name).map_err(CliError::input)?;
+        let spec = DatasetSpec {
+            profile,
+            per_spot: false,
+            wavelengths_nm: Wavelength::NONE,
+            two_bounce: false,
+            subsets: Subsets::NONE,
+            ..*spec
+        };
+        let codec = TransientCodec::new(&spec).map_err(CliError::input)?;
+        Ok((name, codec))
+    };
+    let names = Profile::NAMES.into_iter().filter(|n| *n != "counts-u16");
+    names.map(codec).collect()
+}
+
 fn rows(
-    methods: &[Method],
+    codecs: &[(&'static str, TransientCodec)],
     samples: &[Sample],
     output: Output,
     stop: &CancellationToken,
@@ -146,17 +156,17 @@ fn rows(
         pool.map_err(|e| CliError::new(Code::Resource, format!("cannot start a thread: {e}")))?;
     let mut meter = Meter::new(output);
     let mut rows = Vec::new();
-    for (at, method) in methods.iter().enumerate() {
-        meter.at(at as f64 / methods.len() as f64, method.name.clone());
+    for (at, (name, codec)) in codecs.iter().enumerate() {
+        meter.at(at as f64 / codecs.len() as f64, (*name).into());
         let mut sums = Sums::default();
         for sample in samples {
             if stop.is_cancelled() {
                 return Err(signals::interrupted("what was measured so far is lost"));
             }
-            let one = pool.install(|| measure(method, sample))?;
+            let one = pool.install(|| measure(codec, sample))?;
             sums.add(&one, &sample.loss(&one.decoded), sample);
         }
-        rows.push(sums.row(method));
+        rows.push(sums.row(name));
     }
     meter.finish();
     Ok(rows)
@@ -170,17 +180,17 @@ struct Measured {
 }
 
 /// Codes and decodes one scene on this thread.
-fn measure(method: &Method, sample: &Sample) -> Result<Measured> {
+fn measure(codec: &TransientCodec, sample: &Sample) -> Result<Measured> {
     // Its pages are touched before the clock runs.
     let mut decoded = vec![f32::NAN; sample.h.len()];
     let (mut bytes, mut encode_s, mut decode_s) = (0, f64::INFINITY, f64::INFINITY);
     for _ in 0..REPEATS {
-        let (coded, seconds) = cpu::of_thread(|| method.encode(sample));
-        let coded = coded?;
+        let (coded, seconds) = cpu::of_thread(|| codec.encode(&sample.h, sample.scale));
+        let coded = coded.map_err(CliError::input)?;
         encode_s = seconds.min(encode_s);
-        bytes = coded.bytes();
-        let (done, seconds) = cpu::of_thread(|| method.decode(&coded, sample, &mut decoded));
-        done?;
+        bytes = size(&coded);
+        let (done, seconds) = cpu::of_thread(|| codec.decode(&coded, &mut decoded));
+        done.map_err(CliError::input)?;
         decode_s = seconds.min(decode_s);
     }
     Ok(Measured {
@@ -189,6 +199,12 @@ fn measure(method: &Method, sample: &Sample) -> Result<Measured> {
         decode_s,
         decoded,
     })
+}
+
+/// Bytes of an image with its overflow list, whose entries are an index and a value.
+fn size(coded: &CodedImage) -> usize {
+    const ENTRY: usize = 12;
+    coded.shard.len() + coded.overflow.len() * ENTRY
 }
 
 #[derive(Default)]
@@ -217,11 +233,10 @@ impl Sums {
         self.peak_squares += loss.peak_sigma * loss.peak_sigma;
     }
 
-    fn row(&self, method: &Method) -> Row {
+    fn row(&self, name: &'static str) -> Row {
         let scene = self.bytes / self.raw * VALUES * 4.0;
         Row {
-            name: method.name.clone(),
-            kind: method.kind,
+            name,
             mb_a_scene: scene / 1e6,
             tb: scene * SCENES / 1e12,
             loss: Loss {

@@ -11,7 +11,7 @@ use std::{
 };
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, Wavelengths,
+    Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, Wavelength,
     open_store,
 };
 use picofarm_model::{
@@ -185,7 +185,7 @@ async fn written(
         profile: Profile::default(),
         subsets: Subsets::NONE,
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         ..*source.spec()
     };

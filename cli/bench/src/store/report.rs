@@ -2,7 +2,6 @@
 
 use super::{
     Report, Row,
-    method::Kind,
     reading::{Fetched, Into, Reading, TRAINING},
 };
 use picofarm_cli::output::table;
@@ -25,24 +24,7 @@ pub fn describe(report: &Report) -> String {
             s.arrivals
         );
     }
-    let groups = [
-        (Kind::Profile, "profiles"),
-        (
-            Kind::Candidate,
-            "candidates for the default, of codecs that zarr-python and tensorstore have",
-        ),
-        (
-            Kind::Unreadable,
-            "candidates that need more than a formula to read, or that tensorstore refuses",
-        ),
-        (Kind::Other, "other formats"),
-    ];
-    for (kind, title) in groups {
-        let rows: Vec<&Row> = report.rows.iter().filter(|r| r.kind == kind).collect();
-        if !rows.is_empty() {
-            text += &format!("\n{title}\n{}", ways(&rows));
-        }
-    }
+    text += &format!("\nprofiles\n{}", profiles(&report.rows));
     text += "MB/CPU-s: of 32-bit floats, one thread. sigma = sqrt(max(N, 1)). Projected from these scenes.\n";
     if let Some(reading) = &report.reading {
         text += &read(reading);
@@ -50,7 +32,7 @@ pub fn describe(report: &Report) -> String {
     text
 }
 
-fn ways(rows: &[&Row]) -> String {
+fn profiles(rows: &[Row]) -> String {
     let head = [
         "",
         "MB a scene",
@@ -65,7 +47,7 @@ fn ways(rows: &[&Row]) -> String {
     let mut cells = vec![head.map(String::from).to_vec()];
     for row in rows {
         cells.push(vec![
-            row.name.clone(),
+            row.name.into(),
             format!("{:.2}", row.mb_a_scene),
             format!("{:.2} TB", row.tb),
             error(row.loss.max_sigma),

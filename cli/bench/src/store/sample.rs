@@ -181,23 +181,6 @@ fn brightest(h: &[f32], bins: &[u16]) -> Option<(usize, f32)> {
 }
 
 #[cfg(test)]
-impl Sample {
-    /// An image of which nothing but the values matters.
-    pub fn plain(height: usize, width: usize, bins: usize, h: Vec<f32>, scale: f32) -> Self {
-        assert_eq!(h.len(), height * width * bins);
-        Self {
-            scene: 0,
-            height,
-            width,
-            bins,
-            h,
-            scale,
-            arrivals: vec![vec![]; height * width],
-        }
-    }
-}
-
-#[cfg(test)]
 mod tests {
     use super::*;
 

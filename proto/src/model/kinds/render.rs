@@ -84,10 +84,7 @@ impl RenderTask {
                 bins: render.bins,
                 spots,
             },
-            histograms: 1
-                + render.subsets.len() as u32
-                + if render.per_spot { spots } else { 0 }
-                + render.wavelengths_nm.others().len() as u32,
+            histograms: 1 + render.subsets.len() as u32 + if render.per_spot { spots } else { 0 },
             split: false,
             light_paths: render.max_bounces != 1,
             triangles: self.scenes.kind.triangles(),

@@ -29,7 +29,6 @@ impl Coding {
         let of = match quantity {
             Quantity::Transient => "",
             Quantity::TransientSpots => " of each spot alone",
-            Quantity::TransientWavelengths => " at the wavelengths after the main one",
             _ => " of some of the spots",
         };
         let overflow = match quantity {

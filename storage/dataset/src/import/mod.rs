@@ -41,7 +41,7 @@ pub use scene::ImportedScene;
 use files::Files;
 use scene::Shape;
 
-use crate::layout::spec::{DatasetSpec, Profile, Wavelengths};
+use crate::layout::spec::{DatasetSpec, Profile, Wavelength};
 
 /// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
 pub const IMPORT_VERSION: &str = "import-4";
@@ -186,7 +186,7 @@ impl Source {
             spots: self.shape.spots,
             subsets: self.shape.subsets,
             per_spot: false,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
             two_bounce: self.shape.two_bounce,
             gate: self.shape.gate,
             profile,

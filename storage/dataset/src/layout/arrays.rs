@@ -53,17 +53,6 @@ impl Quantity {
                     let (element, attributes) = coded();
                     (element, vec![n, h, w, b], dims, attributes)
                 }
-                Self::TransientWavelengths => {
-                    let dims = &["scene", "wavelength", "row", "column", "bin"];
-                    let (element, mut attributes) = coded();
-                    attributes["wavelengths_nm"] = json!(spec.wavelengths_nm.others());
-                    (
-                        element,
-                        vec![spec.planes(self) as u64, h, w, b],
-                        dims,
-                        attributes,
-                    )
-                }
                 Self::Intensity => {
                     let a = json!({"long_name": "sum of the transient over all bins, before coding", "units": "1/(m2 sr)"});
                     (F32, vec![h, w], IMAGE, a)
@@ -174,7 +163,7 @@ impl Layout {
     /// Images in an object; see [`DatasetSpec::planes`].
     pub fn planes(&self) -> usize {
         match self.quantity {
-            Quantity::TransientSpots | Quantity::TransientWavelengths => self.shape[0] as usize,
+            Quantity::TransientSpots => self.shape[0] as usize,
             _ => 1,
         }
     }

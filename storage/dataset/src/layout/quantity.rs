@@ -42,8 +42,6 @@ pub enum Quantity {
     Transient25,
     /// h of each spot alone: `[spot][row][column][bin]`, likewise.
     TransientSpots,
-    /// h at the wavelengths after the main one: `[wavelength][row][column][bin]`, likewise.
-    TransientWavelengths,
 }
 
 /// Rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9 of the 10×10 grid.
@@ -90,7 +88,7 @@ impl Element {
 
 impl Quantity {
     /// All quantities there are, in the order of their objects in a manifest; see [`crate::DatasetSpec::quantities`].
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 19] = [
         Self::Transient,
         Self::Intensity,
         Self::Depth,
@@ -110,18 +108,13 @@ impl Quantity {
         Self::Transient4,
         Self::Transient25,
         Self::TransientSpots,
-        Self::TransientWavelengths,
     ];
 
     /// Whether it is a transient, coded with the data set's profile.
     pub fn is_transient(self) -> bool {
         matches!(
             self,
-            Self::Transient
-                | Self::Transient4
-                | Self::Transient25
-                | Self::TransientSpots
-                | Self::TransientWavelengths
+            Self::Transient | Self::Transient4 | Self::Transient25 | Self::TransientSpots
         )
     }
 
@@ -156,7 +149,6 @@ impl Quantity {
             Self::Transient4 => "transient_4",
             Self::Transient25 => "transient_25",
             Self::TransientSpots => "transient_spots",
-            Self::TransientWavelengths => "transient_wavelengths",
         }
     }
 }

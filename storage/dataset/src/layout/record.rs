@@ -72,7 +72,7 @@ pub struct SceneRecord<'a> {
 /// The transient of a subset of the spots, or of each alone.
 #[derive(Debug, Clone)]
 pub struct SubsetRecord<'a> {
-    /// `Transient4`, `Transient25`, `TransientSpots` or `TransientWavelengths`.
+    /// `Transient4`, `Transient25` or `TransientSpots`.
     pub quantity: Quantity,
     /// h, each `[row][column][bin]`: as many as [`DatasetSpec::planes`].
     pub planes: Vec<&'a [f32]>,

@@ -1,6 +1,6 @@
 //! What a data set is: its size, gate and codec profile. Fixed at creation, except that scenes may be added.
 
-pub use picofarm_settings::{Gate, Wavelengths};
+pub use picofarm_settings::{Gate, Wavelength};
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
@@ -69,10 +69,9 @@ pub struct DatasetSpec {
     /// Each spot has a transient of its own (`transient_spots`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub per_spot: bool,
-    /// The laser's wavelengths, nanometres; of those after the main one `transient_wavelengths` holds the histograms. Without
-    /// any, nobody said which it is.
-    #[serde(default, skip_serializing_if = "Wavelengths::is_empty")]
-    pub wavelengths_nm: Wavelengths,
+    /// The laser's wavelength, nanometres. Without one, nobody said which it is.
+    #[serde(default, skip_serializing_if = "Wavelength::is_none")]
+    pub wavelengths_nm: Wavelength,
     /// Two-bounce paths came with the scenes (`two_bounce_path`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub two_bounce: bool,
@@ -270,12 +269,10 @@ impl DatasetSpec {
         self.pixels() * self.gate.bins as usize
     }
 
-    /// Images of a quantity that is a transient: one for each spot of `transient_spots`, one for each wavelength of
-    /// `transient_wavelengths`, otherwise one.
+    /// Images of a quantity that is a transient: one for each spot of `transient_spots`, otherwise one.
     pub fn planes(&self, quantity: Quantity) -> usize {
         match quantity {
             Quantity::TransientSpots => self.spots as usize,
-            Quantity::TransientWavelengths => self.wavelengths_nm.others().len(),
             _ => 1,
         }
     }
@@ -286,7 +283,6 @@ impl DatasetSpec {
             Quantity::Transient4 => self.subsets.four,
             Quantity::Transient25 => self.subsets.twenty_five,
             Quantity::TransientSpots => self.per_spot,
-            Quantity::TransientWavelengths => !self.wavelengths_nm.others().is_empty(),
             Quantity::TwoBouncePath => self.two_bounce,
             _ => true,
         };
@@ -311,8 +307,8 @@ impl DatasetSpec {
             ),
             (
                 "wavelengths_nm",
-                format!("{:?}", self.wavelengths_nm.nm()),
-                format!("{:?}", asked.wavelengths_nm.nm()),
+                format!("{:?}", Vec::from(self.wavelengths_nm)),
+                format!("{:?}", Vec::from(asked.wavelengths_nm)),
             ),
             (
                 "two_bounce",

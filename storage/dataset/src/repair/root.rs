@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::error::DatasetError;
 use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::FORMAT_VERSION;
-use crate::layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelengths};
+use crate::layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelength};
 use crate::repair::recipe::Recipe;
 use crate::scenes::dataset::{Dataset, root_metadata};
 use crate::store::objects;
@@ -35,7 +35,7 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
         spots: 1,
         subsets: Subsets::NONE,
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         gate: Gate {
             start_m: 0.0,

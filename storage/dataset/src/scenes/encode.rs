@@ -172,8 +172,7 @@ fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>)
         Quantity::Transient
         | Quantity::Transient4
         | Quantity::Transient25
-        | Quantity::TransientSpots
-        | Quantity::TransientWavelengths => unreachable!("transients are coded by tiles"),
+        | Quantity::TransientSpots => unreachable!("transients are coded by tiles"),
         Quantity::Intensity => intensity(record.transient, spec.gate.bins),
         Quantity::Depth => bytemuck::cast_slice(record.depth).to_vec(),
         Quantity::Range => bytemuck::cast_slice(record.range).to_vec(),

@@ -81,8 +81,7 @@ impl Dataset {
         } else {
             0
         };
-        let others = spec.wavelengths_nm.others().len() as u64;
-        let histograms = 1 + spec.subsets.sizes().len() as u64 + each + others;
+        let histograms = 1 + spec.subsets.sizes().len() as u64 + each;
         let values = spec.transient_len() as u64;
         values * histograms * HISTOGRAMS * 8 + (64 << 20)
     }

@@ -81,7 +81,7 @@ impl Dataset {
     }
 
     /// h of a scene from any of the data set's transients: `[row][column][bin]`, for `TransientSpots`
-    /// `[spot][row][column][bin]`, for `TransientWavelengths` `[wavelength][row][column][bin]`. Blocks its thread while decoding on rayon's threads.
+    /// `[spot][row][column][bin]`. Blocks its thread while decoding on rayon's threads.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] where the data set has no such transient; those of [`Self::read_transient`].

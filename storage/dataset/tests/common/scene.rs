@@ -16,7 +16,7 @@ pub fn spec(profile: Profile) -> DatasetSpec {
         spots: 9,
         subsets: Subsets::NONE,
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         gate: Gate {
             start_m: 1.0,

@@ -76,8 +76,7 @@ fn rendering(
             bins: settings.gate.bins,
             spots: 25,
         },
-        histograms: (1 + settings.groups.len() as u32)
-            * settings.wavelengths_nm.nm().len().max(1) as u32,
+        histograms: 1 + settings.groups.len() as u32,
         split: settings.split,
         light_paths: settings.max_bounces.is_none_or(|most| most >= 2),
         triangles: triangles as u64,
@@ -141,7 +140,7 @@ mod tests {
 
     use picofarm_proto::model::JobSpec;
     use picofarm_scene::primitive::{self, PrimitiveSettings};
-    use picofarm_transient::{Budget, Gate, Strategy, Wavelengths};
+    use picofarm_transient::{Budget, Gate, Strategy, Wavelength};
 
     use super::*;
 
@@ -161,7 +160,7 @@ mod tests {
             strategy: Strategy::default(),
             beam: None,
             fill_factor: 1.0,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
         }
     }
 

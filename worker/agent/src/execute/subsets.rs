@@ -15,7 +15,6 @@ pub(super) fn groups(spec: &DatasetSpec) -> Vec<Vec<u32>> {
         match quantity {
             Quantity::Transient4 => groups.push(indices(&SPOTS_4_OF_100)),
             Quantity::Transient25 => groups.push(indices(&SPOTS_25_OF_100)),
-            Quantity::TransientWavelengths => {}
             _ => groups.extend((0..spec.spots).map(|spot| vec![spot])),
         }
     }
@@ -28,13 +27,7 @@ pub(super) fn records<'a>(spec: &DatasetSpec, rendered: &'a Rendered) -> Vec<Sub
     further(spec)
         .map(|quantity| SubsetRecord {
             quantity,
-            planes: match quantity {
-                Quantity::TransientWavelengths => {
-                    let others = rendered.others.iter();
-                    others.map(|o| o.transient.as_slice()).collect()
-                }
-                _ => groups.by_ref().take(spec.planes(quantity)).collect(),
-            },
+            planes: groups.by_ref().take(spec.planes(quantity)).collect(),
         })
         .collect()
 }
@@ -46,7 +39,7 @@ fn further(spec: &DatasetSpec) -> impl Iterator<Item = Quantity> {
 
 #[cfg(test)]
 mod tests {
-    use picofarm_dataset::{Gate, Profile, Subsets, Wavelengths};
+    use picofarm_dataset::{Gate, Profile, Subsets, Wavelength};
 
     use super::*;
 
@@ -59,7 +52,7 @@ mod tests {
             spots: 100,
             subsets: Subsets::of(&[4, 25]).unwrap(),
             per_spot: true,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
             two_bounce: false,
             gate: Gate {
                 start_m: 1.0,

@@ -86,7 +86,7 @@ impl Place {
             spots: 2,
             subsets: Subsets::NONE,
             per_spot: true,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
             two_bounce: false,
             gate: Gate {
                 start_m: 1.0,

@@ -25,24 +25,6 @@ pub struct Sweep {
     pub error: String,
     /// Its trials, by number.
     pub trials: Vec<Tried>,
-    /// How much each parameter mattered, the most first; nothing where too few trials have ended.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub importance: Vec<Weight>,
-    /// What that means, and what it is worth.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
-    pub importance_note: String,
-}
-
-/// How much a parameter mattered.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Weight {
-    /// Its name.
-    pub parameter: String,
-    /// Its share of all.
-    pub share: f64,
-    /// How often a parameter without effect would come as far.
-    pub chance: f64,
 }
 
 /// A trial of a sweep.
@@ -187,7 +169,6 @@ pub fn html(sweep: &Sweep) -> String {
         ("Trials", table(sweep)),
         ("Over epochs", curves(sweep)),
         ("Parameters", parameters(sweep)),
-        ("Importance", importance(sweep)),
     ];
     let sections =
         sections.map(|(name, body)| format!("<section><h2>{name}</h2>{body}</section>\n"));
@@ -305,27 +286,6 @@ fn parameters(sweep: &Sweep) -> String {
     drawn(&(out + "</div>"), sweep)
 }
 
-fn importance(sweep: &Sweep) -> String {
-    if sweep.importance.is_empty() {
-        return "<p class=\"note\">Too few trials have ended to say.</p>".into();
-    }
-    let mut out = String::from(
-        "<div class=\"wide\"><table><thead><tr><th>parameter</th><th class=\"n\">share</th>\
-         <th class=\"n\">chance</th></tr></thead><tbody>",
-    );
-    for weight in &sweep.importance {
-        let _ = write!(
-            out,
-            "<tr><td>{}</td><td class=\"n\">{:.0} %</td><td class=\"n\">{:.3}</td></tr>",
-            Safe(&weight.parameter),
-            100.0 * weight.share,
-            weight.chance
-        );
-    }
-    let note = Safe(&sweep.importance_note);
-    out + &format!("</tbody></table></div><p class=\"note\">{note}</p>")
-}
-
 /// A chart and what its colours mean.
 fn drawn(chart: &str, sweep: &Sweep) -> String {
     let there = ENDS.iter().filter(|end| sweep.count(**end) > 0);
@@ -404,12 +364,6 @@ mod tests {
                 tried(2, 3e-2, End::Finished, &[0.9, 0.4, 0.25]),
                 tried(3, 1e-1, End::Diverged, &[]),
             ],
-            importance: vec![Weight {
-                parameter: "<lr>".into(),
-                share: 0.75,
-                chance: 0.005,
-            }],
-            importance_note: "of 4 & few".into(),
         }
     }
 
@@ -429,8 +383,6 @@ mod tests {
         let place = |name: &str| page.find(&format!("<td>&lt;m&gt;.{name}</td>")).unwrap();
         assert!(place("2") < place("0") && place("0") < place("1") && place("1") < place("3"));
         assert!(page.contains("a&lt;b") && !page.contains("<m>"));
-        assert!(page.contains("<td>&lt;lr&gt;</td><td class=\"n\">75 %</td>"));
-        assert!(page.contains("of 4 &amp; few"));
         // One chart over epochs, one for the parameter that has numbers.
         assert_eq!(
             page.matches("role=\"img\"")
@@ -443,6 +395,6 @@ mod tests {
     #[test]
     fn a_sweep_without_trials_is_a_page_too() {
         let page = html(&Sweep::default());
-        assert!(page.contains("0 trials") && page.contains("Too few trials"));
+        assert!(page.contains("0 trials"));
     }
 }

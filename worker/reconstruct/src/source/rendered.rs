@@ -3,7 +3,7 @@
 use picofarm_scene::Scene;
 use picofarm_settings::Sensor;
 use picofarm_transient::{
-    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelengths, render,
+    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelength, render,
 };
 
 use super::{Captures, LIT_THRESHOLD};
@@ -39,7 +39,7 @@ impl CaptureSettings {
             strategy: Strategy::default(),
             beam: None,
             fill_factor: 1.0,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
         }
     }
 }
@@ -64,7 +64,7 @@ pub fn truth_of(scene: &Scene, progress: &dyn Progress) -> Result<Rendered, Reco
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
     };
     Ok(render(scene, &settings, progress)?)
 }

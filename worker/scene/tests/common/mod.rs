@@ -1,7 +1,7 @@
 //! What several tests of files need.
 
 use picofarm_scene::{
-    Bsdf, Distribution, Lobe, Material, Part, Parts, Scene, SpectrumPoint, Texture, Wrap,
+    Bsdf, Distribution, Scene, SpectrumPoint, Texture, Wrap,
     primitive::{self, PrimitiveSettings},
 };
 use std::sync::Arc;
@@ -76,98 +76,4 @@ pub fn spectral_room() -> Scene {
         }
     }
     scene
-}
-
-/// A Lambertian with its share.
-pub fn lambertian(weight: f32, reflectance: f32) -> Part {
-    Part {
-        weight,
-        lobe: Lobe::Diffuse { reflectance },
-    }
-}
-
-/// A conductor with its share.
-pub fn conductor(weight: f32, alpha: f32, reflectance: f32) -> Part {
-    Part {
-        weight,
-        lobe: Lobe::RoughConductor {
-            alpha,
-            distribution: Distribution::Ggx,
-            reflectance,
-        },
-    }
-}
-
-/// [`textured_room`] in which the first five objects are of several parts, the second with a spectrum.
-pub fn parted_room() -> Scene {
-    let mut scene = textured_room();
-    let eight = (0..8).map(|k| match k % 2 {
-        0 => lambertian(0.1, 0.1 * (k + 1) as f32),
-        _ => conductor(0.1, 0.05 * k as f32, 0.9),
-    });
-    let all: [Vec<Part>; 5] = [
-        vec![
-            lambertian(0.5, 0.4),
-            conductor(0.25, 0.05, 0.4),
-            conductor(0.25, 0.5, 0.4),
-        ],
-        vec![
-            conductor(0.3, 0.2, 0.9),
-            lambertian(0.6, 0.3),
-            conductor(0.1, 0.02, 0.7),
-        ],
-        vec![lambertian(0.25, 0.2), conductor(0.25, 0.3, 0.6)],
-        vec![lambertian(0.25, 0.5)],
-        eight.collect(),
-    ];
-    for (k, (object, parts)) in scene.objects.iter_mut().zip(all).enumerate() {
-        let material = &mut Arc::make_mut(&mut object.mesh).materials[0];
-        let parts = Parts::of(&parts).expect("8 parts at most");
-        material.bsdf = Bsdf::Several { parts };
-        material.two_sided = k != 3;
-        if k == 1 {
-            let row = |n: usize| SpectrumPoint {
-                nm: 500.0 + 100.0 * n as f32,
-                reflectance: 0.2 * n as f32,
-                specular_reflectance: (n != 1).then_some(0.5),
-            };
-            material.spectrum = (0..3).map(row).collect();
-        }
-    }
-    scene
-}
-
-/// The parts of a material of several.
-pub fn parts(material: &Material) -> Vec<Part> {
-    match material.bsdf {
-        Bsdf::Several { parts } => parts.list().to_vec(),
-        other => panic!("expected several parts, found {other:?}"),
-    }
-}
-
-/// Fails unless parts are the same but for rounding.
-pub fn alike(found: &[Part], expected: &[Part]) {
-    let close = |a: f32, b: f32| (a - b).abs() < 1e-6;
-    let same = |a: &Part, b: &Part| {
-        let lobes = match (a.lobe, b.lobe) {
-            (Lobe::Diffuse { .. }, Lobe::Diffuse { .. }) => true,
-            (Lobe::RoughConductor { alpha: a, .. }, Lobe::RoughConductor { alpha: b, .. }) => {
-                a == b
-            }
-            _ => false,
-        };
-        lobes && close(a.weight, b.weight) && close(a.lobe.reflectance(), b.lobe.reflectance())
-    };
-    assert!(
-        found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| same(a, b)),
-        "{found:?} {expected:?}"
-    );
-}
-
-/// The same with another reflectance.
-pub fn with_reflectance(part: Part, reflectance: f32) -> Part {
-    match part.lobe {
-        Lobe::Diffuse { .. } => lambertian(part.weight, reflectance),
-        Lobe::RoughConductor { alpha, .. } => conductor(part.weight, alpha, reflectance),
-    }
 }

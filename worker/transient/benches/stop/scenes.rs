@@ -1,8 +1,7 @@
 //! Scenes that are hard to sample: near-mirrors, glossy and mixed surfaces, spots in far corners.
 
 use picofarm_scene::{
-    AssetLibrary, Bsdf, Distribution, Lobe, Material, Object, Part, Parts, Scene, Texture, Vec3,
-    Wrap,
+    AssetLibrary, Bsdf, Distribution, Material, Object, Scene, Texture, Vec3, Wrap,
     furnished::{self, FurnishedSettings},
     primitive,
 };
@@ -32,27 +31,6 @@ fn rough(alpha: f32) -> Material {
             reflectance: 0.8,
         },
         ..grey(0.8)
-    }
-}
-
-/// Paint with a coat and flakes: three parts, and a black rest.
-fn flaked() -> Material {
-    let part = |weight, lobe| Part { weight, lobe };
-    let metal = |alpha| Lobe::RoughConductor {
-        alpha,
-        distribution: Distribution::Ggx,
-        reflectance: 0.8,
-    };
-    let parts = [
-        part(0.5, Lobe::Diffuse { reflectance: 0.7 }),
-        part(0.2, metal(0.3)),
-        part(0.2, metal(0.15)),
-    ];
-    Material {
-        bsdf: Bsdf::Several {
-            parts: Parts::of(&parts).expect("three parts"),
-        },
-        ..grey(0.5)
     }
 }
 
@@ -150,15 +128,6 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         4,
         Material::mirror("ball", 0.01),
     ));
-
-    let mut parts = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &flaked());
-    parts.push(sphere(
-        v(0.7, -0.9, -2.6),
-        0.5,
-        4,
-        Material::mirror("ball", 0.01),
-    ));
-    parts.extend(block(v(-0.9, -1.5, -3.2), v(-0.2, -0.5, -2.5), &grey(0.6)));
 
     let glossy = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &rough(0.3));
 
@@ -274,7 +243,6 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         ("everything", scene(everything, pixels, &BEAMS)),
         ("coated", scene(coated, pixels, &BEAMS)),
         ("angled", scene(angled, pixels, &BEAMS)),
-        ("parts", scene(parts, pixels, &BEAMS)),
         ("glossy", scene(glossy, pixels, &BEAMS[..2])),
         ("primitive", plain),
         ("pair", scene(pair, pixels, &BEAMS)),
@@ -288,7 +256,7 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     .into();
     all.extend((1..=FAR).map(|seed| (format!("far-{seed:02}"), far(seed, None, pixels))));
     // Rooms of rough and mixed walls with Lambertians of the same albedo in their place: what roughness costs.
-    let twins = ["coated", "parts", "glossy", "far-03"].map(|name| {
+    let twins = ["coated", "glossy", "far-03"].map(|name| {
         let (_, rough) = all.iter().find(|(of, _)| of == name).expect("it is one");
         (format!("{name}-lambertian"), lambertian(rough))
     });
@@ -354,10 +322,6 @@ fn albedo(bsdf: &Bsdf) -> f32 {
             weight,
             ..
         } => (1.0 - weight) * reflectance + weight * specular_reflectance,
-        Bsdf::Several { parts } => {
-            let of = |p: &Part| p.weight * p.lobe.reflectance();
-            parts.list().iter().map(of).sum()
-        }
         Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => 0.0,
     }
 }

@@ -14,7 +14,6 @@ use crate::{
     film::Film,
     rng::Rng,
     sink::{Place, Sink, Technique, Way},
-    spectra::{Light, ONES, Ratios, times},
     vertex::{Sight, Vertex},
     walk::{ALL, Walk, draw},
 };
@@ -49,7 +48,6 @@ impl ByGlass {
         let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
         let mut path = Carried {
             weight: 1.0 / chance,
-            ratios: ONES,
             length_m: 0.0,
             bounces: 0,
         };
@@ -71,9 +69,7 @@ impl ByGlass {
                 // The spots themselves are seen as points of light where they can be.
                 let spots = !(point.shows && self.points_of_light());
                 let limits = (walk.max_bounces, world, spots);
-                photons.around(limits, &point, |splat, ratios| {
-                    add(film, (pixel, splat), || ratios, out);
-                });
+                photons.around(limits, &point, |found| add(film, (pixel, found), out));
             }
             let there = &point.path;
             if there.bounces + 1 > walk.max_bounces
@@ -89,15 +85,15 @@ impl ByGlass {
             if self.images.any() && there.bounces + 2 <= walk.max_bounces {
                 let count = if first { IMAGES.0 } else { IMAGES.1 };
                 self.images
-                    .connect(walk, &point, count, rng, buffers, |found, ratios| {
-                        add(film, (pixel, found), || ratios, out);
+                    .connect(walk, &point, count, rng, buffers, |found| {
+                        add(film, (pixel, found), out);
                     });
                 let lit = std::mem::take(&mut buffers.lit);
                 let count = if first { LIT.0 } else { LIT.1 };
                 let of = (walk, &lit);
                 self.images
-                    .connect_lit(of, &point, count, rng, buffers, |found, ratios| {
-                        add(film, (pixel, found), || ratios, out);
+                    .connect_lit(of, &point, count, rng, buffers, |found| {
+                        add(film, (pixel, found), out);
                     });
                 buffers.lit = lit;
             }
@@ -105,7 +101,7 @@ impl ByGlass {
                 join((walk, film), (&point, pixel), rng, buffers, out);
             }
             let on_leg = there.weight / path.weight;
-            let Some(next) = point.seek((world, &self.aim), left * on_leg, rng) else {
+            let Some(next) = point.seek(&self.aim, left * on_leg, rng) else {
                 return;
             };
             (path, ray, left) = next;
@@ -116,7 +112,7 @@ impl ByGlass {
 /// What a camera path found.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Found {
-    /// Radiance, of which the ratios are wanted beside it.
+    /// Radiance.
     pub value: f32,
     /// Optical path, metres.
     pub path_m: f64,
@@ -138,16 +134,16 @@ struct Splats<'a> {
 }
 
 impl Sink for Splats<'_> {
-    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, _: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, _: Way) {
         let to_spot = self.emitters.list[spot].path_m;
         let found = Found {
-            value: light.value,
+            value,
             path_m: self.before_m + (path_m - to_spot) * self.medium + to_spot,
             spot,
             bounces,
             technique: Technique::Straight,
         };
-        add(self.film, (self.pixel, found), || light.ratios, self.out);
+        add(self.film, (self.pixel, found), self.out);
     }
 
     fn at(&mut self, _: Place) {}
@@ -171,12 +167,11 @@ fn straight(
         out,
     };
     let mut hit = point.hit;
-    hit.choose_lobe(walk.world, rng);
+    hit.choose_lobe(rng);
     let vertex = Vertex {
         hit,
         wo: point.back,
         beta: point.path.weight,
-        ratios: point.path.ratios,
         length_m: 0.0,
         bounce: point.path.bounces,
         sight: Sight::ELSEWHERE,
@@ -224,7 +219,6 @@ fn join(
         if free > 0.0 {
             let to = y.hit.p - h.p;
             let leg = world.metres(to.length()) * f64::from(point.medium);
-            let w = to.normalized();
             let found = Found {
                 value: path.weight * value * free,
                 path_m: path.length_m + leg + y.path_m,
@@ -232,32 +226,19 @@ fn join(
                 bounces,
                 technique: Technique::Vertex,
             };
-            let ratios = || {
-                let here = times(path.ratios, world.ratios(h, point.back, w));
-                times(here, times(y.ratios, world.ratios(&y.hit, y.back, -w)))
-            };
-            add(film, (pixel, found), ratios, out);
+            add(film, (pixel, found), out);
         }
     });
 }
 
-/// Adds what was found at all wavelengths.
-fn add(
-    film: &Film,
-    (pixel, found): (u32, Found),
-    ratios: impl FnOnce() -> Ratios,
-    out: &mut Vec<Splat>,
-) {
-    let ratios = if film.spectral { ratios() } else { ONES };
-    let slot = film.slot(found.path_m) as u32;
-    let each = (0u8..).zip(ratios).take(film.wavelengths);
-    out.extend(each.map(|(wavelength, ratio)| Splat {
+/// Adds what was found.
+fn add(film: &Film, (pixel, found): (u32, Found), out: &mut Vec<Splat>) {
+    out.push(Splat {
         pixel,
-        slot,
+        slot: film.slot(found.path_m) as u32,
         spot: found.spot as u16,
-        wavelength,
-        value: found.value * ratio,
+        value: found.value,
         bounces: found.bounces,
         technique: found.technique,
-    }));
+    });
 }

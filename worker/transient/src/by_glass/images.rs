@@ -13,7 +13,6 @@ use crate::{
     glass::Panes,
     rng::Rng,
     sink::Technique,
-    spectra::{ONES, Ratios, times},
     walk::{Walk, draw},
     world::{Hit, World, lift},
 };
@@ -160,21 +159,14 @@ impl Images {
                 };
                 let cos = q.z / d;
                 let value = e.intensity(way.back) * way.free / (d * d * cos * cos * cos * area);
-                let ratios = match film.spectral {
-                    true => e.ratios(world, way.back),
-                    false => ONES,
-                };
-                let slot = film.slot(e.path_m + way.length_m) as u32;
-                let each = (0u8..).zip(ratios).take(film.wavelengths);
-                seen.extend(each.map(|(wavelength, ratio)| Splat {
+                seen.push(Splat {
                     pixel: pixel as u32,
-                    slot,
+                    slot: film.slot(e.path_m + way.length_m) as u32,
                     spot: spot as u16,
-                    wavelength,
-                    value: value * ratio,
+                    value,
                     bounces: 2,
                     technique: Technique::SeenSpot,
-                }));
+                });
             }
         }
         seen.retain(|s| s.value > 0.0);
@@ -189,7 +181,7 @@ impl Images {
         count: u32,
         rng: &mut Rng,
         buffers: &mut Buffers,
-        mut each: impl FnMut(Found, Ratios),
+        mut each: impl FnMut(Found),
     ) {
         let (world, emitters) = (walk.world, walk.emitters);
         let Some(panes) = &world.panes else { return };
@@ -205,9 +197,9 @@ impl Images {
             let (plane, spot) = (k / spots, k % spots);
             // `value` is this image's weight over its chance.
             let of = self.light((walk, panes), (plane, spot), point, buffers);
-            if let Some((share, found, ratios)) = of {
+            if let Some((share, found)) = of {
                 let value = point.path.weight * value * share;
-                each(Found { value, ..found }, ratios);
+                each(Found { value, ..found });
             }
         });
         buffers.lights = weights;
@@ -220,7 +212,7 @@ impl Images {
         (plane, spot): (usize, usize),
         point: &Point,
         buffers: &mut Buffers,
-    ) -> Option<(f32, Found, Ratios)> {
+    ) -> Option<(f32, Found)> {
         let (world, path) = (walk.world, &point.path);
         let e = &walk.emitters.list[spot];
         let from = (lift(point.hit.p, point.hit.n), point.medium);
@@ -232,14 +224,7 @@ impl Images {
             bounces: path.bounces + 2,
             technique: Technique::Image,
         };
-        let ratios = match world.is_spectral() {
-            false => ONES,
-            true => {
-                let here = world.ratios(&point.hit, point.back, way.w);
-                times(times(path.ratios, here), e.ratios(world, way.back))
-            }
-        };
-        Some((way.share, found, ratios))
+        Some((way.share, found))
     }
 
     /// Connects a point of a camera path to images of the points of `lit`, at most `count` of them: a few are looked at, and of
@@ -251,7 +236,7 @@ impl Images {
         count: u32,
         rng: &mut Rng,
         buffers: &mut Buffers,
-        mut each: impl FnMut(Found, Ratios),
+        mut each: impl FnMut(Found),
     ) {
         let world = walk.world;
         let (Some(panes), all) = (&world.panes, lit.list.len()) else {
@@ -283,20 +268,16 @@ impl Images {
                 return;
             };
             let factor = point.path.weight * value * scale * way.share / y.sum;
-            let here = match world.is_spectral() {
-                false => ONES,
-                true => times(point.path.ratios, world.ratios(h, point.back, way.w)),
-            };
             for a in &y.arrivals {
                 let found = Found {
-                    value: factor * a.light.value,
+                    value: factor * a.value,
                     path_m: point.path.length_m + way.length_m + a.path_m,
                     spot: a.spot,
                     bounces: point.path.bounces + 1 + a.bounces,
                     technique: Technique::LitImage,
                 };
                 if found.bounces <= walk.max_bounces {
-                    each(found, times(here, a.light.ratios));
+                    each(found);
                 }
             }
         });
@@ -346,7 +327,6 @@ impl Images {
         (free > 0.0).then(|| Way {
             share: free / panes.weight(plane.pane, cos),
             free,
-            w,
             back: (q - p).normalized(),
             length_m: world.metres(length) * f64::from(medium),
         })
@@ -359,8 +339,7 @@ struct Way {
     share: f32,
     /// The same of all light.
     free: f32,
-    /// Unit directions from both ends.
-    w: Vec3,
+    /// Unit direction from the far end.
     back: Vec3,
     /// Optical length, metres.
     length_m: f64,

@@ -68,7 +68,6 @@ impl ByGlass {
                 hit: point.hit,
                 back: point.back,
                 flux: there.weight,
-                ratios: there.ratios,
                 alpha: 0.0,
                 density: ALONE,
                 path_m: there.length_m,
@@ -80,7 +79,7 @@ impl ByGlass {
                 true => 1.0,
                 false => weight.min(0.95),
             };
-            let Some(onward) = point.scatter(world, survive, rng) else {
+            let Some(onward) = point.scatter(survive, rng) else {
                 return;
             };
             (path, ray) = onward;
@@ -185,7 +184,6 @@ impl ByGlass {
         }
         let path = Carried {
             weight: flux,
-            ratios: e.ratios(world, w),
             length_m: e.path_m,
             bounces: 1,
         };

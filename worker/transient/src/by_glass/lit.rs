@@ -12,7 +12,6 @@ use crate::{
     path_reuse::Sharing,
     rng::Rng,
     sink::{Place, Sink, Way},
-    spectra::{Light, ONES},
     turns::Turns,
     vertex::{Sight, Vertex},
     walk::{Scratch, Walk},
@@ -29,7 +28,7 @@ pub(super) struct Arrival {
     /// Optical path from the laser, metres.
     pub path_m: f64,
     /// Radiance that it leaves with, over the density of the point.
-    pub light: Light,
+    pub value: f32,
     /// Emitter.
     pub spot: usize,
     /// Bounces up to and with the point.
@@ -92,10 +91,10 @@ impl Areas {
 struct Arrivals<'a>(&'a mut Vec<Arrival>);
 
 impl Sink for Arrivals<'_> {
-    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, _: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, _: Way) {
         self.0.push(Arrival {
             path_m,
-            light,
+            value,
             spot,
             bounces,
         });
@@ -143,8 +142,7 @@ impl Lit {
                 let at = (f64::from(j - half) + f64::from(rng.uniform())) / f64::from(half);
                 areas.draw(world, at, rng)
             };
-            let Some(mut hit) = hit else { continue };
-            hit.choose_part(world, rng);
+            let Some(hit) = hit else { continue };
             if Self::may_hold(&walk, &hit) {
                 let even = 0.5 * f64::from(half) / areas.whole();
                 let density = (half as f32 / spots as f32, even as f32);
@@ -189,13 +187,7 @@ impl LitPoint {
             if free * weight > 0.0 {
                 arrivals.push(Arrival {
                     path_m: world.metres(d2.sqrt()) + e.path_m,
-                    light: Light {
-                        value: weight * free,
-                        ratios: crate::spectra::times(
-                            world.ratios(&hit, hit.n, -w),
-                            e.ratios(world, w),
-                        ),
-                    },
+                    value: weight * free,
                     spot,
                     bounces: 2,
                 });
@@ -205,7 +197,6 @@ impl LitPoint {
             hit,
             wo: hit.n,
             beta: 1.0,
-            ratios: ONES,
             length_m: 0.0,
             bounce: 1,
             sight: Sight::ELSEWHERE,
@@ -213,9 +204,9 @@ impl LitPoint {
         let on = (vertex, crate::walk::SPOTS);
         walk.run(rng, on, scratch, &mut Arrivals(&mut arrivals));
         for a in &mut arrivals {
-            a.light.value /= density;
+            a.value /= density;
         }
-        let sum: f32 = arrivals.iter().map(|a| a.light.value).sum();
+        let sum: f32 = arrivals.iter().map(|a| a.value).sum();
         (sum > 0.0 && sum.is_finite()).then_some(Self { hit, arrivals, sum })
     }
 }

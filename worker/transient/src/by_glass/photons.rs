@@ -11,7 +11,6 @@ use crate::{
     emitter::Emitters,
     light_vertices::{ALONE, LightVertex},
     sink::Technique,
-    spectra::{ONES, Ratios, times},
     world::{Hit, World},
 };
 
@@ -51,7 +50,6 @@ impl Photons {
             },
             back: e.back,
             flux: 1.0,
-            ratios: ONES,
             alpha: 0.0,
             density: ALONE,
             path_m: e.path_m,
@@ -75,13 +73,13 @@ impl Photons {
         [p.x, p.y, p.z].map(|x| (x / self.cell).floor() as i32)
     }
 
-    /// Calls `each` with what every photon near a camera path's point brings, and its ratios; without `spots`, what lies behind the
-    /// first bounce alone.
+    /// Calls `each` with what every photon near a camera path's point brings; without `spots`, what lies behind the first
+    /// bounce alone.
     pub(super) fn around(
         &self,
         (max_bounces, world, spots): (u32, &World, bool),
         point: &Point,
-        mut each: impl FnMut(Found, Ratios),
+        mut each: impl FnMut(Found),
     ) {
         let (h, path) = (&point.hit, &point.path);
         let length = path.length_m as f32 * world.scale;
@@ -117,13 +115,7 @@ impl Photons {
                         technique: Technique::Photon,
                     };
                     if found.value > 0.0 {
-                        let here = match world.is_spectral() {
-                            // A spot's surface is not among the triangles.
-                            true if z.bounces > 1 => world.ratios(&z.hit, z.back, point.back),
-                            true => world.ratios(h, z.back, point.back),
-                            false => ONES,
-                        };
-                        each(found, times(times(path.ratios, z.ratios), here));
+                        each(found);
                     }
                 }
             }

@@ -8,7 +8,6 @@ use crate::{
     fresnel::{Body, split},
     glass::Crossing,
     rng::Rng,
-    spectra::{Ratios, times},
     world::{Hit, World, lift},
 };
 
@@ -110,9 +109,8 @@ impl Ray {
 /// What a path has come to.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Carried {
-    /// What is left of radiance or flux, and its ratios.
+    /// What is left of radiance or flux.
     pub weight: f32,
-    pub ratios: Ratios,
     /// Optical path, metres.
     pub length_m: f64,
     pub bounces: u32,
@@ -226,15 +224,13 @@ pub(super) fn arrive(
     rng: &mut Rng,
     tools: (&mut Stack, &mut Vec<Crossing>),
 ) -> Option<Point> {
-    let (ray, mut hit) = follow(world, ray, seek, rng, tools)?;
-    hit.choose_part(world, rng);
+    let (ray, hit) = follow(world, ray, seek, rng, tools)?;
     let once = ray.last.filter(|_| ray.turns == 1);
     Some(Point {
         hit,
         back: -ray.w,
         path: Carried {
             weight: path.weight * ray.weight,
-            ratios: path.ratios,
             length_m: path.length_m + ray.length_m,
             bounces: path.bounces + 1 + ray.reflections,
         },
@@ -248,30 +244,20 @@ pub(super) fn arrive(
 impl Point {
     /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive` says with which chance a step
     /// of a weight does.
-    pub fn scatter(
-        &self,
-        world: &World,
-        survive: impl Fn(f32) -> f32,
-        rng: &mut Rng,
-    ) -> Option<(Carried, Ray)> {
+    pub fn scatter(&self, survive: impl Fn(f32) -> f32, rng: &mut Rng) -> Option<(Carried, Ray)> {
         let h = &self.hit;
         let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
         let chance = survive(weight);
         if chance < 1.0 && rng.uniform() >= chance {
             return None;
         }
-        Some(self.onward(world, (w, weight / chance), false))
+        Some(self.onward((w, weight / chance), false))
     }
 
     /// Radiance goes on by the surface's scattering or to where glass is. What the path carries then, the ray, and what is left of
     /// `left`: what it would carry by scattering alone, since how narrow the cones are says nothing of what lies in them. Roulette
     /// goes by that.
-    pub fn seek(
-        &self,
-        (world, aim): (&World, &Aim),
-        left: f32,
-        rng: &mut Rng,
-    ) -> Option<(Carried, Ray, f32)> {
+    pub fn seek(&self, aim: &Aim, left: f32, rng: &mut Rng) -> Option<(Carried, Ray, f32)> {
         let h = &self.hit;
         let (w, weight, own) = match aim.from(h) {
             Some(cones) => cones.sample(h, self.back, rng)?,
@@ -284,15 +270,14 @@ impl Point {
         if rng.uniform() >= chance {
             return None;
         }
-        let (path, ray) = self.onward(world, (w, weight / chance), true);
+        let (path, ray) = self.onward((w, weight / chance), true);
         Some((path, ray, left * own / chance))
     }
 
-    fn onward(&self, world: &World, (w, weight): (Vec3, f32), radiance: bool) -> (Carried, Ray) {
+    fn onward(&self, (w, weight): (Vec3, f32), radiance: bool) -> (Carried, Ray) {
         let h = &self.hit;
         let path = Carried {
             weight: self.path.weight * weight,
-            ratios: times(self.path.ratios, world.ratios(h, self.back, w)),
             ..self.path
         };
         let from = lift(h.p, h.n);

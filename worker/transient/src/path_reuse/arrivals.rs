@@ -8,7 +8,6 @@ use crate::{
     lobes::Seen,
     rng::Rng,
     sink::{Place, Sink, Way},
-    spectra::{Light, ONES, times},
     vertex::{Sight, Vertex},
     walk::{Scratch, Walk, draw},
     world::{Hit, lift},
@@ -117,7 +116,6 @@ impl Sharing {
             },
             wo,
             beta: 1.0,
-            ratios: ONES,
             length_m: nearest,
             bounce,
             sight: Sight::ELSEWHERE,
@@ -171,18 +169,8 @@ impl Sharing {
             let carried = carry.share(w) * through;
             if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
                 let back = to * (-1.0 / d);
-                let light = Light {
-                    value: carried,
-                    ratios: match film.spectral {
-                        false => ONES,
-                        true => {
-                            let here = walk.world.ratios(h, h.n, back);
-                            times(here, e.ratios(walk.world, -back))
-                        }
-                    },
-                };
                 sink.toward(back);
-                sink.add(path, light, spot, bounce + 1, Way::Spot);
+                sink.add(path, carried, spot, bounce + 1, Way::Spot);
             }
         }
         y.light = from_spots * drawn as f32 / emitters.list.len() as f32;

@@ -9,7 +9,6 @@ use crate::{
     film::Film,
     rng::Rng,
     sink::{PixelSink, Place, Sink, Way},
-    spectra::{Light, ONES, times},
     turns::Turns,
     vertex::{Sight, Vertex},
     walk::{ALL, Lights, Scratch, Step, Walk},
@@ -105,19 +104,7 @@ impl Sharing {
                 if walk.window.is_none_or(|w| w.holds(path)) {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
                     let spot = film.tag(y.spot, Place::Gather, Way::Zone);
-                    let light = Light {
-                        value: self.weight[i] * through,
-                        ratios: match film.spectral {
-                            false => ONES,
-                            true => {
-                                let w = (y.hit.p - v.hit.p).normalized();
-                                let here = times(v.ratios, walk.world.ratios(&v.hit, v.wo, w));
-                                let there = walk.world.ratios(&y.hit, y.back, -w);
-                                times(here, times(y.ratios, there))
-                            }
-                        },
-                    };
-                    film.add(pixel, film.slot(path), light, spot);
+                    film.add(pixel, film.slot(path), self.weight[i] * through, spot);
                 }
             }
         }
@@ -171,7 +158,7 @@ impl Sharing {
             else {
                 continue;
             };
-            next.hit.choose_lobe(walk.world, rng);
+            next.hit.choose_lobe(rng);
             if next.hit.surface.is_black() {
                 continue;
             }
@@ -239,7 +226,7 @@ impl Sharing {
             if next.hit.triangle != triangle {
                 continue;
             }
-            next.hit.choose_lobe(walk.world, rng);
+            next.hit.choose_lobe(rng);
             if !next.hit.surface.specular() || next.hit.surface.is_black() {
                 continue;
             }
@@ -279,7 +266,7 @@ impl Sharing {
             if walk.is_own(spot, &hit) {
                 continue;
             }
-            hit.choose_lobe(walk.world, rng);
+            hit.choose_lobe(rng);
             self.shared.extend(Shared::new(hit));
         }
     }
@@ -300,7 +287,7 @@ impl Sharing {
             let Some(mut hit) = self.shells.draw(place, at, rng) else {
                 continue;
             };
-            hit.choose_lobe(walk.world, rng);
+            hit.choose_lobe(rng);
             self.shared.extend(Shared::new(hit));
         }
     }
@@ -357,7 +344,7 @@ pub(super) fn gather_point(
 ) -> Option<Vertex> {
     let mut vertex = first(walk, ray, scratch)?;
     loop {
-        vertex.hit.choose_lobe(walk.world, rng);
+        vertex.hit.choose_lobe(rng);
         if vertex.bounce > 1 {
             sink.factor = if vertex.hit.surface.specular() {
                 share.spots
@@ -395,7 +382,7 @@ pub(super) fn only_mirrors(
     };
     sink.factor = share.spots;
     loop {
-        vertex.hit.choose_lobe(walk.world, rng);
+        vertex.hit.choose_lobe(rng);
         if !vertex.hit.surface.specular() {
             return;
         }
@@ -424,7 +411,6 @@ fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
         hit,
         wo: -hit.p / range,
         beta: hit.through,
-        ratios: ONES,
         length_m: world.metres(range),
         bounce: 1,
         sight: Sight::FIRST,

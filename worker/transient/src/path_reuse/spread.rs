@@ -6,7 +6,6 @@ use super::{Shared, Sharing};
 use crate::{
     film::Film,
     lanes::{SIDE, Wide, widest},
-    spectra::{Light, ONES},
     vertex::Vertex,
     walk::Walk,
 };
@@ -14,9 +13,6 @@ use crate::{
 impl Sharing {
     /// Carries the arrivals to the pixels.
     pub(super) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
-        if film.spectral {
-            return self.spread_spectral((walk, film), pixels);
-        }
         widest(Spread {
             sharing: self,
             walk,
@@ -96,17 +92,14 @@ impl Sharing {
                         continue;
                     }
                     let slot = floor(b + offset, last) as usize;
-                    let light = Light {
-                        value: weight * value,
-                        ratios: ONES,
-                    };
+                    let value = weight * value;
                     let first = if k % 2 == 0 {
                         &mut pixel[slot]
                     } else {
                         &mut second[slot]
                     };
-                    *first += light.value;
-                    film.add_to_groups(pixel, slot, &light, usize::from(spot));
+                    *first += value;
+                    film.add_to_groups(pixel, slot, value, usize::from(spot));
                 }
             }
             for (sum, second) in pixel.iter_mut().zip(&mut second) {
@@ -134,9 +127,9 @@ impl Wide for Spread<'_> {
     }
 }
 
-/// Unit direction from a shared vertex to a gather point: the same bits for one wavelength and for several.
+/// Unit direction from a shared vertex to a gather point.
 #[inline(always)]
-pub(super) fn toward(y: &Shared, v: &Vertex) -> Vec3 {
+fn toward(y: &Shared, v: &Vertex) -> Vec3 {
     let to = v.hit.p - y.hit.p;
     to * (1.0 / to.length())
 }
@@ -144,7 +137,7 @@ pub(super) fn toward(y: &Shared, v: &Vertex) -> Vec3 {
 /// ⌊x⌋ within 0..=last, for last < 2²². Half an ulp of 2²³ is ½: adding it leaves the integer in the low
 /// bits, without the checks of a cast. (An x within rounding of an integer may fall to either side.)
 #[inline(always)]
-pub(super) fn floor(x: f32, last: f32) -> u32 {
+fn floor(x: f32, last: f32) -> u32 {
     let half = x.max(0.5).min(last + 0.5) - 0.5;
     (half + 8_388_608.0).to_bits() & 0x007f_ffff
 }

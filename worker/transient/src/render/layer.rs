@@ -67,7 +67,6 @@ struct Waiting {
     pass: u32,
     value: f32,
     spot: u16,
-    wavelength: u8,
 }
 
 /// What light paths brought to a pixel, over passes, in metres.
@@ -153,8 +152,7 @@ impl Layer {
         let mut all = 0.0f64;
         for group in splats.chunk_by(|a, b| (a.pixel, a.slot) == (b.pixel, b.slot)) {
             if (1..last).contains(&(group[0].slot as usize)) {
-                let main = group.iter().filter(|s| s.wavelength == 0);
-                all += f64::from(main.map(|s| s.value).sum::<f32>());
+                all += f64::from(group.iter().map(|s| s.value).sum::<f32>());
             }
         }
         for group in splats.chunk_by(|a, b| a.pixel / of_block == b.pixel / of_block) {
@@ -165,7 +163,6 @@ impl Layer {
                 pass,
                 value: s.value,
                 spot: s.spot,
-                wavelength: s.wavelength,
             }));
         }
         self.merge(frame, |block| {
@@ -298,11 +295,9 @@ impl Block {
         if film.channels > 1 {
             let mut of_groups: Vec<Waiting> = vec![];
             for w in &self.waiting {
-                let wavelength = usize::from(w.wavelength);
-                let of_all = (wavelength > 0).then(|| film.first_channel(wavelength));
-                let groups = film.groups_of(wavelength, usize::from(w.spot));
-                of_groups.extend(of_all.into_iter().chain(groups).map(|channel| Waiting {
-                    slot: (channel * film.slots) as u32 + w.slot,
+                let channels = film.of_spot[usize::from(w.spot)].iter();
+                of_groups.extend(channels.map(|&channel| Waiting {
+                    slot: u32::from(channel) * film.slots as u32 + w.slot,
                     ..*w
                 }));
             }
@@ -312,7 +307,6 @@ impl Block {
             })?;
         }
         // Stable: what falls into one slot is summed in the order of the passes, and of the paths.
-        self.waiting.retain(|w| w.wavelength == 0);
         self.waiting.sort_by_key(by_place);
         let add = |[sum, square, alternating]: &mut Moments, group: &[Waiting]| {
             for pass in group.chunk_by(|a, b| a.pass == b.pass) {
@@ -444,7 +438,6 @@ mod tests {
             pass,
             value,
             spot: 0,
-            wavelength: 0,
         }
     }
 

@@ -8,8 +8,8 @@ use super::{
 };
 use crate::{
     api::{
-        AtWavelength, Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered,
-        Settings, Split, Stop,
+        Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered, Settings, Split,
+        Stop,
     },
     beam::find_spots,
     by_glass::ByGlass,
@@ -60,8 +60,8 @@ pub(super) fn prepare<R>(
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
-    let (horizon, wavelengths) = (settings.gate.end_m(), settings.wavelengths_nm.nm());
-    let mut world = World::at(scene, wavelengths, horizon, stop)?;
+    let wavelength = settings.wavelengths_nm.nm();
+    let mut world = World::at(scene, wavelength, settings.gate.end_m(), stop)?;
     world.sensitive = settings.fill_factor.sqrt() as f32;
     let spots = find_spots(&world, &scene.laser.beams);
     let middles = Emitters::new(scene, &world, &spots)?;
@@ -92,14 +92,13 @@ pub(super) fn prepare<R>(
     let sampling = Sampling::plan(&world, emitters, &centres, stop);
     stop.check()?;
     let of_spot = groups_of(settings, sources, spots.len())?;
-    let channels = (settings.groups.len(), wavelengths.len());
-    let film = Film::new(&settings.gate, channels, of_spot);
+    let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     // Sums over light paths count a pixel's slots in 32 bits.
     if u32::try_from(film.pixel()).is_err() {
         return Err(RenderError::Invalid {
             field: "groups".into(),
             what: format!(
-                "make {} histograms of {} bins for each pixel, expected at most {} values; use fewer groups, wavelengths or bins",
+                "make {} histograms of {} bins for each pixel, expected at most {} values; use fewer groups or bins",
                 film.channels,
                 settings.gate.bins,
                 u32::MAX
@@ -286,15 +285,11 @@ impl Ready<'_> {
             let peaks = one_bounce::peaks(walk.world, &mut stack, self.sources);
             for peak in &peaks {
                 let gate = &settings.gate;
-                if !one_bounce::add(peak, 0, gate, &mut image.transient) {
-                    overflow.energy += f64::from(peak.light.value * peak.light.ratios[0]);
+                if !one_bounce::add(peak, gate, &mut image.transient) {
+                    overflow.energy += f64::from(peak.value);
                 }
-                for wavelength in 0..film.wavelengths {
-                    let of_all = (wavelength > 0).then(|| film.first_channel(wavelength));
-                    let groups = film.groups_of(wavelength, peak.spot);
-                    for channel in of_all.into_iter().chain(groups) {
-                        one_bounce::add(peak, wavelength, gate, &mut image.groups[channel - 1]);
-                    }
+                for &channel in &film.of_spot[peak.spot] {
+                    one_bounce::add(peak, gate, &mut image.groups[usize::from(channel) - 1]);
                 }
             }
             rays += stack.rays;
@@ -305,7 +300,6 @@ impl Ready<'_> {
         } else {
             0.0
         };
-        let (groups, others) = by_wavelength(settings, image.groups);
         let outside = self.is_dark || overflow.energy > 0.0;
         let dark = self.dark(&truth, inside, outside);
         let mut warnings = warn::beams(self.spots);
@@ -326,8 +320,7 @@ impl Ready<'_> {
                 multi_se: s.multi_se,
                 multi_noise: s.multi_noise,
             }),
-            groups,
-            others,
+            groups: image.groups,
             truth,
             spots: self.spots.to_vec(),
             overflow,
@@ -336,26 +329,6 @@ impl Ready<'_> {
             rays: rays + seen,
         })
     }
-}
-
-/// The histograms beyond the first: groups of the main wavelength, and what the others have.
-fn by_wavelength(
-    settings: &Settings,
-    mut channels: Vec<Vec<f32>>,
-) -> (Vec<Vec<f32>>, Vec<AtWavelength>) {
-    let each = 1 + settings.groups.len();
-    let rest = channels.split_off(each - 1);
-    let mut rest = rest.into_iter();
-    let others = settings.wavelengths_nm.others().iter().map(|&nm| {
-        let mut of = rest.by_ref().take(each);
-        AtWavelength {
-            nm,
-            transient: of.next().expect("a film has a channel for each wavelength"),
-            groups: of.collect(),
-        }
-    });
-    let others = others.collect();
-    (channels, others)
 }
 
 /// The channels beyond 0 that each emitter's light goes to.

@@ -59,8 +59,7 @@ pub fn variance(
         if !ready.walks() {
             return Ok(vec![]);
         }
-        let spectral = ready.frame.film.spectral;
-        let film = Film::by_class(&settings.gate, spectral);
+        let film = Film::by_class(&settings.gate);
         let by_class = Frame {
             film: &film,
             ..ready.frame

@@ -13,7 +13,6 @@ use crate::{
     reflectors::Aiming,
     rng::Rng,
     sink::{Sink, Way},
-    spectra::{Light, ONES, Ratios, times},
     vertex::Vertex,
     world::{Hit, lift},
 };
@@ -65,12 +64,8 @@ impl Walk<'_> {
             let free = self.world.free(stack, h.p, h.n, e.p, e.n);
             if free > 0.0 {
                 let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
-                let w = (e.p - h.p).normalized();
-                let light = Light {
-                    value: v.beta * value * free,
-                    ratios: self.onward(v, w, || e.ratios(self.world, -w)),
-                };
-                sink.add(path, light, spot, v.bounce + 1, Way::Spot);
+                let value = v.beta * value * free;
+                sink.add(path, value, spot, v.bounce + 1, Way::Spot);
             }
         };
         if count == ALL {
@@ -78,18 +73,6 @@ impl Walk<'_> {
             lit.for_each(|(spot, &w)| each(spot, w));
         } else {
             draw(weights, count, rng.uniform(), each);
-        }
-    }
-
-    /// The ratios of a path that goes on from a vertex along `w` to where the rest of it has the ratios `beyond`.
-    #[inline(always)]
-    fn onward(&self, v: &Vertex, w: Vec3, beyond: impl FnOnce() -> Ratios) -> Ratios {
-        match self.world.is_spectral() {
-            false => ONES,
-            true => times(
-                v.ratios,
-                times(self.world.ratios(&v.hit, v.wo, w), beyond()),
-            ),
         }
     }
 
@@ -188,7 +171,7 @@ impl Walk<'_> {
         let leg = m.p - h.p;
         let w = leg.normalized();
         let e = &self.emitters.list[aim.spot];
-        let near = m.mirror(self.world, rng);
+        let near = m.surface.gloss();
         let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &near);
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
@@ -202,17 +185,9 @@ impl Walk<'_> {
         }
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w) + self.aims(aiming, h.p, &m);
-        let mirror = Hit { surface: near, ..m };
-        let light = Light {
-            value: v.beta * value * free / (aimed + plain),
-            ratios: self.onward(v, w, || {
-                let to = (e.p - m.p).normalized();
-                let there = self.world.ratios(&mirror, -w, to);
-                times(there, e.ratios(self.world, -to))
-            }),
-        };
+        let value = v.beta * value * free / (aimed + plain);
         sink.toward(w);
-        sink.add(path, light, aim.spot, v.bounce + 2, Way::Image);
+        sink.add(path, value, aim.spot, v.bounce + 2, Way::Image);
     }
 
     /// Aims at near-mirrors per steradian from `x` towards `m`, for one direction drawn by scattering.
@@ -297,14 +272,8 @@ impl Walk<'_> {
                 let leg = there.p - h.p;
                 let path = v.length_m + self.world.metres(leg.length()) + y.path_m;
                 let w = leg.normalized();
-                let light = Light {
-                    value: v.beta * value * free,
-                    ratios: self.onward(v, w, || {
-                        times(y.ratios, self.world.ratios(there, y.back, -w))
-                    }),
-                };
                 sink.toward(w);
-                sink.add(path, light, y.spot, bounces, way);
+                sink.add(path, v.beta * value * free, y.spot, bounces, way);
             }
         });
     }

@@ -3,7 +3,7 @@
 
 use std::f64::consts::PI;
 
-use picofarm_scene::{Bsdf, Distribution, Part, Scene, Vec3};
+use picofarm_scene::{Bsdf, Distribution, Scene, Vec3};
 use picofarm_transient::Gate;
 
 /// A point or direction, metres.
@@ -247,10 +247,6 @@ pub fn f(bsdf: Bsdf, n: P, i: P, o: P) -> f64 {
             let w = f64::from(weight);
             let rough = conductor(f64::from(alpha), distribution, n, i, o);
             (1.0 - w) * f64::from(reflectance) / PI + w * f64::from(specular_reflectance) * rough
-        }
-        Bsdf::Several { parts } => {
-            let of = |p: &Part| f64::from(p.weight) * f(p.lobe.bsdf(), n, i, o);
-            parts.list().iter().map(of).sum()
         }
         Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => panic!("glass scatters nothing"),
     }

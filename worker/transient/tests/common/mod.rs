@@ -19,7 +19,7 @@ use picofarm_scene::{
     Vec3,
 };
 use picofarm_transient::{
-    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelengths, render,
+    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelength, render,
 };
 
 /// Lets every render run to its end.
@@ -56,7 +56,7 @@ pub fn settings(budget: Budget) -> Settings {
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Strategy, Wavelengths};
+use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Strategy, Wavelength};
 use serde::{Deserialize, Serialize};
 
 use crate::model::{
@@ -44,9 +44,9 @@ pub struct RenderSettings {
     /// Share of each pixel's area that is sensitive: a square in its middle.
     #[serde(skip_serializing_if = "is_whole")]
     pub fill_factor: f64,
-    /// Wavelengths of the laser, nanometres; the first is the main one. Without any, materials reflect as at the laser's own.
-    #[serde(skip_serializing_if = "Wavelengths::is_empty")]
-    pub wavelengths_nm: Wavelengths,
+    /// Wavelength of the laser, nanometres. Without one, materials reflect as at the laser's own.
+    #[serde(skip_serializing_if = "Wavelength::is_none")]
+    pub wavelengths_nm: Wavelength,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
@@ -70,7 +70,7 @@ impl Default for RenderSettings {
             strategy: Strategy::default(),
             beam: None,
             fill_factor: 1.0,
-            wavelengths_nm: Wavelengths::NONE,
+            wavelengths_nm: Wavelength::NONE,
         }
     }
 }
@@ -141,14 +141,6 @@ impl RenderSettings {
         within("render.fill_factor", self.fill_factor, (0.01, 1.0), share)?;
         if let Some(Err((field, what))) = self.beam.map(|beam| beam.check()) {
             return fail(&format!("beam.{field}"), what);
-        }
-        if !self.wavelengths_nm.others().is_empty() && (self.per_spot || !self.subsets.is_empty()) {
-            return fail(
-                "wavelengths_nm",
-                "data sets store no subsets of the spots at several wavelengths; remove subsets and per_spot, or render them \
-                 apart"
-                    .into(),
-            );
         }
         match self.max_bounces {
             1 => fail(
@@ -316,7 +308,7 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             strategy,
             beam: text.beam,
             fill_factor: text.fill_factor.unwrap_or(default.fill_factor),
-            wavelengths_nm: Wavelengths::of(&text.wavelengths_nm)
+            wavelengths_nm: Wavelength::of(&text.wavelengths_nm)
                 .map_err(|(at, what)| SpecError::new(format!("render.wavelengths_nm{at}"), what))?,
         })
     }

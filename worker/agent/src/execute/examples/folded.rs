@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use picofarm_dataset::{
-    Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, Wavelengths, open_store,
+    Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, Wavelength, open_store,
 };
 use picofarm_model::scene::{Scene as Seen, Scenes};
 use picofarm_proto::{key::TaskKey, model::Histogram};
@@ -104,7 +104,7 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
         spots: 1,
         subsets: Subsets::NONE,
         per_spot: false,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
         two_bounce: false,
         gate,
         profile: Profile::LOSSLESS,
@@ -125,7 +125,7 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
     };
     let rendered = picofarm_transient::render(&scene, &settings, &Quiet).unwrap();
     let spots = rendered.spots.iter();

@@ -313,7 +313,7 @@ pub fn target_spec(
         spots: chosen(settings).map_or(source.spots, |spots| spots.len() as u32),
         subsets: Subsets::NONE,
         per_spot: false,
-        wavelengths_nm: source.wavelengths_nm.main(),
+        wavelengths_nm: source.wavelengths_nm,
         gate: Gate {
             start_m: source.gate.start_m,
             bin_width_m: source.gate.bin_width_m * f64::from(rebin),

@@ -21,7 +21,6 @@ use text::{
 /// Writes the scene to `file` (an `.xml`) with its meshes and textures in folders beside it. Returns what
 /// Mitsuba's model cannot hold, a sentence each; often nothing.
 ///
-/// A material of several parts is a tree of `blendbsdf`, in which the share that its parts lack is a black `diffuse`.
 /// A mesh is written once per material that it uses. Colours are the materials' `rgb`, scaled so that their mean
 /// is the reflectance at the laser's wavelength. Every beam is a `projector` of 0.1°.
 ///

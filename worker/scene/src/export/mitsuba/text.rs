@@ -6,8 +6,7 @@ use std::{collections::BTreeMap, fmt::Write as _, sync::Arc};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Affine, Beam, Bsdf, Camera, Distribution, Lobe, Material, Part, Parts, SpectrumPoint, Texture,
-    Vec3, Wrap,
+    Affine, Beam, Bsdf, Camera, Distribution, Material, SpectrumPoint, Texture, Vec3, Wrap,
     extras::SceneExtras,
     texture::{linear, srgb_byte},
 };
@@ -131,7 +130,6 @@ pub(crate) fn bsdf_text(
                 id_attribute(outer)
             )
         }
-        Bsdf::Several { parts } => several(&mut out, outer, id, material, texture, &parts),
         Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
             unreachable!("glass was written above")
         }
@@ -142,66 +140,6 @@ pub(crate) fn bsdf_text(
         body
     };
     out
-}
-
-/// Shares below this are rounding.
-const NO_SHARE: f64 = 1e-6;
-
-/// Parts as blends of blends, in their order; the share that they lack is black.
-fn several(
-    out: &mut BsdfText,
-    outer: &str,
-    id: &str,
-    material: &Material,
-    texture: Option<&TextureExtras>,
-    parts: &Parts,
-) -> String {
-    let sum: f64 = parts.list().iter().map(|p| f64::from(p.weight)).sum();
-    let black = (1.0 - sum > NO_SHARE).then_some(Part {
-        weight: (1.0 - sum) as f32,
-        lobe: Lobe::Diffuse { reflectance: 0.0 },
-    });
-    let all: Vec<Part> = parts.list().iter().copied().chain(black).collect();
-    let mut leaves = Vec::new();
-    for part in &all {
-        let own = if all.len() == 1 { outer } else { "" };
-        let reflectance = part.lobe.reflectance();
-        // Equal parts share an image; what is black needs none.
-        let first = all.iter().position(|p| p.lobe.reflectance() == reflectance);
-        let image = format!("{id}-part{}", first.unwrap_or(0));
-        let texture = texture.filter(|_| reflectance > 0.0);
-        let text = match part.lobe {
-            Lobe::Diffuse { .. } => diffuse(out, own, &image, material, texture, reflectance),
-            Lobe::RoughConductor {
-                alpha,
-                distribution,
-                ..
-            } => {
-                let specular = (alpha, distribution, reflectance);
-                conductor(out, own, &image, material, texture, specular)
-            }
-        };
-        leaves.push((f64::from(part.weight), text));
-    }
-    blend(outer, &leaves)
-}
-
-/// Leaves with their shares as a tree of blends that is as flat as it can be.
-fn blend(id: &str, leaves: &[(f64, String)]) -> String {
-    if let [(_, text)] = leaves {
-        return text.clone();
-    }
-    let share = |of: &[(f64, String)]| of.iter().map(|l| l.0).sum::<f64>();
-    let (first, second) = leaves.split_at(leaves.len().div_ceil(2));
-    let (a, b) = (share(first), share(second));
-    // A blend's weight is the share of its second.
-    let weight = if b > 0.0 { (b / (a + b)) as f32 } else { 0.0 };
-    format!(
-        "<bsdf type=\"blendbsdf\"{}><float name=\"weight\" value=\"{weight}\"/>{}{}</bsdf>",
-        id_attribute(id),
-        blend("", first),
-        blend("", second)
-    )
 }
 
 fn id_attribute(id: &str) -> String {

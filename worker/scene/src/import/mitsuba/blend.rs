@@ -1,21 +1,21 @@
-//! Mitsuba's blends as materials of parts side by side.
+//! Mitsuba's blends as materials of one or two parts.
 //!
 //! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a blend again. What is read are the
-//! leaves, Lambertians and conductors, in the file's order. The share of a leaf is the product of the weights on the way to it.
-//! Leaves that scatter alike and have one colour are one. One Lambertian and one conductor are [`Bsdf::Mixed`]. One leaf alone
-//! is what it is. All others are [`Bsdf::Several`], without the leaves that have no share and without black Lambertians.
+//! leaves, Lambertians and conductors. The share of a leaf is the product of the weights on the way to it. Lambertians side by
+//! side are one Lambertian of their mean, and so are conductors of one roughness and distribution: both scatter in proportion
+//! to what they reflect. What remains is one Lambertian, one conductor, or [`Bsdf::Mixed`] of both. Conductors that differ are
+//! refused.
 //!
 //! - **Colour**: a material's `rgb` is the mean of its leaves' colours by their shares, so that the mean of its three channels
-//!   is the sum of shares times reflectances. At a stated wavelength every part has the hue of this `rgb`: together the parts
-//!   reflect what they should, unless one of them would reflect more than it gets. A note says so where hues differ.
-//! - **Texture**: it scales all parts. So all leaves with a share have the same bitmap, or none has one. Black Lambertians need none.
-//! - **Spectra**: Lambertians side by side are one Lambertian of their mean. They are read as one where any leaf of a blend has a
-//!   spectrum. What a material's spectrum says of conductors holds for all of them: they have the same spectrum, or none has one.
+//!   is the sum of shares times reflectances. At a stated wavelength both parts have the hue of this `rgb`. A note says so where
+//!   hues differ that were joined.
+//! - **Texture**: it scales both parts. So all leaves with a share have the same bitmap, or none has one. Leaves that reflect
+//!   nothing need none.
 //! - **Sides**: a blend is two-sided where both its BSDFs are.
 
 use std::{rc::Rc, sync::Arc};
 
-use crate::{Bsdf, Distribution, Lobe, MAX_PARTS, Material, Part, Parts, SpectrumPoint, Texture};
+use crate::{Bsdf, Distribution, Material, SpectrumPoint, Texture};
 
 use super::{
     Reader,
@@ -28,6 +28,8 @@ use super::{
 
 /// Hues closer than this are the same.
 const SAME_HUE: f32 = 1e-3;
+/// Most different leaves of a blend.
+const MAX_LEAVES: usize = 64;
 
 /// What blends are made of.
 #[derive(Debug, PartialEq)]
@@ -52,11 +54,11 @@ impl Leaf {
         !self.colour.spectrum.is_empty()
     }
 
-    fn lobe(&self) -> Lobe {
+    fn bsdf(&self) -> Bsdf {
         let reflectance = self.colour.mean();
         match self.metal {
-            None => Lobe::Diffuse { reflectance },
-            Some((alpha, distribution)) => Lobe::RoughConductor {
+            None => Bsdf::Diffuse { reflectance },
+            Some((alpha, distribution)) => Bsdf::RoughConductor {
                 alpha,
                 distribution,
                 reflectance,
@@ -123,12 +125,11 @@ impl Reader<'_> {
             );
         }
         let mix = a.beside(b, f64::from(weight));
-        let count = mix.leaves.iter().filter(|l| has_share(l));
-        let count = count.filter(|l| !l.1.is_black()).count();
-        match count <= MAX_PARTS {
+        let count = mix.leaves.iter().filter(|l| has_share(l)).count();
+        match count <= MAX_LEAVES {
             true => Ok(mix),
             false => Err(node.fail(format!(
-                "has {count} different parts, expected {MAX_PARTS} at most"
+                "has {count} different parts, expected {MAX_LEAVES} at most"
             ))),
         }
     }
@@ -148,26 +149,19 @@ impl Reader<'_> {
                 "parts of mixes without one reflect their mean at every wavelength",
             );
         }
-        if spectral && !is_simple(&leaves) {
-            leaves = with_one_lambertian(leaves);
+        if !is_simple(&leaves) {
+            if !spectral && have_several_hues(&leaves) {
+                self.note(
+                    "blends.hues",
+                    "of several parts are that of their mean at stated wavelengths",
+                );
+            }
+            leaves = joined(leaves);
         }
         let (bsdf, rgb, spectrum) = match (leaves.as_slice(), pair(&leaves)) {
-            ([(_, one)], _) => (
-                one.lobe().bsdf(),
-                one.colour.rgb,
-                one.colour.spectrum.clone(),
-            ),
+            ([(_, one)], _) => (one.bsdf(), one.colour.rgb, one.colour.spectrum.clone()),
             (_, Some((lambertian, metal))) => mixed(&lambertian.1.colour, metal),
-            _ => {
-                leaves.retain(|l| !l.1.is_black());
-                if !spectral && have_several_hues(&leaves) {
-                    self.note(
-                        "blends.hues",
-                        "of several parts are that of their mean at stated wavelengths",
-                    );
-                }
-                several(&leaves).map_err(|what| node.fail(what))?
-            }
+            _ => return Err(node.fail(too_many(&leaves))),
         };
         let (texture, to_uv) = texture.map_or((None, Matrix::IDENTITY), |(t, m)| (Some(t), m));
         let mut material = Material::diffuse(named(node), rgb);
@@ -213,22 +207,53 @@ fn texture_of(leaves: &[Share]) -> Result<Option<(Arc<Texture>, Matrix)>, &'stat
     }
 }
 
-/// The same with all Lambertians but black ones as one, in the place of the first.
-fn with_one_lambertian(leaves: Leaves) -> Leaves {
-    let united = |l: &Share| l.1.metal.is_none() && !l.1.is_black();
-    let (some, mut rest): (Leaves, Leaves) = leaves.iter().cloned().partition(united);
-    if some.len() < 2 {
-        return leaves;
+/// The same with all Lambertians as one, and conductors that differ in colour alone, each in the place of the first.
+fn joined(leaves: Leaves) -> Leaves {
+    let mut all: Vec<Leaves> = vec![];
+    for leaf in leaves {
+        match all
+            .iter_mut()
+            .find(|group| group[0].1.metal == leaf.1.metal)
+        {
+            Some(group) => group.push(leaf),
+            None => all.push(vec![leaf]),
+        }
     }
-    let colours: Vec<(f64, &Colour)> = some.iter().map(|l| (l.0, &l.1.colour)).collect();
-    let leaf = Leaf {
-        colour: mean_of(&colours),
-        metal: None,
+    let join = |group: Leaves| -> Share {
+        if let [one] = group.as_slice() {
+            return one.clone();
+        }
+        let colours: Vec<(f64, &Colour)> = group.iter().map(|l| (l.0, &l.1.colour)).collect();
+        let texture = group.iter().find_map(|l| l.1.colour.texture.clone());
+        let leaf = Leaf {
+            colour: Colour {
+                texture,
+                ..mean_of(&colours)
+            },
+            metal: group[0].1.metal,
+        };
+        (group.iter().map(|l| l.0).sum(), Rc::new(leaf))
     };
-    let share = some.iter().map(|l| l.0).sum();
-    let place = leaves.iter().position(united).unwrap_or(0);
-    rest.insert(place, (share, Rc::new(leaf)));
-    rest
+    all.into_iter().map(join).collect()
+}
+
+/// Why leaves that were joined are no material.
+fn too_many(leaves: &[Share]) -> String {
+    let metals = leaves.iter().filter_map(|l| l.1.metal);
+    let metals: Vec<String> = metals
+        .map(|(alpha, distribution)| {
+            let name = match distribution {
+                Distribution::Beckmann => "beckmann",
+                Distribution::Ggx => "ggx",
+            };
+            format!("alpha {alpha} ({name})")
+        })
+        .collect();
+    format!(
+        "has conductors of {}, expected one roughness in a material; give all roughconductor parts of the blend one alpha \
+         and distribution, or leave the smaller part out",
+        metals.join(", ")
+    )
 }
 
 /// A Lambertian and a conductor with its share.
@@ -244,46 +269,6 @@ fn mixed(d: &Colour, (share, metal): &Share) -> Assembled {
         weight: w,
     };
     (bsdf, rgb, spectrum_of(Some(d), Some(s)))
-}
-
-/// Leaves that are no simpler material; of those with spectra, one Lambertian at most.
-fn several(leaves: &[Share]) -> Result<Assembled, String> {
-    let part = |(share, leaf): &Share| Part {
-        weight: *share as f32,
-        lobe: leaf.lobe(),
-    };
-    let parts: Vec<Part> = leaves.iter().map(part).collect();
-    let rgb = std::array::from_fn(|k| {
-        let channel = leaves.iter().map(|l| l.0 * f64::from(l.1.colour.rgb[k]));
-        channel.sum::<f64>() as f32
-    });
-    let bsdf = Bsdf::Several {
-        parts: Parts::of(&parts)?,
-    };
-    Ok((bsdf, rgb, spectrum_of_several(leaves)?))
-}
-
-fn spectrum_of_several(leaves: &[Share]) -> Result<Vec<SpectrumPoint>, &'static str> {
-    if !leaves.iter().any(|l| l.1.has_spectrum()) {
-        return Ok(vec![]);
-    }
-    let lambertian = leaves.iter().find(|l| l.1.metal.is_none());
-    let mut conductors = leaves.iter().filter(|l| l.1.metal.is_some());
-    let conductor = conductors.next().map(|l| &l.1.colour);
-    if let Some(first) = conductor
-        && conductors.any(|l| l.1.colour.spectrum != first.spectrum)
-    {
-        return Err(
-            "conductors of one blend differ in their spectra: give all the same <spectrum>, or none",
-        );
-    }
-    let mut rows = spectrum_of(lambertian.map(|l| &l.1.colour), conductor);
-    if lambertian.is_none() {
-        for row in &mut rows {
-            row.specular_reflectance = Some(row.reflectance);
-        }
-    }
-    Ok(rows)
 }
 
 /// True where colours differ by more than their brightness.
