@@ -136,7 +136,8 @@ mod tests {
             ..Abilities::default()
         };
         for (plain, special, ability) in [
-            (export("zarr"), export("sb3d"), "export:formats"),
+            (export("zarr"), export("hdf5"), "export:formats"),
+            (export("webdataset"), export("sb3d"), "export:formats"),
             (grid, mlp, "reconstruct:mlp"),
         ] {
             let version = plain.task.version().to_owned();

@@ -51,7 +51,7 @@ fn job(store: &Path, side: u32, samples: u32) -> String {
         stage("split", "kind = \"split\"\nsource = \"render\"\nsplit = { counts = [2, 1, 1] }"),
         stage(
             "export",
-            &format!("kind = \"export\"\nsource = \"joined\"\nexport = {{ dest = \"{at}/sb3d\", format = \"sb3d\" }}"),
+            &format!("kind = \"export\"\nsource = \"joined\"\nexport = {{ dest = \"{at}/h5\", format = \"hdf5\" }}"),
         ),
         stage(
             "train",

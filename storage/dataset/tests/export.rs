@@ -44,7 +44,8 @@ async fn export_as(format: ExportFormat, dataset: &Dataset, scenes: &[u64], to: 
     let mut export = Exporter::new(format, dataset, scenes, &*store, prefix).unwrap();
     let each = match format {
         ExportFormat::Zarr => 16,
-        ExportFormat::Sb3d => 1,
+        ExportFormat::WebDataset => 8,
+        ExportFormat::Sb3d | ExportFormat::Hdf5 => 1,
     };
     assert_eq!(export.steps(), scenes.len().div_ceil(each));
     for k in 0..export.steps() {
@@ -111,15 +112,29 @@ fn reads(python: &OsStr, script: &str, args: &[OsString]) {
     assert!(output.status.success(), "{args:?}\n{out}\n{err}");
 }
 
-#[test]
-fn a_format_that_went_names_the_script_that_writes_it() {
-    for name in ["hdf5", "webdataset"] {
-        let error = ExportFormat::parse(name).unwrap_err();
-        assert!(error.contains("zarr, sb3d"), "{error}");
-        assert!(error.contains("docs/python/convert.py"), "{error}");
+#[tokio::test]
+async fn python_reads_of_tar_and_hdf5_files_what_the_data_set_holds() {
+    let Some(python) = std::env::var_os("PICOFARM_PYTHON") else {
+        println!(
+            "skipped: set PICOFARM_PYTHON to a Python with numpy, zarr, xarray and h5py to run this test"
+        );
+        return;
+    };
+    for profile in PROFILES {
+        let folder = tempfile::tempdir().unwrap();
+        let (dataset, scenes) = source(folder.path(), profile).await;
+        for format in [ExportFormat::WebDataset, ExportFormat::Hdf5] {
+            let place = folder.path().join(format.name());
+            let done = export_as(format, &dataset, &scenes, &place).await;
+            let written = files(&place);
+            assert_eq!((done.scenes, done.files), (21, written.len() as u64));
+            let source = folder.path().join("source").into_os_string();
+            reads(&python, "read_files.py", &[source, place.clone().into()]);
+            // Again: the same bytes, so nothing conflicts.
+            assert_eq!(export_as(format, &dataset, &scenes, &place).await, done);
+            assert!(files(&place) == written);
+        }
     }
-    let other = ExportFormat::parse("parquet").unwrap_err();
-    assert!(!other.contains("convert.py"), "{other}");
 }
 
 #[tokio::test]
@@ -202,17 +217,23 @@ async fn nothing_damaged_missing_or_oversized_is_exported() {
 async fn the_table_of_scenes_names_a_place_for_each_that_is_there_and_no_number() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, scenes) = source(folder.path(), Profile::default()).await;
-    let place = folder.path().join("packed");
-    export(&dataset, &scenes, &place).await;
-    let table = std::fs::read_to_string(place.join("scenes.csv")).unwrap();
-    let mut lines = table
-        .lines()
-        .map(|line| line.split(',').collect::<Vec<_>>());
-    let column = lines.next().unwrap().iter().position(|c| *c == "file");
-    for line in lines {
-        let file = line[column.unwrap()];
-        assert!(!file.is_empty() && place.join(file).exists(), "{line:?}");
-        assert!(file.parse::<f64>().is_err(), "{file} is taken for a number");
+    for format in [
+        ExportFormat::Zarr,
+        ExportFormat::WebDataset,
+        ExportFormat::Hdf5,
+    ] {
+        let place = folder.path().join(format.name());
+        export_as(format, &dataset, &scenes, &place).await;
+        let table = std::fs::read_to_string(place.join("scenes.csv")).unwrap();
+        let mut lines = table
+            .lines()
+            .map(|line| line.split(',').collect::<Vec<_>>());
+        let column = lines.next().unwrap().iter().position(|c| *c == "file");
+        for line in lines {
+            let file = line[column.unwrap()];
+            assert!(!file.is_empty() && place.join(file).exists(), "{line:?}");
+            assert!(file.parse::<f64>().is_err(), "{file} is taken for a number");
+        }
     }
 }
 

@@ -15,7 +15,7 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// What a worker calls OpenEXR, which not every program writes.
+/// What a worker calls OpenEXR and HDF5, which not every program writes.
 pub const FORMATS: &str = "formats";
 
 /// Packing a data set: one task.
@@ -38,7 +38,7 @@ pub struct ExportSettings {
     /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub scenes: String,
-    /// `zarr` (default) or `sb3d`.
+    /// `zarr` (default), `sb3d`, `webdataset` or `hdf5`.
     #[serde(default = "zarr")]
     pub format: String,
 }
@@ -49,7 +49,7 @@ fn zarr() -> String {
 
 impl ExportTask {
     /// Version of the task.
-    pub const VERSION: &'static str = "export-3";
+    pub const VERSION: &'static str = "export-2";
 }
 
 impl Declared for ExportTask {
@@ -71,7 +71,7 @@ impl TaskKind for ExportTask {
     }
 
     fn variant(&self) -> Option<&'static str> {
-        (self.export.format == "sb3d").then_some(FORMATS)
+        matches!(&*self.export.format, "sb3d" | "hdf5").then_some(FORMATS)
     }
 
     fn check(&self) -> Result<(), SpecError> {

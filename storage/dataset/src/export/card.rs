@@ -5,9 +5,8 @@ use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
-use super::ExportFormat;
+use super::{ExportFormat, plain::about};
 use crate::layout::manifest::{Manifest, sha256_hex};
-use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 
 /// A line of `scenes.csv`.
@@ -55,7 +54,7 @@ const COLUMNS: [(&str, &str, &str); 8] = [
     (
         "missing",
         "sc:Text",
-        "what is not known of the scene, between spaces: its values stand for nothing",
+        "what is not known of the scene, between spaces: its values stand for nothing, and are left out of tar and HDF5 files",
     ),
 ];
 
@@ -126,6 +125,8 @@ fn contents(format: ExportFormat) -> (&'static str, &'static str) {
     match format {
         ExportFormat::Zarr => ("**/c/**", "application/vnd+zarr"),
         ExportFormat::Sb3d => ("*/*", "image/x-exr"),
+        ExportFormat::WebDataset => ("scenes-*.tar", "application/x-tar"),
+        ExportFormat::Hdf5 => ("*.h5", "application/x-hdf5"),
     }
 }
 
@@ -253,41 +254,14 @@ fn open(format: ExportFormat) -> &'static str {
              y = OpenEXR.File(f\"{folder}/lidar_25.exr\").channels()[\"Y\"].pixels  # pixels x bins\n\
              h = y.astype(\"float32\") / aside[\"factor\"]"
         }
-    }
-}
-
-/// What the arrays hold.
-fn about(quantity: Quantity) -> &'static str {
-    match quantity {
-        Quantity::Transient => {
-            "histogram h, radiance per pulse energy [row][column][bin]; times photons_per_unit: photons"
+        ExportFormat::WebDataset => {
+            "import webdataset\nfor sample in webdataset.WebDataset(\"scenes-000000.tar\").decode():\n\
+             \x20   h = sample[\"npz\"][\"transient\"]  # row, column, bin"
         }
-        Quantity::Transient4 => "h of the 4 spots of the 10x10 grid at rows and columns 2 and 7",
-        Quantity::Transient25 => "h of the 25 spots of the 10x10 grid at even rows and odd columns",
-        Quantity::TransientSpots => "h of each spot alone [spot][row][column][bin]",
-        Quantity::Intensity => "sum of h over the bins, before coding",
-        Quantity::Depth => "z-depth, metres; 0 = nothing",
-        Quantity::Range => "distance along the ray, metres; 0 = nothing",
-        Quantity::Normal => "unit normals, camera frame (x right, y down, z forward)",
-        Quantity::Instance => "instance, 0 = nothing",
-        Quantity::Label => {
-            "label, 0 = nothing; the names stand in the manifest, provenance.plan.labels"
+        ExportFormat::Hdf5 => {
+            "import h5py\nwith h5py.File(\"000000.h5\") as f:\n    h = f[\"transient\"][:]  # row, column, bin\n\
+             \x20   print(f.attrs[\"bin_width_m\"], f[\"transient\"].attrs[\"long_name\"])"
         }
-        Quantity::Specular => "1 = mirror",
-        Quantity::Visibility => "[spot][row][column]: 1 = the spot lights the point",
-        Quantity::TwoBouncePath => {
-            "[spot][row][column]: measured optical path of the spot's two-bounce light, metres; 0 = not measured"
-        }
-        Quantity::Rgb => {
-            "colour, sRGB: of rendered scenes a preview under a lamp at the ceiling, shadows and mirrors but no indirect light; not radiometric"
-        }
-        Quantity::Spots => {
-            "[spot]: position and normal (camera frame, metres), path from the laser; NaN = the beam meets nothing"
-        }
-        Quantity::Intrinsics => "fx, fy, cx, cy, pixels",
-        Quantity::Camera => "camera to world",
-        Quantity::Laser => "origin of the laser, camera frame, metres",
-        Quantity::Scale => "photons per unit of h",
     }
 }
 
@@ -321,6 +295,7 @@ fn readme(name: &str, format: ExportFormat, spec: &DatasetSpec, rows: &[Row]) ->
          same to machines. Bin b holds optical path lengths from {} + b·{} m on; light goes 299,792,458 m in a second. \
          No one set a licence here: say which before you publish.\n\n\
          ## Open it\n\n```python\n{}\n```\n\n## Arrays\n\n| name | what it holds |\n| --- | --- |\n{arrays}\n{unknown}\
+         In tar and HDF5 files, `scale` is called `photons_per_unit`, normals are floats, and `visibility` has a byte a pixel and spot.\n\n\
          ## Made by\n\n{}\n",
         description(spec, rows.len()),
         spec.gate.start_m,

@@ -5,8 +5,12 @@
 mod card;
 #[cfg(feature = "formats")]
 mod exr;
+#[cfg(feature = "formats")]
+mod hdf5;
 mod packed;
+mod plain;
 mod sb3d;
+mod webdataset;
 #[cfg(not(feature = "formats"))]
 mod without_formats;
 
@@ -21,9 +25,16 @@ use crate::layout::quantity::Quantity;
 use crate::scenes::dataset::Dataset;
 use crate::store::{folder, objects};
 
+#[cfg(feature = "formats")]
+use hdf5::file as hdf5_file;
 pub(crate) use sb3d::{ASIDE, Aside};
+#[cfg(not(feature = "formats"))]
+use without_formats::file as hdf5_file;
 
 use card::Row;
+
+/// Scenes in a tar file of [`ExportFormat::WebDataset`].
+const TAR: usize = 8;
 
 /// What was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -46,17 +57,23 @@ pub enum ExportFormat {
     Zarr,
     /// The paper's release: a folder a scene, histograms as OpenEXR images in halves.
     Sb3d,
+    /// Tar files of 8 scenes with an `.npz` and a `.json` each, for the `webdataset` library.
+    WebDataset,
+    /// An HDF5 file a scene, with shuffle and gzip.
+    Hdf5,
 }
 
 impl ExportFormat {
     /// All of them.
-    pub const ALL: [Self; 2] = [Self::Zarr, Self::Sb3d];
+    pub const ALL: [Self; 4] = [Self::Zarr, Self::Sb3d, Self::WebDataset, Self::Hdf5];
 
     /// Its name in job files and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Zarr => "zarr",
             Self::Sb3d => "sb3d",
+            Self::WebDataset => "webdataset",
+            Self::Hdf5 => "hdf5",
         }
     }
 
@@ -68,13 +85,7 @@ impl ExportFormat {
         let found = Self::ALL.into_iter().find(|f| f.name() == name);
         found.ok_or_else(|| {
             let names = Self::ALL.map(Self::name).join(", ");
-            let instead = match name {
-                "hdf5" | "webdataset" => {
-                    "; docs/python/convert.py writes HDF5 files and tar files of a data set"
-                }
-                _ => "",
-            };
-            format!("{name:?} is not one of {names}{instead}")
+            format!("{name:?} is not one of {names}")
         })
     }
 }
@@ -125,11 +136,10 @@ impl<'a> Exporter<'a> {
             let what = "expected at least one published scene, found none";
             return Err(DatasetError::invalid("scenes", what));
         }
+        #[cfg(not(feature = "formats"))]
+        without_formats::check(format)?;
         packed::check(source)?;
         if format == ExportFormat::Sb3d {
-            #[cfg(not(feature = "formats"))]
-            return Err(without_formats::missing());
-            #[cfg(feature = "formats")]
             sb3d::check(source.spec())?;
         }
         Ok(Self {
@@ -150,7 +160,8 @@ impl<'a> Exporter<'a> {
     pub fn steps(&self) -> usize {
         match self.format {
             ExportFormat::Zarr => self.scenes.len().div_ceil(packed::PACK),
-            ExportFormat::Sb3d => self.scenes.len(),
+            ExportFormat::WebDataset => self.scenes.len().div_ceil(TAR),
+            ExportFormat::Sb3d | ExportFormat::Hdf5 => self.scenes.len(),
         }
     }
 
@@ -164,11 +175,10 @@ impl<'a> Exporter<'a> {
         if k == 0 {
             self.check_folder().await?;
         }
+        let of = |each: usize| k * each..self.scenes.len().min((k + 1) * each);
         match self.format {
             ExportFormat::Zarr => {
-                let first = k * packed::PACK;
-                let end = self.scenes.len().min(first + packed::PACK);
-                let scenes = &self.scenes[first..end];
+                let scenes = &self.scenes[of(packed::PACK)];
                 let file = self.source.array(Quantity::Transient).layout.key(k as u64);
                 for manifest in packed::pack(self.source, scenes, k, &mut self.out).await? {
                     let row = Row::new(self.rows.len(), &manifest, &file);
@@ -184,6 +194,24 @@ impl<'a> Exporter<'a> {
                 let manifest = self.source.manifest(scene).await?;
                 // With the slash, or else readers of tables take it for a number.
                 self.note(&manifest, &format!("{folder}/"));
+            }
+            ExportFormat::Hdf5 => {
+                let scene = self.source.plain(self.scenes[k]).await?;
+                let name = format!("{:06}.h5", self.scenes[k]);
+                self.out
+                    .put(&name, hdf5_file(&scene, self.source.spec())?.into())
+                    .await?;
+                self.note(&scene.manifest, &name);
+            }
+            ExportFormat::WebDataset => {
+                let name = format!("scenes-{k:06}.tar");
+                let mut tar = webdataset::Tar::new();
+                for scene in &self.scenes[of(TAR)] {
+                    let scene = self.source.plain(*scene).await?;
+                    tar.add(&scene, self.source.spec())?;
+                    self.note(&scene.manifest, &name);
+                }
+                self.out.put(&name, tar.finish()?.into()).await?;
             }
         }
         Ok(())
@@ -212,6 +240,13 @@ impl<'a> Exporter<'a> {
         match self.format {
             ExportFormat::Zarr => packed::writes(self.source, name),
             ExportFormat::Sb3d => scene(name),
+            ExportFormat::Hdf5 => name.strip_suffix(".h5").is_some_and(scene),
+            ExportFormat::WebDataset => {
+                let number = name.strip_prefix("scenes-");
+                number
+                    .and_then(|n| n.strip_suffix(".tar"))
+                    .is_some_and(scene)
+            }
         }
     }
 

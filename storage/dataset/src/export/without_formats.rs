@@ -1,7 +1,18 @@
 //! Errors that say that this program was built without OpenEXR and HDF5.
 
-use super::sb3d::Samples;
-use crate::{BUILD_WITH_FORMATS, WITHOUT_FORMATS, error::DatasetError};
+use super::{ExportFormat, plain::PlainScene, sb3d::Samples};
+use crate::{BUILD_WITH_FORMATS, WITHOUT_FORMATS, error::DatasetError, layout::spec::DatasetSpec};
+
+/// Refuses what this program cannot write, before anything is written.
+///
+/// # Errors
+/// [`DatasetError::Invalid`] at `format`.
+pub(super) fn check(format: ExportFormat) -> Result<(), DatasetError> {
+    match format {
+        ExportFormat::Sb3d | ExportFormat::Hdf5 => Err(missing()),
+        ExportFormat::Zarr | ExportFormat::WebDataset => Ok(()),
+    }
+}
 
 /// Says so.
 ///
@@ -11,7 +22,14 @@ pub(super) fn image(_: (usize, usize), _: Samples) -> Result<Vec<u8>, DatasetErr
     Err(missing())
 }
 
-/// The error of a program that cannot write OpenEXR: [`DatasetError::Invalid`] at `format`.
-pub(super) fn missing() -> DatasetError {
+/// Says so.
+///
+/// # Errors
+/// Always.
+pub(super) fn file(_: &PlainScene, _: &DatasetSpec) -> Result<Vec<u8>, DatasetError> {
+    Err(missing())
+}
+
+fn missing() -> DatasetError {
     DatasetError::invalid("format", format!("{WITHOUT_FORMATS}; {BUILD_WITH_FORMATS}"))
 }
