@@ -1,4 +1,4 @@
-//! The wavelengths that a render is made at.
+//! The wavelengths of a render.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,8 +8,8 @@ pub const MAX_WAVELENGTHS: usize = 4;
 /// Shortest and longest wavelength of a render or of a material's spectrum, nanometres.
 pub const WAVELENGTHS_NM: (f64, f64) = (200.0, 20_000.0);
 
-/// Wavelengths of a laser, nanometres: none, or up to [`MAX_WAVELENGTHS`] that differ and lie in [`WAVELENGTHS_NM`]. The first is the
-/// main one.
+/// Wavelengths of a laser, nanometres: none, or up to [`MAX_WAVELENGTHS`] distinct ones inside
+/// [`WAVELENGTHS_NM`]. The first is the main one.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 #[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
 pub struct Wavelengths {
@@ -18,16 +18,17 @@ pub struct Wavelengths {
 }
 
 impl Wavelengths {
-    /// None: materials reflect as at the laser's own wavelength, whichever that is.
+    /// No wavelengths: materials reflect as at the laser's own wavelength, whichever it is.
     pub const NONE: Self = Self {
         nm: [0.0; MAX_WAVELENGTHS],
         count: 0,
     };
 
-    /// These, in nanometres.
+    /// Creates wavelengths from nanometres.
     ///
     /// # Errors
-    /// Which of them, as `[2]` (empty where all of them are meant), and what was expected.
+    /// Returns the position of the invalid one, as `[2]` (empty if all are meant), and the expected
+    /// value.
     pub fn of(nm: &[f64]) -> Result<Self, (String, String)> {
         let mut all = Self::NONE;
         if nm.len() > MAX_WAVELENGTHS {
@@ -51,17 +52,17 @@ impl Wavelengths {
         Ok(all)
     }
 
-    /// All of them, nanometres.
+    /// Returns all wavelengths, nanometres.
     pub fn nm(&self) -> &[f64] {
         &self.nm[..self.count]
     }
 
-    /// Those after the main one.
+    /// Returns the wavelengths after the main one.
     pub fn others(&self) -> &[f64] {
         self.nm().get(1..).unwrap_or_default()
     }
 
-    /// The main one alone.
+    /// Returns the main wavelength alone.
     pub fn main(&self) -> Self {
         Self {
             nm: self.nm,
@@ -69,7 +70,7 @@ impl Wavelengths {
         }
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no wavelengths.
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
