@@ -496,7 +496,7 @@ fn lately(facts: &JobFacts) -> String {
     )
 }
 
-/// Compares a task's memory with that of the largest worker, if all are too small.
+/// Describes the memory that a task needs and that the largest of these too small workers has.
 fn largest(small: &[&Candidate]) -> Option<String> {
     let memory = |c: &&&Candidate| c.lacks_memory.map(|(needed, there)| (there, needed));
     let largest = small.iter().max_by_key(memory)?;

@@ -32,7 +32,7 @@ fn stage_ref() -> StageRef {
     }
 }
 
-/// Returns a stage that holds these pending tasks.
+/// Returns a stage with these pending tasks.
 fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> Stage {
     let existing: Vec<Run> = (0..total)
         .filter(|i| cut.get(*i as usize) == Some(&true))

@@ -1,4 +1,4 @@
-//! Decides which worker may take tasks of which job, and how many at once. Pure.
+//! Decides which worker may take tasks of each job, and how many at once. Pure.
 
 use picofarm_proto::model::{
     Abilities, SceneKind, StageSpec,

@@ -55,7 +55,7 @@ pub enum RangeEvent {
     },
 }
 
-/// An event that is not possible in the range's state.
+/// An event that the range's state does not allow.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{event} cannot happen to range {range} ({state})")]
 pub struct Illegal {

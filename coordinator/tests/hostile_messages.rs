@@ -144,7 +144,7 @@ fn request_of(message: Say) -> wire::SessionRequest {
     }
 }
 
-/// Returns a job that is accepted.
+/// Returns a valid job.
 fn good() -> JobSpec {
     serde_json::from_str(
         r#"{"name": "good", "scenes": {"kind": "primitive", "count": 3},
@@ -161,7 +161,7 @@ fn rendering(spec: &mut JobSpec) -> &mut RenderTask {
     }
 }
 
-/// Returns two stages, of which the second needs the first.
+/// Returns two stages; the second needs the first.
 fn graph() -> JobSpec {
     serde_json::from_str(
         r#"{"name": "graph", "priority": 3, "limits": {"max_workers": 2, "deadline": "2030-01-01T00:00:00Z"}, "stage": [
@@ -397,7 +397,7 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
     server.serves().await;
 
     for case in 0..cases(150) {
-        // A session of random messages, most of which begin correctly.
+        // A session of random messages; most begin correctly.
         let mut said = draws.next(&vec(say(), 0..40));
         if case % 4 != 0 {
             let id = Uuid::from_u128(u128::from(case % 4)).to_string();

@@ -5,7 +5,7 @@ use std::{fmt, str::FromStr};
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-/// The error for a text that is no id of the expected kind.
+/// The error for a text without a valid id of the expected kind.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{text:?} is not a {kind} id; expected a UUID such as {}", Uuid::nil())]
 pub struct IdError {

@@ -132,7 +132,7 @@ impl Caller {
         self.entry.as_ref().map_or(&[], |entry| &entry.maintainer)
     }
 
-    /// Returns the projects of which the caller is a member or maintainer.
+    /// Returns the projects in which the caller is a member or maintainer.
     fn projects(&self) -> impl Iterator<Item = &str> {
         let entry = self.entry.iter();
         entry

@@ -220,7 +220,7 @@ impl Tokens {
         found
     }
 
-    /// Creates a token for a new caller and adds it, with the projects of which the caller is a
+    /// Creates a token for a new caller and adds it, with the projects in which the caller is a
     /// member and a maintainer. The token never expires.
     ///
     /// # Errors

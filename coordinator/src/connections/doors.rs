@@ -11,7 +11,8 @@ use std::{
 
 use tokio_util::sync::CancellationToken;
 
-/// Waiting time of a full server for each further connection, and the interval of checks meanwhile.
+/// Delay of each further connection while all silent places are taken, and the interval of checks
+/// meanwhile.
 const CROWDED: Duration = Duration::from_millis(20);
 const ASK_AGAIN: Duration = Duration::from_millis(2);
 

@@ -72,7 +72,7 @@ pub(crate) struct Certificates {
 /// certificate admits nobody. Connections keep the certificates with which they began. Changed
 /// client certificate authorities that are not in force could admit a revoked client. If they
 /// cannot be used within [`GRACE`], every caller is refused. After a change, callers on older
-/// connections are refused, and reconnect with a certificate that is checked again.
+/// connections are refused, and reconnect with a certificate to be checked again.
 pub(crate) fn follow(
     files: TlsFiles,
     loaded: Loaded,

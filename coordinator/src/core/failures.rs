@@ -87,7 +87,7 @@ impl Core {
         }
     }
 
-    /// Removes a task from the lease of a worker that is not trusted. The task is pending at once,
+    /// Removes a task from the lease of an untrusted worker. The task is pending at once,
     /// without a charge.
     pub(super) fn withdraw(&mut self, range: &Range, task: u64, message: &str, now_ms: i64) {
         let attempt = Attempt {

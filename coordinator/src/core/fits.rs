@@ -8,7 +8,7 @@ use crate::place;
 /// Distinct reasons stored for each stage.
 const REASONS: usize = 3;
 
-/// The connected workers with regard to a job that is not recorded yet.
+/// The connected workers with regard to a job before it is recorded.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct Fits {
     /// Workers with regard to each stage.

@@ -164,18 +164,18 @@ struct WorkerEntry {
     incarnation: Incarnation,
     name: String,
     version: String,
-    /// When its session began.
+    /// Time at which the session began, Unix milliseconds.
     since_ms: i64,
-    /// When it was last heard of.
+    /// Time of its last message, Unix milliseconds.
     heard_ms: i64,
-    /// When it must end, where that is known.
+    /// Time at which it must end, if known, Unix milliseconds.
     ends_ms: Option<i64>,
     abilities: Abilities,
     credits: u32,
     leases: BTreeSet<RangeId>,
-    /// It holds a range under suspicion and gets nothing else.
+    /// Whether it runs a range under suspicion, and therefore gets nothing else.
     quarantined: bool,
-    /// It has been asked to end, and gets nothing more.
+    /// Whether it was asked to end, and therefore gets nothing more.
     drains: bool,
 }
 

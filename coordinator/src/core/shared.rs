@@ -3,7 +3,7 @@
 //! therefore share the work.
 //!
 //! This instance knows the tasks of its own workers, and those of other instances' workers as of
-//! the last news (once a second). A task that is not known yet runs twice and gives the same bytes.
+//! the last news (once a second). A task not yet reported runs twice and gives the same bytes.
 //! Results that others have finished are found when tasks are claimed, and again by the worker that
 //! begins a task.
 

@@ -71,7 +71,7 @@ impl Wait {
     }
 }
 
-/// Returns the store that is blamed when a task fails to store its result.
+/// Returns the store blamed for a task's failure to store its result.
 pub(super) fn store_of(task: &TaskSpec) -> &str {
     task.results().store.trim_end_matches('/')
 }
@@ -197,7 +197,7 @@ impl Stores {
         patient(backoff).after(*times)
     }
 
-    /// Forgets the damage recorded for a task that is done.
+    /// Forgets the damage recorded for a finished task.
     pub(super) fn mended(&mut self, task: (StageRef, u64)) {
         self.damaged.remove(&task);
     }

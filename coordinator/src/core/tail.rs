@@ -76,8 +76,8 @@ impl Core {
         }
     }
 
-    /// Cuts the second half off the lease of a stage that has the most unfinished tasks, if that is
-    /// worth it.
+    /// Cuts the second half off the lease of a stage that has the most unfinished tasks, if the
+    /// remainder is long enough.
     fn trim(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let Some(mean) = self.sets[entry.set].timing.mean() else {

@@ -168,7 +168,7 @@ fn length(prefix: &[u8]) -> Option<u64> {
     Some(u32::from_be_bytes(length).into())
 }
 
-/// A request body of which the beginning was read.
+/// A request body after its beginning was read.
 struct Begun {
     first: VecDeque<Frame<Bytes>>,
     rest: Body,

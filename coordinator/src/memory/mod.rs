@@ -371,7 +371,7 @@ impl Account {
         }
     }
 
-    /// Counts memory that is already in use, whatever the bounds.
+    /// Counts memory already in use, whatever the bounds.
     fn count(&self, bytes: u64) -> Charge {
         self.memory.lock().add(self, bytes);
         Charge {

@@ -11,7 +11,7 @@ use crate::{
     plan::changes,
 };
 
-/// Earlier stages with a known speed that are considered for each stage of a plan.
+/// Earlier stages with speeds to be looked up, for each stage of a plan.
 pub(super) const SIMILAR: usize = 3;
 /// Uncertainty of a speed measured with the same settings, as a factor.
 const SAME: f64 = 1.5;

@@ -11,7 +11,7 @@ use crate::{PATIENCE, Server, start, works};
 
 const MIB: u64 = 1 << 20;
 
-/// Returns a text of many short strings. It is not a spec, but it is charged before that is known.
+/// Returns a text of many short strings. It is no spec, but the charge comes before that check.
 fn dense(strings: usize) -> wire::PlanJobRequest {
     let json = format!("[{}\"a\"]", "\"a\",".repeat(strings));
     wire::PlanJobRequest {

@@ -1,22 +1,23 @@
-//! The commit protocol of tasks, leases, instances (coordinators over one database) and the collector of
-//! orphaned objects, checked exhaustively within bounds: every interleaving of two coordinators, two
-//! workers and a collector over one database and one object store.
+//! The commit protocol of tasks, leases, instances (coordinators over one database) and the
+//! collector of orphaned objects, checked exhaustively within bounds: every interleaving of two
+//! coordinators, two workers and a collector over one database and one object store.
 //!
 //! * `rules.rs`: the checks of the protocol, their places in the product, and the bounds.
-//! * `state.rs`: the state. `instances.rs`, `workers.rs`: the steps of each process. `model.rs`: the
-//!   actions and the laws.
+//! * `state.rs`: the state. `instances.rs`, `workers.rs`: the steps of each process. `model.rs`:
+//!   the actions and the laws.
 //! * `reach.rs`: the job's end can be reached from every state.
 //!
-//! Faults are modelled as follows. *Stopped* processes take no step for any length of time while leases
-//! and instance rows expire around them. Nothing in the model keeps a process from continuing with old
-//! knowledge. *Killed* processes lose their knowledge and restart under a new name. *Messages* stay in
-//! the network forever once sent: they may arrive late, out of order, repeatedly, at either instance, or
-//! never, which models loss. An instance decides from its memory and writes in one transaction. Because
-//! no other process sees its memory, the decision and the write are one step even if time passes between
-//! them. The model has no time: anything that a clock ends may end at any moment.
+//! Faults are modelled as follows. *Stopped* processes take no step for any length of time while
+//! leases and instance rows expire around them. Nothing in the model keeps a process from
+//! continuing with old knowledge. *Killed* processes lose their knowledge and restart under a new
+//! name. *Messages* stay in the network forever once sent: they may arrive late, out of order,
+//! repeatedly, at either instance, or never, which models loss. An instance decides from its memory
+//! and writes in one transaction. Because no other process sees its memory, the decision and the
+//! write are one step even if time passes between them. The model has no time: anything that a
+//! clock ends may end at any moment.
 //!
-//! Faults of coordinators affect process 0 only, and the first lease goes to worker 0, because the others
-//! are symmetric.
+//! Faults of coordinators affect process 0 only, and the first lease goes to worker 0, because the
+//! others are symmetric.
 
 mod instances;
 mod model;

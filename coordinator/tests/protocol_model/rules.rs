@@ -67,9 +67,9 @@ pub struct Bounds {
     pub tasks: u8,
     /// Epochs. In the last one the lease does not expire and the worker is not killed.
     pub epochs: u8,
-    /// Kills of workers, each of which restarts as a new incarnation.
+    /// Kills of workers. Each killed worker restarts as a new incarnation.
     pub worker_kills: u8,
-    /// Kills of coordinators, each of which restarts as a new instance.
+    /// Kills of coordinators. Each killed coordinator restarts as a new instance.
     pub instance_kills: u8,
     /// Running coordinators that are stopped until their instance's row has expired.
     pub instance_stops: u8,

@@ -18,7 +18,7 @@ use tonic::{
     transport::Channel,
 };
 
-/// A caller, its role, and the projects of which it is a member and a maintainer.
+/// A caller, its role, and the projects in which it is a member and a maintainer.
 pub const CALLERS: [(&str, Role, &str, &str); 7] = [
     ("ada", Role::Submit, "lidar", ""),
     ("bob", Role::Submit, "", ""),

@@ -53,7 +53,7 @@ impl LockedFile {
     }
 
     /// Waits for the lock of a file. A missing file is created with access for its owner only. A
-    /// new file that is not replaced is removed again.
+    /// new file is removed again if it is not replaced.
     ///
     /// # Errors
     /// Returns the errors of [`Self::open`], or an error if the file or its folder cannot be

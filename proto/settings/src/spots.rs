@@ -8,8 +8,8 @@ use serde::{
     ser::SerializeMap as _,
 };
 
-/// Positions of the laser's spots in the camera's view. Written as `25`, `{ random = 16 }` or `{ at
-/// = [[0.5, 0.5], [0.2, 0.7]] }`.
+/// Positions of the laser's spots in the camera's view. Written as `25`, `{ random = 16 }` or
+/// `{ at = [[0.5, 0.5], [0.2, 0.7]] }`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Spots {
     /// A square grid of 1, 4, 16, 25 or 100 spots.

@@ -46,7 +46,7 @@ where
     })
 }
 
-/// Adds the field to a failed check.
+/// Converts a failed check to an error about the field.
 fn checked<T>(value: Result<T, String>, field: &'static str) -> Result<T, ConvertError> {
     value.map_err(|what| ConvertError::Invalid { field, what })
 }

@@ -1,4 +1,4 @@
-//! Log lines of tasks and the amount that is kept. Worker and coordinator count by the same rule:
+//! Log lines of tasks, and their limits. Worker and coordinator count by the same rule:
 //! the worker to avoid sending more, the coordinator because it trusts no worker.
 
 use std::fmt;

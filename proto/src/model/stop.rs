@@ -6,7 +6,7 @@
 //!   Hyperparameter Tuning", MLSys 2020). A trial that reaches a rung continues if it is among the
 //!   best 1/factor of the trials that have reached the rung by then.
 //! - **Median** is the rule of Optuna's `MedianPruner`, after Vizier's (Golovin et al., KDD 2017).
-//!   A trial stops at a check if its best value so far is worse than the median of the others' best
+//!   A trial stops at a check if its best value so far is worse than the median of the others'
 //!   values at that epoch. Vizier compares with running averages over epochs instead. The error of
 //!   a network falls so fast at first that such an average describes mostly the first epochs, and
 //!   hardly any trial would stop. Other trials count once they have come as far; they need not have

@@ -3,11 +3,11 @@
 //!
 //! ```toml
 //! [stage.sweep]
-//! trials = 27                                   # drawn at random; without it, the whole grid
-//! stop = { halving = { first = 3, factor = 3 } }    # after 3, 9, 27, … epochs only the best third goes on
+//! trials = 27                                       # drawn at random; without it, the whole grid
+//! stop = { halving = { first = 3, factor = 3 } }    # best third goes on after 3, 9, … epochs
 //! over = { lr = { log = [1e-4, 1e-1] }, width = [8, 16], levels = { int = [2, 4] } }
 //! [stage.train]
-//! model = "depth"                               # trials are depth.0, depth.1, …; the best of them becomes depth
+//! model = "depth"                                   # trials depth.0, …; the best becomes depth
 //! net = { width = "{width}", levels = "{levels}" }
 //! optimise = { learning_rate = "{lr}", epochs = 81 }
 //! ```
@@ -76,7 +76,7 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
         return Ok(vec![stage]);
     };
     let fail = |field: &str, what: String| Err(SpecError::new(format!("stage.{field}"), what));
-    // The location of the store does not count, only its content.
+    // The data set counts, the location of its store does not.
     let source = stage.get("source").map(|s| s.get("dataset").unwrap_or(s));
     let described = json!([
         source,

@@ -188,7 +188,7 @@ impl TaskKind for RenderTask {
         let parts = match self.parts {
             1 => 0.0,
             // Parts are read, decoded and put into the image one after the other. The allocator
-            // keeps the memory of the last one for a second.
+            // still keeps the memory of the previous one.
             _ => 3.0 * rendering.images() + rendering.paths() * LIGHT_PATHS,
         };
         Some(rendering.coded() + parts)

@@ -23,9 +23,9 @@ const TILE_SUMS: (f64, f64) = (3.0, 7.0);
 /// without mirrors and glass need none, but only the scene shows that.
 pub(in crate::model) const LIGHT_PATHS: f64 = 0.25;
 
-/// Bytes of a triangle while the tree over the scene is built, and of one that is kept during
-/// rendering, including the scene's own and excluding those counted with the program. Measured in
-/// rooms of 90,000 to 360,000 triangles.
+/// Bytes of a triangle while the tree over the scene is built, and of one kept during rendering,
+/// including the scene's own and excluding those counted with the program. Measured in rooms of
+/// 90,000 to 360,000 triangles.
 const BUILT: f64 = 750.0;
 const KEPT: f64 = 300.0;
 const COUNTED: f64 = 15e3;
