@@ -144,7 +144,7 @@ impl Core {
         self.block(worker, store.unwrap_or_default(), why);
     }
 
-    /// Blocks the workers that reported a result which another one has replaced. `by` reported the
+    /// Blocks the worker that reported a result which another one has replaced. `by` reported the
     /// replacement.
     pub(crate) fn overruled(
         &mut self,

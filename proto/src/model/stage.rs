@@ -32,8 +32,8 @@ pub struct StageSpec {
     #[serde(skip_serializing_if = "Resources::is_none")]
     pub resources: Resources,
     /// Identities (UUIDs) of the stage's stores, by place. A worker with a different store at a
-    /// place refuses the task. Filled in by the submission if it can reach the stores; not a part
-    /// of any key.
+    /// place does not use it. Filled in by the submission if it can reach the stores; not a part of
+    /// any key.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub stores: BTreeMap<String, String>,
     /// The work of the stage's tasks.
