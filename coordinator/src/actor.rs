@@ -1,5 +1,6 @@
-//! The one task that owns the core. It takes what has arrived, claims the tasks that are wanted, lets the core decide,
-//! makes the outcome durable in one commit, and only then answers: whatever waits meanwhile forms the next commit.
+//! The task that owns the core. It receives commands, claims the tasks that workers want, lets the
+//! core decide, and commits the outcome. It answers only after the commit. Commands that arrive
+//! during a commit form the next batch.
 
 use std::{
     collections::{HashMap, hash_map::Entry},
@@ -38,39 +39,40 @@ use crate::{
     trace,
 };
 
-/// Messages handled in one commit.
+/// Most commands handled in one commit.
 const BATCH: usize = 4096;
-/// How long to wait before trying a catalog again that failed.
+/// Delay before the catalog is tried again after a failure.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
-/// Claims in one turn at most; the rest waits for the next turn.
+/// Most claims in one turn. Further claims wait for the next turn.
 const ROUNDS: usize = 8;
-/// How often the catalog hears that this instance lives, and is asked for news.
+/// Interval at which this instance renews its registration in the catalog and fetches news.
 const BEAT: Duration = Duration::from_secs(1);
-/// Least time between two beats, whatever the hints.
+/// Shortest interval between two beats, even if the catalog reports changes more often.
 const BEAT_AT_LEAST: Duration = Duration::from_millis(100);
 
-/// A job that was to be read and is not known after so long is read again.
+/// A job is read again if it is still unknown this long after its read began.
 const READ_AGAIN: Duration = Duration::from_secs(30);
-/// Disputed reports for which stores are asked at a time; of more, what is recorded stands.
+/// Most disputed reports that are checked against a store at a time. For further reports the
+/// recorded result stands.
 const DISPUTES: usize = 64;
 
-/// A question whose answer may be an error in words.
+/// Sends the answer to a request, or the reason for its refusal.
 pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
 
-/// Why a request was not granted.
+/// The reason why a request was refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Refusal {
     NoSuchJob(JobId),
     Denied(String),
     NotNow(String),
-    /// The catalog cannot hold what was sent.
+    /// The catalog rejects the content of the request.
     Content(String),
     TooMany(String),
     Spec(SpecError),
     Catalog(String),
 }
 
-/// Answer to a submission.
+/// The answer to a submission.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Submitted {
     pub job: JobId,
@@ -78,32 +80,34 @@ pub(crate) struct Submitted {
     pub plan: JobPlan,
 }
 
-/// What the rpc modules ask of the actor.
+/// A request of the rpc modules to the actor.
 pub(crate) enum Command {
     Open {
         session: SessionId,
         hello: WorkerHello,
         say: mpsc::Sender<Say>,
-        /// Heartbeats of the session that wait here to be handled.
+        /// The session's heartbeats that wait in the queue.
         waiting: Waiting,
-        /// The worker is on the coordinator's machine.
+        /// Whether the worker runs on the coordinator's machine.
         here: bool,
     },
     Worker(SessionId, FromWorker),
-    /// Reports whose store was looked into.
+    /// Reports that were checked against their store.
     Verified {
         store: String,
         reports: Vec<(Reported, Verdict)>,
-        /// The store turned out to be another one than that of the workers.
+        /// Whether the store that was checked is not the one that the workers write to.
         blind: bool,
     },
-    /// A report of another result than the recorded one, and what became of that record.
+    /// A report that differs from the recorded result, with the ruling on the record.
     Judged(SessionId, Finished, Ruling),
-    /// The catalog has failed to write beside the actor: a new life begins, as when it fails to write here.
+    /// A catalog write outside the actor failed. A new life begins, as after a failed write of the
+    /// actor.
     Broken(CatalogError),
-    /// A job that was recorded, if it is active; otherwise there is only something to look at.
+    /// A job was recorded. Contains its content if the job is active; otherwise only watchers are
+    /// notified.
     Learn(Option<Box<Learnt>>, Reply<()>),
-    /// What is known here of a job, or of all.
+    /// Returns this instance's knowledge of one job, or of all jobs.
     Overlay(Option<JobId>, Reply<Overlay>),
     Cancel {
         job: JobId,
@@ -119,9 +123,9 @@ pub(crate) enum Command {
     Drain(String, Reply<u32>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
-    /// Which connected workers could run a job that is planned.
+    /// Returns which connected workers could run a planned job.
     Fits(Arc<JobSpec>, Reply<Fits>),
-    /// What the instance knows, without asking the catalog.
+    /// Returns this instance's knowledge without a query to the catalog.
     Look(Reply<Look>),
     LookAt {
         job: JobId,
@@ -131,49 +135,50 @@ pub(crate) enum Command {
     },
 }
 
-/// Which of two results of a task counts.
+/// Decides which of two results of a task counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Ruling {
-    /// The reported one: the record of the other is gone. In words.
+    /// The reported result counts, because the record of the other one was dropped. Contains the
+    /// reason.
     Overruled(String),
-    /// The recorded one.
+    /// The recorded result counts.
     Stands,
-    /// That cannot be found out from here.
+    /// This coordinator cannot find out which result counts.
     Unknown,
 }
 
-/// Whether a store holds what was reported.
+/// The result of checking a report against its store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// It does.
+    /// The store contains the reported result.
     Held,
-    /// That cannot be found out from here.
+    /// This coordinator cannot check the store.
     Unknown,
-    /// It does not: why the report is refused.
+    /// The store does not contain the reported result. Contains the reason for the refusal.
     Contradicted(String),
 }
 
-/// What a worker says in its session.
+/// A message of a worker in its session.
 pub(crate) enum FromWorker {
     Credit(u32),
-    /// With the milliseconds until the worker must end, where that is known.
+    /// Contains the milliseconds until the worker must end, if known.
     Heartbeat(Vec<LeaseRef>, Vec<TaskProgress>, Option<u64>),
     Done(Finished),
     Failed(Failure),
-    /// A report on this task that says what cannot be: why.
+    /// A report with impossible values on this task. Contains the reason.
     Unusable(LeaseRef, u64, String),
     Release(LeaseRef, String),
     Log(TaskLog),
     Closed,
 }
 
-/// What the actor runs with.
+/// The environment in which the actor runs.
 pub(crate) struct Actor {
     pub catalog: Arc<dyn Catalog>,
     pub settings: Settings,
     pub tick: Duration,
     pub clock: Clock,
-    /// Grows with every change that people may want to see.
+    /// Increases with every change that clients may want to display.
     pub revision: watch::Sender<u64>,
     pub metrics: Arc<Metrics>,
     pub health: Arc<Health>,
@@ -182,58 +187,59 @@ pub(crate) struct Actor {
     pub aside: Arc<dyn Aside>,
 }
 
-/// What takes too long for the actor, and comes back as a command.
+/// Work too slow for the actor. Each result comes back as a command.
 pub(crate) trait Aside: Send + Sync {
-    /// Reads a job that the actor has heard of: [`Command::Learn`].
+    /// Reads a job that the actor does not know yet and sends [`Command::Learn`].
     fn learn(&self, job: JobId);
-    /// Asks the store whether a report or what is recorded instead is right: [`Command::Judged`]. `false` where no store can
-    /// be asked; then nothing comes.
+    /// Checks against the store whether a report or the recorded result is right and sends
+    /// [`Command::Judged`]. Returns `false`, and sends nothing, if no store can be checked.
     fn judge(&self, session: SessionId, report: &Finished, dispute: Dispute) -> bool;
-    /// Drops what is recorded instead of a report on which two workers agree: [`Command::Judged`].
+    /// Replaces the recorded result by a report on which two workers agree and sends
+    /// [`Command::Judged`].
     fn replace(&self, session: SessionId, report: &Finished, dispute: Dispute);
-    /// Whether any store can be looked into.
+    /// Returns whether any store can be checked.
     fn looks(&self) -> bool;
-    /// Looks for reported results in their store: [`Command::Verified`].
+    /// Checks reported results against their store and sends [`Command::Verified`].
     fn verify(&self, store: String, reports: Vec<Reported>);
 }
 
-/// A report of another manifest than the one that is recorded.
+/// A report with a manifest that differs from the recorded one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Dispute {
     pub stage: StageRef,
     pub recorded: [u8; 32],
 }
 
-/// What the catalog holds for the tasks that were just reported.
+/// The recorded manifest hash of each task in a batch of reports.
 type Known = HashMap<(StageRef, u64), Option<[u8; 32]>>;
 
-/// One life of a core: from a load of the catalog to the first failure to write it.
+/// One life of a core, from a load of the catalog to the first failed write.
 struct Life<'a> {
     actor: &'a Actor,
     core: Core,
     sessions: Sessions,
     tally: Tally,
-    /// Of reports that are not durable yet.
+    /// Spans of the reports that are not durable yet.
     commits: Vec<Span>,
-    /// By the clock that counts stalls and suspends: when that was looked at last.
+    /// Time at which stalls were last checked, by the clock that also counts suspended time.
     looked_ms: i64,
-    /// Memory that the specs of jobs take that have not ended.
+    /// Memory used by the specs of the jobs that have not ended.
     kept: HashMap<JobId, u64>,
-    /// Jobs that are being read, and since when.
+    /// Jobs that are being read, with the time at which each read began.
     learning: HashMap<JobId, Instant>,
-    /// Reports about which a store is being asked.
+    /// Number of reports that are being checked because they differ from the record.
     disputes: usize,
-    /// Stores that are being looked into, and the reports that wait until that is done.
+    /// Stores that are being checked, with the reports that wait for the next check.
     looking: HashMap<String, Vec<Reported>>,
 }
 
 impl Actor {
-    /// Runs until `stop`. When the catalog fails, sessions end (workers keep computing and come back), and the
-    /// state is loaded afresh.
+    /// Runs until `stop`. If the catalog fails, the sessions end and the state is loaded again.
+    /// Workers keep computing and reconnect.
     pub(crate) async fn run(self, mut commands: mpsc::Receiver<Command>) {
         while !self.stop.is_cancelled() {
             let life = async { self.begin().await?.run(&mut commands).await };
-            // A panic is a bug, but no reason to drop everyone: the state is loaded afresh.
+            // A panic is a bug, but no reason to end the process: the state is loaded again.
             let (brief, why) = match AssertUnwindSafe(life).catch_unwind().await {
                 Ok(Ok(())) => break,
                 Ok(Err(error)) => (error.brief(), error.to_string()),
@@ -248,7 +254,7 @@ impl Actor {
                 () = tokio::time::sleep(RETRY_AFTER) => {}
                 () = self.stop.cancelled() => {}
             }
-            // Those who asked meanwhile get an error at once rather than kept waiting.
+            // Requests that arrived meanwhile fail at once instead of waiting.
             while let Ok(command) = commands.try_recv() {
                 refuse(command, &why);
             }
@@ -296,7 +302,7 @@ impl Life<'_> {
     async fn run(mut self, commands: &mut mpsc::Receiver<Command>) -> Result<(), CatalogError> {
         let mut tick = tokio::time::interval(self.actor.tick);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        // The first beat at once: news that are missed between loading and now come with it.
+        // The first beat comes at once, because it brings the news missed between loading and now.
         let mut beaten: Option<Instant> = None;
         let mut hinted = false;
         let mut batch = Vec::with_capacity(BATCH);
@@ -309,7 +315,8 @@ impl Life<'_> {
                 Some(at) => BEAT.saturating_sub(at.elapsed()),
             };
             if due.is_zero() {
-                // Not left to the timer below: while messages keep coming, one made anew each turn is never heard.
+                // A due beat must not wait for the timer below, which never fires while
+                // messages keep arriving: each turn starts a new one.
                 beaten = Some(Instant::now());
                 hinted = false;
                 self.beat().await?;
@@ -322,10 +329,11 @@ impl Life<'_> {
                         continue;
                     }
                     _ = tick.tick() => {
-                        // In this order: a stall between the two is seen with the next tick.
+                        // This order matters: a stall between the two calls is noticed at the next
+                        // tick.
                         let now = self.now();
                         self.after_stall();
-                        // Whoever's heartbeat waits here is not late.
+                        // A worker with a heartbeat in the queue is not late.
                         for session in self.sessions.waiting() {
                             self.core.spare(session, now);
                         }
@@ -340,7 +348,8 @@ impl Life<'_> {
                             return self.end().await;
                         }
                         self.actor.metrics.handled(n);
-                        // First of all: what has just come may be about leases that ran out meanwhile.
+                        // This comes first, because the batch may be about leases that ran out
+                        // during a stall.
                         self.after_stall();
                         self.handle(&mut batch).await?;
                     }
@@ -351,8 +360,8 @@ impl Life<'_> {
         }
     }
 
-    /// Claims and grants until nothing more can be granted now: what a claim did not bring is
-    /// another job's turn.
+    /// Claims and grants until no further grant is possible. Tasks that one claim did not bring are
+    /// left to the next job.
     async fn serve(&mut self) -> Result<(), CatalogError> {
         for _ in 0..ROUNDS {
             let claimed = self.supply().await?;
@@ -364,8 +373,9 @@ impl Life<'_> {
         self.flush().await
     }
 
-    /// A stall of this process (a suspended machine, a stopped debugger, a catalog that does not answer) is no worker's
-    /// fault: its leases begin anew. To be called before anything is judged by the clock.
+    /// Extends all leases after a stall of this process, because a stall is no worker's fault. A
+    /// stall is a suspended machine, a stopped debugger or a catalog that does not answer. Call it
+    /// before any decision that depends on the clock.
     fn after_stall(&mut self) {
         let passed = self.actor.clock.passed_ms();
         let stall = passed - std::mem::replace(&mut self.looked_ms, passed);
@@ -377,19 +387,20 @@ impl Life<'_> {
         }
     }
 
-    /// The orderly end of an instance: what nobody runs is free for others.
+    /// Ends the instance in order: pending ranges without a worker become free for other instances.
     async fn end(mut self) -> Result<(), CatalogError> {
         self.core.give_back();
         self.flush().await
     }
 
-    /// Claims what connected workers could run; `false` where nothing is to be claimed.
+    /// Claims tasks for connected workers. Returns `false` if there is nothing to claim.
     async fn supply(&mut self) -> Result<bool, CatalogError> {
         let wants = self.core.wants(self.now());
         if wants.is_empty() {
             return Ok(false);
         }
-        // What is noted so far first: the catalog must know this instance's ranges as they are.
+        // Pending changes go first, because the catalog must know the current ranges of this
+        // instance.
         self.flush().await?;
         let claims = self.actor.catalog.claim(&wants).await?;
         let now = self.now();
@@ -399,7 +410,7 @@ impl Life<'_> {
         Ok(true)
     }
 
-    /// Tells the catalog that this instance lives, and hears what is new.
+    /// Renews this instance's registration in the catalog and applies the news.
     async fn beat(&mut self) -> Result<(), CatalogError> {
         self.core.give_back();
         self.flush().await?;
@@ -422,7 +433,7 @@ impl Life<'_> {
         Ok(())
     }
 
-    /// Takes note of a job that is new here.
+    /// Adds a job new to this instance.
     fn learn(&mut self, learnt: Learnt) {
         self.learning.remove(&learnt.job.id);
         if !self.core.knows(learnt.job.id) {
@@ -433,7 +444,7 @@ impl Life<'_> {
         }
     }
 
-    /// Says how much memory the specs of jobs take that have not ended.
+    /// Records how much memory the specs of unfinished jobs use.
     fn note_kept(&self) {
         self.actor.memory.keep_jobs(self.kept.values().sum());
     }
@@ -443,7 +454,7 @@ impl Life<'_> {
     }
 
     async fn handle(&mut self, batch: &mut Vec<Command>) -> Result<(), CatalogError> {
-        // What the catalog holds for the tasks reported, in one go.
+        // The recorded results of all reported tasks are fetched with one query.
         let reports = batch.iter().flat_map(|command| match command {
             Command::Worker(_, FromWorker::Done(report)) | Command::Judged(_, report, _) => {
                 vec![report]
@@ -469,7 +480,7 @@ impl Life<'_> {
                     waiting,
                     here,
                 } => {
-                    // The worker brings its leases along, from whichever coordinator.
+                    // The worker keeps its leases, whichever coordinator granted them.
                     self.flush().await?;
                     let owned = self.actor.catalog.adopt(hello.id).await?;
                     let now = self.now();
@@ -568,7 +579,8 @@ impl Life<'_> {
         Ok(())
     }
 
-    /// Has reported results looked for in their store: one look at a time, since the next one takes what has come meanwhile.
+    /// Starts a check of reported results against their store. Each store has one check at a time;
+    /// reports that arrive meanwhile are part of the next check.
     fn look_for(&mut self, store: String, reports: Vec<Reported>) {
         match self.looking.entry(store) {
             Entry::Occupied(mut waiting) => waiting.get_mut().extend(reports),
@@ -580,7 +592,7 @@ impl Life<'_> {
         }
     }
 
-    /// Commits or refuses reports whose store was looked into.
+    /// Commits or refuses the reports that were checked against their store.
     fn verified(
         &mut self,
         store: &str,
@@ -611,8 +623,8 @@ impl Life<'_> {
         }
     }
 
-    /// Whether this report is the second of another result than the recorded one: then the record gives way, and the report
-    /// is answered after that.
+    /// Returns whether this is the second report of a result that differs from the record. If so,
+    /// the record is replaced first and the report is answered afterwards.
     fn outvoted(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
         let Some(dispute) = self.dispute(report, known) else {
             return false;
@@ -625,8 +637,9 @@ impl Life<'_> {
         outvoted
     }
 
-    /// Whether a store is asked before this report is answered: another manifest is recorded, and who came first is no
-    /// reason to believe it.
+    /// Returns whether the store must be checked before this report is answered. This is the case
+    /// if a different manifest is recorded, because the earlier report is not necessarily the right
+    /// one.
     fn disputed(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
         let Some(dispute) = self.dispute(report, known) else {
             return false;
@@ -636,7 +649,7 @@ impl Life<'_> {
         asked || self.outvoted(session, report, known)
     }
 
-    /// The record that a report contradicts.
+    /// Returns the record that a report contradicts.
     fn dispute(&self, report: &Finished, known: &Known) -> Option<Dispute> {
         let stage = self.core.stage_of(report)?;
         let recorded = known.get(&(stage, report.index)).copied().flatten()?;
@@ -673,7 +686,7 @@ impl Life<'_> {
             FromWorker::Failed(failure) => {
                 let before = self.core.noted();
                 self.core.failed(session, &failure, now);
-                // A refused report leaves no line.
+                // A refused report adds no line to the history.
                 if self.core.noted() > before {
                     self.tally.failed(failure.kind);
                 }
@@ -688,13 +701,13 @@ impl Life<'_> {
         }
     }
 
-    /// Stops a job, if it is active.
+    /// Cancels a job, if it is active.
     async fn cancel(&mut self, job: JobId, why: &str) -> Result<(), CatalogError> {
         let catalog = &self.actor.catalog;
         if catalog.state(job).await?.is_some() && catalog.cancel(job, why, self.now()).await? {
             self.core.drop_job(job, "the job was cancelled");
             self.flush().await?;
-            // Whoever watches a job of which nothing is in hand here hears of it, too.
+            // Watchers are notified even if this instance has no tasks of the job.
             self.actor.revision.send_modify(|n| *n += 1);
         }
         Ok(())
@@ -742,11 +755,11 @@ impl Life<'_> {
         Ok(Ok(retried))
     }
 
-    /// Commits all of a change set but the rows that the catalog refuses by their content, with what follows from that for
-    /// their tasks (see [`picofarm_catalog::culprits`] and [`Core::refused`]).
+    /// Commits a change set without the rows that the catalog rejects for their content. The tasks
+    /// of those rows are handled by [`Core::refused`]; [`picofarm_catalog::culprits`] finds them.
     ///
     /// # Errors
-    /// Those of a commit; `error` where no row is found that is to blame.
+    /// Returns the errors of a commit, or `error` if no row is at fault.
     async fn commit_the_rest(
         &mut self,
         changes: &mut Changes,
@@ -754,7 +767,7 @@ impl Life<'_> {
         mut error: CatalogError,
     ) -> Result<Settled, CatalogError> {
         let catalog = &self.actor.catalog;
-        // First with other words, then without them.
+        // The first attempt rewords the rejected rows; the second leaves them out.
         for again in [false, true] {
             let culprits = picofarm_catalog::culprits(catalog.as_ref(), changes).await?;
             if culprits.is_empty() {
@@ -770,10 +783,10 @@ impl Life<'_> {
         Err(error)
     }
 
-    /// Makes what the core decided durable, then says it.
+    /// Makes the core's decisions durable, then sends its messages.
     async fn flush(&mut self) -> Result<(), CatalogError> {
         let (mut changes, mut say) = self.core.take();
-        // Spans end when what they stand for is durable.
+        // A span ends when the operation it measures is durable.
         let _grants = trace::grants(&mut say);
         let _commits = std::mem::take(&mut self.commits);
         let changed = !changes.is_empty();
@@ -818,8 +831,8 @@ impl Life<'_> {
     }
 }
 
-/// Answers a request. What the catalog refuses for its content is the asker's error, and no reason to begin anew; any other
-/// failure of the catalog is logged and ends this life.
+/// Answers a request. If the catalog rejects the request's content, the error goes to the client
+/// and the life continues. Any other failure of the catalog is logged and ends this life.
 fn answer<T>(
     reply: Reply<T>,
     found: Result<Result<T, Refusal>, CatalogError>,
@@ -829,18 +842,18 @@ fn answer<T>(
         Err(CatalogError::Refused { what, .. }) => (Err(Refusal::Content(what)), Ok(())),
         Err(error) => (Err(Refusal::Catalog(error.to_string())), Err(error)),
     };
-    // Nobody may wait any more.
+    // The client may have stopped waiting.
     let _ = reply.send(answer);
     end
 }
 
-/// Tells whoever asks that the catalog is out of order.
+/// Answers a request with the error that the catalog is unavailable.
 fn refuse(command: Command, error: &str) {
     fn no<T>(reply: Reply<T>, error: &str) {
         let _ = reply.send(Err(Refusal::Catalog(error.to_owned())));
     }
     match command {
-        // Dropping a session's sender ends it.
+        // The session ends because its sender is dropped.
         Command::Open { .. }
         | Command::Worker(..)
         | Command::Verified { .. }

@@ -1,5 +1,6 @@
-//! The audit log: who submitted, stopped, held, retried or drained what, or tried to. Each line goes to the coordinator's
-//! own log at once (target `picofarm::audit`) and into the catalog, where `picofarm audit` reads it.
+//! The audit log records who submitted, cancelled, paused, retried or drained something, or tried
+//! to. Each line goes to the coordinator's own log at once (target `picofarm::audit`) and into the
+//! catalog, where `picofarm audit` reads it.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -21,25 +22,25 @@ use tonic::{Code, Status};
 
 use crate::{auth::caller::ANYONE, clock::Clock};
 
-/// The name in lines about what nobody called for. No caller can have it.
+/// The name in lines without a caller. No caller can have it.
 pub(crate) const COORDINATOR: &str = "(coordinator)";
 /// Lines that may wait to be written.
 const QUEUE: usize = 4_096;
 /// Lines written at a time.
 const BATCH: usize = 256;
-/// Refused attempts of one caller that are listed in a window; the others are counted.
+/// Refused attempts of one caller listed in a window. Further ones are only counted.
 const REFUSED: u32 = 60;
 const WINDOW: Duration = Duration::from_secs(60);
-/// Callers whose refused attempts are counted at a time.
+/// Most callers with counted refused attempts.
 const CALLERS: usize = 1_024;
-/// How long to wait before a failed write is tried again.
+/// Delay before a failed write is tried again.
 const AGAIN: Duration = Duration::from_secs(1);
-/// How long an answer waits for its line to be written.
+/// Longest time that an answer waits for its line to be written.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// How often lines that are too old are looked for.
+/// Interval between removals of old lines.
 const FORGET: Duration = Duration::from_secs(3_600);
 
-/// Where lines are handed in.
+/// The sending end of the audit log.
 #[derive(Clone)]
 pub(crate) struct Audit {
     lines: mpsc::Sender<Line>,
@@ -47,12 +48,12 @@ pub(crate) struct Audit {
     clock: Clock,
 }
 
-/// Where they come out to be written.
+/// The receiving end, which writes the lines.
 pub(crate) struct Writer(mpsc::Receiver<Line>);
 
 struct Line {
     new: NewAudit,
-    /// Hears that it was written, or that it cannot be written now.
+    /// Notified when the line was written, or cannot be written now.
     tried: Option<oneshot::Sender<()>>,
 }
 
@@ -64,7 +65,7 @@ struct Flood {
 }
 
 impl Audit {
-    /// Both ends; lines wait until the writer runs.
+    /// Returns both ends. Lines wait until the writer runs.
     pub(crate) fn new(clock: Clock) -> (Self, Writer) {
         let (lines, queue) = mpsc::channel(QUEUE);
         let audit = Self {
@@ -75,7 +76,7 @@ impl Audit {
         (audit, Writer(queue))
     }
 
-    /// Notes an act and waits until it is written, or cannot be written now.
+    /// Records an act, and waits until it is written or cannot be written now.
     pub(crate) async fn record<T>(
         &self,
         who: &str,
@@ -96,13 +97,13 @@ impl Audit {
             new,
             tried: Some(tried),
         };
-        // Where the writer is gone, the coordinator is stopping.
+        // If the writer is gone, the coordinator is stopping.
         if let Ok(Ok(())) = tokio::time::timeout(PATIENCE, self.lines.send(line)).await {
             let _ = tokio::time::timeout(PATIENCE, heard).await;
         }
     }
 
-    /// Notes an act without waiting.
+    /// Records an act without waiting.
     pub(crate) fn note(&self, who: &str, act: Act, outcome: Outcome, detail: &str) {
         if let Some(new) = self.line(who, act, None, outcome, detail)
             && self.lines.try_send(Line { new, tried: None }).is_err()
@@ -111,7 +112,7 @@ impl Audit {
         }
     }
 
-    /// The line, which is logged; `None` where there are too many like it.
+    /// Logs and returns the line; `None` if there are too many like it.
     fn line(
         &self,
         who: &str,
@@ -131,7 +132,7 @@ impl Audit {
                 "{detail} ({unlisted} earlier refused attempts of this caller are not listed)"
             );
         }
-        // Where anyone may do anything there is nobody to hold to account.
+        // Without authentication nobody can be held to account.
         if who == ANYONE {
             tracing::debug!(target: "picofarm::audit", who, act = act.name(), job = job.map(tracing::field::display),
                 outcome = outcome.name(), "{detail}");
@@ -149,7 +150,8 @@ impl Audit {
         })
     }
 
-    /// How many refused attempts of this caller were left out before this one; `None` if this one is left out too.
+    /// Returns how many refused attempts of this caller were omitted before this one; `None` if
+    /// this one is omitted too.
     fn unlisted(&self, who: &str) -> Option<u64> {
         let mut floods = self.floods.lock().expect("no panic while locked");
         let now = Instant::now();
@@ -177,7 +179,7 @@ impl Audit {
     }
 }
 
-/// What an answer says of an attempt.
+/// Converts the status of an answer to the outcome of the attempt.
 fn outcome(status: &Status) -> Outcome {
     match status.code() {
         Code::Unavailable | Code::Internal | Code::Unknown | Code::Cancelled | Code::Aborted => {
@@ -187,7 +189,7 @@ fn outcome(status: &Status) -> Outcome {
     }
 }
 
-/// One line of text, of so many bytes at most.
+/// Returns one line of text with at most `most` bytes.
 fn bounded(text: &str, most: usize) -> String {
     let line = show::line(text);
     match line.len() <= most {
@@ -197,8 +199,8 @@ fn bounded(text: &str, most: usize) -> String {
 }
 
 impl Writer {
-    /// Writes lines until every [`Audit`] is gone, and removes those older than `keep`. While the catalog takes none, lines
-    /// wait and nobody waits for them.
+    /// Writes lines until every [`Audit`] is dropped, and removes lines older than `keep`. While
+    /// the catalog fails, lines wait and no caller waits for them.
     pub(crate) async fn run(mut self, catalog: Arc<dyn Catalog>, keep: Duration, clock: Clock) {
         let mut forget = tokio::time::interval(FORGET);
         let mut again = tokio::time::interval(AGAIN);
@@ -242,7 +244,7 @@ impl Writer {
 #[derive(Default)]
 struct Waiting {
     lines: VecDeque<NewAudit>,
-    /// The catalog did not take the last ones.
+    /// Whether the last write failed.
     failing: bool,
 }
 
@@ -263,7 +265,7 @@ impl Waiting {
         self.failing = false;
     }
 
-    /// Forgets the oldest of too many.
+    /// Drops the oldest lines if there are too many.
     fn shorten(&mut self) {
         let over = self.lines.len().saturating_sub(QUEUE);
         if over > 0 {

@@ -1,5 +1,5 @@
-//! How often a task is tried: failures of its own, losses of its worker and interruptions have
-//! separate budgets.
+//! Limits on the attempts at a task. Failures of the task, losses of its worker and interruptions
+//! have separate budgets.
 
 use picofarm_catalog::Exception;
 use picofarm_proto::{
@@ -9,12 +9,12 @@ use picofarm_proto::{
 
 use crate::explain::span;
 
-/// Waiting times between tries.
+/// Delays between attempts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Backoff {
-    /// After the first failure, milliseconds; doubles with each further one.
+    /// Delay after the first failure, milliseconds. It doubles with each further failure.
     pub first_ms: u32,
-    /// At most, milliseconds.
+    /// Longest delay, milliseconds.
     pub most_ms: u32,
 }
 
@@ -28,39 +28,40 @@ impl Default for Backoff {
 }
 
 impl Backoff {
-    /// How long to wait after the `n`-th failure (from 1), milliseconds.
+    /// Returns the delay after the `n`-th failure (from 1), milliseconds.
     pub fn after(&self, n: u32) -> i64 {
         let doubled = u64::from(self.first_ms) << n.saturating_sub(1).min(31);
         i64::try_from(doubled.min(u64::from(self.most_ms))).expect("most_ms is a u32")
     }
 }
 
-/// What becomes of a failed task.
+/// The consequence of a failed attempt.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
-    /// When it may be tried again, Unix milliseconds; `None` = given up.
+    /// Time from which the task may run again, Unix milliseconds; `None` if it is given up.
     pub retry_at_ms: Option<i64>,
-    /// Its record after this; `None` where the failure was free and it has none.
+    /// The updated record of the task; `None` if the failure was free and there is no record.
     pub exception: Option<Exception>,
 }
 
-/// An attempt at a task that did not end well.
+/// An attempt at a task that did not succeed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Attempt<'a> {
-    /// How it ended.
+    /// How the attempt ended.
     pub kind: FailureKind,
-    /// The same for people.
+    /// Description of the failure.
     pub message: &'a str,
-    /// How long it took, as far as is known, milliseconds.
+    /// Duration of the attempt, as far as is known, milliseconds.
     pub ms: u64,
-    /// It is the task's to answer for: neither its worker's, nor did it come further than the one
-    /// before.
+    /// Whether the attempt counts against the task. It does not if the worker was at fault, or if
+    /// it made progress beyond the previous attempt.
     pub counts: bool,
-    /// The task need not wait the first time: its worker gave the whole lease back.
+    /// Whether the task may run again at once the first time, because its worker returned the whole
+    /// lease.
     pub at_once: bool,
 }
 
-/// A task's record without failures.
+/// Returns the record of a task without failures.
 pub fn fresh(stage: StageRef, task: u64) -> Exception {
     Exception {
         stage,
@@ -74,7 +75,7 @@ pub fn fresh(stage: StageRef, task: u64) -> Exception {
     }
 }
 
-/// Charges an attempt to a task's budgets. `before` is its record so far, `fresh` one without
+/// Charges an attempt to a task's budgets. `before` is the record so far, `fresh` one without
 /// failures.
 pub fn charge(
     before: Option<&Exception>,
@@ -92,7 +93,8 @@ pub fn charge(
             let tries = exception.interruptions.max(1);
             tries - u32::from(attempt.at_once)
         }
-        // Its store's own wait decides, and of what is damaged the caller, who counts the tries.
+        // The store's own delay decides. For damaged inputs the caller does, which counts the
+        // tries.
         FailureKind::Store | FailureKind::Damaged => {
             return Verdict {
                 retry_at_ms: Some(now_ms + 1),

@@ -1,4 +1,4 @@
-//! The clock by which leases live. Injected, so that tests may turn it.
+//! The clock of the leases. It is injected, so that tests may change it.
 
 use std::{
     fmt,
@@ -10,7 +10,7 @@ use rustix::time::{ClockId, clock_gettime};
 
 type Milliseconds = Arc<dyn Fn() -> i64 + Send + Sync>;
 
-/// Tells Unix time in milliseconds, and how much time has passed while this process ran or did not.
+/// Returns Unix time in milliseconds, and the time passed whether or not this process ran.
 #[derive(Clone)]
 pub struct Clock {
     now: Milliseconds,
@@ -18,7 +18,8 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// A clock of one's own. Whether the process was stalled is what the system's monotonic clock says.
+    /// Creates a custom clock. Stalls of the process are detected with the system's monotonic
+    /// clock.
     pub fn new(now_ms: impl Fn() -> i64 + Send + Sync + 'static) -> Self {
         let since = Instant::now();
         Self::with_stalls(now_ms, move || {
@@ -26,8 +27,8 @@ impl Clock {
         })
     }
 
-    /// A clock of one's own that also tells how much time has passed since some moment, milliseconds: where that jumps, the
-    /// process was stalled or the machine suspended.
+    /// Creates a custom clock that also returns the milliseconds since a fixed moment. A jump of
+    /// that value means that the process was stalled or the machine suspended.
     pub fn with_stalls(
         now_ms: impl Fn() -> i64 + Send + Sync + 'static,
         passed_ms: impl Fn() -> i64 + Send + Sync + 'static,
@@ -38,8 +39,9 @@ impl Clock {
         }
     }
 
-    /// The system's time at the start, advanced by the clock that goes on while the machine is suspended (CLOCK_BOOTTIME):
-    /// setting the time ends no lease, and after a suspend deadlines and times in the history are right.
+    /// Creates a clock that starts at the system's time and advances with CLOCK_BOOTTIME, which
+    /// includes suspended time. Setting the system's time therefore ends no lease, and after a
+    /// suspend deadlines and times in the history are right.
     pub fn system() -> Self {
         let start = SystemTime::now()
             .duration_since(UNIX_EPOCH)
@@ -52,12 +54,12 @@ impl Clock {
         )
     }
 
-    /// Unix time, milliseconds.
+    /// Returns Unix time, milliseconds.
     pub fn now_ms(&self) -> i64 {
         (self.now)()
     }
 
-    /// Milliseconds that have passed since some moment, those of suspends and stalls too.
+    /// Returns the milliseconds since a fixed moment, including suspends and stalls.
     pub fn passed_ms(&self) -> i64 {
         (self.passed)()
     }

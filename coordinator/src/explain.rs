@@ -1,4 +1,4 @@
-//! Why a job's tasks do not run, and what became of one task: in words, from facts that are passed in. Pure.
+//! Explains why a job's tasks do not run, and the history of one task, from the facts given. Pure.
 
 use picofarm_catalog::{Exception, Holdups, TaskRecord};
 use picofarm_proto::{
@@ -48,91 +48,92 @@ impl From<&str> for Barred {
 /// A connected worker with regard to a job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
-    /// Its name.
+    /// Name of the worker.
     pub name: String,
     /// Whether it may run the job's tasks, or why not.
     pub may_run: Result<(), Barred>,
     /// Bytes of memory that a task takes and that the worker has for it, where that is too little.
     pub lacks_memory: Option<(u64, u64)>,
-    /// What a task is taken to need, milliseconds, where the worker ends before that.
+    /// Expected duration of a task, milliseconds, if the worker ends earlier.
     pub lacks_time: Option<i64>,
-    /// It asks for work.
+    /// Whether the worker asks for work.
     pub idle: bool,
-    /// There is a task that it can be granted now, or may be.
+    /// Whether there is, or may be, a task for the worker now.
     pub gets: bool,
-    /// It holds a range that crashed others, and gets nothing else.
+    /// Whether the worker runs a range that crashed other workers, and therefore gets nothing else.
     pub quarantined: bool,
-    /// Milliseconds since it was last heard of, where that is longer than it should be.
+    /// Milliseconds since the worker's last message, if longer than expected.
     pub silent_ms: Option<i64>,
 }
 
-/// How a task runs.
+/// The progress of a running task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Runs {
-    /// Its worker's name.
+    /// Name of the task's worker.
     pub worker: String,
-    /// Share done in [0, 1].
+    /// Completed fraction in [0, 1].
     pub fraction: f32,
-    /// What it is at, in its own words; empty = nothing to say.
+    /// The current step in the task's own words; may be empty.
     pub text: String,
-    /// Unix time at which it was first heard of, milliseconds.
+    /// Unix time of the first report, milliseconds.
     pub since_ms: i64,
 }
 
-/// What decides whether a job's tasks run.
+/// The facts that decide whether a job's tasks run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JobFacts {
-    /// The job.
+    /// Id of the job.
     pub job: JobId,
-    /// Where it stands.
+    /// State of the job.
     pub state: JobState,
-    /// It is held by a person.
+    /// Whether a user has paused the job.
     pub paused: bool,
-    /// Its stages.
+    /// Stages of the job.
     pub stages: Vec<StageStatus>,
-    /// Its tasks.
+    /// Task counts of the job.
     pub counts: TaskCounts,
-    /// What its tasks wait for.
+    /// The conditions that the tasks wait for.
     pub holdups: Holdups,
-    /// The workers connected to the coordinator that answers.
+    /// Workers connected to the answering coordinator.
     pub candidates: Vec<Candidate>,
-    /// Tasks that workers have in hand for other jobs with the same outputs.
+    /// Tasks that workers run for other jobs with the same outputs.
     pub shared: u64,
-    /// Tasks that wait for a worker with nothing else in hand: workers were lost while they ran
+    /// Tasks that wait for a worker without other leases, because workers were lost while they ran
     /// them.
     pub suspects: u64,
-    /// The deadline that stopped the job, as in its file.
+    /// The deadline that stopped the job, as written in the job file.
     pub deadline: Option<String>,
-    /// Jobs that go first and have tasks waiting for the same workers.
+    /// Jobs of higher precedence with tasks waiting for the same workers.
     pub ahead: Vec<JobId>,
-    /// How many more of these there are that the asker may not see.
+    /// Number of further such jobs that the caller may not see.
     pub unseen: u64,
     /// Workers connected to other coordinators.
     pub elsewhere: u32,
-    /// Tasks that run now.
+    /// Currently running tasks.
     pub running: Vec<RunningTask>,
-    /// The last line of history that says why a task did not go on: it failed, was given back, or its lease ran out.
+    /// Latest history line that explains an interruption: a failure, a returned task or an expired
+    /// lease.
     pub setback: Option<Event>,
     /// Unix time, milliseconds.
     pub now_ms: i64,
 }
 
-/// What is known of a task.
+/// The facts about a task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TaskFacts {
-    /// Its index.
+    /// Index of the task.
     pub index: u64,
-    /// Its job.
+    /// Job of the task.
     pub job: JobId,
-    /// What the catalog holds.
+    /// The catalog's record.
     pub record: TaskRecord,
-    /// Its history, oldest first.
+    /// History of the task, oldest first.
     pub events: Vec<Event>,
-    /// The job's budgets.
+    /// Budgets of the job.
     pub limits: Limits,
-    /// Who committed its result under another job: that job and its name, and the line of its history.
+    /// The other job that committed the result, if any: its id, name and history line.
     pub elsewhere: Option<(JobId, String, Event)>,
-    /// Where a worker has reported on it: how it runs.
+    /// Progress of the task, if a worker has reported on it.
     pub running: Option<Runs>,
     /// Unix time, milliseconds.
     pub now_ms: i64,
@@ -147,12 +148,12 @@ fn reason(code: &str, tasks: u64, words: String) -> Reason {
     }
 }
 
-/// "1 task", "3 tasks".
+/// Formats a count: "1 task", "3 tasks".
 fn n(count: u64, what: &str) -> String {
     format!("{count} {what}{}", if count == 1 { "" } else { "s" })
 }
 
-/// "12 s", "3 min".
+/// Formats a duration: "12 s", "3 min".
 pub fn span(ms: i64) -> String {
     let seconds = ms.max(0) as u64 / 1000;
     match seconds {
@@ -162,7 +163,7 @@ pub fn span(ms: i64) -> String {
     }
 }
 
-/// Why a job's tasks do not run, most important first. Never empty.
+/// Returns why a job's tasks do not run, most important reason first. Never empty.
 pub fn job(facts: &JobFacts) -> Vec<Reason> {
     let (counts, id) = (&facts.counts, facts.job);
     let mut reasons = Vec::new();
@@ -214,7 +215,7 @@ pub fn job(facts: &JobFacts) -> Vec<Reason> {
     reasons
 }
 
-/// What becomes of tasks that are under lease: a worker runs one of a lease at a time.
+/// Describes the leased tasks. A worker runs one task of a lease at a time.
 fn leased_words(facts: &JobFacts) -> String {
     const SHOWN: usize = 4;
     let under = format!("{} under lease at workers", n(facts.counts.leased, "task"));
@@ -251,7 +252,7 @@ fn last_error<'a>(mut failed: impl Iterator<Item = &'a Exception>) -> String {
     })
 }
 
-/// Why pending tasks of an active job are not leased.
+/// Explains why pending tasks of an active job are not leased.
 fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
     let Holdups {
         ready,
@@ -284,7 +285,7 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
             format!(", the first for another {}", span(at - facts.now_ms))
         });
         let last = match last_error(failed.iter().filter(|e| !e.dead)) {
-            // What is given back is charged to nobody, and leaves its reason in the history alone.
+            // A returned task is charged to nobody, so only the history contains its reason.
             none if none.is_empty() => facts.setback.as_ref().map_or(none, setback),
             last => last,
         };
@@ -303,7 +304,7 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
     }
 }
 
-/// Why a task did not go on the last time.
+/// Describes the last interruption of a task.
 fn setback(event: &Event) -> String {
     let task = event
         .task
@@ -315,9 +316,9 @@ fn setback(event: &Event) -> String {
     format!("; the last:{task}{on}: {}", event.message)
 }
 
-/// Which stages wait for others.
+/// Explains which stages wait for others.
 fn blocked(facts: &JobFacts, reasons: &mut Vec<Reason>) {
-    // Stages of one matrix are told together.
+    // Stages of one matrix are grouped.
     let stands = |needs: &[String]| {
         let named = |s: &&StageStatus| needs.contains(&s.name);
         let stages: Vec<&StageStatus> = facts.stages.iter().filter(named).collect();
@@ -355,7 +356,7 @@ fn blocked(facts: &JobFacts, reasons: &mut Vec<Reason>) {
     }
 }
 
-/// Why tasks that may run at once are not leased.
+/// Explains why tasks that could run now are not leased.
 fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     let tasks = n(ready, "task");
     let others = match facts.elsewhere {
@@ -480,7 +481,7 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     reason("busy", ready, words)
 }
 
-/// Where those that may run the tasks all end too early.
+/// Explains the case in which every able worker ends too early.
 fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Reason> {
     if able.iter().any(|c| c.lacks_time.is_none()) {
         return None;
@@ -495,7 +496,7 @@ fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Re
     Some(reason("time", ready, words))
 }
 
-/// Where workers were connected a moment ago: what became of their leases.
+/// Describes what happened to the leases of recently connected workers.
 fn lately(facts: &JobFacts) -> String {
     const RECENT_MS: i64 = 600_000;
     let back = facts.setback.as_ref().filter(|event| {
@@ -523,7 +524,7 @@ fn lately(facts: &JobFacts) -> String {
     )
 }
 
-/// What a task needs and what the largest of the workers has that are too small for it, in words.
+/// Describes the memory that a task needs and that the largest of these too small workers has.
 fn largest(small: &[&Candidate]) -> Option<String> {
     let memory = |c: &&&Candidate| c.lacks_memory.map(|(needed, there)| (there, needed));
     let largest = small.iter().max_by_key(memory)?;

@@ -1,5 +1,5 @@
-//! Forgetting jobs that ended long ago, beside all other work: short transactions with rests between, so that whoever has
-//! something to write waits for one of them at most.
+//! Forgets jobs that ended long ago. It uses short transactions with rests between them, so that
+//! other writers wait for at most one of them.
 
 use std::{
     sync::Arc,
@@ -11,11 +11,11 @@ use tokio_util::sync::CancellationToken;
 
 use crate::clock::Clock;
 
-/// How often jobs to forget are looked for.
+/// Interval between searches for jobs to forget.
 const AGAIN: Duration = Duration::from_secs(600);
-/// How soon again where the catalog could not be asked, as before its first life has begun.
+/// Interval if the catalog could not be read, for example before its first life has begun.
 const SOON: Duration = Duration::from_secs(2);
-/// The least rest between two transactions.
+/// Shortest rest between two transactions.
 const REST: Duration = Duration::from_millis(2);
 
 /// Forgets jobs that ended longer ago than `age`, until `stop`.
@@ -55,7 +55,7 @@ async fn all(
         if !forgotten.more {
             break;
         }
-        // As long as it took: the others have half of the time at least.
+        // The rest is as long as the transaction, so that others have at least half of the time.
         tokio::time::sleep(began.elapsed().max(REST)).await;
     }
     if jobs > 0 {

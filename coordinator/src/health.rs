@@ -1,4 +1,5 @@
-//! How the actor does, and how with its catalog: what `/healthz` and `/readyz` tell. Read without asking the actor.
+//! Health of the actor and of its catalog, for `/healthz` and `/readyz`. Reading it does not
+//! involve the actor.
 
 use std::{
     collections::BTreeMap,
@@ -13,24 +14,25 @@ use std::{
 use picofarm_catalog::Catalog;
 use tokio_util::sync::CancellationToken;
 
-/// The actor is thought stuck when its loop has not turned for so long.
+/// The actor counts as stuck if its loop has not turned for this long.
 const ALIVE: Duration = Duration::from_secs(30);
-/// The catalog is thought gone when it has not answered for so long.
+/// The catalog counts as unavailable if it has not answered for this long.
 const READY: Duration = Duration::from_secs(10);
 
-/// How often it is tried whether the catalog can be written, and how long that may take; how soon after a failure.
+/// Interval between test writes to the catalog, which is also the time limit of each; the constant
+/// below applies after a failure.
 const TRY: Duration = Duration::from_secs(10);
 const TRY_AGAIN: Duration = Duration::from_secs(1);
-/// The catalog is thought full or stuck when no write has succeeded for so long.
+/// The catalog counts as full or stuck if no write has succeeded for this long.
 const WRITTEN: Duration = Duration::from_secs(30);
 
-/// How the actor does, and how with its catalog.
+/// Health of the actor and of its catalog.
 pub(crate) struct Health {
     catalog: Mutex<State>,
-    /// Files by which callers are judged and that cannot be used, with the reason.
+    /// Unusable credential files, with the reason for each.
     access: Mutex<BTreeMap<&'static str, String>>,
     began: Instant,
-    /// When its loop turned last, milliseconds after `began`.
+    /// Last turn of the actor's loop, milliseconds after `began`.
     turned: AtomicU64,
 }
 
@@ -48,19 +50,19 @@ impl Default for Health {
 #[derive(Default)]
 struct State {
     beaten: Option<Instant>,
-    /// When a write that takes room last succeeded.
+    /// Last success of a write that needs space.
     wrote: Option<Instant>,
-    /// Why the last one did not.
+    /// The reason if the last such write failed.
     full: Option<(&'static str, String)>,
-    /// In a few words for anyone, and in full for this machine.
+    /// Brief reason for any client, and full reason for this machine.
     fault: Option<(&'static str, String)>,
 }
 
-/// Why no work can be taken: for anyone, and for people on this machine.
+/// The reason why no work is accepted, for any client and for users on this machine.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Unready {
     pub what: String,
-    /// It may name files and hosts.
+    /// May name files and hosts.
     pub detail: Option<String>,
 }
 
@@ -71,44 +73,43 @@ impl fmt::Display for Unready {
 }
 
 impl Health {
-    /// The actor's loop turns.
+    /// Records a turn of the actor's loop.
     pub(crate) fn turn(&self) {
         let now = u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX);
         self.turned.store(now, Ordering::Relaxed);
     }
 
-    /// How long ago it turned; or since the start.
+    /// Returns the time since the last turn, or since the start.
     fn since_turn(&self) -> Duration {
         let turned = Duration::from_millis(self.turned.load(Ordering::Relaxed));
         self.began.elapsed().saturating_sub(turned)
     }
 
-    /// The catalog has answered.
+    /// Records an answer of the catalog.
     pub(crate) fn beat(&self) {
         let mut state = self.lock();
         state.beaten = Some(Instant::now());
         state.fault = None;
     }
 
-    /// The catalog has taken a write that needs room.
+    /// Records a successful write that needs space.
     pub(crate) fn wrote(&self) {
         let mut state = self.lock();
         state.wrote = Some(Instant::now());
         state.full = None;
     }
 
-    /// The catalog has not taken a write that needs room.
+    /// Records a failed write that needs space.
     pub(crate) fn full(&self, brief: &'static str, why: &str) {
         self.lock().full = Some((brief, why.to_owned()));
     }
 
-    /// A life of the actor has ended for this reason; another will be tried.
+    /// Records why a life of the actor ended. Another one will be tried.
     pub(crate) fn fault(&self, brief: &'static str, why: &str) {
         self.lock().fault = Some((brief, why.to_owned()));
     }
 
-    /// A file by which callers are judged cannot be used (`Some`, with the reason), or can be used
-    /// again.
+    /// Records that a credential file is unusable (`Some`, with the reason), or usable again.
     pub(crate) fn access(&self, file: &'static str, why: Option<String>) {
         let mut access = self.access.lock().expect("no panic while locked");
         match why {
@@ -117,10 +118,10 @@ impl Health {
         };
     }
 
-    /// Whether jobs and reports can be taken.
+    /// Checks whether jobs and reports can be accepted.
     ///
     /// # Errors
-    /// Why not.
+    /// Returns the reason why not.
     pub(crate) fn ready(&self) -> Result<(), Unready> {
         let access = self.access.lock().expect("no panic while locked");
         if let Some((file, why)) = access.first_key_value() {
@@ -155,10 +156,11 @@ impl Health {
         Err(Unready { what, detail: None })
     }
 
-    /// Whether the process does its work; one that waits for its catalog does. In words either way.
+    /// Checks whether the process works. A process that waits for its catalog does. Returns a
+    /// description.
     ///
     /// # Errors
-    /// It does not.
+    /// Returns a description if the process does not work.
     pub(crate) fn alive(&self) -> Result<String, String> {
         let since = self.since_turn();
         if self.waits() {
@@ -173,7 +175,7 @@ impl Health {
         Ok(format!("ok, the loop turned {} ms ago", since.as_millis()))
     }
 
-    /// Whether the actor is between two lives: its silence is the catalog's.
+    /// Returns whether the actor is between two lives, so that its silence is the catalog's fault.
     fn waits(&self) -> bool {
         self.lock().fault.is_some()
     }
@@ -183,7 +185,8 @@ impl Health {
     }
 }
 
-/// Tries again and again whether the catalog can be written, until `stop`: beside the actor, which waits for none of it.
+/// Tests repeatedly, until `stop`, whether the catalog can be written. Runs separately from the
+/// actor.
 pub(crate) async fn try_writes(
     health: Arc<Health>,
     catalog: Arc<dyn Catalog>,

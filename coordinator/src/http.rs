@@ -1,10 +1,11 @@
-//! `/healthz`, `/readyz` and `/metrics` over plain HTTP/1.1, for probes and Prometheus: three fixed pages, read only.
-//! They hold counts, never names, paths or URLs; details of a failure are for this machine alone. So there is no token,
-//! and one that is sent here by mistake goes nowhere: of a request only method and path are looked at.
+//! `/healthz`, `/readyz` and `/metrics` over plain HTTP/1.1, for probes and Prometheus: three
+//! fixed, read-only pages. They contain counts, never names, paths or URLs. Details of a failure
+//! are shown only on this machine. The pages therefore need no token, and a token sent here by
+//! mistake is ignored: only the method and path of a request are read.
 //!
-//! They are served by a thread with a runtime of its own and bounds of its own: whatever happens at the gRPC port, in the
-//! actor or in the catalog, an answer comes within a second. hyper speaks HTTP; connections are accepted, counted and
-//! ended here.
+//! A separate thread with its own runtime and bounds serves them, so that an answer takes less than
+//! a second whatever happens at the gRPC port, in the actor or in the catalog. hyper speaks HTTP.
+//! Connections are accepted, counted and ended here.
 
 use std::{
     convert::Infallible,
@@ -37,35 +38,38 @@ use crate::{
     rpc::Link,
 };
 
-/// How long a page waits for fresh gauges, and how old ones it tells otherwise.
+/// Longest time that a page waits for fresh gauges, and the greatest age of the gauges shown
+/// otherwise.
 const WAIT: Duration = Duration::from_millis(500);
 const OLD: Duration = Duration::from_secs(30);
-/// Gauges are read from the catalog at most once in this time, and at most for a tenth of the time.
+/// Gauges are read from the catalog at most once in this interval, and for at most a tenth of the
+/// time.
 const FRESH: Duration = Duration::from_secs(1);
-/// Connections at a time. One more takes the place of the one that has waited longest to send its request.
+/// Most concurrent connections. A further one replaces the one that has waited longest to send its
+/// request.
 const CONNECTIONS: usize = 256;
 /// The longest request head, bytes.
 const HEAD: usize = 8 << 10;
-/// How long a head may take, and how long its answer may wait to be taken.
+/// Time limit of a request head, and of the delivery of its answer.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// What the pages are made of.
+/// The sources of the pages.
 pub(crate) struct Pages {
     pub link: Link,
     pub metrics: Arc<Metrics>,
     pub health: Arc<Health>,
-    /// Of the gRPC port.
+    /// Connections of the gRPC port.
     pub doors: Arc<Doors>,
     pub memory: Arc<Memory>,
     pub gauges: Kept,
-    /// Where the actor and the catalog's connections live.
+    /// The runtime of the actor and of the catalog's connections.
     pub main: Handle,
 }
 
 /// The gauges as last read.
 pub(crate) struct Kept {
     read: Mutex<Option<Read>>,
-    /// Whoever holds it reads them again.
+    /// The holder of the permit reads them again.
     reading: Arc<Semaphore>,
 }
 
@@ -85,10 +89,10 @@ struct Read {
     gauges: Gauges,
 }
 
-/// Answers from a thread of its own, until `stop`.
+/// Serves the pages from a separate thread, until `stop`.
 ///
 /// # Errors
-/// The system gives no thread or no runtime.
+/// Returns an error if the system provides no thread or no runtime.
 pub(crate) fn start(
     listener: std::net::TcpListener,
     pages: Arc<Pages>,
@@ -117,16 +121,16 @@ async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) 
         };
         match accepted {
             Ok((stream, peer)) => {
-                // Full of those whose answer is being written, which takes a moment.
+                // All places have connections with answers being written, which takes a moment.
                 let Ok(held) = doors.enter(peer.ip()) else {
                     continue;
                 };
                 let pages = Arc::clone(&pages);
                 tokio::spawn(async move {
-                    // hyper's own limit of time would need a timer and say the same.
+                    // hyper's own time limit would need a timer and do the same.
                     let over = Arc::clone(held.place()).over(PATIENCE, PATIENCE);
                     tokio::select! {
-                        // One that goes away early is no loss.
+                        // A client that disconnects early is no loss.
                         _ = serve(pages, stream, peer, held.place()) => {}
                         _ = over => {}
                     }
@@ -142,7 +146,7 @@ async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) 
     }
 }
 
-/// One request and its answer: more of them on a connection would keep its place from others.
+/// Serves one request. Further requests on the connection would keep its place from others.
 async fn serve(
     pages: Arc<Pages>,
     stream: TcpStream,
@@ -161,7 +165,7 @@ async fn serve(
     });
     http1::Builder::new()
         .keep_alive(false)
-        // Some clients end their side as soon as they have asked.
+        // Some clients close their side right after the request.
         .half_close(true)
         .max_header_size(HEAD)
         .serve_connection(TokioIo::new(stream), service)
@@ -225,7 +229,7 @@ impl Pages {
         }
     }
 
-    /// The farm's counts; `None` where they cannot be had now.
+    /// Returns the farm's counts; `None` if they are not available now.
     async fn gauges(self: &Arc<Self>) -> Option<Gauges> {
         let kept = |until: fn(&Read) -> Instant| {
             let read = *self.gauges.read.lock().expect("no panic while locked");
@@ -237,7 +241,8 @@ impl Pages {
         }
         let turn = Arc::clone(&self.gauges.reading);
         let pages = Arc::clone(self);
-        // On the main runtime, whose connections to the catalog these are. It goes on where it takes longer.
+        // This runs on the main runtime, which owns the connections to the catalog. It continues if
+        // the page stops waiting.
         let read = self.main.spawn(async move {
             let _turn = turn.acquire().await;
             let fresh = *pages.gauges.read.lock().expect("no panic while locked");

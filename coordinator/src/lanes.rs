@@ -1,5 +1,5 @@
-//! Heavy work beside the actor: on threads of its own, and so much of it at a time that memory and the catalog's
-//! connections are not used up. Heartbeats and reports wait for none of it.
+//! Runs heavy work on separate threads, outside the actor. Its concurrency is bounded, so that
+//! memory and the catalog's connections suffice. Heartbeats and reports never wait for it.
 
 use std::{future::Future, panic, sync::Arc};
 
@@ -9,22 +9,23 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-/// Reads of the catalog at a time; it has more connections than that.
+/// Concurrent reads of the catalog, which has more connections than that.
 const READS: usize = 4;
-/// Requests with small specs at a time.
+/// Concurrent requests with small specs.
 const SMALL: usize = 8;
-/// From here on a spec is large, bytes.
+/// Smallest size of a large spec, bytes.
 const LARGE: usize = 1 << 20;
-/// Large specs in hand together, KiB as sent: two of the largest. In memory each takes several times as much.
+/// Total size of concurrent large specs as sent, KiB: two of the largest. In memory each takes
+/// several times as much.
 const LARGE_KIB: usize = 96 << 10;
 
-/// What may run at a time.
+/// Limits on concurrent work.
 #[derive(Debug, Clone)]
 pub(crate) struct Lanes {
     reads: Arc<Semaphore>,
     small: Arc<Semaphore>,
     large: Arc<Semaphore>,
-    /// The program ends: what runs is given up.
+    /// Cancelled when the program ends. Running work is abandoned.
     stop: CancellationToken,
 }
 
@@ -39,7 +40,7 @@ impl Lanes {
         }
     }
 
-    /// Runs work on a spec that was `bytes` long as sent.
+    /// Runs work on a spec with `bytes` bytes as sent.
     pub(crate) async fn heavy<T, F>(
         &self,
         bytes: usize,
@@ -60,7 +61,8 @@ impl Lanes {
         self.aside(permit.expect("never closed"), work).await
     }
 
-    /// Runs a read of the catalog, with what is made of it. Never called from within another read.
+    /// Runs a read of the catalog with the processing of its result. Never call it within another
+    /// read.
     pub(crate) async fn read<T, F>(&self, work: impl FnOnce() -> F + Send + 'static) -> T
     where
         T: Send + 'static,
@@ -70,7 +72,8 @@ impl Lanes {
         self.aside(permit.expect("never closed"), work).await
     }
 
-    /// Runs `work` on a thread that may block. It goes on when nobody waits any more, so the permit goes with it.
+    /// Runs `work` on a blocking thread. The work continues if nobody waits any more, so it owns
+    /// the permit.
     async fn aside<T, F>(
         &self,
         permit: OwnedSemaphorePermit,
@@ -89,7 +92,7 @@ impl Lanes {
         match running.await {
             Ok(Some(done)) => done,
             Err(error) if error.is_panic() => panic::resume_unwind(error.into_panic()),
-            // The program ends, and whoever waits with it.
+            // The program is ending, together with the waiting caller.
             Ok(None) | Err(_) => std::future::pending().await,
         }
     }

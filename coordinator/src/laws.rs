@@ -1,4 +1,5 @@
-//! Laws of the pure parts: no task is lost or doubled by any sequence of events, sizes stay in bounds.
+//! Laws of the pure parts: no sequence of events loses or duplicates a task, and sizes stay in
+//! bounds.
 
 use picofarm_catalog::{Changes, Range, RangeState, Run};
 use picofarm_proto::{
@@ -31,7 +32,7 @@ fn stage_ref() -> StageRef {
     }
 }
 
-/// A stage with these tasks pending in hand.
+/// Returns a stage with these pending tasks.
 fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> Stage {
     let existing: Vec<Run> = (0..total)
         .filter(|i| cut.get(*i as usize) == Some(&true))
@@ -46,7 +47,7 @@ fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> Stage 
     stage
 }
 
-/// What a person would write down for each task.
+/// The expected state of each task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Task {
     Pending,
@@ -77,7 +78,7 @@ proptest! {
             let lease = (!leased.is_empty()).then(|| leased[a as usize % leased.len()].clone());
             let (range, event) = match (op, lease) {
                 (0, _) => {
-                    // Some tasks are under way for another stage.
+                    // Some tasks run for another stage.
                     let lo = a % (2 * total);
                     let except = [Run { lo, hi: lo + b % 5 }];
                     let among = (lo..except[0].hi.min(total)).filter(|t| table[*t as usize] == Task::Pending);
@@ -165,7 +166,8 @@ proptest! {
             for (i, task) in table.iter().enumerate() {
                 prop_assert_eq!(stage.pending_at(i as u64).is_some(), *task == Task::Pending);
             }
-            // What leaves for the catalog is what is done or dead, each task once.
+            // The ranges that go back to the catalog contain exactly the done and dead tasks, each
+            // once.
             let mut left = vec![None; total as usize];
             for range in changes.free.values() {
                 for t in range.lo..range.hi {
@@ -177,7 +179,7 @@ proptest! {
                 let marked = matches!(table[t], Task::Done) && left.is_none();
                 prop_assert!(marked || *left == Some(table[t]) || (left.is_none() && !matches!(table[t], Task::Dead)));
             }
-            // What changed here is written as it is here.
+            // Changed ranges are written in their current state.
             let now = stage.leased().map(|(r, _)| r).all(|r| changes.ranges.get(&r.id) == Some(r));
             prop_assert!(now);
         }

@@ -1,5 +1,6 @@
-//! The coordinator: plans jobs, places their tasks on workers, leases ranges of them, and commits what workers
-//! finish. [`serve`] runs one; the decisions are pure ([`plan`], [`place`], [`transition`], [`budget`], [`explain`]).
+//! The coordinator plans jobs, places their tasks on workers, leases ranges of them, and commits
+//! the results. [`serve`] runs one. The decisions are pure ([`plan`], [`place`], [`transition`],
+//! [`budget`], [`explain`]).
 
 mod actor;
 mod audit;
@@ -36,5 +37,5 @@ pub use memory::MemoryBounds;
 pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
 pub use stored::{Found, Stored};
 
-/// Version of this program; workers must have the same.
+/// Version of this program. Workers must have the same.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -1,5 +1,5 @@
-//! Numbers for Prometheus: counted where the actor makes changes durable, and read without it. Nothing here is global:
-//! a coordinator has its own.
+//! Metrics for Prometheus, counted when the actor makes changes durable, and read without the
+//! actor. No metric is global: each coordinator has its own.
 
 use std::{
     fmt::{Display, Write},
@@ -26,10 +26,10 @@ const TASK_SECONDS: &[f64] = &[
 ];
 const MESSAGES: &[f64] = &[1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0];
 
-/// How often something lay in each interval, and the sum.
+/// Counts of observations by interval, and their sum.
 struct Histogram {
     bounds: &'static [f64],
-    /// One for each bound and one for what is beyond the last.
+    /// One count for each bound, and one for observations beyond the last.
     counts: Vec<AtomicU64>,
     /// The bits of an `f64`.
     sum: AtomicU64,
@@ -53,7 +53,7 @@ impl Histogram {
     }
 }
 
-/// All that is counted from the start of the process.
+/// All counts since the start of the process.
 pub(crate) struct Metrics {
     granted: AtomicU64,
     computed: AtomicU64,
@@ -67,7 +67,7 @@ pub(crate) struct Metrics {
     commit: Histogram,
     batch: Histogram,
     task: Histogram,
-    /// In the order of [`METHODS`]; the last is of all others.
+    /// Histograms in the order of [`METHODS`]; the last one is for all other methods.
     calls: Vec<Histogram>,
 }
 
@@ -92,7 +92,7 @@ impl Default for Metrics {
     }
 }
 
-/// What one commit adds, once it is durable.
+/// The counts of one commit, added once it is durable.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Tally {
     granted: u64,
@@ -103,12 +103,12 @@ pub(crate) struct Tally {
     dead: u64,
     expired: u64,
     adopted: u64,
-    /// Of each computed task.
+    /// Seconds of each computed task.
     seconds: Vec<f64>,
 }
 
 impl Tally {
-    /// A worker's report of a failure was accepted.
+    /// Counts an accepted report of a failure.
     pub(crate) fn failed(&mut self, kind: FailureKind) {
         match kind {
             FailureKind::User => self.user += 1,
@@ -119,7 +119,7 @@ impl Tally {
         }
     }
 
-    /// What the core decided. Tasks that fail without a report were in the hands of a worker that was lost.
+    /// Counts the core's decisions. Tasks that fail without a report were lost with their worker.
     pub(crate) fn note(&mut self, changes: &Changes, say: &[(SessionId, Say)]) {
         let reported = self.user + self.crash;
         let mut failed = 0;
@@ -156,10 +156,10 @@ impl Tally {
     }
 }
 
-/// What is read from the catalog and the actor when somebody asks.
+/// Values read from the catalog and the actor on request.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Gauges {
-    /// Tasks of the active jobs, together.
+    /// Total tasks of the active jobs.
     pub tasks: TaskCounts,
     /// Tasks that could be leased now.
     pub ready: u64,
@@ -169,7 +169,7 @@ pub(crate) struct Gauges {
 }
 
 impl Metrics {
-    /// Counts what has become durable.
+    /// Adds the counts of a durable commit.
     pub(crate) fn add(&self, tally: &Tally) {
         let computed = tally.seconds.len() as u64;
         for (counter, by) in [
@@ -192,23 +192,23 @@ impl Metrics {
         }
     }
 
-    /// A commit took so long.
+    /// Records the duration of a commit.
     pub(crate) fn committed(&self, took: Duration) {
         self.commit.observe(took.as_secs_f64());
     }
 
-    /// So many messages were handled together.
+    /// Records the number of messages handled together.
     pub(crate) fn handled(&self, messages: usize) {
         self.batch.observe(messages as f64);
     }
 
-    /// A call of a gRPC method was answered, or its stream begun, after so long.
+    /// Records the time until a gRPC call was answered, or its stream begun.
     pub(crate) fn called(&self, path: &str, took: Duration) {
         let at = METHODS.iter().position(|(method, _)| *method == path);
         self.calls[at.unwrap_or(METHODS.len())].observe(took.as_secs_f64());
     }
 
-    /// The text that Prometheus reads. `gauges` is missing where the catalog cannot be read.
+    /// Returns the text for Prometheus. `gauges` is missing if the catalog cannot be read.
     pub(crate) fn page(
         &self,
         gauges: Option<Gauges>,
@@ -321,7 +321,7 @@ impl Metrics {
     }
 }
 
-/// A page in the making. Label values are from fixed sets: nothing in them needs escaping.
+/// A page under construction. Label values come from fixed sets, so nothing needs escaping.
 struct Page(String);
 
 impl Page {

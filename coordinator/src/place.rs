@@ -1,33 +1,35 @@
-//! Which worker may take tasks of which job, and how many at once. Pure.
+//! Decides which worker may take tasks of each job, and how many at once. Pure.
 
 use picofarm_proto::model::{
     Abilities, SceneKind, StageSpec,
     memory::{Known, gib, peak_bytes},
 };
 
-/// Furniture that every worker makes by itself.
+/// Furniture that every worker generates itself.
 pub const PARAMETRIC: &str = "parametric-1";
 
-/// A lease should hold about this much work: long enough that its overhead vanishes, short enough that little
-/// is lost with a worker.
+/// Target duration of a lease: long enough that its overhead is negligible, short enough that
+/// little is lost with a worker.
 const LEASE_SECONDS: f64 = 45.0;
-/// Most tasks in one lease; its marks are written at each commit.
+/// Most tasks in one lease, because its marks are written at each commit.
 const MOST: u64 = 1024;
-/// A lease takes at most this part of an even share of what is left, so that all workers end together.
+/// A lease takes at most this fraction of an even share of the remaining tasks, so that all workers
+/// end together.
 const SHARE: u64 = 2;
 
-/// Memory that a stage's task takes at most on a worker, and what the worker's tasks may take, in bytes; `None` where it
-/// fits, or where one of them is not known.
+/// Returns the most memory that a stage's task takes on a worker, and the memory available to the
+/// worker's tasks, in bytes. Returns `None` if the task fits, or if one of the two is unknown.
 pub fn lacks_memory(stage: &StageSpec, known: &Known, worker: &Abilities) -> Option<(u64, u64)> {
     let there = worker.memory_mib << 20;
     let needed = peak_bytes(&stage.task, known, worker.cores)?;
     (there > 0 && needed > there).then_some((needed, there))
 }
 
-/// Whether a worker may run a stage's tasks, of which so much is `known` as the job tells.
+/// Checks whether a worker may run a stage's tasks. `known` contains the known properties of its
+/// inputs.
 ///
 /// # Errors
-/// Why not, in words.
+/// Returns the reason why not.
 pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(), String> {
     let (kind, version) = (stage.task.kind(), stage.task.version());
     let ability = stage.task.ability();
@@ -89,11 +91,12 @@ pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(
     Ok(())
 }
 
-/// Tasks of the next lease: `mean` seconds a task as observed, `pending` tasks waiting in the job, `in_range` in
-/// the range at hand, `workers` that may take them. At least 1 and at most `in_range`.
+/// Returns the number of tasks in the next lease, from 1 to `in_range`. `mean` is the observed
+/// seconds per task, `pending` the waiting tasks of the job, `in_range` the size of the current
+/// range, and `workers` the number of workers that may take them.
 pub fn lease_size(mean: Option<f64>, pending: u64, in_range: u64, workers: u64) -> u64 {
     let wanted = match mean {
-        // Casting saturates: very short tasks give MOST.
+        // The cast saturates: very short tasks give MOST.
         Some(seconds) => (LEASE_SECONDS / seconds.max(1e-6)) as u64,
         None => 1,
     };

@@ -1,4 +1,4 @@
-//! What a job's tasks are and which of them run, given the outputs that exist. Pure.
+//! Derives a job's tasks and which of them run, given the existing outputs. Pure.
 
 use std::collections::BTreeSet;
 
@@ -9,8 +9,8 @@ use picofarm_proto::{
 };
 use serde_json::Value;
 
-/// The ranges of a new stage: a done range for each run of existing outputs, a pending one for each gap.
-/// `existing` is ascending and disjoint.
+/// Returns the ranges of a new stage: a done range for each run of existing outputs, and a pending
+/// one for each gap. `existing` is ascending and disjoint.
 pub fn expand(
     stage: StageRef,
     count: u64,
@@ -42,7 +42,7 @@ pub fn expand(
     ranges
 }
 
-/// Threads of the worker that a plan counts memory for; each keeps some megabytes of its own.
+/// Threads of the worker assumed for a plan's memory estimate. Each has some megabytes of its own.
 const THREADS: u32 = 8;
 
 /// What is known of a stage's outputs.
@@ -143,17 +143,17 @@ fn reasons(
     reasons
 }
 
-/// A stage of an earlier job, beside the one that is submitted.
+/// A stage of an earlier job that resembles the submitted one.
 struct Kin {
     job: JobId,
-    /// The settings that have changed since, each in words.
+    /// Descriptions of the settings that have changed since.
     changes: Vec<String>,
-    /// Its results are kept where those of the new one will be.
+    /// Whether its results are in the place of the new stage's results.
     same_place: bool,
 }
 
-/// The stage most like this one; of equals the one with the same place, then the latest. Stages are alike that have the
-/// same name, or come from the same matrix.
+/// Returns the most similar earlier stage, preferring the same place and then the latest. Stages
+/// are similar if they have the same name or come from the same matrix.
 fn kin(stage: &StageSpec, recent: &[Job]) -> Option<Kin> {
     let base = |stage: &StageSpec| of_matrix(&stage.name).unwrap_or(&stage.name).to_owned();
     let place = |stage: &StageSpec| {
@@ -173,7 +173,7 @@ fn kin(stage: &StageSpec, recent: &[Job]) -> Option<Kin> {
         .min_by_key(|kin| (kin.changes.len(), !kin.same_place))
 }
 
-/// The settings that shape results and differ between two stages of one kind, each in words:
+/// Returns the settings that affect results and differ between two stages of one kind, in the form
 /// `render.bins is 300 and was 637`.
 pub fn changes(was: &StageSpec, is: &StageSpec) -> Vec<String> {
     let (was, is) = (shaping(was), shaping(is));
@@ -182,7 +182,7 @@ pub fn changes(was: &StageSpec, is: &StageSpec) -> Vec<String> {
     changes
 }
 
-/// Everything of a stage that shapes its results, as one tree.
+/// Returns everything in a stage that affects its results, as one tree.
 fn shaping(stage: &StageSpec) -> Value {
     let mut tree = serde_json::to_value(&stage.task).expect("settings are plain data");
     tree["count"] = Value::Null;
@@ -198,7 +198,7 @@ fn shaping(stage: &StageSpec) -> Value {
     tree
 }
 
-/// Most differences that are listed.
+/// Most differences listed.
 const MOST_LINES: usize = 8;
 
 fn differences(lines: &mut Vec<String>, path: String, was: Option<&Value>, is: Option<&Value>) {

@@ -1,4 +1,4 @@
-//! Starting and stopping a coordinator.
+//! Starts and stops a coordinator.
 
 use std::{io, net::SocketAddr, sync::Arc, time::Duration};
 
@@ -35,69 +35,70 @@ use crate::{
     timed::Timed,
 };
 
-/// Largest message either way: a job of 100,000 scene files is about 15 MB.
+/// Largest message in either direction: a job of 100,000 scene files is about 15 MB.
 pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// Largest message of a worker: a heartbeat or hello that names some ten thousand leases.
 const MAX_WORKER_MESSAGE_BYTES: usize = 1 << 20;
-/// Open requests of one connection at a time. Those of clients wait on the client's side for their turn.
+/// Most open requests of one connection. Further requests wait in the client.
 const MAX_STREAMS: u32 = 100;
-/// What a client may send ahead of what is read: of one request, and of a connection.
+/// Bytes that a client may send ahead of reading, for one request and for one connection.
 const STREAM_WINDOW: u32 = 64 << 10;
 const CONNECTION_WINDOW: u32 = 256 << 10;
 /// Largest headers of a request.
 const MAX_HEADERS_BYTES: u32 = 16 << 10;
-/// Commands that may wait for the actor; more senders wait for room.
+/// Commands that may wait for the actor. Further senders wait for room.
 const QUEUE: usize = 8192;
-/// How long the last lines of the audit log may take.
+/// Time limit for the last lines of the audit log.
 const LAST_LINES: Duration = Duration::from_secs(5);
-/// How often an idle connection is probed, and how long an answer may take.
+/// Interval between probes of an idle connection, and time limit of the answer.
 const KEEPALIVE: Duration = Duration::from_secs(20);
 
-/// How a coordinator runs.
+/// Configuration of a coordinator.
 #[derive(Debug, Clone)]
 pub struct CoordinatorConfig {
-    /// The catalog; what is missing is created.
+    /// The catalog, which is created if missing.
     pub catalog: Arc<dyn CatalogSource>,
-    /// Where to listen; port 0 = any free port.
+    /// Address to listen on; port 0 means any free port.
     pub listen: SocketAddr,
-    /// Life of a lease without a heartbeat, milliseconds (default 60,000).
+    /// Duration of a lease without a heartbeat, milliseconds (default 60,000).
     pub lease_ms: u32,
-    /// How often workers report, milliseconds (default a sixth of a lease).
+    /// Interval between workers' reports, milliseconds (default a sixth of a lease).
     pub heartbeat_ms: u32,
-    /// How long a worker whose connection broke may take to come back, milliseconds (default 1,500).
+    /// Time in which a disconnected worker may reconnect, milliseconds (default 1,500).
     pub reconnect_ms: u32,
-    /// How often leases are looked through for expiry (default 250 ms).
+    /// Interval between checks for expired leases (default 250 ms).
     pub tick: Duration,
-    /// Waiting times after failures.
+    /// Delays after failures.
     pub backoff: Backoff,
-    /// What is left of a lease is shared with an idle worker if it takes at least so long, milliseconds (default 2,000).
+    /// The rest of a lease is shared with an idle worker if it takes at least this long,
+    /// milliseconds (default 2,000).
     pub worth_ms: u32,
-    /// A task is run a second time by an idle worker when it has taken three times as long as its like, and at least so
-    /// long, milliseconds (default 10,000).
+    /// Shortest run time after which an idle worker runs a task a second time, milliseconds
+    /// (default 10,000). The task must also have taken three times the mean of its stage.
     pub slow_ms: u32,
-    /// The clock leases live by.
+    /// The clock of the leases.
     pub clock: Clock,
-    /// Who is let in; by default anyone who reaches the address.
+    /// Who may connect; by default anyone who reaches the address.
     pub access: Access,
-    /// The most of everything.
+    /// Quotas.
     pub quotas: Quotas,
     /// Bounds on connections.
     pub connections: Connections,
-    /// How much memory there is for requests and jobs.
+    /// Memory for requests and jobs.
     pub memory: MemoryBounds,
-    /// Where `/healthz`, `/readyz` and `/metrics` are served, for anyone who reaches it; port 0 = any free port; by default
-    /// nowhere.
+    /// Address of `/healthz`, `/readyz` and `/metrics`, which need no credentials; port 0 means any
+    /// free port. By default they are not served.
     pub http: Option<SocketAddr>,
-    /// Jobs that ended so long ago are forgotten, with their history; by default never.
+    /// Time after which ended jobs are forgotten with their history; by default never.
     pub forget_after: Option<Duration>,
-    /// How long lines of the audit log are kept (default a year).
+    /// Time for which lines of the audit log are kept (default a year).
     pub audit_for: Duration,
-    /// What looks into stores for results that are recorded; by default nothing does, and workers look for them.
+    /// Reads stores to check recorded results. By default nothing does, and workers look for them.
     pub stored: Option<Arc<dyn Stored>>,
 }
 
 impl CoordinatorConfig {
-    /// The defaults, for this catalog and address.
+    /// Returns the defaults for this catalog and address.
     pub fn new(catalog: impl CatalogSource + 'static, listen: SocketAddr) -> Self {
         Self {
             catalog: Arc::new(catalog),
@@ -122,10 +123,10 @@ impl CoordinatorConfig {
     }
 }
 
-/// Why a coordinator does not run.
+/// The reason why a coordinator does not run.
 #[derive(Debug, thiserror::Error)]
 pub enum CoordinatorError {
-    /// The address is taken.
+    /// The address is in use.
     #[error(
         "cannot listen on {address}: the port is in use; is a coordinator running already? Choose another port, or 0 for any free one"
     )]
@@ -138,10 +139,10 @@ pub enum CoordinatorError {
     Listen {
         /// The address.
         address: SocketAddr,
-        /// The system's answer.
+        /// The system's error.
         source: io::Error,
     },
-    /// A time in the configuration makes no sense.
+    /// A time in the configuration is invalid.
     #[error("{0}")]
     Config(String),
     /// A certificate or key cannot be used.
@@ -153,30 +154,30 @@ pub enum CoordinatorError {
     /// The catalog cannot be used.
     #[error(transparent)]
     Catalog(#[from] CatalogError),
-    /// The server broke.
+    /// The server failed.
     #[error("the server stopped: {0}")]
     Server(#[from] tonic::transport::Error),
 }
 
-/// A coordinator at work.
+/// A running coordinator.
 #[derive(Debug)]
 pub struct Running {
-    /// Where it listens, with the port it got.
+    /// The listening address, with the actual port.
     pub address: SocketAddr,
-    /// Where its HTTP endpoint listens.
+    /// The listening address of the HTTP endpoint.
     pub http: Option<SocketAddr>,
     /// Ends after a shutdown, when the catalog is closed.
     pub task: JoinHandle<Result<(), CoordinatorError>>,
 }
 
 impl Running {
-    /// Waits until it has stopped.
+    /// Waits until the coordinator has stopped.
     ///
     /// # Errors
-    /// What stopped it, if not `shutdown`.
+    /// Returns the error that stopped it, if `shutdown` did not.
     ///
     /// # Panics
-    /// When its task panicked.
+    /// Panics if its task panicked.
     pub async fn wait(self) -> Result<(), CoordinatorError> {
         self.task.await.expect("the server task does not panic")
     }
@@ -192,16 +193,16 @@ async fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), Coordi
     Ok((listener, address))
 }
 
-/// Starts a coordinator; it runs until `shutdown` is cancelled
-/// (and cancels it when it ends by itself). Clients may connect when this returns.
+/// Starts a coordinator. It runs until `shutdown` is cancelled, and cancels `shutdown` if it ends
+/// by itself. Clients may connect when this returns.
 ///
 /// # Errors
-/// [`CoordinatorError`] when the address or the catalog cannot be used.
+/// Returns [`CoordinatorError`] if the address or the catalog cannot be used.
 pub fn serve(
     config: CoordinatorConfig,
     shutdown: CancellationToken,
 ) -> BoxFuture<'static, Result<Running, CoordinatorError>> {
-    // Boxed, so that a crate that awaits it does not compile the server again.
+    // Boxed, so that crates that await it do not compile the server again.
     start(config, shutdown).boxed()
 }
 
@@ -342,10 +343,11 @@ async fn start(
         .serve_with_incoming_shutdown(connections, shutdown.clone().cancelled_owned());
     let task = tokio::spawn(async move {
         let served = server.await;
-        // Whatever ended the server ends the actor too.
+        // A failed server also ends the actor.
         shutdown.cancel();
         actor.await.expect("the actor catches panics");
-        // Lines that are under way; a handler that hangs keeps its end, and shall not keep the catalog.
+        // Waits for pending lines. A handler that hangs keeps its sender open, and must not keep
+        // the catalog open.
         let _ = tokio::time::timeout(LAST_LINES, writer).await;
         catalog.close().await;
         Ok(served?)

@@ -1,4 +1,4 @@
-//! The sessions of a life of the actor: where to speak to them, and whose heartbeats wait to be handled.
+//! The sessions of one life of the actor: how to send to each, and which have unhandled heartbeats.
 
 use std::{
     collections::HashMap,
@@ -12,17 +12,17 @@ use tokio::sync::mpsc;
 
 use crate::core::{Say, SessionId};
 
-/// Counts the heartbeats of a session that have arrived and are not handled yet.
+/// Counts a session's heartbeats that have arrived and are not handled yet.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Waiting(Arc<AtomicU32>);
 
 impl Waiting {
-    /// One has arrived.
+    /// Records the arrival of a heartbeat.
     pub(crate) fn arrived(&self) {
         self.0.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How many there are.
+    /// Returns the number of unhandled heartbeats.
     pub(crate) fn count(&self) -> u32 {
         self.0.load(Ordering::Relaxed)
     }
@@ -45,14 +45,14 @@ impl Sessions {
         self.0.get(&session).map(|(say, _)| say)
     }
 
-    /// A heartbeat of this session is handled.
+    /// Records that a heartbeat of this session was handled.
     pub(crate) fn heard(&self, session: SessionId) {
         if let Some((_, waiting)) = self.0.get(&session) {
             waiting.0.fetch_sub(1, Ordering::Relaxed);
         }
     }
 
-    /// The sessions whose heartbeats wait.
+    /// Returns the sessions with unhandled heartbeats.
     pub(crate) fn waiting(&self) -> impl Iterator<Item = SessionId> + '_ {
         let waits = self
             .0

@@ -1,5 +1,5 @@
-//! What a coordinator has in hand of one stage: ranges that are leased to its workers, and pending ones that wait for
-//! them. What is done or given up leaves for the catalog.
+//! A stage's ranges held by a coordinator: those leased to its workers, and claimed pending ones.
+//! Ranges that are done or given up go back to the catalog.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,23 +8,25 @@ use picofarm_proto::ids::{LeaseRef, RangeId};
 
 use crate::transition::{self, Illegal, RangeEvent};
 
-/// The ranges in hand. Pending ones never overlap; a leased one overlaps those of tasks that left it.
+/// The held ranges. Pending ones never overlap. A leased range overlaps the ranges of tasks removed
+/// from it.
 #[derive(Debug, Default)]
 pub struct Stage {
-    /// By first task.
+    /// Pending ranges, by first task.
     pending: BTreeMap<u64, Range>,
     leased: BTreeMap<RangeId, Range>,
     /// Pending ranges by (not before, first task).
     queue: BTreeSet<(i64, u64)>,
-    /// Kept in step with the ranges.
+    /// Updated with the ranges.
     pending_tasks: u64,
     leased_tasks: u64,
 }
 
 impl Stage {
-    /// Takes a range in hand that is this instance's in the catalog; a pending one joins its neighbours.
+    /// Adds a range that the catalog assigns to this instance. A pending range merges with its
+    /// neighbours.
     pub fn receive(&mut self, mut range: Range, changes: &mut Changes) {
-        // One that was another instance's for a while is not what it was here.
+        // If the range belonged to another instance meanwhile, this instance's copy is outdated.
         self.forget(range.id);
         debug_assert_eq!(
             self.outdated_by(&range),
@@ -37,7 +39,7 @@ impl Stage {
         self.hold(range);
     }
 
-    /// Makes a pending range one with its neighbours in hand, if there are any.
+    /// Merges a pending range with its held neighbours, if any.
     fn join(&mut self, range: &mut Range, changes: &mut Changes) -> bool {
         if !(range.merges() && matches!(range.state, RangeState::Pending { .. })) {
             return false;
@@ -81,22 +83,22 @@ impl Stage {
         }
     }
 
-    /// Pending tasks in hand.
+    /// Returns the number of pending tasks held.
     pub fn pending_tasks(&self) -> u64 {
         self.pending_tasks
     }
 
-    /// Tasks under lease that are not done.
+    /// Returns the number of unfinished leased tasks.
     pub fn leased_tasks(&self) -> u64 {
         self.leased_tasks
     }
 
-    /// Whether nothing is in hand.
+    /// Returns whether no range is held.
     pub fn is_empty(&self) -> bool {
         self.pending.is_empty() && self.leased.is_empty()
     }
 
-    /// The leased ranges.
+    /// Returns the leased ranges.
     pub fn leased(&self) -> impl Iterator<Item = (&Range, &LeaseState)> {
         self.leased.values().map(|range| match &range.state {
             RangeState::Leased(lease) => (range, lease),
@@ -104,7 +106,7 @@ impl Stage {
         })
     }
 
-    /// The range of a lease, if that epoch is the live one.
+    /// Returns the range of a lease, if its epoch is the live one.
     pub fn lease(&self, lease: LeaseRef) -> Option<(&Range, &LeaseState)> {
         let range = self.leased.get(&lease.range)?;
         match &range.state {
@@ -113,13 +115,13 @@ impl Stage {
         }
     }
 
-    /// A leased range, whatever its epoch.
+    /// Returns a leased range, whatever its epoch.
     pub fn leased_range(&self, id: RangeId) -> Option<&Range> {
         self.leased.get(&id)
     }
 
-    /// Sets the end of a lease by a function of the present one. Only in memory: what another instance takes over begins a
-    /// new period anyway.
+    /// Sets the end of a lease to a function of its current end. The change is only in memory,
+    /// because a range that another instance takes over begins a new period anyway.
     pub fn set_until(&mut self, id: RangeId, to_ms: impl FnOnce(i64) -> i64) {
         if let Some(range) = self.leased.get_mut(&id)
             && let RangeState::Leased(lease) = &mut range.state
@@ -128,21 +130,22 @@ impl Stage {
         }
     }
 
-    /// A task of a leased range that was done leaves it after all; returns the range as it is then.
+    /// Removes a finished task from a leased range after all. Returns the changed range.
     pub fn leave(&mut self, id: RangeId, task: u64) -> Option<Range> {
         let range = self.leased.get_mut(&id)?;
         let at = usize::try_from(task.checked_sub(range.lo)?).ok()?;
         if let RangeState::Leased(lease) = &mut range.state {
             let mark = lease.marks.get_mut(at)?;
-            // What is to do is counted, and this was not.
+            // Unfinished tasks are counted; a finished task was not.
             debug_assert_ne!(*mark, Mark::Todo, "the task was done");
             *mark = Mark::Left;
         }
         Some(range.clone())
     }
 
-    /// The pending range that should go next at this time, and the first run of its tasks outside `except` (ascending,
-    /// disjoint): fresh ones by index, then the earliest retry.
+    /// Returns the pending range that goes next at this time, and the first run of its tasks
+    /// outside `except` (ascending, disjoint). Fresh ranges come first by index, then the earliest
+    /// retry.
     pub fn front(&self, now_ms: i64, suspects: bool, except: &[Run]) -> Option<(&Range, Run)> {
         self.queue
             .iter()
@@ -152,13 +155,13 @@ impl Stage {
             .find_map(|range| Some((range, first_outside(range, except)?)))
     }
 
-    /// Whether any pending range may go at this time.
+    /// Returns whether any pending range is due at this time.
     pub fn is_due(&self, now_ms: i64) -> bool {
         self.queue.first().is_some_and(|(at, _)| *at <= now_ms)
     }
 
-    /// Pending tasks that may go at this time, outside `except` (ascending, disjoint): those that
-    /// nobody suspects, and those with which workers were lost.
+    /// Returns the number of pending tasks that are due at this time, outside `except` (ascending,
+    /// disjoint): first those not under suspicion, then those with which workers were lost.
     pub fn ready(&self, now_ms: i64, except: &[Run]) -> (u64, u64) {
         let due = self.queue.iter().take_while(|(at, _)| *at <= now_ms);
         let (mut plain, mut suspects) = (0, 0);
@@ -176,13 +179,13 @@ impl Stage {
         (plain, suspects)
     }
 
-    /// The pending range that holds a task.
+    /// Returns the pending range that contains a task.
     pub fn pending_at(&self, task: u64) -> Option<&Range> {
         let (_, range) = self.pending.range(..=task).next_back()?;
         (task < range.hi).then_some(range)
     }
 
-    /// Gives every pending range out of hand.
+    /// Gives back every pending range.
     pub fn give_pending(&mut self, changes: &mut Changes) {
         self.queue.clear();
         self.pending_tasks = 0;
@@ -191,8 +194,8 @@ impl Stage {
         }
     }
 
-    /// Leases in hand that have tasks to do which the catalog says stand in `range`: a worker took them along to another
-    /// instance, and they ended there.
+    /// Returns the held leases with unfinished tasks that the catalog lists in `range`. Their
+    /// workers took them to another instance, where they ended.
     pub fn outdated_by(&self, range: &Range) -> Vec<RangeId> {
         let old = self.leased.values().filter(|leased| {
             let both = range.lo.max(leased.lo)..range.hi.min(leased.hi);
@@ -202,17 +205,17 @@ impl Stage {
         old.map(|leased| leased.id).collect()
     }
 
-    /// Forgets a leased range that has become another instance's.
+    /// Forgets a leased range that another instance has taken over.
     pub fn forget(&mut self, id: RangeId) -> Option<Range> {
         let range = self.leased.remove(&id)?;
         self.count(&range, |n, by| *n -= by);
         Some(range)
     }
 
-    /// Lets `event` happen to `range`; returns the leased range that results first, if any.
+    /// Applies `event` to `range`. Returns the first resulting leased range, if any.
     ///
     /// # Errors
-    /// [`Illegal`] when it cannot happen; then nothing changed.
+    /// Returns [`Illegal`] if the event is not possible. Then nothing changes.
     pub fn apply(
         &mut self,
         range: &Range,
@@ -272,7 +275,7 @@ impl Stage {
     }
 }
 
-/// The first run of a range's tasks outside `except` (ascending, disjoint).
+/// Returns the first run of a range's tasks outside `except` (ascending, disjoint).
 fn first_outside(range: &Range, except: &[Run]) -> Option<Run> {
     let mut lo = range.lo;
     for run in except {

@@ -1,35 +1,36 @@
-//! What a coordinator asks of stores: whether results that are recorded lie there. It links no code that reads stores;
-//! who starts it may hand some in.
+//! The coordinator's interface to stores, which checks whether recorded results exist. The
+//! coordinator links no code that reads stores; the program that starts it may provide some.
 
 use std::fmt;
 
 use futures::future::BoxFuture;
 use picofarm_proto::model::StageSpec;
 
-/// What a store holds of a recorded result.
+/// The state of a recorded result in its store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Found {
-    /// What was reported.
+    /// The reported result.
     Equal,
     /// Nothing, or only a part.
     Gone,
-    /// Something else.
+    /// A different result.
     Differs,
-    /// Nothing, because this machine has no folder at the store's place. Whether results were deleted, or only workers reach
-    /// the store, cannot be told.
+    /// Nothing, because this machine has no folder at the store's place. Either the results were
+    /// deleted, or only workers can reach the store.
     NoFolder,
-    /// Nothing, because there is no folder at the store's place. This machine has the folder around it.
+    /// Nothing, because there is no folder at the store's place. This machine has the parent
+    /// folder.
     NoStore,
 }
 
-/// Looks into stores. Its caller bounds how long it waits and how many ask at a time.
+/// Reads stores. The caller bounds the waiting time and the concurrency.
 pub trait Stored: fmt::Debug + Send + Sync + 'static {
-    /// Whether results of tasks of `stage` lie in its store as they were reported (task and SHA-256 of its manifest), in
-    /// the same order.
+    /// Checks whether results of `stage`'s tasks exist in its store as reported. Each is given by
+    /// its task and the SHA-256 of its manifest. The answers have the same order.
     ///
     /// # Errors
-    /// Why that cannot be found out from here, in words that follow "because": the store is not one that may be looked into, it
-    /// cannot be read, or the kind of stage keeps nothing that tells.
+    /// Returns why this cannot be determined here, in words that follow "because". The store may be
+    /// out of bounds or unreadable, or the kind of stage stores nothing to check.
     fn look<'a>(
         &'a self,
         stage: &'a StageSpec,

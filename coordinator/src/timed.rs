@@ -1,4 +1,4 @@
-//! The layer before every service that measures its calls.
+//! A layer that measures the calls of all services.
 
 use std::{
     future::Future,
@@ -27,7 +27,7 @@ impl<S> Layer<S> for Timed {
     }
 }
 
-/// A service whose calls are measured.
+/// A service with measured calls.
 #[derive(Clone)]
 pub(crate) struct Measured<S> {
     inner: S,

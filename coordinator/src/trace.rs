@@ -1,12 +1,12 @@
-//! The coordinator's spans in traces: a lease begins a trace, and the commit of each of its tasks ends its branch. See
-//! [`picofarm_proto::trace`].
+//! The coordinator's trace spans. A lease begins a trace, and the commit of each of its tasks ends
+//! a branch. See [`picofarm_proto::trace`].
 
 use picofarm_proto::{model::Finished, trace};
 use tracing::{Level, Span, debug_span, enabled};
 
 use crate::core::{Say, SessionId};
 
-/// A span for each lease among what is about to be made durable and said; the leases carry them on.
+/// Creates a span for each lease about to be committed and sent. The lease messages carry it.
 pub(crate) fn grants(say: &mut [(SessionId, Say)]) -> Vec<Span> {
     if !enabled!(target: trace::TARGET, Level::DEBUG) {
         return Vec::new();
@@ -23,7 +23,7 @@ pub(crate) fn grants(say: &mut [(SessionId, Say)]) -> Vec<Span> {
     spans
 }
 
-/// A span for a reported task, as the next one of the task's own.
+/// Creates a span for a reported task, as the child of the task's own span.
 pub(crate) fn commit(report: &Finished) -> Option<Span> {
     if !enabled!(target: trace::TARGET, Level::DEBUG) {
         return None;

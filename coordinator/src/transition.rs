@@ -1,59 +1,61 @@
-//! What may happen to a range: a pure function from a range and an event to the ranges that take its place.
-//! Law: the pieces hold exactly the tasks of the range, each once (a task marked `Left` has a range of its own).
+//! The transitions of a range: a pure function from a range and an event to the ranges that replace
+//! it. Law: the pieces contain exactly the tasks of the range, each once (a task marked `Left` has
+//! a range of its own).
 
 use picofarm_catalog::{LeaseState, Mark, Range, RangeState, Run};
 use picofarm_proto::ids::{Incarnation, RangeId, WorkerId};
 
-/// Something that happens to a range.
+/// An event of a range.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RangeEvent {
     /// `count` tasks from `at` on go to a worker; the rest stays pending.
     Grant {
-        /// The first task granted, one of the range's.
+        /// The first granted task, which belongs to the range.
         at: u64,
-        /// Tasks granted, at least 1 and at most those of the range from `at` on.
+        /// Number of granted tasks, at least 1 and at most those of the range from `at` on.
         count: u64,
-        /// To whom.
+        /// The worker.
         worker: WorkerId,
-        /// To which process.
+        /// The process of the worker.
         incarnation: Incarnation,
-        /// Until when, Unix milliseconds.
+        /// The end of the lease, Unix milliseconds.
         until_ms: i64,
     },
     /// A task's output is committed. The last one ends the lease.
     Finish {
         /// The task.
         task: u64,
-        /// Its output was there already.
+        /// Whether the output existed before.
         reused: bool,
     },
-    /// A task failed and leaves for a range of its own. The last one ends the lease.
+    /// A task failed and moves to a range of its own. The last one ends the lease.
     Leave {
         /// The task.
         task: u64,
-        /// When it may be tried again, Unix milliseconds; `None` = given up.
+        /// Time from which it may run again, Unix milliseconds; `None` if it is given up.
         retry_at_ms: Option<i64>,
         /// Workers lost with it so far.
         crashes: u32,
     },
-    /// The lease ends; what is not done becomes pending again.
+    /// The lease ends and its unfinished tasks become pending again.
     Close {
-        /// The worker was lost: halve what is left, so that a poison task is cornered.
+        /// Whether the worker was lost. The rest is then halved, so that a poison task becomes
+        /// isolated.
         halve: bool,
     },
-    /// The holder loses the tasks from this one on, none of which it has begun.
+    /// The holder loses the tasks from this one on, none of them begun.
     Trim {
-        /// The first of them.
+        /// The first of these tasks.
         at: u64,
     },
-    /// The outputs of pending tasks turned up.
+    /// Outputs of pending tasks were found.
     Settle {
-        /// The tasks, all of the range.
+        /// The tasks, all in the range.
         run: Run,
     },
 }
 
-/// An event that cannot happen to a range in its state.
+/// An event that the range's state does not allow.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{event} cannot happen to range {range} ({state})")]
 pub struct Illegal {
@@ -62,10 +64,10 @@ pub struct Illegal {
     event: String,
 }
 
-/// The ranges that take the place of `range` after `event`; `ids` makes the ids of new ones.
+/// Returns the ranges that replace `range` after `event`; `ids` generates the ids of new ones.
 ///
 /// # Errors
-/// [`Illegal`] when the event cannot happen in the range's state.
+/// Returns [`Illegal`] if the event is not possible in the range's state.
 pub fn next(
     range: &Range,
     event: &RangeEvent,
@@ -100,7 +102,7 @@ pub fn next(
             });
             let end = at + count;
             let mut pieces = Vec::with_capacity(3);
-            // What stays pending keeps the range's id.
+            // Tasks that stay pending keep the range's id.
             for (lo, hi) in [(range.lo, *at), (end, range.hi)] {
                 if lo < hi {
                     let state = range.state.clone();
@@ -188,7 +190,7 @@ pub fn next(
     }
 }
 
-/// The lease with one task marked; `None` when the task is not this lease's to mark.
+/// Returns the lease with one task marked; `None` if this lease may not mark the task.
 fn marked(range: &Range, lease: &LeaseState, task: u64, mark: Mark) -> Option<LeaseState> {
     let at = usize::try_from(task.checked_sub(range.lo)?).ok()?;
     let mut lease = lease.clone();
@@ -197,7 +199,7 @@ fn marked(range: &Range, lease: &LeaseState, task: u64, mark: Mark) -> Option<Le
     Some(lease)
 }
 
-/// A lease with nothing left to do ends by itself.
+/// Ends a lease without unfinished tasks.
 fn after_mark(range: &Range, lease: LeaseState, ids: &mut dyn FnMut() -> RangeId) -> Vec<Range> {
     if lease.marks.contains(&Mark::Todo) {
         vec![Range {
@@ -209,7 +211,7 @@ fn after_mark(range: &Range, lease: LeaseState, ids: &mut dyn FnMut() -> RangeId
     }
 }
 
-/// The runs of equal marks as ranges.
+/// Returns the runs of equal marks as ranges.
 fn closed(
     range: &Range,
     lease: &LeaseState,
@@ -245,7 +247,8 @@ fn closed(
     pieces
 }
 
-/// The first piece keeps the range's id; the epoch goes with all of them, so that it never falls for any id.
+/// Creates a piece of a range. The first piece keeps the range's id. All pieces keep the epoch, so
+/// that it never decreases for any id.
 fn piece(
     range: &Range,
     lo: u64,

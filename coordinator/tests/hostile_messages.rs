@@ -1,5 +1,5 @@
-//! Whatever arrives on the wire, a coordinator neither panics nor grows, and goes on serving those who behave.
-//! `PICOFARM_FUZZ=n` runs n times as many cases.
+//! Whatever messages arrive, a coordinator does not panic or grow, and continues to serve honest
+//! clients. `PICOFARM_FUZZ=n` runs n times as many cases.
 
 use std::{
     sync::atomic::{AtomicUsize, Ordering},
@@ -27,10 +27,10 @@ use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 use uuid::Uuid;
 
-/// Panics of any thread, those that somebody catches too.
+/// Panics of any thread, including caught ones.
 static PANICS: AtomicUsize = AtomicUsize::new(0);
 
-/// How many cases, given how many take a few seconds.
+/// Returns the number of cases, given the number that takes a few seconds.
 fn cases(short: u32) -> u32 {
     let times = std::env::var("PICOFARM_FUZZ").map_or(1, |n| n.parse().expect("a number"));
     short * times
@@ -66,7 +66,8 @@ impl Server {
         JobsClient::new(self.channel.clone())
     }
 
-    /// One session that says all this; it ends when the coordinator ends it, or has heard enough.
+    /// Runs one session that sends all these messages. It ends when the coordinator ends it or has
+    /// received enough.
     async fn session(&self, said: Vec<wire::SessionRequest>) {
         let mut client = FarmClient::new(self.channel.clone());
         let said = tokio_stream::iter(said);
@@ -77,7 +78,7 @@ impl Server {
         }
     }
 
-    /// A job from its submission to its end, by a worker that behaves.
+    /// Runs a job from submission to end with an honest worker.
     async fn serves(&self) {
         let mut jobs = self.jobs();
         let mut spec = good();
@@ -109,7 +110,7 @@ impl Server {
         jobs.cancel_job(cancel).await.unwrap();
     }
 
-    /// Jobs known, and workers connected.
+    /// Returns the known jobs and the connected workers.
     async fn held(&self) -> (usize, u32) {
         let mut jobs = self.jobs();
         let list = jobs
@@ -143,7 +144,7 @@ fn request_of(message: Say) -> wire::SessionRequest {
     }
 }
 
-/// A job that is accepted.
+/// Returns a valid job.
 fn good() -> JobSpec {
     serde_json::from_str(
         r#"{"name": "good", "scenes": {"kind": "primitive", "count": 3},
@@ -160,7 +161,7 @@ fn rendering(spec: &mut JobSpec) -> &mut RenderTask {
     }
 }
 
-/// Two stages, one of which needs the other.
+/// Returns two stages; the second needs the first.
 fn graph() -> JobSpec {
     serde_json::from_str(
         r#"{"name": "graph", "priority": 3, "limits": {"max_workers": 2, "deadline": "2030-01-01T00:00:00Z"}, "stage": [
@@ -192,7 +193,7 @@ fn hello(id: String) -> wire::Hello {
     }
 }
 
-// What is on the wire at random. Ids come from few values, so that messages meet one another.
+// Random messages. Ids come from few values, so that messages refer to one another.
 
 fn id() -> impl Strategy<Value = String> {
     prop_oneof![
@@ -306,7 +307,7 @@ fn job() -> impl Strategy<Value = serde_json::Value> {
     prop::sample::select(jobs.to_vec())
 }
 
-/// A job with some bytes of its text changed, or values of it put in another's place.
+/// Returns a job with changed bytes in its text, or with exchanged values.
 fn spoilt_spec() -> impl Strategy<Value = Option<wire::JobSpec>> {
     let bytes = (
         job(),
@@ -338,7 +339,7 @@ fn spoilt_spec() -> impl Strategy<Value = Option<wire::JobSpec>> {
     ]
 }
 
-/// A value where another was expected, or one beyond every limit.
+/// Returns a value of an unexpected type, or beyond every limit.
 fn value() -> impl Strategy<Value = serde_json::Value> {
     use serde_json::json;
     prop_oneof![
@@ -359,7 +360,7 @@ fn value() -> impl Strategy<Value = serde_json::Value> {
     ]
 }
 
-/// Pointers to every place in a value that may hold another.
+/// Collects pointers to all replaceable places in a value.
 fn leaves(value: &serde_json::Value, path: &str, found: &mut Vec<String>) {
     match value {
         serde_json::Value::Object(all) if !all.is_empty() => {
@@ -376,7 +377,7 @@ fn leaves(value: &serde_json::Value, path: &str, found: &mut Vec<String>) {
     }
 }
 
-/// Draws values one after the other: proptest's own loop knows no asynchronous tests.
+/// Draws values one by one, because proptest's own loop does not support asynchronous tests.
 struct Draws(TestRunner);
 
 impl Draws {
@@ -396,7 +397,7 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
     server.serves().await;
 
     for case in 0..cases(150) {
-        // A session of random messages, most of which begin as they should.
+        // A session of random messages; most begin correctly.
         let mut said = draws.next(&vec(say(), 0..40));
         if case % 4 != 0 {
             let id = Uuid::from_u128(u128::from(case % 4)).to_string();
@@ -435,7 +436,7 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
             logs: draws.next(&any::<bool>()),
             stage: Some(draws.next(&small())),
         };
-        // Any answer will do; that there is one is the point.
+        // Any answer is acceptable, as long as there is one.
         let _ = jobs.list_events(query).await;
         let _ = jobs
             .explain_job(wire::ExplainJobRequest {

@@ -1,5 +1,5 @@
-//! A process that has no file left to open goes on when there is one again. A test program of its own: the limit is of
-//! the whole process.
+//! A process without free file handles continues once there is one again. This is a separate test
+//! program, because the limit applies to the whole process.
 
 use std::time::Duration;
 
@@ -33,7 +33,7 @@ async fn a_listener_without_a_file_left_goes_on_when_there_are_some_again() {
     );
     config.http = Some(any);
     let running = serve(config, CancellationToken::new()).await.unwrap();
-    // Clients of this same process: half of the connections' files are theirs.
+    // The clients are in this process too, so that they use half of the connections' files.
     let mut sockets = Vec::new();
     let full = loop {
         match TcpStream::connect(running.address).await {
@@ -65,7 +65,8 @@ async fn a_listener_without_a_file_left_goes_on_when_there_are_some_again() {
         assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
         let url = format!("http://{}", running.address);
         let mut jobs = JobsClient::connect(url).await.unwrap();
-        // Where the catalog was to be opened while there was no file left, it is tried again a little later.
+        // If the catalog could not be opened for lack of a file handle, opening is tried again a
+        // little later.
         while let Err(status) = jobs.get_server_info(wire::GetServerInfoRequest {}).await {
             assert_eq!(status.code(), Code::Unavailable, "{status}");
             tokio::time::sleep(Duration::from_millis(50)).await;

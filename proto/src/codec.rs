@@ -1,5 +1,5 @@
-//! The codec of all messages: prost's, with buffers that begin small. A coordinator has two for each worker, and what workers
-//! say and hear most of the time is some hundred bytes long.
+//! The codec of all messages: prost's, with small initial buffers. A coordinator has two buffers
+//! for each worker, and most messages of workers are some hundred bytes long.
 
 use std::marker::PhantomData;
 
@@ -7,9 +7,9 @@ use prost::Message;
 use tonic::codec::{BufferSettings, Codec};
 use tonic_prost::ProstCodec;
 
-/// Bytes that a buffer begins with; it grows with the messages.
+/// Initial size of a buffer, bytes. It grows with the messages.
 const BUFFER: usize = 1 << 10;
-/// A stream hands on what it has when it is so long.
+/// A stream flushes its buffer at this size, bytes.
 const HAND_ON: usize = 32 << 10;
 
 /// Prost with small buffers.

@@ -1,8 +1,10 @@
-//! Which workers a coordinator serves, so that a farm can be upgraded one process at a time.
+//! Decides which workers a coordinator serves, so that a farm can be upgraded one process at a
+//! time.
 //!
-//! A coordinator serves workers of its own minor version and of the one before, or of any earlier minor version from 1.0 on.
-//! Coordinators are upgraded first. Results stay the same, because a worker is only given tasks whose kind has the version
-//! that it runs, and a worker refuses a stage with settings that it does not know.
+//! A coordinator serves workers of its own minor version and of the previous one, or of any earlier
+//! minor version from 1.0 on. Coordinators are upgraded first. Results stay the same, because a
+//! worker gets only tasks of kinds with the version that it runs, and refuses a stage with unknown
+//! settings.
 
 /// Version of the worker protocol.
 pub const PROTOCOL: u32 = 2;
@@ -20,10 +22,11 @@ fn parse(version: &str) -> Option<Version> {
     parts.next().is_none().then_some(version)
 }
 
-/// Whether a coordinator of version `ours` serves a worker of version `theirs` that speaks `protocol`.
+/// Checks whether a coordinator of version `ours` serves a worker of version `theirs` that speaks
+/// `protocol`.
 ///
 /// # Errors
-/// Why not, and which of the two must be upgraded.
+/// Returns the reason why not, and which of the two must be upgraded.
 pub fn serves(ours: &str, theirs: &str, protocol: u32) -> Result<(), String> {
     let unreadable = || format!("expected a version such as {ours:?}");
     let (our_major, our_minor, _) = parse(ours).ok_or_else(unreadable)?;

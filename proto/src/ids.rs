@@ -1,11 +1,11 @@
-//! Typed identifiers: a job id cannot be passed for a range id.
+//! Typed identifiers, so that a job id cannot be passed for a range id.
 
 use std::{fmt, str::FromStr};
 
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-/// A text that is not an id of the wanted kind.
+/// The error for a text without a valid id of the expected kind.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{text:?} is not a {kind} id; expected a UUID such as {}", Uuid::nil())]
 pub struct IdError {
@@ -21,12 +21,13 @@ macro_rules! id {
         pub struct $name(Uuid);
 
         impl $name {
-            /// Wraps a UUID made elsewhere (ids are made at the edge, never in pure code).
+            /// Wraps a UUID generated elsewhere (ids are generated at the edge, never in pure
+            /// code).
             pub const fn from_uuid(uuid: Uuid) -> Self {
                 Self(uuid)
             }
 
-            /// The UUID.
+            /// Returns the UUID.
             pub const fn uuid(self) -> Uuid {
                 self.0
             }
@@ -56,7 +57,7 @@ id!(
     "job"
 );
 id!(
-    /// A shard of a stage: consecutive tasks leased together.
+    /// A range of a stage: consecutive tasks leased together.
     RangeId,
     "range"
 );
@@ -66,17 +67,17 @@ id!(
     "worker"
 );
 id!(
-    /// One process of a worker: new at every start.
+    /// One process of a worker, new at every start.
     Incarnation,
     "incarnation"
 );
 id!(
-    /// One life of a coordinator on a catalog: new at every start and after every failure to write.
+    /// One life of a coordinator on a catalog, new at every start and after every failed write.
     InstanceId,
     "instance"
 );
 
-/// A stage of a job; its tasks have indices from 0.
+/// A stage of a job. Its tasks have indices from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct StageRef {
     /// The job.
@@ -91,7 +92,8 @@ impl fmt::Display for StageRef {
     }
 }
 
-/// Fences a lease: grows at each grant of a range, so that a former holder's words no longer count.
+/// Fences a lease. It grows with each grant of a range, so that messages of a former holder no
+/// longer count.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, Default,
 )]
@@ -104,7 +106,7 @@ impl fmt::Display for Epoch {
     }
 }
 
-/// A lease as both sides name it.
+/// Refers to a lease on both sides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LeaseRef {
     /// The range.

@@ -1,5 +1,6 @@
-//! Names of results. A stage key hashes everything that shapes the outputs of a job's tasks; a task key
-//! adds the task's index. Equal key, equal bytes: resume, reuse and reprocessing all rest on this.
+//! Keys of results. A stage key hashes everything that affects the outputs of a job's tasks; a task
+//! key adds the task's index. Equal keys mean equal bytes: resume, reuse and reprocessing rely on
+//! this.
 
 use std::collections::BTreeMap;
 
@@ -15,13 +16,13 @@ pub(crate) mod hash;
 
 pub use hash::{StageKey, TaskKey, derived_key, task_key};
 
-/// The key of a stage: everything that shapes the results of its tasks but their number. A data set that is read counts
-/// by its place.
+/// Returns the key of a stage: everything that affects the results of its tasks except their
+/// number. An input data set counts by its place.
 pub fn stage_key(stage: &StageSpec) -> StageKey {
     StageKey::of(stage.task.shaping())
 }
 
-/// The key of the one task of a split stage over the first `scenes` scenes of what `source` makes.
+/// Returns the key of the single task of a split stage over the first `scenes` scenes of `source`.
 pub fn split_key(settings: &SplitSettings, source: &StageKey, scenes: u64) -> TaskKey {
     let description = serde_json::json!({
         "task": "split",
@@ -32,9 +33,9 @@ pub fn split_key(settings: &SplitSettings, source: &StageKey, scenes: u64) -> Ta
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
-/// Names what a training makes: settings and code, the scenes learnt from and validated on by what pins their bytes, in
-/// order, and what it builds on by field: models by the SHA-256 of their manifests, predictions by what pins their bytes. No name
-/// and no place counts.
+/// Returns the key of a training. It contains the settings and the code, the pinned training and
+/// validation scenes in order, and its inputs by field: models by the SHA-256 of their manifests,
+/// and predictions by their pinned bytes. Names and places do not count.
 pub fn training_key(
     settings: &TrainSettings,
     [training, validation]: [&str; 2],
@@ -59,9 +60,10 @@ pub fn training_key(
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
-/// Names what an evaluation of one model finds: the model by the SHA-256 of its manifest, what pins the bytes of the scenes
-/// and of those that plain answers are fitted to, in order, the histogram, what two-bounce times follow from (`truth`, or what
-/// pins predictions; empty where none are given), whether the model's sensor is between, and the code.
+/// Returns the key of an evaluation of one model. It contains the model by the SHA-256 of its
+/// manifest, the pinned scenes and those to which plain answers are fitted, in order, and the
+/// histogram. It also contains the source of two-bounce times (`truth`, or the pinned predictions;
+/// empty if none are used), whether the model's sensor is applied, and the code.
 pub fn evaluation_key(
     model_sha256: &str,
     data: [&str; 2],
@@ -83,8 +85,9 @@ pub fn evaluation_key(
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
-/// Names what models predict of one scene: the scene by the SHA-256 of its manifest, each kind of model by that of its
-/// manifest and the histogram that it sees, what two-bounce times follow from, and the code.
+/// Returns the key of models' predictions for one scene. It contains the scene by the SHA-256 of
+/// its manifest, each model by that of its manifest with its histogram, the source of two-bounce
+/// times, and the code.
 pub fn inference_key(
     scene_sha256: &str,
     models: &BTreeMap<&str, (String, Histogram, Vec<u32>)>,
@@ -101,8 +104,8 @@ pub fn inference_key(
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
-/// Names a report: its settings but for name and place, the models and their evaluations by what pins them, in order, and the
-/// code.
+/// Returns the key of a report: its settings without name and place, the pinned models and their
+/// evaluations in order, and the code.
 pub fn report_key(settings: &ReportSettings, models: &[String]) -> TaskKey {
     let description = serde_json::json!({
         "task": "report",
@@ -114,7 +117,7 @@ pub fn report_key(settings: &ReportSettings, models: &[String]) -> TaskKey {
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
-/// The seed of scene `index`: the first eight bytes of SHA-256("scene", seed, index).
+/// Returns the seed of scene `index`: the first eight bytes of SHA-256("scene", seed, index).
 pub fn scene_seed(seed: u64, index: u64) -> u64 {
     let mut hash = Sha256::new();
     hash.update(b"scene");
@@ -124,7 +127,7 @@ pub fn scene_seed(seed: u64, index: u64) -> u64 {
     u64::from_le_bytes(digest[..8].try_into().expect("a digest has 32 bytes"))
 }
 
-/// SHA-256 over the whole spec: two submissions with equal hash are the same job.
+/// Returns the SHA-256 of the whole spec. Two submissions with equal hashes are the same job.
 pub fn spec_hash(spec: &JobSpec) -> String {
     let description = serde_json::to_value(spec).expect("a spec is plain data");
     hex::encode(Sha256::digest(canonical(description).as_bytes()))

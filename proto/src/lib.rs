@@ -11,7 +11,7 @@ pub mod show;
 pub mod split;
 pub mod trace;
 
-/// Generated protobuf and gRPC types, package `picofarm.v1`. They never leave the rpc modules.
+/// Generated protobuf and gRPC types, package `picofarm.v1`. They stay inside the rpc modules.
 #[expect(missing_docs, reason = "generated from the schema, which documents it")]
 pub mod wire {
     include!("generated/picofarm.v1.rs");

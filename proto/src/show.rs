@@ -1,10 +1,10 @@
-//! Text for people: what a terminal may be given of text from elsewhere, arguments as a shell reads them, and the nearest
-//! of the names there are.
+//! Text for display: safe terminal output of foreign text, shell arguments, and suggestions for
+//! misspelt names.
 
 use std::{borrow::Cow, cmp::Reverse, fmt::Write};
 
-/// Whether a character must not reach a terminal as it is: controls move the cursor and forge lines, directional
-/// characters change the order in which others are shown.
+/// Returns whether a character must not reach a terminal unescaped. Control characters move the
+/// cursor and forge lines; directional characters change the order in which others are shown.
 fn hidden(c: char) -> bool {
     c.is_control()
         || matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{feff}')
@@ -28,20 +28,21 @@ fn escaped(text: &str, kept: fn(char) -> bool) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Text from elsewhere as one line: line ends, other control characters and directional ones are spelt out (`\n`,
-/// `\u{1b}`). Everything that somebody else wrote (names, messages, errors) goes through this before it stands in a line.
+/// Returns foreign text as one line. Line ends, other control characters and directional ones are
+/// escaped (`\n`, `\u{1b}`). All foreign text (names, messages, errors) must pass through this
+/// function before it becomes part of a line.
 pub fn line(text: &str) -> Cow<'_, str> {
     escaped(text, |_| false)
 }
 
-/// The same of a text that is lines: `\n` stays. The last gate before a terminal: it cannot tell a forged line from
-/// another, so each text from elsewhere goes through [`line`] first.
+/// Like [`line`], but keeps `\n`. This is the last check before a terminal. It cannot tell a forged
+/// line from another, so each foreign text must pass through [`line`] first.
 pub fn lines(text: &str) -> Cow<'_, str> {
     escaped(text, |c| c == '\n')
 }
 
-/// A JSON document in which characters that must not reach a terminal are written `\u…`. It stays the same document: outside
-/// of its texts there are none of them.
+/// Returns a JSON document with unsafe characters written as `\u…`. The document stays equal,
+/// because such characters occur only inside its strings.
 pub fn json(document: &str) -> Cow<'_, str> {
     if !document.contains(|c| hidden(c) && c != '\n') {
         return Cow::Borrowed(document);
@@ -58,8 +59,8 @@ pub fn json(document: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// An argument as a POSIX shell reads it: quoted where it must be. Control characters are written as `$'\x1b'`, which bash,
-/// zsh and ksh read.
+/// Quotes an argument for a POSIX shell, if necessary. Control characters are written as `$'\x1b'`,
+/// which bash, zsh and ksh read.
 pub fn argument(text: &str) -> Cow<'_, str> {
     let plain = |c: char| c.is_alphanumeric() || "@%+=:,./_-".contains(c);
     if !text.is_empty() && text.chars().all(plain) {
@@ -85,22 +86,23 @@ pub fn argument(text: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// A path as an argument; see [`argument`].
+/// Quotes a path as an argument; see [`argument`].
 pub fn path(path: &std::path::Path) -> String {
     argument(&path.to_string_lossy()).into_owned()
 }
 
-/// The one of `names` that `text` was probably meant to be: at most a third of its letters differ.
+/// Returns the name in `names` that `text` probably meant, with at most a third of its letters
+/// different.
 pub fn nearest<'a>(text: &str, names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let text = text.to_lowercase();
     let far = |name: &str| strsim::osa_distance(&text, &name.to_lowercase());
     let best = names.into_iter().map(|name| (far(name), name));
-    // Of two that are as near, the longer was more probably cut short.
+    // Of two equally near names, the longer one was more probably cut short.
     let (distance, name) = best.min_by_key(|(distance, name)| (*distance, Reverse(name.len())))?;
     (distance <= (name.chars().count() / 3).max(1)).then_some(name)
 }
 
-/// Says that `text` is none of `names`, which they are, and which was probably meant.
+/// Returns a message that `text` is unknown, with the known `names` and the one probably meant.
 pub fn unknown(text: &str, names: &[&str]) -> String {
     let quoted: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
     let meant = nearest(text, names.iter().copied());
@@ -111,8 +113,8 @@ pub fn unknown(text: &str, names: &[&str]) -> String {
     }
 }
 
-/// The message of a reader of files (serde) as people understand it: about an unknown name, with the name that was probably
-/// meant; about a number, with the range that was expected.
+/// Rewrites a message of serde for users: an unknown name gets the name probably meant, and a
+/// number gets the expected range.
 pub fn suggest(message: &str) -> String {
     let mut message = message.to_owned();
     for (kind, range) in [
@@ -136,7 +138,7 @@ fn named(message: &str) -> String {
     else {
         return message.to_owned();
     };
-    // Readers within readers, each of which passes it here.
+    // Nested readers each pass their message through this function.
     if after.contains("; did you mean `") {
         return message.to_owned();
     }
@@ -155,7 +157,8 @@ fn named(message: &str) -> String {
 mod tests {
     use super::*;
 
-    /// What an attacker would write: a title, colours, a cleared screen, a forged line, and letters in another order.
+    /// An attacker's text: a title, colours, a cleared screen, a forged line, and reordered
+    /// letters.
     const EVIL: &str =
         "a\u{1b}]0;title\u{7}\u{1b}[2J\u{9b}31m\nerror: run curl\r\u{202e}gpj\u{2069}\tü";
 

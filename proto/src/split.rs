@@ -1,13 +1,14 @@
-//! Splitting a data set into training, validation and test scenes. Pure: indices in, a record out.
+//! Splits a data set into training, validation and test scenes. Pure.
 //!
-//! Each scene has a *rank*: a hash of (seed, scene index). The first version of a split sorts the scenes at hand by rank,
-//! cuts the list at the exact counts asked for, and records the ranks at which it cut. From then on a scene's side
-//! follows from its own rank and those two cuts alone: whatever comes later, no scene changes sides, and the order in
-//! which scenes come changes nothing. The counts are exact at the size at which the split was made. Of M scenes that
-//! come later to N, a share p of them falls on a side with standard deviation √(p(1−p)(1/M + 1/N)).
+//! Each scene has a *rank*: a hash of (seed, scene index). The first version of a split sorts the
+//! existing scenes by rank, cuts the list at the exact requested counts, and records the ranks at
+//! the cuts. From then on a scene's side depends only on its own rank and those two cuts. No scene
+//! changes sides when scenes are added, and their order has no effect. The counts are exact at the
+//! size at which the split was made. If M scenes are added to N, the fraction p of them on a side
+//! has standard deviation √(p(1−p)(1/M + 1/N)).
 //!
-//! The index is the scene's identity, not its task key: a data set reprocessed from another has the same scenes under
-//! the same indices, so that one split fits both.
+//! The index is the scene's identity, not its task key. A reprocessed data set has the same scenes
+//! under the same indices, so that one split fits both.
 
 use std::collections::BTreeSet;
 
@@ -26,7 +27,7 @@ pub const SIDES: [&str; 3] = ["train", "validation", "test"];
 const LETTERS: [u8; 3] = *b"012";
 const ABSENT: u8 = b'.';
 
-/// What is asked for.
+/// The requested split.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SplitSettings {
@@ -49,13 +50,13 @@ fn default_name() -> String {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Parts {
-    /// Scenes; together as many as there are when the split is made.
+    /// Numbers of scenes. Their sum is the number of scenes when the split is made.
     Counts([u64; 3]),
-    /// Shares of the scenes there are when the split is made; together 1. Rounded by largest remainders.
+    /// Fractions of the scenes when the split is made, with sum 1. Rounded by largest remainders.
     Fractions([f64; 3]),
 }
 
-/// Where a scene stands in the order in which scenes are cut; a hash, and the scene itself against ties.
+/// A scene's place in the order of the cuts: a hash, and the scene itself to break ties.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rank {
@@ -67,7 +68,8 @@ pub struct Rank {
 }
 
 impl Rank {
-    /// First eight bytes, little-endian, of SHA-256("split", seed, scene), numbers as eight bytes, little-endian.
+    /// Returns the rank of a scene. The hash is the first eight bytes, little-endian, of
+    /// SHA-256("split", seed, scene), with numbers as eight bytes, little-endian.
     pub fn of(seed: u64, scene: u64) -> Self {
         let mut hash = Sha256::new();
         hash.update(b"split");
@@ -86,33 +88,34 @@ impl Rank {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cut {
-    /// Nothing lies before: every side before it is empty for good.
+    /// Every side before the cut is empty for good.
     Start,
-    /// Ranks below this one lie before.
+    /// Ranks below this one are before the cut.
     At(Rank),
-    /// Everything lies before: every side after it is empty for good.
+    /// Every side after the cut is empty for good.
     End,
 }
 
-/// A version of a split as it is stored.
+/// A stored version of a split.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SplitRecord {
     /// [`SPLIT_FORMAT`].
     pub format: u32,
-    /// What was asked for.
+    /// The requested split.
     pub settings: SplitSettings,
-    /// 1 for the first; each further one extends the one before.
+    /// 1 for the first version; each further one extends its predecessor.
     pub version: u64,
-    /// Scenes there were when the split was made: the counts of version 1 are exact.
+    /// Number of scenes when the split was made. The counts of version 1 are exact.
     pub made_of: u64,
-    /// Between training and validation, and between validation and test.
+    /// The cuts between training and validation, and between validation and test.
     pub cuts: [Cut; 2],
     /// Scenes of training, validation and test set in this version.
     pub counts: [u64; 3],
-    /// One character for each scene index: 0 training, 1 validation, 2 test, `.` not part of this version.
+    /// One character for each scene index: 0 training, 1 validation, 2 test, `.` not part of this
+    /// version.
     pub sides: String,
-    /// How to read `sides` in Python.
+    /// Python code that reads `sides`.
     pub decode: Vec<String>,
 }
 
@@ -120,7 +123,7 @@ impl SplitSettings {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("split.{field}"), what));
         let plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
@@ -157,7 +160,7 @@ impl SplitSettings {
         }
     }
 
-    /// The first field in which `asked` differs: (field, ours, asked).
+    /// Returns the first field in which `asked` differs: (field, ours, asked).
     pub fn difference(&self, asked: &Self) -> Option<(&'static str, String, String)> {
         if self.name != asked.name {
             return Some(("name", self.name.clone(), asked.name.clone()));
@@ -175,10 +178,10 @@ impl SplitSettings {
 }
 
 impl Parts {
-    /// The sizes for `scenes` scenes.
+    /// Returns the sizes for `scenes` scenes.
     ///
     /// # Errors
-    /// Counts that add up to another number.
+    /// Returns an error if the counts have a different sum.
     pub fn counts(&self, scenes: u64) -> Result<[u64; 3], SpecError> {
         match *self {
             Self::Counts(counts) => {
@@ -197,7 +200,8 @@ impl Parts {
             Self::Fractions(shares) => {
                 let exact = shares.map(|f| f * scenes as f64);
                 let mut counts = exact.map(|x| x.floor() as u64);
-                // Largest remainder first; of equal ones, the earlier side. A side of share 0 never gets any.
+                // The largest remainder comes first, and the earlier side if equal. A side with
+                // fraction 0 never gets any scene.
                 let mut order = [0, 1, 2];
                 order.sort_by(|&a, &b| exact[b].fract().total_cmp(&exact[a].fract()));
                 order.sort_by_key(|&side| shares[side] == 0.0);
@@ -212,10 +216,10 @@ impl Parts {
 }
 
 impl SplitRecord {
-    /// The first version, of the scenes at hand.
+    /// Returns the first version for the existing scenes.
     ///
     /// # Errors
-    /// Unusable settings, no scenes, or counts that do not add up to them.
+    /// Returns an error for invalid settings, no scenes, or counts with a different sum.
     pub fn first(settings: &SplitSettings, scenes: &BTreeSet<u64>) -> Result<Self, SpecError> {
         settings.check()?;
         if scenes.is_empty() {
@@ -249,11 +253,11 @@ impl SplitRecord {
         Ok(Self::assemble(settings.clone(), 1, made_of, cuts, scenes))
     }
 
-    /// The next version, which holds the scenes of this one and those at hand; `None` where none is new. No scene
-    /// changes sides.
+    /// Returns the next version, with the scenes of this one and the existing ones; `None` if none
+    /// is new. No scene changes sides.
     ///
     /// # Errors
-    /// Settings that differ from those of this version.
+    /// Returns an error if the settings differ from those of this version.
     pub fn extended(
         &self,
         settings: &SplitSettings,
@@ -317,7 +321,7 @@ impl SplitRecord {
         }
     }
 
-    /// The scenes of `train`, `validation` or `test`, ascending; none for another name.
+    /// Returns the scenes of `train`, `validation` or `test`, ascending; none for another name.
     pub fn scenes(&self, side: &str) -> Vec<u64> {
         let letter = SIDES.iter().position(|s| *s == side).map(|s| LETTERS[s]);
         let letters = self.sides.bytes().zip(0..);
@@ -327,17 +331,17 @@ impl SplitRecord {
             .collect()
     }
 
-    /// The bytes in which it is stored.
+    /// Returns the bytes of the stored form.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self).expect("a record is plain data");
         bytes.push(b'\n');
         bytes
     }
 
-    /// Reads a stored record.
+    /// Parses a stored record.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// Returns a description of the fault.
     pub fn parse(bytes: &[u8]) -> Result<Self, String> {
         let record: Self =
             serde_json::from_slice(bytes).map_err(|e| format!("not a record of a split: {e}"))?;
@@ -355,7 +359,7 @@ impl SplitRecord {
     }
 }
 
-/// The side of a scene: 0, 1 or 2.
+/// Returns the side of a scene: 0, 1 or 2.
 fn side(seed: u64, cuts: &[Cut; 2], scene: u64) -> usize {
     let rank = Rank::of(seed, scene);
     let passed = |cut: &&Cut| match cut {
@@ -366,7 +370,7 @@ fn side(seed: u64, cuts: &[Cut; 2], scene: u64) -> usize {
     cuts.iter().filter(passed).count()
 }
 
-/// Hashes as text: JavaScript and many others know no integers of 64 bits.
+/// Hashes as text, because JavaScript and many other languages have no 64-bit integers.
 mod hex_u64 {
     use serde::{Deserialize, Deserializer, Serializer, de::Error};
 

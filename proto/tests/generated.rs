@@ -1,9 +1,9 @@
-//! The code of the wire is what the schema makes. It is kept, so that a first build need not make it: the compiler of schemas
-//! takes longer to build than all that it makes.
+//! The generated wire code matches the schema. It is committed, because building the schema
+//! compiler takes longer than building all code that it generates.
 
 use std::{fs, path::Path};
 
-/// Set to 1 to write the file anew.
+/// Set to 1 to write the file again.
 const UPDATE: &str = "PICOFARM_UPDATE_WIRE";
 const HEAD: &str = "// @generated from proto/schema by tonic-prost-build; tests/generated.rs says how to make it again.\n";
 

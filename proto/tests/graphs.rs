@@ -1,4 +1,4 @@
-//! Jobs of several stages: how they are written, what follows from what, and what is refused.
+//! Jobs of several stages: their written form, dependencies, and refusals.
 
 use picofarm_proto::{
     key::{spec_hash, stage_key},
@@ -58,7 +58,7 @@ fn what_a_stage_reads_it_needs_and_knows_the_size_of() {
         ("/s", "clean", 9)
     );
     assert_eq!(split.tasks(), 1);
-    // The same by place.
+    // The same, referred to by place.
     let place = good(
         "[[stage]]\nkind = \"split\"\nsource = { store = \"/s\", dataset = \"clean\" }\n\
          split = { fractions = [0.5, 0.3, 0.2] }\n",
@@ -204,7 +204,7 @@ fn a_lease_brings_only_its_own_files() {
     let text = serde_json::to_string(&part).unwrap();
     let back: picofarm_proto::model::StageSpec = serde_json::from_str(&text).unwrap();
     assert_eq!(back, part);
-    // Of a job as it is submitted, all are listed.
+    // A submitted job lists all of them.
     let whole = JobSpec {
         stages: vec![part],
         ..spec
@@ -233,10 +233,10 @@ fn a_render_stage_in_parts_needs_one_that_renders_them_and_its_result_has_the_sa
     let whole: JobSpec = toml::from_str(&HEAVY.replace("parts = 4", "")).unwrap();
     assert_eq!(stage_key(&whole.stages[0]), stage_key(&spec.stages[1]));
     assert_ne!(stage_key(&whole.stages[0]), stage_key(&spec.stages[0]));
-    // Read again, from the catalog or the wire, it gets no further stages.
+    // A job read again, from the catalog or the wire, gets no further stages.
     let text = serde_json::to_string(&spec).unwrap();
     assert_eq!(serde_json::from_str::<JobSpec>(&text).unwrap(), spec);
-    // Tasks 4 to 6 are of scenes 0 and 1.
+    // Tasks 4 to 6 belong to scenes 0 and 1.
     let leased = spec.stages[0].only(4, 7);
     let scenes = leased.task.scenes().unwrap();
     let there = [0, 1, 2].map(|i| scenes.kind.file(i).is_some());

@@ -1,4 +1,4 @@
-//! Inference and reports in job files: what stands for models, what they need, what names a result, and what is refused.
+//! Inference and reports in job files: references to models, needs, keys of results, and refusals.
 
 use picofarm_proto::{
     key::stage_key,
@@ -6,7 +6,7 @@ use picofarm_proto::{
     wire,
 };
 
-/// A data set, its split, and one model of each kind.
+/// Returns a data set, its split, and one model of each kind.
 fn job(stages: &str) -> Result<JobSpec, toml::de::Error> {
     let train = |name: &str, target: &str, model: &str| {
         format!(

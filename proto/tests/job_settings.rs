@@ -1,4 +1,4 @@
-//! Job settings from file to model to wire and back, what is refused, and what a key depends on.
+//! Job settings from file to model to wire and back, refusals, and dependencies of keys.
 
 use picofarm_proto::{
     key::{StageKey, spec_hash, stage_key},

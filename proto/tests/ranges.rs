@@ -1,5 +1,5 @@
-//! Numbers of a job that cannot be meant are refused with the field, the value, the range and how to write it right; those
-//! at the ends of their ranges pass.
+//! Numbers of a job outside any sensible range are refused with the field, the value, the range and
+//! the correct form. Those at the ends of their ranges pass.
 
 use picofarm_proto::model::{JobSpec, parse_share};
 use serde_json::{Value, json};
@@ -20,7 +20,7 @@ fn job() -> Value {
     })
 }
 
-/// The job with a value at a place such as `stage/0/render/bins`.
+/// Returns the job with a value at a path such as `stage/0/render/bins`.
 fn with(at: &str, value: Value) -> Result<JobSpec, String> {
     let mut job = job();
     let (parent, field) = at.rsplit_once('/').unwrap_or(("", at));
@@ -41,7 +41,7 @@ fn with(at: &str, value: Value) -> Result<JobSpec, String> {
 #[test]
 fn what_cannot_be_meant_is_refused_with_the_field_the_value_and_the_range() {
     for (at, value, parts) in [
-        // Picoseconds for metres.
+        // Picoseconds instead of metres.
         (
             "stage/0/render/bin_width_m",
             json!(128),
@@ -256,7 +256,7 @@ fn a_share_is_a_percentage_or_a_fraction_and_never_more_than_all() {
 #[test]
 fn an_unknown_kind_is_named_first_and_with_the_one_that_was_meant() {
     for (at, value, parts) in [
-        // It was said that `assets` belong to another kind.
+        // The error once attributed `assets` to another kind.
         (
             "stage/0/scenes",
             json!({"kind": "furnshed", "assets": "auto", "count": 1}),

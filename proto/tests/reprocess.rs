@@ -1,4 +1,4 @@
-//! Reprocess settings: what a key depends on, and what is refused.
+//! Reprocess settings: dependencies of keys, and refusals.
 
 use picofarm_proto::{
     key::{TaskKey, derived_key},
@@ -41,14 +41,14 @@ fn everything_that_shapes_a_result_is_part_of_its_key_and_nothing_else_is() {
         assert!(!keys[..i].contains(key), "{:?}", settings[i]);
     }
     assert_ne!(good("").stage_key("plain-f32"), keys[0]);
-    // Written out or left to the default, here or there, in this order or that: the same.
+    // Defaults written out, and any order of fields, give the same key.
     let written = good("[sensor]\nrebin = 1\npulse = { kind = \"analytic\", fwhm_ps = 128.0 }");
     assert_eq!(written.stage_key("sqrt-u16"), keys[0]);
     let reversed = good("histogram = \"transient_spots\"\nspots = [5, 0]");
     assert_eq!(reversed.stage_key("sqrt-u16"), keys[2]);
     let tasks = [1, 2].map(|k| derived_key(&keys[0], &TaskKey([k; 32])));
     assert_ne!(tasks[0], tasks[1]);
-    // This key names results that lie in stores: it may never change.
+    // This key names stored results, so it must never change.
     assert_eq!(tasks[0].to_string(), KEY);
 }
 

@@ -1,4 +1,4 @@
-//! Scenes as jobs say them: spots in three ways, rooms of two sizes, and what keys depend on.
+//! Scenes in job files: three forms of spots, two sizes of rooms, and the dependencies of keys.
 
 use std::collections::BTreeSet;
 
@@ -69,7 +69,7 @@ fn what_is_left_out_is_what_the_kind_has() {
         ..PrimitiveRooms::DESKTOP
     };
     assert_eq!(some.kind, SceneKind::Primitive { rooms });
-    // The same said in full is the same.
+    // The same settings written in full give the same key.
     let full = "kind = \"primitive\"\nspots = 25\nfov_deg = 90\nlaser_m = [0, 0, 0]\nrooms = { scale = [0.8, 1.15] }";
     assert_eq!(key(full), key("kind = \"primitive\""));
 }

@@ -1,4 +1,4 @@
-//! Splits: exact where they are made, stable when data sets grow.
+//! Splits: exact when they are made, stable when data sets grow.
 
 use std::collections::BTreeSet;
 
@@ -17,7 +17,7 @@ fn first(n: u64) -> BTreeSet<u64> {
     (0..n).collect()
 }
 
-/// Three counts that add up to n.
+/// Returns three counts with sum n.
 fn counts(n: u64) -> impl Strategy<Value = [u64; 3]> {
     (0..=n, 0..=n).prop_map(move |(a, b)| {
         let (low, high) = (a.min(b), a.max(b));
@@ -34,12 +34,13 @@ fn the_paper_s_split_is_exact_and_the_same_every_time() {
     let again = SplitRecord::first(&asked, &first(97_432)).unwrap();
     assert_eq!(record.to_bytes(), again.to_bytes());
     assert_eq!(SplitRecord::parse(&record.to_bytes()).unwrap(), record);
-    // Nothing new: nothing changes. Grown: the old scenes stay, the new ones fall as the cuts say.
+    // Without new scenes nothing changes. After growth, old scenes keep their sides and the cuts
+    // decide for new ones.
     assert_eq!(record.extended(&asked, &first(97_432)).unwrap(), None);
     let grown = record.extended(&asked, &first(120_000)).unwrap().unwrap();
     assert!(grown.sides.starts_with(&record.sides));
     assert_eq!((grown.version, grown.made_of), (2, 97_432));
-    // These numbers may never change: they say which scene is whose in every data set there is.
+    // These numbers must never change, because they assign every scene in all existing data sets.
     assert_eq!(Rank::of(0, 0).hash, RANK_0);
     assert_eq!(&record.sides[..40], SIDES_40);
 }
@@ -78,7 +79,7 @@ proptest! {
             }
             last = next;
         }
-        // In whatever portions they come: the same.
+        // The result does not depend on how the scenes are divided into batches.
         let all: BTreeSet<u64> = batches.iter().flatten().copied().collect();
         let at_once = one.extended(&asked, &all).unwrap().unwrap_or(one);
         prop_assert_eq!(at_once.sides, last.sides);

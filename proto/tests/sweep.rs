@@ -1,4 +1,4 @@
-//! Sweeps in job files: what they stand for, what is drawn, when trials are asked, and what is refused.
+//! Sweeps in job files: their expansion, draws, checks of trials, and refusals.
 
 use picofarm_proto::{
     key::stage_key,
@@ -99,13 +99,13 @@ fn a_grid_is_every_combination_and_then_the_choice_of_the_best() {
             "render", "tof.0", "tof.1", "tof.2", "tof.3", "tof.4", "tof.5"
         ]
     );
-    // The best of them is what a stage after them means.
+    // A later stage refers to the best trial.
     assert_eq!(spec.stages[9].needs, ["render", "split", "tof"]);
     let TaskSpec::Evaluate(evaluate) = &spec.stages[9].task else {
         panic!("{:?}", spec.stages[9]);
     };
     assert_eq!(evaluate.evaluate.models, ["depth"]);
-    // On the wire and in the catalog it means the same.
+    // The meaning is the same on the wire and in the catalog.
     let again = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
     assert_eq!(again, spec);
 }
@@ -132,7 +132,7 @@ fn draws_lie_where_they_shall_and_more_trials_are_further_ones() {
         low += usize::from(o.learning_rate < 10f64.powf(-2.5));
         widths.insert(settings.net.width);
     }
-    // Half of all draws lie in the lower half of the orders of magnitude.
+    // Half of all draws are in the lower half of the orders of magnitude.
     assert!((15..=45).contains(&low), "{low}");
     assert_eq!(widths.len(), 4);
     let other = job(&format!("trials = 20, seed = 5, {over}"), train, "").unwrap();
@@ -164,7 +164,7 @@ fn what_a_trial_computes_does_not_depend_on_the_sweep_but_its_task_does() {
     task.train.trial = None;
     assert_eq!(settings(stage).shaping(), task.train.shaping());
     assert_ne!(stage_key(stage), stage_key(&plain));
-    // Resources do not set sweeps apart, ranges do.
+    // Ranges distinguish sweeps, resources do not.
     let id = |sweep: &str| trial(trials(&good(sweep))[0]).id.clone();
     assert_ne!(
         id("over = { lr = [0.01], width = [8] }"),
@@ -318,7 +318,8 @@ fn listed_values_are_the_first_trials_and_change_neither_the_sweep_nor_the_tasks
     let listed = good(&format!("values = [{list}], {over}"));
     let keys = |spec: &JobSpec| -> Vec<_> { trials(spec).iter().map(|s| stage_key(s)).collect() };
     assert_eq!(keys(&listed), keys(&drawn));
-    // What is appended is further trials of the same sweep; what is drawn beyond them is what would be drawn anyway.
+    // Appended values are further trials of the same sweep, and the draws beyond them are
+    // unchanged.
     let more = good(&format!(
         "values = [{list}, {{ lr = 0.02, width = 5 }}], trials = 6, {over}"
     ));
@@ -334,7 +335,7 @@ fn listed_values_are_the_first_trials_and_change_neither_the_sweep_nor_the_tasks
         serde_json::to_string(&trial(trials(&more)[3]).values).unwrap(),
         r#"{"lr":0.02,"width":5}"#
     );
-    // By hand, without saying where else they might lie.
+    // Values listed by hand without domains.
     let by_hand = good("values = [{ lr = 0.1, width = 8 }, { lr = 5, width = 9 }]");
     assert_eq!(trials(&by_hand).len(), 2);
     assert_eq!(
@@ -344,7 +345,7 @@ fn listed_values_are_the_first_trials_and_change_neither_the_sweep_nor_the_tasks
     let further =
         good("values = [{ lr = 0.1, width = 8 }, { lr = 5, width = 9 }, { lr = 1, width = 1 }]");
     assert_eq!(keys(&further)[..2], keys(&by_hand)[..]);
-    // Of other rules, it is another sweep.
+    // Other rules give another sweep.
     let other = good(&format!(
         "trials = 3, {over}, stop = {{ median = {{ first = 3 }} }}"
     ));
@@ -361,7 +362,8 @@ fn listed_values_are_the_first_trials_and_change_neither_the_sweep_nor_the_tasks
 
 #[test]
 fn hyperband_deals_trials_to_brackets_as_published() {
-    // Li et al., JMLR 2018, table 1: R = 81, factor 3: 81, 34, 15, 8 and 5 trials; here 1, 3, 9, 27 are rungs before the end.
+    // Li et al., JMLR 2018, table 1: R = 81, factor 3: 81, 34, 15, 8 and 5 trials; here 1, 3, 9, 27
+    // are rungs before the end.
     let stop = Stop::Hyperband(Halving {
         first: 1,
         factor: 3,
@@ -380,7 +382,7 @@ fn hyperband_deals_trials_to_brackets_as_published() {
     assert_eq!(asked(4), [0; 0]);
 }
 
-/// A domain of any kind.
+/// Returns a domain of any kind.
 fn domain() -> impl Strategy<Value = Domain> {
     let ends = (-50i64..50, 1i64..60);
     prop_oneof![
@@ -413,7 +415,7 @@ proptest! {
         prop_assert!(domain.contains(&value), "{value} of {domain:?}");
         let text = serde_json::to_string(&domain).unwrap();
         prop_assert_eq!(&serde_json::from_str::<Domain>(&text).unwrap(), &domain);
-        // A value's share of the interval leads back to it.
+        // A value's fraction of the interval leads back to the value.
         if let Domain::Within(interval) = domain {
             prop_assert_eq!(interval.at(interval.share(&value).unwrap()), value);
         }
@@ -431,7 +433,7 @@ proptest! {
             let due = trials as f64 * weight(bracket) / total;
             prop_assert!((count - due).abs() <= brackets as f64 / 2.0 + 1.0, "bracket {bracket}: {count} of {due}");
         }
-        // Later brackets are asked at fewer of the same rungs, and none at its end.
+        // Later brackets are checked at fewer of the same rungs, and no bracket at its end.
         for index in (0..trials).step_by(7) {
             let asked: Vec<u64> = (0..=of).filter(|e| stop.asks(index, *e, of)).collect();
             prop_assert_eq!(asked.len(), brackets - 1 - dealt[index as usize] as usize);

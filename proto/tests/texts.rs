@@ -1,4 +1,5 @@
-//! Texts of jobs that are too long or steer terminals are refused, by the names of their fields.
+//! Texts of jobs that are too long or control terminals are refused, with the names of their
+//! fields.
 
 use picofarm_proto::model::{
     JobSpec,

@@ -1,4 +1,5 @@
-//! Training and evaluation in job files: defaults, what stands for models, what names a result, and what is refused.
+//! Training and evaluation in job files: defaults, references to models, keys of results, and
+//! refusals.
 
 use picofarm_proto::{
     key::stage_key,
@@ -37,7 +38,7 @@ fn train(name: &str, settings: &str) -> String {
     )
 }
 
-/// What a model predicts, kept in `of-MODEL`.
+/// Returns a stage with a model's predictions, stored in `of-MODEL`.
 fn infer(name: &str, model: &str) -> String {
     format!(
         "[[stage]]\nname = \"{name}\"\nkind = \"infer\"\nsource = \"render\"\ninfer = {{ models = [\"{model}\"] }}\n\
@@ -110,7 +111,7 @@ fn a_training_needs_the_data_the_split_and_the_models_it_reads() {
     assert_eq!(mirror.needs, ["render", "split", "tof"]);
     assert_eq!(settings(other).from, "from-last-year");
     assert_eq!(other.needs, ["render"]);
-    // On the wire and in the catalog it means the same.
+    // The meaning is the same on the wire and in the catalog.
     let again = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
     assert_eq!(again, spec);
 }

@@ -1,4 +1,4 @@
-//! Whoever called.
+//! The caller of a request.
 
 use std::{fmt, sync::Arc};
 
@@ -12,24 +12,25 @@ use super::{
     trust::Trust,
 };
 
-/// Whoever called: known by a token or a client certificate, or anyone, where no proof is asked for.
+/// The caller of a request: known by a token or a client certificate, or anyone if no
+/// authentication is required.
 #[derive(Clone)]
 pub struct Caller {
-    /// Its name in the token file, or its certificate's.
+    /// Name in the token file or in the certificate.
     pub name: Arc<str>,
-    /// What it may do.
+    /// Roles of the caller.
     pub roles: Roles,
-    /// By which entry it is known; none for a certificate that needs none.
+    /// The matching entry of the token file; none for a certificate that needs none.
     pub(super) entry: Option<Arc<Entry>>,
-    /// When its token or its certificate expires.
+    /// Expiry of the token or certificate.
     pub(super) until: Option<Expiry>,
-    /// How often the client certificate authorities had changed when its connection began.
+    /// Number of changes of the client certificate authorities when the connection began.
     pub(super) authorities: u64,
-    /// What it is judged by; `None` where no proof is asked for.
+    /// The data that the caller is checked against; `None` if no authentication is required.
     pub(super) trust: Option<watch::Receiver<Trust>>,
 }
 
-/// The name of callers of whom no proof is asked.
+/// The name of callers if no authentication is required.
 pub(crate) const ANYONE: &str = "anyone";
 
 impl Caller {
@@ -44,12 +45,12 @@ impl Caller {
         }
     }
 
-    /// Whether no proof was asked of it: such callers cannot be told apart.
+    /// Returns whether the caller was not authenticated. Such callers cannot be distinguished.
     pub(crate) fn is_anyone(&self) -> bool {
         self.trust.is_none() && self.entry.is_none() && *self.name == *ANYONE
     }
 
-    /// Pends for as long as the caller has the proof and the roles it came with.
+    /// Stays pending for as long as the caller keeps its credentials and roles.
     pub async fn revoked(&self) -> Status {
         let Some(trust) = &self.trust else {
             return std::future::pending().await;
@@ -85,7 +86,7 @@ impl Caller {
                 return refused;
             }
             if trust.changed().await.is_err() {
-                // The coordinator is stopping, which says so itself.
+                // The coordinator is stopping, and reports that itself.
                 return std::future::pending().await;
             }
         }

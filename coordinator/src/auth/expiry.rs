@@ -1,4 +1,4 @@
-//! When a caller's access ends.
+//! The time at which a caller's access ends.
 
 use std::{
     fmt,
@@ -8,23 +8,23 @@ use std::{
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// A moment from which on an entry of the token file is refused.
+/// The time from which an entry of the token file is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Expiry(SystemTime);
 
 const EXPECTED: &str = "expected a time from now, e.g. 90d or 12h, a date, e.g. 2027-03-01, or e.g. 2027-03-01T08:00:00Z";
 
 impl Expiry {
-    /// Reads `90d`, `2027-03-01` (its beginning, UTC) or `2027-03-01T08:00:00Z`.
+    /// Parses `90d`, `2027-03-01` (its beginning, UTC) or `2027-03-01T08:00:00Z`.
     ///
     /// # Errors
-    /// The text is none of these, or names a moment that `now` has passed.
+    /// Returns an error if the text has none of these forms, or names a time that `now` has passed.
     pub fn parse(text: &str, now: SystemTime) -> Result<Self, String> {
         let at = match humantime::parse_duration(text) {
             Ok(after) => now.checked_add(after),
             Err(_) => Some(text.parse::<Self>()?.0),
         };
-        // Later than this the date could not be written.
+        // Later dates cannot be formatted.
         let last = UNIX_EPOCH + Duration::from_secs(253_402_300_799);
         let at = at
             .filter(|at| *at <= last)
@@ -35,7 +35,7 @@ impl Expiry {
         Ok(Self(at))
     }
 
-    /// Seconds since 1970.
+    /// Creates an expiry from seconds since 1970.
     pub(crate) fn from_seconds(seconds: i64) -> Self {
         let distance = Duration::from_secs(seconds.unsigned_abs());
         let at = match seconds {
@@ -45,7 +45,7 @@ impl Expiry {
         Self(at.unwrap_or(UNIX_EPOCH))
     }
 
-    /// Whether access has ended.
+    /// Returns whether access has ended.
     pub fn is_over(self, now: SystemTime) -> bool {
         now >= self.0
     }
@@ -63,7 +63,7 @@ impl Expiry {
 
 impl fmt::Display for Expiry {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // The formatter refuses times before 1970, which are over in any case.
+        // The formatter refuses times before 1970, which have passed in any case.
         humantime::format_rfc3339_seconds(self.0.max(UNIX_EPOCH)).fmt(f)
     }
 }
@@ -88,7 +88,7 @@ impl Serialize for Expiry {
 
 impl<'de> Deserialize<'de> for Expiry {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        /// TOML has times of its own, which people write without quotes.
+        /// TOML has its own time type, which is written without quotes.
         #[derive(Deserialize)]
         #[serde(
             untagged,

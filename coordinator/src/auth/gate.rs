@@ -1,4 +1,4 @@
-//! Who a caller is, by its proof; and the token file, read again whenever it changes.
+//! Identifies callers by their credentials, and reads the token file again after each change.
 
 use std::{
     path::PathBuf,
@@ -28,32 +28,33 @@ use crate::{
     health::Health,
 };
 
-/// How often the token file is looked at.
+/// Interval between checks of the token file.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Knows callers by their proof.
+/// Identifies callers by their credentials.
 #[derive(Clone)]
 pub(crate) struct Gate {
     asks: Asks,
     trust: watch::Receiver<Trust>,
 }
 
-/// What callers are asked for.
+/// The credentials that callers must present.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Asks {
-    /// No proof.
+    /// None.
     Nothing,
     /// A token, or a certificate that the token file names.
     Token,
-    /// Any certificate of the client CA, to submit and to work.
+    /// Any certificate of the client CA, for the roles submit and work.
     Certificate,
 }
 
 impl Gate {
-    /// The gate that `access` asks for. The token file is read now, and again whenever it changes, until `stop`.
+    /// Creates the gate that `access` requires. The token file is read now, and again after each
+    /// change, until `stop`.
     ///
     /// # Errors
-    /// The token file cannot be used.
+    /// Returns an error if the token file cannot be used.
     pub(crate) fn new(
         access: &Access,
         audit: &Audit,
@@ -76,11 +77,11 @@ impl Gate {
         Ok((Self { asks, trust }, judge))
     }
 
-    /// Who it is, on a connection that began when the client certificate authorities had changed
-    /// `authorities` times.
+    /// Identifies the caller, on a connection that began when the client certificate authorities
+    /// had changed `authorities` times.
     ///
     /// # Errors
-    /// UNAUTHENTICATED, with what to do; UNAVAILABLE while nobody can be judged.
+    /// Returns UNAUTHENTICATED with a remedy, or UNAVAILABLE while no caller can be checked.
     pub(crate) fn admit(
         &self,
         token: Option<&str>,
@@ -116,7 +117,7 @@ impl Gate {
         }
     }
 
-    /// Whether the token with this SHA-256 is accepted now, and why.
+    /// Returns whether the token with this SHA-256 is accepted now, and why.
     pub(crate) fn accepts_digest(&self, digest: &[u8]) -> (bool, String) {
         match self.asks {
             Asks::Nothing => (true, "it asks nobody for a token".into()),
@@ -125,7 +126,7 @@ impl Gate {
         }
     }
 
-    /// Whether a client certificate with this name is accepted now, and why.
+    /// Returns whether a client certificate with this name is accepted now, and why.
     pub(crate) fn accepts_certificate(&self, name: &str) -> (bool, String) {
         match self.asks {
             Asks::Nothing => (true, "it asks nobody for a certificate".into()),
@@ -179,7 +180,7 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
             "the client certificate has no name; make one with a common name or a DNS name",
         )
     })?;
-    // It goes into jobs and logs.
+    // The name appears in jobs and logs.
     if name.len() > WHO_BYTES || show::line(&name) != name {
         return Err(Status::unauthenticated(format!(
             "the client certificate's name has control characters or more than {WHO_BYTES} bytes; make one with a plain name"
@@ -195,9 +196,9 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
     })
 }
 
-/// Reads the token file again and again. A file that cannot be used for a moment changes nothing,
-/// so that a slip of an editor does not stop the farm; after [`GRACE`] every caller is refused
-/// until it can be used again.
+/// Reads the token file repeatedly. A file that cannot be used for a moment changes nothing, so
+/// that a mistake in an editor does not stop the farm. After [`GRACE`] every caller is refused
+/// until the file can be used again.
 async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationToken) {
     let (mut reader, mut trouble) = (Reader::default(), Trouble::default());
     loop {
@@ -244,7 +245,7 @@ async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationTok
             }
             changed
         });
-        // After the new list is in force, so that nobody is let in by the old one.
+        // This comes after the new list is in force, so that the old one admits nobody.
         judge.fault(Source::Tokens, None);
         if !what.is_empty() {
             tracing::info!(file = %path.display(), "the token file was read again");

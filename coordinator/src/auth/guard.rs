@@ -1,4 +1,4 @@
-//! The layer before every service.
+//! The layer that authenticates the calls of every service.
 
 use std::{
     sync::Arc,
@@ -14,7 +14,7 @@ use tower::{Layer, Service};
 use super::{Caller, Gate, Needs, Throttle, act, needs};
 use crate::{audit::Audit, connections::Peer};
 
-/// Lets in those who may call what they call, with a [`Caller`] among the request's extensions.
+/// Admits authorized calls, and adds a [`Caller`] to the request's extensions.
 #[derive(Clone)]
 pub(crate) struct Guard {
     gate: Gate,
@@ -31,9 +31,10 @@ impl Guard {
         }
     }
 
-    /// The answer to the question whether a proof is accepted, if this is one: the header
-    /// `authorization` has the SHA-256 of a token, or the name in a client certificate. Anyone may
-    /// ask, because neither is a proof; nobody is let in by it, and nothing but the header is read.
+    /// Returns the answer if the request asks whether credentials are accepted. The header
+    /// `authorization` then contains the SHA-256 of a token, or the name in a client certificate.
+    /// Anyone may ask, because neither is a credential: it admits nobody, and only the header is
+    /// read.
     fn asked(&self, headers: &http::HeaderMap) -> Option<Status> {
         let text = headers.get(http::header::AUTHORIZATION)?.to_str().ok()?;
         let (scheme, proof) = text.split_once(' ')?;
@@ -78,17 +79,17 @@ impl Guard {
     }
 }
 
-/// The header by which a question whether a proof is accepted is answered: `yes` or `no`. The
-/// message has the reason.
+/// The header with the answer to whether credentials are accepted: `yes` or `no`. The message
+/// contains the reason.
 pub const ACCEPTED: &str = "picofarm-accepted";
 
-/// What stands before the SHA-256 of a token in the header `authorization`, to ask whether that
-/// token is accepted.
+/// The scheme before the SHA-256 of a token in the header `authorization`, to ask whether the token
+/// is accepted.
 pub const BY_DIGEST: &str = "Sha256";
-/// What stands before the name in a client certificate, to ask the same.
+/// The scheme before the name in a client certificate, to ask whether the certificate is accepted.
 pub const BY_CERTIFICATE: &str = "Certificate";
 
-/// The bearer token, where there is one.
+/// Returns the bearer token, if any.
 fn token(headers: &http::HeaderMap) -> Result<Option<&str>, Status> {
     let Some(value) = headers.get(http::header::AUTHORIZATION) else {
         return Ok(None);
@@ -97,13 +98,13 @@ fn token(headers: &http::HeaderMap) -> Result<Option<&str>, Status> {
         let (scheme, token) = text.split_once(' ')?;
         scheme.eq_ignore_ascii_case("bearer").then(|| token.trim())
     });
-    // Its value is not repeated: it may be a secret in the wrong place.
+    // The value is not repeated, because it may be a secret in the wrong place.
     bearer
         .map(Some)
         .ok_or_else(|| Status::unauthenticated("the header authorization must be: Bearer TOKEN"))
 }
 
-/// The caller's own certificate, which the TLS handshake has verified.
+/// Returns the caller's own certificate, which the TLS handshake has verified.
 fn certificate<B>(request: &http::Request<B>) -> Option<Described> {
     let chain = request.extensions().get::<Peer>()?.certificates.as_ref()?;
     Described::of(chain.first()?).ok()

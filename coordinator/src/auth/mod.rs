@@ -1,5 +1,6 @@
-//! Who calls, and what they may do. [`Guard`] stands before every service: it knows the caller by a token or a client
-//! certificate, holds what the method needs against the caller's roles, and hands the [`Caller`] on to the handlers.
+//! Authentication and authorization. [`Guard`] precedes every service. It identifies the caller by
+//! a token or a client certificate, compares the caller's roles with the method's requirement, and
+//! passes the [`Caller`] to the handlers.
 
 mod access;
 pub(crate) mod caller;

@@ -1,4 +1,5 @@
-//! Limits on what callers can make a coordinator hold, and on how much they can make it write into its log.
+//! Limits on the resources of a coordinator that callers can use, and on the log lines that they
+//! can cause.
 
 use std::{
     collections::HashMap,
@@ -9,21 +10,23 @@ use std::{
 use picofarm_proto::ids::WorkerId;
 use tonic::Status;
 
-/// The most of everything; what lies beyond is refused with RESOURCE_EXHAUSTED and the limit's name.
+/// Quotas. A request beyond one is refused with RESOURCE_EXHAUSTED and the name of the limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Quotas {
-    /// Jobs of one caller that have not ended.
+    /// Unfinished jobs of one caller.
     pub jobs_per_user: usize,
     /// Tasks of one job.
     pub tasks_per_job: u64,
-    /// Sessions of workers at a time.
+    /// Concurrent worker sessions.
     pub sessions: usize,
-    /// Priorities from minus this to this are everybody's; others are for administrators.
+    /// Priorities between the negative and positive of this value are open to everyone. Others are
+    /// for administrators.
     pub max_priority: u32,
 }
 
 impl Default for Quotas {
-    /// 1,000 jobs a caller, 10,000,000 tasks a job, 10,000 workers, priorities from -100 to 100.
+    /// Returns 1,000 jobs a caller, 10,000,000 tasks a job, 10,000 workers, priorities from -100 to
+    /// 100.
     fn default() -> Self {
         Self {
             jobs_per_user: 1_000,
@@ -34,12 +37,13 @@ impl Default for Quotas {
     }
 }
 
-/// A line a second, and how many were left out since the last.
+/// Allows one line a second, and counts the suppressed lines.
 #[derive(Debug, Default)]
 pub(crate) struct Throttle(Mutex<(Option<Instant>, u64)>);
 
 impl Throttle {
-    /// How many lines went unsaid before this one, or `None` if this one shall not be said either.
+    /// Returns how many lines were suppressed before this one, or `None` if this one is suppressed
+    /// too.
     pub(crate) fn allows(&self) -> Option<u64> {
         let mut state = self.0.lock().expect("no panic while locked");
         let now = Instant::now();
@@ -55,8 +59,8 @@ impl Throttle {
     }
 }
 
-/// Whose worker ids are. An id stays its caller's while a session of it is open and for some time after, so that
-/// nobody else can take over the leases of a worker that reconnects.
+/// The owners of worker ids. An id belongs to its caller while a session of it is open and for some
+/// time after, so that no other caller can take over the leases of a worker that reconnects.
 #[derive(Debug, Default)]
 pub(crate) struct WorkerIds(Mutex<HashMap<WorkerId, Owned>>);
 
@@ -67,16 +71,16 @@ struct Owned {
     closed: Instant,
 }
 
-/// How long an id stays its caller's after its last session.
+/// Time for which an id belongs to its caller after its last session.
 const OWNED: Duration = Duration::from_secs(24 * 3600);
-/// Ids known at most; beyond, those that have been closed longest are forgotten.
+/// Most ids remembered. Beyond it, the ids closed longest ago are forgotten.
 const IDS: usize = 65_536;
 
 impl WorkerIds {
-    /// Takes `id` for a session of `caller`, until the value is dropped.
+    /// Reserves `id` for a session of `caller`, until the value is dropped.
     ///
     /// # Errors
-    /// PERMISSION_DENIED when it is another caller's.
+    /// Returns PERMISSION_DENIED if the id belongs to another caller.
     pub(crate) fn take(self: &Arc<Self>, id: WorkerId, caller: &Arc<str>) -> Result<Held, Status> {
         let mut ids = self.0.lock().expect("no panic while locked");
         let now = Instant::now();

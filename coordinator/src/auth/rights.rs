@@ -1,4 +1,4 @@
-//! Who may change and see which job. Pure: facts are passed in.
+//! Decides who may change and see which job. Pure.
 
 use std::{fmt, str::FromStr};
 
@@ -10,23 +10,23 @@ use picofarm_proto::{
 
 use super::{caller::Caller, roles::Role};
 
-/// What callers see of jobs that are not theirs. Administrators see everything.
+/// Which jobs of others callers see. Administrators see all jobs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Visibility {
-    /// Everything.
+    /// All jobs.
     #[default]
     All,
-    /// The jobs of their projects; others do not exist for them.
+    /// The jobs of their projects. Other jobs do not exist for them.
     Project,
-    /// Nothing: others' jobs do not exist for them.
+    /// None. Other jobs do not exist for them.
     Own,
 }
 
 impl Visibility {
-    /// All of them.
+    /// All values.
     pub const ALL: [Self; 3] = [Self::All, Self::Project, Self::Own];
 
-    /// Its name.
+    /// Returns the name of the value.
     pub fn name(self) -> &'static str {
         match self {
             Self::All => "all",
@@ -35,11 +35,12 @@ impl Visibility {
         }
     }
 
-    /// Among whose jobs an equal one is looked for; empty = among all. A job is handed only to those who may see it.
+    /// Returns the circle of jobs among which an equal one is looked up; empty means all jobs. A
+    /// job is shared only with callers who may see it.
     pub(crate) fn circle(self, caller: &Caller, spec: &JobSpec) -> String {
         match self {
             Self::All => String::new(),
-            // The project is part of the spec already, so the circle need not name it.
+            // The spec already contains the project, so the circle need not name it.
             Self::Project if !spec.project.is_empty() => "project".into(),
             Self::Project | Self::Own => format!("user {}", caller.name),
         }
@@ -62,25 +63,25 @@ impl FromStr for Visibility {
 }
 
 impl Caller {
-    /// Whether it may do anything.
+    /// Returns whether the caller is an administrator.
     pub fn is_admin(&self) -> bool {
         self.roles.iter().any(|role| role == Role::Admin)
     }
 
-    /// Whether it may cancel, hold, let go on, retry or repeat a job of this owner.
+    /// Returns whether the caller may cancel, pause, resume, retry or repeat a job of this owner.
     pub fn may_change(&self, owner: &Owner) -> bool {
         self.is_admin()
             || owner.user == *self.name
             || (!owner.project.is_empty() && self.maintains().contains(&owner.project))
     }
 
-    /// Whose jobs it may see.
+    /// Returns which jobs the caller may see.
     pub fn sight(&self, visibility: Visibility) -> Sight {
         let projects = match visibility {
             _ if self.is_admin() => return Sight::All,
             Visibility::All => return Sight::All,
             Visibility::Project => self.projects().map(str::to_owned).collect(),
-            // Who may change a job must see it.
+            // A caller who may change a job must see it.
             Visibility::Own => self.maintains().to_vec(),
         };
         Sight::Of {
@@ -89,10 +90,10 @@ impl Caller {
         }
     }
 
-    /// Checks that it may submit a job of this project and priority.
+    /// Checks that the caller may submit a job with this project and priority.
     ///
     /// # Errors
-    /// [`SpecError`] names the field, the bound and the remedy.
+    /// Returns a [`SpecError`] with the field, the bound and the remedy.
     pub(crate) fn may_submit(&self, spec: &JobSpec, max_priority: u32) -> Result<(), SpecError> {
         if self.is_admin() {
             return Ok(());
@@ -126,12 +127,12 @@ impl Caller {
         ))
     }
 
-    /// The projects whose jobs it may change.
+    /// Returns the projects with jobs that the caller may change.
     fn maintains(&self) -> &[String] {
         self.entry.as_ref().map_or(&[], |entry| &entry.maintainer)
     }
 
-    /// The projects that it is a member or maintainer of.
+    /// Returns the projects in which the caller is a member or maintainer.
     fn projects(&self) -> impl Iterator<Item = &str> {
         let entry = self.entry.iter();
         entry
@@ -140,7 +141,7 @@ impl Caller {
     }
 }
 
-/// Why a caller may not change a job that it sees.
+/// Returns the reason why a caller may not change a visible job.
 pub(crate) fn not_yours(job: &JobId, owner: &Owner) -> String {
     let maintainers = match owner.project.as_str() {
         "" => String::new(),
@@ -211,7 +212,7 @@ mod tests {
         ] {
             assert_eq!(who.may_change(&of_lidar), may, "{who:?}");
         }
-        // A job without a project is no project's.
+        // A job without a project belongs to no project.
         assert!(!caller("bob", Role::Submit, &[], &[""]).may_change(&owner("ada", "")));
     }
 

@@ -1,4 +1,4 @@
-//! What callers may do: roles, and which of them each method needs.
+//! The roles of callers, and the role that each method requires.
 
 use std::{fmt, str::FromStr};
 
@@ -9,21 +9,21 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// Look at jobs, their history and the farm.
+    /// View jobs, their history and the farm.
     View,
-    /// Plan, submit and steer jobs; and look at them.
+    /// Plan, submit, steer and view jobs.
     Submit,
     /// Take leases and report results.
     Work,
-    /// Everything.
+    /// All rights.
     Admin,
 }
 
 impl Role {
-    /// All of them.
+    /// All roles.
     pub const ALL: [Self; 4] = [Self::View, Self::Submit, Self::Work, Self::Admin];
 
-    /// Its name, as in the token file.
+    /// Returns the name of the role in the token file.
     pub fn name(self) -> &'static str {
         match self {
             Self::View => "view",
@@ -49,7 +49,7 @@ impl FromStr for Role {
     }
 }
 
-/// The roles of one caller, each once, ascending.
+/// The distinct roles of one caller, ascending.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(from = "Vec<Role>")]
 pub struct Roles(Vec<Role>);
@@ -63,17 +63,18 @@ impl From<Vec<Role>> for Roles {
 }
 
 impl Roles {
-    /// None at all.
+    /// Returns whether there are no roles.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Each of them.
+    /// Iterates over the roles.
     pub fn iter(&self) -> impl Iterator<Item = Role> + '_ {
         self.0.iter().copied()
     }
 
-    /// Whether they suffice for what needs `needed`: the role itself, one that implies it, or any.
+    /// Returns whether the roles satisfy `needed`: the role itself, one that implies it, or any
+    /// role.
     pub fn allow(&self, needed: Needs) -> bool {
         let has = |role| self.0.contains(&role);
         has(Role::Admin)
@@ -92,16 +93,16 @@ impl fmt::Display for Roles {
     }
 }
 
-/// What a method needs of its caller.
+/// The requirement of a method on its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Needs {
-    /// That it is known.
+    /// A known caller.
     Nothing,
     /// A role, or one that implies it.
     Role(Role),
 }
 
-/// Each method of the services with what it needs.
+/// Each method of the services with its requirement.
 pub const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Farm/Session", Needs::Role(Role::Work)),
     ("/picofarm.v1.Jobs/GetServerInfo", Needs::Nothing),
@@ -122,7 +123,7 @@ pub const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/ListAudit", Needs::Role(Role::Admin)),
 ];
 
-/// What a method does that goes into the audit log; `None` for those that only read.
+/// Returns the act that a method records in the audit log; `None` for methods that only read.
 pub(crate) fn act(path: &str) -> Option<Act> {
     Some(match path.strip_prefix("/picofarm.v1.Jobs/")? {
         "SubmitJob" => Act::Submit,
@@ -135,7 +136,8 @@ pub(crate) fn act(path: &str) -> Option<Act> {
     })
 }
 
-/// What a path needs. One that is not listed is for administrators: forgetting it opens nothing.
+/// Returns the requirement of a path. Unlisted paths require an administrator, so an omission opens
+/// nothing.
 pub fn needs(path: &str) -> Needs {
     let listed = METHODS.iter().find(|(method, _)| *method == path);
     listed.map_or(Needs::Role(Role::Admin), |(_, needs)| *needs)

@@ -1,4 +1,4 @@
-//! The coordinator's certificate, and whose client certificates it takes.
+//! The coordinator's certificate, and the authorities of accepted client certificates.
 
 use std::{fmt, path::PathBuf, sync::Arc};
 
@@ -14,22 +14,22 @@ use sha2::{Digest, Sha256};
 /// Files for TLS, all PEM.
 #[derive(Debug, Clone)]
 pub struct TlsFiles {
-    /// The certificate chain, the own one first.
+    /// The certificate chain, own certificate first.
     pub certificate: PathBuf,
-    /// Its private key.
+    /// The private key.
     pub key: PathBuf,
-    /// Certificate authorities of clients: every client must show a certificate of one of them.
+    /// Certificate authorities of clients. Every client must present a certificate of one of them.
     pub client_ca: Option<PathBuf>,
 }
 
-/// What the files hold.
+/// The content of the files.
 pub(crate) struct Loaded {
     pub config: Arc<ServerConfig>,
-    /// Of all files.
+    /// Digest of all files.
     pub digest: [u8; 32],
-    /// Of the client certificate authorities alone.
+    /// Digest of the client certificate authorities.
     pub authorities: [u8; 32],
-    /// Whose certificate it is and until when, in words.
+    /// Description of the certificate's owner and expiry.
     pub about: String,
 }
 
@@ -43,7 +43,7 @@ impl TlsFiles {
     /// Reads and checks the files.
     ///
     /// # Errors
-    /// [`CredentialError`] names the file and what is wrong with it.
+    /// Returns a [`CredentialError`] with the file and its fault.
     pub(crate) fn read(&self) -> Result<Loaded, CredentialError> {
         let pair = Pair::read(&self.certificate, &self.key)?;
         let mut digest = Sha256::new();
@@ -78,7 +78,7 @@ impl TlsFiles {
         let chain: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&pair.certificate).collect();
         let chain = chain.map_err(|e| unusable(&self.certificate, &e))?;
         let key = PrivateKeyDer::from_pem_slice(&pair.key)
-            // What the parser says could quote the file.
+            // The parser's message could quote the file.
             .map_err(|_| unusable(&self.key, &"expected a private key"))?;
         let mut config = builder
             .with_single_cert(chain, key)
@@ -92,7 +92,7 @@ impl TlsFiles {
         })
     }
 
-    /// Whether the client certificate authorities are those of this digest. `false` also if they
+    /// Returns whether the client certificate authorities have this digest. Returns `false` if they
     /// cannot be read.
     pub(crate) fn has_authorities(&self, digest: &[u8; 32]) -> bool {
         self.client_ca.as_ref().is_none_or(|path| {
@@ -101,7 +101,7 @@ impl TlsFiles {
         })
     }
 
-    /// Says in the log what is noteworthy at the start.
+    /// Logs noteworthy facts at the start.
     pub(crate) fn tell(&self, loaded: &Loaded) {
         if let Ok((chain, _)) = certificates(&self.certificate)
             && let Ok(described) = Described::of(&chain[0])

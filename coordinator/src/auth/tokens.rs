@@ -1,5 +1,5 @@
-//! The token file: who there is, with what roles, and the SHA-256 of each one's token. Tokens themselves are shown
-//! once, when they are made, and kept nowhere.
+//! The token file: names, roles, and the SHA-256 of each token. A token itself is shown once, when
+//! it is created, and is stored nowhere.
 
 use std::path::{Path, PathBuf};
 
@@ -12,34 +12,34 @@ use subtle::ConstantTimeEq;
 
 use super::{expiry::Expiry, roles::Roles};
 
-/// Tokens begin with this, so that leaked ones are found by a search.
+/// Prefix of every token, so that a search finds leaked ones.
 pub const TOKEN_PREFIX: &str = "pf-";
 /// Largest token file, bytes: a hundred thousand callers.
 const LARGEST: u64 = 32 << 20;
 
-/// Why the token file cannot be used or changed.
+/// The reason why the token file cannot be used or changed.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenError {
-    /// It cannot be read, or everyone has access to it.
+    /// The file cannot be read, or everyone has access to it.
     #[error(transparent)]
     File(#[from] CredentialError),
-    /// It is not what it should be.
+    /// The file's content is invalid.
     #[error("{}: {what}", path.display())]
     Invalid {
         /// The file.
         path: PathBuf,
-        /// What was expected.
+        /// The expected content.
         what: String,
     },
 }
 
-/// One caller of the token file: known by a token, or by the name in a client certificate.
+/// One caller in the token file, known by a token or by the name in a client certificate.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Entry {
-    /// Who: jobs and workers carry this name.
+    /// Name of the caller, recorded in jobs and workers.
     pub name: String,
-    /// What it may do.
+    /// Roles of the caller.
     pub roles: Roles,
     /// SHA-256 of the token, hexadecimal.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -47,18 +47,18 @@ pub struct Entry {
     /// Common name or alternative name of a client certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub certificate: Option<String>,
-    /// When its access ends.
+    /// The time at which access ends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expires: Option<Expiry>,
-    /// Projects that it may name in its jobs.
+    /// Projects that the caller may name in its jobs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub member: Vec<String>,
-    /// Projects all of whose jobs it may change.
+    /// Projects in which the caller may change all jobs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub maintainer: Vec<String>,
 }
 
-/// The token file's content.
+/// The content of the token file.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tokens {
@@ -79,18 +79,19 @@ impl Tokens {
     /// Reads the file.
     ///
     /// # Errors
-    /// [`TokenError`]: it cannot be read, is open to everyone, or an entry makes no sense.
+    /// Returns a [`TokenError`] if the file cannot be read or is open to everyone, or if an entry
+    /// is invalid.
     pub fn read(path: &Path) -> Result<Self, TokenError> {
         private(path)?;
         Self::parse(&read_text(path, LARGEST)?).map_err(|what| invalid(path, what))
     }
 
-    /// Changes the file while no other process does. Owner, group, mode and access list stay as
-    /// they are.
+    /// Changes the file while no other process does. Owner, group, mode and access list stay the
+    /// same.
     ///
     /// # Errors
-    /// [`TokenError`]: the file cannot be used or replaced, or the error of `change`, in words.
-    /// Nothing is changed then.
+    /// Returns a [`TokenError`] if the file cannot be used or replaced, or the message of `change`.
+    /// Nothing is changed in that case.
     pub fn edit<T>(
         path: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, String>,
@@ -98,10 +99,10 @@ impl Tokens {
         Self::change(path, LockedFile::open(path)?, change)
     }
 
-    /// Like [`Tokens::edit`], but makes the file if there is none.
+    /// Like [`Tokens::edit`], but creates the file if it is missing.
     ///
     /// # Errors
-    /// As [`Tokens::edit`].
+    /// Returns the errors of [`Tokens::edit`].
     pub fn edit_or_create<T>(
         path: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, String>,
@@ -128,7 +129,7 @@ impl Tokens {
     }
 
     fn parse(text: &str) -> Result<Self, String> {
-        // The parser's own words quote the file's lines, which hold no secret.
+        // The parser's message quotes lines of the file, which contain no secret.
         let tokens: Self = toml::from_str(text).map_err(|e| e.to_string().trim_end().to_owned())?;
         for (i, entry) in tokens.entries.iter().enumerate() {
             let at = format!("caller {:?}", entry.name);
@@ -159,12 +160,12 @@ impl Tokens {
         Ok(tokens)
     }
 
-    /// All callers.
+    /// Returns all callers.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// What `new` has that these have not, and the other way round, in words; the names of callers only.
+    /// Describes the difference between these tokens and `new`, by the names of callers only.
     pub(crate) fn difference(&self, new: &Self) -> String {
         let named = |tokens: &Self, name: &str| tokens.entries.iter().any(|e| e.name == name);
         let mut parts = Vec::new();
@@ -186,12 +187,12 @@ impl Tokens {
         }
     }
 
-    /// Whose token this is. Takes the same time for every token.
+    /// Returns the owner of a token. Takes the same time for every token.
     pub fn by_token(&self, token: &str) -> Option<&Entry> {
         self.by_digest(&Sha256::digest(token))
     }
 
-    /// Whose client certificate this is.
+    /// Returns the owner of a client certificate.
     pub fn by_certificate(&self, certificate: &Described) -> Option<&Entry> {
         self.entries.iter().find(|entry| {
             let name = entry.certificate.as_deref();
@@ -199,12 +200,12 @@ impl Tokens {
         })
     }
 
-    /// The entry with this name.
+    /// Returns the entry with this name.
     pub fn by_name(&self, name: &str) -> Option<&Entry> {
         self.entries.iter().find(|entry| entry.name == name)
     }
 
-    /// Whose token has this SHA-256.
+    /// Returns the owner of the token with this SHA-256.
     pub(crate) fn by_digest(&self, digest: &[u8]) -> Option<&Entry> {
         let mut found = None;
         for entry in &self.entries {
@@ -219,11 +220,12 @@ impl Tokens {
         found
     }
 
-    /// Makes a token for a new caller and adds it, with the projects that it is a member and a
-    /// maintainer of. It never expires.
+    /// Creates a token for a new caller and adds it, with the projects in which the caller is a
+    /// member and a maintainer. The token never expires.
     ///
     /// # Errors
-    /// The name is taken or not plain, a project's name is not plain, or there are no roles; in words.
+    /// Returns a message if the name is taken or not plain, a project's name is not plain, or there
+    /// are no roles.
     pub fn create(
         &mut self,
         name: &str,
@@ -237,7 +239,7 @@ impl Tokens {
     /// Like [`Tokens::create`], for a token that expires.
     ///
     /// # Errors
-    /// As [`Tokens::create`].
+    /// Returns the errors of [`Tokens::create`].
     pub fn create_until(
         &mut self,
         name: &str,
@@ -276,17 +278,17 @@ impl Tokens {
         Ok(Secret::new(token))
     }
 
-    /// Removes a caller; `false` if there is none of this name.
+    /// Removes a caller. Returns `false` if no caller has this name.
     pub fn revoke(&mut self, name: &str) -> bool {
         let before = self.entries.len();
         self.entries.retain(|e| e.name != name);
         self.entries.len() < before
     }
 
-    /// Writes the file in one step. A new file is for its owner alone.
+    /// Writes the file atomically. A new file is accessible only to its owner.
     ///
     /// # Errors
-    /// [`TokenError`]: the file cannot be written, or is open to everyone.
+    /// Returns a [`TokenError`] if the file cannot be written or is open to everyone.
     pub fn write(&self, path: &Path) -> Result<(), TokenError> {
         let file = LockedFile::open_or_create(path)?;
         Ok(file.replace(self.to_text().as_bytes())?)
@@ -300,7 +302,7 @@ fn invalid(path: &Path, what: String) -> TokenError {
     }
 }
 
-/// Names go into logs, job lists and label values.
+/// Names appear in logs, job lists and label values.
 fn plain_name(name: &str) -> Result<(), String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.@".contains(c);
     if name.is_empty() || name.len() > 64 || !name.chars().all(plain) {

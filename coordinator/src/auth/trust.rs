@@ -1,8 +1,9 @@
-//! What callers are judged by: the token file and the client certificate authorities, as last read.
+//! The data that callers are checked against: the token file and the client certificate
+//! authorities, as last read.
 //!
-//! Both files are read again every second. While one of them cannot be used, nobody can say who was
-//! revoked in it, so after a short grace every caller is refused: UNAVAILABLE, because the caller
-//! is not at fault and workers come back.
+//! Both files are read again every second. While one of them cannot be used, revocations in it are
+//! unknown. Every caller is therefore refused after a short grace period. The answer is
+//! UNAVAILABLE, because the caller is not at fault and workers reconnect.
 
 use std::{
     sync::Arc,
@@ -15,11 +16,11 @@ use tonic::Status;
 use super::tokens::{Entry, Tokens};
 use crate::health::Health;
 
-/// How long a file may be unusable before every caller is refused. Editors and `kubectl` replace
-/// files in several steps.
+/// Time for which a file may be unusable before every caller is refused. Editors and `kubectl`
+/// replace files in several steps.
 pub(crate) const GRACE: Duration = Duration::from_secs(5);
 
-/// A file that callers are judged by.
+/// A file that callers are checked against.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Source {
     /// The token file.
@@ -37,14 +38,14 @@ impl Source {
     }
 }
 
-/// What callers are judged by.
+/// The data that callers are checked against.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Trust {
     /// The token file as last read.
     pub tokens: Arc<Tokens>,
-    /// How often the client certificate authorities have changed.
+    /// Number of changes of the client certificate authorities.
     pub authorities: u64,
-    /// A file that cannot be used.
+    /// Whether each file is unusable.
     faults: [bool; 2],
 }
 
@@ -56,8 +57,8 @@ impl Trust {
         }
     }
 
-    /// Refuses everybody while a file cannot be used, and connections from before a change of the
-    /// authorities.
+    /// Refuses every caller while a file cannot be used, and connections from before a change of
+    /// the authorities.
     pub(super) fn judge_connection(&self, authorities: u64) -> Result<(), Status> {
         let sources = [Source::Tokens, Source::Authorities];
         if let Some(source) = sources.into_iter().find(|s| self.faults[*s as usize]) {
@@ -74,7 +75,7 @@ impl Trust {
         Ok(())
     }
 
-    /// Refuses a caller whose entry is no longer there or has changed.
+    /// Refuses a caller with a removed or changed entry.
     pub(super) fn judge(&self, entry: Option<&Entry>, authorities: u64) -> Result<(), Status> {
         self.judge_connection(authorities)?;
         match entry {
@@ -89,7 +90,7 @@ impl Trust {
     }
 }
 
-/// Tells everybody who judges callers what a file comes to.
+/// Publishes the state of a file to all checks of callers.
 #[derive(Clone)]
 pub(crate) struct Judge {
     trust: Arc<watch::Sender<Trust>>,
@@ -103,12 +104,12 @@ impl Judge {
         (Self { trust, health }, receiver)
     }
 
-    /// Changes what callers are judged by, if `change` returns `true`.
+    /// Changes the published data, if `change` returns `true`.
     pub(crate) fn change(&self, change: impl FnOnce(&mut Trust) -> bool) -> bool {
         self.trust.send_if_modified(change)
     }
 
-    /// A file cannot be used (`Some`, with the reason), or can be used again.
+    /// Records that a file is unusable (`Some`, with the reason), or usable again.
     pub(crate) fn fault(&self, source: Source, why: Option<String>) {
         let closed = why.is_some();
         self.health.access(source.name(), why);
@@ -119,36 +120,36 @@ impl Judge {
     }
 }
 
-/// Follows one file: says when its trouble has lasted too long.
+/// Follows one file and reports when it has been unusable for too long.
 #[derive(Debug, Default)]
 pub(crate) struct Trouble {
     since: Option<Instant>,
-    /// The reason that was last logged.
+    /// The last logged reason.
     said: String,
-    /// Every caller is refused.
+    /// Whether every caller is refused.
     closed: bool,
 }
 
-/// What a look at a file means.
+/// The consequence of a check of a file.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// Nothing new.
+    /// No change.
     Same,
-    /// The file cannot be used; there is some time left to repair it.
+    /// The file cannot be used, but the grace period has not passed.
     Warn,
     /// The file could not be used for too long.
     Close,
-    /// The file can be used again, after everybody was refused.
+    /// The file can be used again, after every caller was refused.
     Reopen,
 }
 
 impl Trouble {
-    /// Whether the last look found the file usable.
+    /// Returns whether the last check found the file usable.
     pub(crate) fn is_over(&self) -> bool {
         self.since.is_none()
     }
 
-    /// Judges a look at `now`; `why` is the reason why the file cannot be used.
+    /// Evaluates a check at `now`; `why` is the reason why the file cannot be used.
     pub(crate) fn judge(&mut self, why: Option<&str>, now: Instant) -> Verdict {
         let Some(why) = why else {
             return match std::mem::take(self).closed {
@@ -172,7 +173,8 @@ impl Trouble {
     }
 }
 
-/// Reads a file aside, so that a file system that hangs does not keep old rights in force.
+/// Reads a file on a separate thread, so that a file system that hangs does not keep old rights in
+/// force.
 pub(crate) struct Reader<T>(Option<JoinHandle<T>>);
 
 impl<T> Default for Reader<T> {
@@ -182,8 +184,8 @@ impl<T> Default for Reader<T> {
 }
 
 impl<T: Send + 'static> Reader<T> {
-    /// What `read` returns, or `None` if it takes longer than the grace. The next call waits for
-    /// the same reading.
+    /// Returns the result of `read`, or `None` if it takes longer than the grace period. The next
+    /// call waits for the same read.
     pub(crate) async fn read(&mut self, read: impl FnOnce() -> T + Send + 'static) -> Option<T> {
         self.read_within(GRACE, read).await
     }
@@ -208,7 +210,7 @@ impl<T: Send + 'static> Reader<T> {
     }
 }
 
-/// Why a file that [`Reader::read`] did not read in time cannot be used.
+/// Returns the reason why a file that [`Reader::read`] did not read in time cannot be used.
 pub(crate) fn too_slow() -> String {
     format!("reading takes more than {} s", GRACE.as_secs())
 }
@@ -228,7 +230,7 @@ mod tests {
         assert_eq!(look(Some("half written"), 2), Verdict::Same);
         assert_eq!(look(None, 3), Verdict::Same);
         assert_eq!(look(Some("no such file"), 10), Verdict::Warn);
-        // Another reason is no new beginning.
+        // Another reason does not restart the grace period.
         assert_eq!(look(Some("not permitted"), 13), Verdict::Warn);
         assert_eq!(look(Some("not permitted"), 15), Verdict::Close);
         assert_eq!(look(Some("not permitted"), 16), Verdict::Same);
@@ -245,7 +247,7 @@ mod tests {
         let soon = Duration::from_millis(20);
         assert_eq!(reader.read_within(soon, hangs).await, None);
         go.send(()).unwrap();
-        // The same reading ends.
+        // The same read ends.
         assert_eq!(reader.read(|| false).await, Some(true));
     }
 

@@ -1,5 +1,6 @@
-//! Who holds the places that there are for connections. Where none is free, the connection goes that has waited longest
-//! for its first request: whoever means it is done with that within moments, so silent ones shut nobody out.
+//! Assigns the available places to connections. If none is free, the connection that has waited
+//! longest for its first request is closed. Honest clients send it within moments, so silent
+//! connections keep nobody out.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -10,11 +11,13 @@ use std::{
 
 use tokio_util::sync::CancellationToken;
 
-/// How long a full waiting room is left alone, for each connection more; and how often it is looked at meanwhile.
+/// Delay of each further connection while all silent places are taken, and the interval of checks
+/// meanwhile.
 const CROWDED: Duration = Duration::from_millis(20);
 const ASK_AGAIN: Duration = Duration::from_millis(2);
 
-/// Addresses that count as one: an IPv4 address, or a /64 network of IPv6, of which one machine has all.
+/// Addresses that count as one: an IPv4 address, or a /64 network of IPv6, which one machine may
+/// own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct Group([u8; 8]);
 
@@ -22,7 +25,7 @@ impl From<IpAddr> for Group {
     fn from(address: IpAddr) -> Self {
         let mut group = [0; 8];
         match address.to_canonical() {
-            // 0xff begins no unicast network.
+            // No unicast network begins with 0xff.
             IpAddr::V4(v4) => {
                 group[0] = 0xff;
                 group[4..].copy_from_slice(&v4.octets());
@@ -33,47 +36,48 @@ impl From<IpAddr> for Group {
     }
 }
 
-/// The places.
+/// The places for connections.
 pub(crate) struct Doors(Mutex<State>);
 
 struct State {
     all: usize,
     per_address: usize,
-    /// Connections without a request at a time.
+    /// Most connections without a request.
     silent: usize,
     next: u64,
     open: BTreeMap<u64, (Group, CancellationToken)>,
-    /// When the latest came that had to take the place of one without a request.
+    /// Time of the latest connection that had to replace one without a request.
     crowded: Option<Instant>,
     of: HashMap<Group, usize>,
-    /// Those that wait for their first request, the oldest first; of all, and of each group.
+    /// Connections that wait for their first request, oldest first: all of them, and those of each
+    /// group.
     waiting: BTreeSet<u64>,
     waiting_of: HashMap<Group, BTreeSet<u64>>,
     counts: Counts,
 }
 
-/// What became of connections.
+/// Counts of connections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Counts {
-    /// Open now.
+    /// Open connections.
     pub open: u64,
-    /// Refused, because there was no place.
+    /// Connections refused because no place was free.
     pub refused: u64,
-    /// Closed before their first request, to make place for others.
+    /// Connections closed before their first request, to free a place.
     pub displaced: u64,
 }
 
-/// Why there is no place.
+/// The reason why no place is free.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Full {
-    /// As many connections as there may be have requests.
+    /// Every place has a connection with a request.
     All,
-    /// As many of this address as there may be have requests.
+    /// Every place of this address has a connection with a request.
     Address,
 }
 
 impl Doors {
-    /// So many places, so many of one address, and so many for connections that have not sent a request.
+    /// Creates places: in total, for each address, and for connections without a request.
     pub(crate) fn new(all: usize, per_address: usize, silent: usize) -> Self {
         Self(Mutex::new(State {
             all,
@@ -89,7 +93,7 @@ impl Doors {
         }))
     }
 
-    /// What became of connections until now.
+    /// Returns the counts of connections so far.
     pub(crate) fn counts(&self) -> Counts {
         let state = self.lock();
         Counts {
@@ -98,8 +102,8 @@ impl Doors {
         }
     }
 
-    /// How long the next connection had better wait: where there are many without a request, those that are about to send
-    /// theirs get some time before they are displaced.
+    /// Returns how long to wait before the next connection is accepted. If many connections have
+    /// not sent a request, they get some time to do so before they are replaced.
     pub(crate) fn patience(&self) -> Duration {
         let mut state = self.lock();
         if state.waiting.len() < state.silent {
@@ -110,12 +114,12 @@ impl Doors {
         if since < CROWDED {
             return ASK_AGAIN;
         }
-        // For this one; the next waits for its own time.
+        // The wait was for this connection. The next one waits again.
         state.crowded = None;
         Duration::ZERO
     }
 
-    /// Places of all, and of one address.
+    /// Returns the places in total, and for each address.
     pub(crate) fn bounds(&self) -> (usize, usize) {
         let state = self.lock();
         (state.all, state.per_address)
@@ -124,7 +128,7 @@ impl Doors {
     /// Takes a place until the value is dropped.
     ///
     /// # Errors
-    /// There is none, and none can be made.
+    /// Returns the reason if no place is free and none can be freed.
     pub(crate) fn enter(self: &Arc<Self>, address: IpAddr) -> Result<Held, Full> {
         let group = Group::from(address);
         let mut state = self.lock();
@@ -164,7 +168,7 @@ impl Doors {
 }
 
 impl State {
-    /// Closes the connection that has waited longest, if one waits.
+    /// Closes the connection that has waited longest, if any.
     fn make_room(&mut self, oldest: Option<u64>, full: Full) -> Result<(), Full> {
         let Some(closed) = oldest.and_then(|id| self.leave(id)) else {
             self.counts.refused += 1;
@@ -197,7 +201,7 @@ impl State {
     }
 }
 
-/// A connection's place; its owner gives it back by dropping it.
+/// The place of a connection, freed when the value is dropped.
 pub(crate) struct Held(Arc<Place>);
 
 impl Held {
@@ -212,7 +216,7 @@ impl Drop for Held {
     }
 }
 
-/// What is known of a connection while it is open.
+/// The state of an open connection.
 pub(crate) struct Place {
     doors: Arc<Doors>,
     id: u64,
@@ -221,15 +225,15 @@ pub(crate) struct Place {
 }
 
 struct Use {
-    /// A request was let in.
+    /// Whether a request was admitted.
     admitted: bool,
     streams: usize,
-    /// Of the connection's beginning, or of the end of its last stream.
+    /// The connection's beginning, or the end of its last stream.
     since: Instant,
 }
 
 impl Place {
-    /// Its number, unique among the connections of these doors.
+    /// Returns the number of the connection, unique among these doors.
     pub(crate) fn id(&self) -> u64 {
         self.id
     }
@@ -239,7 +243,7 @@ impl Place {
         self.closed.cancel();
     }
 
-    /// A request was let in; it is open until the value is dropped.
+    /// Records an admitted request, which stays open until the value is dropped.
     pub(crate) fn stream(self: &Arc<Self>) -> Stream {
         let first = {
             let mut use_ = self.lock();
@@ -256,8 +260,8 @@ impl Place {
         Stream(Arc::clone(self))
     }
 
-    /// Ends when the connection shall: its place went to another, no request was let in in time, or there were no streams
-    /// for too long. Says why.
+    /// Waits until the connection must end, and returns the reason: its place went to another one,
+    /// no request was admitted in time, or it was without streams for too long.
     pub(crate) async fn over(
         self: Arc<Self>,
         first_request: Duration,
@@ -278,7 +282,7 @@ impl Place {
         }
     }
 
-    /// How long it may stay, as things are.
+    /// Returns how long the connection may stay in its current state.
     fn left(&self, first_request: Duration, idle: Duration) -> (Duration, &'static str) {
         let use_ = self.lock();
         let gone = use_.since.elapsed();
@@ -340,7 +344,7 @@ mod tests {
         assert_eq!(doors.enter(ip("10.0.0.5")).err(), Some(Full::All));
         let counts = doors.counts();
         assert_eq!((counts.open, counts.refused, counts.displaced), (3, 1, 1));
-        // One that has had its request stays although it has none now.
+        // A connection that has had a request stays even without a current one.
         drop(request);
         assert_eq!(doors.enter(ip("10.0.0.5")).err(), Some(Full::All));
         drop(a);

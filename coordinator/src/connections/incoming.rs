@@ -1,5 +1,5 @@
-//! From the listening socket to connections that speak: a place for each, TLS where it is asked for, and the end of
-//! those that say nothing.
+//! Turns accepted sockets into connections: assigns a place to each, begins TLS if required, and
+//! ends silent ones.
 
 use std::{
     future::Future,
@@ -29,14 +29,15 @@ use super::{
 };
 use crate::auth::Throttle;
 
-/// How long a TLS handshake may take.
+/// Time limit of a TLS handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// How long to wait after the system gave no connection (no file left, no memory): others must end first.
+/// Delay after the system returned no connection (no file handles, no memory), so that others can
+/// end.
 const PAUSE: Duration = Duration::from_millis(100);
-/// Connections that may wait for the server to take them.
+/// Connections that may wait for the server.
 const READY: usize = 64;
 
-/// The connections of a listener, until `stop`. `tls` gives the present certificates.
+/// Returns the connections of a listener, until `stop`. `tls` contains the current certificates.
 pub(crate) fn accept(
     listener: TcpListener,
     doors: Arc<Doors>,
@@ -79,7 +80,7 @@ pub(crate) fn accept(
                     continue;
                 }
             };
-            // Small messages are not held back; a socket that cannot be told so works all the same.
+            // Small messages are not delayed. The socket works even if this option fails.
             let _ = stream.set_nodelay(true);
             let tls = tls.as_ref().map(|tls| tls.borrow().clone());
             let ready = ready.clone();
@@ -87,7 +88,7 @@ pub(crate) fn accept(
                 if let Some(connection) =
                     Connection::begin(stream, address, held, bounds, tls).await
                 {
-                    // The server is gone when it stops.
+                    // The server is gone if it is stopping.
                     let _ = ready.send(Ok(connection)).await;
                 }
             });
@@ -101,37 +102,37 @@ enum Io {
     Tls(Box<TlsStream<TcpStream>>),
 }
 
-/// A connection with its place. Reading from it fails when its time is over.
+/// A connection with its place. Reading from it fails when it must end.
 pub(crate) struct Connection {
     io: Io,
     address: SocketAddr,
-    /// How often the client certificate authorities had changed when it began.
+    /// Number of changes of the client certificate authorities when the connection began.
     authorities: u64,
     held: Held,
     over: Option<Pin<Box<dyn Future<Output = &'static str> + Send>>>,
 }
 
-/// What handlers know of a connection.
+/// The information about a connection for handlers.
 #[derive(Clone)]
 pub(crate) struct Peer {
     /// The remote address.
     pub address: SocketAddr,
-    /// The client's certificate chain, verified.
+    /// The client's verified certificate chain.
     pub certificates: Option<Arc<Vec<CertificateDer<'static>>>>,
-    /// How often the client certificate authorities had changed when the connection began.
+    /// Number of changes of the client certificate authorities when the connection began.
     pub authorities: u64,
     pub(super) place: Arc<Place>,
 }
 
 impl Peer {
-    /// Its place among the connections.
+    /// Returns the place of the connection.
     pub(crate) fn place(&self) -> Arc<Place> {
         Arc::clone(&self.place)
     }
 }
 
 impl Connection {
-    /// `None` where TLS did not come about in time.
+    /// Begins a connection. Returns `None` if the TLS handshake did not complete in time.
     async fn begin(
         stream: TcpStream,
         address: SocketAddr,
@@ -171,7 +172,7 @@ impl Connection {
         })
     }
 
-    /// Fails when the connection's time is over.
+    /// Fails if the connection must end.
     fn poll_over(&mut self, context: &mut Context<'_>) -> io::Result<()> {
         if let Some(over) = &mut self.over {
             let Poll::Ready(why) = over.as_mut().poll(context) else {

@@ -1,4 +1,4 @@
-//! Connections: how many there may be, for how long they may say nothing, and how TLS begins on them.
+//! Connections: their number, the time for which they may be silent, and the start of TLS.
 
 mod doors;
 mod incoming;
@@ -17,13 +17,15 @@ pub(crate) use watched::follow as follow_certificates;
 /// Bounds on connections to the gRPC port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Connections {
-    /// At a time; by default 20,000. Never more than the limit of open files allows.
+    /// Most concurrent connections; by default 20,000. The limit of open files may lower it.
     pub all: usize,
-    /// Of one remote address (of IPv6 one /64 network); by default three quarters of all.
+    /// Most connections of one remote address (or IPv6 /64 network); by default three quarters of
+    /// `all`.
     pub per_address: Option<usize>,
-    /// A connection on which no request was let in for so long is closed (default 20 s).
+    /// A connection without an admitted request is closed after this time (default 20 s).
     pub first_request: Duration,
-    /// One without open streams for so long is closed (default 10 min). Clients open another when they need one.
+    /// A connection without open streams is closed after this time (default 10 min). Clients
+    /// reconnect when they need to.
     pub idle: Duration,
 }
 
@@ -38,12 +40,12 @@ impl Default for Connections {
     }
 }
 
-/// Files that the process opens besides connections: catalog, logs, the HTTP endpoint, the runtime.
+/// Open files other than connections: catalog, logs, the HTTP endpoint, the runtime.
 const OTHER_FILES: u64 = 512;
 
 impl Connections {
-    /// Doors for these bounds where so many files may be open and there is so much memory. The greater part of a small limit
-    /// of files is for connections.
+    /// Creates doors for these bounds, a limit of open files, and the available memory. If the
+    /// limit is small, most of it is for connections.
     pub(crate) fn doors(&self, files: u64, memory: MemoryBounds) -> Doors {
         let room = files.saturating_sub(OTHER_FILES).max(files / 2);
         let all = self
@@ -56,7 +58,7 @@ impl Connections {
     }
 }
 
-/// Raises the limit of open files as far as the system lets us; returns it.
+/// Raises the limit of open files as far as the system allows. Returns the new limit.
 pub(crate) fn raise_open_files() -> u64 {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
     let limit = getrlimit(Resource::Nofile);

@@ -1,4 +1,5 @@
-//! The layer that counts a connection's open requests: from when they are let in until their answer's last byte.
+//! The layer that counts a connection's open requests, from admission to the last byte of the
+//! answer.
 
 use std::{
     future::Future,
@@ -25,7 +26,7 @@ impl<S> Layer<S> for Streams {
     }
 }
 
-/// A service whose requests are counted.
+/// A service with counted requests.
 #[derive(Clone)]
 pub(crate) struct Counted<S> {
     inner: S,
@@ -45,7 +46,7 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
-        // Nobody behind this needs it, and whoever kept it would keep the connection's record.
+        // Later layers do not need the peer, and a copy would keep the connection's record alive.
         let peer = request.extensions_mut().remove::<Peer>();
         let stream = peer.map(|peer| peer.place.stream());
         let answer = self.inner.call(request);
@@ -61,7 +62,7 @@ where
     }
 }
 
-/// An answer whose request counts until it is over.
+/// An answer that counts its request until it ends.
 struct Open {
     body: Body,
     _stream: Option<Stream>,

@@ -1,4 +1,4 @@
-//! Certificates that change while the coordinator runs: the files are looked at like the token file.
+//! Certificates that change while the coordinator runs. The files are checked like the token file.
 
 use std::{
     sync::Arc,
@@ -16,20 +16,20 @@ use crate::{
     auth::{GRACE, Judge, Loaded, Reader, Source, TlsFiles, Trouble, Verdict, too_slow},
 };
 
-/// How often the files are looked at.
+/// Interval between checks of the files.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// What a look at the files comes to, given the look before.
+/// The result of a check of the files, given the previous check.
 #[derive(Debug, PartialEq, Eq)]
 enum Seen {
     Same,
     New,
-    /// The files cannot be used, for the second time in a row with these words: certificate and key are two files, and
-    /// whoever replaces them has one of them new for a moment.
+    /// The files cannot be used, with the same message twice in a row. Certificate and key are two
+    /// files, so that one of them is briefly out of date while they are replaced.
     Unusable(String),
 }
 
-/// Judges looks.
+/// Compares successive checks.
 #[derive(Default)]
 struct Looks {
     complaint: String,
@@ -58,21 +58,21 @@ impl Looks {
     }
 }
 
-/// What connections begin with.
+/// The certificates of new connections.
 #[derive(Clone)]
 pub(crate) struct Certificates {
     pub config: Arc<ServerConfig>,
-    /// How often the client certificate authorities have changed.
+    /// Number of changes of the client certificate authorities.
     pub authorities: u64,
 }
 
-/// The present certificates, of files that are read again until `stop`.
+/// Returns the current certificates, from files that are read again until `stop`.
 ///
-/// An own certificate that cannot be used changes nothing, because it lets nobody in; the log says
-/// so. Connections keep the certificates that they began with. Client certificate authorities that
-/// have changed and are not in force let in somebody who may have been revoked: if they cannot be
-/// used within [`GRACE`], every caller is refused. When they have changed, callers on older
-/// connections are refused, and come back with a certificate that is judged anew.
+/// If the own certificate cannot be used, nothing changes except for a log line, because the
+/// certificate admits nobody. Connections keep the certificates with which they began. Changed
+/// client certificate authorities that are not in force could admit a revoked client. If they
+/// cannot be used within [`GRACE`], every caller is refused. After a change, callers on older
+/// connections are refused, and reconnect with a certificate to be checked again.
 pub(crate) fn follow(
     files: TlsFiles,
     loaded: Loaded,

@@ -1,6 +1,6 @@
-//! Workers on which one task of a stage after another fails: a full disk, a broken driver. Such a
-//! worker gets no more of that stage for a while, and for ever longer, as long as others may run
-//! it; and its failures are not the tasks'.
+//! Workers on which one task of a stage after another fails, because of a full disk or a broken
+//! driver. Such a worker gets no more tasks of that stage for increasing times, as long as other
+//! workers may run it. Its failures are not charged to the tasks.
 
 use std::collections::BTreeMap;
 
@@ -8,11 +8,11 @@ use picofarm_proto::{ids::WorkerId, model::FailureKind};
 
 use crate::budget::Backoff;
 
-/// Different tasks that fail on a worker in a row until it is passed over.
+/// A worker is excluded after this many different tasks in a row failed on it.
 const TASKS: usize = 3;
-/// For how long at most, milliseconds.
+/// Longest exclusion, milliseconds.
 const AVOID_MS: u32 = 600_000;
-/// It is passed over this many times as long as a task waits after a failure.
+/// An exclusion is this many times as long as the delay of a task after a failure.
 const LONGER: u32 = 4;
 
 /// The workers on which tasks of one stage failed.
@@ -21,17 +21,17 @@ pub(super) struct Blocklist(BTreeMap<WorkerId, Row>);
 
 #[derive(Debug, Default)]
 struct Row {
-    /// The tasks, with what they were charged with.
+    /// The failed tasks, with the kind of failure charged to each.
     tasks: BTreeMap<u64, FailureKind>,
     tries: u32,
     until_ms: i64,
-    /// The same where no other worker may run the stage.
+    /// End of the exclusion if no other worker may run the stage, Unix milliseconds.
     alone_until_ms: i64,
     last_ms: i64,
 }
 
 impl Blocklist {
-    /// A task failed on a worker.
+    /// Records that a task failed on a worker.
     pub(super) fn failed(
         &mut self,
         worker: WorkerId,
@@ -44,12 +44,12 @@ impl Blocklist {
         if row.last_ms.max(row.until_ms) + i64::from(AVOID_MS) < now_ms {
             *row = Row::default();
         }
-        // More are not needed to know.
+        // Further tasks are not needed for the decision.
         if row.tasks.len() < TASKS {
             row.tasks.entry(task).or_insert(kind);
         }
         row.last_ms = now_ms;
-        // Tasks that ran on it at that time fail too, which counts once.
+        // Failures of tasks that ran on the worker at the same time count once.
         if row.tasks.len() >= TASKS && now_ms >= row.until_ms.min(row.alone_until_ms) {
             let longer = Backoff {
                 first_ms: backoff.first_ms.saturating_mul(LONGER),
@@ -57,39 +57,39 @@ impl Blocklist {
             };
             row.tries = row.tries.saturating_add(1);
             row.until_ms = now_ms + longer.after(row.tries);
-            // The only worker of a stage rests shortly: its tasks may be as much to blame, and a wrong
-            // job must fail soon on a laptop.
+            // The only worker of a stage rests briefly: its tasks may be as much at fault, and a
+            // wrong job must fail soon on a laptop.
             let alone = i64::from(backoff.first_ms);
             row.alone_until_ms = row.until_ms.min(now_ms + alone);
         }
     }
 
-    /// A task went well on a worker.
+    /// Records that a task succeeded on a worker.
     pub(super) fn succeeded(&mut self, worker: WorkerId) {
         self.0.remove(&worker);
     }
 
-    /// Whether tasks failed on a worker one after another, and nothing has gone well on it since.
+    /// Returns whether tasks failed on a worker one after another without a success since.
     pub(super) fn doubts(&self, worker: WorkerId) -> bool {
         self.0
             .get(&worker)
             .is_some_and(|row| row.tasks.len() >= TASKS)
     }
 
-    /// Whether a worker is to be passed over; then for how much longer, milliseconds.
+    /// Returns how much longer a worker is excluded, milliseconds.
     pub(super) fn avoids(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let left = self.0.get(&worker)?.until_ms - now_ms;
         (left > 0).then_some(left)
     }
 
-    /// The same of a worker that is the only one for the stage.
+    /// Like `avoids`, for the only worker of the stage.
     pub(super) fn avoids_alone(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let left = self.0.get(&worker)?.alone_until_ms - now_ms;
         (left > 0).then_some(left)
     }
 
-    /// The tasks that failed on a worker before it was passed over, with what they were charged
-    /// with: once.
+    /// Returns, once, the tasks that failed on a worker before its exclusion, with the kind of
+    /// failure charged to each.
     pub(super) fn take_charged(&mut self, worker: WorkerId) -> Vec<(u64, FailureKind)> {
         let Some(row) = self.0.get_mut(&worker) else {
             return Vec::new();
@@ -136,7 +136,7 @@ mod tests {
         let mut now = 10;
         let mut waits = Vec::new();
         for task in 3..13 {
-            // All that was under way fails at once, which counts once.
+            // All running tasks fail at once, which counts once.
             fail(&mut blocklist, task, now);
             fail(&mut blocklist, task + 100, now);
             waits.push(avoids(&blocklist, now).unwrap());

@@ -1,5 +1,5 @@
-//! Between the catalog and the workers: claiming pending tasks, giving back what nobody here wants, and what is heard
-//! of other instances.
+//! Connects the catalog to the workers: claims pending tasks, gives back unwanted ones, and applies
+//! news of other instances.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -12,16 +12,17 @@ use picofarm_proto::{
 use super::{About, Core, ready::Ready};
 use crate::{place, transition::RangeEvent};
 
-/// Leases claimed for each one that is wanted now, so that short tasks do not cost a transaction each.
+/// Leases claimed for each lease wanted now, so that short tasks do not cost a transaction
+/// each.
 const AHEAD: u64 = 8;
-/// How long not to ask again after an empty answer.
+/// Delay before the catalog is asked again after an empty answer.
 const ASK_AGAIN_MS: i64 = 100;
 
 impl Core {
-    /// The pending tasks that connected workers could run now and that are not in hand. Jobs of one
-    /// priority share: each in its turn is given a lease, until nobody asks for more. Those of
-    /// lower priority get what the others cannot use: tasks that cannot run now, or on none of the
-    /// workers that ask, keep no worker from other jobs.
+    /// Returns the pending tasks that connected workers could run now and that this instance has
+    /// not claimed. Jobs of equal priority share: each gets one lease in turn, until no worker asks
+    /// for more. Jobs of lower priority get the remaining capacity. Tasks that cannot run now, or
+    /// on none of the asking workers, keep no worker from other jobs.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
         let mut hungry = Hungry::new(
             self.workers
@@ -34,7 +35,7 @@ impl Core {
                     ends: worker.ends_ms.is_some(),
                 }),
         );
-        // Mostly everyone is at work: then nothing need be looked at.
+        // Usually all workers are busy, so that nothing needs to be searched.
         if hungry.credits == 0 {
             return Vec::new();
         }
@@ -63,8 +64,8 @@ impl Core {
         wants
     }
 
-    /// Gives a stage one lease more, of whichever of the hungry workers may run it next; `false`
-    /// where none may, or nothing is left.
+    /// Gives a stage one more lease, for the next hungry worker that may run it. Returns `false` if
+    /// no worker may run it or no task is left.
     fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
         let id = demand.stage;
         let job = &self.stages[&id].job;
@@ -82,7 +83,7 @@ impl Core {
                 demand.next += 1;
                 continue;
             }
-            // What there is of the stage may be too long for this worker.
+            // The available tasks of the stage may be too long for this worker.
             if worker.ends && self.ready_for(id, worker.id, now_ms).is_none() {
                 demand.next += 1;
                 continue;
@@ -125,7 +126,7 @@ impl Core {
         }
     }
 
-    /// The tasks to claim for a demand, beyond those in hand.
+    /// Returns the tasks to claim for a demand beyond those already claimed.
     fn want(&self, demand: &Demand, now_ms: i64) -> Option<Want> {
         let supply = demand.supply.as_ref().filter(|_| demand.leases > 0)?;
         let entry = &self.stages[&demand.stage];
@@ -145,7 +146,7 @@ impl Core {
         })
     }
 
-    /// Tasks of the next lease of a stage, at most `in_range`.
+    /// Returns the number of tasks in the next lease of a stage, at most `in_range`.
     pub(super) fn lease_size(
         &self,
         entry: &super::StageEntry,
@@ -154,7 +155,7 @@ impl Core {
         now_ms: i64,
     ) -> u64 {
         let claimable = entry.claimable(now_ms);
-        // As long as it is not known how much there is, there is enough.
+        // The supply counts as sufficient while its size is unknown.
         let free = match claimable.unknown {
             true => u64::MAX / 2,
             false => claimable.known(),
@@ -168,7 +169,7 @@ impl Core {
         )
     }
 
-    /// The answer to a wish.
+    /// Applies the catalog's answer to a `Want`.
     pub(crate) fn claimed(&mut self, stage: StageRef, claim: Claim, now_ms: i64) {
         let Some(entry) = self.stages.get_mut(&stage) else {
             return;
@@ -180,7 +181,8 @@ impl Core {
         self.receive(claim.owned, now_ms);
         for run in claim.existing {
             let entry = self.stages.get_mut(&stage).expect("looked up above");
-            // Runs end at the ends of claimed ranges: each lies in one of them.
+            // Every run is contained in one claimed range, because runs end where claimed ranges
+            // end.
             let Some(range) = entry.stage.pending_at(run.lo).cloned() else {
                 continue;
             };
@@ -199,7 +201,8 @@ impl Core {
         }
     }
 
-    /// Takes ranges in hand that are this instance's in the catalog. Leases begin a new period.
+    /// Takes over ranges that the catalog assigns to this instance. Their leases begin a new
+    /// period.
     pub(crate) fn receive(&mut self, owned: Owned, now_ms: i64) {
         for exception in owned.exceptions {
             if let Some(entry) = self.stages.get_mut(&exception.stage) {
@@ -218,20 +221,22 @@ impl Core {
                     entry.stage.receive(range, &mut self.changes);
                     self.renew(id, now_ms);
                 }
-                // Of a job that is no longer active: it goes back as it would have when the job ended.
+                // The job is no longer active, so the range goes back as it would have when the job
+                // ended.
                 None => give_back(&range, &mut self.changes),
             }
         }
     }
 
-    /// Forgets leases that ended elsewhere, which is found when their tasks come back before the catalog's news do. Left
-    /// in hand, they would run out here, and their tasks would stand in two ranges.
+    /// Forgets leases that ended on another instance. This is noticed when their tasks come back
+    /// before the catalog's news do. If kept, they would run out here and their tasks would be in
+    /// two ranges.
     fn forget_outdated(&mut self, range: &Range) {
         let Some(entry) = self.stages.get_mut(&range.stage) else {
             return;
         };
         let mut ended = entry.stage.outdated_by(range);
-        // The same one, without its worker, or another worker's by now.
+        // The same range, now without its worker or with another one.
         let pending = matches!(range.state, RangeState::Pending { .. });
         let same = entry.stage.leased_range(range.id);
         let same = same.filter(|old| pending || old.epoch != range.epoch);
@@ -245,7 +250,7 @@ impl Core {
         }
     }
 
-    /// Gives back the pending tasks that no worker took, so that other instances may.
+    /// Gives back the pending tasks that no worker took, so that other instances may claim them.
     pub(crate) fn give_back(&mut self) {
         for entry in self.stages.values_mut() {
             let before = self.changes.free.len();
@@ -256,7 +261,7 @@ impl Core {
         }
     }
 
-    /// What the catalog tells from time to time. Returns the active jobs that are not known yet.
+    /// Applies the catalog's news. Returns the active jobs that this instance does not know yet.
     pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
         self.sick.tidy(now_ms);
         self.instances = news.instances.max(1);
@@ -294,13 +299,14 @@ impl Core {
                     entry.stage.forget(range);
                 }
                 self.lease_over(range);
-                // Our own last task was reported while this one seemed to be in hand still, and the instance that has it may
-                // have finished it before ours: then it falls to us to find that the stage is over.
+                // Our last task may have been reported while this one still seemed to be leased,
+                // and the other instance may have finished it before ours. Then this instance must
+                // notice that the stage has finished.
                 self.perhaps_over(stage, now_ms);
             }
         }
         self.receive(news.taken, now_ms);
-        // Held by way of another instance.
+        // Paused through another instance.
         for job in held {
             self.paused(job, true);
         }
@@ -313,9 +319,9 @@ impl Core {
 /// The workers that ask for leases.
 struct Hungry {
     workers: Vec<Asks>,
-    /// Leases that they ask for together.
+    /// Total number of leases that the workers ask for.
     credits: u64,
-    /// Workers that would join those of a job, where it has a limit.
+    /// Workers that would join the workers of a job with a limit.
     joined: HashMap<JobId, BTreeSet<WorkerId>>,
 }
 
@@ -323,7 +329,7 @@ struct Asks {
     id: WorkerId,
     credits: u32,
     empty_handed: bool,
-    /// It must end at a time that is known.
+    /// The worker must end at a known time.
     ends: bool,
 }
 
@@ -338,13 +344,13 @@ impl Hungry {
     }
 }
 
-/// What the workers that ask could take of a stage.
+/// The part of a stage that the asking workers could take.
 struct Demand {
     stage: StageRef,
-    /// The worker to be looked at next.
+    /// The next worker to consider.
     next: usize,
     leases: u64,
-    /// One of the workers has nothing else in hand.
+    /// Whether one of the workers has no other lease.
     suspects: bool,
     supply: Option<Supply>,
 }
@@ -361,14 +367,14 @@ impl Demand {
     }
 }
 
-/// What there is of a stage for them.
+/// The tasks of a stage that are available to these workers.
 struct Supply {
-    /// Tasks of a lease.
+    /// Number of tasks in a lease.
     size: u64,
     ready: Ready,
 }
 
-/// The pieces of a range whose job is not active, as the catalog keeps them.
+/// Gives back the pieces of a range of an inactive job, in the form that the catalog stores.
 fn give_back(range: &Range, changes: &mut Changes) {
     let mut minted = Vec::new();
     let pieces = match range.state {

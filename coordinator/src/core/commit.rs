@@ -1,4 +1,5 @@
-//! The commit rule: a result is accepted only from the holder of a live lease, and each task has one result.
+//! The commit rule: a result is accepted only from the holder of a live lease, and each task has
+//! one result.
 
 use picofarm_catalog::{Output, Range, RangeState};
 use picofarm_proto::{
@@ -10,12 +11,13 @@ use picofarm_proto::{
 use super::{About, Core, Say, SessionId, StageEntry, stores::store_of};
 use crate::transition::RangeEvent;
 
-/// What the catalog already holds for a reported task: looked up before [`Core::finished`].
+/// The recorded result of a reported task, which is looked up before [`Core::finished`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct OutputHint(pub Option<[u8; 32]>);
 
 impl Core {
-    /// The stage whose task a report is about: by its lease, or else by the task key.
+    /// Returns the stage of a reported task. The stage is found by the lease, or else by the task
+    /// key.
     pub(crate) fn stage_of(&self, report: &Finished) -> Option<StageRef> {
         let fits =
             |entry: &StageEntry| task_key(&self.sets[entry.set].key, report.index) == report.key;
@@ -32,8 +34,8 @@ impl Core {
             .map(|(id, _)| *id)
     }
 
-    /// Commits a finished task, or says why not. `hint` is what the catalog holds for it. `checked`: its store was found to
-    /// hold the result.
+    /// Commits a finished task, or refuses it with a reason. `hint` is the recorded result.
+    /// `checked` means that its store contains the result.
     pub(crate) fn finished(
         &mut self,
         session: SessionId,
@@ -52,7 +54,7 @@ impl Core {
         self.acknowledge(session, report.lease, report.index, verdict);
     }
 
-    /// Notes that something is wrong with a reported task.
+    /// Adds a warning about a reported task to the history.
     pub(crate) fn alarm(
         &mut self,
         session: SessionId,
@@ -118,7 +120,7 @@ impl Core {
                 Err(message)
             }
             (live, Some(known)) => {
-                // The output stands, whoever made it: the task is done.
+                // The task is done, because the output is valid whichever worker made it.
                 let had_it = live.is_ok();
                 if let Ok(range) = live {
                     self.mark(
@@ -222,7 +224,7 @@ impl Core {
         self.perhaps_over(id, now_ms);
     }
 
-    /// Where a double was first and nothing of the lease is left, its holder need not go on.
+    /// Tells the holder of a lease to stop if the second run of its last task finished first.
     fn stop_first(&mut self, by: SessionId, range: &Range) {
         let RangeState::Leased(lease) = &range.state else {
             return;

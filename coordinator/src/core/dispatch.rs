@@ -1,4 +1,5 @@
-//! Grants: pending tasks to workers with credit, in memory and only when something has changed.
+//! Grants pending tasks to workers with credit. Works in memory, and only when something has
+//! changed.
 
 use std::cmp::Reverse;
 
@@ -14,19 +15,19 @@ use crate::{
     transition::RangeEvent,
 };
 
-/// Workers other than one that may run a stage.
+/// The other workers that may run a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Others {
-    /// There are some, on which its tasks do not fail.
+    /// At least one of them does not fail on its tasks.
     Good,
-    /// There are some, and its tasks fail on all of them too.
+    /// There are others, and its tasks fail on all of them too.
     Failed,
-    /// There is none.
+    /// There is no other worker.
     None,
 }
 
 impl Core {
-    /// Grants whatever is in hand and can be granted now.
+    /// Grants all claimed tasks that can be granted now.
     pub(crate) fn dispatch(&mut self, now_ms: i64) {
         self.end_doubles();
         let waiting: Vec<StageRef> = self
@@ -52,7 +53,8 @@ impl Core {
             .filter(|stage| !self.ready_here(*stage, now_ms).is_none())
             .map(|stage| (stage, self.able(stage, now_ms)))
             .collect();
-        // In rounds, so that the first worker does not take everything; and in order of rank, which each grant changes.
+        // Granting proceeds in rounds, so that the first worker does not take everything, and by
+        // rank, which each grant changes.
         let mut granted = true;
         while granted {
             granted = false;
@@ -66,8 +68,8 @@ impl Core {
         self.help(&hungry, now_ms);
     }
 
-    /// Who goes first: the higher priority; then whose user has the fewest leases; then which job has; then who came
-    /// first.
+    /// Returns the precedence of a stage: higher priority first, then the user with the fewest
+    /// leases, then the job with the fewest leases, then the earlier submission.
     pub(super) fn rank(&self, id: StageRef) -> impl Ord + use<> {
         let job = &self.stages[&id].job;
         (
@@ -82,10 +84,10 @@ impl Core {
         self.stages[&id].job.spec.priority
     }
 
-    /// Whether a connected worker may run a stage's tasks now.
+    /// Checks whether a connected worker may run a stage's tasks now.
     ///
     /// # Errors
-    /// Why not, in words.
+    /// Returns the reason why not.
     pub(super) fn may_run(
         &self,
         id: StageRef,
@@ -136,9 +138,9 @@ impl Core {
         }
     }
 
-    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer,
-    /// milliseconds, and 0 while one of them is a try. Where they fail on every worker, the tasks
-    /// are to blame, and no worker is passed over.
+    /// Returns how much longer a worker gets no task of a stage because the tasks fail on it,
+    /// milliseconds; 0 while one of them is a try. If they fail on every worker, the tasks are at
+    /// fault and no worker is excluded.
     pub(super) fn passed_over(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let blocklist = &self.stages[&id].blocklist;
         if !blocklist.doubts(worker) {
@@ -157,7 +159,7 @@ impl Core {
         })
     }
 
-    /// What there is of workers other than this one that may run a stage.
+    /// Classifies the other workers that may run a stage.
     pub(super) fn others(&self, id: StageRef, than: WorkerId, now_ms: i64) -> Others {
         let entry = &self.stages[&id];
         let others = self.workers.iter().filter(|(worker, w)| {
@@ -178,14 +180,15 @@ impl Core {
         found
     }
 
-    /// Grants one lease of a stage to a worker, if both can; `able` workers may run it.
+    /// Grants one lease of a stage to a worker, if both are ready; `able` workers may run the
+    /// stage.
     pub(super) fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let who = &self.workers[&worker];
         if !who.hungry() || self.may_run(id, worker, now_ms).is_err() {
             return false;
         }
-        // A range under suspicion runs alone on its worker, so that it cannot draw others into its crash.
+        // A suspect range runs alone on its worker, so that a crash affects no other lease.
         let others = self.not_for(id, worker, now_ms);
         let suspects = who.leases.is_empty();
         let Some((range, run)) = entry.stage.front(now_ms, suspects, &others) else {
@@ -193,8 +196,7 @@ impl Core {
         };
         let range = range.clone();
         let store = store_of(&entry.spec(id).task).to_owned();
-        // A task that may run for days holds up no other; and what fails on this worker shall be
-        // one.
+        // A task that may run for days must not delay others, and a try has a single task.
         let alone = self.away.is_try(&store, worker)
             || entry.spec(id).task.resumes()
             || entry.blocklist.doubts(worker)
@@ -250,13 +252,13 @@ impl Core {
         true
     }
 
-    /// Number of connected workers that may run a stage's tasks.
+    /// Returns the number of connected workers that may run a stage's tasks.
     pub(super) fn able(&self, id: StageRef, now_ms: i64) -> u64 {
         let able = |worker: &&WorkerId| self.may_run(id, **worker, now_ms).is_ok();
         self.workers.keys().filter(able).count() as u64
     }
 
-    /// Where workers are connected but none may run a job, its history says why, once for each reason.
+    /// Records in the history why no connected worker may run a job, once for each reason.
     fn explain_waiting(&mut self, id: StageRef, now_ms: i64) {
         let entry = &self.stages[&id];
         let mut reasons = self

@@ -1,5 +1,5 @@
-//! Reports that their store contradicts, and results on which workers do not agree. A worker that reported what is not there
-//! gets no more tasks until it is restarted.
+//! Handles reports that their store contradicts, and results on which workers disagree. A worker
+//! that reported a missing result gets no more tasks until it is restarted.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -14,12 +14,12 @@ use picofarm_proto::{
 
 use super::{About, Core, Say, SessionId, stores::store_of};
 
-/// Results of which it is remembered who reported them, at most.
+/// Most results for which the reporting worker is remembered.
 const REPORTERS: usize = 100_000;
-/// Tasks of which different results are remembered, at most.
+/// Most tasks for which differing results are remembered.
 const DISPUTED: usize = 10_000;
 
-/// A reported result, with all that its store can be asked by.
+/// A reported result, with everything needed to check its store.
 #[derive(Debug, Clone)]
 pub(crate) struct Reported {
     pub session: SessionId,
@@ -27,20 +27,21 @@ pub(crate) struct Reported {
     pub stage: StageRef,
     pub job: Arc<JobSpec>,
     pub store: String,
-    /// The worker is on the coordinator's machine, so both have the same folders.
+    /// Whether the worker runs on the coordinator's machine, so that both see the same folders.
     pub here: bool,
     pub report: Finished,
 }
 
-/// Workers that are not believed, and what is known of doubtful results.
+/// Workers that are not trusted, and doubtful results.
 #[derive(Debug, Default)]
 pub(super) struct Doubts {
     blocked: BTreeMap<WorkerId, Blocked>,
     /// Sessions of workers on the coordinator's machine.
     here: BTreeSet<SessionId>,
-    /// Who reported a result that was committed without a look into its store, by set and task.
+    /// The worker that reported each result committed without a check of its store, by set and
+    /// task.
     reporters: BTreeMap<(usize, u64), WorkerId>,
-    /// What workers reported instead of such a result.
+    /// The differing results that workers reported for such a task.
     votes: BTreeMap<(usize, u64), BTreeMap<WorkerId, String>>,
 }
 
@@ -52,7 +53,7 @@ struct Blocked {
 }
 
 impl Doubts {
-    /// Notes who reported a result that nobody has looked for.
+    /// Records which worker reported an unchecked result.
     pub(super) fn unverified(&mut self, set: usize, task: u64, worker: WorkerId) {
         if self.reporters.len() >= REPORTERS {
             self.reporters.clear();
@@ -60,12 +61,12 @@ impl Doubts {
         self.reporters.insert((set, task), worker);
     }
 
-    /// Why a worker gets no tasks.
+    /// Returns the reason why a worker gets no tasks.
     pub(super) fn blocked(&self, worker: WorkerId) -> Option<&str> {
         self.blocked.get(&worker).map(|blocked| &*blocked.why)
     }
 
-    /// A worker was restarted, perhaps because somebody has repaired it.
+    /// Unblocks a worker that was restarted, because somebody may have repaired it.
     pub(super) fn restarted(&mut self, worker: WorkerId, incarnation: Incarnation) {
         if self
             .blocked
@@ -76,14 +77,14 @@ impl Doubts {
         }
     }
 
-    /// Whether workers have reported different results of a task.
+    /// Returns whether workers have reported different results of a task.
     pub(super) fn disputed(&self, set: usize, task: u64) -> bool {
         self.votes.contains_key(&(set, task))
     }
 }
 
 impl Core {
-    /// What a report's store is to be asked.
+    /// Returns the data with which a report's store is checked.
     pub(crate) fn reported(&self, session: SessionId, report: &Finished) -> Option<Reported> {
         let stage = self.stage_of(report)?;
         let entry = &self.stages[&stage];
@@ -98,7 +99,7 @@ impl Core {
         })
     }
 
-    /// Notes whether a session's worker is on the coordinator's machine.
+    /// Records whether a session's worker runs on the coordinator's machine.
     pub(crate) fn is_here(&mut self, session: SessionId, here: bool) {
         match here {
             true => self.doubts.here.insert(session),
@@ -106,8 +107,9 @@ impl Core {
         };
     }
 
-    /// A report's store does not hold what was reported: the task runs again, and the worker gets no more tasks. If the worker
-    /// only found the result there, that is a failure of the task: the result may be damaged.
+    /// Handles a report that its store contradicts. The task runs again, and the worker gets no
+    /// more tasks. If the worker only found an existing result, this is a failure of the task
+    /// instead, because that result may be damaged.
     pub(crate) fn contradicted(
         &mut self,
         session: SessionId,
@@ -142,7 +144,8 @@ impl Core {
         self.block(worker, store.unwrap_or_default(), why);
     }
 
-    /// The record of a task gave way to another result: whoever reported it gets no more tasks. `by` has reported the other.
+    /// Blocks the worker that reported a result which another one has replaced. `by` reported the
+    /// replacement.
     pub(crate) fn overruled(
         &mut self,
         by: SessionId,
@@ -173,8 +176,9 @@ impl Core {
         }
     }
 
-    /// Notes that a worker has reported another result than the one that is recorded, of which no store can be asked. `true`
-    /// if two workers, neither of which reported the recorded result, agree on this one.
+    /// Records that a worker reported a result that differs from the record, in a store that cannot
+    /// be checked. Returns `true` if two workers agree on it and neither of them reported the
+    /// recorded result.
     pub(crate) fn outvoted(&mut self, session: SessionId, report: &Finished) -> bool {
         let (Some(worker), Some(stage)) =
             (self.sessions.get(&session).copied(), self.stage_of(report))
@@ -182,7 +186,7 @@ impl Core {
             return false;
         };
         let entry = &self.stages[&stage];
-        // Such results depend on what a store holds at the time.
+        // Results without a manifest depend on the content of the store at the time.
         if entry.spec(stage).task.results().manifest == Manifest::None {
             return false;
         }
@@ -201,14 +205,15 @@ impl Core {
         votes.values().filter(|vote| **vote == manifest).count() >= 2
     }
 
-    /// A store turned out to be another one than that of the workers: who was blocked by what it holds may work again.
+    /// Unblocks workers that were blocked because of a store, after that store turned out not to be
+    /// the one that the workers use.
     pub(crate) fn forgive(&mut self, store: &str) {
         self.doubts
             .blocked
             .retain(|_, blocked| blocked.store != store);
     }
 
-    /// Gives a worker no more tasks, and takes back those that it has.
+    /// Gives a worker no more tasks and takes back its leases.
     fn block(&mut self, worker: WorkerId, store: String, why: &str) {
         let Some(entry) = self.workers.get(&worker) else {
             return;
@@ -240,7 +245,7 @@ impl Core {
         }
     }
 
-    /// Runs a task again on which workers do not agree, until two of them do.
+    /// Runs a task again until two workers agree on its result.
     pub(super) fn undecided(
         &mut self,
         range: &Range,
@@ -250,7 +255,7 @@ impl Core {
         now_ms: i64,
     ) {
         self.leave(range, task, FailureKind::User, message, now_ms);
-        // That results differ is no sign that this worker is at fault.
+        // Differing results are no sign that this worker is at fault.
         if let (Some(worker), Some(entry)) = (
             self.sessions.get(&session),
             self.stages.get_mut(&range.stage),

@@ -1,23 +1,23 @@
-//! Workers that must end at a time that is known: with their Slurm job, or as they were told. They
-//! are given what they can finish by then, as far as it is known how long tasks take.
+//! Workers that must end at a known time, either with their Slurm job or on request. They get the
+//! tasks that they can finish by then, as far as task durations are known.
 
 use picofarm_catalog::{Mark, RangeState, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};
 
 use super::{Core, SessionId};
 
-/// A task is taken to need this many times the mean of its like, and of the longest attempt at it
-/// that did not end.
+/// A task is expected to need this multiple of the mean of its stage and of its longest interrupted
+/// attempt.
 const MARGIN: f64 = 1.25;
 
-/// How long a task is taken to need that took so long.
+/// Returns the expected duration of a task from a measured one.
 fn with_margin(ms: f64) -> i64 {
-    // Casting saturates.
+    // The cast saturates.
     (MARGIN * ms) as i64
 }
 
 impl Core {
-    /// A worker reports in how many milliseconds it must end.
+    /// Records the milliseconds until a worker must end.
     pub(crate) fn ends(&mut self, session: SessionId, ends_in_ms: Option<u64>, now_ms: i64) {
         if let Some(worker) = self.sessions.get(&session)
             && let Some(entry) = self.workers.get_mut(worker)
@@ -26,7 +26,8 @@ impl Core {
         }
     }
 
-    /// What a worker has left for another lease, milliseconds; `None` where it need not end.
+    /// Returns the time that a worker has left for another lease, milliseconds; `None` if it need
+    /// not end.
     fn time_left(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let entry = self.workers.get(&worker)?;
         let left = entry.ends_ms? - now_ms;
@@ -42,8 +43,8 @@ impl Core {
         Some(left.saturating_sub(busy as i64))
     }
 
-    /// What a task of a stage is taken to need, milliseconds; `None` where that is not known, or
-    /// where a task goes on from where it was saved.
+    /// Returns the expected duration of a task of a stage, milliseconds. Returns `None` if it is
+    /// unknown, or if a task continues from its saved progress.
     fn needs_ms(&self, id: StageRef) -> Option<i64> {
         let entry = &self.stages[&id];
         if entry.spec(id).task.resumes() {
@@ -55,10 +56,10 @@ impl Core {
         }
     }
 
-    /// Whether a worker has the time that a task of a stage is taken to need.
+    /// Checks whether a worker has enough time left for a task of a stage.
     ///
     /// # Errors
-    /// What it needs and what there is, milliseconds.
+    /// Returns the time needed and the time left, milliseconds.
     pub(super) fn has_time(
         &self,
         id: StageRef,
@@ -72,8 +73,8 @@ impl Core {
         }
     }
 
-    /// Tasks of a stage that took longer than a worker has left, and did not end: ascending,
-    /// disjoint.
+    /// Returns the tasks of a stage with an interrupted attempt longer than the time that a worker
+    /// has left, as ascending, disjoint runs.
     fn too_long(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
         let entry = &self.stages[&id];
         let Some(left) = self.time_left(worker, now_ms) else {
@@ -91,7 +92,8 @@ impl Core {
             .collect()
     }
 
-    /// Tasks of a stage that this worker is not to be given now: ascending, disjoint.
+    /// Returns the tasks of a stage not to be given to this worker now, as ascending, disjoint
+    /// runs.
     pub(super) fn not_for(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
         let mut runs = self.done_for_others(id);
         let long = self.too_long(id, worker, now_ms);
@@ -102,7 +104,7 @@ impl Core {
         runs
     }
 
-    /// How many tasks of a stage a worker can finish before it ends.
+    /// Returns how many tasks of a stage a worker can finish before it ends.
     pub(super) fn most_that_fit(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> u64 {
         match (self.time_left(worker, now_ms), self.needs_ms(id)) {
             (Some(left), Some(needs)) => (left / needs.max(1)).max(1).unsigned_abs(),
@@ -110,8 +112,8 @@ impl Core {
         }
     }
 
-    /// Whether it is for want of time that a worker gets no task of a stage; then what one is taken
-    /// to need, milliseconds.
+    /// Returns the expected duration of a task, milliseconds, if lack of time is the reason why a
+    /// worker gets no task of the stage.
     pub(super) fn lacks_time(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let entry = &self.stages[&id];
         let abilities = &self.workers.get(&worker)?.abilities;
@@ -132,7 +134,7 @@ impl Core {
     }
 }
 
-/// The time at which a worker must end, from the milliseconds that it reports.
+/// Converts a worker's reported milliseconds until its end to a time.
 pub(super) fn at(ends_in_ms: Option<u64>, now_ms: i64) -> Option<i64> {
     let ms = i64::try_from(ends_in_ms?).unwrap_or(i64::MAX);
     Some(now_ms.saturating_add(ms))

@@ -1,4 +1,4 @@
-//! What this instance knows of its workers and of the order of jobs, for those who ask why. Changes nothing.
+//! Reports this instance's workers and the order of jobs, for explanations. Changes nothing.
 
 use picofarm_proto::{
     ids::{JobId, StageRef, WorkerId},
@@ -11,41 +11,41 @@ use crate::{
     place,
 };
 
-/// What the instance knows at this moment.
+/// A snapshot of the instance's knowledge.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Look {
     /// Active jobs, in the order in which they get workers.
     pub jobs: Vec<JobId>,
-    /// Tasks that could be leased now, if there were workers: those of nobody's and those in hand
-    /// here.
+    /// Tasks that could be leased now if there were workers: unclaimed ones and those claimed by
+    /// this instance.
     pub ready: u64,
-    /// Workers connected here.
+    /// Workers connected to this instance.
     pub workers: Vec<ConnectedWorker>,
     /// Workers connected to other instances.
     pub elsewhere: u32,
-    /// Instances alive, this one too.
+    /// Live instances, including this one.
     pub instances: u32,
 }
 
-/// What it knows with regard to one job.
+/// A snapshot of the instance's knowledge with regard to one job.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct JobLook {
-    /// Whether the workers here may run its tasks, and what they do.
+    /// Whether each worker of this instance may run the job's tasks, and its current work.
     pub candidates: Vec<Candidate>,
-    /// Tasks that wait only because workers have them in hand for other jobs with the same outputs.
+    /// Tasks that wait only because workers run them for other jobs with the same outputs.
     pub shared: u64,
-    /// Tasks that wait for a worker with nothing else in hand.
+    /// Tasks that wait for a worker without other leases.
     pub suspects: u64,
-    /// Jobs that go first and have tasks waiting that one of these workers may run.
+    /// Jobs of higher precedence with waiting tasks that one of these workers may run.
     pub ahead: Vec<JobId>,
     /// Workers connected to other instances.
     pub elsewhere: u32,
-    /// Of the task asked for, where a worker here has reported on it: how it runs.
+    /// Progress of the requested task, if a worker of this instance has reported on it.
     pub running: Option<Runs>,
 }
 
 impl Core {
-    /// What is known now.
+    /// Returns the current state.
     pub(crate) fn look(&self, now_ms: i64) -> Look {
         let mut stages: Vec<StageRef> = self.stages.keys().copied().collect();
         stages.sort_by_cached_key(|id| self.rank(*id));
@@ -81,15 +81,15 @@ impl Core {
         }
     }
 
-    /// For how long a worker was not heard of, where that is longer than it should be: it sends a
-    /// sign of life every sixth of a lease, whether it has one or not.
+    /// Returns how long a worker has been silent, if longer than expected. A worker
+    /// sends a heartbeat every sixth of a lease period, even without a lease.
     fn silent_ms(&self, worker: &WorkerEntry, now_ms: i64) -> Option<i64> {
         let silent = now_ms - worker.heard_ms;
         let long = silent > i64::from(self.settings.lease_ms) / 2;
         long.then_some(silent)
     }
 
-    /// Why a worker gets nothing, or when it ends.
+    /// Returns why a worker gets no tasks, or when it ends.
     fn note(&self, id: WorkerId, worker: &WorkerEntry, now_ms: i64) -> String {
         if let Some(ms) = self.silent_ms(worker, now_ms) {
             return format!(
@@ -128,8 +128,8 @@ impl Core {
             .sum()
     }
 
-    /// What is known with regard to a stage (of a job as a whole: the first that has tasks waiting), and to one of its
-    /// tasks.
+    /// Returns the state with regard to a stage and to one of its tasks. For a job as a whole, the
+    /// stage is the first one with waiting tasks.
     pub(crate) fn look_at(
         &self,
         job: JobId,
@@ -211,7 +211,7 @@ impl Core {
         })
     }
 
-    /// How many lines of history wait to be written.
+    /// Returns the number of history lines that wait to be written.
     pub(crate) fn noted(&self) -> usize {
         self.changes.events.len()
     }

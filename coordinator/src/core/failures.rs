@@ -1,5 +1,4 @@
-//! Attempts that do not end well: whom they are put down to, what they cost the task and the
-//! worker.
+//! Failed attempts: whether the task, the worker or the store is at fault, and the cost to each.
 
 use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
@@ -14,7 +13,7 @@ use crate::{
 };
 
 impl Core {
-    /// One task fails and leaves its lease; `true` where that counts against the task.
+    /// Removes a failed task from its lease. Returns whether the failure counts against the task.
     pub(super) fn leave(
         &mut self,
         range: &Range,
@@ -38,7 +37,7 @@ impl Core {
         let verdict = self.charge(range, task, attempt, now_ms);
         let event = match verdict.retry_at_ms {
             None => EventKind::Dead,
-            // The task was given back, nothing is wrong with it.
+            // The task was returned, so nothing is wrong with it.
             _ if matches!(
                 kind,
                 FailureKind::Interrupted | FailureKind::Store | FailureKind::Damaged
@@ -63,7 +62,8 @@ impl Core {
         counts
     }
 
-    /// A task leaves a lease that its worker gives back. It is pending at once the first time.
+    /// Removes a task from a lease that its worker returns. The first time, the task is pending at
+    /// once.
     pub(super) fn interrupted(&mut self, range: &Range, task: u64, reason: &str, now_ms: i64) {
         let attempt = Attempt {
             kind: FailureKind::Interrupted,
@@ -87,7 +87,8 @@ impl Core {
         }
     }
 
-    /// A task leaves its lease because its worker is not believed: it is pending at once and costs the task nothing.
+    /// Removes a task from the lease of an untrusted worker. The task is pending at once,
+    /// without a charge.
     pub(super) fn withdraw(&mut self, range: &Range, task: u64, message: &str, now_ms: i64) {
         let attempt = Attempt {
             kind: FailureKind::Interrupted,
@@ -105,13 +106,13 @@ impl Core {
         self.event(now_ms, range.stage, EventKind::Released, about);
     }
 
-    /// How long a task has run under a lease, as far as is known, milliseconds.
+    /// Returns how long a task has run under a lease, as far as is known, milliseconds.
     fn attempt_ms(&self, range: RangeId, task: u64, now_ms: i64) -> u64 {
         let progress = self.progress.get(&range).and_then(|tasks| tasks.get(&task));
         progress.map_or(0, |p| (now_ms - p.since_ms).max(0).unsigned_abs())
     }
 
-    /// Whether a task that goes on from where it was saved came further under this lease.
+    /// Returns whether a resumable task made progress under this lease.
     fn came_further(&self, range: &Range, task: u64) -> bool {
         let resumes = self.stages[&range.stage].spec(range.stage).task.resumes();
         let progress = self
@@ -121,7 +122,8 @@ impl Core {
         resumes && progress.is_some_and(|p| p.first.is_some_and(|first| p.fraction > first))
     }
 
-    /// Puts a failure down to whom it belongs; `false` where it is not the task's to answer for.
+    /// Charges a failure to the worker or the store at fault. Returns whether it counts against the
+    /// task.
     fn counts(
         &mut self,
         range: &Range,
@@ -140,7 +142,7 @@ impl Core {
                 self.blame(worker, Trouble::GaveBack, others, now_ms);
                 !self.came_further(range, task)
             }
-            // The object is at fault, and is replaced or comes back.
+            // The object is at fault. It is replaced or becomes available again.
             FailureKind::Damaged => false,
             FailureKind::Store => {
                 let store = store_of(&entry.spec(id).task).to_owned();
@@ -160,7 +162,7 @@ impl Core {
         }
     }
 
-    /// Something went wrong on a worker, whatever it was.
+    /// Records a failure on a worker, whatever its kind.
     pub(super) fn blame(
         &mut self,
         worker: WorkerId,
@@ -173,8 +175,8 @@ impl Core {
         self.sick.failed(worker, trouble, others, &backoff, now_ms);
     }
 
-    /// What tasks of a stage were charged with on a worker is the worker's. (A task that was given
-    /// up by that stays so; `retry` is for that.)
+    /// Moves the charges of a stage's tasks on a worker to the worker. Tasks that were given up
+    /// meanwhile stay given up; `retry` restarts those.
     fn take_charges_back(&mut self, id: StageRef, worker: WorkerId) {
         let entry = self.stages.get_mut(&id).expect("a lease has a stage");
         for (task, kind) in entry.blocklist.take_charged(worker) {
@@ -192,7 +194,7 @@ impl Core {
         }
     }
 
-    /// Charges an attempt to its task, which leaves the lease.
+    /// Charges an attempt to its task and removes the task from the lease.
     fn charge(&mut self, range: &Range, task: u64, attempt: Attempt<'_>, now_ms: i64) -> Verdict {
         let entry = self
             .stages
@@ -200,8 +202,8 @@ impl Core {
             .expect("a lease has a stage");
         let mut backoff = self.settings.backoff;
         if attempt.kind == FailureKind::Crash && entry.spec(range.stage).task.resumes() {
-            // It goes on from where it was saved, so losing workers again and again is no sign that
-            // it never ends.
+            // The task continues from its saved progress, so repeated losses of workers do not mean
+            // that it never ends.
             backoff.most_ms = backoff.first_ms;
         }
         let mut verdict = budget::charge(
@@ -253,8 +255,8 @@ impl Core {
         self.close(&range, false);
     }
 
-    /// Takes from a session's worker what it would not be given now: of a stage that fails on it,
-    /// or all where nothing goes well.
+    /// Takes back the leases that a session's worker would not be given now: those of a stage that
+    /// fails on it, or all if every task fails.
     pub(super) fn take_back_all(&mut self, session: SessionId, stage: StageRef, now_ms: i64) {
         let Some(worker) = self.sessions.get(&session).copied() else {
             return;

@@ -1,17 +1,17 @@
-//! Which connected workers could run a job that is planned. Changes nothing.
+//! Returns which connected workers could run a planned job. Changes nothing.
 
 use picofarm_proto::model::JobSpec;
 
 use super::Core;
 use crate::place;
 
-/// Distinct reasons that are kept for each stage.
+/// Distinct reasons stored for each stage.
 const REASONS: usize = 3;
 
-/// The connected workers with regard to a job that is not recorded yet.
+/// The connected workers with regard to a job before it is recorded.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct Fits {
-    /// By stage.
+    /// Workers with regard to each stage.
     pub stages: Vec<Fit>,
     /// Workers connected to this coordinator.
     pub here: u32,
@@ -22,16 +22,16 @@ pub(crate) struct Fits {
 /// The connected workers with regard to one stage.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct Fit {
-    /// How many of them can run its tasks.
+    /// Number of workers that can run the stage's tasks.
     pub able: u32,
-    /// CPU cores of those together.
+    /// Total CPU cores of these workers.
     pub cores: u32,
-    /// Why the others cannot, without repetitions.
+    /// Distinct reasons why the other workers cannot.
     pub refusals: Vec<String>,
 }
 
 impl Core {
-    /// Compares what the stages of a job need with what the connected workers have.
+    /// Compares the requirements of a job's stages with the connected workers.
     pub(crate) fn fits(&self, spec: &JobSpec) -> Fits {
         let stages = spec.stages.iter().enumerate().map(|(position, stage)| {
             let known = spec.known(position);

@@ -1,4 +1,4 @@
-//! Submission, the end of jobs, and what is known of them here.
+//! Submits jobs, ends them, and reports this instance's knowledge of them.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -27,7 +27,7 @@ use crate::{
 pub(crate) struct Prepared {
     pub job: Job,
     pub stages: Vec<StageRecord>,
-    /// Nobody's.
+    /// Pending ranges that no instance has claimed.
     pub ranges: Vec<Range>,
     pub events: Vec<NewEvent>,
 }
@@ -51,7 +51,8 @@ pub(crate) struct Listed {
 /// not see are not named. Returns what jobs with the same settings and another list of files have to do there.
 ///
 /// # Errors
-/// [`SpecError`] at `output.dataset` that names the job and the first setting that differs.
+/// Returns a [`SpecError`] at `output.dataset` that names the job and the first setting that
+/// differs.
 pub(crate) fn place_is_free(
     stage: &StageSpec,
     set: &ResultSet,
@@ -155,11 +156,12 @@ pub(crate) fn made_of_another(
     SpecError::new(field, what)
 }
 
-/// Checks that a caller may run a stage again whose results exist: they are of the first job that has them. `others` are
-/// the jobs that write to `set`, where the stage does, the latest first.
+/// Checks that a caller may run a stage with existing results again. The results belong to the
+/// first job that has them. `others` are the jobs that write to `set`, the stage's result set,
+/// latest first.
 ///
 /// # Errors
-/// Whose they are.
+/// Returns an error that names the owner of the results.
 pub(crate) fn may_force(
     stage: &StageSpec,
     set: &ResultSet,
@@ -185,12 +187,14 @@ pub(crate) fn may_force(
     ))
 }
 
-/// Whether the latest job with a spec, in this state, stands for it: unless it ended badly and the spec is to run again.
+/// Returns whether the latest job with a spec, in this state, is reused for a new submission. It is
+/// not if the job ended badly and the caller asks to run it again.
 pub(crate) fn stands_for(state: JobState, again: bool) -> bool {
     !(again && matches!(state, JobState::Failed | JobState::Cancelled))
 }
 
-/// Lays a job out as ranges, given the outputs that exist, by stage. An equal job is looked for in `circle`.
+/// Divides a job into ranges, given the existing outputs by stage. An equal job is looked up in
+/// `circle`.
 pub(crate) fn prepare(
     draft: &Draft,
     user: String,
@@ -231,21 +235,21 @@ pub(crate) fn prepare(
     }
 }
 
-/// A job that the core is to know.
+/// A job to be added to the core.
 #[derive(Debug, Clone)]
 pub(crate) struct Learnt {
     pub job: Job,
     pub stages: Vec<StageRecord>,
-    /// Of its result sets.
+    /// Timings of the job's result sets.
     pub timings: Timings,
-    /// Memory that its spec takes.
+    /// Memory used by the job's spec.
     pub kept: u64,
 }
 
-/// What this instance adds to what the catalog knows of jobs.
+/// This instance's additions to the catalog's knowledge of jobs.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Overlay {
-    /// Tasks that run, by job.
+    /// Running tasks, by job.
     running: BTreeMap<JobId, Vec<RunningTask>>,
     /// Mean seconds of a task, by stage.
     means: BTreeMap<StageRef, Option<f64>>,
@@ -254,7 +258,7 @@ pub(crate) struct Overlay {
 }
 
 impl Overlay {
-    /// Adds what is known here.
+    /// Adds this instance's knowledge to a job's status.
     pub(crate) fn complete(&mut self, status: &mut JobStatus) {
         status.workers = self.workers;
         status.running = self.running.remove(&status.id).unwrap_or_default();
@@ -263,7 +267,7 @@ impl Overlay {
                 job: status.id,
                 stage: ordinal,
             };
-            // Of the stages that run, the last: the others are nearly done.
+            // The estimate uses the last running stage, because the earlier ones are nearly done.
             if stage.state == StageState::Open
                 && let Some(mean) = self.means.get(&id)
             {
@@ -273,7 +277,7 @@ impl Overlay {
     }
 }
 
-/// A job as the catalog knows it.
+/// Converts the catalog's record of a job to a status.
 pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
     let counts = record.counts();
     let JobRecord {
@@ -307,7 +311,7 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
             limits: job.spec.limits.clone(),
             nonce: job.spec.nonce.clone(),
             project: job.spec.project.clone(),
-            // Lists of files may be long.
+            // Lists of files may be long, so they are left out.
             stages: job.spec.stages.iter().map(|s| s.only(0, 0)).collect(),
         },
         mean_task_seconds: timing.mean(),
@@ -318,7 +322,8 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
 }
 
 impl Core {
-    /// A job is held, or goes on: what no worker has begun goes back, what runs goes on.
+    /// Pauses or resumes a job. A paused job's tasks that no worker has begun go back; running
+    /// tasks continue.
     pub(crate) fn paused(&mut self, job: JobId, paused: bool) {
         if paused {
             self.free_what_waits(job);
@@ -332,8 +337,8 @@ impl Core {
         }
     }
 
-    /// Takes from the leases of a job what their workers have not begun, as far as is known: a worker has one task in hand, and
-    /// works off a lease in order.
+    /// Takes back the tasks of a job's leases that their workers have not begun, as far as is
+    /// known. A worker runs one task at a time and works through a lease in order.
     fn free_what_waits(&mut self, job: JobId) {
         let stages = self.stages.iter().filter(|(id, _)| id.job == job);
         let leases = stages.flat_map(|(_, entry)| entry.stage.leased());
@@ -368,7 +373,7 @@ impl Core {
         }
     }
 
-    /// Jobs whose time is over.
+    /// Returns the jobs that have passed their deadline.
     pub(crate) fn overdue(&self, now_ms: i64) -> BTreeMap<JobId, String> {
         let late = self.stages.iter().filter(|(_, entry)| {
             let deadline = entry.deadline_ms;
@@ -378,7 +383,8 @@ impl Core {
             .collect()
     }
 
-    /// A job that is no longer active: its leases are revoked, what is not done goes back to the catalog.
+    /// Removes a job after it has ended. Its leases are revoked, and its unfinished tasks go
+    /// back to the catalog.
     pub(crate) fn drop_job(&mut self, job: JobId, reason: &str) {
         let stages: Vec<StageRef> = self
             .stages
@@ -409,7 +415,7 @@ impl Core {
         }
     }
 
-    /// Given-up tasks of an active job are pending again.
+    /// Makes the given-up tasks of an active job pending again.
     pub(crate) fn retried(&mut self, job: JobId) {
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
             entry.exceptions.clear();
@@ -418,7 +424,7 @@ impl Core {
         }
     }
 
-    /// What is known here of a job, or of all.
+    /// Returns this instance's knowledge of one job, or of all jobs.
     pub(crate) fn overlay(&self, one: Option<JobId>, now_ms: i64) -> Overlay {
         let mut overlay = Overlay {
             workers: self.everywhere(),
@@ -450,16 +456,16 @@ impl Core {
         overlay
     }
 
-    /// Number of workers connected to this instance.
+    /// Returns the number of workers connected to this instance.
     pub(crate) fn connected(&self) -> u32 {
         u32::try_from(self.workers.len()).unwrap_or(u32::MAX)
     }
 
-    /// Number of workers connected to any instance.
+    /// Returns the number of workers connected to any instance.
     pub(crate) fn everywhere(&self) -> u32 {
         self.connected() + self.elsewhere
     }
 }
 
-/// What is known of result sets.
+/// The known timings of result sets.
 pub(crate) type Timings = HashMap<ResultSet, Timing>;

@@ -9,11 +9,11 @@ use picofarm_proto::{
 use super::{About, Core, Progress, Say, SessionId, dispatch::Others, sick::Trouble};
 use crate::transition::RangeEvent;
 
-/// Lost workers remembered at most.
+/// Most lost workers that are remembered.
 const CHARGED: usize = 4096;
 
 impl Core {
-    /// Charges a failed task to its budgets and takes it out of the lease.
+    /// Charges a failed task to its budgets and removes it from the lease.
     pub(crate) fn failed(&mut self, session: SessionId, failure: &Failure, now_ms: i64) {
         if self.drop_double(session, failure.lease) {
             return self.acknowledge(session, failure.lease, failure.index, Ok(()));
@@ -41,8 +41,8 @@ impl Core {
         self.acknowledge(session, failure.lease, failure.index, verdict);
     }
 
-    /// A report on a task says what cannot be. It counts as a failure of the task, and is refused with the reason: the worker
-    /// does not send it again.
+    /// Handles a report with impossible values on a task. It counts as a failure of the task and is
+    /// refused with the reason, so the worker does not send it again.
     pub(crate) fn unusable(
         &mut self,
         session: SessionId,
@@ -70,8 +70,8 @@ impl Core {
         self.acknowledge(session, lease, index, Err(refusal));
     }
 
-    /// Takes a lease back that the worker gives up of itself: an interruption of the tasks that it
-    /// had begun.
+    /// Takes back a lease that its worker returns. The tasks that the worker had begun count as
+    /// interrupted.
     pub(crate) fn released(
         &mut self,
         session: SessionId,
@@ -102,7 +102,8 @@ impl Core {
         self.acknowledge(session, lease, 0, verdict);
     }
 
-    /// Prolongs the leases a worker names and notes how far it is; says which live on.
+    /// Extends the leases that a worker names, records its progress, and reports which leases are
+    /// still live.
     pub(crate) fn heartbeat(
         &mut self,
         session: SessionId,
@@ -149,8 +150,8 @@ impl Core {
         ));
     }
 
-    /// Prolongs the leases of a session's worker that would run out now: its heartbeat has arrived, and waits only because
-    /// this coordinator is busy.
+    /// Extends a worker's leases that would run out now. Its heartbeat has arrived and waits only
+    /// because this coordinator is busy.
     pub(crate) fn spare(&mut self, session: SessionId, now_ms: i64) {
         let Some(entry) = self
             .sessions
@@ -167,7 +168,7 @@ impl Core {
         }
     }
 
-    /// Takes back every lease that has run out; to be called a few times a second.
+    /// Takes back every lease that has run out. Call it a few times a second.
     pub(crate) fn expire(&mut self, now_ms: i64) {
         let over: Vec<Range> = self
             .leases
@@ -182,7 +183,7 @@ impl Core {
         }
     }
 
-    /// Why a lease ran out, in words: its worker is gone, or it is there and silent.
+    /// Returns the reason why a lease ran out: its worker is gone, or it is connected and silent.
     fn silence(&self, range: &Range, now_ms: i64) -> String {
         let RangeState::Leased(lease) = &range.state else {
             return "the lease ran out".to_owned();
@@ -210,7 +211,8 @@ impl Core {
         }
     }
 
-    /// The tasks of a lease that its worker works on, as far as is known; of one that has reported nothing, the first to do.
+    /// Returns the tasks of a lease that its worker runs, as far as is known. If the worker has
+    /// reported nothing, this is the first unfinished task.
     pub(super) fn in_hand(&self, range: &Range) -> Vec<u64> {
         let todo = |task: &u64| range.has_to_do(*task);
         let reported = self.progress.get(&range.id).into_iter();
@@ -222,7 +224,8 @@ impl Core {
         tasks
     }
 
-    /// The tasks of a lease that its worker has begun, as far as is known: it runs one at a time.
+    /// Returns the tasks of a lease that its worker has begun, as far as is known. A worker runs
+    /// one at a time.
     fn begun(&self, range: &Range) -> Vec<u64> {
         let runs = |id: &RangeId| self.progress.get(id).is_some_and(|tasks| !tasks.is_empty());
         let RangeState::Leased(lease) = &range.state else {
@@ -237,7 +240,8 @@ impl Core {
         }
     }
 
-    /// The worker was lost without a goodbye: the task in hand is charged with a crash, the rest is halved.
+    /// Handles a worker that was lost without a goodbye. The running task is charged with a crash,
+    /// and the rest of the range is halved.
     pub(crate) fn lost(&mut self, range: &Range, why: &str, now_ms: i64) {
         let Some((_, lease)) = self.stages[&range.stage].stage.lease(range.lease()) else {
             return;
@@ -275,15 +279,15 @@ impl Core {
         if let Some((_, charged)) = self.charged.get_mut(&worker) {
             charged.extend(counted);
         }
-        // The last task to leave has closed the lease.
+        // If the last task was removed, the lease is already closed.
         if let Some(range) = self.range(range.id).cloned() {
             self.close(&range, true);
         }
         self.perhaps_over(range.stage, now_ms);
     }
 
-    /// A worker that was thought dead is back: what it was charged with was a broken connection. (A task that was given
-    /// up by that stays so; `retry` is for that.)
+    /// Refunds the charges of a worker that reconnected, because only its connection was broken.
+    /// Tasks that were given up meanwhile stay given up; `retry` restarts those.
     pub(super) fn refund(&mut self, worker: WorkerId, incarnation: Incarnation) {
         let Some((of, tasks)) = self.charged.remove(&worker) else {
             return;
@@ -304,18 +308,18 @@ impl Core {
         }
     }
 
-    /// Ends a lease; what is not done becomes pending.
+    /// Ends a lease. Its unfinished tasks become pending.
     pub(super) fn close(&mut self, range: &Range, halve: bool) {
         self.mark(range, &RangeEvent::Close { halve });
     }
 
-    /// Prolongs a lease by one period from now.
+    /// Extends a lease by one period from now.
     pub(super) fn renew(&mut self, id: RangeId, now_ms: i64) {
         let until_ms = now_ms + i64::from(self.settings.lease_ms);
         self.set_until(id, |_| until_ms);
     }
 
-    /// Sets the end of a lease by a function of the present one.
+    /// Sets the end of a lease to a function of its current end.
     pub(super) fn set_until(&mut self, id: RangeId, to_ms: impl FnOnce(i64) -> i64) {
         if let Some(stage) = self.leases.get(&id)
             && let Some(entry) = self.stages.get_mut(stage)
@@ -324,7 +328,7 @@ impl Core {
         }
     }
 
-    /// Lets something happen to a leased range and forgets the lease when it has ended by that.
+    /// Applies an event to a leased range, and forgets the lease if the event has ended it.
     pub(super) fn mark(&mut self, range: &Range, event: &RangeEvent) {
         let entry = self
             .stages
@@ -362,13 +366,13 @@ impl Core {
         }
     }
 
-    /// A leased range.
+    /// Returns a leased range.
     pub(super) fn range(&self, id: RangeId) -> Option<&Range> {
         let stage = self.leases.get(&id)?;
         self.stages[stage].stage.leased_range(id)
     }
 
-    /// The range of a lease that this session's worker holds now.
+    /// Returns the range of a live lease of this session's worker.
     fn held(&self, session: SessionId, lease: LeaseRef, now_ms: i64) -> Result<&Range, String> {
         let worker = self
             .sessions
@@ -389,7 +393,7 @@ impl Core {
         Ok(range)
     }
 
-    /// As [`Core::held`], for a lease that has this task to do.
+    /// Like [`Core::held`], but requires that the lease still has this task to do.
     pub(super) fn held_to_do(
         &self,
         session: SessionId,

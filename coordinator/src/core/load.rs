@@ -1,17 +1,17 @@
-//! Who works on which job: what fair shares and limits are measured by.
+//! Counts which workers run which job. Fair shares and limits are based on these counts.
 
 use std::collections::{BTreeMap, HashMap};
 
 use picofarm_catalog::Job;
 use picofarm_proto::ids::{JobId, RangeId, WorkerId};
 
-/// Leases in hand by job and by user, kept in step with every grant and every end.
+/// Live leases by job and by user, updated with every grant and every end.
 #[derive(Debug, Default)]
 pub(super) struct Load {
     leases: HashMap<RangeId, (JobId, WorkerId)>,
     jobs: HashMap<JobId, JobLoad>,
     users: HashMap<String, u32>,
-    /// Workers of other instances, by job, as last heard.
+    /// Workers of other instances by job, as last reported.
     elsewhere: BTreeMap<JobId, u32>,
 }
 
@@ -23,9 +23,9 @@ struct JobLoad {
 }
 
 impl Load {
-    /// A lease has begun.
+    /// Adds a lease that has begun.
     pub(super) fn begun(&mut self, lease: RangeId, job: &Job, worker: WorkerId) {
-        // One that is known may be another worker's by now.
+        // A known lease may have moved to another worker.
         self.over(lease);
         self.leases.insert(lease, (job.id, worker));
         let load = self.jobs.entry(job.id).or_default();
@@ -35,7 +35,7 @@ impl Load {
         *self.users.entry(job.user.clone()).or_default() += 1;
     }
 
-    /// A lease has ended.
+    /// Removes a lease that has ended.
     pub(super) fn over(&mut self, lease: RangeId) {
         let Some((job, worker)) = self.leases.remove(&lease) else {
             return;
@@ -57,36 +57,36 @@ impl Load {
         }
     }
 
-    /// Takes note of other instances' workers, by job.
+    /// Records the workers of other instances, by job.
     pub(super) fn hear_elsewhere(&mut self, workers: BTreeMap<JobId, u32>) {
         self.elsewhere = workers;
     }
 
-    /// Leases of a user's jobs.
+    /// Returns the number of leases of a user's jobs.
     pub(super) fn of_user(&self, user: &str) -> u32 {
         self.users.get(user).copied().unwrap_or(0)
     }
 
-    /// Leases of a job.
+    /// Returns the number of leases of a job.
     pub(super) fn of_job(&self, job: JobId) -> u32 {
         self.jobs.get(&job).map_or(0, |load| load.leases)
     }
 
-    /// Whether a worker has leases of a job.
+    /// Returns whether a worker has leases of a job.
     pub(super) fn works(&self, job: JobId, worker: WorkerId) -> bool {
         let load = self.jobs.get(&job);
         load.is_some_and(|load| load.workers.contains_key(&worker))
     }
 
-    /// How many workers more may join those that work on a job, of which there may be `most`.
+    /// Returns how many more workers may join a job that may have `most` workers.
     pub(super) fn room(&self, job: JobId, most: u32) -> u64 {
         let elsewhere = self.elsewhere.get(&job).copied().unwrap_or(0);
         let here = self.jobs.get(&job).map_or(0, |load| load.workers.len());
         u64::from(most).saturating_sub(here as u64 + u64::from(elsewhere))
     }
 
-    /// Whether a worker may join those that work on a job, of which there may be `most`. Of other instances' workers it is
-    /// known how many there were a second ago: for so long there may be more.
+    /// Returns whether a worker may join a job that may have `most` workers. The counts of other
+    /// instances are up to a second old, so that the limit can be exceeded for as long.
     pub(super) fn may_join(&self, job: JobId, worker: WorkerId, most: u32) -> bool {
         self.works(job, worker) || self.room(job, most) > 0
     }

@@ -1,14 +1,14 @@
-//! What tasks log on their workers, as lines of their history.
+//! Adds the log lines of tasks to their history.
 
 use picofarm_proto::model::{EventKind, TaskLog};
 
 use super::{About, Core, Progress, SessionId};
 
 impl Core {
-    /// Notes lines of a task that this session's worker has in hand, as far as the task's allowance goes; drops them where
-    /// the lease is not its own, or not live. Nobody waits for an answer.
+    /// Records log lines of a task that this session's worker runs, within the task's allowance.
+    /// Drops them if the lease is not the worker's own or not live. No answer is sent.
     pub(crate) fn logged(&mut self, session: SessionId, log: &TaskLog, now_ms: i64) {
-        // A task in the hands of two has one allowance.
+        // A task that runs twice has one allowance.
         let double = self
             .sessions
             .get(&session)

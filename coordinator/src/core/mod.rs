@@ -1,8 +1,9 @@
-//! The coordinator's state: what this instance has in hand, synchronous methods over it, no I/O. Time and ids are
-//! passed in. Each method notes what must become durable ([`Changes`]) and what to say afterwards ([`Say`]).
+//! The coordinator's state in memory, with synchronous methods and no I/O. Times and ids are
+//! arguments. Each method records the changes that must become durable ([`Changes`]) and the
+//! messages to send afterwards ([`Say`]).
 //!
-//! In hand are the active jobs, the ranges leased to connected workers (or to those that may come back), and the pending
-//! ranges claimed for them. Everything else is the catalog's.
+//! The state contains the active jobs, the ranges leased to workers that are connected or may
+//! reconnect, and the pending ranges claimed for them. The catalog has everything else.
 
 mod blocklist;
 mod claims;
@@ -53,29 +54,31 @@ pub(crate) use jobs::{
     recorded_status, stands_for,
 };
 
-/// Makes UUIDs; passed in, so that the core is deterministic.
+/// Generates UUIDs. It is an argument so that the core is deterministic.
 pub(crate) type MakeId = Box<dyn FnMut() -> Uuid + Send + Sync>;
 
 /// Number of a session, unique in this process.
 pub(crate) type SessionId = u64;
 
-/// Times of the core.
+/// The core's time limits.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Settings {
-    /// Life of a lease, milliseconds.
+    /// Duration of a lease, milliseconds.
     pub lease_ms: u32,
-    /// How long a worker whose connection broke may take to come back before its leases are others', milliseconds.
+    /// Time in which a disconnected worker may reconnect before its leases go to others,
+    /// milliseconds.
     pub reconnect_ms: u32,
-    /// Waiting times after failures.
+    /// Delays after failures.
     pub backoff: Backoff,
-    /// What is left of a lease is shared with an idle worker if it takes at least so long, milliseconds.
+    /// The rest of a lease is shared with an idle worker if it takes at least this long,
+    /// milliseconds.
     pub worth_ms: u32,
-    /// A task is run a second time by an idle worker when it has taken three times as long as its like, and at least so
-    /// long, milliseconds.
+    /// Shortest run time after which an idle worker runs a task a second time, milliseconds. The
+    /// task must also have taken three times the mean of its stage.
     pub slow_ms: u32,
 }
 
-/// Something to tell a worker once the changes are durable.
+/// A message to a worker, sent once the changes are durable.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Say {
     Lease(Box<Lease>),
@@ -93,37 +96,38 @@ pub(crate) enum Say {
         lease: LeaseRef,
         reason: String,
     },
-    /// Of this lease, tasks from `hi` on are another's.
+    /// Tasks of this lease from `hi` on now belong to another worker.
     Trim {
         lease: LeaseRef,
         hi: u64,
     },
-    /// Finish what is in hand, and end.
+    /// Finish the current tasks, then end.
     Drain,
-    /// The session ends; a newer one has taken its place.
+    /// The session ends because a newer one has replaced it.
     Replaced,
 }
 
 struct StageEntry {
-    /// The stage's job.
+    /// The job of the stage.
     job: Job,
-    /// What the job tells of what its tasks read.
+    /// Properties of the job's inputs.
     known: Known,
     set: usize,
     stage: Stage,
-    /// Of tasks that were ever in hand.
+    /// Exceptional state of tasks that this coordinator has leased at least once.
     exceptions: BTreeMap<u64, Exception>,
-    /// Of these the longest attempt that did not end, milliseconds.
+    /// The longest interrupted attempt among these tasks, milliseconds.
     longest_ms: u64,
-    /// Pending tasks that are nobody's, as last heard; `None` = ask.
+    /// Unclaimed pending tasks, as last reported by the catalog; `None` if the catalog must be
+    /// asked.
     free: Option<Free>,
-    /// The catalog is not asked for tasks before this time: it had none to give just now.
+    /// The catalog is not asked for tasks before this time, because it had none a moment ago.
     ask_at_ms: i64,
-    /// Why no connected worker may run it, as last reported.
+    /// The last reported reason why no connected worker may run the stage.
     waiting: Option<String>,
-    /// The workers on which its tasks failed.
+    /// Workers on which tasks of the stage failed.
     blocklist: Blocklist,
-    /// When its job is given up, Unix milliseconds.
+    /// Deadline of the job, Unix milliseconds.
     deadline_ms: Option<i64>,
 }
 
@@ -132,26 +136,26 @@ impl StageEntry {
         &self.job.spec.stages[id.stage as usize]
     }
 
-    /// Takes note of a task's failures.
+    /// Records the failures of a task.
     fn note(&mut self, exception: Exception) {
         self.longest_ms = self.longest_ms.max(exception.longest_ms);
         self.exceptions.insert(exception.task, exception);
     }
 
-    /// Whether a worker has what its tasks need.
+    /// Checks whether a worker has everything that the stage's tasks need.
     ///
     /// # Errors
-    /// Why not, in words.
+    /// Returns the reason why the worker does not qualify.
     fn suits(&self, id: StageRef, worker: &Abilities) -> Result<(), String> {
         place::may_run(self.spec(id), &self.known, worker)
     }
 }
 
-/// Outputs that stages of one job or of several share.
+/// A set of outputs shared by stages of one or several jobs.
 struct SetEntry {
     key: StageKey,
     timing: Timing,
-    /// The stages of active jobs that have them.
+    /// Stages of active jobs that write to this set.
     stages: BTreeSet<StageRef>,
 }
 
@@ -160,23 +164,23 @@ struct WorkerEntry {
     incarnation: Incarnation,
     name: String,
     version: String,
-    /// When its session began.
+    /// Time at which the session began, Unix milliseconds.
     since_ms: i64,
-    /// When it was last heard of.
+    /// Time of its last message, Unix milliseconds.
     heard_ms: i64,
-    /// When it must end, where that is known.
+    /// Time at which it must end, if known, Unix milliseconds.
     ends_ms: Option<i64>,
     abilities: Abilities,
     credits: u32,
     leases: BTreeSet<RangeId>,
-    /// It holds a range under suspicion and gets nothing else.
+    /// Whether it runs a range under suspicion, and therefore gets nothing else.
     quarantined: bool,
-    /// It has been asked to end, and gets nothing more.
+    /// Whether it was asked to end, and therefore gets nothing more.
     drains: bool,
 }
 
 impl WorkerEntry {
-    /// Whether it may be given leases now.
+    /// Returns whether the worker may be given leases now.
     fn hungry(&self) -> bool {
         self.credits > 0 && !self.quarantined && !self.drains
     }
@@ -185,17 +189,17 @@ impl WorkerEntry {
 #[derive(Debug, Clone)]
 struct Progress {
     fraction: f32,
-    /// As first reported: that of what was saved by an earlier attempt.
+    /// The first reported progress, which is the progress saved by an earlier attempt.
     first: Option<f32>,
-    /// What it is at, in its worker's words.
+    /// The current step of the task, in the worker's words.
     at: TaskAt,
     since_ms: i64,
-    /// What its worker may still say in its name.
+    /// Remaining allowance of log lines that the worker may send for this task.
     log: LogAllowance,
 }
 
 impl Progress {
-    /// Of a task that has just begun.
+    /// Creates the progress of a task that has just begun.
     fn since(since_ms: i64) -> Self {
         Self {
             fraction: 0.0,
@@ -210,50 +214,52 @@ impl Progress {
 pub(crate) struct Core {
     settings: Settings,
     make_id: MakeId,
-    /// Stages of active jobs; ids of jobs grow with time, so this is the order of submission.
+    /// Stages of active jobs. Job ids grow with time, so this is the order of submission.
     stages: BTreeMap<StageRef, StageEntry>,
     sets: Vec<SetEntry>,
     set_ids: HashMap<ResultSet, usize>,
     /// Connected workers.
     workers: BTreeMap<WorkerId, WorkerEntry>,
     sessions: HashMap<SessionId, WorkerId>,
-    /// Names of all workers ever seen.
+    /// Names of all workers that have ever connected.
     names: HashMap<WorkerId, String>,
     /// The stage of each leased range.
     leases: BTreeMap<RangeId, StageRef>,
-    /// Who works on which job.
+    /// Which workers run which job.
     load: Load,
-    /// Tasks that run a second time, by the lease of that.
+    /// Tasks that run a second time, by the lease of the second run.
     doubles: BTreeMap<RangeId, Double>,
-    /// When idle workers are looked after next.
+    /// Next time at which idle workers are given parts of other leases.
     help_at_ms: i64,
-    /// Stores that tasks wait for.
+    /// Unavailable stores for which tasks wait.
     away: stores::Stores,
-    /// Workers that are not believed, and doubtful results.
+    /// Workers that are not trusted, and doubtful results.
     doubts: doubt::Doubts,
-    /// Workers on which nothing goes well.
+    /// Workers on which every task fails.
     sick: sick::Sick,
-    /// Connections that break before this time, Unix milliseconds, broke by a stall of the coordinator's own.
+    /// Connections that break before this time are blamed on a stall of the coordinator, Unix
+    /// milliseconds.
     graced_until_ms: i64,
-    /// What workers were charged with when their connection broke, for the case that they live.
+    /// The charges against each disconnected worker, which are refunded if it reconnects.
     charged: HashMap<WorkerId, (Incarnation, Vec<(StageRef, u64)>)>,
-    /// Tasks in hand, by lease, as last reported.
+    /// Last reported progress of running tasks, by lease.
     progress: BTreeMap<RangeId, BTreeMap<u64, Progress>>,
-    /// Instances alive, this one too.
+    /// Live instances, including this one.
     instances: u32,
     /// Workers connected to other instances.
     elsewhere: u32,
-    /// What these workers had in hand when last heard, of stages whose outputs another stage has, too.
+    /// Tasks that other instances' workers were last reported to run, for stages that share
+    /// outputs.
     shared_elsewhere: BTreeMap<StageRef, Vec<Run>>,
-    /// Outputs of `changes`, by set and task.
+    /// Outputs in `changes`, by set and task.
     fresh: HashMap<(usize, u64), [u8; 32]>,
     changes: Changes,
     say: Vec<(SessionId, Say)>,
 }
 
 impl Core {
-    /// Takes up where the catalog stands. Live leases get a fresh lease period, so that workers that reconnect
-    /// keep them. `timing` holds what is known of each result set of an active job.
+    /// Restores the state from the catalog. Live leases get a new period, so that workers that
+    /// reconnect keep them. `timing` contains the known timing of each result set of an active job.
     pub(crate) fn load(
         snapshot: Snapshot,
         timing: &HashMap<ResultSet, Timing>,
@@ -298,12 +304,12 @@ impl Core {
         core
     }
 
-    /// Whether a job is known to be active.
+    /// Returns whether a job is known to be active.
     pub(crate) fn knows(&self, job: JobId) -> bool {
         self.stages.contains_key(&StageRef { job, stage: 0 })
     }
 
-    /// Takes note of an active job, given its stages.
+    /// Adds an active job with its stages.
     pub(crate) fn add_job(
         &mut self,
         job: &Job,
@@ -343,7 +349,7 @@ impl Core {
         }
     }
 
-    /// Takes note of stages that may begin and of jobs that have ended.
+    /// Opens stages that may begin and removes jobs that have ended.
     pub(crate) fn settled(&mut self, settled: &Settled) {
         for id in &settled.opened {
             if let Some(entry) = self.stages.get_mut(id) {
@@ -360,7 +366,7 @@ impl Core {
         }
     }
 
-    /// What must become durable, and what to say when it is.
+    /// Returns the changes to commit, and the messages to send after the commit.
     pub(crate) fn take(&mut self) -> (Changes, Vec<(SessionId, Say)>) {
         self.fresh.clear();
         (
@@ -369,8 +375,8 @@ impl Core {
         )
     }
 
-    /// Prolongs every lease by one lease period from now: after a stall of the coordinator itself, for which no worker
-    /// is to blame.
+    /// Extends every lease by one period from now. Used after a stall of the coordinator, because
+    /// no worker is at fault then.
     pub(crate) fn grace(&mut self, now_ms: i64) {
         for range in self.leases.keys().copied().collect::<Vec<_>>() {
             self.renew(range, now_ms);
@@ -385,7 +391,7 @@ impl Core {
             .unwrap_or_else(|| worker.to_string())
     }
 
-    /// Notes a line of history. Neighbouring tasks that a worker finished in one batch share a line.
+    /// Adds a line of history. Adjacent tasks that a worker finished in one batch share a line.
     fn event(&mut self, at_ms: i64, stage: StageRef, kind: EventKind, about: About) {
         if let (Some(last), Some(tasks)) = (self.changes.events.last_mut(), about.tasks)
             && matches!(kind, EventKind::Committed | EventKind::Reused)
@@ -410,7 +416,7 @@ impl Core {
         });
     }
 
-    /// Where nothing of a stage is in hand any more, it may be over.
+    /// Marks a stage as possibly finished if none of its tasks is held by this instance.
     fn perhaps_over(&mut self, stage: StageRef, now_ms: i64) {
         let empty = self.stages.get(&stage).is_none_or(|e| e.stage.is_empty());
         if empty {

@@ -1,5 +1,6 @@
-//! What a database refuses for its content is taken out of a change set, so that the rest becomes durable: a task whose result
-//! cannot be recorded is given up with the reason; a message that cannot be recorded gives way to the reason.
+//! Removes rows that a database rejects for their content from a change set, so that the rest
+//! becomes durable. A task with a result that cannot be recorded is given up with the reason. A
+//! message that cannot be recorded is replaced by the reason.
 
 use picofarm_catalog::{Changes, Culprit, Mark, NewEvent, Range, RangeState, Row, Run};
 use picofarm_proto::{
@@ -11,8 +12,8 @@ use super::{Core, Say, SessionId};
 use crate::budget::fresh;
 
 impl Core {
-    /// Changes what was just taken ([`Core::take`]) so that it no longer holds these rows as they are. `again`: they were
-    /// refused in words of ours too, and are left out.
+    /// Removes rejected rows from the changes that [`Core::take`] returned. If `again`, their
+    /// reworded versions were rejected too and are left out.
     pub(crate) fn refused(
         &mut self,
         changes: &mut Changes,
@@ -44,7 +45,7 @@ impl Core {
                 }
             }
         }
-        // From the last, so that positions stay what they are.
+        // Removal starts at the end so that earlier positions stay valid.
         for (at, why) in events.into_iter().rev() {
             if again {
                 changes.events.remove(at);
@@ -61,7 +62,7 @@ impl Core {
         }
     }
 
-    /// A worker whose name is refused goes by its id.
+    /// Replaces a rejected worker name by the worker's id.
     fn rename(&mut self, changes: &mut Changes, id: WorkerId, again: bool) {
         if again {
             changes.workers.remove(&id);
@@ -75,7 +76,7 @@ impl Core {
         }
     }
 
-    /// A task's result cannot be recorded: it is not done but given up.
+    /// Gives up a task with a result that cannot be recorded, instead of marking it as done.
     fn give_up(
         &mut self,
         changes: &mut Changes,
@@ -124,8 +125,8 @@ impl Core {
         }
     }
 
-    /// Makes one task of a range that is to be written as done one that is given up; returns the lease under which it was
-    /// done.
+    /// Turns one task of a range about to be written as done into a given-up task. Returns the
+    /// lease under which it was done.
     fn undo(&mut self, changes: &mut Changes, stage: StageRef, task: u64) -> Option<LeaseRef> {
         let of_stage = |range: &Range| range.stage == stage && (range.lo..range.hi).contains(&task);
         let done = |range: &Range| match &range.state {
@@ -167,7 +168,7 @@ impl Core {
         Some(range.lease())
     }
 
-    /// Gives out a range under an id of its own.
+    /// Writes a range under a new id.
     fn give_new(&mut self, changes: &mut Changes, mut range: Range) {
         range.id = RangeId::from_uuid((self.make_id)());
         changes.minted.insert(range.id);
@@ -175,7 +176,7 @@ impl Core {
     }
 }
 
-/// Takes back the line of history that says that a task was done; returns the worker it names.
+/// Removes the history line about a finished task. Returns the worker that the line names.
 fn unsay(events: &mut Vec<NewEvent>, stage: StageRef, task: u64) -> String {
     let says = |event: &NewEvent| {
         (event.job, event.stage) == (stage.job, Some(stage.stage))

@@ -1,4 +1,4 @@
-//! Workers come and go. One session a worker: a newer one takes the older one's place.
+//! Connects and disconnects workers. A worker has one session; a newer one replaces the older one.
 
 use picofarm_catalog::{Range, Worker};
 use picofarm_proto::{ids::LeaseRef, model::WorkerHello};
@@ -6,8 +6,8 @@ use picofarm_proto::{ids::LeaseRef, model::WorkerHello};
 use super::{Core, Say, SessionId, WorkerEntry};
 
 impl Core {
-    /// A worker connects. Leases it still holds live on; those it does not know of become pending again; those
-    /// of an earlier process of it are lost.
+    /// Connects a worker. Leases that it still has stay live. Leases that it does not know become
+    /// pending again. Leases of an earlier process of the worker are lost.
     pub(crate) fn hello(&mut self, session: SessionId, hello: WorkerHello, now_ms: i64) {
         let id = hello.id;
         if let Some(old) = self.workers.remove(&id) {
@@ -89,13 +89,13 @@ impl Core {
                 entry.leases.insert(range.id);
                 entry.quarantined |= range.crashes > 0;
             } else {
-                // The grant was lost on the way: nobody works on it and nobody is to blame.
+                // The grant was lost on the way, so nobody runs it and nobody is at fault.
                 self.close(&range, false);
             }
         }
     }
 
-    /// A worker can take more leases; with 0 it takes back what it asked for.
+    /// Sets how many more leases a worker can take; 0 withdraws its request.
     pub(crate) fn credit(&mut self, session: SessionId, leases: u32) {
         if let Some(worker) = self.sessions.get(&session)
             && let Some(entry) = self.workers.get_mut(worker)
@@ -107,7 +107,8 @@ impl Core {
         }
     }
 
-    /// Workers of this id or name are asked to finish what is in hand and to end; returns how many there are.
+    /// Tells workers with this id or name to finish their current tasks and to end. Returns their
+    /// number.
     pub(crate) fn drain(&mut self, worker: &str) -> u32 {
         let mut count = 0;
         for (id, entry) in &mut self.workers {
@@ -120,15 +121,16 @@ impl Core {
         count
     }
 
-    /// A session has ended. Leases that were not given back live on for a moment: the worker may come back. If its
-    /// process died, its tasks shall not wait for the end of the lease.
+    /// Ends a session. Leases that were not returned stay live for a moment, because the worker may
+    /// reconnect. If its process died, its tasks need not wait for the end of the lease.
     pub(crate) fn closed(&mut self, session: SessionId, now_ms: i64) {
         let Some(worker) = self.sessions.remove(&session) else {
             return;
         };
         if let Some(entry) = self.workers.remove(&worker) {
             let until_ms = now_ms + i64::from(self.settings.reconnect_ms);
-            // Broken by a stall here: the worker may still be waiting before it tries again.
+            // After a stall of this coordinator, the worker may still be waiting before it
+            // reconnects.
             let until_ms = until_ms.max(self.graced_until_ms);
             for range in &entry.leases {
                 self.set_until(*range, |until| until.min(until_ms));

@@ -1,9 +1,11 @@
-//! Outputs that several jobs want. What a worker has in hand for one of them is not begun for another: its result counts for
-//! both. So jobs over the same data set that are submitted at once share the work instead of doing it twice.
+//! Outputs that several jobs want. A task that a worker runs for one job is not begun for another,
+//! because its result counts for both. Jobs over the same data set that are submitted together
+//! therefore share the work.
 //!
-//! This instance knows what its own workers have in hand, and what those of other instances had when it last heard of them
-//! (once a second). What it does not know yet is done twice, and comes to the same bytes; what others have finished is found,
-//! as ever, when tasks are claimed, and once more by the worker that begins them.
+//! This instance knows the tasks of its own workers, and those of other instances' workers as of
+//! the last news (once a second). A task not yet reported runs twice and gives the same bytes.
+//! Results that others have finished are found when tasks are claimed, and again by the worker that
+//! begins a task.
 
 use picofarm_catalog::{Mark, Run};
 use picofarm_proto::ids::StageRef;
@@ -11,8 +13,8 @@ use picofarm_proto::ids::StageRef;
 use super::Core;
 
 impl Core {
-    /// Tasks of a stage that workers have in hand for other stages with the same outputs: ascending, disjoint. None for a
-    /// stage whose outputs do not count where they exist.
+    /// Returns the tasks of a stage that workers run for other stages with the same outputs, as
+    /// ascending, disjoint runs. Returns none for a stage that does not reuse existing outputs.
     pub(super) fn done_for_others(&self, id: StageRef) -> Vec<Run> {
         let entry = &self.stages[&id];
         let sharing = &self.sets[entry.set].stages;
@@ -22,7 +24,7 @@ impl Core {
         let others = || sharing.iter().filter(|other| **other != id);
         let here = others().flat_map(|other| self.stages[other].stage.leased());
         let here = here.filter_map(|(range, lease)| {
-            // Leases are worked off in order.
+            // A lease is worked through in order.
             let first = lease.marks.iter().position(|m| *m == Mark::Todo)?;
             Some(Run {
                 lo: range.lo + first as u64,
@@ -35,14 +37,14 @@ impl Core {
         runs
     }
 
-    /// How many tasks of a stage wait only because they are in hand for other stages.
+    /// Returns how many tasks of a stage wait only because they run for other stages.
     pub(super) fn waits_for_others(&self, id: StageRef) -> u64 {
         let runs = self.done_for_others(id);
         let among = |task: u64| {
             let before = runs.partition_point(|run| run.lo <= task);
             before > 0 && task < runs[before - 1].hi
         };
-        // Of another instance's it may have some in hand itself.
+        // Some of another instance's tasks may be in this instance's own leases.
         let own = self.stages[&id].stage.leased().map(|(range, _)| {
             let both = (range.lo..range.hi).filter(|t| range.has_to_do(*t) && among(*t));
             both.count() as u64
@@ -52,7 +54,7 @@ impl Core {
     }
 }
 
-/// Makes runs ascending and disjoint.
+/// Sorts and merges runs so that they are ascending and disjoint.
 pub(super) fn in_order(runs: &mut Vec<Run>) {
     runs.sort_unstable_by_key(|run| run.lo);
     runs.dedup_by(|next, run| {

@@ -1,6 +1,6 @@
-//! Workers that fail, or give back, whatever they get: a full disk, a wrong mount, a machine about
-//! to end. Such a worker rests ever longer, whatever the kind of its failures, until something goes
-//! well on it.
+//! Workers that fail or return every task, because of a full disk, a wrong mount or a machine about
+//! to end. Such a worker rests for increasing times, whatever the kind of failure, until a task
+//! succeeds on it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,26 +8,26 @@ use picofarm_proto::ids::{StageRef, WorkerId};
 
 use crate::budget::Backoff;
 
-/// Leases given back in a row that cost nothing: a worker that ends gives back all it has.
+/// Consecutive returned leases without penalty, because a worker that ends returns all its leases.
 const FREE: u32 = 3;
-/// Stages and stores that fail on a worker, and nothing goes well between, until the worker is to
-/// blame.
+/// A worker is at fault once this many stages and stores have failed on it without a success in
+/// between.
 const SUBJECTS: usize = 3;
-/// After so long without trouble the count begins again, milliseconds.
+/// The count restarts after this long without trouble, milliseconds.
 const FORGET_MS: i64 = 300_000;
 
-/// The workers on which nothing has gone well since the last failure.
+/// The workers without a success since their last failure.
 #[derive(Debug, Default)]
 pub(super) struct Sick(BTreeMap<WorkerId, Row>);
 
-/// What went wrong on a worker.
+/// A failure on a worker.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Trouble {
     /// A task of this stage failed, or was lost with the worker.
     Stage(StageRef),
-    /// This store could not be used.
+    /// The worker could not use this store.
     Store(String),
-    /// It gave a task or a lease back.
+    /// The worker returned a task or a lease.
     GaveBack,
 }
 
@@ -41,7 +41,7 @@ struct Row {
 }
 
 impl Sick {
-    /// Something went wrong on a worker. `others`: there are workers that could take its work.
+    /// Records a failure on a worker. `others`: whether other workers could take its work.
     pub(super) fn failed(
         &mut self,
         worker: WorkerId,
@@ -62,33 +62,33 @@ impl Sick {
             if row.subjects.len() < SUBJECTS {
                 row.subjects.insert(trouble);
             }
-            // Where it is the only one, its tasks may be as much to blame.
+            // If the worker is the only one, its tasks may be as much at fault.
             others && row.subjects.len() >= SUBJECTS
         };
-        // Tasks that ran on it at that time fail too, which counts once.
+        // Failures of tasks that ran on the worker at the same time count once.
         if blamed && now_ms >= row.until_ms {
             row.tries = row.tries.saturating_add(1);
             row.until_ms = now_ms + backoff.after(row.tries);
         }
     }
 
-    /// Something went well on a worker.
+    /// Records a success on a worker.
     pub(super) fn succeeded(&mut self, worker: WorkerId) {
         self.0.remove(&worker);
     }
 
-    /// Whether a worker rests; then for how much longer, milliseconds.
+    /// Returns how much longer a worker rests, milliseconds, or `None` if it does not.
     pub(super) fn rests(&self, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let left = self.0.get(&worker)?.until_ms - now_ms;
         (left > 0).then_some(left)
     }
 
-    /// Whether the next lease of a worker is a try: then it has one task.
+    /// Returns whether the next lease of a worker is a try. A try has one task.
     pub(super) fn is_try(&self, worker: WorkerId) -> bool {
         self.0.get(&worker).is_some_and(|row| row.tries > 0)
     }
 
-    /// Forgets workers that have had no trouble for long.
+    /// Forgets workers without recent trouble.
     pub(super) fn tidy(&mut self, now_ms: i64) {
         self.0
             .retain(|_, row| row.last_ms.max(row.until_ms) + FORGET_MS >= now_ms);
@@ -121,7 +121,7 @@ mod tests {
     #[test]
     fn a_worker_that_gives_everything_back_gets_ever_less() {
         let (mut sick, mut now, mut leases) = (Sick::default(), 0, 0);
-        // It asks again every millisecond.
+        // The worker asks again every millisecond.
         while now < 60_000 {
             if sick.rests(worker(1), now).is_none() {
                 leases += 1;

@@ -1,6 +1,7 @@
-//! Stores that tasks wait for: away, full, forbidden, not mounted. Where one worker fails at a store, that worker waits, ever
-//! longer, and others go on. Where several fail at it and nobody succeeds, the store waits: it is tried by one task at a time
-//! and ever more rarely, however many tasks wait for it. Meanwhile workers do other work.
+//! Stores that tasks wait for because they are unavailable, full, forbidden or not mounted. If one
+//! worker fails at a store, that worker waits for increasing times while others continue. If
+//! several workers fail and none succeeds, the store waits: one task at a time tries it, at
+//! increasing intervals, however many tasks wait for it. Meanwhile workers do other work.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -11,34 +12,34 @@ use picofarm_proto::{
 
 use crate::{budget::Backoff, explain::Barred};
 
-/// Longest wait between tries of a store, milliseconds.
+/// Longest delay between tries of a store, milliseconds.
 const MOST_MS: u32 = 300_000;
-/// Rows of workers that have not failed for so long are forgotten, milliseconds.
+/// A worker without failures for this long is forgotten, milliseconds.
 const FORGET_MS: i64 = 2 * MOST_MS as i64;
-/// Longest reason kept, characters.
+/// Longest reason stored, characters.
 const MOST_WORDS: usize = 600;
-/// Workers that must fail at a store, while nobody succeeds, for it to be the store's trouble and not theirs.
+/// The store is blamed, not the workers, once this many workers have failed and none has succeeded.
 const SEVERAL: usize = 2;
-/// Tasks that wait for what they read, remembered at most.
+/// Most tasks remembered that wait for damaged inputs.
 const DAMAGED: usize = 4096;
 
-/// The stores on which tasks failed last.
+/// The stores at which tasks failed last.
 #[derive(Debug, Default)]
 pub(super) struct Stores {
-    /// By location.
+    /// State of each store, by location.
     rows: BTreeMap<String, Row>,
-    /// How often tasks found damaged what they read.
+    /// How often each task found its inputs damaged.
     damaged: HashMap<(StageRef, u64), u32>,
 }
 
 #[derive(Debug, Default)]
 struct Row {
-    /// Several workers failed at it, and nobody has used it since.
+    /// Whether several workers failed at the store and none has used it since.
     shut: bool,
     wait: Wait,
-    /// The lease that tries it now.
+    /// The lease that currently tries the store.
     trying: Option<RangeId>,
-    /// Workers that failed to use it: others may be able to.
+    /// Workers that failed to use the store. Others may be able to.
     workers: BTreeMap<WorkerId, Faulty>,
     why: String,
 }
@@ -47,9 +48,9 @@ struct Row {
 #[derive(Debug, Default)]
 struct Faulty {
     wait: Wait,
-    /// Its lease that tries the store now.
+    /// The worker's lease that currently tries the store.
     trying: Option<RangeId>,
-    /// Another worker has used the store since: the trouble is this worker's own.
+    /// Whether another worker has used the store since, so that the fault is this worker's own.
     alone: bool,
     why: String,
 }
@@ -62,7 +63,7 @@ struct Wait {
 
 impl Wait {
     fn failed(&mut self, backoff: &Backoff, now_ms: i64) {
-        // Others that were at it when it failed say the same of the same time.
+        // Failures of tasks that ran at the same time count once.
         if now_ms >= self.until_ms {
             self.tries += 1;
             self.until_ms = now_ms + backoff.after(self.tries);
@@ -70,7 +71,7 @@ impl Wait {
     }
 }
 
-/// The store that a task's failure to store is put down to.
+/// Returns the store blamed for a task's failure to store its result.
 pub(super) fn store_of(task: &TaskSpec) -> &str {
     task.results().store.trim_end_matches('/')
 }
@@ -83,7 +84,7 @@ fn patient(backoff: &Backoff) -> Backoff {
 }
 
 impl Stores {
-    /// A worker could not use a store.
+    /// Records that a worker could not use a store.
     pub(super) fn failed(
         &mut self,
         store: &str,
@@ -112,7 +113,7 @@ impl Stores {
         }
     }
 
-    /// A worker has used a store.
+    /// Records that a worker has used a store.
     pub(super) fn worked(&mut self, store: &str, worker: WorkerId) {
         let Some(row) = self.rows.get_mut(store) else {
             return;
@@ -129,7 +130,7 @@ impl Stores {
         }
     }
 
-    /// Whether a worker may be given tasks that use a store.
+    /// Checks whether a worker may be given tasks that use a store.
     ///
     /// # Errors
     /// Why not, and when it is tried again.
@@ -156,13 +157,13 @@ impl Stores {
         )))
     }
 
-    /// Whether a worker's lease that uses a store is a try of it: then it has one task.
+    /// Returns whether a worker's lease that uses a store is a try. A try has one task.
     pub(super) fn is_try(&self, store: &str, worker: WorkerId) -> bool {
         let row = self.rows.get(store);
         row.is_some_and(|row| row.shut || row.workers.contains_key(&worker))
     }
 
-    /// A worker's lease that uses a store begins.
+    /// Records that a worker's lease that uses a store begins.
     pub(super) fn begun(&mut self, store: &str, worker: WorkerId, lease: RangeId) {
         let Some(row) = self.rows.get_mut(store) else {
             return;
@@ -175,7 +176,7 @@ impl Stores {
         }
     }
 
-    /// A lease is over, however it ended.
+    /// Records the end of a lease.
     pub(super) fn over(&mut self, lease: RangeId) {
         for row in self.rows.values_mut() {
             let workers = row.workers.values_mut().map(|faulty| &mut faulty.trying);
@@ -187,8 +188,8 @@ impl Stores {
         }
     }
 
-    /// A task found damaged what it reads, which its store does not cure by waiting: only the task waits. How long,
-    /// milliseconds.
+    /// Records that a task found its inputs damaged. Waiting does not repair a store, so only the
+    /// task waits. Returns the delay, milliseconds.
     pub(super) fn damaged(&mut self, task: (StageRef, u64), backoff: &Backoff) -> i64 {
         if self.damaged.len() >= DAMAGED && !self.damaged.contains_key(&task) {
             self.damaged.clear();
@@ -198,7 +199,7 @@ impl Stores {
         patient(backoff).after(*times)
     }
 
-    /// A task is done.
+    /// Forgets the damage recorded for a finished task.
     pub(super) fn mended(&mut self, task: (StageRef, u64)) {
         self.damaged.remove(&task);
     }
@@ -233,7 +234,7 @@ mod tests {
         let mut now = 0;
         let mut waits = Vec::new();
         for _ in 0..12 {
-            // All that were at it say so, which counts once.
+            // All running tasks report the failure, which counts once.
             for w in 0..50 {
                 stores.failed(S, worker(w), "full", &backoff(), now);
             }
@@ -277,7 +278,7 @@ mod tests {
                 .words()
                 .to_owned();
             assert!(why.contains(S) && why.contains("wrong keys"), "{why}");
-            // Others use it, or nobody does: it is the same.
+            // The result is the same whether or not others use the store.
             if now > 60_000 {
                 stores.worked(S, worker(2));
             }
@@ -286,7 +287,7 @@ mod tests {
                 now += 500;
             }
             waits.push(now - begun);
-            // It tries with one task at a time.
+            // The worker tries the store with one task at a time.
             assert!(stores.is_try(S, worker(1)));
             stores.begun(S, worker(1), range(1));
             assert!(stores.may_use(S, worker(1), now).is_err());
@@ -294,7 +295,7 @@ mod tests {
         }
         assert_eq!(waits[..3], [1_000, 2_000, 4_000]);
         assert_eq!(*waits.last().unwrap(), i64::from(MOST_MS));
-        // A second one with the same keys is known for it once the store works.
+        // A second worker with the same wrong keys is noticed once the store works.
         stores.failed(S, worker(3), "wrong keys", &backoff(), now);
         assert_eq!(stores.may_use(S, worker(2), now), Ok(()));
         stores.worked(S, worker(2));

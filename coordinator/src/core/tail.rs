@@ -1,9 +1,10 @@
-//! The end of a stage: when nothing waits any more, idle workers help those that are behind.
+//! The end of a stage. When no task is pending, idle workers help slow ones.
 //!
-//! *Trimming*: of the lease with the most left, the second half goes to whoever is idle; its holder hears where it ends
-//! now. *Doubling*: a task that takes far longer than its like is run a second time elsewhere; whichever is done first
-//! is committed. Both rest on tasks being pure: two workers that run the same task publish the same bytes, and the
-//! second finds the output there.
+//! *Trimming* gives the second half of the lease with the most unfinished tasks to an idle worker,
+//! and tells the holder the new end of its lease. *Doubling* runs a task that takes far longer than
+//! the mean of its stage on a second worker, and commits the run that ends first. Both work because
+//! tasks are pure: two workers that run the same task publish the same bytes, and the second finds
+//! the output.
 
 use picofarm_catalog::{Mark, Range};
 use picofarm_proto::{
@@ -14,15 +15,16 @@ use picofarm_proto::{
 use super::{About, Core, Say, SessionId};
 use crate::transition::RangeEvent;
 
-/// How often idle workers are looked after, milliseconds.
+/// Interval at which idle workers are considered, milliseconds.
 const LOOK_MS: i64 = 200;
-/// A task is doubled when it has taken so many times the mean of its like.
+/// A task is doubled when it has taken this multiple of the mean of its stage.
 const SLOW: f64 = 3.0;
 
-/// A task that runs a second time. It is no range: the catalog knows nothing of it, and when its instance is gone, so is it.
+/// A task that runs a second time. It is not a range: the catalog does not know it, and it
+/// disappears with its instance.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Double {
-    /// The lease under which it is run first.
+    /// The lease of the first run.
     pub of: LeaseRef,
     pub stage: StageRef,
     pub task: u64,
@@ -30,10 +32,10 @@ pub(super) struct Double {
 }
 
 impl Core {
-    /// Gives idle workers a part of what others hold. To be called when all that was pending has been granted; looks a
-    /// few times a second only, since all leases are looked at.
+    /// Gives idle workers a part of other workers' leases. Call it when all pending tasks have been
+    /// granted. It searches only a few times a second, because it visits every lease.
     pub(super) fn help(&mut self, hungry: &[WorkerId], now_ms: i64) {
-        // A worker that only asks ahead is not idle.
+        // A worker that asks for leases ahead of time is not idle.
         let idle = |worker: &&WorkerId| {
             let who = &self.workers[*worker];
             who.hungry() && who.leases.is_empty()
@@ -46,9 +48,10 @@ impl Core {
         let mut stages: Vec<StageRef> = self
             .stages
             .iter()
-            // Tasks that wait after a failure keep nobody from helping.
+            // Tasks that wait after a failure do not prevent help.
             .filter(|(_, e)| !e.job.paused && !e.waits(now_ms) && e.stage.leased_tasks() > 0)
-            // Half of such a task's work would be in vain, and it has been saved on the way.
+            // Half the work of a resumable task would be wasted, and the task has saved its
+            // progress.
             .filter(|(id, e)| !e.spec(**id).task.resumes())
             .map(|(id, _)| *id)
             .collect();
@@ -60,7 +63,7 @@ impl Core {
                 if self.may_run(stage, worker, now_ms).is_err() {
                     others.push(worker);
                 } else if self.trim(stage, worker, now_ms) {
-                    // What was cut off is pending now: this worker is the first to be asked.
+                    // The tasks cut off are pending now, and this worker is the first to get them.
                     let able = self.able(stage, now_ms);
                     self.grant(stage, worker, able, now_ms);
                 } else if !self.double(stage, worker, now_ms) {
@@ -73,7 +76,8 @@ impl Core {
         }
     }
 
-    /// Cuts the second half off the lease of a stage that has the most left, if that is worth it.
+    /// Cuts the second half off the lease of a stage that has the most unfinished tasks, if the
+    /// remainder is long enough.
     fn trim(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let Some(mean) = self.sets[entry.set].timing.mean() else {
@@ -94,7 +98,7 @@ impl Core {
         if todo < 2 || todo as f64 * mean * 1000.0 < f64::from(self.settings.worth_ms) {
             return false;
         }
-        // Leases are worked off in order: what is in hand stays.
+        // A lease is worked through in order, so the running task stays.
         let mut left = (range.lo..)
             .zip(&lease.marks)
             .filter(|(_, m)| **m == Mark::Todo);
@@ -121,7 +125,7 @@ impl Core {
         true
     }
 
-    /// Runs the slowest task of a stage a second time, if it is slow and alone.
+    /// Runs the slowest task of a stage a second time, if it is slow and runs only once.
     fn double(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let Some(mean) = self.sets[entry.set].timing.mean() else {
@@ -186,8 +190,8 @@ impl Core {
         true
     }
 
-    /// The double that a session's worker holds under this lease, with the range under which its task runs first, if
-    /// that still has it to do.
+    /// Returns the double that a worker runs under this lease, with the range of the first run, if
+    /// that range still has the task to do.
     pub(super) fn doubled(&self, worker: WorkerId, lease: LeaseRef) -> Option<(Double, &Range)> {
         let double = self.doubles.get(&lease.range)?;
         if lease.epoch != Epoch(0) || double.worker != worker {
@@ -198,8 +202,8 @@ impl Core {
         (state.marks.get(at) == Some(&Mark::Todo)).then_some((*double, range))
     }
 
-    /// Forgets doubles whose task is no longer to be done, and tells those who work on it; and those of a worker that
-    /// is gone.
+    /// Forgets doubles of tasks that are no longer to be done, and tells their workers. Also
+    /// forgets the doubles of disconnected workers.
     pub(super) fn end_doubles(&mut self) {
         let over: Vec<(RangeId, WorkerId)> = self
             .doubles
@@ -231,7 +235,8 @@ impl Core {
         }
     }
 
-    /// A worker gives a double up, or fails at it: it is as if it had never been. `false` where it is none.
+    /// Forgets a double that its worker returned or failed. This has no further effect. Returns
+    /// `false` if the lease is not a double.
     pub(super) fn drop_double(&mut self, session: SessionId, lease: LeaseRef) -> bool {
         let Some(worker) = self.sessions.get(&session) else {
             return false;

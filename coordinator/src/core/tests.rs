@@ -1,6 +1,7 @@
-//! Cores over a real catalog against a simple model: whatever happens in whatever order, every task is committed
-//! exactly once, the counts add up, and the catalog holds what the cores think. One instance over SQLite, two over
-//! Postgres, which lose their workers to each other, their time, and their memory.
+//! Compares cores over a real catalog with a simple model. After any sequence of events every task
+//! is committed exactly once, the counts are consistent, and the catalog agrees with the cores.
+//! There is one instance on SQLite, or two on Postgres, which lose workers to each other, lose
+//! their time, and lose their memory.
 
 mod starving;
 mod troubled;
@@ -54,7 +55,7 @@ fn jobs_that_want_the_same_outputs_share_the_work() {
         assert_eq!(look(first).shared, b.hi - b.lo);
         assert_eq!(look(second).shared, a.hi - a.lo);
         world.check_shared();
-        // What the second job made counts for the first, and the other way round.
+        // Results of the second job count for the first, and the reverse.
         world.end().await;
     });
 }
@@ -121,8 +122,9 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
     });
 }
 
-/// A worker's heartbeat waits in line while this coordinator is busy: its leases, which would run out, are prolonged; those
-/// of a silent worker are not, and the history says what it did.
+/// While a coordinator is busy, a worker's heartbeat waits in the queue. The worker's leases, which
+/// would run out, are extended. Those of a silent worker are not, and the history records its
+/// silence.
 #[test]
 fn only_leases_of_workers_that_were_heard_outlive_a_busy_coordinator() {
     block_on(async {
@@ -157,7 +159,7 @@ fn only_leases_of_workers_that_were_heard_outlive_a_busy_coordinator() {
         let said: Vec<String> = said.filter(|m| m.contains("w1")).collect();
         let what = format!("worker w1 fell silent while it ran task {}", silent.lo);
         assert!(said.iter().any(|m| m.starts_with(&what)), "{said:?}");
-        // Once only: the next heartbeat must come in time.
+        // The extension works only once: the next heartbeat must come in time.
         world.now += i64::from(SETTINGS.lease_ms) + 1;
         let core = &mut world.instances[0].core;
         core.expire(world.now);
@@ -165,8 +167,8 @@ fn only_leases_of_workers_that_were_heard_outlive_a_busy_coordinator() {
     });
 }
 
-/// Found by chaos: a worker takes its lease along to another instance and ends it there, before its former instance, which does
-/// not know yet, commits the last task that it has itself.
+/// Found by a chaos test. A worker takes its lease to another instance and ends it there. Its
+/// former instance, which does not know yet, commits its own last task afterwards.
 #[test]
 fn a_stage_is_over_although_its_last_instance_believed_to_hold_a_lease_that_ended_elsewhere() {
     block_on(async {
@@ -184,7 +186,7 @@ fn a_stage_is_over_although_its_last_instance_believed_to_hold_a_lease_that_ende
         world.beat(0).await;
         world.flush(0).await;
         world.beat(1).await;
-        // The other worker does all there is but its last lease.
+        // The other worker finishes all tasks except those of its last lease.
         loop {
             world.act(&Op::Credit(0)).await;
             world.flush(0).await;
@@ -219,8 +221,8 @@ fn a_stage_is_over_although_its_last_instance_believed_to_hold_a_lease_that_ende
     });
 }
 
-/// A worker takes its lease along to another instance and gives it back there; its former instance claims the tasks before it has
-/// heard of that.
+/// A worker takes its lease to another instance and returns it there. Its former instance claims
+/// the tasks before it has received that news.
 #[test]
 fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
     block_on(async {
@@ -231,7 +233,7 @@ fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
         world.act(&Op::Credit(0)).await;
         let lease = world.workers[0].leases[0].clone();
         world.connect(0, 1).await;
-        // One task back with its own range, the rest as the lease's.
+        // One task comes back in its own range, the rest in the lease's range.
         let session = world.workers[0].session.unwrap().1;
         let failure = Failure {
             lease: lease.lease,

@@ -1,11 +1,11 @@
-//! What became of one task, and why.
+//! Explains the state of one task.
 
 use picofarm_catalog::RangeState;
 use picofarm_proto::model::{Event, EventKind, Made, TaskExplanation, TaskOutput, TaskState};
 
 use super::{TaskFacts, span};
 
-/// What became of a task and why.
+/// Explains the state of a task and its reason.
 pub fn task(facts: TaskFacts) -> TaskExplanation {
     let (failures, crashes, interruptions, last_error) = facts
         .record
@@ -140,7 +140,7 @@ fn output(facts: &TaskFacts) -> Option<TaskOutput> {
     })
 }
 
-/// Whether a line of history says that a worker handed in a result.
+/// Returns whether a history line records a worker's reported result.
 pub fn committed(event: &Event) -> bool {
     match event.kind {
         EventKind::Committed => true,
@@ -149,7 +149,7 @@ pub fn committed(event: &Event) -> bool {
     }
 }
 
-/// Why a task was run more than once: what ended each lease but the last.
+/// Returns why a task ran more than once: the reason why each lease but the last ended.
 fn reruns(events: &[Event]) -> Vec<String> {
     let mut reruns = Vec::new();
     let mut why: Option<String> = None;
@@ -166,7 +166,8 @@ fn reruns(events: &[Event]) -> Vec<String> {
                 why = None;
                 continue;
             }
-            // A loss is reported twice, for the lease and for the task in hand: the first says enough.
+            // A loss is recorded twice, for the lease and for the running task. The first record
+            // suffices.
             _ if why.is_some() => continue,
             EventKind::Expired => event.message.clone(),
             EventKind::Released => format!("{} gave it back: {}", event.worker, event.message),

@@ -1,4 +1,4 @@
-//! Each answer has the facts that call for it.
+//! Each answer follows from the facts that require it.
 
 use picofarm_catalog::{LeaseState, Mark, Output, Range, RangeState};
 use picofarm_proto::{
@@ -76,7 +76,7 @@ fn stage() -> StageRef {
     }
 }
 
-/// The first reason's code and words.
+/// Returns the first reason's code and words.
 fn first(facts: &JobFacts) -> (String, String) {
     let reasons = job(facts);
     (reasons[0].code.clone(), reasons[0].words.clone())
@@ -213,7 +213,7 @@ fn tasks_under_way_for_another_job_are_told_from_those_that_wait_for_a_worker() 
     assert_eq!(found, [("shared", 4), ("busy", 6)]);
     assert!(reasons[0].words.starts_with("4 tasks under way"));
 
-    // What other jobs have in hand may be more than what waits here.
+    // Other jobs may run more shared tasks than wait here.
     let all = JobFacts {
         shared: 40,
         ..facts()
@@ -456,7 +456,7 @@ fn a_silent_worker_is_not_called_busy() {
         words.contains("rack-1 for 42 s") && words.contains("frozen"),
         "{words}"
     );
-    // Another one that works is what the tasks wait for.
+    // The tasks wait for another worker that works.
     let (code, _) = first(&JobFacts {
         candidates: vec![silent, able("rack-2")],
         ..facts()
@@ -554,7 +554,7 @@ fn tasks_that_no_worker_has_the_time_for_say_how_long_they_need() {
         words.contains("no connected worker has 75 min left for 10 tasks"),
         "{words}"
     );
-    // Another one has the time and is at work.
+    // Another worker has enough time and is busy.
     let (code, _) = first(&JobFacts {
         candidates: vec![short("a"), able("b")],
         ..facts()
@@ -585,7 +585,7 @@ fn where_workers_come_and_give_their_leases_back_it_is_said() {
             && words.contains("task 4 was interrupted 4 times"),
         "{words}"
     );
-    // Long ago it is no reason any more.
+    // An old interruption is no reason any more.
     let later = JobFacts {
         now_ms: NOW + 3_600_000,
         ..loops

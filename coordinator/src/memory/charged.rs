@@ -1,5 +1,5 @@
-//! The layer that charges requests and answers. It is behind the guard: nothing of a request's body is read before its
-//! caller is known.
+//! The layer that charges requests and answers. It comes after the guard, so that no part of a
+//! request's body is read before its caller is known.
 
 use std::{
     collections::VecDeque,
@@ -22,21 +22,21 @@ use crate::{
     connections::{Peer, Place},
 };
 
-/// The one method whose requests are a stream; its messages are small.
+/// The only method with a stream of requests. Its messages are small.
 const SESSION: &str = "/picofarm.v1.Farm/Session";
-/// A message's flags and length.
+/// Length of a message's flags and length field.
 const PREFIX: usize = 5;
-/// What an open request takes by itself: headers, task, buffers.
+/// Memory of an open request without its message: headers, task, buffers.
 const CALL: u64 = 16 << 10;
-/// How long the beginning of a message may take.
+/// Time limit for the beginning of a message.
 const BEGINNING: Duration = Duration::from_secs(20);
-/// How long the rest may take.
+/// Time limit for the rest of a message.
 const WHOLE: Duration = Duration::from_secs(120);
-/// Messages of a session up to this length are free: there is room for them anyway.
+/// Messages of a session up to this length are free, because memory is reserved for them.
 const FREE: u64 = 16 << 10;
-/// A part of an answer that is longer has to be taken in time.
+/// Parts of an answer longer than this must be received in time.
 const LARGE: usize = 32 << 10;
-/// How long taking it may take, and for each MiB.
+/// Time limit for receiving a part, plus the same for each MiB.
 const TAKEN: Duration = Duration::from_secs(30);
 
 /// Charges requests.
@@ -54,7 +54,7 @@ impl<S> Layer<S> for Charging {
     }
 }
 
-/// A service whose requests are charged.
+/// A service that charges its requests.
 #[derive(Clone)]
 pub(crate) struct Charged<S> {
     inner: S,
@@ -77,7 +77,7 @@ where
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
         let place = request.extensions().get::<Peer>().map(Peer::place);
         let account = account(&self.memory, &request);
-        // The service that is ready is this one.
+        // `self.inner` is the service that reported ready, so the clone replaces it.
         let ready = self.inner.clone();
         let mut inner = std::mem::replace(&mut self.inner, ready);
         if request.uri().path() == SESSION {
@@ -123,7 +123,7 @@ fn account<B>(memory: &Arc<Memory>, request: &http::Request<B>) -> Account {
     Account::new(Arc::clone(memory), who, connection)
 }
 
-/// Reads a request's body up to the length of its message, and charges it.
+/// Reads a request's body up to the length of its message, and charges that length.
 async fn begin(mut body: Body, account: &Account) -> Result<(Begun, Charge, Charge), Status> {
     let mut first = VecDeque::new();
     let mut prefix = Vec::with_capacity(PREFIX);
@@ -162,13 +162,13 @@ async fn begin(mut body: Body, account: &Account) -> Result<(Begun, Charge, Char
     Ok((begun, call, charge))
 }
 
-/// The length in a message's prefix.
+/// Returns the length in a message's prefix.
 fn length(prefix: &[u8]) -> Option<u64> {
     let length: [u8; 4] = prefix.get(1..PREFIX)?.try_into().ok()?;
     Some(u32::from_be_bytes(length).into())
 }
 
-/// A request's body whose beginning was read.
+/// A request body after its beginning was read.
 struct Begun {
     first: VecDeque<Frame<Bytes>>,
     rest: Body,
@@ -201,12 +201,12 @@ impl HttpBody for Begun {
     }
 }
 
-/// The messages of a session as they come. Its buffer keeps the size of the longest.
+/// The messages of a session as they arrive. The buffer keeps the size of the longest one.
 struct Messages {
     body: Body,
     account: Account,
     prefix: Vec<u8>,
-    /// Bytes of the message in hand that are still to come.
+    /// Missing bytes of the current message.
     left: u64,
     longest: u64,
     charges: Vec<Charge>,
@@ -274,7 +274,8 @@ impl HttpBody for Messages {
     }
 }
 
-/// An answer whose request is charged until it is over, and each of whose parts until the next is asked for.
+/// An answer that keeps its request charged until it ends. Each part is charged until the next one
+/// is requested.
 struct Answer {
     body: Body,
     account: Account,
@@ -291,7 +292,7 @@ impl HttpBody for Answer {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        // The part before has been taken, or this would not be asked for.
+        // The next part is requested only after the previous one was received.
         self.part = None;
         let polled = Pin::new(&mut self.body).poll_frame(context);
         if let Poll::Ready(Some(Ok(frame))) = &polled
@@ -314,7 +315,7 @@ impl HttpBody for Answer {
     }
 }
 
-/// Ends a connection that does not take a part of an answer, unless the value is dropped before.
+/// Ends a connection that does not receive a part of an answer, unless the value is dropped first.
 fn watch(place: Arc<Place>, bytes: usize) -> DropGuard {
     let taken = CancellationToken::new();
     let guard = taken.clone().drop_guard();

@@ -1,8 +1,10 @@
-//! Memory that callers can make a coordinator use: counted before it is used, for each connection, for each caller and for
-//! all together. What does not fit waits for a moment and is refused then; what can never fit is refused at once.
+//! Limits the memory that callers can make a coordinator use. Memory is counted before it is used,
+//! for each connection, for each caller and in total. A request that does not fit now waits a
+//! moment and is then refused. A request that can never fit is refused at once.
 //!
-//! Requests are charged by the length that they announce, specs again by what they cost once read, reading calls by what
-//! they read, and answers by their length until they are taken.
+//! Requests are charged by their announced length, and specs again by their size in memory. Reading
+//! calls are charged by the size of the data read, and answers by their length until they are
+//! received.
 
 mod charged;
 
@@ -25,29 +27,31 @@ use crate::connections::{Doors, Group};
 pub(crate) use charged::Charging;
 
 const MIB: u64 = 1 << 20;
-/// Memory of the process where nothing else is known.
+/// Memory of the process if no limit is known.
 const DEFAULT: u64 = 2048 * MIB;
-/// What a worker's connection with its session takes.
+/// Memory of a worker's connection with its session.
 const CONNECTION: u64 = 36 << 10;
-/// The most that a connection takes on which no request was let in: half of a TLS handshake or of a request's headers, or a
-/// hundred refusals that it does not take.
+/// Most memory of a connection without an accepted request: half of a TLS handshake or of a
+/// request's headers, or a hundred refusals that the client does not receive.
 const SILENT: u64 = 128 << 10;
-/// How long a charge waits for others to end.
+/// Longest time that a charge waits for others to end.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// A message in hand takes its length twice: as it came, and as it is decoded.
+/// A message takes its length twice: once as received and once as decoded.
 const TWICE: u64 = 2;
-/// Bytes of memory for each byte of a spec while it is read, checked, hashed and recorded: the strings that it consists of,
-/// its text, and copies of the text as it is hashed and bound to a statement.
+/// Bytes of memory for each byte of a spec while it is read, checked, hashed and recorded. They
+/// cover its strings, its text, and copies of the text as it is hashed and bound to a statement.
 const SPEC_BYTE: u64 = 4;
-/// The same for each byte of a spec that is read from the catalog: the strings, and the text of one at a time.
+/// Bytes of memory for each byte of a spec read from the catalog: the strings, and the text of one
+/// spec at a time.
 const STORED_BYTE: u64 = 2;
-/// Bytes of memory for each value of a spec: a string takes 24 by itself, and the least that the allocator gives.
+/// Bytes of memory for each value of a spec. A string takes 24, plus the allocator's smallest
+/// block.
 const SPEC_VALUE: u64 = 48;
 
-/// How much memory a coordinator may use.
+/// Limit on the memory of a coordinator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MemoryBounds {
-    /// Bytes of the whole process: its control group's limit, or an option.
+    /// Bytes of the whole process, from its control group's limit or an option.
     pub process: u64,
 }
 
@@ -58,54 +62,55 @@ impl Default for MemoryBounds {
 }
 
 impl MemoryBounds {
-    /// Connections, jobs and requests together; the rest is the program's own, and what the allocator keeps.
+    /// Returns the memory of connections, jobs and requests together. The rest is for the program
+    /// and the allocator.
     fn pool(self) -> u64 {
         self.process / 4 * 3
     }
 
-    /// Requests and answers of one caller.
+    /// Returns the memory of one caller's requests and answers.
     fn caller(self) -> u64 {
         self.pool() / 2
     }
 
-    /// Requests and answers on one connection.
+    /// Returns the memory of requests and answers on one connection.
     fn connection(self) -> u64 {
         self.pool() / 8 * 3
     }
 
-    /// The most connections.
+    /// Returns the largest number of connections.
     pub(crate) fn connections(self) -> usize {
         usize::try_from(self.pool() / CONNECTION).unwrap_or(usize::MAX)
     }
 
-    /// Connections that have not sent a request.
+    /// Returns the largest number of connections that have not sent a request.
     pub(crate) fn silent(self) -> usize {
         usize::try_from(self.process / 8 / SILENT).unwrap_or(usize::MAX)
     }
 
-    /// Specs of jobs that have not ended, which the coordinator keeps.
+    /// Returns the memory of the specs of unfinished jobs, which the coordinator keeps.
     fn jobs(self) -> u64 {
         self.process / 4
     }
 }
 
-/// Whose memory it is.
+/// The owner of charged memory.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) enum Who {
-    /// A caller known by its proof.
+    /// A caller identified by its credentials.
     Name(Arc<str>),
-    /// Whoever calls from an address, where no proof is asked for.
+    /// Any caller from an address, if no credentials are required.
     Address(Group),
 }
 
-/// The counts.
+/// The memory counters.
 pub(crate) struct Memory {
     bounds: MemoryBounds,
     doors: Arc<Doors>,
     state: Mutex<State>,
-    /// Something was given back.
+    /// Notified when memory is released.
     freed: Notify,
-    /// Specs of jobs that have not ended.
+    /// Memory of the specs of unfinished jobs.
     jobs: AtomicU64,
     refused: AtomicU64,
 }
@@ -113,7 +118,7 @@ pub(crate) struct Memory {
 #[derive(Debug, Default)]
 struct State {
     all: u64,
-    /// The most that `all` ever was.
+    /// The highest value of `all` so far.
     most: u64,
     callers: HashMap<Who, u64>,
     connections: HashMap<u64, u64>,
@@ -122,19 +127,19 @@ struct State {
 /// Counts for the metrics.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Used {
-    /// Bytes of requests and answers now.
+    /// Bytes of current requests and answers.
     pub requests: u64,
-    /// The most of them since the start.
+    /// Highest value of `requests` since the start, bytes.
     pub most: u64,
-    /// The most that is allowed.
+    /// Limit of `requests`, bytes.
     pub allowed: u64,
-    /// Bytes of the specs of jobs that have not ended.
+    /// Bytes of the specs of unfinished jobs.
     pub jobs: u64,
     /// Requests refused for lack of memory.
     pub refused: u64,
 }
 
-/// Which bound a charge does not fit.
+/// The bound that a charge exceeds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Bound {
     Connection,
@@ -175,7 +180,7 @@ impl Memory {
         }
     }
 
-    /// Notes what the specs of jobs that have not ended take together.
+    /// Records the total memory of the specs of unfinished jobs.
     pub(crate) fn keep_jobs(&self, bytes: u64) {
         self.jobs.store(bytes, Ordering::Relaxed);
     }
@@ -183,7 +188,7 @@ impl Memory {
     /// Checks that there is room for the spec of one more job.
     ///
     /// # Errors
-    /// There is none: why, in words.
+    /// Returns the reason if there is no room.
     pub(crate) fn room_for_job(&self, bytes: u64) -> Result<(), String> {
         let (kept, most) = (self.jobs.load(Ordering::Relaxed), self.bounds.jobs());
         if kept.saturating_add(bytes) <= most {
@@ -270,13 +275,13 @@ impl fmt::Debug for Memory {
     }
 }
 
-/// Whose requests are charged, and on which connection they came.
+/// The caller charged for requests, and the connection of the requests.
 #[derive(Debug, Clone)]
 pub(crate) struct Account {
     memory: Arc<Memory>,
     who: Who,
     connection: u64,
-    /// The message of the request that this account came with.
+    /// The charge for the message of this account's request.
     message: Option<Arc<Charge>>,
 }
 
@@ -290,30 +295,33 @@ impl Account {
         }
     }
 
-    /// The same with what the request's message is charged with, which lives as long.
+    /// Returns the account with the charge for its request's message, which lives as long as the
+    /// account.
     fn holding(mut self, message: Charge) -> Self {
         self.message = Some(Arc::new(message));
         self
     }
 
-    /// Takes what a spec costs beyond what its message was charged with.
+    /// Charges the memory of a spec beyond the charge for its message.
     ///
     /// # Errors
-    /// As [`Self::charge`].
+    /// Returns the errors of [`Self::charge`].
     pub(crate) async fn charge_spec(&self, json: &str) -> Result<Charge, Status> {
         let paid = self.message.as_ref().map_or(0, |message| message.bytes);
         let cost = SPEC_BYTE * json.len() as u64 + SPEC_VALUE * values(json.as_bytes());
         self.charge("spec", cost.saturating_sub(paid)).await
     }
 
-    /// Takes so much memory until the value is dropped; waits a moment where others have it.
+    /// Charges this much memory until the value is dropped. Waits a moment if other requests use
+    /// it.
     ///
     /// # Errors
-    /// RESOURCE_EXHAUSTED with the bound and what to do.
+    /// Returns RESOURCE_EXHAUSTED with the bound and a remedy.
     pub(crate) async fn charge(&self, what: &str, bytes: u64) -> Result<Charge, Status> {
         let until = tokio::time::Instant::now() + PATIENCE;
         loop {
-            // Before the attempt, so that nothing that is given back after it is missed.
+            // This comes before the attempt, so that memory released after the attempt is not
+            // missed.
             let freed = self.memory.freed.notified();
             let bound = match self.memory.add(self, bytes) {
                 Ok(()) => {
@@ -345,10 +353,10 @@ impl Account {
         }
     }
 
-    /// Takes so much memory until the value is dropped, without waiting.
+    /// Charges this much memory until the value is dropped, without waiting.
     ///
     /// # Errors
-    /// RESOURCE_EXHAUSTED with the bound.
+    /// Returns RESOURCE_EXHAUSTED with the bound.
     fn charge_now(&self, what: &str, bytes: u64) -> Result<Charge, Status> {
         match self.memory.add(self, bytes) {
             Ok(()) => Ok(Charge {
@@ -363,7 +371,7 @@ impl Account {
         }
     }
 
-    /// Counts memory that is taken already.
+    /// Counts memory already in use, whatever the bounds.
     fn count(&self, bytes: u64) -> Charge {
         self.memory.lock().add(self, bytes);
         Charge {
@@ -378,7 +386,7 @@ impl Account {
     }
 }
 
-/// Memory that is taken, until the value is dropped.
+/// Charged memory, released when the value is dropped.
 #[derive(Debug)]
 pub(crate) struct Charge {
     account: Account,
@@ -393,25 +401,25 @@ impl Drop for Charge {
     }
 }
 
-/// What specs of this length together take while they are read from the catalog.
+/// Returns the memory of specs of this total length while they are read from the catalog.
 pub(crate) fn stored_cost(bytes: u64) -> u64 {
     bytes.saturating_mul(STORED_BYTE)
 }
 
-/// What a spec takes for as long as it is kept.
+/// Returns the memory of a spec for as long as it is kept.
 pub(crate) fn kept_cost(spec: &JobSpec) -> u64 {
     let mut size = Size::default();
     serde_json::to_writer(&mut size, spec).expect("a spec is plain data");
     size.bytes + SPEC_VALUE * size.values
 }
 
-/// The values in a part of a JSON text, at most.
+/// Returns an upper bound on the number of values in a part of a JSON text.
 fn values(text: &[u8]) -> u64 {
     let begins = text.iter().filter(|b| matches!(b, b',' | b'[' | b'{'));
     begins.count() as u64
 }
 
-/// Counts what is written and keeps nothing.
+/// Counts written bytes and discards them.
 #[derive(Default)]
 struct Size {
     bytes: u64,
@@ -453,7 +461,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn each_bound_refuses_by_its_name_and_gives_back_what_was_taken() {
-        // 192 MiB in all: 72 for a connection, 96 for a caller.
+        // The pool is 192 MiB: at most 72 for a connection and 96 for a caller.
         let memory = memory(256);
         let ada = account(&memory, 1, 1);
         let first = ada.charge("a", 60 * MIB).await.unwrap();

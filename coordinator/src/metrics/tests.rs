@@ -1,4 +1,4 @@
-//! Names and help texts are a promise to dashboards; numbers are those of the events.
+//! Names and help texts are stable for dashboards, and the numbers match the events.
 
 use picofarm_catalog::{NewEvent, Output};
 use picofarm_proto::ids::{Epoch, JobId, LeaseRef, RangeId, StageRef};

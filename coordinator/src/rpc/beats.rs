@@ -1,5 +1,6 @@
-//! Heartbeats are answered by their session, at once, for the leases that the actor last said are live: a lease must not run
-//! out because the actor waits for the catalog. The actor hears of them all the same, and what it answers counts.
+//! Sessions answer heartbeats at once, for the leases that the actor last reported as live. A lease
+//! must not run out because the actor waits for the catalog. The actor still receives each
+//! heartbeat, and its answer takes precedence.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -11,21 +12,22 @@ use picofarm_proto::ids::LeaseRef;
 
 use crate::core::Say;
 
-/// For how long leases are prolonged without a word of the actor: this, or so many leases. Then the worker shall look for
-/// another coordinator.
+/// Longest time for which leases are extended without an answer of the actor: this time, or the
+/// number of lease periods below. Afterwards the worker should look for another coordinator.
 const SILENCE: Duration = Duration::from_secs(60);
 const LEASES: u32 = 4;
 
-/// A lease that the actor said is live.
+/// A lease that the actor reported as live.
 #[derive(Debug, Clone, Copy)]
 struct Live {
-    /// How many heartbeats the actor had been told of when it said so last.
+    /// The number of heartbeats sent to the actor before it last reported the lease as live.
     told: u64,
-    /// Tasks whose reports were not answered; `None` = not known, and the next answer may be the last.
+    /// Tasks with unanswered reports; `None` if unknown, in which case the next answer may be the
+    /// last.
     left: Option<u64>,
 }
 
-/// What one session knows of its leases.
+/// The leases of one session.
 #[derive(Debug)]
 pub(super) struct Beats {
     state: Mutex<State>,
@@ -35,14 +37,14 @@ pub(super) struct Beats {
 #[derive(Debug)]
 struct State {
     live: HashMap<LeaseRef, Live>,
-    /// Heartbeats that the actor was told of.
+    /// Number of heartbeats sent to the actor.
     told: u64,
-    /// Those that it has not answered, with what was answered here.
+    /// Heartbeats that the actor has not answered, with the session's own answer.
     open: VecDeque<(u64, Option<Vec<LeaseRef>>)>,
-    /// The worker has taken back what it asked for, and takes the answer to the next heartbeat that the actor is told of for
-    /// the end of what was granted before: number of that heartbeat.
+    /// Number of the heartbeat after the worker withdrew its request for leases. The worker takes
+    /// the answer to that heartbeat as the end of earlier grants.
     withdrawn: Option<u64>,
-    /// When the actor last said anything.
+    /// Time of the actor's last message.
     heard: Instant,
 }
 
@@ -61,8 +63,9 @@ impl Beats {
         }
     }
 
-    /// The answer to a heartbeat for these leases, if there are any and all of them are known to be live. Answers keep their
-    /// order: there is none while the actor owes one.
+    /// Returns the answer to a heartbeat for these leases, if there are any and all of them are
+    /// known to be live. Answers stay in order, so there is none while the actor has an unanswered
+    /// heartbeat.
     pub(super) fn answer(&self, leases: &[LeaseRef]) -> Option<Vec<LeaseRef>> {
         let state = self.lock();
         let known = leases.iter().all(|lease| state.live.contains_key(lease));
@@ -72,13 +75,13 @@ impl Beats {
         (known && heard && free && !leases.is_empty()).then(|| leases.to_vec())
     }
 
-    /// The worker has taken back what it asked for.
+    /// Records that the worker has withdrawn its request for leases.
     pub(super) fn withdraw(&self) {
         let mut state = self.lock();
         state.withdrawn = Some(state.told + 1);
     }
 
-    /// The actor is told of a heartbeat that was answered so here, or not at all.
+    /// Records a heartbeat sent to the actor, with the session's own answer, if any.
     pub(super) fn tell(&self, answered: Option<Vec<LeaseRef>>) {
         let mut state = self.lock();
         state.told += 1;
@@ -86,7 +89,8 @@ impl Beats {
         state.open.push_back((told, answered));
     }
 
-    /// What the worker is to hear when the actor says this: each heartbeat has one answer.
+    /// Returns the messages to the worker that follow from a message of the actor. Each heartbeat
+    /// has one answer.
     pub(super) fn hear(&self, say: Say) -> Vec<Say> {
         let mut state = self.lock();
         state.heard = Instant::now();
@@ -132,7 +136,8 @@ impl Beats {
 }
 
 impl State {
-    /// The actor answers a heartbeat with these leases. Where it was answered here, what the worker has to hear of it.
+    /// Handles the actor's answer to a heartbeat. If the session has answered it already, returns
+    /// the remaining messages to the worker.
     fn renewed(
         &mut self,
         told: u64,
@@ -151,7 +156,7 @@ impl State {
             let lost = known.filter(|lease| !leases.contains(lease));
             lost.map(revoke).collect()
         });
-        // Those granted since the heartbeat was sent are not among its leases.
+        // Leases granted since the heartbeat was sent are not among its leases.
         self.live
             .retain(|lease, live| live.told >= told || leases.contains(lease));
         for lease in leases {

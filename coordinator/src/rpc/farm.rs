@@ -32,12 +32,13 @@ use crate::{
     sessions::Waiting,
 };
 
-/// How long a worker may take to say who it is.
+/// Time limit for a worker's hello.
 const HELLO: Duration = Duration::from_secs(20);
-/// Messages that may wait for a worker; one that reads none of them is let go.
+/// Messages that may wait for a worker. A worker that reads none of them is disconnected.
 const OUTBOX: usize = 16_384;
 
-/// Heartbeats of a session that may wait for the actor, and how often it is looked whether it has come to them.
+/// Most heartbeats of a session that wait for the actor, and the interval at which their number is
+/// checked.
 const BEATS: u32 = 4;
 const PAUSE: Duration = Duration::from_millis(20);
 
@@ -60,7 +61,7 @@ impl FarmService {
         }
     }
 
-    /// Counts a session in, until the value is dropped.
+    /// Counts a session until the value is dropped.
     fn enter(&self) -> Result<Counted, Status> {
         let (open, most) = (Arc::clone(&self.open), self.quotas.sessions);
         let counted = Counted(open);
@@ -73,7 +74,7 @@ impl FarmService {
     }
 }
 
-/// A session that counts.
+/// A counted session.
 struct Counted(Arc<AtomicUsize>);
 
 impl Drop for Counted {
@@ -82,7 +83,7 @@ impl Drop for Counted {
     }
 }
 
-/// Boxed: a channel has room for 32 from the start.
+/// Boxed, because a channel allocates room for 32 items from the start.
 type Out = mpsc::Sender<Result<Box<wire::SessionResponse>, Status>>;
 
 #[tonic::async_trait]
@@ -112,7 +113,7 @@ impl Farm for FarmService {
             .await;
             drop(counted);
         });
-        // At once: a client may wait for this before it says hello.
+        // The answer is immediate, because a client may wait for it before its hello.
         let stream = ReceiverStream::new(stream).map_ok(|response| *response);
         Ok(Response::new(Box::pin(stream)))
     }
@@ -175,7 +176,7 @@ async fn run(
         () = link.stop.cancelled() => Err(Status::unavailable("the coordinator is stopping; reconnect")),
     };
     tracing::info!(worker, session, "worker disconnected");
-    // The actor is gone when the coordinator stops.
+    // The actor is gone if the coordinator is stopping.
     let _ = link
         .commands
         .send(Command::Worker(session, FromWorker::Closed))
@@ -185,7 +186,7 @@ async fn run(
     }
 }
 
-/// The first message, if this worker may work here.
+/// Reads the first message. Returns the hello if this worker may work here.
 async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerHello, Status> {
     let first = tokio::time::timeout(HELLO, input.message())
         .await
@@ -210,7 +211,7 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
     WorkerHello::try_from(hello).map_err(invalid)
 }
 
-/// Where a session listens to its worker.
+/// Receives a worker's messages in its session.
 struct Listener<'a> {
     link: &'a Link,
     session: SessionId,
@@ -220,7 +221,7 @@ struct Listener<'a> {
 }
 
 impl Listener<'_> {
-    /// Passes on what the worker says, until it ends its side.
+    /// Forwards the worker's messages until it closes its side.
     async fn listen(&self, input: &mut Streaming<wire::SessionRequest>) -> Result<(), Status> {
         loop {
             let Some(request) = input.message().await? else {
@@ -251,18 +252,19 @@ impl Listener<'_> {
         }
     }
 
-    /// Answers a heartbeat, if that can be done without the actor; `false` where the actor need not hear of it, because it
-    /// has not come to the one before.
+    /// Answers a heartbeat, if possible without the actor. Returns `false` if the actor need not
+    /// receive it, because the previous one is still waiting.
     async fn beat(&self, leases: &[LeaseRef]) -> Result<bool, Status> {
         let answered = self.beats.answer(leases);
         let behind = self.waiting.count() > 0;
-        // They are in memory together, and a worker sends the next one when it likes.
+        // Waiting heartbeats are all in memory, and the number that a worker sends is not limited.
         while answered.is_none() && self.waiting.count() >= BEATS {
             tokio::time::sleep(PAUSE).await;
         }
         let pass_on = answered.is_none() || !behind;
         if pass_on {
-            // Before the answer: from then on no lease of this session runs out until the actor has come to it.
+            // This comes before the answer. From then on no lease of this session runs out until
+            // the actor has handled the heartbeat.
             self.waiting.arrived();
             self.beats.tell(answered.clone());
         }
@@ -277,12 +279,13 @@ impl Listener<'_> {
     }
 }
 
-/// What a worker says, checked. A report that cannot be used but says what it is about counts as that task's failure: refused
-/// with the session, it would be sent again in the next. Log lines that cannot be used are dropped (the inner error): nobody
-/// waits for an answer to them.
+/// Checks a worker's message. An invalid report that names its task counts as that task's failure;
+/// if it ended the session, the worker would send it again in the next one. Invalid log lines are
+/// dropped (the inner error), because nobody waits for an answer to them.
 ///
 /// # Errors
-/// A message that says nothing at all, which no worker of this version sends: the session ends.
+/// Returns an error for an empty message, which no worker of this version sends. It ends the
+/// session.
 fn checked(
     request: wire::SessionRequest,
 ) -> Result<Result<FromWorker, ConvertError>, ConvertError> {
@@ -340,7 +343,7 @@ fn checked(
     }))
 }
 
-/// Tells the worker what the actor says, until the actor lets it go.
+/// Sends the actor's messages to the worker until the actor ends the session.
 async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out, beats: &Beats) -> Result<(), Status> {
     while let Some(say) = said.recv().await {
         for say in beats.hear(say) {
@@ -352,7 +355,7 @@ async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out, beats: &Beats) -> Resu
     ))
 }
 
-/// What the actor says, on the wire.
+/// Converts a message of the actor to its wire form.
 fn message(say: Say) -> Result<To, Status> {
     Ok(match say {
         Say::Lease(lease) => To::Lease((*lease).into()),

@@ -1,4 +1,4 @@
-//! Service `Jobs`: what clients ask.
+//! Service `Jobs`: the requests of clients.
 
 use std::{pin::Pin, sync::Arc, time::Duration};
 
@@ -25,19 +25,19 @@ use crate::{
     submission::Draft,
 };
 
-/// Least time between two reports to a watcher.
+/// Shortest interval between two reports to a watcher.
 const DEBOUNCE: Duration = Duration::from_millis(250);
-/// Most time between two looks at a watched job.
+/// Longest interval between two reads of a watched job.
 const LOOK: Duration = Duration::from_secs(5);
-/// Events in one answer where the client names no limit, and at most: with the longest messages some 4 MB.
+/// Default and largest number of events in one answer: some 4 MB with the longest messages.
 const EVENTS: u32 = 1_000;
-/// Jobs in one answer where the client names no number, and at most.
+/// Default number of jobs in one answer; the constant below is the largest.
 const JOBS: u32 = 100;
 const MOST_JOBS: u32 = 1_000;
-/// Memory of a line of history or of the audit log, or of a job in a list, while it is read and sent: three times what the
-/// longest but few take.
+/// Memory of a line of history or of the audit log, or of a job in a list, while it is read and
+/// sent: three times the size of all but the longest few.
 const LINE: u64 = 8 << 10;
-/// The same of a worker.
+/// Memory of a worker in a list, while it is read and sent.
 const WORKER: u64 = 4 << 10;
 
 pub(crate) struct JobsService {
@@ -50,7 +50,7 @@ impl JobsService {
         Self { link, quotas }
     }
 
-    /// Reads and checks a spec, beside everything else: a large one takes seconds.
+    /// Reads and checks a spec on a separate thread, because a large one takes seconds.
     async fn draft(
         &self,
         wire: Option<wire::JobSpec>,
@@ -109,7 +109,7 @@ fn wrong(field: &str, what: &str) -> Status {
     Status::invalid_argument(format!("{field}: {what}"))
 }
 
-/// A text that a list is filtered by; empty = not at all.
+/// Reads the text by which a list is filtered; empty means no filter.
 fn filter(text: String, field: &str) -> Result<Option<String>, Status> {
     if text.is_empty() {
         return Ok(None);
@@ -119,7 +119,7 @@ fn filter(text: String, field: &str) -> Result<Option<String>, Status> {
     Ok(Some(text))
 }
 
-/// What a list is to show.
+/// Reads the query of a list.
 fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Status> {
     let state = match wire::JobState::try_from(request.state) {
         Ok(wire::JobState::Unspecified) => None,
@@ -281,12 +281,12 @@ impl Jobs for JobsService {
         let (caller, account) = (caller(&request), account(&request));
         let id = job_id(&request.into_inner().job_id)?;
         self.link.may_see(&caller, id).await?;
-        // A job that does not exist is an error now, not in the stream.
+        // A missing job is an error at once, not in the stream.
         self.link.state(id).await?;
         let (sender, stream) = mpsc::channel(1);
         let link = self.link.clone();
         tokio::spawn(watch_while_allowed(link, caller, account, id, sender));
-        // Charged until it is encoded, and as a part of the answer from then on.
+        // The response is charged until it is encoded, and as a part of the answer from then on.
         let stream = ReceiverStream::new(stream).map_ok(|(response, _charge)| response);
         Ok(Response::new(Box::pin(stream)))
     }
@@ -375,7 +375,7 @@ impl Jobs for JobsService {
             "" => None,
             id => Some(job_id(id)?),
         };
-        // A job that does not exist is an error, not an empty history.
+        // A missing job is an error, not an empty history.
         let ended = match job {
             None => false,
             Some(job) => {
@@ -476,7 +476,7 @@ impl Jobs for JobsService {
     }
 }
 
-/// What a watcher hears, with its charge.
+/// A message to a watcher, with its charge.
 type Watched = Result<(wire::WatchJobResponse, Charge), Status>;
 
 /// Watches until the caller's token is revoked.
@@ -510,7 +510,7 @@ async fn watch(mut link: Link, account: Account, id: JobId, sender: mpsc::Sender
         if last.as_ref() != Some(&status) {
             let job = Some(status.clone().into());
             let response = wire::WatchJobResponse { job };
-            // This one, and the last one to compare it with.
+            // The charge covers this response, and the last one, with which it is compared.
             let bytes = 2 * response.encoded_len() as u64;
             let charged = account.charge("the job's status", bytes).await;
             let over = charged.is_err();

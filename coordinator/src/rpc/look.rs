@@ -1,4 +1,4 @@
-//! Gathering the facts for an explanation.
+//! Collects the facts for an explanation.
 
 use picofarm_catalog::{EventQuery, Owner, ResultSet, Sight};
 use picofarm_proto::{
@@ -19,13 +19,13 @@ use crate::{
 
 /// Lines of a task's history in an answer.
 const EVENTS: u32 = 1_000;
-/// Other jobs whose history is searched for the maker of a result.
+/// Most other jobs searched for the origin of a result.
 const OTHERS: usize = 20;
 
-/// Why a job does not run; and what became of one task, where one is named.
+/// Explains why a job does not run, and the history of one task if one is named.
 ///
 /// # Errors
-/// NOT_FOUND for a job or task that there is not; UNAVAILABLE where the catalog is out of order.
+/// Returns NOT_FOUND for a missing job or task, or UNAVAILABLE if the catalog fails.
 pub(super) async fn explain(
     link: &Link,
     (by, account): (&Caller, &Account),
@@ -117,7 +117,7 @@ pub(super) async fn explain(
     })
 }
 
-/// Of these jobs those that may be seen, and the number of the others.
+/// Returns the visible jobs among these, and the number of the others.
 async fn seen(link: &Link, sight: &Sight, jobs: Vec<JobId>) -> Result<(Vec<JobId>, u64), Status> {
     if *sight == Sight::All {
         return Ok((jobs, 0));
@@ -135,7 +135,7 @@ async fn seen(link: &Link, sight: &Sight, jobs: Vec<JobId>) -> Result<(Vec<JobId
     Ok((seen, unseen))
 }
 
-/// The last line of a job's history that says why a task did not go on, if there is one among its latest.
+/// Returns the last line of a job's recent history that explains an interrupted task, if any.
 async fn setback(link: &Link, job: JobId) -> Result<Option<Event>, Status> {
     const LATEST: u32 = 200;
     let query = EventQuery {
@@ -160,7 +160,7 @@ async fn setback(link: &Link, job: JobId) -> Result<Option<Event>, Status> {
     Ok(events.into_iter().rfind(against))
 }
 
-/// The history of a task: its last lines.
+/// Returns the last lines of a task's history.
 async fn history(link: &Link, stage: StageRef, task: u64) -> Result<Vec<Event>, Status> {
     let query = EventQuery {
         job: Some(stage.job),
@@ -170,14 +170,14 @@ async fn history(link: &Link, stage: StageRef, task: u64) -> Result<Vec<Event>, 
         task: Some(task),
         newest: true,
         logs: false,
-        // The caller may see the job, or it would not be asked.
+        // The caller may see the job, which was checked before.
         sight: Sight::All,
     };
     link.read(move |catalog| async move { catalog.events(&query).await })
         .await
 }
 
-/// The job with the same results under which a task was handed in, and the line that says so.
+/// Returns the job with the same results under which a task was reported, with that history line.
 async fn maker(
     link: &Link,
     sight: &Sight,

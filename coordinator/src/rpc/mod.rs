@@ -1,4 +1,4 @@
-//! The gRPC services. Protobuf types stay in here; behind it is the checked model.
+//! The gRPC services. Protobuf types stay in this module; the rest uses the checked model.
 
 mod beats;
 mod farm;
@@ -34,17 +34,17 @@ pub(crate) use farm::FarmService;
 pub(crate) use jobs::JobsService;
 use rights::no_such_job;
 
-/// What the services share.
+/// State shared by the services.
 #[derive(Clone)]
 pub(crate) struct Link {
     pub commands: mpsc::Sender<Command>,
     pub revision: watch::Receiver<u64>,
     pub catalog: Arc<dyn Catalog>,
     pub stop: CancellationToken,
-    /// What callers see of others' jobs.
+    /// Which jobs of others callers see.
     pub visibility: Visibility,
     pub audit: Audit,
-    /// Names this coordinator, for people.
+    /// Name of this coordinator, for display.
     pub name: Arc<str>,
     pub clock: Clock,
     pub lease_ms: u32,
@@ -54,7 +54,7 @@ pub(crate) struct Link {
 }
 
 impl Link {
-    /// Asks the actor and waits for its answer.
+    /// Sends a request to the actor and waits for its answer.
     pub(crate) async fn ask<T>(
         &self,
         command: impl FnOnce(Reply<T>) -> Command,
@@ -70,7 +70,7 @@ impl Link {
         answer.await.map_err(|_| gone())?.map_err(refused)
     }
 
-    /// Reads the catalog beside the actor.
+    /// Reads the catalog without the actor.
     pub(crate) async fn read<T, F>(
         &self,
         work: impl FnOnce(Arc<dyn Catalog>) -> F + Send + 'static,
@@ -84,14 +84,15 @@ impl Link {
         read.map_err(broken)
     }
 
-    /// A job as people see it.
+    /// Returns a job's status for display.
     pub(crate) async fn status(&self, account: &Account, id: JobId) -> Result<JobStatus, Status> {
         let bytes = self.catalog.spec_bytes(Specs::Job(id)).await;
         let bytes = bytes.map_err(broken)?;
         let what = "reading the job's spec";
         let charge = account.charge(what, stored_cost(bytes)).await?;
         let recorded = self.read(move |catalog| async move {
-            // For as long as the spec is in memory, also where nobody waits for it any more.
+            // The charge lasts as long as the spec is in memory, even if nobody waits for it any
+            // more.
             let _charge = charge;
             Ok(catalog.job(id).await?.map(recorded_status))
         });
@@ -127,7 +128,7 @@ impl Link {
     }
 }
 
-/// A refusal as a caller hears it.
+/// Converts a refusal to the status that a caller receives.
 pub(crate) fn refused(why: Refusal) -> Status {
     match why {
         Refusal::NoSuchJob(id) => no_such_job(id),
@@ -160,7 +161,7 @@ fn broken(error: CatalogError) -> Status {
     }
 }
 
-/// Who called.
+/// Returns the caller of a request.
 fn caller<T>(request: &Request<T>) -> Caller {
     let caller = request.extensions().get::<Caller>();
     caller
@@ -168,13 +169,14 @@ fn caller<T>(request: &Request<T>) -> Caller {
         .clone()
 }
 
-/// Whose memory a request takes.
+/// Returns the account charged for a request.
 fn account<T>(request: &Request<T>) -> Account {
     let account = request.extensions().get::<Account>();
     account.expect("each request is charged").clone()
 }
 
-/// An error as an answer. It may repeat what was sent, and an answer's words are a header, which must not be long.
+/// Converts an error to a status. The error may quote the request, and the message of a status is a
+/// header, which must be short.
 fn invalid(error: ConvertError) -> Status {
     Status::invalid_argument(bounds::message(&error.to_string()))
 }

@@ -1,4 +1,4 @@
-//! The gate before jobs: who may see and change which, and the note of it in the audit log.
+//! Checks who may see and change which job, and records it in the audit log.
 
 use picofarm_catalog::Owner;
 use picofarm_proto::{ids::JobId, model::Act};
@@ -20,7 +20,7 @@ impl Link {
     /// Checks that a caller may see a job.
     ///
     /// # Errors
-    /// NOT_FOUND, in the words for a job that there is not.
+    /// Returns NOT_FOUND with the same message as for a job that does not exist.
     pub(super) async fn may_see(&self, caller: &Caller, job: JobId) -> Result<(), Status> {
         let sight = caller.sight(self.visibility);
         if sight == picofarm_catalog::Sight::All {
@@ -35,7 +35,7 @@ impl Link {
     /// Checks that a caller may change a job.
     ///
     /// # Errors
-    /// PERMISSION_DENIED; NOT_FOUND for a job that it may not see.
+    /// Returns PERMISSION_DENIED, or NOT_FOUND for a job that the caller may not see.
     async fn may_change(&self, caller: &Caller, job: JobId) -> Result<(), Status> {
         if caller.is_admin() {
             return Ok(());
@@ -50,7 +50,7 @@ impl Link {
         Err(Status::permission_denied(not_yours(&job, &owner)))
     }
 
-    /// Lets the actor do something to a job, if the caller may, and notes it.
+    /// Sends a command about a job to the actor, if the caller may change the job, and records it.
     pub(super) async fn steer<T>(
         &self,
         caller: &Caller,
@@ -69,7 +69,7 @@ impl Link {
     }
 }
 
-/// The answer for a job that there is not, or that the caller may not see.
+/// Returns the answer for a job that does not exist or that the caller may not see.
 pub(super) fn no_such_job(job: JobId) -> Status {
     Status::not_found(format!(
         "there is no job {job}; list the jobs to see their ids"

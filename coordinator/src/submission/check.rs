@@ -1,4 +1,4 @@
-//! Which recorded outputs a store is asked about, and which of them count. Pure.
+//! Decides which recorded outputs are checked against a store, and which of them count. Pure.
 
 use std::collections::BTreeMap;
 
@@ -9,32 +9,32 @@ use sha2::{Digest, Sha256};
 use super::files::Elsewhere;
 use crate::{plan::Outputs, stored::Found};
 
-/// Outputs of a stage that are all looked at; of more, those that were found before are sampled.
+/// Up to this many outputs of a stage are all checked. Beyond it, those found before are sampled.
 pub(crate) const ALL: usize = 1_000;
 /// Size of the sample.
 const SAMPLE: usize = 64;
 
-/// What is known of a stage's recorded outputs once its store was asked.
+/// The result of checking a stage's recorded outputs against its store.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Findings {
-    /// How many are recorded.
+    /// Number of recorded outputs.
     pub recorded: u64,
-    /// Those that count, ascending.
+    /// Outputs that count, ascending.
     pub counts: Vec<Run>,
-    /// Those that are gone.
+    /// Outputs missing from the store.
     pub gone: Vec<Recorded>,
-    /// Those in whose place the store holds something else.
+    /// Outputs that differ from their record.
     pub differ: Vec<Recorded>,
-    /// How many nobody has ever looked at, and could not be looked at now.
+    /// Number of outputs that were never checked, and could not be checked now.
     pub unseen: u64,
-    /// Why some could not be looked at.
+    /// The reason why some outputs could not be checked.
     pub why: Option<String>,
     /// What is recorded of other jobs of the same files.
     pub elsewhere: Elsewhere,
 }
 
 impl Findings {
-    /// The records that must go before these tasks can run again.
+    /// Returns the records to delete before these tasks can run again.
     pub(crate) fn dropped(&self, set: &ResultSet) -> Vec<Gone> {
         let lost = self.gone.iter().chain(&self.differ);
         lost.map(|output| Gone {
@@ -62,7 +62,7 @@ impl Findings {
             || (!trusted && self.unseen > 0)
     }
 
-    /// The same in words, for a plan.
+    /// Describes the findings for a plan.
     pub(crate) fn words(&self, stage: &StageSpec, set: &ResultSet) -> Vec<String> {
         let what = match stage.task.writes().is_some() {
             true => "scenes",
@@ -102,8 +102,8 @@ impl Findings {
     }
 }
 
-/// The outputs to ask the store about, by position: those that nobody has looked at, and of the others all or a sample.
-/// `seed` decides the sample.
+/// Returns the positions of the outputs to check: all that were never checked, and all or a sample
+/// of the others. `seed` determines the sample.
 pub(crate) fn choose(recorded: &[Recorded], seed: &str) -> Vec<usize> {
     let (known, unknown): (Vec<usize>, Vec<usize>) =
         (0..recorded.len()).partition(|i| recorded[*i].checked);
@@ -116,7 +116,7 @@ pub(crate) fn choose(recorded: &[Recorded], seed: &str) -> Vec<usize> {
     chosen
 }
 
-/// Those whose hashes with the seed are smallest.
+/// Selects the outputs with the smallest hashes under the seed.
 fn sample(mut from: Vec<usize>, seed: &str) -> Vec<usize> {
     if from.len() > SAMPLE {
         from.sort_by_cached_key(|i| {
@@ -130,17 +130,17 @@ fn sample(mut from: Vec<usize>, seed: &str) -> Vec<usize> {
     from
 }
 
-/// Whether the outputs that were passed over must be asked about too: one of the sample is not there.
+/// Returns whether the remaining outputs must be checked too, because one of the sample is missing.
 pub(crate) fn suspicious(recorded: &[Recorded], found: &BTreeMap<u64, Found>) -> bool {
     recorded
         .iter()
         .any(|o| o.checked && found.get(&o.task).is_some_and(|f| *f != Found::Equal))
 }
 
-/// Why results in a folder that this machine does not have cannot be looked at.
+/// Reason why results in a folder missing from this machine cannot be checked.
 pub(super) const NO_FOLDER: &str = "the coordinator's machine has no such folder (mount the store there, or name the stores it reaches with --check-stores)";
 
-/// What follows from the store's answers, by task.
+/// Derives the findings from the store's answers by task.
 pub(crate) fn judge(
     recorded: &[Recorded],
     found: &BTreeMap<u64, Found>,
@@ -161,7 +161,7 @@ pub(crate) fn judge(
     }
     for output in recorded {
         match found.get(&output.task) {
-            // It was found in this folder before.
+            // The output was found in this folder before.
             Some(Found::NoFolder | Found::NoStore) if output.checked => findings.gone.push(*output),
             Some(Found::NoFolder | Found::NoStore) => findings.unseen += 1,
             Some(Found::Gone) => findings.gone.push(*output),

@@ -1,4 +1,4 @@
-//! A spec that was read and checked, with what follows from it and takes long to find out: once.
+//! A spec that was read and checked once, with the derived values that are slow to compute.
 
 use std::sync::Arc;
 
@@ -19,18 +19,18 @@ pub(crate) struct Draft {
     pub spec: Arc<JobSpec>,
     /// SHA-256 of the spec, hexadecimal.
     pub hash: String,
-    /// Its stages, whose job has no id yet.
+    /// The job's stages, which have no job id yet.
     stages: Vec<StageRecord>,
-    /// Size of the spec as it was sent.
+    /// Size of the spec as it was sent, bytes.
     pub bytes: usize,
-    /// Memory that the job takes until it ends.
+    /// Memory that the job uses until it ends, bytes.
     pub kept: u64,
-    /// Who pays for its memory, until it is dropped.
+    /// The account charged for the draft's memory, until the draft is dropped.
     charged: Option<Arc<(Account, Charge)>>,
 }
 
 impl Draft {
-    /// Hashes the spec: seconds for one of some ten megabytes.
+    /// Hashes the spec, which takes seconds for a spec of tens of megabytes.
     pub(crate) fn new(spec: JobSpec, bytes: usize) -> Self {
         let hash = spec_hash(&spec);
         let spec = Arc::new(spec);
@@ -54,16 +54,16 @@ impl Draft {
         }
     }
 
-    /// The same, whose memory is on this account.
+    /// Returns the draft with its memory charged to this account.
     pub(crate) fn charged(mut self, charged: (Account, Charge)) -> Self {
         self.charged = Some(Arc::new(charged));
         self
     }
 
-    /// Takes memory for specs of this length together that are read because of it.
+    /// Charges the memory for specs of this total length that are read because of the draft.
     ///
     /// # Errors
-    /// There is none, in words.
+    /// Returns the reason if the memory is not available.
     pub(crate) async fn charge(&self, bytes: u64) -> Result<Option<Charge>, String> {
         let Some(charged) = &self.charged else {
             return Ok(None);
@@ -75,8 +75,8 @@ impl Draft {
         }
     }
 
-    /// What tells whether two submissions are the same job: the whole spec, and among whose jobs an equal one is looked for
-    /// (empty = among all).
+    /// Returns the identity of a submission: the hash of the whole spec, and the circle of jobs
+    /// among which an equal one is looked up. An empty circle means all jobs.
     pub(crate) fn identity(&self, circle: &str) -> String {
         match circle {
             "" => self.hash.clone(),
@@ -84,13 +84,12 @@ impl Draft {
         }
     }
 
-    /// Its stages.
+    /// Returns the job's stages.
     pub(crate) fn stages(&self) -> &[StageRecord] {
         &self.stages
     }
 
-    /// The job that it becomes, and that job's stages.
-    /// An equal job is looked for in `circle`.
+    /// Returns the job to be recorded and its stages. An equal job is looked up in `circle`.
     pub(crate) fn job(
         &self,
         id: JobId,

@@ -1,5 +1,6 @@
-//! Adds to a plan what would otherwise be learnt only after the submission: stages that no connected worker can run, settings that
-//! are probably not meant, and estimates of time and bytes. Pure.
+//! Adds information to a plan that would otherwise appear only after the submission: stages that no
+//! connected worker can run, settings that are probably mistakes, and estimates of time and bytes.
+//! Pure.
 
 use picofarm_catalog::{Job, ResultSet, Timing};
 use picofarm_proto::model::{Estimate, JobPlan, JobSpec, StageSpec, TaskSpec};
@@ -10,7 +11,7 @@ use crate::{
     plan::changes,
 };
 
-/// Stages of earlier jobs whose speed is looked up for each stage of a plan.
+/// Earlier stages with speeds to be looked up, for each stage of a plan.
 pub(super) const SIMILAR: usize = 3;
 /// Uncertainty of a speed measured with the same settings, as a factor.
 const SAME: f64 = 1.5;
@@ -25,7 +26,7 @@ const ROOM_PATHS: f64 = 6.0;
 /// Bytes of one bin at rest: 97,432 scenes of 256×256×637 take 1.78 TB (docs/benchmarks.md).
 const BIN_BYTES: f64 = 0.44;
 
-/// Stages of recent jobs that did the same kind of work, the most similar first. At most [`SIMILAR`].
+/// Returns up to [`SIMILAR`] stages of recent jobs with the same kind of work, most similar first.
 pub(super) fn similar<'a>(stage: &StageSpec, recent: &'a [Job]) -> Vec<&'a StageSpec> {
     let same_kind = |other: &&StageSpec| {
         let scenes = |stage: &StageSpec| {
@@ -47,7 +48,7 @@ pub(super) fn similar<'a>(stage: &StageSpec, recent: &'a [Job]) -> Vec<&'a Stage
     found.into_iter().map(|(_, stage)| stage).collect()
 }
 
-/// Relative work of one task: pixels times paths of a render, 1 for other kinds.
+/// Returns the relative work of one task: pixels times paths for a render, 1 for other kinds.
 fn work(stage: &StageSpec) -> f64 {
     match &stage.task {
         TaskSpec::Render(task) => {
@@ -61,7 +62,7 @@ fn work(stage: &StageSpec) -> f64 {
     }
 }
 
-/// Relative size of what one task stores.
+/// Returns the relative size of one task's result.
 fn size(stage: &StageSpec) -> f64 {
     match &stage.task {
         TaskSpec::Render(task) => {
@@ -74,7 +75,7 @@ fn size(stage: &StageSpec) -> f64 {
 /// Estimates for one task: seconds, bytes, and whether they were measured.
 type Estimates = (Option<Estimate>, Option<Estimate>, bool);
 
-/// The estimates for a stage, given the timings of similar stages, the most similar first.
+/// Estimates a stage from the timings of similar stages, most similar first.
 pub(super) fn estimate(
     stage: &StageSpec,
     fit: &Fit,
@@ -109,7 +110,7 @@ pub(super) fn estimate(
     }
 }
 
-/// What the workers mean for a stage that none of them can run; `None` where one can.
+/// Returns why no worker can run a stage; `None` if one can.
 fn unplaceable(fit: &Fit, fits: &Fits) -> Option<String> {
     if fit.able > 0 {
         return None;
@@ -140,7 +141,7 @@ fn unplaceable(fit: &Fit, fits: &Fits) -> Option<String> {
     })
 }
 
-/// The warnings of a plan. Stages with the same warning share a line.
+/// Returns the warnings of a plan. Stages with the same warning share a line.
 pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &Fits) -> Vec<String> {
     const NAMED: usize = 3;
     let mut warnings: Vec<(String, Vec<&str>)> = Vec::new();
@@ -277,7 +278,8 @@ mod tests {
         assert!(
             warnings(&spec, &plan(8), &fits(0, &[], 0, 0))[0].contains("no worker is connected")
         );
-        // Nothing runs, one can run it, or only other coordinators know.
+        // There is no warning if nothing runs, if one worker can run it, or if only other
+        // coordinators know.
         assert!(warnings(&spec, &plan(0), &fits(0, &[why], 3, 0)).is_empty());
         assert!(warnings(&spec, &plan(8), &fits(1, &[why], 3, 0)).is_empty());
         assert!(warnings(&spec, &plan(8), &fits(0, &[], 0, 2)).is_empty());

@@ -1,4 +1,4 @@
-//! What the actor leaves to others: reading jobs that it has heard of, and asking a store who is right.
+//! Runs the slow work of the actor: reading jobs, and checking disputed results against a store.
 
 use picofarm_catalog::{Gone, Recorded, ResultSet};
 use picofarm_proto::{
@@ -31,7 +31,7 @@ impl Aside for Submissions {
         tokio::spawn(async move {
             let ruling = it.judged(&report, dispute).await.unwrap_or(Ruling::Unknown);
             let command = Command::Judged(session, report, ruling);
-            // An actor that is gone needs no answer.
+            // If the actor is gone, it needs no answer.
             let _ = it.commands.send(command).await;
         });
         true
@@ -45,7 +45,7 @@ impl Aside for Submissions {
                 None => Ruling::Stands,
             };
             let command = Command::Judged(session, report, ruling);
-            // An actor that is gone needs no answer.
+            // If the actor is gone, it needs no answer.
             let _ = it.commands.send(command).await;
         });
     }
@@ -63,14 +63,15 @@ impl Aside for Submissions {
                 reports,
                 blind,
             };
-            // An actor that is gone needs no answer.
+            // If the actor is gone, it needs no answer.
             let _ = it.commands.send(command).await;
         });
     }
 }
 
 impl Submissions {
-    /// Drops what is recorded instead of a report on which two workers agree, and says so.
+    /// Drops the recorded result in favour of a report on which two workers agree. Returns the
+    /// message.
     async fn replaced(&self, report: &Finished, dispute: Dispute) -> Option<String> {
         let (catalog, stage) = (self.catalog.clone(), dispute.stage);
         let read = self.lanes.read(move || async move {
@@ -93,7 +94,8 @@ impl Submissions {
         })
     }
 
-    /// If the store holds what is reported, drops what is recorded instead, and says so. `None` if that cannot be found out.
+    /// Drops the recorded result if the store contains the reported one. Returns `None` if this
+    /// cannot be determined.
     async fn judged(&self, report: &Finished, dispute: Dispute) -> Option<Ruling> {
         let mut manifest = [0; 32];
         hex::decode_to_slice(&report.manifest_sha256, &mut manifest).ok()?;
@@ -127,7 +129,7 @@ impl Submissions {
         })
     }
 
-    /// Whether the store holds this result; `None` if that cannot be found out.
+    /// Returns whether the store contains this result; `None` if this cannot be determined.
     async fn holds(
         &self,
         spec: &StageSpec,

@@ -1,4 +1,5 @@
-//! Asking stores, for a bounded time and few at a time: a store that hangs holds up whoever asked about it, once.
+//! Checks stores in bounded time and with bounded concurrency. A store that hangs delays each
+//! caller only once.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -15,21 +16,21 @@ use tokio::{
 
 use crate::stored::{Found, Stored};
 
-/// How long a plan or submission waits for stores.
+/// Longest time that a plan or submission waits for stores.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// How long a worker's report waits for its store.
+/// Longest time that a worker's report waits for its store.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
-/// How long a store that did not answer is not asked again.
+/// Time after which a store that did not answer is tried again.
 const SILENT: Duration = Duration::from_secs(60);
-/// Who may ask one store at a time, and all of them.
+/// Most concurrent checks of one store, and of all stores.
 const EACH: usize = 4;
 const TOGETHER: usize = 32;
-/// Results in one question.
+/// Results in one query.
 const BATCH: usize = 64;
-/// Stores remembered at most.
+/// Most stores remembered.
 const STORES: usize = 1_024;
 
-/// The stores of this coordinator, as far as it may look into them.
+/// The stores that this coordinator may read.
 #[derive(Debug, Clone)]
 pub(crate) struct Stores {
     reader: Option<Arc<dyn Stored>>,
@@ -43,12 +44,12 @@ struct Store {
     silent_until: Option<Instant>,
 }
 
-/// When a report waits no longer for its store, and is committed as unverified.
+/// Returns the time at which a report stops waiting for its store and is committed as unverified.
 pub(crate) fn soon() -> Instant {
     Instant::now() + REPORT_PATIENCE
 }
 
-/// When a plan waits no longer for stores.
+/// Returns the time at which a plan stops waiting for stores.
 pub(crate) fn deadline() -> Instant {
     Instant::now() + PATIENCE
 }
@@ -62,12 +63,13 @@ impl Stores {
         }
     }
 
-    /// Whether any store can be asked.
+    /// Returns whether any store can be checked.
     pub(crate) fn any(&self) -> bool {
         self.reader.is_some()
     }
 
-    /// Asks about recorded outputs of a stage; gives the answers by task, and why there are not more.
+    /// Checks recorded outputs of a stage. Returns the answers by task, and the reason if some are
+    /// missing.
     pub(crate) async fn look(
         &self,
         stage: &StageSpec,
@@ -134,5 +136,5 @@ impl Stores {
     }
 }
 
-/// Why a coordinator that was given nothing to look with does not look.
+/// Reason given by a coordinator without access to any store.
 const UNTOLD: &str = "this coordinator looks into no stores (--check-stores none)";

@@ -1,8 +1,9 @@
-//! Planning and submitting, beside the actor: a spec is compared with what the catalog holds and what the stores hold, and
-//! recorded in one transaction. The actor only hears that there is a job.
+//! Plans and submits jobs outside the actor. A spec is compared with the catalog and the stores,
+//! and is recorded in one transaction. The actor only learns that there is a new job.
 //!
-//! An output counts for a new job if its store was found to hold it. What a worker has reported and nobody has seen since
-//! is laid out as pending, and a worker looks for it. So is what is committed while a job is being planned.
+//! An output counts for a new job if it was found in its store. Outputs that a worker reported and
+//! nobody has checked since are planned as pending, and a worker looks for them. So are outputs
+//! committed while the job is being planned.
 
 mod check;
 mod draft;
@@ -41,12 +42,12 @@ use look::Stores;
 
 pub(crate) use draft::Draft;
 
-/// Jobs that a new one is compared with.
+/// Recent jobs with which a new one is compared.
 const RECENT: u32 = 50;
-/// How often a submission is planned anew because what it counted on has changed meanwhile.
+/// Most attempts to plan a submission again because the catalog changed meanwhile.
 const ATTEMPTS: usize = 4;
 
-/// Plans and submits.
+/// Plans and submits jobs.
 #[derive(Clone)]
 pub(crate) struct Submissions {
     catalog: Arc<dyn Catalog>,
@@ -54,18 +55,18 @@ pub(crate) struct Submissions {
     stores: Stores,
     commands: mpsc::Sender<Command>,
     clock: Clock,
-    /// What callers see of others' jobs.
+    /// Which jobs of others a caller can see.
     visibility: Visibility,
     memory: Arc<Memory>,
-    /// What is known of whether the stores here are those of the workers.
+    /// Evidence of whether the stores here are those of the workers.
     evidence: verify::Evidence,
-    /// Held while a job is counted against its user's quota and recorded.
+    /// Locked while a job is counted against its user's quota and recorded.
     turn: Arc<Mutex<()>>,
 }
 
-/// What the catalog holds of a draft.
+/// The catalog's data about a draft.
 struct Facts {
-    /// By stage.
+    /// Recorded outputs, by stage.
     recorded: Vec<Vec<Recorded>>,
     /// By stage, of jobs with other lists of files; with the outputs that are recorded of them.
     listed: Vec<Vec<(Listed, Vec<Recorded>)>>,
@@ -82,13 +83,13 @@ struct Latest {
     owner: Owner,
 }
 
-/// A draft, considered.
+/// A draft with its plan.
 struct Considered {
     plan: JobPlan,
     latest: Option<Latest>,
-    /// The latest job is done, but its results are not all there.
+    /// Whether the latest job is done but some of its results are missing.
     lost: bool,
-    /// By stage.
+    /// Findings, by stage.
     findings: Vec<Findings>,
     /// Normal forms of others' places that the caller may write into.
     permitted: Vec<String>,
@@ -117,7 +118,7 @@ impl Submissions {
         }
     }
 
-    /// What submitting would do.
+    /// Returns what submitting the draft would do.
     pub(crate) async fn plan(&self, draft: &Arc<Draft>, by: &Caller) -> Result<JobPlan, Refusal> {
         self.in_time(draft)?;
         Ok(self.consider(draft, by).await?.plan)
@@ -167,7 +168,7 @@ impl Submissions {
         Ok(())
     }
 
-    /// Records a job, unless there is one that stands for it. `most`: jobs that the caller may have that have not ended.
+    /// Records a job, unless an existing one is reused. `most` limits the caller's unfinished jobs.
     pub(crate) async fn submit(
         &self,
         draft: &Arc<Draft>,
@@ -187,7 +188,7 @@ impl Submissions {
                     plan: considered.plan,
                 });
             }
-            // It failed or was cancelled, and is asked for again.
+            // The job failed or was cancelled, and is requested again.
             if let Some(job) = latest.filter(|job| job.state != JobState::Done)
                 && !by.may_change(&job.owner)
             {
@@ -258,13 +259,13 @@ impl Submissions {
         })
     }
 
-    /// Takes memory for these specs until the value is dropped.
+    /// Charges the memory for these specs until the value is dropped.
     async fn charge(&self, draft: &Draft, specs: Specs<'_>) -> Result<Option<Charge>, Refusal> {
         let bytes = self.catalog.spec_bytes(specs).await.map_err(broken)?;
         draft.charge(bytes).await.map_err(Refusal::TooMany)
     }
 
-    /// What the catalog holds of it.
+    /// Collects the catalog's data about a draft.
     async fn facts(&self, draft: &Draft, by: &Caller) -> Result<Facts, Refusal> {
         let catalog = &self.catalog;
         let sight = by.sight(self.visibility);
@@ -312,7 +313,8 @@ impl Submissions {
         })
     }
 
-    /// Checks that the caller may write into every place that the job names. Returns others' places among them.
+    /// Checks that the caller may write into every place that the job names. Returns the places
+    /// owned by others.
     async fn permitted(&self, draft: &Draft, by: &Caller) -> Result<Vec<String>, Refusal> {
         let sight = by.sight(self.visibility);
         let owner = Owner {
@@ -325,7 +327,7 @@ impl Submissions {
             let near = self.catalog.owned_near(&mine.place).await.map_err(broken)?;
             for (other, may_write) in places::of_others(&mine, &near, by) {
                 if !may_write {
-                    // The same results may be reused, but none added.
+                    // The same results may be reused, but none may be added.
                     let theirs = self.catalog.largest_stage(&record.set, &other.owner.user);
                     let theirs = theirs.await.map_err(broken)?;
                     if other.place != mine.place || record.tasks > theirs {
@@ -339,7 +341,7 @@ impl Submissions {
         Ok(permitted)
     }
 
-    /// Asks the store of a stage about its recorded outputs.
+    /// Checks a stage's recorded outputs against its store.
     async fn look(
         &self,
         draft: &Draft,
@@ -372,7 +374,7 @@ impl Submissions {
         Ok(check::judge(&recorded, &found, why))
     }
 
-    /// Records the job; `None` where something has changed since it was considered.
+    /// Records the job. Returns `None` if the catalog has changed since the job was considered.
     async fn record(
         &self,
         draft: &Arc<Draft>,
@@ -403,7 +405,7 @@ impl Submissions {
             let dropped = findings.iter().zip(draft.stages());
             let gone: Vec<Gone> = dropped.flat_map(|(f, stage)| f.dropped(&stage.set)).collect();
             let owner = Owner::from(&prepared.job);
-            // Without tokens, everybody is the same caller, and owns nothing.
+            // Without tokens, all users are the same caller, who owns nothing.
             let places = match anyone {
                 true => Vec::new(),
                 false => places::written(&draft.spec.stages, &prepared.stages, &owner),
@@ -451,25 +453,26 @@ impl Submissions {
         Ok(Some(id))
     }
 
-    /// What is said when the catalog could not be written; the actor hears of it, unless what was to be written is at fault.
+    /// Returns the refusal after a failed catalog write. The actor is notified unless the content
+    /// is at fault.
     async fn unwritable(&self, error: CatalogError) -> Refusal {
         if matches!(error, CatalogError::Refused { .. }) {
             return broken(error);
         }
         let why = Refusal::Catalog(error.to_string());
-        // An actor that is gone has heard it already.
+        // If the actor is gone, it already knows.
         let _ = self.commands.send(Command::Broken(error)).await;
         why
     }
 
-    /// Tells the actor of a job that is recorded, and waits until it knows.
+    /// Sends a recorded job to the actor and waits until the actor has added it.
     async fn announce(&self, job: Job, stages: Vec<StageRecord>) -> Result<(), Refusal> {
         let mut timings = Timings::new();
         for stage in &stages {
             let timing = self.catalog.timing(&stage.set).await.map_err(broken)?;
             timings.insert(stage.set.clone(), timing);
         }
-        // A job without anything to run has ended by now.
+        // A job without any task to run has already ended.
         let state = self.catalog.state(job.id).await.map_err(broken)?;
         let learnt = Learnt {
             kept: kept_cost(&job.spec),
@@ -481,13 +484,13 @@ impl Submissions {
         let (reply, answer) = tokio::sync::oneshot::channel();
         let command = Command::Learn(learnt.map(Box::new), reply);
         if self.commands.send(command).await.is_ok() {
-            // An actor between two lives finds the job in the catalog.
+            // If the actor is between two lives, it finds the job in the catalog.
             let _ = answer.await;
         }
         Ok(())
     }
 
-    /// Tells the actor of a job that it has heard of, if the job is active.
+    /// Sends the actor a job that it does not know yet, if the job is active.
     pub(crate) async fn learn(&self, id: JobId) -> Result<(), Refusal> {
         let it = self.clone();
         self.lanes
@@ -503,7 +506,7 @@ impl Submissions {
             .await
     }
 
-    /// Runs work on a draft beside everything else.
+    /// Runs slow work on a draft on a separate thread.
     async fn heavy<T, F>(
         &self,
         draft: &Arc<Draft>,

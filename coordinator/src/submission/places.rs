@@ -1,12 +1,13 @@
-//! Whose the places are that a job writes into. They belong to their first submitter. Jobs of others may only reuse what is
-//! there.
+//! Ownership of the places that a job writes into. A place belongs to its first submitter. Jobs of
+//! other users may only reuse its results.
 
 use picofarm_catalog::{OwnedPlace, Owner, Sight, StageRecord};
 use picofarm_proto::model::{Destination, SpecError, StageSpec};
 
 use crate::auth::Caller;
 
-/// The places that the stages of a job write into, each with its stage's position. `owner` submits the job.
+/// Returns the places that a job's stages write into, each with its stage's position. `owner`
+/// submits the job.
 pub(super) fn written(
     specs: &[StageSpec],
     stages: &[StageRecord],
@@ -28,13 +29,13 @@ pub(super) fn written(
     places
 }
 
-/// The places of others `near` the place `mine`, each with whether `by` may write there.
+/// Returns others' places `near` the place `mine`, each with whether `by` may write there.
 pub(super) fn of_others<'a>(
     mine: &OwnedPlace,
     near: &'a [OwnedPlace],
     by: &Caller,
 ) -> Vec<(&'a OwnedPlace, bool)> {
-    // Who owns a data set may change every record in it.
+    // The owner of a data set may change every record in it.
     let owns_around = mine.record
         && near
             .iter()
@@ -45,7 +46,8 @@ pub(super) fn of_others<'a>(
         .collect()
 }
 
-/// The error for a stage that would write into `other`, which somebody else owns. `sight` decides what is told of it.
+/// Returns the error for a stage that would write into another owner's place `other`. `sight`
+/// decides how much the error reveals.
 pub(super) fn refused(
     stage: &StageSpec,
     mine: &OwnedPlace,

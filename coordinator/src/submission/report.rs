@@ -1,4 +1,4 @@
-//! What submitting a draft would do, in the words of a plan.
+//! Describes the effect of submitting a draft, as a plan.
 
 use picofarm_catalog::Job;
 use picofarm_proto::{ids::JobId, model::JobPlan};
@@ -6,8 +6,8 @@ use picofarm_proto::{ids::JobId, model::JobPlan};
 use super::{Draft, check::Findings};
 use crate::plan;
 
-/// The plan, given for each stage what was found of its outputs, the job that has this spec, and recent jobs. If that job is
-/// done and `stands`, submitting answers with it, and nothing runs.
+/// Creates the plan from the findings for each stage, the job with this spec, and recent jobs. If
+/// that job is done and `stands`, the submission returns it and nothing runs.
 pub(super) fn plan(
     draft: &Draft,
     findings: &[Findings],

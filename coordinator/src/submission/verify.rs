@@ -1,9 +1,10 @@
-//! Looks for reported results in their stores before they are committed.
+//! Checks reported results against their stores before they are committed.
 //!
-//! A report is only refused if this coordinator surely sees the store that the worker writes to: it found another result
-//! there before and still finds it, or a single worker contradicts a store whose folder exists here (or, if the worker is on
-//! this machine, whose folder should). If it finds nothing of what two workers report, it takes itself for the one that sees
-//! another disk, and commits the results as unverified.
+//! A report is refused only if this coordinator certainly sees the store that the worker writes to.
+//! This is so if it found another result there before and still finds it. It is also so if a single
+//! worker contradicts a store with a folder that exists here, or that should exist here because the
+//! worker is on this machine. If it finds none of the results that two workers report, it assumes
+//! that it sees another disk, and commits the results as unverified.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -20,31 +21,33 @@ use picofarm_proto::{
 use super::{Submissions, look};
 use crate::{actor::Verdict, core::Reported, stored::Found};
 
-/// A result that is missing is looked for again after so long: a network's file system may show it late.
+/// Delay before a missing result is looked up again, because a network file system may show it
+/// late.
 const AGAIN: Duration = Duration::from_millis(500);
-/// Stores remembered at most.
+/// Most stores remembered.
 const STORES: usize = 1_024;
 
-/// What is known of whether this coordinator sees the stores of its workers.
+/// Evidence of whether this coordinator sees the stores of its workers.
 pub(super) type Evidence = Arc<Mutex<HashMap<String, Seen>>>;
 
-/// What this coordinator has seen of a store.
+/// This coordinator's evidence about a store.
 #[derive(Debug, Default)]
 pub(super) struct Seen {
-    /// A result that it found there.
+    /// A result that was found in the store.
     witness: Option<(Arc<JobSpec>, StageRef, Recorded)>,
-    /// Workers whose reports it did not find before it found any.
+    /// Workers with missing results, before the first result was found.
     doubted: BTreeSet<WorkerId>,
 }
 
 impl Submissions {
-    /// What the store holds of reported results, and whether it turned out to be another one than that of the workers.
+    /// Checks reported results against the store. Also returns whether the store turned out not to
+    /// be the workers' one.
     pub(super) async fn verified(
         &self,
         store: &str,
         reports: Vec<Reported>,
     ) -> (Vec<(Reported, Verdict)>, bool) {
-        // Two reports of one task are two questions.
+        // Two reports of one task are checked separately.
         let mut questions: BTreeMap<(StageRef, usize), Vec<Reported>> = BTreeMap::new();
         let mut seen = HashMap::new();
         for reported in reports {
@@ -95,7 +98,7 @@ impl Submissions {
         (verdicts, blind)
     }
 
-    /// What the store holds, by report; `None` if it could not be asked.
+    /// Returns the store's answer to each report; `None` if the store could not be checked.
     async fn find(&self, store: &str, reports: &[Reported]) -> Vec<Option<Found>> {
         let Some(first) = reports.first() else {
             return Vec::new();
@@ -114,7 +117,7 @@ impl Submissions {
             .collect()
     }
 
-    /// The verdict on a result that the store does not hold as it was reported.
+    /// Returns the verdict on a result that the store does not contain as reported.
     async fn missing(&self, store: &str, reported: &Reported, what: &str) -> Verdict {
         let witness = self.seen(store, |seen| seen.witness.clone());
         let sure = match witness {
@@ -150,7 +153,7 @@ impl Submissions {
         ))
     }
 
-    /// Why what a store holds here says nothing: nothing was found of what workers reported.
+    /// Returns why the store's content is no evidence: none of the workers' results were found.
     pub(super) fn sees_another_disk(&self, store: &str) -> Option<String> {
         let blind = self.seen(store, |seen| {
             seen.witness.is_none() && seen.doubted.len() >= 2
@@ -171,10 +174,10 @@ impl Submissions {
     }
 }
 
-/// A reported result as a store is asked about it.
+/// Returns a reported result in the form in which a store is checked.
 fn witness(reported: &Reported) -> (Arc<JobSpec>, StageRef, Recorded) {
     let mut manifest = [0; 32];
-    // A hash that cannot be read equals none; the core refuses the report for it.
+    // An invalid hash equals no other; the core refuses the report because of it.
     let _ = hex::decode_to_slice(&reported.report.manifest_sha256, &mut manifest);
     let result = Recorded {
         task: reported.report.index,

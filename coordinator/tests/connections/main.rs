@@ -1,5 +1,5 @@
-//! What connections may do to a coordinator: hundreds that say nothing, slow ones, idle ones; and certificates that change
-//! while it runs.
+//! Harmful connections to a coordinator: hundreds of silent ones, slow ones, idle ones. Also
+//! certificates that change while it runs.
 
 mod memory;
 mod pages;
@@ -27,7 +27,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 use uuid::Uuid;
 
-/// Nothing that works takes so long; what is shut out takes longer.
+/// Longer than any successful operation takes, and shorter than the wait of an excluded client.
 const PATIENCE: Duration = Duration::from_secs(20);
 
 struct Server {
@@ -46,7 +46,7 @@ async fn start(folder: &Path, change: impl FnOnce(&mut CoordinatorConfig)) -> Se
 }
 
 impl Server {
-    /// The body of a page.
+    /// Returns the body of a page.
     async fn page(&self, path: &str) -> String {
         let whole = async {
             let mut stream = TcpStream::connect(self.running.http.unwrap())
@@ -74,7 +74,7 @@ impl Server {
     }
 }
 
-/// A worker's session up to the welcome, and a call of a client.
+/// Opens a worker's session up to the welcome, and makes a client's call.
 async fn works(channel: Channel) {
     let (say, said) = tokio::sync::mpsc::channel(4);
     let hello = wire::Hello {
@@ -113,14 +113,14 @@ async fn silent_and_slow_clients_shut_nobody_out() {
         config.connections = Connections {
             all: 60,
             per_address: Some(50),
-            // Longer than the test: that they are silent is no help.
+            // Longer than the test, so that silence alone does not end the connections.
             first_request: Duration::from_secs(3_600),
             ..Connections::default()
         };
     })
     .await;
     let mut silent = server.silent(200).await;
-    // Some of them say hello and nothing more.
+    // Some of them complete the handshake and send nothing more.
     let mut shaken = Vec::new();
     for socket in silent.drain(150..) {
         shaken.push(tokio::spawn(ours.handshake(socket)));
@@ -140,7 +140,7 @@ async fn silent_and_slow_clients_shut_nobody_out() {
         .await
         .unwrap();
     works(channel.clone()).await;
-    // They come again and again, and who has had a request stays.
+    // They keep reconnecting, and a client that has had a request stays.
     let more = server.silent(200).await;
     works(channel).await;
     server.page("/metrics").await;
@@ -176,18 +176,18 @@ async fn silence_ends_a_connection_and_open_streams_keep_one() {
     let mut watch = jobs.watch_job(watch).await.unwrap().into_inner();
     watch.message().await.unwrap().unwrap();
     for mut socket in server.silent(20).await {
-        // The server's settings, and then an end or a reset.
+        // The connection ends after the server's settings, cleanly or with a reset.
         let end = timeout(PATIENCE, socket.read_to_end(&mut Vec::new())).await;
         let _ = end.expect("it is closed in time");
     }
     tokio::time::sleep(Duration::from_millis(1_200)).await;
-    // The stream that was quiet for several times as long as may be is there still.
+    // The stream that was quiet for several times the limit is still open.
     let cancel = wire::CancelJobRequest { job_id };
     jobs.cancel_job(cancel).await.unwrap();
     let heard = timeout(PATIENCE, watch.message()).await.unwrap().unwrap();
     assert!(heard.unwrap().job.unwrap().ended_at_ms > 0);
     drop(watch);
-    // Without streams the connection ends, and a client that needs one opens another.
+    // A connection without streams ends, and a client that needs one opens another.
     tokio::time::sleep(Duration::from_millis(1_200)).await;
     works(channel).await;
 }
@@ -225,7 +225,7 @@ async fn new_certificates_are_used_without_a_restart_and_bad_ones_are_not() {
     let before = until_connected(&old, port, Some(&old)).await;
     assert!(new.channel(port, Some(&old)).await.is_err());
 
-    // Certificate and client authority both change.
+    // The certificate and the client authority both change.
     new.serve(folder.path(), Some(&new));
     let after = until_connected(&new, port, Some(&new)).await;
     works(after).await;
@@ -242,13 +242,14 @@ async fn new_certificates_are_used_without_a_restart_and_bad_ones_are_not() {
         }
     };
     assert!(refused, "the old authority's clients are let in still");
-    // Nor is one that was connected before: it may have been revoked with its authority.
+    // An earlier connection is refused too, because its client may have been revoked with its
+    // authority.
     let info = wire::GetServerInfoRequest {};
     let refused = JobsClient::new(before).get_server_info(info).await;
     let refused = refused.expect_err("the old authority's clients are let in still");
     assert!(refused.message().contains("connect again"), "{refused}");
 
-    // The key of another certificate; the present ones stay in force.
+    // This key belongs to another certificate, so the current ones stay in force.
     std::fs::write(folder.path().join("server.pem"), old.pem()).unwrap();
     tokio::time::sleep(Duration::from_secs(4)).await;
     works(until_connected(&new, port, Some(&new)).await).await;

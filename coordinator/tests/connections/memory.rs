@@ -1,4 +1,4 @@
-//! What callers can make a coordinator hold at a time.
+//! The memory that callers can make a coordinator use.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use crate::{PATIENCE, Server, start, works};
 
 const MIB: u64 = 1 << 20;
 
-/// A text that is no spec, of so many short strings: it is charged before that is found out.
+/// Returns a text of many short strings. It is no spec, but the charge comes before that check.
 fn dense(strings: usize) -> wire::PlanJobRequest {
     let json = format!("[{}\"a\"]", "\"a\",".repeat(strings));
     wire::PlanJobRequest {
@@ -57,7 +57,7 @@ async fn large_specs_of_many_connections_are_admitted_by_what_they_cost() {
     }
     let most = metric(&server, "request_memory_most_bytes").await;
     assert!((32 * MIB..=96 * MIB).contains(&most), "{most}");
-    // One that could never be read is refused at once, and its message says what to do.
+    // A request that could never be read is refused at once with a remedy.
     let refused = plan(connect(&server).await, dense(3 << 20)).await;
     assert_eq!(refused.code(), Code::ResourceExhausted, "{refused:?}");
     assert!(refused.message().contains("--memory-mib"), "{refused:?}");

@@ -1,4 +1,4 @@
-//! What the HTTP endpoint says to requests of every sort, and to what is no request.
+//! Answers of the HTTP endpoint to requests of all kinds, and to invalid ones.
 
 use std::time::Duration;
 
@@ -23,8 +23,8 @@ async fn start(folder: &tempfile::TempDir) -> Running {
     serve(config, CancellationToken::new()).await.unwrap()
 }
 
-/// Everything that comes until the connection ends. It may end with a reset, because the server closes without having read
-/// what it refuses.
+/// Returns everything received until the connection ends. It may end with a reset, because the
+/// server closes without reading the rest of a refused request.
 async fn heard(stream: &mut TcpStream) -> String {
     let mut bytes = Vec::new();
     let end = timeout(PATIENCE, stream.read_to_end(&mut bytes)).await;
@@ -34,7 +34,7 @@ async fn heard(stream: &mut TcpStream) -> String {
 
 async fn answer(to: &Running, request: impl AsRef<[u8]>) -> String {
     let mut stream = TcpStream::connect(to.http.unwrap()).await.unwrap();
-    // A server that has heard enough may close before everything is written.
+    // The server may close before everything is written.
     let _ = stream.write_all(request.as_ref()).await;
     heard(&mut stream).await
 }
@@ -43,7 +43,7 @@ fn code(answer: &str) -> &str {
     answer.split(' ').nth(1).unwrap_or_default()
 }
 
-/// The value of a header, whatever the case of its name.
+/// Returns the value of a header, ignoring the case of its name.
 fn header<'a>(answer: &'a str, name: &str) -> Option<&'a str> {
     let head = answer.split("\r\n\r\n").next()?;
     head.lines()
@@ -81,7 +81,7 @@ async fn pages_are_for_get_and_head() {
     ] {
         let answer = answer(&running, request).await;
         assert_eq!(code(&answer), expected, "{request:?}: {answer}");
-        // HTTP/1.0 closes unless told otherwise.
+        // HTTP/1.0 closes by default.
         if request.contains("HTTP/1.1") {
             assert_eq!(header(&answer, "connection"), Some("close"), "{answer}");
         }
@@ -158,7 +158,7 @@ async fn a_head_may_have_eight_kibibytes() {
         let answer = answer_to(long).await;
         assert_eq!(code(&answer), "431", "{long}: {answer}");
     }
-    // One without an end is cut off long before that.
+    // A request without an end is cut off much earlier.
     let mut stream = TcpStream::connect(running.http.unwrap()).await.unwrap();
     let endless = async { while stream.write_all(&[b'x'; 1 << 16]).await.is_ok() {} };
     timeout(PATIENCE, endless).await.expect("it is cut off");

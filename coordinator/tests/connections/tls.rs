@@ -24,7 +24,7 @@ impl Authority {
         self.0.pem()
     }
 
-    /// A certificate for localhost, and its key.
+    /// Returns a certificate for localhost and its key.
     fn pair(&self) -> (String, String) {
         let mut params = CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
         params
@@ -51,7 +51,7 @@ impl Authority {
         }
     }
 
-    /// A connection of a client that trusts this authority, with a certificate of `client`.
+    /// Connects a client that trusts this authority, with a certificate of `client`.
     pub async fn channel(&self, port: u16, client: Option<&Self>) -> Result<Channel, Error> {
         let mut tls = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(self.pem()));
         if let Some(client) = client {
@@ -62,7 +62,7 @@ impl Authority {
         Endpoint::from_shared(url)?.tls_config(tls)?.connect().await
     }
 
-    /// A handshake, after which nothing is said.
+    /// Makes a handshake and sends nothing afterwards.
     pub fn handshake(
         &self,
         socket: TcpStream,

@@ -1,5 +1,5 @@
-//! A catalog's file on a full disk, deleted, or replaced while the coordinator runs: nothing is taken that is not durable, the
-//! coordinator says what is the matter, and goes on by itself when it can.
+//! The catalog's file is on a full disk, deleted, or replaced while the coordinator runs. Only
+//! durable work is accepted, the coordinator reports the fault, and it recovers by itself.
 
 use std::{path::PathBuf, process::Command};
 
@@ -8,11 +8,11 @@ use picofarm_proto::{model::JobState, wire};
 
 use crate::harness::{Farm, catalog_of, rendering, spec};
 
-/// A small file system; unmounted with the value.
+/// A small file system, unmounted when the value is dropped.
 struct Disk(tempfile::TempDir);
 
 impl Disk {
-    /// `None`, with a word on stderr, where the system does not let us mount one.
+    /// Mounts a disk. Returns `None`, with a note on stderr, if the system does not allow mounting.
     fn mount() -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         let tried = Command::new("mount")
@@ -28,7 +28,7 @@ impl Disk {
         }
     }
 
-    /// Writes until nothing goes in any more.
+    /// Writes until the disk is full.
     fn fill(&self) {
         use std::io::Write;
         let mut file = std::fs::File::create(self.0.path().join("ballast")).unwrap();
@@ -46,11 +46,11 @@ impl Drop for Disk {
     }
 }
 
-/// Submits a job that the coordinator cannot take now; returns its words.
+/// Submits a job that the coordinator cannot accept now. Returns the message.
 async fn refused(farm: &mut Farm, n: u64) -> String {
     let mut job = spec(3);
     rendering(&mut job).output.dataset = format!("refused-{n}");
-    // A long one, so that no page that is there already holds it.
+    // A long text, so that it fits no existing page.
     rendering(&mut job).render.renderer = "r".repeat(4_000);
     let request = wire::SubmitJobRequest {
         spec: Some(job.into()),
@@ -74,7 +74,7 @@ async fn a_full_disk_makes_it_unready_until_there_is_room_and_loses_nothing() {
     let lease = worker.lease().await;
     assert!(worker.done(&lease, lease.lo).await.accepted);
     disk.fill();
-    // Whatever fills the pages that are there already is durable; then there is no more room.
+    // Text that fits into existing pages is durable. Afterwards there is no room.
     for n in 0.. {
         let mut job = spec(1);
         rendering(&mut job).output.dataset = format!("filler-{n}");
@@ -88,7 +88,7 @@ async fn a_full_disk_makes_it_unready_until_there_is_room_and_loses_nothing() {
         }
     }
     farm.until_ready(Some("the catalog's disk is full")).await;
-    // It stays so: no life begins that could not keep a promise.
+    // The state persists: no life begins that could not keep a promise.
     for n in 0..60 {
         let (status, words) = farm.readiness().await;
         assert!(

@@ -1,4 +1,4 @@
-//! A coordinator with a clock of its own, a client, and a worker that does what the test says.
+//! A coordinator with its own clock, a client, and a worker scripted by the test.
 
 use std::{
     collections::BTreeMap,
@@ -33,28 +33,28 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming, transport::Channel};
 use uuid::Uuid;
 
-/// Life of a lease in these tests, in milliseconds of the test's clock.
+/// Duration of a lease in these tests, in milliseconds of the test's clock.
 pub const LEASE_MS: u32 = 60_000;
-/// Nothing here takes long; a test that waits longer has failed.
+/// No operation takes this long; a test that waits longer has failed.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// A store as a test wants it: it holds what is reported, but for the exceptions.
+/// A scripted store. It contains every reported result, with exceptions.
 #[derive(Debug, Default)]
 pub struct FakeStore {
-    /// What it holds instead, by task; `None`: nothing.
+    /// Different manifests by task; `None` for a missing result.
     pub instead: Mutex<BTreeMap<u64, Option<[u8; 32]>>>,
-    /// Why it cannot be read.
+    /// The reason why the store cannot be read.
     pub closed: Mutex<Option<String>>,
-    /// It never answers.
+    /// Whether the store never answers.
     pub hangs: AtomicBool,
-    /// This machine has no such folder.
+    /// Whether this machine has no such folder.
     pub absent: AtomicBool,
-    /// How many results it was asked about.
+    /// Number of results checked.
     pub asked: AtomicUsize,
 }
 
 impl FakeStore {
-    /// From now on it holds this of a task.
+    /// Sets the manifest that the store contains for a task.
     pub fn put(&self, task: u64, manifest: Option<[u8; 32]>) {
         self.instead.lock().unwrap().insert(task, manifest);
     }
@@ -94,10 +94,10 @@ impl Stored for FakeStore {
 
 pub struct Farm {
     _folder: tempfile::TempDir,
-    /// What the coordinator takes for the store.
+    /// The store that the coordinator reads.
     pub stored: Arc<FakeStore>,
     pub clock: Arc<AtomicI64>,
-    /// How long the coordinator was suspended.
+    /// Time for which the coordinator was suspended.
     slept: Arc<AtomicI64>,
     pub config: CoordinatorConfig,
     catalog: CatalogPlace,
@@ -111,7 +111,7 @@ impl Farm {
         Self::start_on(None).await
     }
 
-    /// A farm on each kind of catalog: SQLite, and Postgres where there is one for tests.
+    /// Starts a farm on each kind of catalog: SQLite, and Postgres if a test server is available.
     pub async fn start_on_each() -> Vec<Self> {
         let mut farms = vec![Self::start().await];
         if let Some(url) = picofarm_database::testing::postgres().await {
@@ -161,7 +161,7 @@ impl Farm {
         self.running.as_ref().unwrap().address
     }
 
-    /// The status line and the text of `/readyz`.
+    /// Returns the status line and the text of `/readyz`.
     pub async fn readiness(&self) -> (String, String) {
         use tokio::io::{AsyncReadExt, AsyncWriteExt};
         let address = self.running.as_ref().unwrap().http.unwrap();
@@ -176,7 +176,7 @@ impl Farm {
         (head.lines().next().unwrap().to_owned(), body.to_owned())
     }
 
-    /// Waits until it is ready, or not ready with these words.
+    /// Waits until the coordinator is ready, or not ready with this message.
     pub async fn until_ready(&self, unready: Option<&str>) {
         let start = std::time::Instant::now();
         loop {
@@ -216,7 +216,7 @@ impl Farm {
         self.clock.fetch_add(ms, Ordering::SeqCst);
     }
 
-    /// Time that passes while the coordinator's machine is suspended.
+    /// Advances the time while the coordinator's machine is suspended.
     pub fn suspend(&self, ms: i64) {
         self.slept.fetch_add(ms, Ordering::SeqCst);
     }
@@ -247,7 +247,7 @@ impl Farm {
         response.job.unwrap().try_into().unwrap()
     }
 
-    /// Waits until the job is as wanted.
+    /// Waits until the job's status satisfies the condition.
     pub async fn until(&mut self, job: &str, what: impl Fn(&JobStatus) -> bool) -> JobStatus {
         let start = std::time::Instant::now();
         loop {
@@ -297,7 +297,7 @@ async fn run(
     Ok((running, stop, jobs))
 }
 
-/// A worker that fits [`spec`].
+/// Returns the hello of a worker that can run [`spec`].
 pub fn hello(name: &str) -> WorkerHello {
     WorkerHello {
         id: WorkerId::from_uuid(Uuid::new_v4()),
@@ -328,7 +328,7 @@ pub fn spec(count: u64) -> JobSpec {
     serde_json::from_str(&text).unwrap()
 }
 
-/// The rendering of a job's first stage.
+/// Returns the render task of a job's first stage.
 pub fn rendering(spec: &mut JobSpec) -> &mut RenderTask {
     match &mut spec.stages[0].task {
         TaskSpec::Render(task) => task,
@@ -336,7 +336,7 @@ pub fn rendering(spec: &mut JobSpec) -> &mut RenderTask {
     }
 }
 
-/// The manifest hash that an honest worker reports for a task.
+/// Returns the manifest hash that an honest worker reports for a task.
 pub fn manifest(index: u64) -> String {
     format!("{index:064x}")
 }
@@ -378,7 +378,7 @@ impl Worker {
         self.say.send(request).await.unwrap();
     }
 
-    /// The next message.
+    /// Returns the next message.
     pub async fn hear(&mut self) -> Result<Heard, Status> {
         let message = tokio::time::timeout(PATIENCE, self.heard.message())
             .await
@@ -391,7 +391,7 @@ impl Worker {
         self.say(Say::Credit(wire::Credit { leases })).await;
     }
 
-    /// Asks for one lease and waits for it.
+    /// Requests one lease and waits for it.
     pub async fn lease(&mut self) -> Lease {
         self.credit(1).await;
         match self.hear().await.unwrap() {
@@ -400,7 +400,7 @@ impl Worker {
         }
     }
 
-    /// Reports a task and waits for no answer.
+    /// Reports a task without waiting for an answer.
     pub async fn say_done(&mut self, lease: &Lease, index: u64, manifest: &str) {
         let done = wire::TaskDone {
             lease: Some(lease.lease.into()),
@@ -445,7 +445,7 @@ impl Worker {
         self.acknowledged().await
     }
 
-    /// Names leases and the task in hand; returns those that live on.
+    /// Sends a heartbeat with leases and the running task. Returns the live leases.
     pub async fn beat(&mut self, leases: &[&Lease], in_hand: Option<u64>) -> Vec<wire::LeaseRef> {
         self.say(Say::Heartbeat(wire::Heartbeat {
             leases: leases.iter().map(|l| l.lease.into()).collect(),

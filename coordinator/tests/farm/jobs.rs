@@ -1,4 +1,4 @@
-//! Jobs as their owner sees them.
+//! Jobs from their owner's point of view.
 
 use picofarm_proto::{model::JobState, wire};
 use tonic::Code;
@@ -52,7 +52,7 @@ async fn a_larger_job_reuses_the_outputs_of_a_smaller_one() {
     assert_eq!((status.tasks.reused, status.tasks.pending), (8, 8));
     let status = worker.work(&mut farm, &large).await;
     assert_eq!((status.tasks.done, status.tasks.reused), (16, 8));
-    // All of it exists now: nothing runs.
+    // All results exist now, so that nothing runs.
     let mut other = spec(16);
     other.name = "another name".into();
     let third = farm.submit(&other).await.job_id;
@@ -75,7 +75,7 @@ async fn a_job_that_would_mix_settings_in_one_data_set_is_refused() {
     for part in ["output.dataset", &first, "render.bins"] {
         assert!(refused.message().contains(part), "{}", refused.message());
     }
-    // Another data set is another matter.
+    // Another data set gives a different job.
     rendering(&mut other).output.dataset = "elsewhere".into();
     assert!(!farm.submit(&other).await.existed);
 }
@@ -175,7 +175,7 @@ async fn a_failed_task_waits_before_it_is_tried_again() {
     let lease = worker.lease().await;
     worker.fail(&lease, 0, wire::FailureKind::User).await;
     worker.credit(1).await;
-    // A heartbeat is answered before any lease: the task still waits.
+    // A heartbeat is answered before any lease is granted, and the task still waits.
     assert!(worker.beat(&[], None).await.is_empty());
     farm.pass(1_000);
     let again = match worker.hear().await.unwrap() {

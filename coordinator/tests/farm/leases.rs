@@ -1,4 +1,5 @@
-//! Fencing: whoever lost a lease changes nothing any more, whoever still has it loses nothing.
+//! Fencing: a worker that lost a lease changes nothing, and a worker that still has one loses
+//! nothing.
 
 use picofarm_database::{CatalogPlace, testing::hold_writes};
 use picofarm_proto::{
@@ -26,7 +27,7 @@ async fn a_report_after_expiry_is_refused() {
     assert!(!slow.done(&lease, 0).await.accepted);
     assert!(other.done(&second, 0).await.accepted);
     assert_eq!(farm.until_ended(&job).await.state, JobState::Done);
-    // The job has ended: the output stands, and nobody needs another word about it.
+    // The job has ended: the output counts, and no further message is needed.
     let late = slow.done(&lease, 0).await;
     assert!(
         !late.accepted && late.reason.contains("ended"),
@@ -44,7 +45,8 @@ async fn a_heartbeat_keeps_a_lease() {
     for _ in 0..3 {
         farm.pass(i64::from(LEASE_MS) - 1_000);
         assert_eq!(worker.beat(&[&lease], Some(0)).await.len(), 1);
-        // The session answers before the actor has heard; the actor answers calls in order.
+        // The session answers before the actor has received the heartbeat. The actor answers calls
+        // in order.
         farm.status(&job).await;
     }
     assert!(worker.done(&lease, 0).await.accepted);
@@ -61,7 +63,7 @@ async fn a_heartbeat_does_not_wait_for_the_catalog() {
         panic!("this farm's catalog is a file");
     };
     let held = hold_writes(&path).await;
-    // What the actor now waits for.
+    // The actor now waits for this commit.
     worker.say_done(&lease, lease.lo, &manifest(lease.lo)).await;
     for _ in 0..5 {
         assert_eq!(worker.beat(&[&lease], None).await, [lease.lease.into()]);
@@ -76,10 +78,11 @@ async fn a_suspend_of_the_coordinator_ends_no_lease() {
     let job = farm.submit(&spec(2)).await.job_id;
     let mut worker = farm.worker().await;
     let lease = worker.lease().await;
-    // A night; the worker was awake, or slept as well.
+    // The coordinator sleeps for a night. The worker was awake or slept too.
     farm.suspend(500 * i64::from(LEASE_MS));
     assert_eq!(worker.beat(&[&lease], Some(lease.lo)).await.len(), 1);
-    // Its connection breaks, and it takes longer to come back than a worker may whose process ended.
+    // The connection breaks, and the worker takes longer to reconnect than a worker with a dead
+    // process may.
     farm.suspend(500 * i64::from(LEASE_MS));
     farm.until(&job, |status| status.tasks.leased > 0).await;
     let mut again = worker.hello.clone();
@@ -95,7 +98,7 @@ async fn a_suspend_of_the_coordinator_ends_no_lease() {
     let events = farm.events(&job, None).await;
     let expired = events.iter().any(|e| e.kind() == wire::EventKind::Expired);
     assert!(!expired, "{events:?}");
-    // What was graced lasts no longer than any lease.
+    // Extended leases last no longer than any lease.
     assert!(worker.beat(&[&lease], None).await.is_empty());
     if farm.status(&job).await.state == JobState::Active {
         let rest = worker.lease().await;
@@ -128,7 +131,7 @@ async fn a_restarted_worker_is_not_its_predecessor() {
     let mut second = farm.connect(again).await.unwrap();
     assert_eq!(second.revoked().await.lease, Some(lease.lease.into()));
     assert!(!second.done(&lease, 0).await.accepted);
-    // The loss counts as a crash of the task in hand, at once.
+    // The loss counts at once as a crash of the running task.
     let events = farm.events(&job, Some(0)).await;
     assert!(events.iter().any(|e| e.kind() == wire::EventKind::Failed));
     assert!(first.hear().await.is_err(), "the older session has ended");
@@ -185,7 +188,7 @@ async fn two_different_results_of_a_task_are_an_alarm() {
     let mut worker = farm.worker().await;
     let lease = worker.lease().await;
     assert!(worker.done(&lease, lease.lo).await.accepted);
-    // The store cannot tell who is right.
+    // The store cannot decide which result is right.
     farm.stored.close("it is on another machine");
     let answer = worker.report(&lease, lease.lo, &manifest(99)).await;
     assert!(!answer.accepted);
@@ -218,7 +221,8 @@ async fn a_poison_task_is_cornered_and_everything_else_is_done() {
         if status.state != JobState::Active {
             break status;
         }
-        // Each process dies of the poison; the next one is another incarnation of the same worker.
+        // Each process dies of the poison task, and the next is another incarnation of the same
+        // worker.
         let mut worker = farm.worker().await;
         'process: loop {
             let status = farm.status(&job).await;

@@ -1,4 +1,4 @@
-//! The list of jobs over the wire: by pages, the latest first, without specs.
+//! The list of jobs over the wire: paged, latest first, without specs.
 
 use picofarm_proto::{model::bounds, wire};
 use prost::Message;
@@ -19,7 +19,7 @@ async fn jobs_come_in_pages_and_the_answer_says_where_the_next_begins() {
         let mut ids = Vec::new();
         for n in 0..5 {
             let mut job = spec(3);
-            // As long as a name may be.
+            // The longest allowed name.
             job.name = format!("{n}{}", "x".repeat(bounds::NAME_BYTES - 1));
             rendering(&mut job).output.dataset = format!("d{n}");
             ids.push(farm.submit(&job).await.job_id);
@@ -61,7 +61,7 @@ async fn jobs_come_in_pages_and_the_answer_says_where_the_next_begins() {
             find: ids[2][..30].into(),
             ..Default::default()
         };
-        // Ids of one moment begin alike.
+        // Ids created at the same time have a common prefix.
         let page = list(&mut farm, found).await.unwrap();
         assert!(page.jobs.iter().any(|job| job.id == ids[2]));
     }

@@ -1,4 +1,4 @@
-//! What tasks log: noted for the holder of the live lease, and no more of it than a task is allowed.
+//! Logs of tasks: recorded for the holder of the live lease, within the task's allowance.
 
 use picofarm_proto::{
     model::{Lease, log},
@@ -21,12 +21,12 @@ impl Worker {
             lines: texts.iter().map(line).collect(),
         }))
         .await;
-        // The answer to a heartbeat without leases is the actor's.
+        // The answer to a heartbeat without leases comes from the actor.
         self.beat(&[], None).await;
     }
 }
 
-/// Time, worker and text of each line.
+/// Returns time, worker and text of each line.
 async fn lines(farm: &mut Farm, job: &str, task: Option<u64>) -> Vec<(i64, String, String)> {
     let events = farm.events(job, task).await;
     let logs = events
@@ -82,7 +82,7 @@ async fn a_task_fills_the_history_no_further_than_its_allowance_whatever_its_wor
         worker.log(&lease, 0, &["x"; log::LINES]).await;
     }
     assert_eq!(lines(&mut farm, &job, None).await.len(), log::LINES);
-    // Another attempt is allowed as much again.
+    // Another attempt has the same allowance again.
     worker.fail(&lease, 0, wire::FailureKind::User).await;
     farm.pass(10_000);
     let lease = worker.lease().await;

@@ -1,5 +1,5 @@
-//! Messages that cannot be used, or that a database refuses, cost what they are about and nothing else: no session ends, no
-//! other task or job waits.
+//! Invalid messages, and messages that a database rejects, affect only their own task or job: no
+//! session ends, and no other task or job waits.
 
 use picofarm_database::testing;
 use picofarm_proto::{
@@ -11,7 +11,7 @@ use tonic::Code;
 
 use crate::harness::{Farm, catalog_of, hello, manifest, rendering, spec};
 
-/// A job whose tasks have one try.
+/// Returns a job with one attempt for each task.
 fn strict(name: &str, count: u64) -> JobSpec {
     let mut job = spec(count);
     job.name = name.into();
@@ -66,7 +66,7 @@ async fn an_error_message_with_control_characters_is_recorded_printable_and_nobo
         assert!(said.starts_with("no mesh    [2J x"), "{said:?}");
         assert!(said.len() <= 4096, "{}", said.len());
         assert_eq!(farm.until_ended(&job).await.state, JobState::Failed);
-        // The same session works on.
+        // The same session continues to work.
         let other = farm.submit(&strict("other", 3)).await.job_id;
         let done = worker.work(&mut farm, &other).await;
         assert_eq!((done.state, done.tasks.done), (JobState::Done, 3));
@@ -158,7 +158,8 @@ async fn what_the_database_refuses_costs_its_task_and_all_else_is_durable() {
         let mut worker = farm.connect(hello("bob")).await.unwrap();
         testing::refuse_poison(&catalog_of(&farm)).await;
 
-        // Everything of a job at once, with three culprits: a result, and an error message (which is a line of history too).
+        // The whole job at once, with three rejected rows: a result, and an error message (which is
+        // also a history line).
         let mut reports = 0;
         let (mut refused, mut seen) = (Vec::new(), 0);
         while seen < 8 {
@@ -203,13 +204,13 @@ async fn what_the_database_refuses_costs_its_task_and_all_else_is_durable() {
             let said = last_error(&mut farm, &mine, task).await;
             assert!(said.contains(why), "{said}");
         }
-        // The other worker's session and lease are what they were.
+        // The other worker's session and lease are unchanged.
         for index in held.lo..held.hi {
             assert!(honest.done(&held, index).await.accepted);
         }
         let done = honest.work(&mut farm, &theirs).await;
         assert_eq!((done.state, done.tasks.done), (JobState::Done, 4));
-        // What was given up runs again where somebody says so, and is what it was.
+        // Given-up tasks run again on request, and give the same results.
         farm.restart().await;
         let status = farm.status(&mine).await;
         assert_eq!((status.tasks.done, status.tasks.dead), (6, 2));

@@ -1,4 +1,4 @@
-//! What is recorded counts for another job only if the store holds it.
+//! A recorded result counts for another job only if the store contains it.
 
 use std::sync::atomic::Ordering;
 
@@ -9,7 +9,7 @@ use picofarm_proto::{
 
 use crate::harness::{Farm, Worker, manifest, rendering, spec};
 
-/// A job of `count` scenes that was done, and its worker.
+/// Completes a job of `count` scenes. Returns it and its worker.
 async fn done(farm: &mut Farm, count: u64) -> (String, Worker) {
     let job = farm.submit(&spec(count)).await.job_id;
     let mut worker = farm.worker().await;
@@ -17,7 +17,7 @@ async fn done(farm: &mut Farm, count: u64) -> (String, Worker) {
     (job, worker)
 }
 
-/// The same settings under another name.
+/// Returns the same settings under another name.
 fn renamed(count: u64) -> JobSpec {
     let mut other = spec(count);
     other.name = "another name".into();
@@ -51,7 +51,8 @@ async fn a_done_job_whose_results_are_gone_runs_again_without_being_asked() {
         assert_ne!(again.job_id, job);
         let status = farm.status(&again.job_id).await;
         assert_eq!((status.tasks.reused, status.tasks.pending), (5, 3));
-        // Not yet made, the scenes stay missing for everyone: a twin follows the one that makes them.
+        // Scenes not yet made stay missing for all jobs, and a twin waits for the job that makes
+        // them.
         assert!(farm.submit(&spec(8)).await.existed);
         farm.stored.instead.lock().unwrap().clear();
         let status = worker.work(&mut farm, &again.job_id).await;
@@ -113,7 +114,7 @@ async fn a_result_that_a_worker_made_up_does_not_count_for_the_next_job() {
             );
         }
         farm.until_ended(&job).await;
-        // The store holds nothing: nothing was ever rendered.
+        // The store is empty, because nothing was ever rendered.
         for task in 0..2 {
             farm.stored.put(task, None);
         }
@@ -159,7 +160,7 @@ async fn between_two_manifests_the_store_decides_and_not_who_came_first() {
         let next = farm.submit(&renamed(1)).await.job_id;
         *farm.stored.closed.lock().unwrap() = None;
         farm.stored.put(0, Some(bytes(7)));
-        // An honest worker reports what it published.
+        // An honest worker reports its published result.
         let lease = liar.lease().await;
         assert!(liar.report(&lease, 0, &manifest(7)).await.accepted);
         let status = farm.until_ended(&next).await;
@@ -167,7 +168,7 @@ async fn between_two_manifests_the_store_decides_and_not_who_came_first() {
         let events = farm.events(&next, None).await;
         let alarm = events.iter().find(|e| e.kind() == wire::EventKind::Alarm);
         assert!(alarm.unwrap().message.contains("ffff"), "{events:?}");
-        // And the other way round: what is recorded lies there, and stands.
+        // In the reverse case the store contains the recorded result, which stands.
         let mut third = renamed(1);
         third.stages[0].force = true;
         let third = farm.submit(&third).await.job_id;
@@ -196,7 +197,7 @@ async fn a_store_that_hangs_holds_up_nobody_else() {
             .plan
             .unwrap()
     });
-    // A job elsewhere is submitted, run and watched meanwhile.
+    // Meanwhile a job in another place is submitted, run and watched.
     let mut elsewhere = spec(4);
     rendering(&mut elsewhere).output.dataset = "elsewhere".into();
     let job = farm.submit(&elsewhere).await.job_id;

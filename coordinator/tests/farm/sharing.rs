@@ -1,4 +1,5 @@
-//! Who gets what: stages after one another, priorities, shares, limits, held jobs, and the help that idle workers give.
+//! The order of work: consecutive stages, priorities, shares, limits, paused jobs, and help from
+//! idle workers.
 
 use picofarm_proto::{
     model::{JobSpec, JobState, Lease, StageState},
@@ -7,7 +8,7 @@ use picofarm_proto::{
 
 use crate::harness::{Farm, LEASE_MS, Worker, hello, rendering, spec};
 
-/// A job of its own, beside others.
+/// Returns a job with its own data set.
 fn named(name: &str, count: u64) -> JobSpec {
     let mut spec = spec(count);
     spec.name = name.into();
@@ -34,7 +35,7 @@ async fn leases(worker: &mut Worker, n: u32) -> Vec<Lease> {
     got
 }
 
-/// The names of the jobs of these leases.
+/// Returns the names of the jobs of these leases.
 async fn jobs_of(farm: &mut Farm, leases: &[Lease]) -> Vec<String> {
     let mut names = Vec::new();
     for lease in leases {
@@ -110,7 +111,7 @@ async fn no_more_workers_than_a_job_allows() {
         .await
         .unwrap();
     second.credit(1).await;
-    // The second asks in vain as long as the first is there.
+    // The second worker gets nothing while the first one is connected.
     let mut second = second;
     assert!(second.beat(&[], None).await.is_empty());
     assert_eq!(farm.status(&job).await.tasks.leased, 2);
@@ -192,7 +193,7 @@ async fn only_a_worker_that_has_what_a_stage_needs_gets_it() {
     able.lease().await;
 }
 
-/// A worker that holds tasks 1..n of a job of which task 0 took two seconds.
+/// Returns a worker with leases of tasks 1..n of a job, after its task 0 took two seconds.
 async fn busy(farm: &mut Farm) -> (Worker, Vec<Lease>) {
     let mut worker = farm.worker().await;
     let first = worker.lease().await;
@@ -256,7 +257,8 @@ async fn an_idle_worker_takes_half_of_what_a_busy_one_has_not_begun() {
     assert_eq!(trim.lease, Some(held[0].lease.into()));
     assert_eq!(trim.hi, taken.lo);
     assert!(held[0].lo < taken.lo && taken.hi <= held[0].hi);
-    // What it has lost it may finish all the same: the other one finds it, and each task counts once.
+    // The worker may still finish lost tasks: the other worker finds the result, and each task
+    // counts once.
     assert!(!worker.done(&held[0], taken.lo).await.accepted);
     assert!(worker.done(&held[0], held[0].lo).await.accepted);
     for task in taken.lo..taken.hi {
@@ -295,7 +297,7 @@ async fn a_task_that_takes_far_too_long_runs_a_second_time_and_the_first_result_
     assert_eq!(slow.revoked().await.lease, Some(last.lease.into()));
     let status = farm.until(&job, |s| s.state != JobState::Active).await;
     assert_eq!((status.state, status.tasks.done), (JobState::Done, 2));
-    // The first may still come: it is the same, and too late for a job that has ended.
+    // The first run may still end: it is equal, and too late for an ended job.
     slow.done(&last, last.lo).await;
     assert_eq!(farm.status(&job).await.tasks.done, 2);
 }
@@ -340,7 +342,7 @@ async fn a_worker_at_which_one_task_after_another_fails_is_passed_over_while_oth
         let lease = broken.lease().await;
         broken.fail(&lease, lease.lo, wire::FailureKind::User).await;
     }
-    // Alone it goes on, more slowly: perhaps the job is to blame.
+    // A single worker continues more slowly, because the job may be at fault.
     broken.credit(1).await;
     assert!(broken.beat(&[], None).await.is_empty());
     farm.pass(10_001);
@@ -380,7 +382,7 @@ async fn a_crash_that_was_a_broken_connection_is_taken_back() {
         why.task.unwrap().crashes
     };
     assert_eq!(crashes(&mut farm).await, 1);
-    // Another process of the same worker changes nothing: that one did die.
+    // Another process of the same worker changes nothing, because the first one died.
     let mut other = who.clone();
     other.incarnation = hello("x").incarnation;
     drop(Worker::connect(farm.address(), other).await.unwrap());

@@ -1,4 +1,4 @@
-//! Starting, stopping and starting again.
+//! Starts, stops and restarts a coordinator.
 
 use picofarm_coordinator::{CoordinatorConfig, CoordinatorError, serve};
 use picofarm_database::CatalogPlace;
@@ -16,7 +16,7 @@ async fn a_restarted_coordinator_goes_on_where_it_was() {
     let first = worker.lease().await;
     assert!(worker.done(&first, first.lo).await.accepted);
     let held = worker.lease().await;
-    // Down for longer than a lease: no worker is to blame.
+    // The coordinator is down for longer than a lease, and no worker is at fault.
     farm.stop().await;
     farm.pass(10 * i64::from(LEASE_MS));
     farm.restart().await;

@@ -1,4 +1,5 @@
-//! Results are looked for in their store before they count, and workers that report what is not there are not believed.
+//! Results are checked against their store before they count, and workers that report missing
+//! results are not trusted.
 
 use std::sync::atomic::Ordering;
 
@@ -9,7 +10,7 @@ use picofarm_proto::{
 
 use crate::harness::{Farm, hello, manifest, spec};
 
-/// The same settings under another name.
+/// Returns the same settings under another name.
 fn renamed(count: u64) -> JobSpec {
     let mut other = spec(count);
     other.name = "another name".into();
@@ -67,7 +68,7 @@ async fn a_coordinator_that_finds_nothing_of_two_workers_sees_another_disk() {
         assert!(!first.done(&lease, lease.lo).await.accepted);
         let status = second.work(&mut farm, &job).await;
         assert_eq!((status.state, status.unverified), (JobState::Done, 2));
-        // The first one is believed again.
+        // The first worker is trusted again.
         let mut elsewhere = spec(1);
         elsewhere.name = "elsewhere".into();
         crate::harness::rendering(&mut elsewhere).output.dataset = "elsewhere".into();
@@ -102,7 +103,7 @@ async fn a_folder_that_was_deleted_is_told_from_one_that_was_never_here() {
         assert_eq!(again.plan.unwrap(), plan, "plan and submit agree");
         let status = worker.work(&mut farm, &again.job_id).await;
         assert_eq!((status.state, status.unverified), (JobState::Done, 3));
-        // Nobody has seen these here.
+        // These results were never checked here.
         let plan = farm.plan(&spec(3)).await;
         assert_eq!((plan.reuse, plan.run), (3, 0));
         let reasons = plan.stages[0].reasons.join(" ");

@@ -1,4 +1,5 @@
-//! What an instance does: it decides by its memory, and writes in one transaction that checks the database's rows.
+//! The steps of an instance. It decides from memory, and writes in one transaction that checks the
+//! database's rows.
 
 use crate::{
     model::{InstanceStep, Protocol},
@@ -6,7 +7,7 @@ use crate::{
 };
 
 impl Protocol {
-    /// A step of an instance; `None` if it cannot happen.
+    /// Applies a step of an instance; `None` if the step is not possible.
     pub fn instance(&self, s: &mut State, process: u8, step: InstanceStep) -> Option<()> {
         let me = s.instance(process);
         let at = usize::from(process);
@@ -31,7 +32,7 @@ impl Protocol {
                 let mut range = s.instances[at].memory?;
                 let tasks = self.tasks().without(range.done);
                 let pending = range.lease.is_none() && !tasks.is_empty();
-                // The workers are alike: the first lease is worker 0's.
+                // The workers are symmetric, so the first lease goes to worker 0.
                 let first = range.epoch > 0 || worker == 0;
                 (pending && first && range.epoch < self.bounds.epochs).then_some(())?;
                 self.begin_on_range(s, me)?;
@@ -93,7 +94,7 @@ impl Protocol {
                 (other != me && (expired || !self.rules.takeover_waits_for_expiry)).then_some(())?;
                 self.begin(s, me)?;
                 s.database.instances.remove(&other);
-                // A row that owns nothing may lie there for ever.
+                // A row that owns nothing may stay forever.
                 (s.database.owner == Owner::Instance(other)).then_some(())?;
                 s.history.robbed |= !expired && s.runs(other);
                 self.own(s, me);
@@ -127,40 +128,40 @@ impl Protocol {
         Some(())
     }
 
-    /// A process opens a new instance. The row of its former one stays until it has run out.
+    /// Opens a new instance of a process. The row of the former instance stays until it expires.
     fn open(&self, s: &mut State, process: u8) {
         s.instances[usize::from(process)].life += 1;
         let me = s.instance(process);
         s.database.instances.insert(me, InstanceRow::Live);
     }
 
-    /// A write transaction begins: the fence.
+    /// Begins a write transaction with the fence.
     fn begin(&self, s: &mut State, me: InstanceId) -> Option<()> {
         let live = s.database.instances.get(&me) == Some(&InstanceRow::Live);
         s.history.fenced_write |= !live;
         (live || !self.rules.instance_is_fenced).then_some(())
     }
 
-    /// A transaction begins that writes the range by what the instance remembers of it.
+    /// Begins a transaction that writes the range from the instance's memory.
     fn begin_on_range(&self, s: &mut State, me: InstanceId) -> Option<()> {
         let mine = s.database.owner == Owner::Instance(me);
         (mine || !self.rules.writes_check_owner).then_some(())?;
         self.begin(s, me)
     }
 
-    /// The instance becomes the owner and reads the range.
+    /// Makes the instance the owner, which reads the range.
     fn own(&self, s: &mut State, me: InstanceId) {
         s.database.owner = Owner::Instance(me);
         s.instances[usize::from(me.process)].memory = Some(s.database.range);
     }
 
-    /// The range's row and the instance's memory become `range`.
+    /// Sets the range's row and the instance's memory to `range`.
     fn write(&self, s: &mut State, at: usize, range: Range) {
         s.database.range = range;
         s.instances[at].memory = Some(range);
     }
 
-    /// A step of the collector; `None` if it cannot happen.
+    /// Applies a step of the collector; `None` if the step is not possible.
     pub fn collector(&self, s: &mut State, step: crate::model::CollectorStep) -> Option<()> {
         use crate::model::CollectorStep as Step;
         let over = match (step, s.collector) {

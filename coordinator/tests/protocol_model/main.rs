@@ -1,19 +1,23 @@
-//! The commit protocol of tasks, leases, instances (coordinators over one database) and the collector of orphaned
-//! objects, checked exhaustively within bounds: every interleaving of two coordinators, two workers and a collector
-//! over one database and one object store.
+//! The commit protocol of tasks, leases, instances (coordinators over one database) and the
+//! collector of orphaned objects, checked exhaustively within bounds: every interleaving of two
+//! coordinators, two workers and a collector over one database and one object store.
 //!
-//! * `rules.rs`: what the protocol checks, and where in the product; the bounds.
-//! * `state.rs`: the state. `instances.rs`, `workers.rs`: who does what. `model.rs`: the actions, the laws.
-//! * `reach.rs`: from every state the job's end can be reached.
+//! * `rules.rs`: the checks of the protocol, their places in the product, and the bounds.
+//! * `state.rs`: the state. `instances.rs`, `workers.rs`: the steps of each process. `model.rs`:
+//!   the actions and the laws.
+//! * `reach.rs`: the job's end can be reached from every state.
 //!
-//! How faults are modelled. *Stopped* processes take no step for as long as one likes while leases and instance rows run
-//! out around them; nothing in the model keeps a process from going on with what it knew. *Killed* ones lose what they
-//! knew and come back under a new name. *Messages* stay in the network for ever once sent: they may arrive late, out of
-//! order, repeatedly, at either instance, or never, which is how a lost one looks. An instance decides by its memory and
-//! writes by one transaction; as its memory is its own, deciding and writing are one step even if time passes between
-//! them. Time has no place here: whatever ends by a clock may end at any moment.
+//! Faults are modelled as follows. *Stopped* processes take no step for any length of time while
+//! leases and instance rows expire around them. Nothing in the model keeps a process from
+//! continuing with old knowledge. *Killed* processes lose their knowledge and restart under a new
+//! name. *Messages* stay in the network forever once sent: they may arrive late, out of order,
+//! repeatedly, at either instance, or never, which models loss. An instance decides from its memory
+//! and writes in one transaction. Because no other process sees its memory, the decision and the
+//! write are one step even if time passes between them. The model has no time: anything that a
+//! clock ends may end at any moment.
 //!
-//! Faults of coordinators strike process 0 only, and the first lease goes to worker 0: the others are alike.
+//! Faults of coordinators affect process 0 only, and the first lease goes to worker 0, because the
+//! others are symmetric.
 
 mod instances;
 mod model;
@@ -27,7 +31,7 @@ use stateright::{Checker, HasDiscoveries, Model};
 use model::{DEAD_EPOCH, FENCED, LAWS, LEASED_AGAIN, ONCE, Protocol, ROBBED, THERE};
 use rules::{Bounds, Rules};
 
-/// One task; a worker's kill, a stopped coordinator and a run of the collector, together.
+/// One task, with a worker's kill, a stopped coordinator and a run of the collector together.
 const STOPPED_INSTANCE: Bounds = Bounds {
     tasks: 1,
     epochs: 2,
@@ -37,14 +41,15 @@ const STOPPED_INSTANCE: Bounds = Bounds {
     collections: 1,
 };
 
-/// The coordinator is killed instead.
+/// The coordinator is killed instead of stopped.
 const KILLED_INSTANCE: Bounds = Bounds {
     instance_kills: 1,
     instance_stops: 0,
     ..STOPPED_INSTANCE
 };
 
-/// Three epochs; nothing is killed, workers and collector may be stopped, and the collector comes twice.
+/// Three epochs without kills. Workers and the collector may be stopped, and the collector runs
+/// twice.
 const THREE_EPOCHS: Bounds = Bounds {
     epochs: 3,
     worker_kills: 0,
@@ -53,7 +58,7 @@ const THREE_EPOCHS: Bounds = Bounds {
     ..STOPPED_INSTANCE
 };
 
-/// A range of two tasks, so that a lease may be left half done; processes are only stopped.
+/// A range of two tasks, so that a lease may end half done. Processes are only stopped.
 const TWO_TASKS: Bounds = Bounds {
     tasks: 2,
     worker_kills: 0,
@@ -61,7 +66,7 @@ const TWO_TASKS: Bounds = Bounds {
     ..STOPPED_INSTANCE
 };
 
-/// Every law holds, and the model is not empty: each of its `sometimes` happens.
+/// Asserts that every law is true, and that each `sometimes` of the model happens.
 fn assert_holds(bounds: Bounds) {
     let checker = Protocol {
         rules: Rules::ALL,
@@ -84,7 +89,7 @@ fn assert_holds(bounds: Bounds) {
     }
 }
 
-/// Each of these laws breaks; a shortest trace of each goes to standard output.
+/// Asserts that each of these laws breaks, and prints a shortest trace for each.
 fn assert_breaks(rules: Rules, laws: &[&'static str]) {
     let checker = Protocol {
         rules,
@@ -103,7 +108,7 @@ fn assert_breaks(rules: Rules, laws: &[&'static str]) {
     }
 }
 
-/// No law breaks but this one, in all of the state space.
+/// Asserts that only this law breaks in the whole state space.
 fn assert_breaks_only(rules: Rules, law: &'static str) {
     assert_breaks(rules, &[law]);
     let bounds = STOPPED_INSTANCE;

@@ -1,5 +1,5 @@
-//! The protocol as a transition system: who may do what, and which laws must hold. An action whose guard does not
-//! hold is no step.
+//! The protocol as a transition system: the possible actions of each process, and the laws. An
+//! action with a false guard is no step.
 
 use stateright::{Model, Property};
 
@@ -22,7 +22,7 @@ pub const ZOMBIE: &str = "a stopped worker can leave a manifest whose objects we
 /// A condition on a state.
 type Law = fn(&Protocol, &State) -> bool;
 
-/// What must hold in every state.
+/// The laws of every state.
 pub const LAWS: [(&str, Law); 7] = [
     (ONCE, |_, s| {
         let commits = &s.history.commits;
@@ -51,41 +51,43 @@ pub enum Action {
     Instance(u8, InstanceStep),
     Worker(u8, WorkerStep),
     Collector(CollectorStep),
-    /// An instance's row runs out: of one that is dead at any time, of one that runs if it is stopped so long.
+    /// An instance's row expires: that of a dead instance at any time, that of a running one only
+    /// if the instance is stopped for long enough.
     Expire(InstanceId),
 }
 
-/// What an instance does, each with one transaction or none.
+/// A step of an instance, each with at most one transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InstanceStep {
-    /// It takes a pending range that nobody owns.
+    /// It takes a pending range without an owner.
     Claim,
     /// It gives a pending range back.
     Release,
     /// It leases the range to a worker.
     Grant(u8),
-    /// It ends a lease: heartbeats are missing, or the worker gave it back.
+    /// It ends a lease, because heartbeats are missing or the worker returned it.
     Close,
     /// It accepts a report (`Message::Done`).
     Commit(Message),
-    /// A worker connects and names its lease; the instance becomes the owner of its range.
+    /// A worker connects and names its lease. The instance becomes the owner of its range.
     Adopt(u8),
-    /// It deletes another instance's row and becomes the owner of what that one had.
+    /// It deletes another instance's row and becomes the owner of that instance's range.
     TakeOver(InstanceId),
-    /// As `TakeOver`, of a collector whose lease has run out.
+    /// Like `TakeOver`, for a collector with an expired lease.
     TakeOverCollector,
-    /// A write was refused: it forgets everything, and comes back as a new instance if its row is no longer live.
+    /// A write was refused. It forgets everything, and restarts as a new instance if its row is no
+    /// longer live.
     Reload,
-    /// It is killed and started again.
+    /// It is killed and restarted.
     Restart,
 }
 
-/// What a worker does.
+/// A step of a worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WorkerStep {
     /// A lease arrives (`Message::Grant`).
     Receive(Message),
-    /// It looks for a manifest of the task in hand.
+    /// It looks for a manifest of the current task.
     Look,
     /// It checks that the objects of the manifest exist.
     Check,
@@ -93,30 +95,31 @@ pub enum WorkerStep {
     PutObject,
     /// It stores the manifest, create-only.
     PutManifest,
-    /// It reports the task in hand though nothing is stored yet. No worker of the product does.
+    /// It reports the current task although nothing is stored yet. No worker of the product does
+    /// this.
     ReportEarly,
     /// It reports a finished task, for the first time or again.
     Report(u8),
-    /// It is done with its lease: everything acknowledged, refused, revoked, or lost from sight.
+    /// It has finished with its lease: all tasks are acknowledged, refused, revoked or lost.
     Forget,
-    /// It is killed and started again.
+    /// It is killed and restarted.
     Restart,
 }
 
-/// What the collector does.
+/// A step of the collector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CollectorStep {
-    /// It takes a pending range that nobody owns.
+    /// It takes a pending range without an owner.
     Claim,
     /// It looks for objects without a manifest.
     Look,
-    /// It deletes the object of one task; after the last one it gives the range back.
+    /// It deletes the object of one task, and gives the range back after the last one.
     Delete,
-    /// It is killed: its database session ends, and with it its hold.
+    /// It is killed. Its database session ends, and with it its hold on the range.
     Restart,
 }
 
-/// The model: the rules in force and its size.
+/// The model: the rules in force and its bounds.
 #[derive(Debug, Clone, Copy)]
 pub struct Protocol {
     pub rules: Rules,
@@ -128,7 +131,8 @@ impl Protocol {
         Tasks::first(self.bounds.tasks)
     }
 
-    /// Whether the last epoch is granted: faults that would ask for a further one are out of bounds.
+    /// Returns whether the last epoch is granted. Faults that would need a further one are out of
+    /// bounds.
     pub fn last_epoch(&self, state: &State) -> bool {
         state.database.range.epoch == self.bounds.epochs
     }
@@ -143,7 +147,7 @@ impl Model for Protocol {
     }
 
     fn actions(&self, state: &State, actions: &mut Vec<Action>) {
-        // What follows a broken law is of no interest.
+        // States after a broken law are not explored.
         if !LAWS.iter().all(|(_, law)| law(self, state)) {
             return;
         }
@@ -217,7 +221,7 @@ impl Model for Protocol {
 }
 
 impl Protocol {
-    /// Every task is committed.
+    /// Returns whether every task is committed.
     pub fn ended(&self, state: &State) -> bool {
         state.database.outputs == self.tasks() && state.database.range.done == self.tasks()
     }

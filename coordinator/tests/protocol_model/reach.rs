@@ -1,5 +1,6 @@
-//! What stateright's `eventually` cannot say (it knows no fairness and may miss cycles): from every reachable state
-//! a good one can be reached, AG EF in CTL. The whole graph is explored and walked backwards from the good states.
+//! A property that stateright's `eventually` cannot express, because it knows no fairness and may
+//! miss cycles: a good state can be reached from every reachable state (AG EF in CTL). The whole
+//! graph is explored and walked backwards from the good states.
 
 use std::collections::HashMap;
 
@@ -7,7 +8,8 @@ use stateright::Model;
 
 use crate::{model::Protocol, state::State};
 
-/// The reachable states from which no state that is `good` can be reached, and the number of reachable states.
+/// Returns the reachable states from which no `good` state can be reached, and the number of
+/// reachable states.
 pub fn stranded(model: &Protocol, good: impl Fn(&State) -> bool) -> (Vec<State>, usize) {
     let mut index = HashMap::new();
     let mut states = Vec::new();

@@ -1,4 +1,4 @@
-//! The state: database, object store, network, and what each process knows.
+//! The state: database, object store, network, and the knowledge of each process.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -39,27 +39,27 @@ impl Tasks {
         (0..8).filter(move |task| self.has(*task))
     }
 
-    /// The task that is worked on first.
+    /// Returns the first task to work on.
     pub fn lowest(self) -> Option<u8> {
         self.iter().next()
     }
 }
 
-/// A worker's process: a killed worker comes back as the next incarnation.
+/// A worker's process. A killed worker restarts as the next incarnation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct WorkerId {
     pub worker: u8,
     pub incarnation: u8,
 }
 
-/// A life of a coordinator: a killed or fenced coordinator comes back as a new instance.
+/// A life of a coordinator. A killed or fenced coordinator restarts as a new instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct InstanceId {
     pub process: u8,
     pub life: u8,
 }
 
-/// Who may write the range.
+/// The process that may write the range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Owner {
     Nobody,
@@ -67,19 +67,19 @@ pub enum Owner {
     Collector,
 }
 
-/// An instance's row; one that was taken over is gone from the table.
+/// The row of an instance. The row is deleted when another instance takes over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum InstanceRow {
     Live,
-    /// By the database's clock.
+    /// Expired by the database's clock.
     Expired,
 }
 
-/// The range, as a row of the database or as an instance remembers it.
+/// The range, as a row of the database or in the memory of an instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Range {
     pub epoch: u8,
-    /// Whom the epoch was granted to, while its lease is live.
+    /// The worker to which the epoch was granted, while its lease is live.
     pub lease: Option<WorkerId>,
     pub done: Tasks,
 }
@@ -90,21 +90,21 @@ pub struct Database {
     pub instances: BTreeMap<InstanceId, InstanceRow>,
     pub owner: Owner,
     pub range: Range,
-    /// Tasks whose output the catalog names.
+    /// Tasks with an output in the catalog.
     pub outputs: Tasks,
 }
 
-/// The object store. A task has one object besides its manifest: a task half written is one without the manifest.
+/// The object store. A task has one object and a manifest. A half-written task has no manifest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Store {
     pub objects: Tasks,
     pub manifests: Tasks,
 }
 
-/// A message that may arrive at any time, any number of times, at any process it concerns; or never.
+/// A message that may arrive at any time, any number of times, at any process concerned, or never.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Message {
-    /// A lease, said after the grant is durable.
+    /// A lease, sent after the grant is durable.
     Grant {
         epoch: u8,
         to: WorkerId,
@@ -114,37 +114,37 @@ pub enum Message {
     Done { epoch: u8, from: WorkerId, task: u8 },
 }
 
-/// How far a worker is with the task in hand.
+/// Progress of a worker's current task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Step {
-    /// Nothing known yet.
+    /// Nothing is known yet.
     Begun,
-    /// It has seen the manifest and is about to check the objects.
+    /// The worker has seen the manifest and is about to check the objects.
     Found,
-    /// It saw no usable output and renders.
+    /// The worker saw no usable output and renders.
     Rendering,
-    /// It has stored the object, or found it stored with equal bytes.
+    /// The worker has stored the object, or found it stored with equal bytes.
     Uploaded,
 }
 
-/// A lease as its worker sees it.
+/// A lease as seen by its worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct HeldLease {
     pub epoch: u8,
     pub todo: Tasks,
     pub step: Step,
-    /// Finished and not acknowledged.
+    /// Finished and unacknowledged tasks.
     pub outbox: Tasks,
 }
 
-/// A worker. A stopped one is one that takes no step for long; what it knows is then old.
+/// A worker. A stopped worker takes no step for long, so that its knowledge is outdated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Worker {
     pub incarnation: u8,
     pub held: Option<HeldLease>,
 }
 
-/// A coordinator. A stopped one is one that takes no step for long, while others may find its row expired.
+/// A coordinator. A stopped one takes no step for long, while others may find its row expired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Instance {
     pub life: u8,
@@ -156,9 +156,9 @@ pub struct Instance {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Collector {
     Idle,
-    /// It has the range (or believes that nobody works on it) and is about to look.
+    /// It owns the range (or believes that nobody works on it) and is about to look for objects.
     Claimed,
-    /// It saw no manifest for these and is about to delete their objects.
+    /// It saw no manifest for these tasks and is about to delete their objects.
     Deleting(Tasks),
 }
 
@@ -168,23 +168,23 @@ pub struct Commit {
     pub task: u8,
     pub epoch: u8,
     pub by: InstanceId,
-    /// Its lease was live by the database's row.
+    /// Whether its lease was live according to the database's row.
     pub lease_was_live: bool,
 }
 
-/// What the laws need to know of the past; no process reads it.
+/// The past as far as the laws need it. No process reads it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
 pub struct History {
     pub commits: Vec<Commit>,
-    /// An instance without a live row has written.
+    /// Whether an instance without a live row has written.
     pub fenced_write: bool,
-    /// A lease named a task that was committed already.
+    /// Whether a lease named a task that was already committed.
     pub leased_again: bool,
-    /// An instance with a live row has lost the range to a takeover.
+    /// Whether an instance with a live row has lost the range to a takeover.
     pub robbed: bool,
 }
 
-/// Faults that have happened, of those that are counted.
+/// Counted faults that have happened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Faults {
     pub worker_kills: u8,
@@ -193,7 +193,7 @@ pub struct Faults {
     pub collections: u8,
 }
 
-/// Everything.
+/// The complete state.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct State {
     pub database: Database,
@@ -207,7 +207,8 @@ pub struct State {
 }
 
 impl State {
-    /// Two instances and two workers have just started; the range is pending and nobody's.
+    /// Returns the initial state: two instances and two workers have just started, and the range is
+    /// pending without an owner.
     pub fn initial() -> Self {
         let instance = |process| (InstanceId { process, life: 0 }, InstanceRow::Live);
         Self {
@@ -251,7 +252,7 @@ impl State {
         }
     }
 
-    /// Whether an instance of this id runs now.
+    /// Returns whether an instance with this id runs now.
     pub fn runs(&self, id: InstanceId) -> bool {
         self.instance(id.process) == id
     }

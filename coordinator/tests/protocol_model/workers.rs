@@ -1,4 +1,5 @@
-//! What a worker does: lease in, objects and manifest to the store, report out. It never reads the database.
+//! The steps of a worker: it receives a lease, stores objects and a manifest, and sends a report.
+//! It never reads the database.
 
 use crate::{
     model::{Protocol, WorkerStep},
@@ -6,7 +7,7 @@ use crate::{
 };
 
 impl Protocol {
-    /// A step of a worker; `None` if it cannot happen.
+    /// Applies a step of a worker; `None` if the step is not possible.
     pub fn worker(&self, s: &mut State, worker: u8, step: WorkerStep) -> Option<()> {
         let me = s.worker(worker);
         let at = usize::from(worker);

@@ -18,7 +18,7 @@ use tonic::{
     transport::Channel,
 };
 
-/// A caller, its role, and the projects of which it is a member and a maintainer.
+/// A caller, its role, and the projects in which it is a member and a maintainer.
 pub const CALLERS: [(&str, Role, &str, &str); 7] = [
     ("ada", Role::Submit, "lidar", ""),
     ("bob", Role::Submit, "", ""),
@@ -41,7 +41,8 @@ pub struct Farm {
     running: Running,
 }
 
-/// The catalogs there are: a new SQLite file, and a new Postgres database where a server is named.
+/// Returns the available catalogs: a new SQLite file, and a new Postgres database if a server is
+/// given.
 pub async fn catalogs(folder: &tempfile::TempDir) -> Vec<CatalogPlace> {
     let mut places = vec![CatalogPlace::from(folder.path().join("catalog.sqlite"))];
     if let Some(url) = testing::postgres().await {
@@ -50,7 +51,8 @@ pub async fn catalogs(folder: &tempfile::TempDir) -> Vec<CatalogPlace> {
     places
 }
 
-/// A coordinator that the machine kept from its catalog for five seconds begins anew, and says that nothing was done.
+/// Returns whether a coordinator restarted its life because the machine kept it from its catalog
+/// for five seconds. It then reports that nothing was done.
 pub fn begins_anew(code: Code) -> bool {
     code == Code::Unavailable
 }
@@ -109,7 +111,7 @@ impl Farm {
         JobsClient::with_interceptor(self.channel.clone(), self.bearer(name))
     }
 
-    /// Whether a caller may open a worker's session.
+    /// Returns whether a caller may open a worker's session.
     pub async fn session(&self, name: &str) -> Code {
         let mut client = FarmClient::with_interceptor(self.channel.clone(), self.bearer(name));
         let answer = client.session(tokio_stream::empty()).await;
@@ -154,7 +156,7 @@ pub struct Submitted {
     pub existed: bool,
 }
 
-/// A job of this name; `extra` are more fields of it.
+/// Returns a job with this name; `extra` contains further fields.
 pub fn spec(name: &str, extra: &str) -> JobSpec {
     let text = format!(
         r#"{{"name": "{name}", {extra} "scenes": {{"kind": "primitive", "count": 2}},

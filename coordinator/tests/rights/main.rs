@@ -1,5 +1,5 @@
-//! Who may see and change which job, method by method and caller by caller, on both catalogs; and what the audit log says
-//! of it.
+//! Who may see and change which job, method by method and caller by caller, on both catalogs, and
+//! the lines of the audit log.
 
 mod harness;
 mod places;
@@ -11,14 +11,14 @@ use picofarm_coordinator::auth::{METHODS, Needs, Role, Roles, Tokens, Visibility
 use picofarm_proto::wire;
 use tonic::Code;
 
-/// How a caller stands to ada's job of the project lidar.
+/// A caller's rights to ada's job of the project lidar.
 #[derive(Debug, Clone, Copy)]
 struct Standing {
     who: &'static str,
     role: Role,
     sees: bool,
     changes: bool,
-    /// An equal job that it submits is ada's.
+    /// Whether an equal job that the caller submits is ada's job.
     shares: bool,
 }
 
@@ -44,7 +44,7 @@ fn standings(visibility: Visibility) -> impl Iterator<Item = Standing> {
         })
 }
 
-/// What a call comes to, for those whose role suffices.
+/// Returns the expected status of a call for callers with a sufficient role.
 fn expected(method: &str, standing: Standing) -> Code {
     let (sees, changes) = (standing.sees, standing.changes);
     match method {
@@ -55,7 +55,7 @@ fn expected(method: &str, standing: Standing) -> Code {
         "CancelJob" | "PauseJob" | "ResumeJob" | "RetryJob" if !changes => Code::PermissionDenied,
         // There is no worker.
         "DrainWorker" => Code::NotFound,
-        // The project is one's own or not.
+        // The caller may not use the project.
         "PlanJob" | "SubmitJob" if !matches!(standing.who, "ada" | "mia" | "max" | "root") => {
             Code::InvalidArgument
         }
@@ -120,7 +120,7 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
     }
 }
 
-/// The act that a method is noted as.
+/// Returns the act recorded for a method.
 fn act(method: &str) -> Option<&'static str> {
     Some(match method {
         "SubmitJob" => "submit",
@@ -143,7 +143,7 @@ async fn each_method_does_for_each_caller_what_it_should_and_acts_are_noted() {
             for (path, needs) in METHODS {
                 let method = path.rsplit('/').next().unwrap();
                 for standing in standings(visibility) {
-                    // A job for each: some calls end it.
+                    // Each call has its own job, because some calls end it.
                     let name = format!("{method}-{}", standing.who);
                     let of_lidar = spec(&name, r#""project": "lidar","#);
                     let job = farm.submit("ada", &of_lidar, false).await.unwrap().job;
@@ -297,7 +297,7 @@ async fn the_audit_log_outlives_the_coordinator_and_pages_and_notes_new_tokens()
         farm.stop().await;
         let farm = Farm::start(catalog, Visibility::All).await;
         let whole = farm.audit().await;
-        // A submission that met a coordinator that begins anew was made again; the log has both.
+        // A submission was repeated if the coordinator restarted its life; the log then has both.
         let done: Vec<_> = whole.iter().filter(|line| line.outcome == "done").collect();
         assert_eq!(done.len(), 5, "{whole:#?}");
         let mut paged = Vec::new();

@@ -26,7 +26,8 @@ fn job(name: &str, stage: &str) -> JobSpec {
     job
 }
 
-/// A stage of each kind that would write into ada's data set "rooms", or replace what is hers, with the field at fault.
+/// Returns a stage of each kind that would write into ada's data set "rooms", or replace her
+/// results, with the field at fault.
 fn trespasses() -> Vec<(&'static str, JobSpec)> {
     let source = r#""source": {"store": "file:///nowhere", "dataset": "other"}, "count": 2"#;
     let export = |dest: &str| {
@@ -92,15 +93,15 @@ async fn nobody_writes_into_the_folders_of_others() {
                 "plan and submit agree"
             );
         }
-        // A folder of a similar name is another one.
+        // A folder with a similar name is a different one.
         farm.submit("bob", &spec("rooms2", ""), false)
             .await
             .unwrap();
-        // Who asks for the same scenes reuses them.
+        // A job for the same scenes reuses them.
         let mut same = spec("rooms", "");
         same.name = "the same scenes".into();
         farm.submit("bob", &same, false).await.unwrap();
-        // What bob reuses is not his.
+        // The results that bob reuses are not his.
         let (_, trespass) = trespasses().swap_remove(1);
         farm.submit("bob", &trespass, false).await.unwrap_err();
         for who in ["ada", "root"] {
@@ -140,7 +141,7 @@ async fn names_of_models_reports_and_splits_belong_to_their_makers() {
                 assert!(refused.message().contains(part), "{refused}");
             }
         }
-        // The data set is ada's, so its splits are, too.
+        // The data set is ada's, so its splits are hers too.
         farm.submit("ada", &job("hers", &other_split), false)
             .await
             .unwrap();

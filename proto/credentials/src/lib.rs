@@ -1,5 +1,5 @@
-//! Certificates, keys and secrets on disk, read the same way by both sides: every error names the file and how to
-//! repair it, and no secret can reach a log.
+//! Certificates, keys and secrets on disk, read the same way by both sides. Every error names the
+//! file and the remedy, and no secret can reach a log.
 
 mod locked;
 
@@ -28,7 +28,7 @@ const LARGEST_SECRET: u64 = 1 << 20;
 /// Largest file with certificates or a key, bytes: a system's list of authorities is some 300 kB.
 const LARGEST_PEM: u64 = 16 << 20;
 
-/// A secret text. Shown by neither `Debug` nor `Display`; [`Secret::expose`] is the only way to it.
+/// A secret text. Neither `Debug` nor `Display` shows it; only [`Secret::expose`] does.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 
@@ -38,18 +38,19 @@ impl Secret {
         Self(text.into())
     }
 
-    /// The secret itself, for the one place that needs it.
+    /// Returns the secret itself, for the single place that needs it.
     pub fn expose(&self) -> &str {
         &self.0
     }
 
-    /// The first line of a file that others have no access to.
+    /// Reads the first line of a file to which others have no access.
     ///
     /// # Errors
-    /// The file cannot be read, is empty, or is open to everyone on the machine.
+    /// Returns an error if the file cannot be read, is empty, or is open to everyone on the
+    /// machine.
     pub fn read(path: &Path) -> Result<Self, CredentialError> {
         private(path)?;
-        // It may come from a pipe, e.g. of a program that keeps secrets.
+        // The path may be a pipe, e.g. of a secret manager.
         let text = text(path, read_bytes(path, LARGEST_SECRET)?)?;
         let line = text.lines().next().unwrap_or_default().trim();
         if line.is_empty() {
@@ -74,7 +75,7 @@ impl fmt::Display for Secret {
     }
 }
 
-/// A file with credentials that cannot be used.
+/// An unusable file with credentials.
 #[derive(Debug, thiserror::Error)]
 pub enum CredentialError {
     /// The file cannot be read.
@@ -82,7 +83,7 @@ pub enum CredentialError {
     Read {
         /// The file.
         path: PathBuf,
-        /// The system's answer.
+        /// The system's error.
         source: io::Error,
     },
     /// The file cannot be written.
@@ -90,10 +91,10 @@ pub enum CredentialError {
     Write {
         /// The file.
         path: PathBuf,
-        /// The system's answer.
+        /// The system's error.
         source: io::Error,
     },
-    /// Everyone on the machine has access to it.
+    /// Everyone on the machine has access to the file.
     #[error(
         "{}: others than its owner and group have access to it (mode {mode:03o}); run `chmod o-rwx {}`",
         path.display(), path.display()
@@ -104,12 +105,12 @@ pub enum CredentialError {
         /// Its permission bits.
         mode: u32,
     },
-    /// Its content is not what it should be.
+    /// The file's content is invalid.
     #[error("{}: {what}", path.display())]
     Unusable {
         /// The file.
         path: PathBuf,
-        /// What was expected.
+        /// The expected content.
         what: String,
     },
 }
@@ -140,7 +141,7 @@ impl CredentialError {
 /// Refuses a file that everyone on the machine may read or write.
 ///
 /// # Errors
-/// [`CredentialError::Open`], or the file is not there.
+/// Returns [`CredentialError::Open`], or an error if the file is missing.
 pub fn private(path: &Path) -> Result<(), CredentialError> {
     use std::os::unix::fs::PermissionsExt;
     let metadata = std::fs::metadata(path).map_err(|e| CredentialError::read(path, e))?;
@@ -157,16 +158,16 @@ pub fn private(path: &Path) -> Result<(), CredentialError> {
 /// Reads a file of at most `most` bytes.
 ///
 /// # Errors
-/// The file cannot be read, or is larger.
+/// Returns an error if the file cannot be read, or is larger.
 pub fn read_bytes(path: &Path, most: u64) -> Result<Vec<u8>, CredentialError> {
     let file = File::open(path).map_err(|e| CredentialError::read(path, e))?;
     read_at_most(&file, path, most)
 }
 
-/// Reads a regular text file of at most `most` bytes. A pipe is not waited for.
+/// Reads a regular text file of at most `most` bytes. It does not wait for a pipe.
 ///
 /// # Errors
-/// The file cannot be read, is not a regular file, is larger, or is not UTF-8.
+/// Returns an error if the file cannot be read, is not a regular file, is larger, or is not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> Result<String, CredentialError> {
     let metadata = std::fs::metadata(path).map_err(|e| CredentialError::read(path, e))?;
     if !metadata.is_file() {
@@ -197,10 +198,10 @@ fn read_at_most(file: &File, path: &Path, most: u64) -> Result<Vec<u8>, Credenti
     Ok(bytes)
 }
 
-/// The certificates of a PEM file, and its bytes.
+/// Reads the certificates of a PEM file, and its bytes.
 ///
 /// # Errors
-/// The file cannot be read, or holds no certificate.
+/// Returns an error if the file cannot be read, or contains no certificate.
 pub fn certificates(
     path: &Path,
 ) -> Result<(Vec<CertificateDer<'static>>, Vec<u8>), CredentialError> {
@@ -231,11 +232,11 @@ const EXPECTED_CERTIFICATE: &str = "expected PEM with -----BEGIN CERTIFICATE----
 /// A certificate chain with its private key, as PEM.
 #[derive(Clone)]
 pub struct Pair {
-    /// The chain, the own certificate first.
+    /// The chain, own certificate first.
     pub certificate: Vec<u8>,
     /// The private key.
     pub key: Vec<u8>,
-    /// Who it is of.
+    /// Description of the own certificate.
     pub described: Described,
 }
 
@@ -249,13 +250,14 @@ impl Pair {
     /// Reads a certificate chain and its key, and checks that they belong together.
     ///
     /// # Errors
-    /// A file cannot be read or is not PEM, the key is open to everyone, or is of another certificate.
+    /// Returns an error if a file cannot be read or is not PEM, if the key is open to everyone, or
+    /// if it belongs to another certificate.
     pub fn read(certificate: &Path, key: &Path) -> Result<Self, CredentialError> {
         let (chain, certificate_pem) = certificates(certificate)?;
         private(key)?;
         let key_pem = read_bytes(key, LARGEST_PEM)?;
         let secret = PrivateKeyDer::from_pem_slice(&key_pem).map_err(|_| {
-            // What the parser says could quote the file.
+            // The parser's message could quote the file.
             CredentialError::unusable(
                 key,
                 "holds no private key; expected PEM with -----BEGIN PRIVATE KEY-----",
@@ -281,12 +283,12 @@ impl Pair {
     }
 }
 
-/// What a certificate says of its owner.
+/// The identity and validity in a certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Described {
-    /// Its common name, where it has one.
+    /// Common name, if any.
     pub common_name: Option<String>,
-    /// Its alternative names: DNS names, and URIs such as SPIFFE ids.
+    /// Alternative names: DNS names, and URIs such as SPIFFE ids.
     pub names: Vec<String>,
     /// Valid from, seconds since 1970.
     pub not_before: i64,
@@ -295,10 +297,10 @@ pub struct Described {
 }
 
 impl Described {
-    /// Reads a certificate.
+    /// Parses a certificate.
     ///
     /// # Errors
-    /// What is wrong with it, in words that follow "a certificate that".
+    /// Returns a description of the fault, in words that follow "a certificate that".
     pub fn of(der: &[u8]) -> Result<Self, String> {
         let (_, parsed) = X509Certificate::from_der(der)
             .map_err(|e| format!("cannot be read ({e}); make it again"))?;
@@ -320,12 +322,12 @@ impl Described {
         })
     }
 
-    /// Whether the certificate is called `name`.
+    /// Returns whether `name` is a name of the certificate.
     pub fn is(&self, name: &str) -> bool {
         self.common_name.as_deref() == Some(name) || self.names.iter().any(|n| n == name)
     }
 
-    /// Why the certificate is of no use now, if so.
+    /// Returns why the certificate is not valid now, if so.
     pub fn out_of_date(&self) -> Option<&'static str> {
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
         let now = since_1970.map_or(0, |d| i64::try_from(d.as_secs()).unwrap_or(i64::MAX));

@@ -1,7 +1,7 @@
-//! Changing a file that other processes read and change.
+//! Changes a file that other processes read and change.
 //!
-//! One process at a time has the lock, which is on the file itself. The file is replaced in one
-//! step by a file with the same owner, group, mode and access list, so a reader sees the old
+//! One process at a time has the lock, which is on the file itself. The file is replaced atomically
+//! by a file with the same owner, group, mode and access list. A reader therefore sees the old
 //! content or the new, and can read both.
 
 use std::{
@@ -20,24 +20,25 @@ use rustix::{
 
 use crate::{CredentialError, private, read_at_most};
 
-/// How long to wait for another process that changes the file.
+/// Longest wait for another process that changes the file.
 const WAIT: Duration = Duration::from_secs(10);
 /// Time between two attempts to get the lock.
 const RETRY: Duration = Duration::from_millis(20);
 /// Largest extended attribute, and largest list of their names, on Linux.
 const LARGEST_ATTRIBUTE: usize = 64 << 10;
-/// The access list of a file.
+/// Name of the attribute with the access list of a file.
 const ACCESS_LIST: &str = "system.posix_acl_access";
-/// Attributes that belong to the old content; the system makes new ones.
+/// Attributes that belong to the old content. The system creates new ones.
 const OF_THE_CONTENT: [&str; 3] = ["security.ima", "security.evm", "security.capability"];
 
 /// A file that no other process changes while this value lives.
 #[derive(Debug)]
 pub struct LockedFile {
     file: File,
-    /// The file after all links: replacing it leaves a link in place.
+    /// The path with all links resolved, so that replacing the file leaves a link in place.
     place: PathBuf,
-    /// This value made the file and has not replaced it: it is removed again.
+    /// Whether this value created the file and has not replaced it. If so, the file is removed
+    /// again.
     new: bool,
 }
 
@@ -45,17 +46,18 @@ impl LockedFile {
     /// Waits for the lock of an existing file.
     ///
     /// # Errors
-    /// The file cannot be opened, is open to everyone, or another process keeps its lock for ten
-    /// seconds.
+    /// Returns an error if the file cannot be opened or is open to everyone, or if another process
+    /// keeps its lock for ten seconds.
     pub fn open(path: &Path) -> Result<Self, CredentialError> {
         Self::wait(path, false)
     }
 
-    /// Waits for the lock of a file, which is made for its owner alone if there is none. A new file
-    /// that is not replaced is removed again.
+    /// Waits for the lock of a file. A missing file is created with access for its owner only. A
+    /// new file is removed again if it is not replaced.
     ///
     /// # Errors
-    /// As [`Self::open`]; the file or its folder cannot be made.
+    /// Returns the errors of [`Self::open`], or an error if the file or its folder cannot be
+    /// created.
     pub fn open_or_create(path: &Path) -> Result<Self, CredentialError> {
         if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
             std::fs::create_dir_all(folder).map_err(|e| CredentialError::write(path, e))?;
@@ -82,11 +84,11 @@ impl LockedFile {
         }
     }
 
-    /// `None` if another process has the lock, or replaced the file before this one got it.
+    /// Returns `None` if another process has the lock, or replaced the file before this one got it.
     fn attempt(path: &Path, create: bool) -> Result<Option<Self>, CredentialError> {
         let failed = |e: io::Error| CredentialError::write(path, e);
         let mut options = OpenOptions::new();
-        // A pipe is not waited for.
+        // A pipe must not block.
         let flags = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
         options.read(true).write(true).custom_flags(flags);
         let (file, new) = match options.open(path) {
@@ -127,20 +129,20 @@ impl LockedFile {
         Ok(Some(Self { file, place, new }))
     }
 
-    /// The content, of at most `most` bytes.
+    /// Reads the content, of at most `most` bytes.
     ///
     /// # Errors
-    /// The file cannot be read, or is larger.
+    /// Returns an error if the file cannot be read, or is larger.
     pub fn read(&self, most: u64) -> Result<Vec<u8>, CredentialError> {
         read_at_most(&self.file, &self.place, most)
     }
 
-    /// Replaces the file in one step and gives the lock back. The new file has the old one's owner,
+    /// Replaces the file atomically and releases the lock. The new file has the old one's owner,
     /// group, mode and extended attributes, which include its access list.
     ///
     /// # Errors
-    /// The new file cannot be written, or this user may not give it what the old one has. The old
-    /// file stays then.
+    /// Returns an error if the new file cannot be written, or if this user may not give it the old
+    /// one's attributes. The old file then stays.
     pub fn replace(mut self, content: &[u8]) -> Result<(), CredentialError> {
         let failed = |e: io::Error| CredentialError::write(&self.place, e);
         let folder = self.place.parent().unwrap_or(Path::new("/"));
@@ -156,13 +158,13 @@ impl LockedFile {
         next.as_file().sync_all().map_err(failed)?;
         next.persist(&self.place).map_err(|e| failed(e.error))?;
         self.new = false;
-        // Without this, a crash of the machine could bring the old file back.
+        // Without this, a crash of the machine could restore the old file.
         File::open(folder)
             .and_then(|folder| folder.sync_all())
             .map_err(|e| CredentialError::write(&self.place, e))
     }
 
-    /// Gives `next` what this file has besides its content.
+    /// Copies this file's metadata to `next`.
     fn hand_down(&self, next: &File) -> Result<(), CredentialError> {
         let failed = |e: io::Error| CredentialError::write(&self.place, e);
         let (old, new) = (
@@ -183,7 +185,7 @@ impl LockedFile {
             })?;
         }
         self.hand_down_attributes(next)?;
-        // After the access list, whose mask is the mode's middle digit.
+        // This follows the access list, because the middle digit of the mode is the list's mask.
         next.set_permissions(Permissions::from_mode(old.mode() & 0o7777))
             .map_err(failed)
     }
@@ -221,13 +223,14 @@ impl LockedFile {
 impl Drop for LockedFile {
     fn drop(&mut self) {
         if self.new {
-            // The reason why it was not replaced is the error that matters.
+            // The relevant error is the reason why the file was not replaced.
             let _ = std::fs::remove_file(&self.place);
         }
     }
 }
 
-/// The names of a file's extended attributes; none where the file system has no such thing.
+/// Returns the names of a file's extended attributes; none if the file system does not support
+/// them.
 fn attributes(file: &File) -> Result<Vec<String>, Errno> {
     let mut names = Vec::with_capacity(LARGEST_ATTRIBUTE);
     match flistxattr(file, rustix::buffer::spare_capacity(&mut names)) {
@@ -296,7 +299,7 @@ mod tests {
         }
     }
 
-    /// Only root may give files away, so elsewhere the test checks that nothing is replaced.
+    /// Only root may change a file's owner, so elsewhere the test checks that nothing is replaced.
     #[test]
     fn a_replaced_file_keeps_its_owner_and_group() {
         let folder = tempfile::tempdir().unwrap();

@@ -14,16 +14,16 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// ℓ_max, metres.
+    /// Returns ℓ_max, metres.
     pub fn end_m(&self) -> f64 {
         self.start_m + self.bin_width_m * f64::from(self.bins)
     }
 
-    /// bin(ℓ) = floor((ℓ − ℓ_min)/Δ); `None` outside the gate.
+    /// Returns bin(ℓ) = floor((ℓ − ℓ_min)/Δ); `None` outside the gate.
     #[inline]
     pub fn bin(&self, path_m: f64) -> Option<u32> {
         let b = (path_m - self.start_m) / self.bin_width_m;
-        // `as` would turn negatives and NaN into bin 0.
+        // A cast with `as` would turn negative values and NaN into bin 0.
         (b >= 0.0 && b < f64::from(self.bins)).then_some(b as u32)
     }
 }

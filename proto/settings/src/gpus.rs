@@ -1,16 +1,16 @@
-//! Which graphics processors a process is to use.
+//! The GPUs that a process uses.
 
 use std::{fmt, str::FromStr};
 
-/// Most of them in one process.
+/// Most GPUs of one process.
 const MOST: u32 = 256;
 
-/// Which graphics processors a process is to use: a number, or names (`cuda:0,cuda:2`).
+/// The GPUs that a process uses: a number, or names (`cuda:0,cuda:2`).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Gpus {
-    /// So many: the first that drivers list, all of one runtime, and no software device.
+    /// This many: the first that drivers list, all of one runtime, without software devices.
     Count(u32),
-    /// These: a runtime and a number there each.
+    /// These GPUs, each as a runtime and a number.
     Named(Vec<String>),
 }
 
@@ -21,7 +21,7 @@ impl Default for Gpus {
 }
 
 impl Gpus {
-    /// Those of these names; an empty list is none.
+    /// Returns the GPUs with these names; an empty list means none.
     pub fn named(names: Vec<String>) -> Self {
         match names.is_empty() {
             true => Self::default(),

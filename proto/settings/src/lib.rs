@@ -1,5 +1,6 @@
-//! The plain settings that jobs, data sets, the renderer and the networks share: each is declared here once, and every
-//! other crate uses this one type. Nothing here computes, reads or sends anything.
+//! The plain settings shared by jobs, data sets, the renderer and the networks. Each is declared
+//! once in this crate, and all other crates use its type. This crate computes, reads and sends
+//! nothing.
 
 mod gate;
 mod gpus;

@@ -1,22 +1,22 @@
-//! What a network learns, what it is built of and how it is trained (Shoot-Bounce-3D: section 4, appendices A.1 and B, and
-//! the released code).
+//! Settings of networks: targets, architectures and training (Shoot-Bounce-3D: section 4,
+//! appendices A.1 and B, and the released code).
 
 use serde::{Deserialize, Serialize};
 
-/// What a network predicts.
+/// The target of a network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Target {
     /// Depth, from which the times of two-bounce light follow.
     Tof,
-    /// Which pixels each spot lights.
+    /// The pixels that each spot lights.
     Shadow,
-    /// Which pixels are mirrors.
+    /// The pixels that are mirrors.
     Specular,
 }
 
 impl Target {
-    /// Its name, as in a job file.
+    /// Returns the name in a job file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Tof => "tof",
@@ -26,24 +26,24 @@ impl Target {
     }
 }
 
-/// How a shadow network is asked for a spot (A.1): with m the measurement and H_i the spot's two-bounce times as a one-hot
-/// histogram, its shadow transient.
+/// The input of a shadow network for a spot (A.1). m is the measurement, and H_i is the spot's
+/// shadow transient: its two-bounce times as a one-hot histogram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ShadowVariant {
-    /// m and H_i, side by side; a spot at random each visit.
+    /// m and H_i, concatenated, with a random spot at each visit.
     #[default]
     Concat,
-    /// |H_i − m|.
+    /// H_i − m|.
     Difference,
-    /// m, and a plane for each spot, all ones for the spot in question.
+    /// m, and a plane for each spot, with ones for the requested spot.
     Index,
-    /// m alone; the masks of all spots at once.
+    /// m alone; predicts the masks of all spots at once.
     All,
 }
 
 impl ShadowVariant {
-    /// Its name, as in a job file.
+    /// Returns the name in a job file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Concat => "concat",
@@ -53,13 +53,13 @@ impl ShadowVariant {
         }
     }
 
-    /// Whether the network is given two-bounce times.
+    /// Returns whether the network uses two-bounce times.
     pub fn is_timed(self) -> bool {
         matches!(self, Self::Concat | Self::Difference)
     }
 }
 
-/// The kinds of network.
+/// The architectures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Architecture {
@@ -70,15 +70,16 @@ pub enum Architecture {
     Unet25d,
     /// SwinIR: bins are channels, attention within windows (Liang et al., ICCVW 2021).
     Swinir,
-    /// Learned feature embeddings: a volume of features, its greatest values over time and their moments, and a network over those
-    /// images (Chen et al., SIGGRAPH Asia 2020).
+    /// Learned feature embeddings: a volume of features, its maxima over time and their moments,
+    /// and a network over those images (Chen et al., SIGGRAPH Asia 2020).
     Embeddings,
-    /// NLOST: such a volume, attention in it within windows and over all of it, and a network over images (Li et al., CVPR 2023).
+    /// NLOST: such a volume, attention in it within windows and over all of it, and a network over
+    /// images (Li et al., CVPR 2023).
     Nlost,
 }
 
 impl Architecture {
-    /// Its name, as in a job file.
+    /// Returns the name in a job file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Unet2d => "unet2d",
@@ -94,9 +95,10 @@ impl Architecture {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Swin {
-    /// Residual groups: blocks, a convolution, and what went in. The lightweight SwinIR has 4, the others 6.
+    /// Residual groups: blocks, a convolution, and the input. The lightweight SwinIR has 4, the
+    /// others 6.
     pub groups: u32,
-    /// Blocks of a group; every second one's windows are shifted by half a window.
+    /// Blocks of a group. The windows of every second block are shifted by half a window.
     pub depth: u32,
     /// Heads of attention; must divide the width.
     pub heads: u32,
@@ -116,10 +118,10 @@ impl Default for Swin {
 }
 
 impl Swin {
-    /// Whether a network of `width` channels can be built of them.
+    /// Checks that a network of `width` channels can be built from them.
     ///
     /// # Errors
-    /// The field, below `net`, and what is wrong with it.
+    /// Returns the field below `net`, and a description of the fault.
     pub fn check(&self, width: usize) -> Result<(), (&'static str, String)> {
         for (field, value, least, most) in [
             ("swin.groups", self.groups, 1, 64),
@@ -142,18 +144,20 @@ impl Swin {
     }
 }
 
-/// What the projection before the first level is (appendix B names a convolution to 128 channels and nothing more).
+/// The form of the projection before the first level (appendix B only names a convolution to 128
+/// channels).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum StemForm {
-    /// 3×3 convolution, batch norm, ReLU: a first half of a block.
+    /// 3×3 convolution, batch norm, ReLU: the first half of a block.
     #[default]
     Block,
-    /// 1×1 convolution with a bias, as the layer of that name is in the released 2.5D network.
+    /// 1×1 convolution with a bias, like the layer with that name in the released 2.5D network.
     Linear,
 }
 
-/// Whether the two streams of a 2.5D network, measurement and shadow transient, share their first projection of time.
+/// Whether the two streams of a 2.5D network, measurement and shadow transient, share their first
+/// projection of time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TimeProjection {
@@ -164,34 +168,35 @@ pub enum TimeProjection {
     Each,
 }
 
-/// Numbers in which convolutions are computed; all else is 32 bits: weights, their gradients' sums and moments, batch norms,
-/// losses.
+/// The number format of convolutions. All other values have 32 bits: weights, sums and moments of
+/// their gradients, batch norms, losses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// 32 bits.
     #[default]
     F32,
-    /// Inputs, weights and outputs, and their gradients, are rounded to bfloat16 (PyTorch's autocast). On a processor this
-    /// is rounding alone, no faster than f32: products and sums have 32 bits there as on tensor cores.
+    /// Inputs, weights and outputs, and their gradients, are rounded to bfloat16 (PyTorch's
+    /// autocast). On a CPU only the rounding applies and it is no faster than f32. Products and
+    /// sums have 32 bits there, as on tensor cores.
     Bf16,
 }
 
-/// How the learning rate changes with the steps.
+/// The schedule of the learning rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Schedule {
-    /// One cycle over the run's real length: from 1/25 of the rate up to it within the first hundredth of the steps, then
-    /// down (PyTorch's `OneCycleLR`, cosine).
+    /// One cycle over the run's real length: from 1/25 of the rate up to the rate within the first
+    /// hundredth of the steps, then down (PyTorch's `OneCycleLR`, cosine).
     #[default]
     Onecycle,
-    /// One cycle over a million steps, however long the run is: what the released code does.
+    /// One cycle over a million steps, whatever the length of the run, as in the released code.
     OnecyclePaper,
     /// From the rate to zero on half a cosine.
     Cosine,
-    /// From the rate to zero on half a cosine, again and again in cycles that become longer (SGDR, Loshchilov and Hutter, ICLR
-    /// 2017; PyTorch's `CosineAnnealingWarmRestarts`).
+    /// From the rate to zero on half a cosine, repeatedly, in cycles of increasing length (SGDR,
+    /// Loshchilov and Hutter, ICLR 2017; PyTorch's `CosineAnnealingWarmRestarts`).
     Restarts,
-    /// The same all the time.
+    /// Constant.
     Constant,
 }

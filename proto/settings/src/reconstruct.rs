@@ -1,15 +1,15 @@
-//! How a scene is reconstructed.
+//! Settings of a scene's reconstruction.
 
 use serde::{Deserialize, Serialize};
 
 /// Most nodes along the longest side of the grid.
 pub const MOST_NODES: u32 = 512;
 
-/// How far light paths are believed.
+/// The use of shadow masks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Shadows {
-    /// Not at all: what the camera does not see is empty.
+    /// Shadow masks are ignored: space outside the camera's view is empty.
     Ignore,
     /// Carving alone.
     Carve,
@@ -18,25 +18,25 @@ pub enum Shadows {
     Optimise,
 }
 
-/// What the density of the room is.
+/// The representation of the room's density.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FieldKind {
     /// A grid: seconds.
     #[default]
     Grid,
-    /// PlatoNeRF's networks, sampled on the grid: the oracle. Minutes to days.
+    /// PlatoNeRF's networks, sampled on the grid, as the oracle. Minutes to days.
     Mlp,
 }
 
-/// What the networks compare transmittances and shadow masks by.
+/// The loss between the networks' transmittances and shadow masks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ShadowLoss {
-    /// Mean squares, as the paper has them.
+    /// Mean squares, as in the paper.
     #[default]
     Squares,
-    /// Cross-entropy: a lit ray whose light is all stopped still has a gradient.
+    /// Cross-entropy, which has a gradient even for a lit ray with no light left.
     CrossEntropy,
 }
 
@@ -50,7 +50,7 @@ pub struct MlpSettings {
     pub width: u32,
     /// Rays of a step.
     pub batch: u32,
-    /// What transmittances and shadow masks are compared by.
+    /// The loss between transmittances and shadow masks.
     pub shadow_loss: ShadowLoss,
 }
 
@@ -69,7 +69,7 @@ impl MlpSettings {
     /// Checks the ranges.
     ///
     /// # Errors
-    /// The setting, and what is wrong with it.
+    /// Returns the setting, and a description of the fault.
     pub fn check(&self) -> Result<(), (&'static str, String)> {
         within(&[
             ("steps", self.steps, 8, 100_000_000),
@@ -94,17 +94,18 @@ fn within(all: &[(&'static str, u32, u32, u32)]) -> Result<(), (&'static str, St
 pub struct GridSettings {
     /// Nodes along the longest side of the grid, 16 to [`MOST_NODES`]. 192 by default; 256 is fine.
     pub nodes: u32,
-    /// Close the room by planes where the camera does not look.
+    /// Whether planes close the room outside the camera's view.
     pub planes: bool,
-    /// What becomes of the shadow masks.
+    /// The use of shadow masks.
     pub shadows: Shadows,
-    /// Iterations of the optimisation, at most: it ends once held-out rays say that more do not help.
+    /// Most iterations of the optimisation, which ends once held-out rays show that more do not
+    /// help.
     pub iterations: u32,
     /// Rays of an iteration.
     pub batch: u32,
     /// Seed of all random numbers.
     pub seed: u64,
-    /// Go on where the measurements contradict one another.
+    /// Whether to continue if the measurements contradict one another.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub accept_inconsistent: bool,
 }
@@ -124,13 +125,13 @@ impl Default for GridSettings {
 }
 
 impl GridSettings {
-    /// The grid for quality rather than speed.
+    /// Number of nodes for quality instead of speed.
     pub const FINE_NODES: u32 = 256;
 
     /// Checks the ranges.
     ///
     /// # Errors
-    /// The setting, and what is wrong with it.
+    /// Returns the setting, and a description of the fault.
     pub fn check(&self) -> Result<(), (&'static str, String)> {
         within(&[
             ("nodes", self.nodes, 16, MOST_NODES),

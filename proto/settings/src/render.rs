@@ -1,37 +1,38 @@
-//! How much the renderer does, and which ways of finding light it uses.
+//! The renderer's budget and techniques.
 
 use serde::{Deserialize, Serialize};
 
-/// How much multi-bounce work to do.
+/// The amount of multi-bounce work.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Budget {
     /// Camera paths per pixel.
     Samples(u32),
-    /// Until the median per-pixel relative standard error falls to this share (0.1 = 10 %).
+    /// Stops when the median per-pixel relative standard error has fallen to this fraction (0.1 =
+    /// 10 %).
     Error(f64),
 }
 
-/// Ways of finding light, to be chosen by hand; the default lets the renderer choose by the scene. Every
-/// choice gives the same expected result, some at far more noise.
+/// Techniques chosen by hand; by default the renderer chooses them for the scene. Every choice
+/// gives the same expected result, some with far more noise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Strategy {
-    /// Side in pixels of the tiles that share vertices, 1 to 32; 1 = every pixel by itself.
+    /// Side in pixels of the tiles that share vertices, 1 to 32; at 1, each pixel is separate.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path_reuse: Option<u32>,
-    /// Walks connect to light vertices drawn from the spots.
+    /// Whether walks connect to light vertices drawn from the spots.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub light_vertices: Option<bool>,
-    /// Aim at the spots' mirror images in planar near-mirrors.
+    /// Whether to aim at the spots' mirror images in planar near-mirrors.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mirror_images: Option<bool>,
-    /// Light paths from the spots for what comes by way of near-mirrors that have no mirror images: curved
-    /// ones, and several in a row.
+    /// Whether to trace light paths from the spots for light from near-mirrors without mirror
+    /// images: curved ones, and several in a row.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub caustics: Option<bool>,
-    /// Look for light in the ellipsoidal shells of a narrow gate, and leave what falls outside the gate
-    /// unlooked at: the overflow that a render states is then a lower bound.
+    /// Whether to search for light in the ellipsoidal shells of a narrow gate. Light outside the
+    /// gate is then not searched for, so that the overflow stated by a render is a lower bound.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ellipsoidal: Option<bool>,
 }
@@ -42,12 +43,12 @@ pub struct Strategy {
 pub enum Choice {
     /// Used or not.
     On(bool),
-    /// A size, in the unit that the name stands for.
+    /// A size, in the unit that the name implies.
     Size(u32),
 }
 
 impl Strategy {
-    /// The names of the ways, as job files and `--strategy` know them.
+    /// The names of the techniques in job files and `--strategy`.
     pub const NAMES: [&str; 5] = [
         "path_reuse",
         "light_vertices",
@@ -56,15 +57,15 @@ impl Strategy {
         "ellipsoidal",
     ];
 
-    /// Whether every way is left to the renderer.
+    /// Returns whether every technique is left to the renderer.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Chooses one way by its name.
+    /// Chooses one technique by its name.
     ///
     /// # Errors
-    /// A message that names what is unknown or of the wrong kind.
+    /// Returns a message about an unknown name or a choice of the wrong kind.
     pub fn choose(&mut self, name: &str, choice: Choice) -> Result<(), String> {
         let way = match name {
             "path_reuse" => {
@@ -91,16 +92,18 @@ impl Strategy {
     }
 }
 
-/// The width of a laser's beams, as data sheets state it: Gaussian, by the diameter in which the intensity has fallen to 1/e². At a
-/// distance z it is √(`diameter_mm`² + (`divergence_mrad` · z in metres)²) millimetres.
+/// The width of a laser's beams, as data sheets state it: Gaussian, by the diameter at which the
+/// intensity has fallen to 1/e². At a distance z it is √(`diameter_mm`² + (`divergence_mrad` · z in
+/// metres)²) millimetres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BeamWidth {
-    /// Diameter where the laser stands, millimetres.
+    /// Diameter at the laser, millimetres.
     pub diameter_mm: f64,
     /// Divergence, full angle, milliradians.
     pub divergence_mrad: f64,
-    /// Rays that stand for a beam, each with an equal share of its light, as so many spots. More take more time.
+    /// Rays that represent a beam, each with an equal fraction of its light, like additional spots.
+    /// More rays take more time.
     pub points: u32,
 }
 
@@ -118,7 +121,7 @@ impl BeamWidth {
     /// Checks the fields against their limits.
     ///
     /// # Errors
-    /// The field and what was expected of it.
+    /// Returns the field and the expected range.
     pub fn check(&self) -> Result<(), (&'static str, String)> {
         let range = |field, value: f64, most: f64, unit: &str| match (0.0..=most).contains(&value) {
             true => Ok(()),

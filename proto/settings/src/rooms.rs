@@ -1,38 +1,39 @@
-//! Primitive rooms: a cube, a cylinder and a mirror in a bare room (Shoot-Bounce-3D, appendices B and F.1).
+//! Primitive rooms: a cube, a cylinder and a mirror in a bare room (Shoot-Bounce-3D, appendices B
+//! and F.1).
 
 use serde::{Deserialize, Serialize};
 
-/// From which ranges the sizes of one kind of object are drawn, metres.
+/// The ranges of an object's size, metres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
-    /// Width: of a cube its two sides on the floor, of a cylinder its diameter.
+    /// Width: the two floor sides of a cube, or the diameter of a cylinder.
     pub width_m: [f64; 2],
     /// Height.
     pub height_m: [f64; 2],
 }
 
-/// On which wall the mirror hangs.
+/// The mirror's wall.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MirrorWall {
-    /// On any of the four.
+    /// Any of the four walls.
     Any,
-    /// On the one that the camera looks at.
+    /// The wall opposite the camera.
     Back,
     /// There is no mirror.
     None,
 }
 
-/// What primitive rooms are like. Each range is drawn from uniformly, for every room.
+/// Properties of primitive rooms. Each range is sampled uniformly for every room.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PrimitiveRooms {
-    /// The room's size: of 1, it is 3.6 m wide and deep (each ± 10 %) and 2.6 m high.
+    /// The room's scale: at 1, it is 3.6 m wide and deep (each ± 10 %) and 2.6 m high.
     pub scale: [f64; 2],
-    /// Least and greatest z-depth of the camera's view, metres; views beyond are drawn again.
+    /// Least and greatest z-depth in the camera's view, metres; views outside are drawn again.
     pub depth_m: [f64; 2],
-    /// The horizontal field of view is within ± this, degrees.
+    /// The horizontal field of view varies by ± this, degrees.
     pub fov_jitter_deg: f64,
     /// The cube.
     pub cube: Sizes,
@@ -40,9 +41,9 @@ pub struct PrimitiveRooms {
     pub cylinder: Sizes,
     /// The mirror.
     pub mirror: Sizes,
-    /// On which wall the mirror hangs.
+    /// The mirror's wall.
     pub mirror_wall: MirrorWall,
-    /// Height of the mirror's lower edge over the floor, metres.
+    /// Height of the mirror's lower edge above the floor, metres.
     pub mirror_from_m: [f64; 2],
 }
 
@@ -68,8 +69,8 @@ impl PrimitiveRooms {
         mirror_from_m: [0.3, 0.8],
     };
 
-    /// Boxes on a desk, as the laboratory of appendix F has them: up to 1.4 m deep, a foam cube, a cylinder of one inch, a mirror
-    /// on the back wall.
+    /// Boxes on a desk, like those of the laboratory in appendix F: up to 1.4 m deep, with a foam
+    /// cube, a cylinder of one inch, and a mirror on the back wall.
     pub const DESKTOP: Self = Self {
         scale: [0.22, 0.34],
         depth_m: [0.3, 1.4],
@@ -90,7 +91,7 @@ impl PrimitiveRooms {
         mirror_from_m: [0.05, 0.2],
     };
 
-    /// Every range with its name, and what it may be.
+    /// Returns every range with its name and its limits.
     fn ranges(&self) -> [(&'static str, [f64; 2], [f64; 2]); 9] {
         let size = [0.005, 5.0];
         [
@@ -109,7 +110,7 @@ impl PrimitiveRooms {
     /// Checks the ranges.
     ///
     /// # Errors
-    /// The field, and what was expected.
+    /// Returns the field and the expected range.
     pub fn check(&self) -> Result<(), (&'static str, String)> {
         for (field, [lo, hi], [least, most]) in self.ranges() {
             if !(least <= lo && lo <= hi && hi <= most) {

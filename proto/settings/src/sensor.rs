@@ -1,12 +1,13 @@
-//! What a sensor is: its settings, in the order in which they act, and what they may be.
+//! Settings of a sensor, in the order of their effect, and their limits.
 
 use serde::{Deserialize, Serialize};
 
 /// Picoseconds that light takes for a metre of path.
 pub const PS_PER_M: f64 = 1e12 / 299_792_458.0;
 
-/// Settings of a sensor. The default is the method's: an analytic pulse of 128 ps, 50 ps of jitter, a two-bounce peak
-/// of 10 to 400 photons, no dark counts, Poisson noise, no rebinning, no dead time.
+/// Settings of a sensor. The defaults are the method's: an analytic pulse of 128 ps, 50 ps of
+/// jitter, a two-bounce peak of 10 to 400 photons, no dark counts, Poisson noise, no rebinning, no
+/// dead time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Sensor {
@@ -14,15 +15,16 @@ pub struct Sensor {
     pub pulse: Pulse,
     /// Timing jitter.
     pub jitter: Jitter,
-    /// How many photons the light is.
+    /// Conversion of light to photons.
     pub scale: Scale,
-    /// Ambient and dark counts: photons a bin (before rebinning) and pixel.
+    /// Ambient and dark counts: photons for each bin (before rebinning) and pixel.
     pub dark_per_bin: f64,
-    /// Draw counts; otherwise the expected rates are the result.
+    /// Whether counts are drawn. Otherwise the expected rates are the result.
     pub poisson: bool,
-    /// How many adjacent bins are summed at the end; bins left over at the end of the gate are dropped. 1 = none.
+    /// Number of adjacent bins that are summed at the end. Bins left over at the end of the gate
+    /// are dropped. 1 means none.
     pub rebin: u32,
-    /// Pile-up; `None` = every photon is counted.
+    /// Pile-up; `None` means that every photon is counted.
     pub dead_time: Option<DeadTime>,
 }
 
@@ -44,23 +46,24 @@ impl Default for Sensor {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Pulse {
-    /// No blur at all.
+    /// No blur.
     None {},
-    /// A Gaussian that goes over smoothly into an exponential tail, as single-photon detectors show. With
-    /// τ = 2s the tail's time constant and t₁ = s²/τ = s/2 where the slopes meet:
-    /// p(t) ∝ exp(−t²/2s²) for t < t₁, exp(−t₁²/2s²)·exp(−(t−t₁)/τ) from there on.
-    /// Its FWHM is s·(√(2 ln 2) + ¼ + 2 ln 2) ≈ 2.8137 s. Its peak, t = 0, is where the light arrives.
+    /// A Gaussian with a smooth transition to an exponential tail, as single-photon detectors show.
+    /// With τ = 2s the tail's time constant and t₁ = s²/τ = s/2 where the slopes are equal: p(t) ∝
+    /// exp(−t²/2s²) for t < t₁, exp(−t₁²/2s²)·exp(−(t−t₁)/τ) from there on. Its FWHM is s·(√(2 ln
+    /// 2) + ¼ + 2 ln 2) ≈ 2.8137 s. Its peak, t = 0, is the arrival of the light.
     Analytic {
         /// Full width at half maximum, picoseconds.
         fwhm_ps: f64,
     },
-    /// A measured pulse: energy by bin, taken as constant within each of its bins.
+    /// A measured pulse: energy by bin, constant within each of its bins.
     Sampled {
-        /// Width of a bin of `values`, picoseconds; need not be the histogram's.
+        /// Width of a bin of `values`, picoseconds; may differ from the histogram's.
         bin_width_ps: f64,
         /// Energy of each bin, at least 0, in any unit.
         values: Vec<f64>,
-        /// The bin whose centre is time zero (fractions are allowed); absent = the largest value's.
+        /// The bin centred at time zero (fractions are allowed); defaults to the bin of the largest
+        /// value.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         zero_bin: Option<f64>,
     },
@@ -76,15 +79,16 @@ impl Default for Pulse {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Jitter {
-    /// Every photon is displaced on its own: a Gaussian blur of the rate.
+    /// Every photon is displaced independently: a Gaussian blur of the rate.
     Gaussian {
-        /// Full width at half maximum, picoseconds; σ = FWHM / (2√(2 ln 2)). 0 = none.
+        /// Full width at half maximum, picoseconds; σ = FWHM / (2√(2 ln 2)). 0 means none.
         fwhm_ps: f64,
     },
-    /// As the published code does it: the pulse is rolled by floor(N(0, σ)) bins of the histogram, once for all pixels.
-    /// The pulse is shifted rather than rolled round its own array, so no tail appears before its rise.
+    /// Like the published code: the pulse is rolled by floor(N(0, σ)) bins of the histogram, once
+    /// for all pixels. The pulse is shifted instead of rolled around its own array, so that no tail
+    /// appears before its rise.
     Sb3dCompat {
-        /// σ in bins of the histogram; absent = [`Jitter::SB3D_SIGMA_BINS`].
+        /// σ in bins of the histogram; defaults to [`Jitter::SB3D_SIGMA_BINS`].
         #[serde(default = "sb3d_sigma")]
         sigma_bins: f64,
     },
@@ -105,9 +109,9 @@ impl Default for Jitter {
     }
 }
 
-/// How many photons a unit of h is. A peak is that of the rate without dark counts: the median over the lit pixels of
-/// the brightest bin of the blurred two-bounce part. (The few pixels close to a spot are far brighter, which a median
-/// does not notice.)
+/// The number of photons for a unit of h. A peak refers to the rate without dark counts: the median
+/// over the lit pixels of the brightest bin of the blurred two-bounce part. The few pixels close to
+/// a spot are far brighter and do not affect the median.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Scale {
@@ -143,32 +147,33 @@ impl Default for Scale {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum DeadTime {
-    /// A pixel sees the first photon after each pulse and is blind until the next pulse, when it is ready again: the dead
-    /// time is longer than the gate and shorter than the repetition period. Of N pulses with rate_b/N expected photons a
-    /// bin, a pulse not yet seen is seen in bin b with probability 1 − exp(−rate_b/N); so the counts are multinomial.
-    /// N → ∞ gives plain Poisson counts. Source: Coates, J. Phys. E 1, 878 (1968); Pediredla et al.,
-    /// "Signal processing based pile-up compensation for gated SPADs" (2018), section 2.
+    /// A pixel records the first photon after each pulse and is blind until the next pulse: the
+    /// dead time is longer than the gate and shorter than the repetition period. With N pulses and
+    /// rate_b/N expected photons a bin, a pulse without a photon so far gives one in bin b with
+    /// probability 1 − exp(−rate_b/N), so that the counts are multinomial. N → ∞ gives plain
+    /// Poisson counts. Source: Coates, J. Phys. E 1, 878 (1968); Pediredla et al., "Signal
+    /// processing based pile-up compensation for gated SPADs" (2018), section 2.
     FirstPhoton {
         /// Pulses in a histogram, N.
         pulses: u64,
     },
 }
 
-/// Why a sensor cannot be used.
+/// The reason why a sensor cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SensorError {
-    /// A setting or an argument is unusable.
+    /// A setting or an argument is invalid.
     #[error("{field}: {what}")]
     Invalid {
         /// The field, e.g. `sensor.pulse.fwhm_ps` or `transient`.
         field: String,
-        /// What was expected, what was found and how to correct it.
+        /// The expected value, the actual value, and the correction.
         what: String,
     },
 }
 
 impl SensorError {
-    /// An error about a field or argument.
+    /// Creates an error about a field or argument.
     pub fn new(field: impl Into<String>, what: impl Into<String>) -> Self {
         Self::Invalid {
             field: field.into(),
@@ -188,7 +193,7 @@ impl Sensor {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`SensorError::Invalid`] names the first unusable field.
+    /// Returns [`SensorError::Invalid`] for the first invalid field.
     pub fn check(&self) -> Result<(), SensorError> {
         match &self.pulse {
             Pulse::None {} => {}

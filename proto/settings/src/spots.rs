@@ -1,4 +1,4 @@
-//! Where the laser's spots lie in the camera's view: on a grid, at random places, or where somebody says.
+//! Positions of the laser's spots in the camera's view: on a grid, random, or given.
 
 use std::{fmt, str::FromStr};
 
@@ -8,24 +8,26 @@ use serde::{
     ser::SerializeMap as _,
 };
 
-/// Where the laser's spots lie in the camera's view. As written: `25`, `{ random = 16 }` or `{ at = [[0.5, 0.5], [0.2, 0.7]] }`.
+/// Positions of the laser's spots in the camera's view. Written as `25`, `{ random = 16 }` or
+/// `{ at = [[0.5, 0.5], [0.2, 0.7]] }`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Spots {
-    /// A square grid of 1, 4, 16, 25 or 100.
+    /// A square grid of 1, 4, 16, 25 or 100 spots.
     Grid(u32),
-    /// So many, uniform over the image and independent of each other, other ones in each scene (Shoot-Bounce-3D, appendix F.3).
+    /// This many random spots, uniform over the image, independent of each other, and different in
+    /// each scene (Shoot-Bounce-3D, appendix F.3).
     Random(u32),
-    /// At these places of the image: x to the right and y down, both from 0 to 1.
+    /// Spots at these positions in the image: x to the right and y down, both from 0 to 1.
     At(Vec<[f64; 2]>),
 }
 
 impl Spots {
-    /// The grids that there are.
+    /// The available grids.
     pub const GRIDS: [u32; 5] = [1, 4, 16, 25, 100];
     /// Most spots of a scene.
     pub const MOST: u32 = 100;
 
-    /// How many there are.
+    /// Returns the number of spots.
     pub fn count(&self) -> u32 {
         match self {
             Self::Grid(n) | Self::Random(n) => *n,
@@ -33,15 +35,15 @@ impl Spots {
         }
     }
 
-    /// Whether the spots lie on a grid.
+    /// Returns whether the spots are on a grid.
     pub fn is_grid(&self) -> bool {
         matches!(self, Self::Grid(_))
     }
 
-    /// Checks the number and the places.
+    /// Checks the number and the positions.
     ///
     /// # Errors
-    /// What is wrong, and what there is.
+    /// Returns a description of the fault and the valid values.
     pub fn check(&self) -> Result<(), String> {
         let most = Self::MOST;
         match self {
@@ -76,7 +78,7 @@ impl From<u32> for Spots {
     }
 }
 
-/// As on a command line: `25`, `random:16`, `0.5,0.5/0.2,0.7`.
+/// Formats the spots as on a command line: `25`, `random:16`, `0.5,0.5/0.2,0.7`.
 impl fmt::Display for Spots {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -90,7 +92,7 @@ impl fmt::Display for Spots {
     }
 }
 
-/// What [`Display`](fmt::Display) writes.
+/// Parses the output of [`Display`](fmt::Display).
 impl FromStr for Spots {
     type Err = String;
 
@@ -138,7 +140,7 @@ impl<'de> Deserialize<'de> for Spots {
     }
 }
 
-/// Reads the three forms, and says which there are where it is none of them.
+/// Reads the three forms, and lists them in the error for any other.
 struct Written;
 
 impl<'de> Visitor<'de> for Written {
@@ -149,7 +151,8 @@ impl<'de> Visitor<'de> for Written {
     }
 
     fn visit_u64<E: serde::de::Error>(self, n: u64) -> Result<Spots, E> {
-        // What is too large for a number of spots is refused as such a number, by the check.
+        // A number too large for `u32` is refused by the check like any other invalid number of
+        // spots.
         Ok(Spots::Grid(u32::try_from(n).unwrap_or(u32::MAX)))
     }
 

@@ -1,4 +1,4 @@
-//! Wire → model and back. Every error names the field that cannot be used.
+//! Conversions between wire types and the model. Every error names the invalid field.
 
 mod audit;
 mod explain;
@@ -10,24 +10,24 @@ use std::str::FromStr;
 
 use crate::model::SpecError;
 
-/// A wire message that cannot be used.
+/// An invalid wire message.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ConvertError {
-    /// A field that must be there is not.
+    /// A required field is missing.
     #[error("{field} is missing")]
     Missing {
         /// The field.
         field: &'static str,
     },
-    /// A field's value cannot be read.
+    /// A field's value is invalid.
     #[error("{field}: {what}")]
     Invalid {
         /// The field.
         field: &'static str,
-        /// What was expected.
+        /// The expected value.
         what: String,
     },
-    /// A job's field lies outside its limits.
+    /// A job's field is outside its limits.
     #[error(transparent)]
     Spec(#[from] SpecError),
 }
@@ -46,12 +46,12 @@ where
     })
 }
 
-/// What is wrong with a field, where something is.
+/// Converts a failed check to an error about the field.
 fn checked<T>(value: Result<T, String>, field: &'static str) -> Result<T, ConvertError> {
     value.map_err(|what| ConvertError::Invalid { field, what })
 }
 
-/// A list of at most so many.
+/// Checks that a list has at most `most` entries.
 fn at_most<T>(list: Vec<T>, most: usize, field: &'static str) -> Result<Vec<T>, ConvertError> {
     let what = || format!("{} entries; at most {most} are allowed", list.len());
     match list.len() > most {

@@ -42,14 +42,14 @@ fn named(name: String, field: &'static str) -> Result<String, ConvertError> {
     Ok(name)
 }
 
-/// The kinds of task a worker runs, with their versions.
+/// Converts the kinds of tasks that a worker runs, with their versions.
 fn kinds(all: HashMap<String, String>) -> Result<BTreeMap<String, String>, ConvertError> {
     let all = at_most(all.into_iter().collect(), bounds::LIST, "hello.kinds")?;
     let kind = |(kind, version)| Ok((named(kind, "hello.kinds")?, named(version, "hello.kinds")?));
     all.into_iter().map(kind).collect()
 }
 
-/// As much of how a worker's process ended as goes into the history of a task.
+/// Returns the part of a worker's exit description that goes into the history of a task.
 fn ended(text: &str) -> String {
     let plain = text.chars().filter(|c| !c.is_control());
     let mut kept = String::new();
@@ -206,7 +206,7 @@ impl TryFrom<wire::TaskDone> for Finished {
             bytes: checked(bytes(w.bytes), "done.bytes")?,
             seconds: checked(bounds::seconds(w.seconds), "done.seconds")?,
             adopted: w.adopted,
-            // Without it the result is worth the same.
+            // A result is equally valid without a trace.
             traceparent: match bounds::name(&w.traceparent, bounds::NAME_BYTES) {
                 Ok(()) => w.traceparent,
                 Err(_) => String::new(),
@@ -267,7 +267,7 @@ impl From<Failure> for wire::TaskFailed {
             lease: Some(m.lease.into()),
             index: m.index,
             kind: kind.into(),
-            // Longer than a message may be, it would end the session each time it is sent.
+            // A longer text than allowed would end the session each time it is sent.
             message: bounds::message(&m.message),
             damaged: m.kind == FailureKind::Damaged,
         }
@@ -341,7 +341,7 @@ impl TryFrom<wire::TaskProgress> for TaskProgress {
         Ok(TaskProgress {
             lease: lease_ref(w.lease)?,
             index: w.index,
-            // What is no number is no progress.
+            // NaN means no progress.
             fraction: match w.fraction.is_nan() {
                 true => 0.0,
                 false => w.fraction.clamp(0.0, 1.0),

@@ -9,7 +9,7 @@ use crate::{
     wire,
 };
 
-/// Pairs of model and wire variants, converted both ways; the wire's zero is an error.
+/// Pairs of model and wire variants, converted both ways. The wire's zero is an error.
 macro_rules! enum_pairs {
     ($model:ident, $wire:path, $field:literal, [$($v:ident),* $(,)?]) => {
         impl From<$model> for $wire {
@@ -104,7 +104,7 @@ impl TryFrom<wire::StageStatus> for StageStatus {
     }
 }
 
-/// A running task, with what it is at or without.
+/// Converts a running task, with its current step if `at`.
 fn running(m: RunningTask, at: bool) -> wire::RunningTask {
     let brief = wire::RunningTask {
         stage: m.stage,

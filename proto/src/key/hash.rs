@@ -1,4 +1,4 @@
-//! What a result is named by: hashes of descriptions.
+//! Keys of results: hashes of descriptions.
 
 use std::fmt;
 
@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct StageKey(pub [u8; 32]);
 
-/// Names one task's result.
+/// Key of one task's result.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TaskKey(pub [u8; 32]);
 
@@ -38,13 +38,14 @@ hex_text!(StageKey);
 hex_text!(TaskKey);
 
 impl StageKey {
-    /// Of a description of all that shapes the results of a stage's tasks but their number.
+    /// Returns the key for a description of everything that affects the results of a stage's tasks
+    /// except their number.
     pub fn of(description: serde_json::Value) -> Self {
         Self(Sha256::digest(canonical(description).as_bytes()).into())
     }
 }
 
-/// The key of task `index` of a stage.
+/// Returns the key of task `index` of a stage.
 pub fn task_key(stage: &StageKey, index: u64) -> TaskKey {
     let mut hash = Sha256::new();
     hash.update(stage.0);
@@ -52,7 +53,8 @@ pub fn task_key(stage: &StageKey, index: u64) -> TaskKey {
     TaskKey(hash.finalize().into())
 }
 
-/// The key of a task that makes one scene of another: the stage, and the key of the task that made the source.
+/// Returns the key of a task that makes one scene from another, given the stage and the key of the
+/// source scene.
 pub fn derived_key(stage: &StageKey, source: &TaskKey) -> TaskKey {
     let mut hash = Sha256::new();
     hash.update(b"derived");
@@ -61,8 +63,8 @@ pub fn derived_key(stage: &StageKey, source: &TaskKey) -> TaskKey {
     TaskKey(hash.finalize().into())
 }
 
-/// JSON with the members of each object sorted. Whether serde_json sorts them by itself depends on its feature
-/// `preserve_order`, which any crate of a build may switch on.
+/// Returns JSON with the members of each object sorted. Whether serde_json sorts them itself
+/// depends on its feature `preserve_order`, which any crate of a build may enable.
 pub(super) fn canonical(mut description: serde_json::Value) -> String {
     description.sort_all_objects();
     description.to_string()

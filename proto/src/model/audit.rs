@@ -1,29 +1,29 @@
-//! Who did what: the lines of the audit log.
+//! The lines of the audit log.
 
 use serde::Serialize;
 
 use crate::ids::JobId;
 
-/// Most bytes of a name in the log.
+/// Longest name in the log, bytes.
 pub const WHO_BYTES: usize = 200;
-/// Most bytes of a detail in the log.
+/// Longest detail in the log, bytes.
 pub const DETAIL_BYTES: usize = 1_000;
 
-/// Something that is done to a farm, or attempted.
+/// An action on a farm, done or attempted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Act {
-    /// A job is submitted.
+    /// Submits a job.
     Submit,
-    /// A job is stopped.
+    /// Cancels a job.
     Cancel,
-    /// A job is held.
+    /// Pauses a job.
     Pause,
-    /// A held job goes on.
+    /// Resumes a paused job.
     Resume,
-    /// A job's given-up tasks are pending again.
+    /// Makes a job's given-up tasks pending again.
     Retry,
-    /// A worker is asked to end.
+    /// Asks a worker to end.
     Drain,
     /// The coordinator read the token file again.
     Tokens,
@@ -32,7 +32,7 @@ pub enum Act {
 }
 
 impl Act {
-    /// All of them.
+    /// All acts.
     pub const ALL: [Self; 8] = [
         Self::Submit,
         Self::Cancel,
@@ -44,7 +44,7 @@ impl Act {
         Self::Certificates,
     ];
 
-    /// Its name.
+    /// Returns the name of the act.
     pub fn name(self) -> &'static str {
         match self {
             Self::Submit => "submit",
@@ -58,29 +58,29 @@ impl Act {
         }
     }
 
-    /// The act of this name.
+    /// Returns the act with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|act| act.name() == name)
     }
 }
 
-/// What became of it.
+/// The outcome of an act.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// It was done.
+    /// The act was done.
     Done,
     /// The caller may not do it, or it cannot be done.
     Refused,
-    /// The coordinator could not, for reasons of its own.
+    /// The coordinator failed.
     Failed,
 }
 
 impl Outcome {
-    /// All of them.
+    /// All outcomes.
     pub const ALL: [Self; 3] = [Self::Done, Self::Refused, Self::Failed];
 
-    /// Its name.
+    /// Returns the name of the outcome.
     pub fn name(self) -> &'static str {
         match self {
             Self::Done => "done",
@@ -89,7 +89,7 @@ impl Outcome {
         }
     }
 
-    /// The outcome of this name.
+    /// Returns the outcome with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|outcome| outcome.name() == name)
     }
@@ -98,18 +98,18 @@ impl Outcome {
 /// A line of the audit log.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct AuditEntry {
-    /// Position in the log, growing.
+    /// Position in the log, ascending.
     pub sequence: u64,
     /// Unix time, milliseconds.
     pub at_ms: i64,
-    /// Name of the caller; `(coordinator)` where nobody called.
+    /// Name of the caller; `(coordinator)` if there was none.
     pub who: String,
-    /// What was done or attempted.
+    /// The act, done or attempted.
     pub act: Act,
-    /// The job, where it concerns one. It may be forgotten by now.
+    /// The job concerned, if any. It may have been forgotten since.
     pub job: Option<JobId>,
-    /// What became of it.
+    /// The outcome.
     pub outcome: Outcome,
-    /// In words.
+    /// Description.
     pub detail: String,
 }

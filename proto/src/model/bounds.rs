@@ -1,32 +1,35 @@
-//! How long a text and how large a number may be that comes from outside, and the checks. All bounds are here.
+//! Bounds on the length of texts and the size of numbers from outside, and their checks. All bounds
+//! are in this module.
 //!
-//! Two rules. A *name* (of a job, a data set, a worker, a store, any text of a job) that breaks its bound is refused, with
-//! the field's name: whoever sent it can send another. A *free text* (an error message, a log line, a reason) is made
-//! printable and cut: refusing it would lose an honest worker's report.
+//! There are two rules. A *name* (of a job, a data set, a worker, a store; any text of a job)
+//! beyond its bound is refused with the name of its field, because the sender can send another. A
+//! *free text* (an error message, a log line, a reason) is made printable and cut, because refusing
+//! it would lose an honest worker's report.
 
-/// Bytes of a name: of a job, stage, data set, split, model, report, worker, user. A store's place and two names with a few
-/// letters between are one index entry of the catalog, and Postgres takes at most 2,704 bytes there.
+/// Bytes of a name: of a job, stage, data set, split, model, report, worker, user. A store's place
+/// and two names with a few letters between them form one index entry of the catalog, and Postgres
+/// allows at most 2,704 bytes there.
 pub const NAME_BYTES: usize = 200;
-/// Bytes of a store's place, or of another folder's or file's path or URL that the catalog indexes.
+/// Bytes of a store's place, or of another path or URL that the catalog indexes.
 pub const PLACE_BYTES: usize = 1024;
 /// Bytes of any other text of a job: a path's limit on Linux.
 pub const TEXT_BYTES: usize = 4096;
-/// Bytes of a message for people. It is stored for each failed task and repeated in the history.
+/// Bytes of a message. It is stored for each failed task and repeated in the history.
 pub const MESSAGE_BYTES: usize = 4096;
-/// Labels, assets or kinds that a worker names, and labels that a stage asks for.
+/// Labels, assets or kinds that a worker names, and labels that a stage requires.
 pub const LIST: usize = 256;
-/// Leases that a worker names at a time; a message of 1 MiB holds some 20,000.
+/// Leases that a worker names at a time. A message of 1 MiB has room for some 20,000.
 pub const LEASES: usize = 16_384;
-/// Running tasks of a job whose status tells what they are at, some 1 MB with the longest texts; of more it tells who runs
-/// them and how far they are. A status is sent a few times a second.
+/// Running tasks of a job with a full description in its status, some 1 MB with the longest texts.
+/// Further tasks only show their worker and progress. A status is sent a few times a second.
 pub const RUNNING: usize = 1_000;
 /// Seconds that a task may have taken: some thirty years.
 pub const SECONDS: f64 = 1e9;
-/// Bytes that a task may have published; the databases' integers are signed.
+/// Bytes that a task may have published. The databases' integers are signed.
 pub const BYTES: u64 = i64::MAX as u64;
 
-/// Whether a terminal does anything with it but show it: control characters, line separators, and those that turn the
-/// direction of writing.
+/// Returns whether a character controls a terminal: control characters, line separators, and
+/// characters that change the direction of writing.
 pub fn steers(c: char) -> bool {
     c.is_control()
         || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
@@ -35,7 +38,7 @@ pub fn steers(c: char) -> bool {
 /// Checks a name.
 ///
 /// # Errors
-/// What is wrong with it.
+/// Returns a description of the fault.
 pub fn name(text: &str, most: usize) -> Result<(), String> {
     if let Some(c) = text.chars().find(|c| steers(*c)) {
         return Err(control(c));
@@ -43,7 +46,7 @@ pub fn name(text: &str, most: usize) -> Result<(), String> {
     length(text.len(), most)
 }
 
-/// That a text holds a control character.
+/// Returns the error for a text with a control character.
 pub(super) fn control(c: char) -> String {
     format!(
         "holds the control character U+{:04X}; remove it",
@@ -59,21 +62,21 @@ pub(super) fn length(bytes: usize, most: usize) -> Result<(), String> {
     }
 }
 
-/// A free text as it is kept: printable, and at most [`MESSAGE_BYTES`].
+/// Returns a free text as it is stored: printable, and at most [`MESSAGE_BYTES`].
 pub fn message(text: &str) -> String {
     cut(text, MESSAGE_BYTES)
 }
 
-/// A name that somebody else chose, as it may stand in a message.
+/// Quotes a name from elsewhere for use in a message.
 pub fn quoted(text: &str) -> String {
     format!("{:?}", cut(text, NAME_BYTES))
 }
 
-/// The beginning of a text in at most `most` bytes (at least 8), printable.
+/// Returns the beginning of a text in at most `most` bytes (at least 8), printable.
 pub fn cut(text: &str, most: usize) -> String {
     const MARK: &str = " …";
     let shown = |c: char| if steers(c) { ' ' } else { c };
-    // A character that steers and its space: the text only gets shorter.
+    // A control character becomes a space, so the text only gets shorter.
     if text.len() <= most {
         return text.chars().map(shown).collect();
     }
@@ -83,10 +86,10 @@ pub fn cut(text: &str, most: usize) -> String {
     short
 }
 
-/// Checks how long a task took.
+/// Checks the duration of a task.
 ///
 /// # Errors
-/// What is wrong with it.
+/// Returns a description of the fault.
 pub fn seconds(value: f64) -> Result<f64, String> {
     match (0.0..=SECONDS).contains(&value) {
         true => Ok(value),

@@ -1,33 +1,34 @@
-//! Where the tasks of a stage write, in a form that can be compared. A coordinator decides by it whose a folder is.
+//! The place to which a stage's tasks write, in a comparable form. A coordinator uses it to decide
+//! who owns a folder.
 
 use std::borrow::Cow;
 
 use super::places::OutputSettings;
 
-/// Where the tasks of a kind write.
+/// The place to which the tasks of a kind write.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Destination<'a> {
-    /// A folder and everything in it.
+    /// A folder with its content.
     Folder(Place<'a>),
     /// A named record in a data set, which may be another user's.
     Record(Place<'a>),
-    /// Only objects that are named by their content, so that nobody can replace another's.
+    /// Only objects named by their content, so that nobody can replace another user's.
     Shared,
 }
 
 /// A folder in a store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Place<'a> {
-    /// The field of the job file that names it.
+    /// The field of the job file that names the folder.
     pub field: &'static str,
     /// The store.
     pub store: &'a str,
-    /// The folder in the store; empty = the store itself.
+    /// The folder in the store; empty means the store itself.
     pub folder: Cow<'a, str>,
 }
 
 impl<'a> Destination<'a> {
-    /// A folder of a store.
+    /// Returns a folder of a store.
     pub(super) fn folder(
         field: &'static str,
         store: &'a str,
@@ -40,12 +41,12 @@ impl<'a> Destination<'a> {
         })
     }
 
-    /// The data set of an output.
+    /// Returns the data set of an output.
     pub(super) fn output(output: &'a OutputSettings) -> Self {
         Self::folder("output.dataset", &output.store, &*output.dataset)
     }
 
-    /// The place that somebody owns, if any.
+    /// Returns the place that a user owns, if any.
     pub fn place(&self) -> Option<&Place<'a>> {
         match self {
             Self::Folder(place) | Self::Record(place) => Some(place),
@@ -55,8 +56,8 @@ impl<'a> Destination<'a> {
 }
 
 impl Place<'_> {
-    /// The place in a form that is equal for equal places: a path or URL that ends with a slash. One place lies in another
-    /// if its text begins with the other's. Links are not followed.
+    /// Returns the normal form, which is equal for equal places: a path or URL with a final slash.
+    /// A place is inside another one if its text begins with the other's. Links are not followed.
     pub fn normal(&self) -> String {
         let (root, path) = match self.store.split_once("://") {
             None => (String::new(), Cow::Borrowed(self.store)),
@@ -84,7 +85,7 @@ impl Place<'_> {
     }
 }
 
-/// A URL's path without percent signs.
+/// Returns a URL's path with its percent escapes decoded.
 fn unescaped(path: &str) -> Cow<'_, str> {
     if !path.contains('%') {
         return path.into();

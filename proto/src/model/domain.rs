@@ -1,4 +1,4 @@
-//! The values that a parameter of a sweep may have, and draws from them.
+//! The possible values of a sweep parameter, and random draws from them.
 
 use std::collections::BTreeMap;
 
@@ -6,29 +6,29 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-/// The values that a parameter may have.
+/// The possible values of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Domain {
-    /// One of these.
+    /// One of these values.
     OneOf(Vec<Value>),
     /// An interval.
     Within(Interval),
 }
 
-/// An interval: `{ range = [a, b] }`, `{ log = [a, b] }` or `{ int = [a, b] }`, ends among it.
+/// An interval, ends included: `{ range = [a, b] }`, `{ log = [a, b] }` or `{ int = [a, b] }`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Interval {
-    /// Every number alike.
+    /// Uniform over numbers.
     Range([f64; 2]),
-    /// Every order of magnitude alike.
+    /// Uniform over orders of magnitude.
     Log([f64; 2]),
-    /// Every whole number alike.
+    /// Uniform over whole numbers.
     Int([i64; 2]),
 }
 
-/// One combination at random. It follows from seed, number and the parameters' names alone.
+/// Draws one combination. It depends only on the seed, the trial number and the parameters' names.
 pub fn draw(over: &BTreeMap<String, Domain>, seed: u64, trial: u64) -> BTreeMap<String, Value> {
     over.iter()
         .map(|(parameter, domain)| {
@@ -45,7 +45,7 @@ pub fn draw(over: &BTreeMap<String, Domain>, seed: u64, trial: u64) -> BTreeMap<
 }
 
 impl Domain {
-    /// What is wrong with it.
+    /// Returns the fault of the domain, if any.
     pub(super) fn fault(&self) -> Option<String> {
         let ordered = |a: f64, b: f64| a.is_finite() && b.is_finite() && a < b;
         match self {
@@ -61,7 +61,7 @@ impl Domain {
         }
     }
 
-    /// Whether a value is one of these.
+    /// Returns whether the domain contains a value.
     pub fn contains(&self, value: &Value) -> bool {
         match self {
             Self::OneOf(_) => self.position(value).is_some(),
@@ -74,7 +74,8 @@ impl Domain {
         }
     }
 
-    /// Which of a list a value is; `None` for an interval, or where it is not among them.
+    /// Returns the position of a value in a list; `None` for an interval, or if the list does not
+    /// contain it.
     pub fn position(&self, value: &Value) -> Option<usize> {
         match self {
             Self::OneOf(values) => values.iter().position(|other| alike(other, value)),
@@ -82,8 +83,8 @@ impl Domain {
         }
     }
 
-    /// The value that random bits choose. Numbers of an interval have four digits, which are readable and the same on
-    /// every machine.
+    /// Returns the value for random bits. Numbers of an interval have four digits, which are
+    /// readable and the same on every machine.
     fn at(&self, bits: u64) -> Value {
         let share = (bits >> 11) as f64 / (1u64 << 53) as f64;
         let whole = |n: u64| ((u128::from(bits) * u128::from(n)) >> 64) as u64;
@@ -98,7 +99,7 @@ impl Domain {
 }
 
 impl Interval {
-    /// The value at a share of the interval, in [0, 1]: with four digits, or whole.
+    /// Returns the value at a fraction of the interval, in [0, 1]: with four digits, or whole.
     pub fn at(&self, share: f64) -> Value {
         let four = |x: f64, [a, b]: [f64; 2]| {
             let rounded: f64 = format!("{x:.3e}").parse().expect("a number");
@@ -118,7 +119,8 @@ impl Interval {
         }
     }
 
-    /// Where a value lies in the interval, in [0, 1]; of whole numbers the middle of its step. `None` for what is no number.
+    /// Returns the fraction of the interval at which a value is, in [0, 1]. For a whole number it
+    /// is the middle of its step. Returns `None` for a value other than a number.
     pub fn share(&self, value: &Value) -> Option<f64> {
         let share = match self {
             Self::Range([a, b]) => (value.as_f64()? - a) / (b - a),
@@ -135,7 +137,7 @@ impl Interval {
     }
 }
 
-/// Whether two values mean the same: 8 and 8.0 do.
+/// Returns whether two values are equal as numbers, for example 8 and 8.0.
 fn alike(a: &Value, b: &Value) -> bool {
     a == b || matches!((a.as_f64(), b.as_f64()), (Some(a), Some(b)) if a == b)
 }

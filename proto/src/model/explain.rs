@@ -1,40 +1,41 @@
-//! Answers to the question why.
+//! Explanations of jobs and tasks.
 
 use serde::Serialize;
 
 use crate::{ids::JobId, model::Event};
 
-/// Why tasks of a job do not run, or what they do instead.
+/// A reason why tasks of a job do not run, or a description of their current work.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Reason {
-    /// One of a fixed set of words, for programs: `no_workers`, `unable`, `busy`, `after_failure`, …
+    /// One of a fixed set of words, for programs: `no_workers`, `unable`, `busy`, `after_failure`,
+    /// …
     pub code: String,
-    /// How many tasks it concerns.
+    /// Number of tasks concerned.
     pub tasks: u64,
-    /// For people.
+    /// Description for users.
     pub words: String,
-    /// Unix time at which it is over, milliseconds, where that is known.
+    /// Unix time at which the reason ends, milliseconds, if known.
     pub until_ms: Option<i64>,
 }
 
-/// Where a task stands.
+/// The state of a task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TaskState {
-    /// Waits.
+    /// Waiting.
     Pending,
-    /// A worker has it.
+    /// Leased to a worker.
     Leased,
-    /// Its output is committed.
+    /// The output is committed.
     Done,
     /// Given up.
     Dead,
-    /// Of a job that was stopped before it ran.
+    /// Part of a job that was stopped before the task ran.
     Gone,
 }
 
 impl TaskState {
-    /// All of them.
+    /// All states.
     pub const ALL: [Self; 5] = [
         Self::Pending,
         Self::Leased,
@@ -43,7 +44,7 @@ impl TaskState {
         Self::Gone,
     ];
 
-    /// Its name.
+    /// Returns the name of the state.
     pub fn name(self) -> &'static str {
         match self {
             Self::Pending => "pending",
@@ -55,86 +56,86 @@ impl TaskState {
     }
 }
 
-/// What became of one task and why.
+/// The state of one task and its reason.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TaskExplanation {
     /// Task index.
     pub index: u64,
-    /// Where it stands.
+    /// State of the task.
     pub state: TaskState,
-    /// The same for people, with the reason.
+    /// The state in words, with its reason.
     pub words: String,
-    /// Failures of its own.
+    /// Failures of the task itself.
     pub failures: u32,
-    /// Failures after which it is given up.
+    /// Failures after which the task is given up.
     pub max_failures: u32,
-    /// Workers lost while they ran it.
+    /// Workers lost while they ran the task.
     pub crashes: u32,
-    /// Lost workers after which it is given up.
+    /// Lost workers after which the task is given up.
     pub max_crashes: u32,
-    /// Attempts that a worker gave back half-way.
+    /// Attempts that a worker returned half-way.
     pub interruptions: u32,
-    /// Interruptions after which it is given up.
+    /// Interruptions after which the task is given up.
     pub max_interruptions: u32,
-    /// The last failure; empty where there was none.
+    /// The last failure; empty if there was none.
     pub last_error: String,
-    /// Why it was run again, once for each time; for people.
+    /// The reason for each repeated run, in words.
     pub reruns: Vec<String>,
-    /// Its result, where there is one.
+    /// The task's result, if any.
     pub output: Option<TaskOutput>,
-    /// Its history, oldest first.
+    /// The task's history, oldest first.
     pub events: Vec<Event>,
 }
 
-/// A task's result and where it came from.
+/// A task's result and its origin.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TaskOutput {
     /// SHA-256 of the manifest, hexadecimal.
     pub manifest_sha256: String,
     /// Bytes published.
     pub bytes: u64,
-    /// Seconds it took.
+    /// Seconds that the task took.
     pub seconds: f64,
-    /// Found in the store and not computed.
+    /// Whether the result was found in the store instead of computed.
     pub adopted: bool,
-    /// Who committed it, under which job and when, as far as the history tells.
+    /// The worker, job and time of the commit, as far as the history contains them.
     pub made: Option<Made>,
 }
 
-/// Who committed a result.
+/// The origin of a result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Made {
-    /// Worker's name.
+    /// Name of the worker.
     pub worker: String,
-    /// The job under which it ran.
+    /// The job under which the task ran.
     pub job: JobId,
-    /// That job's name.
+    /// Name of that job.
     pub job_name: String,
     /// Unix time, milliseconds.
     pub at_ms: i64,
 }
 
-/// A worker that is connected to a coordinator.
+/// A worker connected to a coordinator.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ConnectedWorker {
-    /// Its id, across restarts.
+    /// Id, the same across restarts.
     pub id: String,
-    /// Name, for people.
+    /// Name for display.
     pub name: String,
     /// Program version.
     pub version: String,
     /// Renderer version.
     pub renderer: String,
-    /// CPU cores it uses.
+    /// CPU cores that the worker uses.
     pub cores: u32,
-    /// Leases it holds.
+    /// Number of leases.
     pub leases: u32,
-    /// Tasks of its leases that are not done.
+    /// Unfinished tasks of its leases.
     pub tasks: u64,
     /// Unix time of its connection, milliseconds.
     pub since_ms: i64,
-    /// It is on probation with a range that crashed others, and gets nothing else.
+    /// Whether the worker runs a range that crashed others on probation, and gets nothing else.
     pub quarantined: bool,
-    /// Why it gets nothing, or when it ends, for people; empty = nothing to say.
+    /// The reason why the worker gets no tasks, or its end, in words; may be empty.
     pub note: String,
 }

@@ -1,18 +1,21 @@
-//! How a job is written, in a TOML file, in the catalog and on the wire: every field known, every other one refused.
+//! The written form of a job in a TOML file, in the catalog and on the wire. Unknown fields are
+//! refused.
 //!
-//! A job that only renders may leave `[[stage]]` away and put `[scenes]`, `[render]`, `[output]` and `[resources]` at the
-//! top. In a stage, `kind` is `render` and `name` is the kind unless they are given; `source` may be the name of a stage,
-//! whose data set is read then; a stage needs those whose data it reads; and the number of scenes of a data set that
-//! another stage makes need not be said.
+//! A job that only renders may omit `[[stage]]` and put `[scenes]`, `[render]`, `[output]` and
+//! `[resources]` at the top level. In a stage, `kind` defaults to `render` and `name` to the kind.
+//! `source` may name a stage, and then means its data set. A stage needs the stages that make its
+//! input data. The number of scenes of a data set that another stage makes may be omitted.
 //!
-//! `parts = 8` beside `[render]` divides each scene among that many tasks and the light paths' one, and joins them: the
-//! job gets a stage of kind `part`, called `NAME.parts`, before the render stage. So do `shards = 8` in an evaluation:
-//! `NAME.shards` is of kind `evaluate_shard`.
+//! `parts = 8` next to `[render]` divides each scene into that many tasks and one for the light
+//! paths, and joins them. The job gets a stage of kind `part`, called `NAME.parts`, before the
+//! render stage. Likewise, `shards = 8` in an evaluation adds `NAME.shards`, of kind
+//! `evaluate_shard`.
 //!
-//! `matrix = { dark = [0.0, 0.1], bins = [1, 4] }` makes a stage for each combination of values. Anywhere in the stage,
-//! the text `"{dark}"` stands for the value, and `{dark}` inside a text for its text. An instance is called
-//! `name[0.1,4]`, values in the order of the parameters' names; `needs = ["name"]` means all of them. `[stage.sweep]` does
-//! the like for trainings among which the best is wanted ([`super::sweep`]).
+//! `matrix = { dark = [0.0, 0.1], bins = [1, 4] }` makes a stage for each combination of values.
+//! Anywhere in the stage, the text `"{dark}"` becomes the value, and `{dark}` inside a longer text
+//! becomes the value's text. An instance is called `name[0.1,4]`, with values in the order of the
+//! parameters' names; `needs = ["name"]` means all instances. `[stage.sweep]` is similar, for
+//! trainings from which the best is chosen ([`super::sweep`]).
 
 use serde::Deserialize;
 use serde_json::Value;
@@ -52,10 +55,10 @@ pub(super) struct JobText {
 }
 
 impl JobText {
-    /// Takes out the stages, as they are written: what follows from others is not filled in yet.
+    /// Takes the stages in their written form, without the values that follow from other stages.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be read.
+    /// Returns a [`SpecError`] for the first field that cannot be read.
     pub(super) fn stages(&mut self) -> Result<Vec<StageSpec>, SpecError> {
         let mut stages = Vec::new();
         let missing = |field: &str, what: &str| {
@@ -111,7 +114,8 @@ impl JobText {
     }
 }
 
-/// Puts a stage that makes the parts before each stage that joins them, unless it is there already.
+/// Inserts a stage that makes the parts before each stage that joins them, unless it exists
+/// already.
 fn divided(written: Vec<StageSpec>) -> Vec<StageSpec> {
     let mut stages: Vec<StageSpec> = Vec::with_capacity(written.len());
     for mut stage in written {
@@ -133,7 +137,7 @@ fn divided(written: Vec<StageSpec>) -> Vec<StageSpec> {
     stages
 }
 
-/// The tasks that make what a stage joins, and how the name of their stage ends.
+/// Returns the tasks that make the inputs of a joining stage, and the suffix of their stage's name.
 fn parts_of(task: &TaskSpec) -> Option<(&'static str, TaskSpec)> {
     match task {
         TaskSpec::Render(task) if task.parts > 1 => {

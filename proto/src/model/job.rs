@@ -1,5 +1,6 @@
-//! A job: a graph of stages, each of them many tasks of one kind. The TOML job file has exactly these fields; see
-//! [`JobSpec::check`] for their limits, and [`super::file`] for what may be left out or written shorter.
+//! A job: a graph of stages, each with many tasks of one kind. The TOML job file has exactly these
+//! fields. See [`JobSpec::check`] for their limits, and [`super::file`] for optional and short
+//! forms.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,19 +19,20 @@ use super::{
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "JobText")]
 pub struct JobSpec {
-    /// Name, for people.
+    /// Name for display.
     pub name: String,
     /// Jobs of a higher priority get workers first (default 0).
     pub priority: i32,
-    /// When a task, or the job, is given up.
+    /// Limits after which a task, or the job, is given up.
     pub limits: Limits,
-    /// Sets it apart from a job that is otherwise the same; empty but for those that run again what is done.
+    /// Distinguishes the job from an otherwise equal one. Empty except for jobs that repeat
+    /// finished work.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub nonce: String,
-    /// Whose it is besides its submitter's: maintainers of the project may change it; empty = nobody's.
+    /// Project of the job; its maintainers may change the job. Empty means none.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub project: String,
-    /// What is done, in an order in which each stage comes after those that it needs.
+    /// Stages, each after the stages that it needs.
     #[serde(rename = "stage")]
     pub stages: Vec<StageSpec>,
 }
@@ -53,7 +55,7 @@ impl TryFrom<JobText> for JobSpec {
 }
 
 impl JobSpec {
-    /// A job of one stage that renders.
+    /// Creates a job with a single render stage.
     pub fn render(name: impl Into<String>, task: RenderTask) -> Self {
         Self {
             name: name.into(),
@@ -65,10 +67,10 @@ impl JobSpec {
         }
     }
 
-    /// Fills in what follows from other stages: places, needs and numbers of scenes.
+    /// Fills in values that follow from other stages: places, needs and numbers of scenes.
     ///
     /// # Errors
-    /// A source that no stage before makes.
+    /// Returns an error for a source that no earlier stage makes.
     pub fn resolve(&mut self) -> Result<(), SpecError> {
         refer::resolve(&mut self.stages)
     }
@@ -76,9 +78,9 @@ impl JobSpec {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
-        // First: what follows repeats texts in its messages.
+        // This comes first, because the later checks repeat texts in their messages.
         self.check_texts()?;
         if self.name.trim().is_empty() {
             return Err(SpecError::new("name", "is empty; give the job a name"));
@@ -109,11 +111,12 @@ impl JobSpec {
         Ok(())
     }
 
-    /// Checks all that a coordinator holds a submitted job to: fields within their limits, everything pinned that a client
-    /// must pin, and places that mean the same to everyone. Called once on either side.
+    /// Checks all requirements of a coordinator on a submitted job: fields within their limits,
+    /// pinned versions and hashes, and places that mean the same on every machine. Client and
+    /// coordinator each call it once.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check_submitted(&self) -> Result<(), SpecError> {
         self.check()?;
         let mut stages = self.stages.iter();
@@ -121,17 +124,17 @@ impl JobSpec {
         self.check_places()
     }
 
-    /// Checks where a submitted job reads and writes: absolute paths or URLs, none of which climbs. (Job files may name
-    /// relative ones; submission resolves them.)
+    /// Checks the places of a submitted job: absolute paths or URLs without `..`. Job files may
+    /// contain relative paths, which the submission resolves.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check_places(&self) -> Result<(), SpecError> {
         let mut stages = self.stages.iter();
         stages.try_for_each(|stage| stage.check_places().map_err(|e| self.at(stage, e)))
     }
 
-    /// The field's full name: of several stages it says which.
+    /// Returns the full name of a field, which includes the stage if there are several.
     pub fn at(&self, stage: &StageSpec, error: SpecError) -> SpecError {
         match self.stages.len() {
             1 => error,
@@ -139,7 +142,7 @@ impl JobSpec {
         }
     }
 
-    /// Checks the length of every text, and that none has control characters.
+    /// Checks that every text is short enough and has no control characters.
     fn check_texts(&self) -> Result<(), SpecError> {
         let Err(fault) = texts::check(self) else {
             return Ok(());
@@ -157,7 +160,7 @@ impl JobSpec {
         Err(SpecError::new(field.join("."), fault.what))
     }
 
-    /// The stage of this name and its position.
+    /// Returns the stage with this name and its position.
     pub fn stage(&self, name: &str) -> Option<(usize, &StageSpec)> {
         self.stages.iter().enumerate().find(|(_, s)| s.name == name)
     }

@@ -1,4 +1,4 @@
-//! What passes between coordinator and worker, checked.
+//! Checked messages between coordinator and worker.
 
 use std::collections::BTreeMap;
 
@@ -9,51 +9,51 @@ use crate::{
     model::StageSpec,
 };
 
-/// Who a worker says it is at the start of a session.
+/// A worker's description of itself at the start of a session.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorkerHello {
-    /// The worker, across restarts.
+    /// Id of the worker, the same across restarts.
     pub id: WorkerId,
-    /// This process.
+    /// Id of this process.
     pub incarnation: Incarnation,
-    /// Name, for people (host and process).
+    /// Name for display (host and process).
     pub name: String,
     /// Program version.
     pub version: String,
     /// Protocol version; see [`crate::PROTOCOL`].
     pub protocol: u32,
-    /// Leases it still holds from before a reconnect.
+    /// Leases kept from before a reconnect.
     pub held: Vec<LeaseRef>,
-    /// How its process before this one ended, in words, where its parent knows; empty otherwise.
+    /// Description of how the previous process ended, if its parent knows; otherwise empty.
     pub ended: String,
-    /// Milliseconds until it must end, where that is known.
+    /// Milliseconds until the worker must end, if known.
     pub ends_in_ms: Option<u64>,
-    /// What it is able to do and what it has.
+    /// Abilities of the worker.
     pub abilities: Abilities,
 }
 
-/// What a worker is able to do and what it has.
+/// The abilities and resources of a worker.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Abilities {
-    /// The kinds of task that it runs, and parts of kinds that not every worker has
+    /// The kinds of tasks that the worker runs, and optional parts of kinds
     /// ([`TaskSpec::ability`](crate::model::TaskSpec::ability)), each with the version of its code.
     pub kinds: BTreeMap<String, String>,
-    /// Fingerprints of the furniture it has.
+    /// Fingerprints of the installed furniture.
     pub assets: Vec<String>,
-    /// CPU cores it uses.
+    /// CPU cores that the worker uses.
     pub cores: u32,
-    /// Memory in MiB; 0 = not known.
+    /// Memory in MiB; 0 if unknown.
     pub memory_mib: u64,
-    /// Graphics processors that it has opened, as they call themselves.
+    /// Names of the GPUs that the worker has opened.
     pub gpus: Vec<String>,
-    /// Labels it was given.
+    /// Labels of the worker.
     pub labels: Vec<String>,
 }
 
-/// A granted lease: tasks `lo ≤ i < hi` less `skip`.
+/// A granted lease: tasks `lo ≤ i < hi` without `skip`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lease {
-    /// Its name.
+    /// Reference of the lease.
     pub lease: LeaseRef,
     /// The job.
     pub job: JobId,
@@ -61,100 +61,101 @@ pub struct Lease {
     pub lo: u64,
     /// One past the last task.
     pub hi: u64,
-    /// Tasks of the interval that are not to be run.
+    /// Tasks of the interval that must not run.
     pub skip: Vec<u64>,
     /// Time to live from receipt, milliseconds.
     pub ttl_ms: u32,
-    /// The stage; of its lists as much as these tasks need.
+    /// The stage, with its lists reduced to these tasks.
     pub stage: StageSpec,
     /// Position of the stage in the job.
     pub ordinal: u32,
-    /// The stage's key.
+    /// Key of the stage.
     pub key: StageKey,
-    /// Where it belongs in a trace; see [`crate::trace`].
+    /// Trace context; see [`crate::trace`].
     pub traceparent: String,
 }
 
-/// A finished task as the worker reports it.
+/// A worker's report of a finished task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finished {
-    /// The lease it ran under.
+    /// The lease of the task.
     pub lease: LeaseRef,
     /// Task index.
     pub index: u64,
-    /// Names the result.
+    /// Key of the result.
     pub key: TaskKey,
     /// SHA-256 of the manifest, hexadecimal.
     pub manifest_sha256: String,
     /// Bytes published.
     pub bytes: u64,
-    /// Seconds it took.
+    /// Seconds that the task took.
     pub seconds: f64,
-    /// Found in the store, not computed.
+    /// Whether the result was found in the store instead of computed.
     pub adopted: bool,
-    /// Where the task was in a trace; see [`crate::trace`].
+    /// Trace context of the task; see [`crate::trace`].
     pub traceparent: String,
 }
 
-/// Who is to blame for a failure; budgets are separate.
+/// The cause of a failure. Each has its own budget.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FailureKind {
     /// The task's own input or settings.
     User,
     /// The executor panicked, or the worker was lost.
     Crash,
-    /// Shutdown, preemption, the machine's trouble: counted by itself.
+    /// Shutdown, preemption, or a fault of the machine. Counted separately.
     Interrupted,
-    /// The store cannot be reached or written: free, and all that use it wait.
+    /// The store cannot be reached or written. Not charged, and all tasks that use the store wait.
     Store,
-    /// The store answers, but an object in it is damaged or missing: free, and the task waits until it is repaired.
+    /// The store answers, but an object in it is damaged or missing. Not charged, and the task
+    /// waits until the object is repaired.
     Damaged,
 }
 
-/// A failed task as the worker reports it.
+/// A worker's report of a failed task.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Failure {
-    /// The lease it ran under.
+    /// The lease of the task.
     pub lease: LeaseRef,
     /// Task index.
     pub index: u64,
-    /// Whose fault.
+    /// Cause of the failure.
     pub kind: FailureKind,
-    /// Why, for people.
+    /// Description of the failure.
     pub message: String,
 }
 
-/// How far a running task is.
+/// Progress of a running task.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TaskProgress {
-    /// Its lease.
+    /// Lease of the task.
     pub lease: LeaseRef,
     /// Task index.
     pub index: u64,
-    /// Share done in [0, 1].
+    /// Completed fraction in [0, 1].
     pub fraction: f32,
-    /// What it is at.
+    /// Current step of the task.
     pub at: TaskAt,
 }
 
-/// What a running task is at: its own words and figures.
+/// The current step of a running task, in its own words and figures.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TaskAt {
-    /// For people; empty = nothing to say.
+    /// Text for display; may be empty.
     pub text: String,
-    /// For programs: loss, samples_per_s, …
+    /// Figures for programs: loss, samples_per_s, …
     pub figures: BTreeMap<String, f64>,
 }
 
 impl TaskAt {
-    /// Bytes of the text.
+    /// Longest text, bytes.
     const TEXT: usize = 256;
-    /// Figures.
+    /// Most figures.
     const FIGURES: usize = 16;
-    /// Bytes of a figure's name.
+    /// Longest name of a figure, bytes.
     const NAME: usize = 32;
 
-    /// As much of it as a message may carry, as it is sent with each heartbeat, in a text that a terminal only shows.
+    /// Returns the part that fits into each heartbeat, with a printable text.
     #[must_use]
     pub fn limited(self) -> Self {
         let figures = self.figures.into_iter();

@@ -1,4 +1,4 @@
-//! How large a job may be, when it is given up, and what its workers must have.
+//! Limits on the size of a job and on its failures, and the resources of its workers.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,23 +18,24 @@ pub(super) fn check_count(field: &str, count: u64) -> Result<(), SpecError> {
     within(field, count, (1, MAX_TASKS), "scenes")
 }
 
-/// When a task, or the job, is given up.
+/// Limits after which a task, or the job, is given up.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// Failures of the task itself before it is dead.
+    /// Failures of the task itself after which it is dead.
     pub max_failures: u32,
-    /// Losses of the worker while it ran the task before it is dead.
+    /// Losses of the worker during the task after which it is dead.
     pub max_crashes: u32,
-    /// Attempts that a worker gave back half-way (it was told to end, or its machine was in
-    /// trouble) before the task is dead. An attempt at a task that goes on from where it was saved
-    /// does not count where it came further.
+    /// Attempts returned half-way by a worker after which the task is dead. A worker returns a task
+    /// if it is told to end, or if its machine is in trouble. An attempt at a resumable task does
+    /// not count if it made progress.
     #[serde(skip_serializing_if = "is_usual")]
     pub max_interruptions: u32,
-    /// Workers that may run the job at a time; 0 = as many as there are.
+    /// Most workers that may run the job at a time; 0 means no limit.
     #[serde(skip_serializing_if = "is_zero")]
     pub max_workers: u32,
-    /// What is not done by then (RFC 3339, e.g. `2026-12-01T18:00:00Z`) is cancelled; empty = never.
+    /// Time at which the unfinished job is cancelled (RFC 3339, e.g. `2026-12-01T18:00:00Z`); empty
+    /// means never.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub deadline: String,
 }
@@ -44,7 +45,8 @@ fn is_zero(n: &u32) -> bool {
     *n == 0
 }
 
-/// Left out of a job that does not say it, so that its hash is that of earlier versions.
+/// Omits the default from the written form of a job, so that its hash matches that of earlier
+/// versions.
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
 fn is_usual(n: &u32) -> bool {
     *n == MAX_INTERRUPTIONS
@@ -63,10 +65,10 @@ impl Default for Limits {
 }
 
 impl Limits {
-    /// The deadline as Unix time, milliseconds.
+    /// Returns the deadline as Unix time, milliseconds.
     ///
     /// # Errors
-    /// It is no time.
+    /// Returns an error if the text is not a time.
     pub fn deadline_ms(&self) -> Result<Option<i64>, SpecError> {
         if self.deadline.is_empty() {
             return Ok(None);
@@ -86,7 +88,7 @@ impl Limits {
     }
 
     pub(super) fn check(&self) -> Result<(), SpecError> {
-        // More attempts than these are an endless loop.
+        // More attempts than this amount to an endless loop.
         for (field, value) in [
             ("limits.max_failures", self.max_failures),
             ("limits.max_crashes", self.max_crashes),
@@ -101,7 +103,8 @@ impl Limits {
     }
 }
 
-/// What a worker must have to run a stage's tasks. A worker runs one task at a time with all that it has.
+/// The resources that a worker must have to run a stage's tasks. A worker runs one task at a time
+/// with all its resources.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Resources {
@@ -109,14 +112,14 @@ pub struct Resources {
     pub cores: u32,
     /// Memory in GiB (2^30 bytes).
     pub memory_gib: f64,
-    /// Graphics processors: 1 for networks that are to be trained or asked on one.
+    /// GPUs: 1 for networks to be trained or evaluated on one.
     pub gpus: u32,
-    /// Labels, each of which the worker must have been given.
+    /// Labels that the worker must have.
     pub labels: Vec<String>,
 }
 
 impl Resources {
-    /// Whether nothing is asked for.
+    /// Returns whether there is no requirement.
     pub fn is_none(&self) -> bool {
         *self == Self::default()
     }
@@ -151,10 +154,10 @@ impl Resources {
     }
 }
 
-/// Checks a label: it stands between commas and in messages.
+/// Checks a label, which appears in comma-separated lists and in messages.
 ///
 /// # Errors
-/// What is wrong with it.
+/// Returns a description of the fault.
 pub fn check_label(label: &str) -> Result<(), String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.=".contains(c);
     if label.is_empty() || label.len() > 64 || !label.chars().all(plain) {
@@ -165,10 +168,10 @@ pub fn check_label(label: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks the name of a project: it stands between commas and in messages.
+/// Checks the name of a project, which appears in comma-separated lists and in messages.
 ///
 /// # Errors
-/// What is wrong with it.
+/// Returns a description of the fault.
 pub fn check_project(name: &str) -> Result<(), String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     if name.is_empty() || name.len() > 64 || !name.chars().all(plain) {

@@ -1,19 +1,20 @@
-//! What a task logs on its worker, and how much of it is kept. Worker and coordinator count by the same rule: the one so
-//! that it sends no more, the other because nobody is trusted to.
+//! Log lines of tasks, and their limits. Worker and coordinator count by the same rule:
+//! the worker to avoid sending more, the coordinator because it trusts no worker.
 
 use std::fmt;
 
 use super::bounds::steers;
 use crate::ids::LeaseRef;
 
-/// Lines of a task that are kept.
+/// Most lines kept for a task.
 pub const LINES: usize = 200;
-/// Bytes of text of a task that are kept.
+/// Most bytes of text kept for a task.
 pub const BYTES: usize = 16 << 10;
-/// Bytes of a line, at most.
+/// Longest line, bytes.
 pub const LINE_BYTES: usize = 2 << 10;
 
-/// How a task's line begins that states what its result is worth; `job watch` shows such lines when the job ends.
+/// Prefix of a line that states the quality of a task's result. `job watch` shows such lines when
+/// the job ends.
 pub const VERDICT: &str = "verdict: ";
 
 /// How a task's line begins that says why its scene is without light; where a job ends, such scenes are counted.
@@ -29,11 +30,11 @@ pub fn marked<'a>(message: &'a str, mark: &str) -> Option<(bool, &'a str)> {
 /// How grave a line is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogLevel {
-    /// It cannot go on so.
+    /// The task cannot continue.
     Error,
-    /// It goes on, and somebody should know.
+    /// The task continues, but somebody should know.
     Warn,
-    /// What it does.
+    /// Information about the task.
     Info,
 }
 
@@ -57,18 +58,18 @@ impl fmt::Display for LogLevel {
 /// One line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogLine {
-    /// Milliseconds from its writing to its sending.
+    /// Milliseconds between writing and sending the line.
     pub ago_ms: u32,
-    /// How grave it is.
+    /// Severity.
     pub level: LogLevel,
-    /// What it says.
+    /// Text.
     pub text: String,
 }
 
 /// Lines of one task, in order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TaskLog {
-    /// The lease it runs under.
+    /// Lease of the task.
     pub lease: LeaseRef,
     /// Task index.
     pub index: u64,
@@ -76,7 +77,7 @@ pub struct TaskLog {
     pub lines: Vec<LogLine>,
 }
 
-/// What a task may still log.
+/// The remaining log allowance of a task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LogAllowance {
     lines: usize,
@@ -93,7 +94,8 @@ impl Default for LogAllowance {
 }
 
 impl LogAllowance {
-    /// Takes one line of so many bytes out of it; `false` where it is not enough, and from then on for every line.
+    /// Deducts a line of `bytes` bytes. Returns `false` if the allowance is too small, and then for
+    /// every later line.
     #[must_use]
     pub fn take(&mut self, bytes: usize) -> bool {
         if self.lines == 0 || bytes > self.bytes {
@@ -106,13 +108,13 @@ impl LogAllowance {
     }
 }
 
-/// A text that a terminal only shows: characters that do anything else become spaces.
+/// Returns a printable text: characters that control a terminal become spaces.
 pub fn printable(text: &str) -> String {
     let shown = |c: char| if steers(c) { ' ' } else { c };
     text.chars().map(shown).collect()
 }
 
-/// The beginning of a text that fits a line, cut between two characters.
+/// Cuts a text between two characters so that it fits into a line.
 pub fn cut(text: &mut String) {
     if text.len() > LINE_BYTES {
         const MARK: &str = " …";

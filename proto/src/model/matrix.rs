@@ -1,4 +1,4 @@
-//! The stages that one with `matrix = { … }` stands for: one of each combination of values.
+//! Expands a stage with `matrix = { … }` into one stage for each combination of values.
 
 use serde_json::{Map, Value};
 
@@ -8,7 +8,7 @@ use super::{
     substitute::{plain, substitute},
 };
 
-/// The stages that a stage with a matrix stands for; one without stands for itself.
+/// Returns the instances of a stage with a matrix. A stage without one is returned unchanged.
 pub(super) fn instances(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     let Some(matrix) = stage.as_object_mut().and_then(|s| s.remove("matrix")) else {
         return Ok(vec![stage]);
@@ -51,7 +51,7 @@ pub(super) fn instances(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     Ok(choices.into_iter().map(instance).collect())
 }
 
-/// `name` becomes `name[values]`, unless it names its values itself.
+/// Changes `name` to `name[values]`, unless the name contains its values already.
 fn name_instance(stage: &mut Map<String, Value>, values: &str) {
     let kind = stage
         .get("kind")
@@ -64,17 +64,19 @@ fn name_instance(stage: &mut Map<String, Value>, values: &str) {
     }
 }
 
-/// The name that a stage of a matrix was given, without its values: `tof` of `tof[125,1]`; `None` = it is of none.
+/// Returns the name of a matrix stage without its values: `tof` for `tof[125,1]`. Returns `None`
+/// for a stage outside any matrix.
 pub fn of_matrix(name: &str) -> Option<&str> {
     name.strip_suffix(']')?.split_once('[').map(|(of, _)| of)
 }
 
-/// Whether two stages are of one matrix, by their names.
+/// Returns whether two stages belong to one matrix, by their names.
 pub fn same_matrix(a: &str, b: &str) -> bool {
     of_matrix(a).is_some_and(|of| of_matrix(b) == Some(of))
 }
 
-/// What stages of one matrix are called together: `tof[…]`; a stage alone by its name. Empty for none.
+/// Returns the common name of the stages of one matrix, `tof[…]`, or the name of a single stage.
+/// Empty for no stage.
 pub fn together(names: &[impl AsRef<str>]) -> String {
     match names {
         [] => String::new(),

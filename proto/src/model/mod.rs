@@ -1,4 +1,4 @@
-//! The checked model: what the coordinator and the agent reason about. Wire types convert into these.
+//! The checked model used by the coordinator and the agent. Wire types convert into these types.
 
 pub mod audit;
 pub mod bounds;
@@ -28,7 +28,7 @@ pub mod trial;
 pub use audit::{Act, AuditEntry, Outcome};
 pub use destination::{Destination, Place};
 pub use domain::{Domain, Interval};
-// What jobs share with data sets, the renderer and the networks.
+// Types shared by jobs, data sets, the renderer and the networks.
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use job::JobSpec;
 pub use kinds::{

@@ -1,15 +1,15 @@
-//! Where a job reads and writes: stores, folders in them, and their checks.
+//! The places that a job reads and writes: stores, folders in them, and their checks.
 
 use serde::{Deserialize, Serialize};
 
 use super::spec_error::SpecError;
 
-/// Folder of a store in which trained models are kept.
+/// Folder of a store for trained models.
 pub const MODELS: &str = "models";
-/// Folder of a store in which reports about them are kept.
+/// Folder of a store for reports about models.
 pub const REPORTS: &str = "reports";
 
-/// Where results go.
+/// The destination of results.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OutputSettings {
@@ -57,7 +57,7 @@ impl OutputSettings {
     }
 }
 
-/// A data set that is read.
+/// An input data set.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SourceSettings {
     /// The store: a path or URL that every worker can reach.
@@ -67,7 +67,7 @@ pub struct SourceSettings {
 }
 
 impl SourceSettings {
-    /// How keys know it: by its place.
+    /// Returns the form used in keys, which is the place.
     pub(super) fn shaping(&self) -> serde_json::Value {
         serde_json::json!([self.store, self.dataset])
     }
@@ -88,7 +88,7 @@ struct PlaceText {
     dataset: String,
 }
 
-/// Until a job is read as a whole, a source without a store names a stage.
+/// Until the whole job has been read, a source without a store names a stage.
 impl<'de> Deserialize<'de> for SourceSettings {
     fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let text = SourceText::deserialize(deserializer).map_err(|_| {
@@ -122,13 +122,13 @@ pub(super) fn check_source(source: &SourceSettings) -> Result<(), SpecError> {
     Ok(())
 }
 
-/// A place that means the same to everyone: absolute, and without a way up.
+/// Checks a place that must mean the same on every machine: absolute, and without `..`.
 pub(super) fn place(field: &str, text: &str) -> Result<(), SpecError> {
     let fail = |what: &str| Err(SpecError::new(field, format!("{text:?} {what}")));
     if text.contains('\0') {
         return fail("holds a zero byte");
     }
-    // What a URL's percent signs stand for counts too.
+    // The check includes decoded percent escapes of a URL.
     let plain = text
         .to_ascii_lowercase()
         .replace("%2e", ".")

@@ -1,15 +1,15 @@
-//! What stages refer to in those before them: data sets, models, which the name of a stage that trains them may stand for, splits, and
-//! evaluations.
+//! Resolves references of stages to earlier stages: data sets, models (which may be named by the
+//! stages that train them), splits, and evaluations.
 //!
-//! A name is first that of a model that some stage before trains, then that of a stage: so a job that was read once, and
-//! names models only, means the same when it is read again.
+//! A name refers first to a model that an earlier stage trains, then to a stage. A resolved job
+//! contains only names of models, so that it means the same when it is read again.
 
 use super::{kinds::ModelNames, places::SourceSettings, spec_error::SpecError, stage::StageSpec};
 
-/// Fills in what follows from other stages: places, needs and numbers of scenes.
+/// Fills in values that follow from other stages: places, needs and numbers of scenes.
 ///
 /// # Errors
-/// A source that no stage before makes.
+/// Returns an error for a source that no earlier stage makes.
 pub(super) fn resolve(stages: &mut [StageSpec]) -> Result<(), SpecError> {
     for i in 0..stages.len() {
         let (before, rest) = stages.split_at_mut(i);
@@ -61,11 +61,12 @@ pub(super) fn resolve(stages: &mut [StageSpec]) -> Result<(), SpecError> {
     Ok(())
 }
 
-/// Puts the names of models in place of those of stages, and lets `stage` need those `before` whose models, split or
-/// evaluations it reads.
+/// Replaces names of stages by names of models. Adds to `stage.needs` the stages in `before` that
+/// make its models, split or evaluations.
 ///
 /// # Errors
-/// A name that stands for several models where one is wanted, or for a stage that trains none.
+/// Returns an error for a name that means several models where one is required, or a stage that
+/// trains no model.
 fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
     if stage.task.models_store().is_some_and(String::is_empty) {
         let models = stage
@@ -118,7 +119,7 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
         let divides = s.task.divides().is_some_and(|(divided, name)| {
             Some(divided) == source.as_ref() && task.split() == Some(name)
         });
-        // A report tells what evaluations of its models found.
+        // A report uses the evaluations of its models.
         let evaluates = task.reports().is_some()
             && s.task.models_store() == Some(&store)
             && s.task.evaluates().iter().any(read);
@@ -140,9 +141,9 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
     Ok(())
 }
 
-/// The folder that the stage of this name writes; `None` where the name is a folder's.
+/// Returns the folder that the stage with this name writes; `None` if the name is a folder's.
 fn beside(name: &str, before: &[StageSpec], store: &str) -> Result<Option<String>, String> {
-    // A folder that a stage writes means itself, so that a job may be read again.
+    // A folder that a stage writes refers to itself, so that a job may be read again.
     let written = |s: &StageSpec| s.task.writes().is_some_and(|(_, to)| to == name);
     if before.iter().any(written) {
         return Ok(None);
@@ -168,7 +169,7 @@ fn beside(name: &str, before: &[StageSpec], store: &str) -> Result<Option<String
     }
 }
 
-/// Puts all models that each name stands for in its place.
+/// Replaces each name by all models that it means.
 fn all(names: &mut Vec<String>, before: &[StageSpec], store: &str) -> Result<(), String> {
     let mut models = Vec::with_capacity(names.len());
     for name in names.drain(..) {
@@ -182,7 +183,7 @@ fn all(names: &mut Vec<String>, before: &[StageSpec], store: &str) -> Result<(),
     Ok(())
 }
 
-/// The store in which the first stage that trains one of `names` keeps it; empty where none does.
+/// Returns the store of the first stage that trains one of `names`; empty if no stage does.
 fn store_of(names: &[String], before: &[StageSpec]) -> String {
     let meant = |stage: &&StageSpec| {
         stage.task.trains().is_some_and(|(_, model)| {
@@ -198,7 +199,8 @@ fn store_of(names: &[String], before: &[StageSpec]) -> String {
         .unwrap_or_default()
 }
 
-/// The stages that train what `name` stands for, each with its model; none where it is a model that exists already.
+/// Returns the stages that train the models meant by `name`, each with its model; none if it is an
+/// existing model.
 fn named(name: &str, before: &[StageSpec], store: &str) -> Result<Vec<(String, String)>, String> {
     let trained = |s: &&StageSpec| s.task.trains().is_some_and(|(_, model)| model == name);
     if before.iter().any(|s| trained(&s)) {

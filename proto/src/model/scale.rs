@@ -1,5 +1,6 @@
-//! One job file, several sizes: `[scale.NAME]` gives values, and anywhere else in the file the text `"{side}"` stands for the
-//! value of `side`, and `{side}` inside a text for its text. `--scale NAME` chooses.
+//! One job file in several sizes. `[scale.NAME]` gives values. Anywhere else in the file the text
+//! `"{side}"` becomes the value of `side`, and `{side}` inside a longer text becomes the value's
+//! text. `--scale NAME` chooses a scale.
 
 use serde_json::Value;
 
@@ -8,10 +9,11 @@ use super::{
     substitute::{plain, substitute},
 };
 
-/// A job file's content at a scale: without its scales, values in place.
+/// Returns a job file's content at a scale, with values filled in and without its scales.
 ///
 /// # Errors
-/// [`SpecError`] where the scale is not in the file, none is chosen of those that are, or they do not have the same values.
+/// Returns a [`SpecError`] if the file has no such scale, if it has scales and none is chosen, or
+/// if its scales do not have the same values.
 pub fn scaled(mut job: Value, scale: Option<&str>) -> Result<Value, SpecError> {
     let fail = |what: String| Err(SpecError::new("scale", what));
     let scales = job.as_object_mut().and_then(|job| job.remove("scale"));

@@ -1,12 +1,12 @@
-//! What is wrong with a field of a job, and the check of a number against a range.
+//! An error about a field of a job, and the check of a number against a range.
 
-/// A field of a job that cannot be used.
+/// An invalid field of a job.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {what}")]
 pub struct SpecError {
     /// The field, as in the job file, e.g. `render.bin_width_m`.
     pub field: String,
-    /// What was expected and how to correct it.
+    /// The expected value and the correction.
     pub what: String,
 }
 
@@ -23,8 +23,8 @@ impl SpecError {
     }
 }
 
-/// Checks that a value lies in a range, ends included. `unit` says what it counts, and may go on after a semicolon with how
-/// to find the right value.
+/// Checks that a value is in a range, ends included. `unit` names the unit, and may continue after
+/// a semicolon with a hint for finding the right value.
 pub(super) fn within<T: PartialOrd + std::fmt::Display>(
     field: impl Into<String>,
     value: T,

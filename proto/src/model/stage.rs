@@ -1,4 +1,4 @@
-//! One stage of a job, and its checks: alone, and among the stages before and after it.
+//! One stage of a job, and its checks: alone, and together with earlier and later stages.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -16,25 +16,27 @@ use super::{
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "serde_json::Value")]
 pub struct StageSpec {
-    /// Its name in the job.
+    /// Name of the stage in the job.
     pub name: String,
     /// Stages that must be done before this one begins.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<String>,
-    /// It begins although tasks of the stages that it needs were given up.
+    /// Whether the stage begins although tasks of the stages that it needs were given up.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub tolerate_dead: bool,
-    /// Its tasks run although their results exist. Equal tasks give equal bytes: this proves it.
+    /// Whether tasks run although their results exist. This proves that equal tasks give equal
+    /// bytes.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub force: bool,
-    /// What a worker must have.
+    /// Resources that a worker must have.
     #[serde(skip_serializing_if = "Resources::is_none")]
     pub resources: Resources,
-    /// The identities (UUIDs) of the stores that it uses, by their places: a worker whose store is another one works with
-    /// none. Filled in by the submission, where it reaches them; no part of any key.
+    /// Identities (UUIDs) of the stage's stores, by place. A worker with a different store at a
+    /// place does not use it. Filled in by the submission if it can reach the stores; not a part of
+    /// any key.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub stores: BTreeMap<String, String>,
-    /// What its tasks do.
+    /// The work of the stage's tasks.
     #[serde(flatten)]
     pub task: TaskSpec,
 }
@@ -58,7 +60,7 @@ impl TryFrom<Value> for StageSpec {
 }
 
 impl StageSpec {
-    /// A stage named after its kind, which needs nothing.
+    /// Creates a stage named after its kind, without needs.
     pub fn new(task: TaskSpec) -> Self {
         Self {
             name: task.kind().to_owned(),
@@ -71,12 +73,12 @@ impl StageSpec {
         }
     }
 
-    /// Number of its tasks.
+    /// Returns the number of tasks.
     pub fn tasks(&self) -> u64 {
         self.task.tasks()
     }
 
-    /// The same with as much of its lists as a lease of tasks `lo..hi` needs.
+    /// Returns the stage with its lists reduced to those needed by a lease of tasks `lo..hi`.
     pub fn only(&self, lo: u64, hi: u64) -> Self {
         Self {
             task: self.task.only(lo, hi).unwrap_or_else(|| self.task.clone()),
@@ -99,7 +101,7 @@ impl StageSpec {
         self.task.check()
     }
 
-    /// The places of the stores that it uses, without a slash at the end: those that it writes to, and those that it reads.
+    /// Returns the places of the stage's stores without a final slash, for writing and reading.
     pub fn places(&self) -> BTreeSet<&str> {
         let read = self.task.reads().map(|source| &*source.store);
         let models = self.task.models_store().map(String::as_str);
@@ -126,7 +128,7 @@ impl StageSpec {
         Ok(())
     }
 
-    /// Checks that it fits the stages before it and after it.
+    /// Checks that the stage fits the stages before and after it.
     pub(super) fn check_among(&self, before: &[Self], after: &[Self]) -> Result<(), SpecError> {
         if before.iter().any(|other| other.name == self.name) {
             let what = format!("{:?} is another stage's too", self.name);
@@ -223,10 +225,10 @@ impl StageSpec {
         self.task.check_among(&before)
     }
 
-    /// Checks where it reads and writes: absolute paths or URLs, none of which climbs.
+    /// Checks the places that the stage reads and writes: absolute paths or URLs without `..`.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check_places(&self) -> Result<(), SpecError> {
         if let Some(source) = self.task.reads() {
             place("source.store", &source.store)?;
@@ -237,10 +239,10 @@ impl StageSpec {
         inputs.try_for_each(|(field, path)| place(&field, path))
     }
 
-    /// Checks what a client must have filled in before it submits.
+    /// Checks the values that a client must have filled in before it submits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the field.
+    /// Returns a [`SpecError`] for the field.
     pub fn check_resolved(&self) -> Result<(), SpecError> {
         if let (field, "") = self.task.versioned() {
             let what = format!(

@@ -1,4 +1,4 @@
-//! Reports on jobs, for people. Every count is derived from ranges and outputs.
+//! Reports on jobs for users. Every count is derived from ranges and outputs.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use crate::{ids::JobId, model::JobSpec};
 
-/// Where a job stands.
+/// The state of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
@@ -16,24 +16,24 @@ pub enum JobState {
     Done,
     /// Every task is done or dead, and at least one is dead.
     Failed,
-    /// Stopped by a person; finished tasks stay.
+    /// Stopped by a user. Results of finished tasks stay.
     Cancelled,
 }
 
 /// Tasks of a job by state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct TaskCounts {
-    /// All.
+    /// All tasks.
     pub total: u64,
-    /// Output committed.
+    /// Tasks with a committed output.
     pub done: u64,
-    /// Part of `done` that was there before this job ran it.
+    /// Part of `done` with an output that existed before this job ran the task.
     pub reused: u64,
-    /// In a live lease and not done.
+    /// Unfinished tasks in a live lease.
     pub leased: u64,
-    /// Waiting.
+    /// Waiting tasks.
     pub pending: u64,
-    /// Given up.
+    /// Given-up tasks.
     pub dead: u64,
 }
 
@@ -48,11 +48,11 @@ impl std::ops::AddAssign for TaskCounts {
     }
 }
 
-/// Where a stage stands.
+/// The state of a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum StageState {
-    /// It waits for others.
+    /// The stage waits for others.
     Blocked,
     /// Its tasks may run.
     Open,
@@ -62,43 +62,43 @@ pub enum StageState {
     Failed,
 }
 
-/// A stage as people see it.
+/// A stage as shown to users.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StageStatus {
-    /// Its name.
+    /// Name.
     pub name: String,
-    /// What its tasks do.
+    /// Kind of its tasks.
     pub kind: String,
     /// State.
     pub state: StageState,
-    /// The stages it needs.
+    /// The stages that it needs.
     pub needs: Vec<String>,
     /// Counts.
     pub tasks: TaskCounts,
 }
 
-/// A task that runs now.
+/// A running task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunningTask {
     /// Position of its stage in the job.
     pub stage: u32,
     /// Task index.
     pub index: u64,
-    /// Worker's name.
+    /// Name of the worker.
     pub worker: String,
-    /// Share done in [0, 1].
+    /// Completed fraction in [0, 1].
     pub fraction: f32,
     /// Seconds since the worker began it.
     pub seconds: f64,
-    /// What it is at, in its own words.
+    /// Its current step in its own words.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub text: String,
-    /// The same as figures: loss, samples_per_s, …
+    /// Its figures: loss, samples_per_s, …
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub figures: BTreeMap<String, f64>,
 }
 
-/// A job as people see it.
+/// A job as shown to users.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JobStatus {
     /// Id.
@@ -113,26 +113,27 @@ pub struct JobStatus {
     pub submitted_at_ms: i64,
     /// Unix time of the end, milliseconds.
     pub ended_at_ms: Option<i64>,
-    /// It is held: nothing of it is begun.
+    /// Whether the job is paused, so that no further task begins.
     pub paused: bool,
-    /// Who submitted it.
+    /// The submitter.
     pub user: String,
     /// Its stages, in order.
     pub stages: Vec<StageStatus>,
     /// The job, without lists of files.
     pub spec: JobSpec,
-    /// Mean seconds of a computed task on one worker, of the stage that runs; `None` before the first.
+    /// Mean seconds of a computed task on one worker, for the running stage; `None` before the
+    /// first.
     pub mean_task_seconds: Option<f64>,
-    /// Tasks that run now.
+    /// Running tasks.
     pub running: Vec<RunningTask>,
     /// Workers connected to the coordinator.
     pub workers: u32,
-    /// Results that workers have reported and that the coordinator has not found in their store.
+    /// Reported results that the coordinator has not found in their store.
     pub unverified: u64,
 }
 
 impl JobStatus {
-    /// The deadline that stopped the job, as in its file.
+    /// Returns the deadline that stopped the job, as written in the job file.
     pub fn passed_deadline(&self) -> Option<&str> {
         let limits = &self.spec.limits;
         let deadline = limits.deadline_ms().ok().flatten()?;
@@ -141,20 +142,20 @@ impl JobStatus {
     }
 }
 
-/// A job as a list shows it, without what it is made of.
+/// A job as shown in a list, without its content.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct JobSummary {
     /// Id.
     pub id: JobId,
     /// Name.
     pub name: String,
-    /// Who submitted it.
+    /// The submitter.
     pub user: String,
-    /// Its project; empty = none.
+    /// Its project; empty means none.
     pub project: String,
     /// State.
     pub state: JobState,
-    /// It is held: nothing of it is begun.
+    /// Whether the job is paused, so that no further task begins.
     pub paused: bool,
     /// Counts.
     pub tasks: TaskCounts,
@@ -164,39 +165,40 @@ pub struct JobSummary {
     pub ended_at_ms: Option<i64>,
 }
 
-/// What a submission would do.
+/// The effect of a submission.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JobPlan {
     /// SHA-256 of the canonical spec, hexadecimal.
     pub spec_hash: String,
-    /// Tasks.
+    /// Number of tasks.
     pub total: u64,
-    /// Tasks whose output exists.
+    /// Tasks with an existing output.
     pub reuse: u64,
     /// Tasks whose output lies in the store without a record of it: workers look at each, and take it over. The client counts
     /// them, where it can read the store.
     pub taken: u64,
     /// Tasks that will run.
     pub run: u64,
-    /// The job that has this exact spec already.
+    /// The job that already has this exact spec.
     pub existing_job: Option<JobId>,
-    /// The same by stage, with the reasons.
+    /// The effect on each stage, with reasons.
     pub stages: Vec<StagePlan>,
-    /// Settings that are probably not meant, and stages that no connected worker can run; in words.
+    /// Settings that are probably mistakes, and stages that no connected worker can run, in words.
     pub warnings: Vec<String>,
 }
 
 /// An estimated quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
-    /// At least.
+    /// Lower bound.
     pub low: f64,
-    /// At most.
+    /// Upper bound.
     pub high: f64,
 }
 
 impl Estimate {
-    /// `middle` with an uncertainty of the factor `spread` (at least 1) in both directions.
+    /// Creates an estimate around `middle` with an uncertainty of the factor `spread` (at least 1)
+    /// in both directions.
     pub fn within(middle: f64, spread: f64) -> Self {
         Self {
             low: middle / spread,
@@ -204,7 +206,7 @@ impl Estimate {
         }
     }
 
-    /// The estimate of a sum of two quantities.
+    /// Returns the estimate of the sum of two quantities.
     pub fn plus(self, other: Self) -> Self {
         Self {
             low: self.low + other.low,
@@ -212,7 +214,7 @@ impl Estimate {
         }
     }
 
-    /// The estimate of a multiple of the quantity.
+    /// Returns the estimate of a multiple of the quantity.
     pub fn times(self, factor: f64) -> Self {
         Self {
             low: self.low * factor,
@@ -221,73 +223,74 @@ impl Estimate {
     }
 }
 
-/// What a submission would do in a stage.
+/// The effect of a submission on a stage.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StagePlan {
-    /// Its name.
+    /// Name of the stage.
     pub name: String,
-    /// What its tasks do.
+    /// Kind of its tasks.
     pub kind: String,
-    /// Tasks.
+    /// Number of tasks.
     pub total: u64,
-    /// Tasks whose output exists.
+    /// Tasks with an existing output.
     pub reuse: u64,
     /// Tasks whose output lies in the store without a record of it: workers look at each, and take it over. The client counts
     /// them, where it can read the store.
     pub taken: u64,
     /// Tasks that will run.
     pub run: u64,
-    /// About how much memory each takes; 0 = not known before a worker has seen what it reads.
+    /// Approximate memory of each task, bytes; 0 if unknown until a worker has read the inputs.
     pub memory_bytes: u64,
     /// Connected workers that can run its tasks.
     pub workers: u32,
-    /// Seconds that one task takes on one of them; `None` = not known.
+    /// Seconds of one task on one worker; `None` if unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_seconds: Option<Estimate>,
-    /// Bytes that one task stores; `None` = not known.
+    /// Bytes that one task stores; `None` if unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_bytes: Option<Estimate>,
-    /// Whether the estimates come from tasks that this farm has run; otherwise they are rules of thumb.
+    /// Whether the estimates come from tasks that this farm has run; otherwise they are rules of
+    /// thumb.
     pub measured: bool,
-    /// Why tasks run, in words.
+    /// The reasons why tasks run, in words.
     pub reasons: Vec<String>,
 }
 
-/// What happened.
+/// The kind of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EventKind {
-    /// Job accepted.
+    /// The job was accepted.
     Submitted,
-    /// Range granted to a worker.
+    /// A range was granted to a worker.
     Leased,
-    /// Task's output committed.
+    /// A task's output was committed.
     Committed,
-    /// Task's output was there already.
+    /// A task's output existed already.
     Reused,
-    /// Task failed and will be tried again.
+    /// A task failed and will run again.
     Failed,
-    /// Task given up.
+    /// A task was given up.
     Dead,
     /// A lease ran out.
     Expired,
-    /// A worker gave a lease back.
+    /// A worker returned a lease.
     Released,
-    /// Job cancelled.
+    /// The job was cancelled.
     Cancelled,
-    /// Dead tasks made pending again.
+    /// Dead tasks became pending again.
     Retried,
-    /// Job ended.
+    /// The job ended.
     Ended,
     /// Tasks are pending, but no connected worker may run them.
     Waiting,
-    /// Something that must not happen did, e.g. two different results of one task.
+    /// An error that must not happen, e.g. two different results of one task.
     Alarm,
-    /// A stage's tasks may run: what it needs is done.
+    /// A stage's tasks may run, because the stages that it needs are done.
     Opened,
-    /// Job held by a person.
+    /// A user paused the job.
     Paused,
-    /// Job let go on.
+    /// A user resumed the job.
     Resumed,
     /// A line that a task logged on its worker.
     Log,
@@ -296,26 +299,26 @@ pub enum EventKind {
 /// One line of a job's history.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Event {
-    /// Position in the history, growing.
+    /// Position in the history, ascending.
     pub sequence: u64,
     /// Unix time, milliseconds.
     pub at_ms: i64,
     /// The job.
     pub job: JobId,
-    /// Position of the stage that it concerns, where it concerns one.
+    /// Position of the stage concerned, if any.
     pub stage: Option<u32>,
-    /// What.
+    /// Kind of the event.
     pub kind: EventKind,
-    /// Task, where it concerns one.
+    /// Task concerned, if any.
     pub task: Option<u64>,
-    /// First of the tasks it concerns, where it concerns any.
+    /// First of the tasks concerned, if any.
     pub lo: Option<u64>,
     /// One past the last of them.
     pub hi: Option<u64>,
-    /// Worker's name, where one is concerned.
+    /// Name of the worker concerned, if any.
     pub worker: String,
-    /// In words.
+    /// Description.
     pub message: String,
-    /// Seconds the task took, where it ended.
+    /// Seconds that the task took, if it ended.
     pub seconds: f64,
 }

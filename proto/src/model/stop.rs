@@ -1,46 +1,50 @@
-//! When trials of a sweep stop that fall behind: the rules, and after which epochs a trial is asked. What others had found
-//! by then is in the store; the worker that trains compares (`worker/agent`, `train/verdict.rs`).
+//! Early stopping of trials in a sweep: the rules, and the epochs after which a trial is checked.
+//! The earlier results of other trials are in the store, and the training worker compares with them
+//! (`worker/agent`, `train/verdict.rs`).
 //!
-//! - **Halving** is ASHA (Li et al., "A System for Massively Parallel Hyperparameter Tuning", MLSys 2020) in the form that
-//!   stops: a trial that reaches a rung goes on if it is among the best 1/factor of those that have reached it by then.
-//! - **Median** is the rule of Optuna's `MedianPruner`, after Vizier's (Golovin et al., KDD 2017): a trial stops at a check
-//!   if the best that it has found so far is worse than the median of what the others found at that epoch. Vizier compares
-//!   with running averages over epochs instead; the error of a network falls so fast at first that such an average says
-//!   more of the first epochs than of the trial, and hardly anything would stop. Others count as soon as they have come
-//!   as far; they need not have ended.
-//! - **Hyperband** (Li et al., JMLR 2018), asynchronous as in the first paper: trials are dealt to brackets by their number,
-//!   and each bracket is a halving of its own, compared within itself. Bracket 0 has all rungs, each further one lacks one
-//!   more of the first, the last has none. A bracket gets about the share of trials that Hyperband gives it, so that each
-//!   may use as many epochs. It is for sweeps whose early errors may mislead.
+//! - **Halving** is the stopping variant of ASHA (Li et al., "A System for Massively Parallel
+//!   Hyperparameter Tuning", MLSys 2020). A trial that reaches a rung continues if it is among the
+//!   best 1/factor of the trials that have reached the rung by then.
+//! - **Median** is the rule of Optuna's `MedianPruner`, after Vizier's (Golovin et al., KDD 2017).
+//!   A trial stops at a check if its best value so far is worse than the median of the others'
+//!   values at that epoch. Vizier compares with running averages over epochs instead. The error of
+//!   a network falls so fast at first that such an average describes mostly the first epochs, and
+//!   hardly any trial would stop. Other trials count once they have come as far; they need not have
+//!   ended.
+//! - **Hyperband** (Li et al., JMLR 2018), asynchronous as in the first paper. Trials are dealt to
+//!   brackets by their number, and each bracket is a separate halving, compared within itself.
+//!   Bracket 0 has all rungs, each further bracket lacks one more of the first, and the last has
+//!   none. A bracket gets about the fraction of trials that Hyperband gives it, so that each may
+//!   use as many epochs. It suits sweeps with misleading early errors.
 
 use serde::{Deserialize, Serialize};
 
 use super::spec_error::SpecError;
 
-/// When trials stop that fall behind.
+/// The rule that stops inferior trials.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Stop {
-    /// At rungs, only the best go on.
+    /// At rungs, only the best trials continue.
     Halving(Halving),
-    /// Who is worse than the median of the others.
+    /// Stops trials that are worse than the median of the others.
     Median(Median),
-    /// Several halvings side by side, which begin later and later.
+    /// Several halvings in parallel, which begin at increasing epochs.
     Hyperband(Halving),
 }
 
-/// Rungs, and who goes on.
+/// The rungs, and the fraction of trials that continues.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Halving {
     /// Epochs until the first rung.
     pub first: u32,
-    /// Each further rung lies so many times as far; of those that reach one, one in so many goes on.
+    /// Ratio of the epochs of consecutive rungs. At each rung, one in this many trials continues.
     #[serde(default = "three")]
     pub factor: u32,
 }
 
-/// Checks, and how many others it takes.
+/// The checks, and the number of other trials required.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Median {
@@ -49,7 +53,7 @@ pub struct Median {
     /// Epochs from one check to the next.
     #[serde(default = "one")]
     pub every: u32,
-    /// Others that must have been at a check before a trial may stop there. Optuna's default.
+    /// Other trials that must have reached a check before a trial may stop there. Optuna's default.
     #[serde(default = "five")]
     pub least: u32,
 }
@@ -67,7 +71,8 @@ fn five() -> u32 {
 }
 
 impl Stop {
-    /// Whether trial `index` is asked after so many epochs of `of`: never at its end.
+    /// Returns whether trial `index` is checked after this many epochs of `of`. It never is at its
+    /// end.
     pub fn asks(&self, index: u64, epoch: u64, of: u64) -> bool {
         match self {
             Self::Halving(halving) => halving.is_rung(epoch, of),
@@ -83,7 +88,8 @@ impl Stop {
         }
     }
 
-    /// Among which trials `index` is compared, of trainings of `of` epochs: those with the same number.
+    /// Returns the bracket of trial `index` for trainings of `of` epochs. Trials are compared
+    /// within their bracket.
     pub fn bracket(&self, index: u64, of: u64) -> u32 {
         match self {
             Self::Halving(_) | Self::Median(_) => 0,
@@ -133,12 +139,12 @@ impl Stop {
 }
 
 impl Halving {
-    /// Whether a trial is asked after so many epochs of `of`: at rungs, but not at its end.
+    /// Returns whether this epoch of `of` is a rung. The end is none.
     pub fn is_rung(&self, epoch: u64, of: u64) -> bool {
         self.rungs(of).contains(&epoch)
     }
 
-    /// The epochs of all rungs before the end.
+    /// Returns the epochs of all rungs before the end.
     fn rungs(self, of: u64) -> Vec<u64> {
         let (factor, mut rung) = (u64::from(self.factor).max(2), u64::from(self.first).max(1));
         let mut rungs = Vec::new();
@@ -149,7 +155,8 @@ impl Halving {
         rungs
     }
 
-    /// How many trials each bracket gets in a round of Hyperband: with s rungs of B − 1, ⌈B/(s+1)·factor^s⌉ (algorithm 1).
+    /// Returns the number of trials of each bracket in a round of Hyperband: with s rungs of B − 1,
+    /// ⌈B/(s+1)·factor^s⌉ (algorithm 1).
     fn shares(self, of: u64) -> Vec<u64> {
         let rungs = self.rungs(of).len() as u32;
         let brackets = u64::from(rungs) + 1;
@@ -163,8 +170,9 @@ impl Halving {
     }
 }
 
-/// To whom a number is dealt if each has such a share: in turns that keep the shares all along ("smooth weighted round
-/// robin"), so that the first few trials are not all of one bracket.
+/// Returns the bracket to which a trial number is dealt, given each bracket's share. The turns keep
+/// to the shares throughout ("smooth weighted round robin"), so that the first few trials are not
+/// all in one bracket.
 fn dealt(shares: &[u64], index: u64) -> u32 {
     let total: i128 = shares.iter().map(|share| i128::from(*share)).sum();
     let turns = i128::from(index) % total.max(1);

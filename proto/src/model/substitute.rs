@@ -1,8 +1,9 @@
-//! Values in the places of their names: wherever a job says `{name}`.
+//! Replaces names by values: every `{name}` in a job.
 
 use serde_json::Value;
 
-/// Puts `value` where `mark` stands: in place of a text that is nothing else, and into others as text.
+/// Replaces `mark` by `value`. A text equal to the mark becomes the value itself; inside a longer
+/// text the value is inserted as text.
 pub(super) fn substitute(into: &mut Value, mark: &str, value: &Value) {
     match into {
         Value::String(text) if text == mark => *into = value.clone(),
@@ -13,7 +14,7 @@ pub(super) fn substitute(into: &mut Value, mark: &str, value: &Value) {
     }
 }
 
-/// A value as text inside a text.
+/// Returns a value as text for insertion into a longer text.
 pub(super) fn plain(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),

@@ -1,28 +1,31 @@
-//! Sweeps: one train stage stands for many trainings, *trials*, whose values are a grid or drawn at random, and for a last
-//! step that gives the best of them a name of its own.
+//! Sweeps. A train stage with a sweep becomes many trainings, *trials*, with values from a grid or
+//! drawn at random, and a last step that gives the best of them its own name.
 //!
 //! ```toml
 //! [stage.sweep]
-//! trials = 27                                   # drawn at random; without it, the whole grid
-//! stop = { halving = { first = 3, factor = 3 } }    # after 3, 9, 27, … epochs only the best third goes on
+//! trials = 27                                       # drawn at random; without it, the whole grid
+//! stop = { halving = { first = 3, factor = 3 } }    # best third goes on after 3, 9, … epochs
 //! over = { lr = { log = [1e-4, 1e-1] }, width = [8, 16], levels = { int = [2, 4] } }
 //! [stage.train]
-//! model = "depth"                               # trials are depth.0, depth.1, …; the best of them becomes depth
+//! model = "depth"                                   # trials depth.0, …; the best becomes depth
 //! net = { width = "{width}", levels = "{levels}" }
 //! optimise = { learning_rate = "{lr}", epochs = 81 }
 //! ```
 //!
-//! Trial `i` of `tof` is a stage of one task, `tof.i`, an ordinary training with ordinary settings: it is leased, resumed,
-//! reused and looked at as any other. Its draws follow from the seed, its number and the parameters' names alone, so more
-//! trials later are further ones. `tof` itself becomes a stage of kind `promote` which needs all of them.
+//! Trial `i` of `tof` is a stage of one task, `tof.i`. It is an ordinary training with ordinary
+//! settings, and is leased, resumed, reused and inspected like any other. Its draws depend only on
+//! the seed, its number and the parameters' names, so that a later increase adds further trials.
+//! `tof` itself becomes a stage of kind `promote`, which needs all trials.
 //!
-//! `values = [{ lr = 0.01, width = 8, levels = 3 }, …]` lists the values of the first trials by hand; `trials` counts them
-//! in, and those beyond are drawn. `picofarm sweep extend` writes such a list. The sweep's id follows from what is trained,
-//! `over`, `seed` and `stop`, neither from the number of trials nor from who chose their values: a sweep that is extended
-//! stays the same one, and what its trials have found is compared with.
+//! `values = [{ lr = 0.01, width = 8, levels = 3 }, …]` lists the values of the first trials by
+//! hand. `trials` includes them, and the trials beyond are drawn. `picofarm sweep extend` writes
+//! such a list. The sweep's id depends on the training, `over`, `seed` and `stop`. It does not
+//! depend on the number of trials or on the origin of their values, so that an extended sweep stays
+//! the same, and its trials are compared with the earlier ones.
 //!
-//! When trials stop that fall behind: [`super::stop`]. No trial waits for another, and one that stops leaves its worker to
-//! the next. Which trials come to their end thus depends on which came first; what each of them computes does not.
+//! [`super::stop`] defines when inferior trials stop. No trial waits for another, and a stopped
+//! trial leaves its worker to the next. The set of trials that run to the end therefore depends on
+//! their order. The result of each trial does not.
 
 use std::collections::BTreeMap;
 
@@ -39,26 +42,26 @@ use super::{
     trial::Trial,
 };
 
-/// `[stage.sweep]`.
+/// The fields of `[stage.sweep]`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SweepText {
-    /// Trials in all; those that `values` does not list are drawn at random. 0 = those listed or, where none is, each
-    /// combination of values, which must be lists.
+    /// Total number of trials; those not listed in `values` are drawn at random. 0 means the listed
+    /// trials or, without a list, each combination of values, which must then be lists.
     #[serde(default)]
     trials: u64,
     /// Seed of the draws.
     #[serde(default)]
     seed: u64,
-    /// By the parameters' names: the values that each may have.
+    /// The possible values of each parameter, by name.
     #[serde(default)]
     over: BTreeMap<String, Domain>,
     /// The values of the first trials.
     #[serde(default)]
     values: Vec<Values>,
-    /// When trials stop that fall behind; never without it.
+    /// The rule that stops inferior trials; without it they never stop.
     stop: Option<Stop>,
-    /// The name that the best model gets; that of the stage's model without it.
+    /// The name for the best model; defaults to the name of the stage's model.
     #[serde(default)]
     promote: String,
 }
@@ -66,13 +69,14 @@ struct SweepText {
 /// A trial's values, by the parameters' names.
 type Values = BTreeMap<String, Value>;
 
-/// The stages that a stage with a sweep stands for, its trials and what chooses among them; one without stands for itself.
+/// Expands a stage with a sweep into its trials and the stage that chooses the best. A stage
+/// without one is returned unchanged.
 pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     let Some(sweep) = stage.as_object_mut().and_then(|s| s.remove("sweep")) else {
         return Ok(vec![stage]);
     };
     let fail = |field: &str, what: String| Err(SpecError::new(format!("stage.{field}"), what));
-    // Where a store lies does not count, only what lies in it.
+    // The data set counts, the location of its store does not.
     let source = stage.get("source").map(|s| s.get("dataset").unwrap_or(s));
     let described = json!([
         source,
@@ -153,7 +157,7 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     Ok(stages)
 }
 
-/// Tells sweeps apart.
+/// Returns the id that distinguishes sweeps.
 fn id(mut described: Value) -> String {
     described.sort_all_objects();
     let mut id = hex::encode(Sha256::digest(described.to_string().as_bytes()));
@@ -162,7 +166,7 @@ fn id(mut described: Value) -> String {
 }
 
 impl SweepText {
-    /// The values of every trial.
+    /// Returns the values of every trial.
     fn choose(&self) -> Result<Vec<Values>, SpecError> {
         let fail = |field: String, what: String| Err(SpecError::new(field, what));
         if self.over.is_empty() && self.values.is_empty() {
@@ -201,7 +205,7 @@ impl SweepText {
         Ok(self.values.iter().cloned().chain(drawn).collect())
     }
 
-    /// Whether listed values name every parameter, and no other, and lie where they shall.
+    /// Checks that the listed values name every parameter and no other, and are in their domains.
     fn check_values(&self) -> Result<(), SpecError> {
         let fail = |i: usize, parameter: &str, what: String| {
             let field = format!("stage.sweep.values[{i}].{parameter}");
@@ -250,7 +254,7 @@ impl SweepText {
         Ok(())
     }
 
-    /// Each combination.
+    /// Returns each combination of values.
     fn grid(&self) -> Result<Vec<Values>, SpecError> {
         let mut grid = vec![BTreeMap::new()];
         for (parameter, values) in &self.over {

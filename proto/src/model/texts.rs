@@ -1,4 +1,4 @@
-//! The check of every text of a job: its length, and that it has no control characters.
+//! Checks every text of a job: its length, and that it has no control characters.
 
 use std::io;
 
@@ -7,19 +7,19 @@ use serde_json::ser::CharEscape;
 
 use super::bounds::{NAME_BYTES, PLACE_BYTES, TEXT_BYTES, control, cut, length, steers};
 
-/// A text that cannot be used.
+/// An invalid text.
 #[derive(Debug)]
 pub(super) struct Fault {
-    /// The way to it: names of fields, and positions in lists.
+    /// The path to the text: names of fields, and positions in lists.
     pub path: Vec<String>,
-    /// What is wrong with it.
+    /// Description of the fault.
     pub what: String,
 }
 
 /// Checks every text of a value.
 ///
 /// # Errors
-/// The first that cannot be used.
+/// Returns the first invalid text.
 pub(super) fn check(value: &impl Serialize) -> Result<(), Fault> {
     let mut walk = Walk::default();
     let mut writer = serde_json::Serializer::with_formatter(io::sink(), &mut walk);
@@ -39,19 +39,20 @@ pub(super) fn check(value: &impl Serialize) -> Result<(), Fault> {
     })
 }
 
-/// A step from a value to one within it.
+/// A step from a value to one inside it.
 #[derive(Debug)]
 enum Step {
     Key(String),
     Item(usize),
 }
 
-/// Looks at every text while a job is written as JSON into nothing: so nothing is copied, and no field is forgotten.
+/// Visits every text while a job is serialized as JSON without output. Nothing is copied, and no
+/// field can be forgotten.
 #[derive(Debug, Default)]
 struct Walk {
     path: Vec<Step>,
     in_key: bool,
-    /// Bytes of the text in hand.
+    /// Bytes of the current text.
     bytes: usize,
     wrong: Option<String>,
 }
@@ -62,7 +63,7 @@ impl Walk {
         Err(io::Error::other("a text that cannot be used"))
     }
 
-    /// How long the text in hand may be.
+    /// Returns the longest allowed length of the current text.
     fn most(&self) -> usize {
         let named = self.path.iter().rev().find_map(|step| match step {
             Step::Key(key) => Some(&**key),

@@ -1,4 +1,5 @@
-//! A training that is one of several: its values, and when it stops. [`super::sweep`] makes them.
+//! A training that belongs to a sweep: its values, and its stopping rule. [`super::sweep`] makes
+//! them.
 
 use std::collections::BTreeMap;
 
@@ -7,25 +8,26 @@ use serde_json::Value;
 
 use super::{domain::Domain, kinds::names::check_model, spec_error::SpecError, stop::Stop};
 
-/// What makes a training a trial of a sweep.
+/// The data that makes a training a trial of a sweep.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Trial {
-    /// The sweep's name: under it, in the folder of models, trials tell how far they came.
+    /// Name of the sweep. Trials record their progress under it, in the folder of models.
     pub sweep: String,
-    /// Tells sweeps of one name apart: 16 hexadecimal digits that follow from all but the trials' number and values.
+    /// Distinguishes sweeps with the same name: 16 hexadecimal digits that depend on everything
+    /// except the trials' number and values.
     pub id: String,
     /// The trial's number, from 0.
     pub index: u64,
-    /// Its values by the parameters' names.
+    /// The trial's values, by the parameters' names.
     pub values: BTreeMap<String, Value>,
-    /// By the parameters' names: the values that each may have, where the sweep says it.
+    /// The possible values of each parameter by name, if the sweep gives them.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub over: BTreeMap<String, Domain>,
     /// Seed of the sweep's draws.
     #[serde(default)]
     pub seed: u64,
-    /// When it stops.
+    /// The stopping rule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stop: Option<Stop>,
 }

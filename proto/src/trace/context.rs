@@ -7,7 +7,7 @@ use opentelemetry::{
 use tracing::Span;
 use tracing_opentelemetry::OpenTelemetrySpanExt;
 
-/// Where a span is: what others need to go on from it. Empty where it is in no trace.
+/// Returns the context with which others continue a span; empty if the span belongs to no trace.
 pub fn traceparent(span: &Span) -> String {
     if span.is_disabled() {
         return String::new();
@@ -21,19 +21,19 @@ pub fn traceparent(span: &Span) -> String {
     format!("00-{}-{}-{flags:02x}", place.trace_id(), place.span_id())
 }
 
-/// Makes a span the next one of another, which `traceparent` names: of this process or of another one. What names none
-/// leaves it the first of a trace of its own.
+/// Makes a span the child of the span named by `traceparent`, from this process or another. If the
+/// text is invalid, the span begins a trace of its own.
 pub fn join(span: &Span, traceparent: &str) {
     if span.is_disabled() {
         return;
     }
     if let Some(place) = parse(traceparent) {
-        // An error says that there is no OpenTelemetry layer: then there is no trace to join.
+        // An error means that there is no OpenTelemetry layer, and therefore no trace to join.
         let _ = span.set_parent(Context::new().with_remote_span_context(place));
     }
 }
 
-/// Version 00 of the format only: nothing else is written by this program.
+/// Parses version 00 of the format only, because this program writes no other.
 fn parse(traceparent: &str) -> Option<SpanContext> {
     let mut parts = traceparent.split('-');
     let (version, trace, span, flags) =

@@ -1,4 +1,4 @@
-//! Tasks that cannot run now keep no worker from those that can.
+//! Tasks that cannot run now do not keep a worker from tasks that can.
 
 use picofarm_catalog::RangeState;
 use picofarm_proto::{
@@ -12,7 +12,7 @@ use super::{
     world::{Op, World},
 };
 
-/// A job of one stage. Its settings hold it up.
+/// A job of one stage with settings that delay it.
 fn job(name: &str, priority: i32, settings: &str) -> JobSpec {
     let text = format!(
         r#"{{"name": "{name}", "priority": {priority}, "scenes": {{"kind": "primitive", "count": 8}},
@@ -21,7 +21,7 @@ fn job(name: &str, priority: i32, settings: &str) -> JobSpec {
     serde_json::from_str(&text).unwrap()
 }
 
-/// Things that may be in the way of a stage.
+/// Settings that may delay a stage.
 const WAYS: [&str; 6] = [
     r#""limits": {"max_failures": 50}"#,
     r#""limits": {"max_failures": 50, "max_crashes": 50}"#,
@@ -32,7 +32,7 @@ const WAYS: [&str; 6] = [
 ];
 
 impl World {
-    /// The law: where a worker asks for work and a pending task could run on it, it has been
+    /// The law: if a worker asks for work and a pending task could run on it, the task has been
     /// leased.
     async fn check_nobody_starves(&self) {
         let instance = &self.instances[0];
@@ -136,7 +136,7 @@ proptest! {
     }
 }
 
-/// As it was seen: eight tasks that cannot be parsed, fifty tries each, one worker.
+/// The case as it was observed: eight tasks that cannot be parsed, fifty tries each, one worker.
 #[test]
 fn a_job_of_failing_tasks_leaves_the_worker_to_the_job_of_another() {
     for priority in [0, 5] {
@@ -167,7 +167,7 @@ fn a_job_of_failing_tasks_leaves_the_worker_to_the_job_of_another() {
                 // Shorter than the rest after a failure.
                 world.act(&Op::Pass(4)).await;
             }
-            // Both its stages.
+            // Both stages of the job are done.
             assert_eq!(done, 2 * super::TASKS, "priority {priority}");
             world.close().await;
         });

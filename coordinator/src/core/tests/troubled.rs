@@ -1,4 +1,4 @@
-//! Workers on which everything fails, and workers that end before their tasks do.
+//! Workers on which every task fails, and workers that end before their tasks do.
 
 use picofarm_proto::model::FailureKind;
 
@@ -8,7 +8,7 @@ use super::{
 };
 
 impl World {
-    /// What the worker at this place would be told by `explain`.
+    /// Returns the entry of this worker in the output of `explain`.
     fn candidate(&self, w: usize) -> crate::explain::Candidate {
         let core = &self.instances[0].core;
         let look = core.look_at(self.jobs[0], None, None, self.now);
@@ -26,7 +26,7 @@ impl World {
         record.exception.unwrap()
     }
 
-    /// All that a worker has fails at once; returns how many tasks.
+    /// Fails all tasks of a worker at once. Returns their number.
     async fn fail_all(&mut self, w: usize, kind: FailureKind) -> u64 {
         let mut failed = 0;
         for lease in std::mem::take(&mut self.workers[w].leases) {
@@ -60,7 +60,7 @@ fn tasks_that_fail_on_one_worker_alone_are_not_charged_with_it() {
         let entry = core.stages.values().next().unwrap();
         let charged = entry.exceptions.values().filter(|e| e.failures > 0);
         assert_eq!(charged.count(), 0, "another could run them");
-        // They fail there too: now they are charged.
+        // The tasks fail there too, so they are charged now.
         for _ in 0..10 {
             world.act(&Op::Credit(1)).await;
             world.fail_all(1, FailureKind::User).await;
@@ -110,7 +110,7 @@ fn a_task_that_took_longer_than_a_worker_has_left_waits_for_one_that_has_more() 
         let exception = world.exception(0, 0).await;
         assert_eq!((exception.interruptions, exception.longest_ms), (1, 2_400));
         world.act(&Op::Drop(0, true)).await;
-        // The next allocation is as long, less what it takes to begin.
+        // The next allocation is as long, except for its startup time.
         world.workers[1].ends_in_ms = Some(2_900);
         world.connect(1, 0).await;
         world.act(&Op::Credit(1)).await;
@@ -140,7 +140,7 @@ fn a_task_that_is_interrupted_again_and_again_is_given_up() {
             .await;
         let mut attempts = 0;
         for w in (0..3).cycle().take(60) {
-            // Longer than a task waits at most.
+            // Longer than the longest delay of a task.
             world.act(&Op::Pass(200)).await;
             world.connect(w, 0).await;
             world.act(&Op::Credit(w)).await;

@@ -1,4 +1,5 @@
-//! Instances of the core over one catalog, workers that do what they are told, and a model of what must come out.
+//! Instances of the core over one catalog, workers that follow instructions, and a model of the
+//! expected result.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -24,7 +25,7 @@ use super::super::{Core, OutputHint, Say, Settings, Timings, prepare, stands_for
 use crate::{budget::Backoff, submission::Draft};
 
 pub(super) const TASKS: u64 = 12;
-/// As the actor's.
+/// The same value as the actor's.
 const ROUNDS: usize = 8;
 const WORKERS: u8 = 3;
 pub(super) const SETTINGS: Settings = Settings {
@@ -41,27 +42,27 @@ pub(super) const SETTINGS: Settings = Settings {
 #[derive(Debug, Clone)]
 pub(super) enum Op {
     Credit(u8),
-    /// The worker finishes the nth task of the nth lease it ever had, live or not.
+    /// The worker finishes the nth task of the nth lease that it ever had, live or not.
     Finish(u8, u8, u8),
     Fail(u8, u8, u8, FailureKind),
     Release(u8, u8),
     Beat(u8),
     /// The connection breaks; with `true`, the process dies too.
     Drop(u8, bool),
-    /// The worker connects to the nth instance, without having left another.
+    /// The worker connects to the nth instance without leaving another first.
     Connect(u8, u8),
     Pass(u16),
-    /// An instance beats: it hears what is new.
+    /// An instance beats and receives news.
     InstanceBeats(u8),
-    /// An instance's process starts again.
+    /// An instance's process restarts.
     InstanceRestarts(u8),
-    /// An instance's time runs out while it sleeps.
+    /// An instance's registration runs out while it sleeps.
     InstanceIsLost(u8),
     Retry,
-    /// The first job is held, or goes on.
+    /// The first job is paused or resumed.
     Pause(bool),
     Cancel,
-    /// A second job over the same outputs.
+    /// A second job writes to the same outputs.
     Grow,
     /// The worker must end in this many milliseconds.
     Ends(u8, u16),
@@ -104,12 +105,12 @@ fn spec(count: u64) -> JobSpec {
 
 #[derive(Default)]
 pub(super) struct FakeWorker {
-    /// The instance and the session there.
+    /// The instance, and the session with it.
     pub(super) session: Option<(usize, u64)>,
     incarnation: u128,
-    /// When it must end, as it reports.
+    /// The reported milliseconds until the worker must end.
     pub(super) ends_in_ms: Option<u64>,
-    /// Latest first.
+    /// Leases of the worker, latest first.
     pub(super) leases: Vec<Lease>,
 }
 
@@ -140,12 +141,12 @@ async fn load(catalog: &dyn Catalog, now: i64) -> (InstanceId, Core) {
 
 pub(super) struct World {
     pub(super) instances: Vec<Instance>,
-    /// Where instances can be lost.
+    /// Address of the Postgres catalog, on which instances can be lost.
     postgres: Option<String>,
     pub(super) now: i64,
     pub(super) workers: Vec<FakeWorker>,
     next: u128,
-    /// What the model knows to be committed, by stage and task.
+    /// The results that the model expects to be committed, by stage and task.
     committed: BTreeMap<(u32, u64), String>,
     pub(super) jobs: Vec<JobId>,
     pub(super) trims: u32,
@@ -153,13 +154,13 @@ pub(super) struct World {
 }
 
 impl World {
-    /// One instance on SQLite in a folder.
+    /// Creates one instance on SQLite in a folder.
     pub(super) async fn on_sqlite(folder: &Path) -> Self {
         let catalog = SqliteCatalog::open(&folder.join("c.db"), "test").await;
         Self::new(vec![Arc::new(catalog.unwrap())], None).await
     }
 
-    /// Two instances on one Postgres, where there is one.
+    /// Creates two instances on one Postgres, if one is available.
     pub(super) async fn on_postgres() -> Option<Self> {
         let url = testing::postgres().await?;
         let mut catalogs: Vec<Arc<dyn Catalog>> = Vec::new();
@@ -189,7 +190,7 @@ impl World {
         world
     }
 
-    /// A new life of an instance, as the actor begins one when the catalog refuses it.
+    /// Begins a new life of an instance, as the actor does after a failed catalog call.
     async fn reload(&mut self, h: usize) {
         let instance = &mut self.instances[h];
         (instance.id, instance.core) = load(&*instance.catalog, self.now).await;
@@ -198,7 +199,7 @@ impl World {
         }
     }
 
-    /// What an instance does when the catalog answers: a refusal ends its life.
+    /// Reacts to the catalog's answer as an instance does: an error ends its life.
     async fn or_reload<T>(&mut self, h: usize, result: Result<T, CatalogError>) -> Option<T> {
         match result {
             Ok(value) => Some(value),
@@ -230,7 +231,7 @@ impl World {
         let mut runs = Vec::new();
         for stage in draft.stages() {
             let recorded = catalog.recorded(&stage.set, stage.tasks).await.unwrap();
-            // The store holds every other one; of the rest nobody knows.
+            // The store contains every other result; the rest were never checked.
             let seen: Vec<_> = recorded.into_iter().filter(|o| o.task % 2 == 0).collect();
             let marked = catalog.mark_checked(&stage.set, &seen).await;
             if self.or_reload(h, marked).await.is_none() {
@@ -328,7 +329,7 @@ impl World {
                 kinds: ["render", "reprocess"]
                     .map(|kind| (kind.to_owned(), "r".to_owned()))
                     .into(),
-                // One of them has a label.
+                // One of the workers has a label.
                 labels: (w == 2).then(|| "x".to_owned()).into_iter().collect(),
                 ..Abilities::default()
             },
@@ -380,12 +381,12 @@ impl World {
         }
     }
 
-    /// The first worker's task fails.
+    /// Fails a task of the first worker.
     pub(super) async fn fail(&mut self, lease: &Lease, index: u64, kind: FailureKind) {
         self.fail_on(0, lease, index, kind).await;
     }
 
-    /// A worker's task fails.
+    /// Fails a task of a worker.
     pub(super) async fn fail_on(&mut self, w: usize, lease: &Lease, index: u64, kind: FailureKind) {
         let Some((h, session)) = self.workers[w].session else {
             return;
@@ -493,7 +494,7 @@ impl World {
             Op::Retry => {
                 for job in self.jobs.clone() {
                     let retried = self.instances[0].catalog.retry(job, self.now).await;
-                    // One with a later twin stays as it is.
+                    // A job with a later twin stays as it is.
                     if matches!(retried, Ok(1..)) {
                         self.instances[0].core.retried(job);
                         self.learn(0, job).await;
@@ -533,7 +534,7 @@ impl World {
         }
     }
 
-    /// One turn of an instance's actor.
+    /// Runs one turn of an instance's actor.
     async fn step(&mut self, h: usize) {
         self.instances[h].core.expire(self.now);
         for _ in 0..ROUNDS {
@@ -557,7 +558,7 @@ impl World {
         self.flush(h).await;
     }
 
-    /// The laws.
+    /// Checks the laws.
     pub(super) async fn check(&self) {
         let catalog = &self.instances[0].catalog;
         for job in &self.jobs {
@@ -591,7 +592,8 @@ impl World {
         self.check_shared();
     }
 
-    /// Of outputs that jobs share, an instance has none in hand for two of them. (It does not know what others have in hand.)
+    /// Checks that a single instance has no shared output leased for two jobs. Instances do not
+    /// know each other's leases, so the check needs a single one.
     pub(super) fn check_shared(&self) {
         if let [instance] = &*self.instances {
             for set in &instance.core.sets {
@@ -606,12 +608,12 @@ impl World {
         }
     }
 
-    /// An honest worker finishes what is left.
+    /// Finishes all remaining tasks with honest workers.
     async fn finish_all(&mut self) {
         for w in 0..WORKERS {
             self.act(&Op::Drop(w, true)).await;
         }
-        // An instance that was lost meanwhile refuses the first call after it.
+        // An instance that was lost meanwhile refuses the first call afterwards.
         for h in 0..self.instances.len() {
             self.beat(h).await;
         }
@@ -640,7 +642,7 @@ impl World {
         panic!("the jobs do not end");
     }
 
-    /// All is finished, the laws hold, and the catalogs are closed.
+    /// Finishes all tasks, checks the laws and closes the catalogs.
     pub(super) async fn end(mut self) {
         self.finish_all().await;
         self.check().await;
@@ -649,7 +651,7 @@ impl World {
         }
     }
 
-    /// One worker takes everything, and another comes and has nothing: trimming, then doubling.
+    /// One worker takes all tasks and another one arrives with none: trimming, then doubling.
     pub(super) async fn greedy(&mut self) {
         for op in [Op::Connect(0, 0), Op::Credit(0), Op::Finish(0, 0, 0)] {
             self.act(&op).await;

@@ -1,4 +1,4 @@
-//! How the tasks of a stage that renders parts go over scenes.
+//! The division of scenes into the tasks of a part stage.
 
 /// Task `i` is part `i % tasks_per_scene` of scene `i / tasks_per_scene`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -8,12 +8,13 @@ pub struct Division {
 }
 
 impl Division {
-    /// Tasks of each scene: the ranges of tiles, and the light paths that cross them.
+    /// Returns the tasks of each scene: the ranges of tiles, and one for the light paths that cross
+    /// them.
     pub fn tasks_per_scene(self) -> u64 {
         u64::from(self.parts) + 1
     }
 
-    /// The scene and the part that task `index` is.
+    /// Returns the scene and the part of task `index`.
     pub fn split(self, index: u64) -> (u64, u32) {
         let part = index % self.tasks_per_scene();
         (index / self.tasks_per_scene(), part as u32)

@@ -1,5 +1,5 @@
-//! Evaluation: trained models meet scenes that they have not seen. One task, or one for each shard of the scenes and one
-//! that joins them; what it finds is kept beside each model.
+//! Evaluation: measures trained models on unseen scenes. One task, or one for each shard of the
+//! scenes and one that joins them. The result is stored next to each model.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -23,30 +23,31 @@ use crate::{
     split::SIDES,
 };
 
-/// Most models in one evaluation, or in one report.
+/// Most models in one evaluation or one report.
 pub(super) const MAX_MODELS: usize = 1_000;
-/// Most tasks that an evaluation is divided among.
+/// Most shards of an evaluation.
 const MAX_SHARDS: u32 = 10_000;
 
 /// The field of [`EvaluateSettings::times`].
 const TIMES: &str = "evaluate.times";
 
-/// Evaluating models: one task.
+/// Evaluates models: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EvaluateTask {
-    /// The data set whose scenes they meet. The models are kept in the same store.
+    /// The data set with the scenes. The models are in the same store.
     pub source: SourceSettings,
-    /// Its number of scenes.
+    /// Number of scenes of the data set.
     pub count: u64,
-    /// Which models, and which scenes.
+    /// The models and the scenes.
     pub evaluate: EvaluateSettings,
 }
 
-/// Which models meet which scenes.
+/// The models and the scenes of an evaluation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluateSettings {
-    /// Names of models, or of stages that train them (of a matrix: the name before the bracket means all of it).
+    /// Names of models, or of stages that train them (in a matrix, the name before the bracket
+    /// means all of it).
     pub models: Vec<String>,
     /// The split of the data set.
     #[serde(default = "default_split")]
@@ -54,28 +55,29 @@ pub struct EvaluateSettings {
     /// `test` (default), `validation` or `train`.
     #[serde(default = "test")]
     pub side: String,
-    /// Only so many scenes of that side, the first by the split's order; 0 = all.
+    /// Number of scenes of that side, the first by the split's order; 0 means all.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub scenes: u64,
-    /// Which of the data set's histograms; left out: for each model that which it was trained on.
+    /// Histogram of the data set; defaults to each model's training histogram.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub histogram: Option<Histogram>,
-    /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
+    /// Only these spots, summed. Requires `histogram = "transient_spots"`, which in turn requires
+    /// it; ascending.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
-    /// For shadow networks that are given two-bounce times: what those follow from, as `train.shadow.times`; left out: for each
-    /// model what it was trained with.
+    /// Source of two-bounce times for shadow networks that use them, as in `train.shadow.times`;
+    /// defaults to each model's training setting.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub times: String,
-    /// Histograms go through the sensor that a model was trained with, if it was; with false they are seen as stored. Default
-    /// true.
+    /// Whether histograms pass through the sensor with which a model was trained, if any. With
+    /// false they are used as stored. Default true.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub sensor: bool,
-    /// The scenes are asked of in so many tasks, 1 to 10,000, whose sums one more task joins: the figures are the same to
-    /// the bit. Default 1: one task for all.
+    /// Number of shards, 1 to 10,000: tasks that each evaluate a part of the scenes. One more task
+    /// joins their sums. The figures are bit-identical. Default 1: one task for all scenes.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub shards: u32,
-    /// Version of networks and metrics, part of every task key; filled in at submission where left out.
+    /// Version of networks and metrics, part of every task key; filled in at submission if omitted.
     #[serde(default)]
     pub version: String,
 }
@@ -97,7 +99,8 @@ fn is_one(shards: &u32) -> bool {
     *shards == 1
 }
 
-/// Asking models of a shard of the scenes, which the evaluation that needs it joins: one task a shard.
+/// Evaluates models on a shard of the scenes, which the dependent evaluation joins: one task a
+/// shard.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EvaluateShardTask {
     /// The evaluation.
@@ -108,7 +111,7 @@ pub struct EvaluateShardTask {
 impl Declared for EvaluateShardTask {
     const NAME: &'static str = "evaluate_shard";
     const FIELDS: &'static [&'static str] = EvaluateTask::FIELDS;
-    /// An evaluation with `shards` stands for it.
+    /// Written in job files as an evaluation with `shards`.
     const WRITTEN: bool = false;
 
     fn read(fields: &mut Fields) -> Result<Self, SpecError> {
@@ -286,7 +289,7 @@ impl TaskKind for EvaluateTask {
         is_folder(&self.evaluate.times).then_some((TIMES, &mut self.evaluate.times))
     }
 
-    /// Depths are predicted by then.
+    /// Predicted depths must come from a depth network.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         predicts_depth(self, before)
     }
@@ -309,7 +312,7 @@ impl EvaluateSettings {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail =
             |field: &str, what: String| Err(SpecError::new(format!("evaluate.{field}"), what));

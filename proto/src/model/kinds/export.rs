@@ -1,4 +1,4 @@
-//! Exports: a data set is packed for sharing. One task.
+//! Exports: packs a data set for sharing. One task.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -15,27 +15,27 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// What a worker calls OpenEXR and HDF5, which not every program writes.
+/// Name of the ability to write OpenEXR and HDF5, which not every program has.
 pub const FORMATS: &str = "formats";
 
-/// Packing a data set: one task.
+/// Packs a data set: one task.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ExportTask {
     /// The data set.
     pub source: SourceSettings,
-    /// Its number of scenes.
+    /// Number of scenes of the data set.
     pub count: u64,
-    /// What is packed, and where it goes.
+    /// The selection and the destination.
     pub export: ExportSettings,
 }
 
-/// What is packed, and where it goes.
+/// The selection and the destination of an export.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExportSettings {
     /// A path or URL that every worker can reach.
     pub dest: String,
-    /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
+    /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty means every scene.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub scenes: String,
     /// `zarr` (default), `sb3d`, `webdataset` or `hdf5`.

@@ -5,7 +5,7 @@ use serde_json::{Map, Value};
 
 use crate::{model::spec_error::SpecError, show};
 
-/// Fields that every stage may have.
+/// The fields common to all stages.
 const COMMON: [&str; 6] = [
     "name",
     "kind",
@@ -19,16 +19,16 @@ const COMMON: [&str; 6] = [
 #[derive(Debug)]
 pub struct Fields {
     kind: String,
-    /// How messages begin: the stage's name.
+    /// Prefix of messages: the stage's name.
     named: String,
     table: Map<String, Value>,
 }
 
 impl Fields {
-    /// Of a stage as it is written.
+    /// Creates the fields of a stage from its written form.
     ///
     /// # Errors
-    /// What is no table, or has no text where its kind and name stand.
+    /// Returns an error if the value is not a table, or if its kind or name is not a text.
     pub(in crate::model) fn new(stage: Value) -> Result<Self, SpecError> {
         let Value::Object(table) = stage else {
             return Err(SpecError::new("stage", "is not a table; write [[stage]]"));
@@ -44,15 +44,15 @@ impl Fields {
         Ok(fields)
     }
 
-    /// The name of its kind.
+    /// Returns the name of the stage's kind.
     pub fn kind(&self) -> &str {
         &self.kind
     }
 
-    /// Takes a field that may be left out.
+    /// Takes an optional field.
     ///
     /// # Errors
-    /// A value of another form.
+    /// Returns an error for a value of the wrong type.
     pub fn optional<T: DeserializeOwned>(&mut self, field: &str) -> Result<Option<T>, SpecError> {
         let value = match self.table.remove(field) {
             None | Some(Value::Null) => return Ok(None),
@@ -71,10 +71,10 @@ impl Fields {
             })
     }
 
-    /// The same with a value for where it is left out.
+    /// Takes a field, or the default if it is missing.
     ///
     /// # Errors
-    /// A value of another form.
+    /// Returns an error for a value of the wrong type.
     pub fn or_default<T: DeserializeOwned + Default>(
         &mut self,
         field: &str,
@@ -82,20 +82,21 @@ impl Fields {
         Ok(self.optional(field)?.unwrap_or_default())
     }
 
-    /// Takes a field that must be there.
+    /// Takes a required field.
     ///
     /// # Errors
-    /// None; a value of another form.
+    /// Returns an error for a missing field or a value of the wrong type.
     pub fn required<T: DeserializeOwned>(&mut self, field: &str) -> Result<T, SpecError> {
         let missing = format!("is missing; kind = {:?} needs it", self.kind);
         self.optional(field)?
             .ok_or_else(|| SpecError::new(field, missing))
     }
 
-    /// Checks that there are no fields but those that every stage has and `own`; `owners` says which kinds have a field.
+    /// Checks that there are no fields except the common ones and `own`; `owners` lists the kinds
+    /// that have a field.
     ///
     /// # Errors
-    /// A field of another kind, or of none.
+    /// Returns an error for a field of another kind, or of none.
     pub(super) fn only(
         &self,
         own: &[&str],

@@ -1,5 +1,5 @@
-//! What a generate task does: a scene, written as a file for other programs. (Rendering needs no such files: it makes its
-//! scenes itself, and names its results by what makes them.)
+//! Generation: writes scenes as files for other programs. One task a scene. Rendering needs no such
+//! files, because it generates its scenes itself and keys its results by their settings.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -19,20 +19,21 @@ use crate::{
     show,
 };
 
-/// Writing generated scenes as files: one task a scene.
+/// Writes generated scenes as files: one task a scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct GenerateTask {
-    /// Which scenes; not files.
+    /// The scenes; not files.
     pub scenes: SceneSource,
-    /// Where and how they are written.
+    /// The destination and form of the files.
     pub generate: GenerateSettings,
 }
 
-/// Where and how generated scenes are written.
+/// The destination and form of generated scenes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GenerateSettings {
-    /// A path or URL that every worker can reach; scene 7 becomes `000007.glb` or `000007/scene.xml` in it.
+    /// A path or URL that every worker can reach. Scene 7 becomes `000007.glb` or
+    /// `000007/scene.xml` in it.
     pub dest: String,
     /// `glb` (default) or `mitsuba`.
     #[serde(default = "glb")]
@@ -40,7 +41,8 @@ pub struct GenerateSettings {
     /// Width and height of the camera's image in pixels (default 256).
     #[serde(default = "side")]
     pub resolution: u32,
-    /// Version of generators and writers, part of every task key; filled in at submission where left out.
+    /// Version of generators and writers, part of every task key; filled in at submission if
+    /// omitted.
     #[serde(default)]
     pub version: String,
 }

@@ -1,4 +1,4 @@
-//! What an import task does: a scene of other people's data, converted into a data set.
+//! Imports: converts scenes of other formats into a data set. One task a scene.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -15,37 +15,38 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// Importing scenes into a data set: one task a scene.
+/// Imports scenes into a data set: one task a scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ImportTask {
-    /// Which scenes, and how they are read.
+    /// The scenes and the way to read them.
     pub import: ImportSettings,
-    /// Where results go.
+    /// The destination of results.
     pub output: OutputSettings,
 }
 
-/// Which scenes, and how they are read.
+/// The scenes and the way to read them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImportSettings {
-    /// The folder with the files, as the workers see it.
+    /// The folder with the files, as seen by the workers.
     pub folder: String,
-    /// Their layout; filled in at submission where left out.
+    /// The layout of the files; filled in at submission if omitted.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub format: String,
-    /// What overrides the files, by name; the importer knows the names.
+    /// Values that override the files, by name. The importer defines the names.
     #[serde(default, skip_serializing_if = "Map::is_empty")]
     pub options: Map<String, Value>,
-    /// The scenes, by name, in the order of their indices; filled in at submission where left out (all of them).
+    /// Names of the scenes, in the order of their indices; filled in at submission if omitted (all
+    /// of them).
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub scenes: Vec<String>,
-    /// Index of the first of them: 0 but in a lease, which brings only its own.
+    /// Index of the first listed scene: 0 except in a lease, which contains only its own.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub first: u64,
-    /// Number of scenes; follows from the list.
+    /// Number of scenes, derived from the list.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub count: u64,
-    /// Version of the importer, part of every task key; filled in at submission where left out.
+    /// Version of the importer, part of every task key; filled in at submission if omitted.
     #[serde(default)]
     pub version: String,
 }
@@ -56,7 +57,7 @@ fn is_zero(n: &u64) -> bool {
 }
 
 impl ImportSettings {
-    /// The name of scene `index`, where it is listed.
+    /// Returns the name of scene `index`, if it is listed.
     pub fn name(&self, index: u64) -> Option<&str> {
         let at = usize::try_from(index.checked_sub(self.first)?).ok()?;
         self.scenes.get(at).map(String::as_str)

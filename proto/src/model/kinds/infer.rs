@@ -1,4 +1,5 @@
-//! Inference: trained models say what they see in the scenes of a data set, and it is kept. One task a scene.
+//! Inference: stores the predictions of trained models for the scenes of a data set. One task a
+//! scene.
 
 use std::collections::BTreeMap;
 
@@ -23,32 +24,35 @@ use crate::model::{
 /// Most models in one inference: one of each kind.
 const MAX_MODELS: usize = 3;
 
-/// What trained models see in each scene of a data set: one task a scene.
+/// Predicts each scene of a data set with trained models: one task a scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct InferTask {
-    /// The data set whose scenes they see. The models are kept in the same store.
+    /// The data set with the scenes. The models are in the same store.
     pub source: SourceSettings,
-    /// The number of scenes that the source has room for.
+    /// The number of scenes for which the source has room.
     pub count: u64,
-    /// Which models.
+    /// The models.
     pub infer: InferSettings,
-    /// Where predictions go: a folder of their own, beside data sets. They have no histograms, so no profile either.
+    /// The destination of predictions: a separate folder next to data sets. Predictions have no
+    /// histograms, and therefore no profile.
     pub output: OutputSettings,
 }
 
-/// Which models see the scenes.
+/// The models of an inference.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InferSettings {
-    /// Names of models, or of stages that train them: at most one of each kind (`tof`, `shadow`, `specular`).
+    /// Names of models, or of stages that train them: at most one of each kind (`tof`, `shadow`,
+    /// `specular`).
     pub models: Vec<String>,
-    /// Which of the data set's histograms; left out: for each model that which it was trained on.
+    /// Histogram of the data set; defaults to each model's training histogram.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub histogram: Option<Histogram>,
-    /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
+    /// Only these spots, summed. Requires `histogram = "transient_spots"`, which in turn requires
+    /// it; ascending.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
-    /// Version of networks and encoder, part of every task key; filled in at submission where left out.
+    /// Version of networks and encoder, part of every task key; filled in at submission if omitted.
     #[serde(default)]
     pub version: String,
 }
@@ -98,7 +102,7 @@ impl TaskKind for InferTask {
         to.check()
     }
 
-    /// No two models, as far as stages before it train them, predict the same.
+    /// No two models, as far as earlier stages train them, may have the same target.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         let mut kinds = BTreeMap::new();
         for model in &self.infer.models {
@@ -179,7 +183,7 @@ impl InferSettings {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("infer.{field}"), what));
         if self.models.is_empty() || self.models.len() > MAX_MODELS {

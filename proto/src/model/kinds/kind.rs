@@ -1,4 +1,5 @@
-//! What a kind of task is: how job files write it, what the farm must know of it, and where its results lie.
+//! The description of a kind of task: its form in job files, its properties for the farm, and the
+//! places of its results.
 
 use std::fmt;
 
@@ -16,33 +17,35 @@ use crate::{
     },
 };
 
-/// How a kind is written in a job file, and in leases.
+/// The written form of a kind in job files and in leases.
 pub trait Declared: TaskKind + Sized {
-    /// Its name.
+    /// Name of the kind.
     const NAME: &'static str;
-    /// The fields of its stages, beside those that every stage has.
+    /// The fields of its stages, in addition to the common ones.
     const FIELDS: &'static [&'static str];
-    /// Job files may name it; otherwise only this program makes stages of it.
+    /// Whether job files may name the kind. Otherwise only this program makes stages of it.
     const WRITTEN: bool = true;
 
-    /// Reads its fields.
+    /// Reads the kind's fields.
     ///
     /// # Errors
-    /// A field that is missing or cannot be read.
+    /// Returns an error for a missing or invalid field.
     fn read(fields: &mut Fields) -> Result<Self, SpecError>;
 
-    /// The same with as much of its lists as a lease of tasks `lo..hi` needs; `None` = all of it.
+    /// Returns the task with its lists reduced to those needed by a lease of tasks `lo..hi`; `None`
+    /// if nothing is removed.
     fn only(&self, _lo: u64, _hi: u64) -> Option<Self> {
         None
     }
 }
 
-/// What the farm must know of a kind of task, but for how it runs.
+/// The properties of a kind of task for the farm, excluding the code that runs it.
 pub trait TaskKind: fmt::Debug + Send + Sync {
-    /// Version of the code that decides the bytes of its results, which a worker's must equal, and the field that holds it.
+    /// Returns the version of the code that decides the bytes of the results, and the field with
+    /// it. A worker's version must be equal.
     fn versioned(&self) -> (&'static str, &str);
 
-    /// The same version, to be filled in; `None` where it is not written in jobs.
+    /// Returns the version to be filled in; `None` if jobs do not contain it.
     fn version_mut(&mut self) -> Option<&mut String> {
         None
     }
@@ -50,31 +53,34 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     fn check(&self) -> Result<(), SpecError>;
 
-    /// Checks that it fits the tasks of the stages before its own.
+    /// Checks that the task fits the tasks of earlier stages.
     ///
     /// # Errors
-    /// [`SpecError`] naming the field.
+    /// Returns a [`SpecError`] for the field.
     fn check_among(&self, _before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         Ok(())
     }
 
-    /// Checks what a client must have filled in before it submits, beside the version and what its scenes need.
+    /// Checks the values that a client must have filled in before it submits, except for the
+    /// version and the scenes.
     ///
     /// # Errors
-    /// [`SpecError`] naming the field.
+    /// Returns a [`SpecError`] for the field.
     fn check_resolved(&self) -> Result<(), SpecError> {
         Ok(())
     }
 
-    /// Settings that can be used but are probably not meant, in words that name the field. They are warnings of a plan.
+    /// Returns warnings about valid settings that are probably mistakes, each with its field. A
+    /// plan shows them.
     fn remarks(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Everything that shapes its results but their number: what the key of its stage hashes.
+    /// Returns everything that affects the results except their number. The key of the stage hashes
+    /// it.
     fn shaping(&self) -> Value;
 
     /// Names the bytes of a scene that it makes, where they follow from its settings and the scene's own file alone: equal
@@ -91,51 +97,53 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
     /// Where its tasks write, which decides whose that is. Without a default, so that no kind leaves it out.
     fn destination(&self) -> Destination<'_>;
 
-    /// Where its results lie.
+    /// Returns the place of the results.
     fn results(&self) -> Results<'_>;
 
-    /// Bytes of memory that a task takes at most on so many threads; `None` where that depends on data of which nothing is
-    /// known.
+    /// Returns the most bytes of memory that a task takes on `threads` threads; `None` if that
+    /// depends on unknown data.
     fn memory(&self, known: &Known, threads: u32) -> Option<f64>;
 
-    /// Number of tasks.
+    /// Returns the number of tasks.
     fn tasks(&self) -> u64 {
         1
     }
 
-    /// Whether its tasks, when they are stopped, keep what they have done, and whoever runs them next goes on from there.
-    /// They may run for days: none is run twice at a time, and a worker that shall end does not finish them first.
+    /// Returns whether stopped tasks keep their progress, so that the next worker continues from
+    /// there. Such tasks may run for days. None runs twice at a time, and a worker that must end
+    /// does not finish them first.
     fn resumes(&self) -> bool {
         false
     }
 
-    /// What its tasks need of a worker beyond the kind: see [`TaskSpec::ability`](super::TaskSpec::ability).
+    /// Returns the requirement on workers beyond the kind; see
+    /// [`TaskSpec::ability`](super::TaskSpec::ability).
     fn variant(&self) -> Option<&'static str> {
         None
     }
 
-    /// The data set that is read.
+    /// Returns the input data set.
     fn reads(&self) -> Option<&SourceSettings> {
         None
     }
 
-    /// The data set that is read, and the number of its scenes; to be filled in.
+    /// Returns the input data set and the number of its scenes, to be filled in.
     fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
         None
     }
 
-    /// What is read beside it: a folder of the same store, into which a stage may put something of each scene; and the field
-    /// that names it.
+    /// Returns an additional input with its field: a folder of the same store, into which a stage
+    /// may write something for each scene.
     fn reads_beside(&self) -> Option<(&'static str, &String)> {
         None
     }
 
-    /// The same, for the name of a stage to be replaced by its folder.
+    /// Like `reads_beside`, to replace the name of a stage by its folder.
     fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
         None
     }
 
-    /// Where scenes come from that are made or read as files.
+    /// Returns the scenes that are generated or read as files.
     fn scenes(&self) -> Option<&SceneSource> {
         None
     }
@@ -150,77 +158,80 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         Vec::new()
     }
 
-    /// The stores that are named beside that of the data set which is read, each with its field; to be made absolute.
+    /// Returns the stores named in addition to that of the input data set, each with its field, to
+    /// be made absolute.
     fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
         Vec::new()
     }
 
-    /// Where something of each scene is put, of a data set or of predictions: store and folder.
+    /// Returns the store and folder into which something is written for each scene, a data set or
+    /// predictions.
     fn writes(&self) -> Option<(&String, &String)> {
         None
     }
 
-    /// The data set that scenes are put into: store and folder.
+    /// Returns the store and folder of the data set into which scenes are written.
     fn makes(&self) -> Option<(&String, &String)> {
         self.writes()
     }
 
-    /// The size of the scenes that it makes, of such scenes as it reads.
+    /// Returns the size of the resulting scenes, given the size of the input scenes.
     fn shape(&self, _source: Option<Shape>) -> Option<Shape> {
         None
     }
 
-    /// The split that is made: of which data set, and its name.
+    /// Returns the split that the task makes: its data set and its name.
     fn divides(&self) -> Option<(&SourceSettings, &String)> {
         None
     }
 
-    /// The split of the data set of [`Self::reads`] that is read.
+    /// Returns the split of the data set of [`Self::reads`] that the task uses.
     fn split(&self) -> Option<&String> {
         None
     }
 
-    /// The model that is made: store and name.
+    /// Returns the model that the task trains: store and name.
     fn trains(&self) -> Option<(&String, &String)> {
         None
     }
 
-    /// What the model predicts that is trained.
+    /// Returns the target of the trained model.
     fn predicts(&self) -> Option<&'static str> {
         None
     }
 
-    /// The network that is trained on such scenes.
+    /// Returns the network trained on such scenes.
     fn network(&self, _source: &Shape) -> Option<Network> {
         None
     }
 
-    /// The models that are evaluated.
+    /// Returns the evaluated models.
     fn evaluates(&self) -> &[String] {
         &[]
     }
 
-    /// The report that is made: store and name.
+    /// Returns the report that the task makes: store and name.
     fn reports(&self) -> Option<(&String, &String)> {
         None
     }
 
-    /// The store that keeps the models which are read or trained.
+    /// Returns the store of the models that the task uses or trains.
     fn models_store(&self) -> Option<&String> {
         self.reads().map(|source| &source.store)
     }
 
-    /// The same where it may be left out, to be filled in.
+    /// Like `models_store`, to be filled in if it may be omitted.
     fn models_store_mut(&mut self) -> Option<&mut String> {
         None
     }
 
-    /// The models that are read, from the store of [`Self::models_store`]: field and name.
+    /// Returns the models that the task reads from the store of [`Self::models_store`]: field and
+    /// name.
     fn models(&self) -> Vec<(&'static str, &String)> {
         Vec::new()
     }
 
-    /// The same, for names of stages to be replaced by those of their models.
+    /// Like `models`, to replace names of stages by those of their models.
     fn models_mut(&mut self) -> ModelNames<'_> {
         ModelNames::Single(Vec::new())
     }
@@ -229,27 +240,28 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
 /// Names of models in a task.
 #[derive(Debug)]
 pub enum ModelNames<'a> {
-    /// Fields that hold one each.
+    /// Fields with one name each.
     Single(Vec<(&'static str, &'a mut String)>),
-    /// A field that holds any number.
+    /// A field with any number of names.
     List(&'static str, &'a mut Vec<String>),
 }
 
-/// Where the results of a stage lie.
+/// The place of a stage's results.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Results<'a> {
     /// The field that names the store.
     pub field: &'static str,
     /// The store.
     pub store: &'a str,
-    /// What tells them from other results in the store: a folder, or a name that no folder can have.
+    /// Distinguishes the results from others in the store: a folder, or a name that no folder can
+    /// have.
     pub folder: String,
-    /// What a store is asked to learn whether a result is there.
+    /// The manifest by which a store shows whether a result exists.
     pub manifest: Manifest<'a>,
 }
 
 impl<'a> Results<'a> {
-    /// Those of tasks that put something of a scene each into a folder.
+    /// Returns the results of tasks that write something for one scene each into a folder.
     pub(super) fn scenes(output: &'a OutputSettings) -> Self {
         Self {
             field: "output.store",
@@ -262,12 +274,12 @@ impl<'a> Results<'a> {
     }
 }
 
-/// The manifests of results: a worker reports the SHA-256 of one for each task.
+/// The manifests of results. A worker reports the SHA-256 of one for each task.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Manifest<'a> {
     /// There is none.
     None,
-    /// That of a scene, or of a scene's predictions.
+    /// The manifest of a scene, or of a scene's predictions.
     Scene {
         /// Folder of the data set.
         dataset: &'a str,
@@ -283,32 +295,32 @@ pub enum Manifest<'a> {
     },
     /// A glTF scene itself.
     Gltf,
-    /// A model's.
+    /// The manifest of a model.
     Model {
-        /// Its name.
+        /// Name of the model.
         name: &'a str,
     },
     /// The record of a sweep's trial.
     Trial(&'a Trial),
-    /// A report's.
+    /// The manifest of a report.
     Report {
-        /// Its name.
+        /// Name of the report.
         name: &'a str,
     },
     /// A split itself.
     Split {
         /// Folder of the data set.
         dataset: &'a str,
-        /// Its name.
+        /// Name of the split.
         name: &'a str,
     },
 }
 
-/// Refuses a folder that [`TaskKind::reads_beside`] names where a stage before writes it and predicts no depth. Folders of
-/// which no stage is known are looked at when the stage runs.
+/// Refuses a folder in [`TaskKind::reads_beside`] if an earlier stage writes it and predicts no
+/// depth. Other folders are checked when the stage runs.
 ///
 /// # Errors
-/// [`SpecError`] at the field that names it.
+/// Returns a [`SpecError`] at the field that names the folder.
 pub(super) fn predicts_depth(
     task: &dyn TaskKind,
     before: &[&dyn TaskKind],
@@ -326,7 +338,7 @@ pub(super) fn predicts_depth(
         let trained = before
             .iter()
             .find(|task| task.trains() == Some((store, model)));
-        // Of a model that exists, only the store knows what it predicts.
+        // Only the store knows the target of an existing model.
         trained.is_none_or(|task| task.predicts() == Some("tof"))
     };
     if writer

@@ -1,8 +1,9 @@
-//! The kinds of tasks. Each is declared by one file here, which says how a job file writes it ([`Declared`]) and what the
-//! farm must know of it ([`TaskKind`]); the table below lists them. How its tasks run is one file too, under the agent's
-//! `execute`, with a line in the table there. Nothing else knows kinds by name, but where kinds belong to each other: the
-//! parts that [`super::file`] puts before a rendering, the trials of [`super::sweep`], and recipes and repairs in the agent,
-//! which are of scenes that are rendered, measured again or imported.
+//! The kinds of tasks. Each is declared by one file in this folder, which defines its form in a job
+//! file ([`Declared`]) and its properties for the farm ([`TaskKind`]). The table below lists them.
+//! The code that runs a kind's tasks is one file too, under the agent's `execute`, with a line in
+//! the table there. No other code knows kinds by name, except for related kinds: the parts that
+//! [`super::file`] puts before a render stage, the trials of [`super::sweep`], and recipes and
+//! repairs in the agent, which concern rendered, reprocessed or imported scenes.
 
 mod division;
 pub mod evaluate;
@@ -49,10 +50,10 @@ pub use split::SplitTask;
 pub use train::TrainTask;
 pub use verify::{VerifySettings, VerifyTask};
 
-/// Makes [`TaskSpec`] and all that goes over every kind.
+/// Defines [`TaskSpec`] and all code that covers every kind.
 macro_rules! kinds {
     ($($(#[$doc:meta])* $kind:ident($task:ident),)*) => {
-        /// What the tasks of a stage do. It answers as its [`TaskKind`].
+        /// The work of a stage's tasks. It dereferences to its [`TaskKind`].
         #[derive(Debug, Clone, PartialEq, Serialize)]
         #[serde(tag = "kind", rename_all = "snake_case")]
         pub enum TaskSpec {
@@ -84,14 +85,15 @@ macro_rules! kinds {
         })*
 
         impl TaskSpec {
-            /// The kind's name, as in a job file.
+            /// Returns the kind's name in a job file.
             pub fn kind(&self) -> &'static str {
                 match self {
                     $(Self::$kind(_) => $task::NAME,)*
                 }
             }
 
-            /// The same with as much of its lists as a lease of tasks `lo..hi` needs; `None` = all of it.
+            /// Returns the task with its lists reduced to those needed by a lease of tasks
+            /// `lo..hi`; `None` if nothing is removed.
             pub fn only(&self, lo: u64, hi: u64) -> Option<Self> {
                 match self {
                     $(Self::$kind(task) => Declared::only(task, lo, hi).map(Self::$kind),)*
@@ -109,39 +111,39 @@ macro_rules! kinds {
 }
 
 kinds! {
-    /// Scenes are rendered: one task each.
+    /// Renders scenes: one task each.
     Render(RenderTask),
-    /// Scenes of a data set go through a sensor into another: one task each.
+    /// Applies a sensor to the scenes of a data set and writes another: one task each.
     Reprocess(ReprocessTask),
-    /// The scenes of a data set are divided into training, validation and test: one task.
+    /// Divides the scenes of a data set into training, validation and test sets: one task.
     Split(SplitTask),
-    /// A data set is packed for sharing: one task.
+    /// Packs a data set for sharing: one task.
     Export(ExportTask),
-    /// Scenes of other people's data are converted into a data set: one task each.
+    /// Converts scenes of other formats into a data set: one task each.
     Import(ImportTask),
-    /// Scenes are made and written as files: one task each.
+    /// Generates scenes and writes them as files: one task each.
     Generate(GenerateTask),
-    /// A network learns from a data set: one task.
+    /// Trains a network on a data set: one task.
     Train(TrainTask),
-    /// Models meet scenes that they have not seen: one task.
+    /// Evaluates models on unseen scenes: one task.
     Evaluate(EvaluateTask),
-    /// The best of several models gets a name: one task.
+    /// Gives the best of several models a name: one task.
     Promote(PromoteTask),
-    /// Models say what they see in scenes: one task each.
+    /// Predicts scenes with models: one task each.
     Infer(InferTask),
-    /// What models came to, as a page: one task.
+    /// Reports the results of models as a page: one task.
     Report(ReportTask),
-    /// Scenes become rooms in 3D: one task each.
+    /// Reconstructs scenes as rooms in 3D: one task each.
     Reconstruct(ReconstructTask),
-    /// Scenes of a data set are read and compared with their manifests: one task each.
+    /// Reads scenes of a data set and compares them with their manifests: one task each.
     Verify(VerifyTask),
-    /// Parts of heavy scenes are rendered, for a render stage to join: one task a part.
+    /// Renders parts of heavy scenes, which a render stage joins: one task a part.
     Part(PartTask),
-    /// Models meet shards of the scenes, for an evaluation to join: one task a shard.
+    /// Evaluates models on shards of the scenes, which an evaluation joins: one task a shard.
     EvaluateShard(EvaluateShardTask),
 }
 
-/// A kind, as job files are read.
+/// A kind, for reading job files.
 struct Row {
     name: &'static str,
     fields: &'static [&'static str],
@@ -150,13 +152,14 @@ struct Row {
 }
 
 impl TaskSpec {
-    /// Version of the code that decides the bytes of its results; a worker's must equal it.
+    /// Returns the version of the code that decides the bytes of the results. A worker's version
+    /// must be equal.
     pub fn version(&self) -> &str {
         self.versioned().1
     }
 
-    /// What a worker must announce to be given its tasks: the kind, and where not every program that runs the kind can run
-    /// these, a colon and what is needed.
+    /// Returns the ability that a worker must announce to get the tasks. It is the kind, followed
+    /// by a colon and the requirement if not every program that runs the kind can run these tasks.
     pub fn ability(&self) -> Cow<'static, str> {
         match self.variant() {
             None => self.kind().into(),
@@ -164,10 +167,11 @@ impl TaskSpec {
         }
     }
 
-    /// Reads a task of the kind that the fields name; those that every stage has were taken out of them.
+    /// Reads a task of the kind that the fields name. The common fields of stages were removed
+    /// before.
     ///
     /// # Errors
-    /// A kind that is unknown; a field that is missing, of another kind, or cannot be read.
+    /// Returns an error for an unknown kind, or for a missing, foreign or invalid field.
     pub(super) fn read(mut fields: Fields) -> Result<Self, SpecError> {
         let kind = fields.kind().to_owned();
         let Some(row) = TABLE.iter().find(|row| row.name == kind) else {

@@ -2,10 +2,10 @@
 
 use crate::model::spec_error::SpecError;
 
-/// Checks the name of a model: it is a folder's.
+/// Checks the name of a model, which is also the name of a folder.
 ///
 /// # Errors
-/// [`SpecError`] naming the field.
+/// Returns a [`SpecError`] for the field.
 pub fn check_model(field: &str, name: &str) -> Result<(), SpecError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     if (1..=128).contains(&name.len()) && !name.starts_with('.') && name.chars().all(plain) {
@@ -27,7 +27,7 @@ pub(super) fn check_split(field: &str, name: &str) -> Result<(), SpecError> {
     Err(SpecError::new(field, what))
 }
 
-/// Checks what two-bounce times follow from: `truth`, or the folder of predictions.
+/// Checks a source of two-bounce times: `truth`, or the folder of predictions.
 pub(super) fn check_times(field: &str, name: &str) -> Result<(), SpecError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     if !name.is_empty() && !name.starts_with('.') && name.chars().all(plain) {

@@ -1,4 +1,5 @@
-//! Parts of heavy scenes: several workers share one scene, whose render stage joins what they make.
+//! Parts of heavy scenes. Several workers share one scene, and its render stage joins their
+//! results.
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -19,7 +20,7 @@ use crate::{
     },
 };
 
-/// Rendering parts of scenes, which the stage that needs it joins: one task a part.
+/// Renders parts of scenes, which the dependent stage joins: one task a part.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PartTask {
     /// The rendering.
@@ -28,7 +29,7 @@ pub struct PartTask {
 }
 
 impl PartTask {
-    /// How its tasks go over scenes.
+    /// Returns the division of scenes into tasks.
     pub fn division(&self) -> Division {
         Division {
             parts: self.whole.parts,
@@ -39,7 +40,7 @@ impl PartTask {
 impl Declared for PartTask {
     const NAME: &'static str = "part";
     const FIELDS: &'static [&'static str] = &["scenes", "render", "output", "parts", "joined_by"];
-    /// A rendering with `parts` stands for it.
+    /// Written in job files as a render stage with `parts`.
     const WRITTEN: bool = false;
 
     fn read(fields: &mut Fields) -> Result<Self, SpecError> {
@@ -105,7 +106,7 @@ impl TaskKind for PartTask {
     fn memory(&self, _known: &Known, threads: u32) -> Option<f64> {
         let rendering = self.whole.rendering(threads);
         let share = 1.0 / f64::from(self.whole.parts.max(1));
-        // Cut out of the image, and written.
+        // Tiles are cut out of the image, and written.
         let tiles = 3.0 * share * rendering.images() + rendering.tiles();
         let paths = 3.0 * LIGHT_PATHS * rendering.paths();
         let kept = rendering.shape.truth() + tiles.max(paths);

@@ -1,4 +1,4 @@
-//! Promotion: the best of several models gets a name of its own. One task; sweeps end with one.
+//! Promotion: gives the best of several models its own name. One task. A sweep ends with one.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -16,29 +16,30 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// Giving the best of several models a name: one task.
+/// Gives the best of several models a name: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PromoteTask {
-    /// The data set that they learnt from, in whose store they are kept.
+    /// The training data set, with the models in its store.
     pub source: SourceSettings,
-    /// Its number of scenes.
+    /// Number of scenes of the data set.
     pub count: u64,
-    /// Which models.
+    /// The models and the name.
     pub promote: PromoteSettings,
 }
 
-/// The best of which models gets which name.
+/// Candidate models, and the name for the best.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PromoteSettings {
-    /// The name that the best gets.
+    /// The name for the best model.
     pub model: String,
-    /// The models among which it is chosen, or stages that train them. Trials that stopped on their way are passed over.
+    /// The candidate models, or stages that train them. Trials that stopped early are skipped.
     pub among: Vec<String>,
-    /// Models that were never made are passed over, too.
+    /// Whether missing models are skipped too.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tolerate_missing: bool,
-    /// Version of networks and training, part of every task key; filled in at submission where left out.
+    /// Version of networks and training, part of every task key; filled in at submission if
+    /// omitted.
     #[serde(default)]
     pub version: String,
 }

@@ -1,4 +1,5 @@
-//! Reconstruction: each scene of a data set becomes a room in 3D, from light that bounced twice. One task a scene.
+//! Reconstruction: turns each scene of a data set into a room in 3D, from two-bounce light. One
+//! task a scene.
 
 use picofarm_settings::{FieldKind, GridSettings, MlpSettings, Sensor, SensorError, Shadows};
 use serde::{Deserialize, Serialize};
@@ -16,90 +17,100 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// Bytes of a node of the grid while it is fitted: 19 to 25 were measured at 256 to 128 nodes.
+/// Bytes of a node of the grid during fitting: 19 to 25 were measured at 256 to 128 nodes.
 const NODE: f64 = 28.0;
-/// Bytes of networks while they are fitted: at all, for each neuron of a layer (what 64 rays leave behind on the way to their
-/// gradients), and for each weight of a layer. 59, 227 and 863 MiB were measured at widths of 8, 64 and 256.
+/// Bytes of networks during fitting: a constant, the bytes for each neuron of a layer (values that
+/// 64 rays store for their gradients), and for each weight of a layer. 59, 227 and 863 MiB were
+/// measured at widths of 8, 64 and 256.
 const NETWORKS: f64 = 48.0 * 1024.0 * 1024.0;
 const NEURON: f64 = 3.3 * 1024.0 * 1024.0;
 const WEIGHT: f64 = 1024.0;
-/// Bytes of a pixel for each spot: its time, its mask, its strongest return, and all of them twice while masks are compared.
+/// Bytes of a pixel for each spot: its time, its mask, its strongest return, and all of them twice
+/// while masks are compared.
 const PATH: f64 = 40.0;
-/// What a worker calls the networks that it can fit.
+/// Name of the ability to fit networks.
 pub const MLP: &str = "mlp";
 /// Most novel views of a scene.
 const MOST_VIEWS: u32 = 1_000;
 
-/// A density field, a mesh and their errors for each scene of a data set: one task a scene.
+/// Reconstructs a density field, a mesh and their errors for each scene of a data set: one task a
+/// scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ReconstructTask {
-    /// The data set whose scenes are reconstructed.
+    /// The data set with the scenes.
     pub source: SourceSettings,
-    /// The number of scenes that the source has room for.
+    /// The number of scenes for which the source has room.
     pub count: u64,
-    /// From what, and how.
+    /// The inputs and the method.
     pub reconstruct: ReconstructSettings,
-    /// Where reconstructions go: a folder of their own, beside data sets. They have no histograms, so no profile either.
+    /// The destination of reconstructions: a separate folder next to data sets. Reconstructions
+    /// have no histograms, and therefore no profile.
     pub output: OutputSettings,
 }
 
-/// From what a scene is reconstructed, and how.
+/// The inputs and the method of a reconstruction.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReconstructSettings {
-    /// Where two-bounce times and shadow masks come from.
+    /// Source of two-bounce times and shadow masks.
     pub from: Measurements,
-    /// With `from = "predictions"`: an infer stage, or the folder in the source's store that one wrote, with depth and masks.
+    /// With `from = "predictions"`: an infer stage, or the folder in the source's store that an
+    /// infer stage wrote, with depth and masks.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub predictions: String,
-    /// Only these spots, ascending; empty = all.
+    /// Only these spots, ascending; empty means all.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
-    /// What becomes of pixels that are known to see a mirror.
+    /// Treatment of pixels that are known to see a mirror.
     #[serde(skip_serializing_if = "Mirrors::is_default")]
     pub mirrors: Mirrors,
-    /// With `from = "captures"`: the detector that counts their photons; left out, what is rendered is what is measured. Its seed is
-    /// the grid's.
+    /// With `from = "captures"`: the detector that counts the photons. Without it, the rendered
+    /// histograms are the measurements. Its seed is the grid's.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensor: Option<Sensor>,
-    /// Views from elsewhere on which the depth is compared with the scene's, which is made again for it; 0 = none.
+    /// Number of novel views at which the depth is compared with the scene's, which is generated
+    /// again for this; 0 means none.
     pub views: u32,
-    /// What the density is: a grid, or PlatoNeRF's networks.
+    /// Representation of the density: a grid, or PlatoNeRF's networks.
     #[serde(skip_serializing_if = "is_grid")]
     pub field: FieldKind,
-    /// The grid. Networks are sampled on it: their `nodes` and `seed` are its own.
+    /// The grid. Networks are sampled on it, with its `nodes` and `seed`.
     pub grid: GridSettings,
     /// With `field = "mlp"`: the networks.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mlp: Option<MlpSettings>,
-    /// Version of the reconstruction, part of every task key; filled in at submission where left out.
+    /// Version of the reconstruction, part of every task key; filled in at submission if omitted.
     pub version: String,
 }
 
-/// Where two-bounce times and shadow masks come from.
+/// Source of two-bounce times and shadow masks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measurements {
     /// The ground truth's depth and visibility.
     #[default]
     Truth,
-    /// What networks predict of one histogram (Shoot-Bounce-3D, appendices C and E).
+    /// The predictions of networks from one histogram (Shoot-Bounce-3D, appendices C and E).
     Predictions,
-    /// A histogram of each spot alone (`per_spot = true` in the render stage), through PlatoNeRF's matched filter.
+    /// A histogram of each spot alone (`per_spot = true` in the render stage), through PlatoNeRF's
+    /// matched filter.
     Captures,
-    /// Two-bounce paths and masks that an import brought along (`two_bounce_path`): of bounce-flash lidar, or of one's own.
+    /// Two-bounce paths and masks of an import (`two_bounce_path`), from bounce-flash lidar or from
+    /// the user.
     Given,
 }
 
-/// What becomes of pixels that see a mirror. Light comes to and from a mirror by other ways than two-bounce times suppose, so the
-/// method leaves open what to do (Shoot-Bounce-3D, appendix E).
+/// Treatment of pixels that see a mirror. Light reaches and leaves a mirror on paths that
+/// contradict the assumption of two-bounce times, so that the method leaves the treatment open
+/// (Shoot-Bounce-3D, appendix E).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mirrors {
-    /// They take no part.
+    /// They are excluded.
     #[default]
     LeaveOut,
-    /// They take part as any other pixel: a network that predicts depth predicts the mirror's own.
+    /// They are treated like any other pixel. A network that predicts depth predicts the mirror's
+    /// own.
     Keep,
 }
 
@@ -113,13 +124,14 @@ fn is_grid(field: &FieldKind) -> bool {
     *field == FieldKind::Grid
 }
 
-/// Bytes that a grid of `nodes` nodes along its longest side takes at most while it is fitted to images of this shape.
+/// Returns the most bytes that a grid of `nodes` nodes along its longest side takes while it is
+/// fitted to images of this shape.
 pub fn grid_bytes(nodes: u32, shape: &Shape) -> u64 {
     let paths = PATH * shape.pixels() * f64::from(shape.spots);
     (NODE * f64::from(nodes).powi(3) + paths) as u64
 }
 
-/// Bytes that networks of this width take at most while they are fitted.
+/// Returns the most bytes that networks of this width take during fitting.
 fn mlp_bytes(width: u32) -> f64 {
     NETWORKS + NEURON * f64::from(width) + WEIGHT * f64::from(width).powi(2)
 }
@@ -252,7 +264,7 @@ impl ReconstructSettings {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail =
             |field: &str, what: String| Err(SpecError::new(format!("reconstruct.{field}"), what));

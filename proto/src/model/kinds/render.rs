@@ -1,4 +1,4 @@
-//! What a render task does: which scenes, rendered how.
+//! Rendering: the scenes and the render settings. One task a scene.
 
 use picofarm_settings::{Budget, Spots};
 use serde::Serialize;
@@ -24,17 +24,17 @@ mod settings;
 pub use super::scenes::{SceneFile, SceneKind, SceneSource};
 pub use settings::{RenderSettings, parse_share};
 
-/// Rendering scenes into a data set: one task a scene.
+/// Renders scenes into a data set: one task a scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RenderTask {
-    /// Which scenes.
+    /// The scenes.
     pub scenes: SceneSource,
-    /// How they are rendered.
+    /// The render settings.
     pub render: RenderSettings,
-    /// Where results go.
+    /// The destination of results.
     pub output: OutputSettings,
-    /// Into how many ranges of tiles each scene is divided, for several workers to share it; 1 = not divided. The result
-    /// is the same to the bit.
+    /// Number of ranges of tiles into which each scene is divided, so that several workers share
+    /// it; 1 means not divided. The result is bit-identical.
     #[serde(skip_serializing_if = "is_one")]
     pub parts: u32,
 }
@@ -45,10 +45,10 @@ fn is_one(n: &u32) -> bool {
 }
 
 impl RenderTask {
-    /// Most ranges that a scene is divided into.
+    /// Most ranges into which a scene is divided.
     pub const MAX_PARTS: u32 = 1024;
 
-    /// What tasks `lo..hi` need of this: of a list of files only its own.
+    /// Returns the task with its list of files reduced to those of tasks `lo..hi`.
     pub(super) fn some(&self, lo: u64, hi: u64) -> Self {
         let kind = match &self.scenes.kind {
             SceneKind::Files { files, first, root } => {
@@ -73,7 +73,7 @@ impl RenderTask {
         }
     }
 
-    /// What a task keeps in memory.
+    /// Returns the values that determine a task's memory.
     pub(super) fn rendering(&self, threads: u32) -> Rendering {
         let render = &self.render;
         let spots = self.scenes.spots.count();
@@ -92,7 +92,7 @@ impl RenderTask {
         }
     }
 
-    /// The key of the stage.
+    /// Returns the key of the stage.
     pub fn stage_key(&self) -> StageKey {
         StageKey::of(self.shaping())
     }
@@ -205,7 +205,8 @@ impl TaskKind for RenderTask {
         let rendering = self.rendering(threads);
         let parts = match self.parts {
             1 => 0.0,
-            // Read, decoded and put into the image one after the other; the allocator holds for a second what the last one took.
+            // Parts are read, decoded and put into the image one after the other. The allocator
+            // still keeps the memory of the previous one.
             _ => 3.0 * rendering.images() + rendering.paths() * LIGHT_PATHS,
         };
         Some(rendering.coded() + parts)

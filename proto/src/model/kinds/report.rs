@@ -1,4 +1,5 @@
-//! Reports: what trained models came to, as one page and as JSON, kept in their store. One task.
+//! Reports: presents the results of trained models as one page and as JSON, stored with the models.
+//! One task.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -16,34 +17,36 @@ use crate::model::{
     spec_error::{SpecError, within},
 };
 
-/// Most scenes of each model that a report shows.
+/// Most scenes of each model in a report.
 pub const MAX_PICTURES: u32 = 100;
 
-/// A report about models: one task.
+/// Reports on models: one task.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ReportTask {
-    /// What it is about.
+    /// The content of the report.
     pub report: ReportSettings,
 }
 
-/// What a report is about.
+/// The content of a report.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReportSettings {
-    /// Its name, under which it is kept in the store: letters, digits, `-`, `_` and `.`.
+    /// The name under which the report is stored: letters, digits, `-`, `_` and `.`.
     pub name: String,
-    /// Names of models, or of stages that train them (of a matrix: the name before the bracket means all of it).
+    /// Names of models, or of stages that train them (in a matrix, the name before the bracket
+    /// means all of it).
     pub models: Vec<String>,
-    /// The store that keeps the models, and the report; where left out, that in which stages before it train them.
+    /// The store of the models and the report; defaults to the store in which earlier stages train
+    /// the models.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub store: String,
     /// Title of the page.
     #[serde(default = "title")]
     pub title: String,
-    /// Scenes of each model to show.
+    /// Number of scenes shown for each model.
     #[serde(default = "two")]
     pub pictures: u32,
-    /// Version of networks and metrics, part of the task key; filled in at submission where left out.
+    /// Version of networks and metrics, part of the task key; filled in at submission if omitted.
     #[serde(default)]
     pub version: String,
 }
@@ -100,7 +103,7 @@ impl TaskKind for ReportTask {
         }
     }
 
-    /// Its pictures are of scenes that its models look at.
+    /// The pictures show scenes on which the models run.
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let asked = known
             .networks
@@ -139,7 +142,7 @@ impl ReportSettings {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("report.{field}"), what));
         check_model("report.name", &self.name)?;

@@ -1,5 +1,5 @@
-//! Reprocessing: the histograms of a finished data set through a sensor, into another data set. One task a scene;
-//! nothing is rendered.
+//! Reprocessing: applies a sensor to the histograms of a finished data set and writes another data
+//! set. One task a scene. Renders nothing.
 
 use picofarm_settings::{Sensor, SensorError};
 use serde::{Deserialize, Serialize};
@@ -21,16 +21,17 @@ use crate::{
     show,
 };
 
-/// Reprocessing a data set into another: one task a scene.
+/// Reprocesses a data set into another: one task a scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ReprocessTask {
-    /// The data set that is read. Its place is not part of a result's name: that follows from the names of its scenes.
+    /// The input data set. Its place does not affect the keys of results, which depend on the keys
+    /// of its scenes.
     pub source: SourceSettings,
-    /// The number of scenes that the source has room for.
+    /// The number of scenes for which the source has room.
     pub count: u64,
-    /// What is done to each scene.
+    /// The processing of each scene.
     pub reprocess: ReprocessSettings,
-    /// Where results go.
+    /// The destination of results.
     pub output: OutputSettings,
 }
 
@@ -91,7 +92,7 @@ impl TaskKind for ReprocessTask {
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let source = known.source.as_ref()?;
         let spots = self.reprocess.histogram == Histogram::TransientSpots;
-        // With what the allocator still holds of the scene before.
+        // Includes the memory of the previous scene that the allocator still keeps.
         let histograms = if spots { 5.6 } else { 4.2 };
         Some(BASE + source.truth() + histograms * source.histogram())
     }
@@ -132,23 +133,26 @@ impl TaskKind for ReprocessTask {
     }
 }
 
-/// What is done to each scene.
+/// The processing of each scene.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReprocessSettings {
-    /// Which of its histograms.
+    /// Histogram of the scene.
     pub histogram: Histogram,
-    /// Only these spots, summed: multiplexing. Only with `histogram = "transient_spots"`, which needs it; ascending.
+    /// Only these spots, summed (multiplexing). Requires `histogram = "transient_spots"`, which in
+    /// turn requires it; ascending.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
     /// The sensor.
     pub sensor: Sensor,
-    /// Bins that `sensor.rebin` leaves over at the end of the gate are dropped; otherwise it must divide the bins.
+    /// Whether bins that `sensor.rebin` leaves over at the end of the gate are dropped. Otherwise
+    /// it must divide the number of bins.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub drop_left_over: bool,
-    /// Chooses another draw of the same noise (default 0).
+    /// Selects another draw of the same noise (default 0).
     pub seed: u64,
-    /// Version of the sensor model and the encoder, part of every task key; filled in at submission where left out.
+    /// Version of the sensor model and the encoder, part of every task key; filled in at submission
+    /// if omitted.
     pub version: String,
 }
 
@@ -156,7 +160,7 @@ pub struct ReprocessSettings {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Histogram {
-    /// All spots at once.
+    /// All spots together.
     #[default]
     Transient,
     /// 4 of the 100 spots.
@@ -170,7 +174,7 @@ pub enum Histogram {
 }
 
 impl Histogram {
-    /// All there are.
+    /// All histograms.
     pub const ALL: [Self; 4] = [
         Self::Transient,
         Self::Transient4,
@@ -178,7 +182,7 @@ impl Histogram {
         Self::TransientSpots,
     ];
 
-    /// Name of the array.
+    /// Returns the name of the array.
     pub fn name(self) -> &'static str {
         match self {
             Self::Transient => "transient",
@@ -188,10 +192,10 @@ impl Histogram {
         }
     }
 
-    /// The histogram of this name.
+    /// Returns the histogram with this name.
     ///
     /// # Errors
-    /// A message that lists those there are.
+    /// Returns a message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|h| h.name() == name);
         found.ok_or_else(|| show::unknown(name, &Self::ALL.map(Self::name)))
@@ -199,8 +203,8 @@ impl Histogram {
 }
 
 impl ReprocessSettings {
-    /// The stage key of a reprocess stage: everything but the places of source and target, which follow from the keys of
-    /// the source's scenes ([`crate::key::derived_key`]).
+    /// Returns the stage key of a reprocess stage. It excludes the places of source and target,
+    /// because those follow from the keys of the source's scenes ([`crate::key::derived_key`]).
     pub fn stage_key(&self, profile: &str) -> StageKey {
         let description = json!({
             "task": "reprocess",
@@ -215,8 +219,8 @@ impl ReprocessSettings {
         StageKey::of(description)
     }
 
-    /// The codec profile that loses nothing that matters: whole counts are kept exactly, rates to a fraction of the
-    /// photon noise.
+    /// Returns the codec profile without relevant loss: whole counts are kept exactly, rates to a
+    /// fraction of the photon noise.
     pub fn natural_profile(&self) -> &'static str {
         if self.sensor.poisson {
             "counts-u16"
@@ -225,15 +229,15 @@ impl ReprocessSettings {
         }
     }
 
-    /// Puts the spots in order: the order in which somebody names them shall not make other results of them.
+    /// Sorts the spots, because the order in which they are written must not affect the results.
     pub fn normalise(&mut self) {
         self.spots.sort_unstable();
     }
 
-    /// Checks every field against its limits, and the codec profile of the target against the sensor.
+    /// Checks every field against its limits, and the target's codec profile against the sensor.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self, profile: &str) -> Result<(), SpecError> {
         let fail =
             |field: &str, what: String| Err(SpecError::new(format!("reprocess.{field}"), what));

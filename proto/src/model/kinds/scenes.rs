@@ -1,4 +1,5 @@
-//! The scenes of a stage that renders or generates: where they come from, how a job file says it, and the checks.
+//! The scenes of a render or generate stage: their source, their form in a job file, and the
+//! checks.
 
 use picofarm_settings::{MirrorWall, PrimitiveRooms, Sizes, Spots};
 use serde::{Deserialize, Serialize};
@@ -12,7 +13,7 @@ use crate::{
     show,
 };
 
-/// Names of furniture that stand for whatever a machine has of it.
+/// Names of furniture that stand for any installed library.
 const LIBRARIES: [&str; 5] = ["", "auto", "parametric", "sweethome3d", "gltf"];
 /// The kinds of scenes.
 const KINDS: [&str; 4] = ["furnished", "primitive", "desktop", "files"];
@@ -21,19 +22,21 @@ const KINDS: [&str; 4] = ["furnished", "primitive", "desktop", "files"];
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "SceneSourceText")]
 pub struct SceneSource {
-    /// Where scenes come from.
+    /// The kind of scenes.
     #[serde(flatten)]
     pub kind: SceneKind,
-    /// Number of scenes; with `kind = "files"`, the number of files (may be left out).
+    /// Number of scenes; with `kind = "files"`, the number of files (may be omitted).
     pub count: u64,
-    /// Seed (default 0); scene i derives its own from (seed, i).
+    /// Seed (default 0). Scene i derives its own from (seed, i).
     pub seed: u64,
-    /// Horizontal field of view in degrees (generated scenes; default 90, of boxes on a desk 46).
+    /// Horizontal field of view in degrees (generated scenes; default 90, for boxes on a desk 46).
     pub fov_deg: f64,
-    /// Laser spots (generated scenes, and files without a laser; default a grid of 25, in boxes on a desk of 16).
+    /// Laser spots (generated scenes, and files without a laser; default a grid of 25, for boxes on
+    /// a desk 16).
     pub spots: Spots,
-    /// Where the laser stands in the camera's frame, x right, y down, z forward, metres (generated scenes; default at the camera's
-    /// centre). Its beams go to the points that the camera sees at the spots' places.
+    /// Position of the laser in the camera's frame: x right, y down, z forward, metres (generated
+    /// scenes; default the camera's centre). Its beams go to the points that the camera sees at the
+    /// spots' places.
     #[serde(skip_serializing_if = "is_centre")]
     pub laser_m: [f64; 3],
 }
@@ -42,20 +45,20 @@ fn is_centre(place: &[f64; 3]) -> bool {
     *place == [0.0; 3]
 }
 
-/// Where scenes come from.
+/// The kind of scenes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum SceneKind {
     /// Furnished rooms.
     Furnished {
-        /// `parametric`, `sweethome3d`, `auto` (default: whichever is installed; resolved before
+        /// `parametric`, `sweethome3d`, `auto` (default: the installed library, resolved before
         /// submission), or a resolved fingerprint.
         assets: String,
-        /// At least this many mirrors a room (default 1).
+        /// Fewest mirrors in a room (default 1).
         min_specular: u32,
     },
-    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale. `kind = "desktop"` are those of
-    /// [`PrimitiveRooms::DESKTOP`].
+    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale. `kind = "desktop"`
+    /// stands for [`PrimitiveRooms::DESKTOP`].
     Primitive {
         /// Sizes of rooms and objects, bounds of depth, the mirror's wall.
         #[serde(skip_serializing_if = "is_living")]
@@ -63,12 +66,13 @@ pub enum SceneKind {
     },
     /// Scene files (.glb, .gltf, .json), one scene each.
     Files {
-        /// The files; in a job file, plain paths.
+        /// The files; plain paths in a job file.
         files: Vec<SceneFile>,
-        /// Index of the first of them: 0 but in a lease, which brings only its own.
+        /// Index of the first file: 0 except in a lease, which contains only its own files.
         #[serde(skip_serializing_if = "is_zero")]
         first: u64,
-        /// Folder that holds everything the scene files name (meshes, buffers, textures); without, each scene file's own.
+        /// Folder with everything that the scene files refer to (meshes, buffers, textures);
+        /// defaults to each scene file's own folder.
         #[serde(skip_serializing_if = "Option::is_none")]
         root: Option<String>,
     },
@@ -83,12 +87,13 @@ fn is_zero(n: &u64) -> bool {
     *n == 0
 }
 
-/// Triangles of a room with furniture that is not parametric, with room for more: of 87 rooms with Sweet Home 3D's the most had
-/// 399,000.
+/// Triangles of a room with furniture of a library, with a margin: the largest of 87 rooms with
+/// Sweet Home 3D's furniture had 399,000.
 const FURNISHED: u64 = 450_000;
 
 impl SceneKind {
-    /// Triangles of a scene, as far as memory depends on them; 0 where they are few, or where only the files tell.
+    /// Returns the triangles of a scene, as far as memory depends on them; 0 if they are few, or
+    /// unknown without the files.
     pub(super) fn triangles(&self) -> u64 {
         match self {
             Self::Furnished { assets, .. } if !assets.starts_with("parametric") => FURNISHED,
@@ -96,7 +101,7 @@ impl SceneKind {
         }
     }
 
-    /// The file of scene `index`, where scenes are files and this one is listed.
+    /// Returns the file of scene `index`, if it is listed.
     pub fn file(&self, index: u64) -> Option<&SceneFile> {
         match self {
             Self::Files { files, first, .. } => {
@@ -122,7 +127,7 @@ pub(super) enum FilesIn<'a> {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "SceneFileText")]
 pub struct SceneFile {
-    /// Path as the workers see it.
+    /// Path on the workers.
     pub path: String,
     /// SHA-256 of the content in hexadecimal; empty until submission fills it in.
     pub sha256: String,
@@ -176,10 +181,10 @@ impl SceneSource {
         }
     }
 
-    /// Checks what a client must have filled in before it submits.
+    /// Checks the values that a client must have filled in before it submits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the field.
+    /// Returns a [`SpecError`] for the field.
     pub(in crate::model) fn check_resolved(&self) -> Result<(), SpecError> {
         match &self.kind {
             SceneKind::Furnished { assets, .. } if LIBRARIES.contains(&&**assets) => {
@@ -224,7 +229,7 @@ impl SceneSource {
                 ),
             ));
         }
-        // What the generators can furnish: beyond, walls or furniture leave the view.
+        // The limits of the generators: beyond them, walls or furniture leave the view.
         let degrees = "degrees from left to right";
         within("scenes.fov_deg", self.fov_deg, (20.0, 120.0), degrees)?;
         let spots = self.spots.check();
@@ -258,7 +263,7 @@ impl SceneSource {
     }
 }
 
-/// `[scenes]` as it is written: every field known, every other one refused.
+/// The written form of `[scenes]`. Unknown fields are refused.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SceneSourceText {
@@ -279,7 +284,7 @@ struct SceneSourceText {
     rooms: Option<RoomsText>,
 }
 
-/// `scenes.rooms` as it is written: what is left out is as the kind has it.
+/// The written form of `scenes.rooms`. Omitted fields default to the kind's values.
 #[derive(Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 struct RoomsText {
@@ -312,7 +317,7 @@ impl TryFrom<SceneSourceText> for SceneSource {
     type Error = SpecError;
 
     fn try_from(text: SceneSourceText) -> Result<Self, SpecError> {
-        // First: of a kind that is unknown, fields cannot be said to belong to another.
+        // This check comes first, because fields can only be attributed to a known kind.
         if !KINDS.contains(&&*text.kind) {
             return Err(SpecError::new(
                 "scenes.kind",

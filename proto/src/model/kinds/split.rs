@@ -1,4 +1,4 @@
-//! Splits: the scenes of a data set are divided into training, validation and test. One task.
+//! Splits: divides the scenes of a data set into training, validation and test sets. One task.
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -18,14 +18,14 @@ use crate::{
     split::SplitSettings,
 };
 
-/// Dividing a data set: one task.
+/// Divides a data set: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SplitTask {
     /// The data set.
     pub source: SourceSettings,
-    /// Its number of scenes.
+    /// Number of scenes of the data set.
     pub count: u64,
-    /// How.
+    /// Settings of the split.
     pub split: SplitSettings,
 }
 
@@ -86,7 +86,7 @@ impl TaskKind for SplitTask {
         }
     }
 
-    /// Lists of scenes: 64 bytes each.
+    /// Lists of scenes take 64 bytes a scene.
     fn memory(&self, _known: &Known, _threads: u32) -> Option<f64> {
         Some(BASE + 64.0 * self.count as f64)
     }

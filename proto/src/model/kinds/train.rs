@@ -1,5 +1,6 @@
-//! Training: a network learns from the scenes of a data set and is kept in its store under a name. One task. Defaults are
-//! the published experiments' (Shoot-Bounce-3D: the paper, its appendix and its released code).
+//! Training: trains a network on the scenes of a data set and stores it under a name. One task.
+//! Defaults come from the published experiments (Shoot-Bounce-3D: the paper, its appendix and its
+//! released code).
 
 use picofarm_settings::Spots;
 pub use picofarm_settings::{
@@ -35,14 +36,14 @@ pub use settings::{
 /// The field of [`ShadowSettings::times`].
 const TIMES: &str = "train.shadow.times";
 
-/// Training a network: a task for each process that does.
+/// Trains a network: one task for each process.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrainTask {
-    /// The data set that is learnt from. The model is kept in the same store.
+    /// The training data set. The model is stored in the same store.
     pub source: SourceSettings,
-    /// Its number of scenes.
+    /// Number of scenes of the data set.
     pub count: u64,
-    /// What is learnt, and how.
+    /// Settings of the training.
     pub train: TrainSettings,
 }
 
@@ -112,12 +113,13 @@ impl TaskKind for TrainTask {
         let others = known.networks.iter().map(|n| n.ask(source));
         let images = self.train.optimise.batch / self.train.optimise.accumulate.max(1);
         let learns = ours.learn(source, images.max(1));
-        // Sums of blocks of 2, 4, … parts of a batch wait for one another; and what others have comes beside.
+        // Sums of blocks of 2, 4, … parts of a batch wait for one another, plus the sums of other
+        // processes.
         let waiting = self.train.optimise.accumulate.max(2).ilog2() - 1;
         let exchanged = if self.train.processes > 1 { 3 } else { 0 };
         let average = if self.train.optimise.ema > 0.0 { 1 } else { 0 };
         let sums = f64::from(waiting + exchanged + average) * ours.weights();
-        // What a sensor makes of a scene lies beside it.
+        // The output of a sensor takes the same memory as the scene.
         let sensed = self.train.sensor.as_ref().map_or(0.0, |_| source.two());
         Some(BASE + source.two() + sensed + learns + sums + others.fold(0.0, f64::max))
     }
@@ -163,7 +165,8 @@ impl TaskKind for TrainTask {
         Some((TIMES, &mut self.train.shadow.times))
     }
 
-    /// Depths are predicted by then, and spots that are known by their number are at the same places in all scenes.
+    /// Predicted depths must come from a depth network, and spots that are known by their number
+    /// must be at the same places in all scenes.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         predicts_depth(self, before)?;
         let numbered = self.train.target == Target::Shadow && !self.train.shadow.variant.is_timed();
@@ -190,7 +193,7 @@ impl TaskKind for TrainTask {
     }
 }
 
-/// The scenes of a data set, as far as stages before render them or measure them again.
+/// Returns the scenes of a data set, as far as earlier stages render or reprocess them.
 fn scenes_of<'a>(
     source: &'a SourceSettings,
     before: &'a [&dyn TaskKind],

@@ -1,4 +1,5 @@
-//! Verification: every scene of a data set is read and compared with its manifest. One task a scene; nothing is written.
+//! Verification: reads every scene of a data set and compares it with its manifest. One task a
+//! scene. Writes nothing.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -15,22 +16,23 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// Verifying a data set: one task a scene. It is over when the scene is sound, and fails when it is not.
+/// Verifies a data set: one task a scene, which fails if the scene is damaged.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct VerifyTask {
     /// The data set.
     pub source: SourceSettings,
-    /// Its number of scenes.
+    /// Number of scenes of the data set.
     pub count: u64,
-    /// How thoroughly.
+    /// The thoroughness.
     pub verify: VerifySettings,
 }
 
-/// How thoroughly a data set is verified.
+/// The thoroughness of a verification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VerifySettings {
-    /// Only that each object is there and has its size; otherwise also its SHA-256, and that it decodes.
+    /// Whether to check only that each object exists with its size. Otherwise its SHA-256 and
+    /// decoding are checked too.
     pub fast: bool,
 }
 

@@ -1,33 +1,37 @@
-//! What the tasks of a job's stages take, from the stages before them.
+//! The memory of a job's tasks, derived from the stages before them.
 
 use super::{known::Known, network::Network, shape::Shape};
 use crate::model::{JobSpec, StageSpec, TaskSpec};
 
-/// Bytes that a task takes at most, in a process of its own; `None` where that depends on a data set of which nothing is
-/// known here.
+/// Returns the most bytes that a task takes in a process of its own; `None` if that depends on an
+/// unknown data set.
 ///
-/// | kind | beside the program (70 MB) and the store (60 MB); H = 4·pixels·bins |
-/// | --- | --- |
-/// | render | H a histogram, truth (260 + spots a pixel), tiles of each thread; and what is more: .6 of the light paths' sums, or the coded result (.45·H) |
-/// | render of parts | the same, and all parts (as much as the image) |
-/// | part | the image's and truth's, of the range of tiles; the sums over light paths, and both once more as a message |
-/// | generate | nothing that grows with pixels: its scene is counted with the program |
-/// | import | 3.2·H |
-/// | reprocess | 3.4·H; from single spots 5·H |
-/// | split | nothing that grows with pixels |
-/// | promote | twice the weights |
-/// | reconstruct | 28 bytes a node of the grid, 40 a pixel and spot; from single spots 2·H |
-/// | export | 3.5·H |
-/// | verify | 2.6·H |
-/// | train, evaluate, infer, report | see [`Network`]; and two scenes |
+/// Each kind takes the following, in addition to the program (70 MB) and the store (60 MB), with H
+/// = 4·pixels·bins:
+///
+/// - render: H for each histogram, the truth (260 + spots bytes a pixel), and tiles of each thread;
+///   plus the larger of .6 of the light paths' sums and the coded result (.45·H).
+/// - render of parts: the same, and all parts (as much as the image).
+/// - part: the image and truth of its range of tiles, the sums over light paths, and both again as
+///   a message.
+/// - generate: nothing that grows with pixels, because its scene is counted with the program.
+/// - import: 3.2·H.
+/// - reprocess: 3.4·H; from single spots 5·H.
+/// - split: nothing that grows with pixels.
+/// - promote: twice the weights.
+/// - reconstruct: 28 bytes a node of the grid, 40 a pixel and spot; from single spots 2·H.
+/// - export: 3.5·H.
+/// - verify: 2.6·H.
+/// - train, evaluate, infer, report: see [`Network`]; and two scenes.
 pub fn peak_bytes(task: &TaskSpec, known: &Known, threads: u32) -> Option<u64> {
     let estimate = task.memory(known, threads)?;
-    // Casting saturates.
+    // The cast saturates.
     Some(estimate as u64)
 }
 
 impl JobSpec {
-    /// What is known of what the stage at a position reads: from the stages before it, which make it.
+    /// Returns the known properties of the inputs of the stage at a position, from the stages that
+    /// make them.
     pub fn known(&self, stage: usize) -> Known {
         let before = &self.stages[..stage.min(self.stages.len())];
         let Some(spec) = self.stages.get(stage) else {
@@ -43,7 +47,7 @@ impl JobSpec {
     }
 }
 
-/// The scenes that a stage puts into a place.
+/// Returns the scenes that a stage puts into a place.
 pub(super) fn made(before: &[StageSpec], place: (&String, &String)) -> Option<Shape> {
     let at = before.iter().rposition(|s| s.task.makes() == Some(place))?;
     let source = before[at].task.reads();
@@ -51,7 +55,7 @@ pub(super) fn made(before: &[StageSpec], place: (&String, &String)) -> Option<Sh
     before[at].task.shape(source)
 }
 
-/// The networks that stages train of which another one reads the models.
+/// Returns the networks of the models that a stage reads, as far as earlier stages train them.
 fn networks(before: &[StageSpec], spec: &StageSpec) -> Vec<Network> {
     let Some(store) = spec.task.models_store() else {
         return Vec::new();

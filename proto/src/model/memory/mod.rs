@@ -1,8 +1,10 @@
-//! How much memory a task takes at most, from its settings and what is known of what it reads. Plain arithmetic: the
-//! coordinator places tasks by it, plans say it, and workers refuse by it, before anything is made.
+//! Estimates a task's largest memory from its settings and the known properties of its inputs. The
+//! arithmetic is plain. The coordinator places tasks by the estimate, plans show it, and workers
+//! refuse tasks by it before they allocate anything.
 //!
-//! The constants are measured (`tests/tests/memory.rs`, which compares these numbers with the largest memory of
-//! processes that run each kind of task): estimates lie within a factor of two above, and not more than a quarter below.
+//! The constants are measured. `tests/tests/memory.rs` compares the estimates with the largest
+//! memory of processes that run each kind of task. An estimate is at most a factor of two above,
+//! and at most a quarter below.
 
 mod job;
 mod known;

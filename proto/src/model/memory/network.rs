@@ -1,29 +1,31 @@
-//! What networks take: weights, what passes keep, and what the optimiser keeps.
+//! The memory of networks: weights, values stored by passes, and the optimiser's state.
 
 use picofarm_settings::{Architecture, Swin};
 
 use super::shape::{BIN, Shape};
 
-/// Copies of the weights in a training: their values, the optimiser's two moments, gradients, and a checkpoint of the
-/// first three on its way to the store.
+/// Copies of the weights in a training: their values, the optimiser's two moments, gradients, and a
+/// checkpoint of the first three on its way to the store.
 const LEARNT: f64 = 7.0;
-/// Bytes of a value that a pass keeps for its way back, in 32 bits, with what is computed from it at the same time.
+/// Bytes of a value that a forward pass stores for the backward pass, in 32 bits, including values
+/// that are computed from it at the same time.
 const KEPT: f64 = 5.0;
-/// The same where time is a dimension: gradients of three moments beside each other live beside more of them.
+/// The same if time is a dimension, because more gradients of three adjacent moments exist at once.
 const KEPT_OF_TIME: f64 = 7.0;
-/// Feature maps of the finest level that live at once when a network is asked.
+/// Feature maps of the finest level that exist at once during inference.
 const LIVE: f64 = 7.0;
-/// The same of the widest convolution, which is computed in a transformed form of four times the values on either side.
+/// The same for the widest convolution, which is computed in a transformed form of four times the
+/// values on either side.
 const WIDEST: f64 = 8.0;
 
 /// The shape of a network, as far as memory depends on it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Network {
-    /// The scenes that it learns from.
+    /// The scenes from which it learns.
     pub scene: Shape,
     /// Channels of the input, one-hot ones included.
     pub inputs: f64,
-    /// Of them, those that take memory: one-hot channels are kept as numbers.
+    /// Input channels that take memory. One-hot channels are stored as numbers.
     pub dense: f64,
     /// Channels of the first level.
     pub width: f64,
@@ -31,22 +33,23 @@ pub struct Network {
     pub levels: u32,
     /// Moments of the time axis of a 2.5D network; 1 for a 2D one.
     pub time: f64,
-    /// Channels of a projection before the first level; 0 = none.
+    /// Channels of a projection before the first level; 0 means none.
     pub stem: f64,
     /// Weights of that projection for each pair of channels.
     pub stem_taps: f64,
-    /// Its kind.
+    /// Architecture.
     pub architecture: Architecture,
     /// Groups and blocks of a SwinIR.
     pub swin: Swin,
 }
 
-/// Feature maps that a transformer block keeps for its way back: norms, queries, keys, values, sums and the perceptron.
-/// Scores of attention are not among them: the gradient computes them again.
+/// Feature maps that a transformer block stores for the backward pass: norms, queries, keys,
+/// values, sums and the perceptron. Scores of attention are not included, because the gradient
+/// recomputes them.
 const BLOCK: f64 = 15.0;
 
 impl Network {
-    /// Inputs, middle and outputs of each level's encoder, from the finest.
+    /// Returns inputs, middle and outputs of each level's encoder, from the finest.
     fn encoders(&self) -> impl Iterator<Item = [f64; 3]> {
         let first = match (self.time > 1.0, self.stem > 0.0) {
             (true, _) => (self.inputs / self.dense.max(1.0)).ceil(),
@@ -61,7 +64,7 @@ impl Network {
         })
     }
 
-    /// Bytes of its weights: 3×3 convolutions (3×3×3 in the encoder of a 2.5D network).
+    /// Returns the bytes of the weights: 3×3 convolutions (3×3×3 in the encoder of a 2.5D network).
     pub fn weights(&self) -> f64 {
         match self.architecture {
             Architecture::Unet2d | Architecture::Unet25d => {}
@@ -72,7 +75,8 @@ impl Network {
                 return BIN * (volume + 9.0 * (5.0 + 2.0 + 16.0) * flat * flat);
             }
             Architecture::Nlost => {
-                // 3×3×3 around the middle, 5×5×5 three times, transposed ones, and layers of attention.
+                // 3×3×3 around the middle, 5×5×5 three times, transposed ones, and layers of
+                // attention.
                 let c = self.width;
                 let volume = 27.0 * (6.0 + 2.0 + 3.0) * c * c + 3.0 * 125.0 * c * c;
                 let transposed = (108.0 + 2.0 * 54.0 * (0.5 + 0.125 + 0.25)) * c * c;
@@ -95,8 +99,8 @@ impl Network {
         BIN * (encoders + decoders + stem)
     }
 
-    /// Values that a pass over one image keeps for its way back: of each convolution what goes in, what comes out, and
-    /// what the norm makes of it.
+    /// Returns the number of values that a pass over one image stores for the backward pass: for
+    /// each convolution its input, its output and the normalized output.
     fn kept(&self, source: &Shape) -> f64 {
         if self.architecture == Architecture::Swinir {
             let blocks = f64::from(self.swin.groups * self.swin.depth);
@@ -106,8 +110,8 @@ impl Network {
         }
         if self.architecture == Architecture::Embeddings {
             let [width, streams, flat] = self.embedded();
-            // An eighth of the voxels: what the first convolutions see, and four others with what lies around them (fitted to
-            // processes that trained).
+            // An eighth of the voxels: the inputs of the first convolutions, and four others with
+            // their neighbourhoods (fitted to processes that trained).
             let voxels = source.pixels() * self.dense / 8.0;
             let volume = voxels * (2.0 * 27.0 * streams + 4.0 * 4.5 * width + 4.0 * flat);
             return volume + source.pixels() * (self.dense + 30.0 * flat);
@@ -117,7 +121,7 @@ impl Network {
         }
         let mut sum = source.pixels() * (self.dense + 2.0 * self.stem);
         for (level, [inputs, between, outputs]) in self.encoders().enumerate() {
-            // A quarter of the pixels a level, and half of the moments.
+            // A quarter of the pixels for each level, and half of the moments.
             let scale = f64::from(1u32 << (2 * level));
             let time = (self.time / f64::from(1u32 << level)).max(1.0);
             let beside = if self.time > 1.0 {
@@ -136,20 +140,23 @@ impl Network {
         sum
     }
 
-    /// Values that a pass of NLOST over one image keeps, in a volume of a quarter of the pixels: processes that trained at eight sizes
-    /// took 0.76 to 0.94 of what follows from it.
+    /// Returns the number of values that a pass of NLOST over one image stores, in a volume of a
+    /// quarter of the pixels. Processes that trained at eight sizes took 0.76 to 0.94 of the
+    /// resulting memory.
     fn kept_of_nlost(&self, source: &Shape) -> f64 {
         let [c, streams, _] = self.embedded();
         let features = streams + 3.0;
         let pixels = source.pixels() / 4.0;
         let half = pixels * self.dense / 2.0;
-        // What convolutions see, three or five moments beside each other, is kept with what they give.
+        // The inputs of convolutions, three or five adjacent moments, are stored with their
+        // outputs.
         let first = half * (2.0 * 27.0 * streams + 4.0 * 4.5 * 3.0 + 8.0 * features);
         let scales = half / 2.0 * (12.0 * features + 12.0 * c);
         let halved = half / 4.0 * (15.0 * c + 4.0 * 4.5 * c);
         let embedded = half / 8.0 * 24.0 * c;
         let joined = half / 2.0 * (16.0 * c + 4.0 * features);
-        // Sixteenths of the moments: attention near and far, decoders, their way back to more moments.
+        // Sixteenths of the moments: local and global attention, decoders, and their upsampling to
+        // more moments.
         let tokens = half / 16.0;
         let attention = tokens * (60.0 * c + 3.0 * pixels / 4.0);
         first
@@ -161,13 +168,13 @@ impl Network {
             + source.pixels() * (self.dense + 60.0 * features)
     }
 
-    /// Channels of the volume, streams, and channels of the images that it becomes.
+    /// Returns the channels of the volume, the streams, and the channels of the resulting images.
     fn embedded(&self) -> [f64; 3] {
         let streams = (self.inputs / self.dense.max(1.0)).ceil();
         [self.width, streams, 2.0 * (self.width + streams)]
     }
 
-    /// Numbers of a SwinIR's weights.
+    /// Returns the number of weights of a SwinIR.
     fn swin_weights(&self) -> f64 {
         let (e, swin) = (self.width, &self.swin);
         let places = f64::from(2 * swin.window - 1).powi(2);
@@ -176,7 +183,7 @@ impl Network {
         9.0 * e * convolutions + f64::from(swin.groups * swin.depth) * block
     }
 
-    /// Bytes that a training takes, `images` at a time.
+    /// Returns the bytes of a training with `images` images at a time.
     pub(in crate::model) fn learn(&self, source: &Shape, images: u32) -> f64 {
         let images = f64::from(images);
         // Two batches wait for the network.
@@ -185,7 +192,7 @@ impl Network {
         LEARNT * self.weights() + kept * images * self.kept(source) + batches
     }
 
-    /// Bytes that asking it about one image takes, its weights included.
+    /// Returns the bytes of an inference on one image, weights included.
     pub(in crate::model) fn ask(&self, source: &Shape) -> f64 {
         match self.architecture {
             Architecture::Unet2d | Architecture::Unet25d => {}

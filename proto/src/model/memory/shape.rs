@@ -1,14 +1,15 @@
-//! The size of scenes, and what every task takes.
+//! The size of scenes, and the base memory of every task.
 
-/// The program with its threads, what it has read of furniture, and a scene of some ten thousand triangles.
+/// The program with its threads, its furniture data, and a scene of some ten thousand triangles.
 pub(super) const PROGRAM: f64 = 70e6;
-/// What a store's requests and the coding of small arrays take beside the histograms, and what the allocator keeps for the next.
+/// Memory of a store's requests and of coding small arrays, in addition to histograms, including
+/// memory that the allocator keeps for reuse.
 pub(super) const STORE: f64 = 60e6;
-/// Both: what every task takes.
+/// Base memory of every task.
 pub(in crate::model) const BASE: f64 = PROGRAM + STORE;
 /// Bytes of a histogram's bin in memory.
 pub(super) const BIN: f64 = 4.0;
-/// Bytes of a pixel for the ground truth, what its centre sees, and error sums.
+/// Bytes of a pixel for the ground truth, the view of its centre, and error sums.
 const TRUTH: f64 = 260.0;
 
 /// The size of scenes that a task reads or makes.
@@ -29,23 +30,23 @@ impl Shape {
         f64::from(self.height) * f64::from(self.width)
     }
 
-    /// Bytes of one histogram of every pixel.
+    /// Returns the bytes of one histogram of every pixel.
     pub(in crate::model) fn histogram(&self) -> f64 {
         BIN * self.pixels() * f64::from(self.bins)
     }
 
-    /// Bytes of what is kept of each pixel beside histograms.
+    /// Returns the bytes stored for all pixels in addition to histograms.
     pub(in crate::model) fn truth(&self) -> f64 {
         self.pixels() * (TRUTH + f64::from(self.spots))
     }
 
-    /// Bytes of two scenes as networks meet them: the histogram as it is read, and as it is kept.
+    /// Returns the bytes of two scenes as networks use them: the histogram as read, and as stored.
     pub(in crate::model) fn two(&self) -> f64 {
         self.truth() + 2.0 * self.histogram()
     }
 }
 
-/// Bytes in words: "41.3 GiB".
+/// Formats bytes: "41.3 GiB".
 pub fn gib(bytes: u64) -> String {
     let gib = bytes as f64 / (1u64 << 30) as f64;
     match gib {

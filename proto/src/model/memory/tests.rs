@@ -1,4 +1,4 @@
-//! That estimates follow the settings, and are known where they can be.
+//! Estimates depend on the settings, and exist if they can be computed.
 
 use super::{Shape, peak_bytes};
 use crate::model::JobSpec;
@@ -51,7 +51,7 @@ fn rooms_with_furniture_of_many_triangles_take_more() {
     };
     let primitive = of(&job(&rendering(64, "")), 0).unwrap();
     assert_eq!(with("parametric-1"), primitive);
-    // Of 355,000 triangles a render took 313 to 350 MB, with 70 MB of the program.
+    // With 355,000 triangles a render took 313 to 350 MB, with 70 MB of the program.
     let more = with("sweethome3d-abc") - primitive;
     assert!((200_000_000..400_000_000).contains(&more), "{more}");
 }
@@ -94,7 +94,8 @@ fn the_released_network_takes_what_is_known_of_it() {
     assert!(net.ask(&source) < 0.1 * learns);
 }
 
-/// 262,530 values a block, 36 blocks; 11,504,163 with three channels in and out (11.5 M as published).
+/// 262,530 values for each block, 36 blocks; 11,504,163 with three channels in and out (11.5 M as
+/// published).
 #[test]
 fn a_swinir_takes_what_is_known_of_it() {
     let settings = r#"{"target": "tof", "model": "m", "net":
@@ -110,7 +111,7 @@ fn a_swinir_takes_what_is_known_of_it() {
     let net = settings.network(&source);
     let share = net.weights() / (4.0 * 11_504_163.0);
     assert!((0.99..1.01).contains(&share), "{share}");
-    // Features of 36 blocks, of 65,536 pixels.
+    // Features of 36 blocks, for 65,536 pixels.
     let learns = net.learn(&source, 1);
     assert!(learns > 36.0 * 65_536.0 * 180.0 * 4.0 * 10.0, "{learns}");
     assert!(net.ask(&source) < 0.1 * learns);

@@ -1,4 +1,4 @@
-//! How scenes are rendered: the settings, how a job file says them, and the checks.
+//! Render settings, their form in a job file, and the checks.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use crate::model::{
     spec_error::{SpecError, within},
 };
 
-/// How scenes are rendered.
+/// Settings of a render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "RenderSettingsText")]
 pub struct RenderSettings {
@@ -25,23 +25,24 @@ pub struct RenderSettings {
     /// Multi-bounce work: `samples = N` (paths per pixel) or `error = 0.1` (target).
     #[serde(flatten)]
     pub budget: Budget,
-    /// Longest path in bounces; 0 = until the gate ends.
+    /// Longest path in bounces; 0 means until the gate ends.
     pub max_bounces: u32,
-    /// Version of the renderer, part of every task key; filled in at submission where left out.
+    /// Version of the renderer, part of every task key; filled in at submission if omitted.
     pub renderer: String,
-    /// Subsets of the 10×10 grid of spots that get histograms of their own, from the same rays: 4 and 25, ascending.
+    /// Subsets of the 10×10 grid of spots with a histogram of their own, from the same rays: 4 and
+    /// 25, ascending.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub subsets: Vec<u32>,
-    /// Each spot gets a histogram of its own, from the same rays.
+    /// Whether each spot gets a histogram of its own, from the same rays.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub per_spot: bool,
-    /// The renderer's ways of finding light that are chosen by hand; the others are left to the renderer.
+    /// Techniques of the renderer chosen by hand. The renderer chooses the others.
     #[serde(skip_serializing_if = "Strategy::is_default")]
     pub strategy: Strategy,
-    /// The width of the laser's beams; without it they have none.
+    /// The width of the laser's beams; without it they have no width.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub beam: Option<BeamWidth>,
-    /// Share of each pixel's area that is sensitive: a square in its middle.
+    /// Sensitive fraction of each pixel's area: a square in its middle.
     #[serde(skip_serializing_if = "is_whole")]
     pub fill_factor: f64,
     /// Wavelength of the laser, nanometres. Without one, materials reflect as at the laser's own.
@@ -55,7 +56,8 @@ fn is_whole(share: &f64) -> bool {
 }
 
 impl Default for RenderSettings {
-    /// The measurement contract's default gate: [1.0, 25.45584) m in 637 bins of 0.0384 m, 256×256 px.
+    /// Returns the measurement contract's default gate: [1.0, 25.45584) m in 637 bins of 0.0384 m,
+    /// 256×256 px.
     fn default() -> Self {
         Self {
             resolution: 256,
@@ -76,7 +78,7 @@ impl Default for RenderSettings {
 }
 
 impl RenderSettings {
-    /// The recorded interval.
+    /// Returns the recorded interval.
     pub fn gate(&self) -> Gate {
         Gate {
             start_m: self.gate_start_m,
@@ -87,7 +89,7 @@ impl RenderSettings {
 }
 
 impl RenderSettings {
-    /// The subsets of the 10×10 grid of spots there are.
+    /// The available subsets of the 10×10 grid of spots.
     pub const SUBSETS: [u32; 2] = [4, 25];
 
     /// Most pixels of an image's side.
@@ -96,7 +98,7 @@ impl RenderSettings {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("render.{field}"), what));
         within(
@@ -105,11 +107,11 @@ impl RenderSettings {
             (1, Self::MAX_SIDE),
             "pixels a side",
         )?;
-        // Light that has gone 10 km comes from no room.
+        // No room returns light after 10 km.
         let start = "metres of optical path (there and back); 1 ns of delay is 0.3 m";
         within("render.gate_start_m", self.gate_start_m, (0.0, 1e4), start)?;
-        // From a hundredth of a picosecond to 33 ns: both ends are beyond any detector. Picoseconds taken for metres are not
-        // in it.
+        // From a hundredth of a picosecond to 33 ns, beyond any detector on either side.
+        // Picoseconds mistaken for metres are outside this range.
         let width = "metres of optical path; 1 ps is 0.0002998 m, so 128 ps are 0.0384";
         within("render.bin_width_m", self.bin_width_m, (1e-6, 10.0), width)?;
         within("render.bins", self.bins, (1, 65_536), "bins")?;
@@ -152,17 +154,19 @@ impl RenderSettings {
     }
 }
 
-/// Longest path of two-bounce light in a room of at most 4.5 m a side, metres: the default gate ends there.
+/// Longest path of two-bounce light in a room of at most 4.5 m a side, metres; the default gate
+/// ends there.
 const ROOM_PATH_M: f64 = 25.456;
 /// Shortest gate that records the two-bounce light of most rooms, metres of path.
 const ROOM_GATE_M: f64 = 8.0;
-/// Widest bin that tells the depths in a room apart, metres of path.
+/// Widest bin that distinguishes the depths in a room, metres of path.
 const ROOM_BIN_M: f64 = 0.5;
 /// Errors below this take thousands of paths a pixel.
 const SMALL_ERROR: f64 = 0.005;
 
 impl RenderSettings {
-    /// Settings that can be used but are probably not meant for such scenes, each named by its field.
+    /// Returns warnings about valid settings that are probably mistakes for such scenes, each with
+    /// its field.
     pub(super) fn remarks(&self, scenes: &SceneKind) -> Vec<String> {
         let mut remarks = Vec::new();
         let gate = self.gate();
@@ -203,7 +207,7 @@ impl RenderSettings {
     }
 }
 
-/// `[render]` as it is written: every field known, every other one refused.
+/// The written form of `[render]`. Unknown fields are refused.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RenderSettingsText {
@@ -234,10 +238,10 @@ enum Share {
     Text(String),
 }
 
-/// Reads "10%" or "0.1" as 0.1.
+/// Parses "10%" or "0.1" as 0.1.
 ///
 /// # Errors
-/// A message that says what was expected.
+/// Returns a message with the expected form.
 pub fn parse_share(text: &str) -> Result<f64, String> {
     let (number, scale) = match text.trim().strip_suffix('%') {
         Some(percent) => (percent, 0.01),
@@ -249,10 +253,11 @@ pub fn parse_share(text: &str) -> Result<f64, String> {
     check_share(share).map(|()| share)
 }
 
-/// Checks the error that a render is to reach: an error of the whole is no error, and nothing reaches one of nothing.
+/// Checks the target error of a render. An error of 1 is no target, and an error of 0 is
+/// unreachable.
 ///
 /// # Errors
-/// A message that says what was expected.
+/// Returns a message with the expected range.
 fn check_share(share: f64) -> Result<(), String> {
     if (1e-6..1.0).contains(&share) {
         return Ok(());
@@ -292,7 +297,7 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
                 .choose(&name, choice)
                 .map_err(|what| SpecError::new("render.strategy", what))?;
         }
-        // The order in which somebody names them shall not make other results of them.
+        // The order in which subsets are written must not affect the results.
         let mut subsets = text.subsets;
         subsets.sort_unstable();
         Ok(RenderSettings {

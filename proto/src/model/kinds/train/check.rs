@@ -1,4 +1,4 @@
-//! What a training's settings may be.
+//! Checks of a training's settings.
 
 use picofarm_settings::{
     Architecture, Schedule, SensorError, ShadowVariant, StemForm, Swin, Target, TimeProjection,
@@ -23,7 +23,7 @@ impl TrainSettings {
     /// Checks every field against its limits.
     ///
     /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
+    /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("train.{field}"), what));
         check_model("train.model", &self.model)?;
@@ -350,14 +350,14 @@ impl OptimiseSettings {
     }
 }
 
-/// Checks the spots that are summed of a histogram.
+/// Checks the spots that are summed from a histogram.
 pub(in crate::model::kinds) fn check_spots(
     field: &str,
     histogram: Histogram,
     spots: &[u32],
 ) -> Result<(), SpecError> {
     let fail = |what: String| Err(SpecError::new(field, what));
-    // Indices of the spots of a data set: how many it has is known when it is read.
+    // The number of spots of the data set is known only when it is read.
     if let Some(spot) = spots.iter().find(|spot| **spot >= 1024) {
         return fail(format!("{spot} lies outside 0..=1023 (spots count from 0)"));
     }

@@ -1,4 +1,4 @@
-//! What is learnt, and how: the settings of trainings, and the network that follows from them.
+//! Settings of trainings, and the resulting network.
 
 use picofarm_settings::{
     Architecture, Precision, Schedule, Sensor, ShadowVariant, StemForm, Swin, Target,
@@ -12,92 +12,101 @@ use crate::model::{
     trial::Trial,
 };
 
-/// What is learnt, and how.
+/// Settings of a training.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainSettings {
-    /// What the network predicts.
+    /// The prediction of the network.
     pub target: Target,
-    /// The name under which the model is kept in the store: letters, digits, `-`, `_` and `.`.
+    /// The name under which the model is stored: letters, digits, `-`, `_` and `.`.
     pub model: String,
-    /// The split of the data set whose training scenes are learnt from, and whose validation scenes tell when to stop.
+    /// The split of the data set. Its training scenes are learnt, and its validation scenes decide
+    /// when to stop.
     #[serde(default = "default_split")]
     pub split: String,
-    /// Only so many training scenes, the first by the split's order: the fewer are always among the more. 0 = all.
+    /// Number of training scenes, the first by the split's order, so that a smaller set is
+    /// contained in a larger one. 0 means all.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub scenes: u64,
-    /// Which of the data set's histograms.
+    /// Histogram of the data set.
     #[serde(default)]
     pub histogram: Histogram,
-    /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
+    /// Only these spots, summed. Requires `histogram = "transient_spots"`, which in turn requires
+    /// it; ascending.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
-    /// A sensor through which histograms go when they are read, with noise that is drawn anew at each visit; for validation and
-    /// evaluation once for each scene. Without it they are seen as stored.
+    /// A sensor applied to histograms as they are read. Its noise is drawn again at each visit, and
+    /// once for each scene in validation and evaluation. Without it, histograms are used as stored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<Box<Sensor>>,
-    /// What the network sees of a histogram.
+    /// The form of a histogram as network input.
     #[serde(default)]
     pub input: InputSettings,
-    /// By how many metres depths are divided, which a network predicts within 0 to 1: about the greatest of the data set; for
-    /// `target = "tof"` only.
+    /// Divisor of depths, which a network predicts in 0 to 1, metres: about the greatest depth of
+    /// the data set. Only for `target = "tof"`.
     #[serde(default = "of_rooms", skip_serializing_if = "is_of_rooms")]
     pub depth_scale_m: f64,
     /// The network.
     #[serde(default)]
     pub net: NetSettings,
-    /// How shadows are predicted; for `target = "shadow"` only.
+    /// Settings of shadow prediction; only for `target = "shadow"`.
     #[serde(default, skip_serializing_if = "is_default")]
     pub shadow: ShadowSettings,
-    /// What mirrors are predicted from; for `target = "specular"` only.
+    /// Settings of mirror prediction; only for `target = "specular"`.
     #[serde(default, skip_serializing_if = "is_default")]
     pub specular: SpecularSettings,
     /// Steps, rates and precision.
     #[serde(default)]
     pub optimise: OptimiseSettings,
-    /// Scenes are flipped at random, in both directions, together with their spots; not where a shadow network knows spots by
-    /// their number (`index`, `all`), since a flipped spot is at another one's place.
+    /// Whether scenes are flipped at random, in both directions, together with their spots. Not
+    /// allowed for shadow networks that know spots by their number (`index`, `all`), because a
+    /// flipped spot is at another spot's place.
     #[serde(default = "yes")]
     pub augment: bool,
     /// Seed of weights, order of scenes, spots and flips.
     #[serde(default)]
     pub seed: u64,
-    /// A trained model of the same network, or the stage that trains it, to start from; empty = random weights.
+    /// A trained model of the same network to start from, or the stage that trains it; empty means
+    /// random weights.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub from: String,
-    /// Processes that train it together, each a task of the stage that any worker takes; they share the `accumulate` parts of each
-    /// batch. They come and go as workers do, and the result is the same to the bit however many there are. Default 1.
+    /// Processes that train the network together, each a task for any worker. They share the
+    /// `accumulate` parts of each batch. They come and go with their workers, and the result is
+    /// bit-identical for any number of them. Default 1.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub processes: u32,
-    /// Minutes between checkpoints: as much is lost at most when a worker dies, and what one takes to be written. 0 = after each
-    /// step, and the next waits for it: no more than one step is lost. Changes no result.
+    /// Minutes between checkpoints. A worker's death loses at most this much, plus the time to
+    /// write one. 0 means after each step, and the next step waits for it, so that at most one step
+    /// is lost. Does not affect the result.
     #[serde(default = "ten")]
     pub checkpoint_minutes: f64,
-    /// What makes it a trial of a sweep; written by `[stage.sweep]`, not by hand.
+    /// Data that makes the training a trial of a sweep; written by `[stage.sweep]`, not by hand.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trial: Option<Trial>,
-    /// Version of networks and training, part of every task key; filled in at submission where left out.
+    /// Version of networks and training, part of every task key; filled in at submission if
+    /// omitted.
     #[serde(default)]
     pub version: String,
 }
 
-/// What a network sees of a histogram.
+/// The form of a histogram as network input.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InputSettings {
-    /// How photons become numbers around 1.
+    /// Normalisation of photons to numbers around 1.
     pub normalise: Normalise,
-    /// For `normalise = "log"`: the largest bin of the data set, in its unit; 0 = that of the training scenes, which are
-    /// read once for it.
+    /// For `normalise = "log"`: the largest bin of the data set, in its unit; 0 means that of the
+    /// training scenes, which are read once to find it.
     #[serde(skip_serializing_if = "is_zero_f64")]
     pub max: f64,
-    /// Bins of the input: adjacent bins are summed to so many, those left over at the end dropped. 0 = all.
+    /// Bins of the input: adjacent bins are summed to this number, and bins left over at the end
+    /// are dropped. 0 means all.
     pub bins: u32,
-    /// The sum over bins alone: a picture instead of a histogram.
+    /// Whether the input is the sum over bins, an image instead of a histogram.
     pub intensity_only: bool,
 }
 
-/// How photons become numbers around 1 (appendix B of the paper).
+/// Normalisation of photons to numbers around 1 (appendix B of the paper).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Normalise {
@@ -112,19 +121,22 @@ pub enum Normalise {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct NetSettings {
-    /// Its kind.
+    /// Architecture.
     pub architecture: Architecture,
-    /// Channels of the first level of a U-Net; each further one has twice as many. Of `swinir` the channels of all its
-    /// features, of `embeddings` those of the volume's, of `nlost` those of its attention.
+    /// Channels of the first level of a U-Net; each further level has twice as many. For `swinir`
+    /// the channels of all features, for `embeddings` those of the volume's features, for `nlost`
+    /// those of its attention.
     pub width: u32,
-    /// Levels of a U-Net's encoder; between two of them the image is halved.
+    /// Levels of a U-Net's encoder. The image is halved between two levels.
     pub levels: u32,
-    /// Channels of a projection before the first level, as in the paper's appendix (128); 0 = none, as in the released code.
+    /// Channels of a projection before the first level, as in the paper's appendix (128); 0 means
+    /// none, as in the released code.
     pub stem: u32,
-    /// What that projection is.
+    /// The form of that projection.
     #[serde(skip_serializing_if = "is_default")]
     pub stem_form: StemForm,
-    /// For `unet25d`: bins of time after the learnt projection of each stream; its levels halve them. 0 otherwise.
+    /// For `unet25d`: bins of time after the learnt projection of each stream; its levels halve
+    /// them. Otherwise 0.
     #[serde(skip_serializing_if = "is_zero_u32")]
     pub time_features: u32,
     /// For `unet25d`: whether both streams share that projection, as in the released code.
@@ -135,23 +147,23 @@ pub struct NetSettings {
     pub swin: Swin,
 }
 
-/// How shadows are predicted (appendix A.1 of the paper).
+/// Settings of shadow prediction (appendix A.1 of the paper).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ShadowSettings {
-    /// What the network is given of a spot.
+    /// The network's input for a spot.
     pub variant: ShadowVariant,
-    /// What two-bounce times follow from: the depths of the `truth`, or those of an infer stage, or of the folder in the source's
-    /// store that one wrote.
+    /// Source of two-bounce times: the depths of the `truth`, an infer stage, or the folder in the
+    /// source's store that an infer stage wrote.
     pub times: String,
 }
 
-/// What mirrors are predicted from.
+/// Settings of mirror prediction.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpecularSettings {
-    /// A trained ToF model, or the stage that trains it, whose frozen features a decoder learns from; empty = a network
-    /// of its own, from scratch.
+    /// A trained ToF model, or the stage that trains it, with frozen features from which a decoder
+    /// learns; empty means a separate network, from scratch.
     pub on: String,
 }
 
@@ -159,33 +171,37 @@ pub struct SpecularSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OptimiseSettings {
-    /// Times that each training scene is seen.
+    /// Number of times that each training scene is seen.
     pub epochs: u32,
     /// Scenes a step.
     pub batch: u32,
-    /// Parts in which a batch is computed, to save memory; their gradients are added up. Must divide the batch.
+    /// Parts in which a batch is computed to save memory. Their gradients are summed. Must divide
+    /// the batch.
     pub accumulate: u32,
     /// Largest learning rate (AdamW).
     pub learning_rate: f64,
     /// Weight decay (AdamW).
     pub weight_decay: f64,
-    /// How the rate changes with the steps.
+    /// Schedule of the learning rate.
     pub schedule: Schedule,
-    /// Numbers in which the network is computed.
+    /// Number format in which the network is computed.
     pub precision: Precision,
     /// For `schedule = "restarts"`: the cycles.
     #[serde(skip_serializing_if = "is_default")]
     pub restarts: RestartSettings,
-    /// Gradients whose norm, of all parameters together, is greater are shortened to it (PyTorch's `clip_grad_norm_`); 0 = never.
+    /// Largest norm of the gradients of all parameters together; longer gradients are shortened to
+    /// it (PyTorch's `clip_grad_norm_`). 0 means no limit.
     #[serde(skip_serializing_if = "is_zero_f64")]
     pub clip_norm: f64,
-    /// Decay of an exponential moving average of all weights and statistics, e.g. 0.999, which is validated and kept in their place;
-    /// at step t no more than (1 + t)/(10 + t). 0 = none.
+    /// Decay of an exponential moving average of all weights and statistics, e.g. 0.999. The
+    /// average is validated and stored instead of the weights. At step t the decay is at most (1 +
+    /// t)/(10 + t). 0 means none.
     #[serde(skip_serializing_if = "is_zero_f64")]
     pub ema: f64,
-    /// Stop after so many validations without improvement; 0 = never.
+    /// Stops after this many validations without improvement; 0 means never.
     pub early_stop: u32,
-    /// Steps after which it is validated within an epoch too, counted from the beginning; 0 = at the end of each epoch only.
+    /// Steps between additional validations within an epoch, counted from the beginning; 0 means
+    /// only at the end of each epoch.
     #[serde(skip_serializing_if = "is_zero_u32")]
     pub validate_every: u32,
 }
@@ -196,7 +212,7 @@ pub struct OptimiseSettings {
 pub struct RestartSettings {
     /// Epochs of the first cycle.
     pub first: u32,
-    /// Each further cycle is so many times as long.
+    /// Ratio of the lengths of consecutive cycles.
     pub factor: u32,
 }
 
@@ -252,10 +268,10 @@ impl Default for OptimiseSettings {
     }
 }
 
-/// [`ShadowSettings::times`] where two-bounce times are the ground truth's.
+/// [`ShadowSettings::times`] for two-bounce times from the ground truth.
 pub const TRUTH: &str = "truth";
 
-/// [`TrainSettings::depth_scale_m`] of furnished rooms.
+/// [`TrainSettings::depth_scale_m`] for furnished rooms.
 const OF_ROOMS_M: f64 = 4.5;
 
 fn of_rooms() -> f64 {
@@ -308,7 +324,7 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 }
 
 impl TrainSettings {
-    /// The shape of the network that learns from such scenes.
+    /// Returns the shape of the network for such scenes.
     pub(in crate::model) fn network(&self, source: &Shape) -> Network {
         let bins = match self.input.bins {
             0 => source.bins,
@@ -328,7 +344,7 @@ impl TrainSettings {
         Network {
             scene: *source,
             inputs: dense + one_hot,
-            // A linear stem is given one-hot channels as dense ones.
+            // A linear stem receives one-hot channels as dense ones.
             dense: if linear { dense + one_hot } else { dense },
             width: f64::from(net.width),
             levels: net.levels,
@@ -346,8 +362,8 @@ impl TrainSettings {
         }
     }
 
-    /// What of them decides the bytes of the model: all but its name, by how many processes it is trained, how often it is
-    /// saved on the way, and whether it is one of a sweep.
+    /// Returns the settings that affect the bytes of the model: all except its name, the number of
+    /// processes, the interval of checkpoints, and its sweep.
     pub fn shaping(&self) -> serde_json::Value {
         let mut settings = serde_json::to_value(self).expect("settings are plain data");
         let table = settings.as_object_mut().expect("settings are a table");
@@ -358,12 +374,12 @@ impl TrainSettings {
         settings
     }
 
-    /// The folder of predictions that two-bounce times follow from, if any.
+    /// Returns the folder of predictions that two-bounce times come from, if any.
     pub fn times(&self) -> Option<&String> {
         Some(&self.shadow.times).filter(|times| *times != TRUTH)
     }
 
-    /// The models that it builds on: field and name.
+    /// Returns the models on which this training builds: field and name.
     pub fn models(&self) -> Vec<(&'static str, &String)> {
         let mut models = Vec::new();
         if !self.specular.on.is_empty() {
@@ -375,7 +391,7 @@ impl TrainSettings {
         models
     }
 
-    /// The same, to be filled in.
+    /// Like `models`, to be filled in.
     pub(crate) fn models_mut(&mut self) -> Vec<(&'static str, &mut String)> {
         let mut models = Vec::new();
         if !self.specular.on.is_empty() {
