@@ -13,7 +13,7 @@ pub enum Quantity {
     Range,
     /// Unit normals in the camera frame, i16 `[row][column][3]`, to be divided by 32767.
     Normal,
-    /// Instance id, u32 `[row][column]`, 0 = nothing.
+    /// Semantic label, u16 `[row][column]`, 0 = nothing.
     Instance,
     /// Semantic label, u16 `[row][column]`, 0 = nothing.
     Label,
@@ -21,8 +21,9 @@ pub enum Quantity {
     Specular,
     /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 = lit.
     Visibility,
-    /// Measured optical path of the two-bounce light of each spot in metres, f32 `[spot][row][column]`, 0 = not measured. Only
-    /// data sets whose source gave it have it.
+    /// Measured optical path of the two-bounce light of each spot in metres, f32
+    /// `[spot][row][column]`, 0 = not measured. It exists only in data sets from sources that
+    /// provide it.
     TwoBouncePath,
     /// sRGB-encoded colour, u8 `[row][column][3]`.
     Rgb,
@@ -34,15 +35,16 @@ pub enum Quantity {
     Camera,
     /// Laser origin in the camera frame in metres, f32 `[3]`.
     Laser,
-    /// Photons per unit of h, f32; NaN where the scene is missing.
+    /// Photons per unit of h, f32; NaN if the scene is missing.
     Scale,
-    /// h of the 4 of the 100 spots of [`Self::spots_of_100`] alone, coded as the transient, with the same scale.
+    /// h of the 4 of the 100 spots given by [`Self::spots_of_100`], encoded like the transient,
+    /// with the same scale.
     Transient4,
-    /// h of the 25 of the 100 spots of [`Self::spots_of_100`] alone, likewise.
+    /// h of the 25 of the 100 spots given by [`Self::spots_of_100`], encoded likewise.
     Transient25,
-    /// h of each spot alone: `[spot][row][column][bin]`, likewise.
+    /// h of each single spot: `[spot][row][column][bin]`, encoded likewise.
     TransientSpots,
-    /// h at the wavelengths after the main one: `[wavelength][row][column][bin]`, likewise.
+    /// h at the wavelengths after the main one: `[wavelength][row][column][bin]`, encoded likewise.
     TransientWavelengths,
 }
 
@@ -89,7 +91,8 @@ impl Element {
 }
 
 impl Quantity {
-    /// All quantities there are, in the order of their objects in a manifest; see [`crate::DatasetSpec::quantities`].
+    /// All quantities, in the order of their objects in a manifest; see
+    /// [`crate::DatasetSpec::quantities`].
     pub const ALL: [Self; 20] = [
         Self::Transient,
         Self::Intensity,
@@ -113,7 +116,7 @@ impl Quantity {
         Self::TransientWavelengths,
     ];
 
-    /// Whether it is a transient, coded with the data set's profile.
+    /// Returns whether it is a transient, encoded with the data set's profile.
     pub fn is_transient(self) -> bool {
         matches!(
             self,
@@ -125,7 +128,8 @@ impl Quantity {
         )
     }
 
-    /// Which of the 100 spots of a 10×10 grid (row by row) make up this transient; empty for other quantities.
+    /// Returns which of the 100 spots of a 10×10 grid (row by row) this transient includes; empty
+    /// for other quantities.
     pub fn spots_of_100(self) -> &'static [u32] {
         match self {
             Self::Transient4 => &SPOTS_4,
@@ -134,7 +138,7 @@ impl Quantity {
         }
     }
 
-    /// Name of the Zarr array.
+    /// Returns the name of the Zarr array.
     pub fn name(self) -> &'static str {
         match self {
             Self::Transient => "transient",
