@@ -47,7 +47,8 @@ impl Verdict {
         };
         let trivial = metrics["baselines"].as_object().into_iter().flatten();
         let trivial = trivial.filter_map(|(answer, m)| Some((answer, m[name].as_f64()?)));
-        // The order is worst first, so that the first by name wins among equals.
+        // `min_by` with a reversed comparison returns the first by name among equals, unlike
+        // `max_by`.
         let best = trivial.min_by(|a, b| match less_is_better {
             true => a.1.total_cmp(&b.1),
             false => b.1.total_cmp(&a.1),
