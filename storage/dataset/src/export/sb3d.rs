@@ -207,7 +207,7 @@ fn check_known(scene: u64, missing: &[String]) -> Result<(), DatasetError> {
     Err(DatasetError::invalid("scenes", what))
 }
 
-/// Returns the power of two that scales the brightest value to (BRIGHTEST/2, BRIGHTEST].
+/// Returns the power of two that scales the brightest value to [BRIGHTEST/2, BRIGHTEST).
 fn factor_of(h: &[f32]) -> f32 {
     let brightest = h.iter().fold(0.0f32, |m, x| m.max(*x));
     if brightest == 0.0 {
