@@ -19,7 +19,8 @@ pub enum Quantity {
     Label,
     /// 1 = mirror, u8 `[row][column]`.
     Specular,
-    /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 = lit.
+    /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 =
+    /// lit.
     Visibility,
     /// Measured optical path of the two-bounce light of each spot in metres, f32
     /// `[spot][row][column]`, 0 = not measured. It exists only in data sets from sources that
@@ -27,7 +28,8 @@ pub enum Quantity {
     TwoBouncePath,
     /// sRGB-encoded colour, u8 `[row][column][3]`.
     Rgb,
-    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN = no spot.
+    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN
+    /// = no spot.
     Spots,
     /// fx, fy, cx, cy in pixels, f32.
     Intrinsics,

@@ -83,7 +83,8 @@ pub struct DatasetSpec {
     pub profile: Profile,
 }
 
-/// A set of subsets of the 10×10 grid of spots, named by their sizes; see [`crate::Quantity::spots_of_100`].
+/// A set of subsets of the 10×10 grid of spots, named by their sizes; see
+/// [`crate::Quantity::spots_of_100`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
 pub struct Subsets {

@@ -22,7 +22,8 @@ pub struct Summary {
     pub bytes: u64,
     /// Largest coding error of any bin of any scene, in σ.
     pub max_sigma: f64,
-    /// Smallest and largest root-mean-square coding error of a scene, in σ; `None` while nothing is published.
+    /// Smallest and largest root-mean-square coding error of a scene, in σ; `None` if nothing is
+    /// published.
     pub rms_sigma: Option<(f64, f64)>,
     /// Number of saturated bins in overflow lists.
     pub overflow: u64,
