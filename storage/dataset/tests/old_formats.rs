@@ -1,4 +1,5 @@
-//! Data sets of format 1, as an earlier version wrote them, stay readable, verifiable and can grow.
+//! Tests that data sets of format 1, written by an earlier version, can still be read, verified and
+//! extended.
 
 mod common;
 
@@ -73,7 +74,7 @@ async fn data_sets_of_format_1_are_read_verified_and_grow() {
         let found = dataset.verify(VerifyMode::Full).await.unwrap();
         assert!(found.problems.is_empty(), "{name}: {:?}", found.problems);
 
-        // A scene is added in the old format, and the data set stays one that old programs read.
+        // A scene is added in the old format, and old programs can still read the data set.
         let more = DatasetSpec { scenes: 6, ..spec };
         let grown = Dataset::create_or_open(store, prefix, &more).await.unwrap();
         let alone: Vec<Vec<f32>> = (0..9).map(|i| Scene::new(&spec, i).transient).collect();

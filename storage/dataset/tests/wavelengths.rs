@@ -1,4 +1,5 @@
-//! Histograms at further wavelengths lie beside the main one: same codec, same scale, in the manifest, and as safe.
+//! Tests of histograms at additional wavelengths: they use the same codec and scale as the main
+//! one, are listed in the manifest, and are as safe.
 
 mod common;
 
@@ -20,7 +21,7 @@ fn coloured(profile: Profile) -> DatasetSpec {
     }
 }
 
-/// Histograms at the wavelengths after the main one.
+/// Returns histograms at the wavelengths after the main one.
 fn planes(spec: &DatasetSpec) -> Vec<Vec<f32>> {
     let mut random = Lcg(5);
     let plane = |_| {
@@ -87,7 +88,7 @@ async fn other_wavelengths_come_back_as_they_were_and_their_array_names_them() {
             serde_json::json!(["scene", "wavelength", "row", "column", "bin"])
         );
 
-        // Opened again, it is the same data set; damage is found.
+        // Opened again, it is the same data set, and damage is detected.
         let again = Dataset::open(store.clone(), dataset.prefix().clone())
             .await
             .unwrap();

@@ -6,7 +6,7 @@ use font8x8::UnicodeFonts;
 
 use crate::rgb_png;
 
-/// Maximum number of pixels of a picture that is read.
+/// Maximum number of pixels of a decoded picture.
 const MOST_PIXELS: usize = 1 << 24;
 
 /// 8-bit RGB, row-major.

@@ -1,6 +1,6 @@
 //! Formats numbers for people.
 
-/// Formats with about `count` significant digits, without an exponent between 0.001 and 999,999.
+/// Formats with about `count` significant digits, without an exponent between 0.0001 and 999,999.
 pub fn digits(value: f64, count: i32) -> String {
     if !value.is_finite() {
         return "–".to_owned();
@@ -87,7 +87,7 @@ pub fn thousands(value: u64) -> String {
     out
 }
 
-/// Formats metres; small values have a resolution of a tenth of a millimetre.
+/// Formats metres with three significant digits.
 pub fn metres(value: f64) -> String {
     digits(value, 3)
 }

@@ -33,7 +33,7 @@ use crate::{
 const ASK: Duration = Duration::from_millis(100);
 /// Timeout for connecting all processes with one another.
 const CONNECTED_WITHIN: Duration = Duration::from_secs(20);
-/// Interval at which a process that is alone checks for newer calls of others.
+/// Interval at which a lone process checks for newer calls of others.
 const LOOK: Duration = Duration::from_secs(20);
 /// Maximum number of processes.
 const MOST: usize = 1024;

@@ -335,7 +335,7 @@ fn connections_without_the_secret_disturb_nothing() {
 fn a_call_that_nobody_answers_is_followed_by_another() {
     let plan = of_steps(2);
     let board = Board::default();
-    // A machine that is gone, and one that listens but sends nothing.
+    // An unreachable machine, and one that listens but sends nothing.
     let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     for address in [
         "127.0.0.1:1".to_owned(),

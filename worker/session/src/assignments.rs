@@ -457,8 +457,8 @@ impl Assignments {
         messages
     }
 
-    /// Withdraws a request for a lease: returns the zero credit, and a heartbeat whose answer
-    /// proves that no lease is in transit.
+    /// Withdraws a request for a lease. Returns the zero credit and a heartbeat; the answer to this
+    /// heartbeat proves that no lease is in transit.
     pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Vec<Outgoing> {
         if !self.asked {
             return Vec::new();

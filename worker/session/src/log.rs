@@ -214,7 +214,7 @@ mod tests {
         lines.iter().map(text).collect()
     }
 
-    /// Runs `work` on a thread whose lines are collected.
+    /// Runs `work` on a thread that the collector serves.
     fn on_a_worker(collector: &Arc<Collector>, work: impl FnOnce() + Send) {
         std::thread::scope(|s| {
             s.spawn(|| {

@@ -19,8 +19,8 @@
 //!
 //! A lease is *lost* if a heartbeat's answer does not list it, or if it is revoked after it expired
 //! here (a laptop that slept, a coordinator that was unreachable for long). Its waiting tasks are
-//! dropped and its running task continues, because its result can still be adopted. A lease that is
-//! revoked before it expires is no longer *wanted* (a cancelled job): its running task is stopped.
+//! dropped and its running task continues, because its result can still be adopted. A lease revoked
+//! before it expires is no longer *wanted* (a cancelled job): its running task is stopped.
 
 use std::time::Duration;
 

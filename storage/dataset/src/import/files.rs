@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::ImportError;
 
-/// Maximum size in bytes of a file that is read as a whole.
+/// Maximum size in bytes of a file read as a whole.
 const MOST: u64 = 16 << 30;
 
 /// A source file of a scene.

@@ -21,8 +21,8 @@ const FEWEST: usize = 50;
 /// Median differences above this are errors: this number of bins, and at least this number of
 /// metres.
 const RESIDUAL: [f64; 2] = [2.0, 0.1];
-/// The limit for a single spot: this multiple of the overall median, and at least this number of
-/// metres.
+/// The limit for a single spot's median difference, which must also be this multiple of the median
+/// over all spots to be an error.
 const SPOT: [f64; 2] = [3.0, 0.15];
 const SPOT_TIMES: f64 = 4.0;
 /// The limit for the common offset of all paths if depth is known.

@@ -215,7 +215,7 @@ impl ImportedScene {
     /// Sets the lengths of the beams in metres; a beam that hits nothing has none.
     ///
     /// # Errors
-    /// The first beam that is shorter than the straight line, or has no length: its index, and its
+    /// The index of the first beam that is shorter than the straight line or has no length, and its
     /// minimum length.
     pub(super) fn set_paths(&mut self, paths_m: &[f32]) -> Result<(), (usize, f32)> {
         for (beam, (spot, path)) in self.spots.iter_mut().zip(paths_m).enumerate() {

@@ -154,8 +154,8 @@ impl Models {
                     None
                 }
             },
-            // It belongs to an evaluation or a training that is in progress or was abandoned. A
-            // reader of a damaged one regenerates it.
+            // It belongs to an unfinished or abandoned evaluation or training. A reader of a
+            // damaged one regenerates it.
             Some((super::shard::FOLDER | super::call::FOLDER, _)) => {
                 check.unused.push(at.clone());
                 None

@@ -42,7 +42,7 @@ impl Dataset {
     /// first dimension of every array's shape is replaced, the root's last. If it is larger, the
     /// stored number is retained. Only one process at a time should grow a data set, because
     /// metadata is replaced without comparison. Published scenes are never touched, so the worst
-    /// case is a number of scenes that is too small, which growing again repairs.
+    /// case is too small a number of scenes, which growing again repairs.
     ///
     /// # Errors
     /// [`DatasetError::SpecMismatch`] names the first differing field and both values;

@@ -28,7 +28,7 @@ const FIELD: &str = "picofarm_store";
 /// this costs next to nothing there, and only folders can be unmounted.
 pub(super) const FRESH: Duration = Duration::from_secs(10);
 
-/// The error for a store that is not the expected one.
+/// The error for a store with another identity than expected.
 #[derive(Debug)]
 pub(crate) struct Mismatch(String);
 
