@@ -1,4 +1,4 @@
-//! A set of changes that is committed atomically.
+//! A set of changes for one atomic commit.
 
 use std::collections::{BTreeMap, BTreeSet};
 

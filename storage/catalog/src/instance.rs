@@ -121,7 +121,7 @@ pub struct Settled {
 }
 
 impl Settled {
-    /// Adds the effects of another commit.
+    /// Adds the effects of another part.
     pub fn join(&mut self, other: Self) {
         self.opened.extend(other.opened);
         self.ends.extend(other.ends);

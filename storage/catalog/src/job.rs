@@ -16,7 +16,7 @@ pub struct Job {
     /// Its id.
     pub id: JobId,
     /// Hash that identifies equal submissions, in hexadecimal: SHA-256 of the canonical spec and,
-    /// if needed, of the group of users whose jobs are searched for an equal one.
+    /// if needed, of the group of users in which jobs with the same spec are considered equal.
     pub spec_hash: String,
     /// The submitted spec.
     pub spec: Arc<JobSpec>,

@@ -196,9 +196,9 @@ pub trait Catalog: Rights {
     /// Returns a job and its progress.
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError>;
 
-    /// Writes about ten pages, permanently or in a transaction that is rolled back, to check for
-    /// free space. On a full disk the smallest writes may still succeed while submissions and
-    /// commits fail.
+    /// Writes about ten pages, permanently or in a transaction with a rollback, to check for free
+    /// space. On a full disk the smallest writes may still succeed while submissions and commits
+    /// fail.
     ///
     /// # Errors
     /// The catalog cannot be written.

@@ -46,7 +46,7 @@ pub enum RangeState {
         /// The outputs existed before this job ran the tasks.
         reused: bool,
     },
-    /// Given up, after too many failures or crashes.
+    /// Given up.
     Dead,
 }
 

@@ -46,7 +46,7 @@ impl<'a> Submission<'a> {
         }
     }
 
-    /// Returns the tasks whose initial state is done, by result set.
+    /// Returns the tasks laid out as done, by result set.
     pub fn done(&self) -> Vec<(&'a ResultSet, Run)> {
         let done = self
             .ranges

@@ -10,7 +10,7 @@ use std::{
 
 use picofarm_catalog::CatalogError;
 
-/// A lock that is held while the catalog is open.
+/// A lock held while the catalog is open.
 #[derive(Debug)]
 pub(crate) struct CatalogLock(
     #[expect(dead_code, reason = "the lock lives as long as the file")] File,

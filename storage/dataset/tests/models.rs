@@ -195,7 +195,7 @@ async fn the_newest_two_checkpoints_are_kept_and_none_after_the_end() {
         .map(|c| c.step)
         .collect();
     assert_eq!(steps, [30, 1_000_000_000_000, 1]);
-    // A slow worker deletes nothing of one that is further ahead.
+    // A slow worker deletes nothing of a worker at a later step.
     models
         .put_checkpoint("m", "k", 25, pieces(&[b""]))
         .await

@@ -9,7 +9,8 @@ use std::path::Path;
 use common::*;
 use picofarm_dataset::*;
 
-/// Unpacks `format-1.zip`: the data sets `sqrt` (with `transient_spots`), `plain` and `counts`, each with scene 1.
+/// Unpacks `format-1.zip`: the data sets `sqrt` (with `transient_spots`), `plain` and `counts`,
+/// each with scene 1.
 fn unpack(to: &Path) {
     let bytes = include_bytes!("fixtures/format-1.zip");
     let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).unwrap();

@@ -29,8 +29,8 @@ impl Opener {
         Self::default()
     }
 
-    /// Returns an opener that is further restricted to files inside `folders`. Folders are resolved
-    /// to their real paths; a missing folder contains nothing.
+    /// Returns an opener with the same restrictions, and additionally restricted to files inside
+    /// `folders`. Folders are resolved to their real paths; a missing folder contains nothing.
     #[must_use]
     pub fn within<P: AsRef<Path>>(&self, folders: impl IntoIterator<Item = P>) -> Self {
         let mut sets = self.sets.clone();

@@ -1,5 +1,5 @@
-//! The square-root code: photon counts as 16-bit codes with an error that is a fixed share of the
-//! photon noise, its error statistics, and the choice of a scene's photon scale.
+//! The square-root code: photon counts as 16-bit codes with an error proportional to the photon
+//! noise, its error statistics, and the choice of a scene's photon scale.
 //!
 //! All arithmetic is IEEE single precision in a fixed order, so that the same histogram gives the
 //! same codes on every machine, and numpy's float32 decodes to the same bits.

@@ -36,7 +36,7 @@ impl TransientCodec {
     /// Returns a codec of the newest format.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] names the property that is out of range.
+    /// [`DatasetError::Invalid`] names the property out of range.
     pub fn new(spec: &DatasetSpec) -> Result<Self, DatasetError> {
         spec.check()?;
         let layout = Quantity::Transient.layout(spec, FORMAT_VERSION);

@@ -163,8 +163,8 @@ impl Manifest {
         }
         match &manifest.checksum {
             Some(checksum) => drop(unseal(bytes, checksum).map_err(damaged)?),
-            // Older programs wrote no checksum. A manifest with a misspelt member "checksum" was
-            // damaged instead.
+            // Older programs wrote no checksum. A manifest with a damaged name of the member
+            // `checksum` must not count as one of these.
             None => no_strange_member(bytes, &manifest).map_err(damaged)?,
         }
         Ok(manifest)

@@ -13,7 +13,7 @@ pub enum Quantity {
     Range,
     /// Unit normals in the camera frame, i16 `[row][column][3]`, to be divided by 32767.
     Normal,
-    /// Semantic label, u16 `[row][column]`, 0 = nothing.
+    /// Instance id, u32 `[row][column]`, 0 = nothing.
     Instance,
     /// Semantic label, u16 `[row][column]`, 0 = nothing.
     Label,

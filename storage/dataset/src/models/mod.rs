@@ -190,7 +190,7 @@ impl Models {
     /// retained, unless `exact` requests an error.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that is invalid or belongs to another training;
+    /// [`DatasetError::Invalid`] for a name of another training, or an invalid name;
     /// [`DatasetError::Conflict`] with `exact`, for different bits; [`DatasetError::Store`].
     pub async fn publish(&self, model: NewModel, exact: bool) -> Result<Published, DatasetError> {
         let NewModel { manifest, objects } = model;

@@ -3,7 +3,7 @@
 //! Only this code overwrites a scene's objects. It writes nothing unless the regenerated scene is
 //! proved to equal the original. The proof is the manifest, if its checksum shows that it is
 //! intact. If the manifest itself is broken, the proof is a snapshot with its SHA-256, or the
-//! remaining objects, each of which must be equal.
+//! remaining objects, which must all be equal.
 
 use futures::{StreamExt, TryStreamExt, stream};
 

@@ -205,7 +205,7 @@ impl Decoding<'_> {
     }
 
     /// Like [`Self::shard`], but as one image per bin. Tiles with the same bins write to adjacent
-    /// memory, so they are decoded together; tiles with other bins are decoded in parallel.
+    /// memory, so one thread decodes them; different ranges of bins are decoded in parallel.
     pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
         let chunks = Self::chunks(&tiles, bytes)?;

@@ -58,7 +58,7 @@ impl VerifyOptions<'_> {
 }
 
 impl Dataset {
-    /// Checks the data set and reports each object that is broken, missing or foreign.
+    /// Checks the data set and reports each broken, missing or foreign object.
     ///
     /// # Errors
     /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.

@@ -67,7 +67,7 @@ impl Settings {
         self.0.contains_key(name)
     }
 
-    /// Returns the first of these names that is set.
+    /// Returns the first name with a value.
     pub(super) fn first<'a>(&self, names: &[&'a str]) -> Option<&'a str> {
         names.iter().copied().find(|name| self.has(name))
     }
