@@ -189,8 +189,8 @@ fn platonerfs_axes_angles_and_gate_are_checked_by_light_of_one_bounce() {
     );
 }
 
-/// Writes a scan of 8×6 pixels of a wall at z = 2, and counts with the spot at pixel (row 2, column
-/// 5) from the top left.
+/// Writes a scan of 8×6 pixels of a wall at z = 2, and counts with the spot at pixel
+/// (row 2, column 5) from the top left.
 fn collection(folder: &Path) -> Vec<f64> {
     let (columns, rows, bins) = (8usize, 6usize, 700usize);
     let (mut theta, mut phi) = (Vec::new(), Vec::new());

@@ -21,7 +21,7 @@ impl Backoff {
         }
     }
 
-    /// Returns the next wait: between half of the doubled wait and all of it, by `random` in [0,
+    /// Returns the next wait: between half of the doubled wait and all of it. `random` is in [0,
     /// 1).
     pub fn next(&mut self, random: f64) -> Duration {
         let full = self

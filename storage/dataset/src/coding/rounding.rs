@@ -3,8 +3,8 @@
 
 use crate::coding::squareroot::ErrorSums;
 
-/// Rounds h to a multiple of the largest power of two with an error within a share of σ = √max(N,
-/// 1), N = h·scale photons.
+/// Rounds h to a multiple of the largest power of two with an error within a share of σ =
+/// √max(N, 1), N = h·scale photons.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rounding {
     /// Twice the share, in units of h.

@@ -148,8 +148,8 @@ impl ErrorSums {
     }
 }
 
-/// Error of a scene's encoded transient, in standard deviations of the photon noise, σ = √max(N,
-/// 1).
+/// Error of a scene's encoded transient, in standard deviations of the photon noise, σ =
+/// √max(N, 1).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct EncodeError {
     /// The maximum over all bins.

@@ -39,8 +39,8 @@ struct Description {
     depth: Option<Depth>,
     /// `[spot][row][column]`.
     visibility: Option<Visibility>,
-    /// `[spot][row][column]`: measured path of each spot's two-bounce light, in the length unit; 0
-    /// = not measured.
+    /// `[spot][row][column]`: measured path of each spot's two-bounce light, in the length unit;
+    /// 0 = not measured.
     two_bounce: Option<File>,
     /// `[row][column]`, 1 = mirror.
     specular: Option<File>,

@@ -28,7 +28,7 @@ pub enum Quantity {
     TwoBouncePath,
     /// sRGB-encoded colour, u8 `[row][column][3]`.
     Rgb,
-    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN
+    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres. NaN
     /// = no spot.
     Spots,
     /// fx, fy, cx, cy in pixels, f32.
