@@ -1,4 +1,4 @@
-//! A set of changes that becomes durable as a whole.
+//! A set of changes for one atomic commit.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,60 +11,63 @@ use crate::{
     task::{Exception, Output},
 };
 
-/// What one commit writes. For each range, exception and worker only the last word counts.
+/// The writes of one commit. If a range, exception or worker changes several times, only the last
+/// state is written.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Changes {
-    /// Ranges that this instance owns, as they are now.
+    /// Current state of the ranges that this instance owns.
     pub ranges: BTreeMap<RangeId, Range>,
-    /// Ranges that this instance gives out of its hands, as they are now: done and dead ones for good, pending ones
-    /// for whoever claims them. The catalog may merge them with their neighbours.
+    /// Current state of the ranges that this instance releases: done and dead ones for good,
+    /// pending ones for the next instance that claims them. The catalog may merge them with their
+    /// neighbours.
     pub free: BTreeMap<RangeId, Range>,
-    /// Ranges that are no more.
+    /// Ranges that no longer exist.
     pub gone: BTreeSet<RangeId>,
-    /// Ids among these that were made since the last commit: the catalog does not know them. It must know all others
-    /// as this instance's.
+    /// Ids among these that were created since the last commit, so that the catalog does not know
+    /// them. The catalog must know all others as owned by this instance.
     pub minted: BTreeSet<RangeId>,
     /// New outputs.
     pub outputs: Vec<Output>,
-    /// Failed tasks as they are now.
+    /// Current state of the failed tasks.
     pub exceptions: BTreeMap<(StageRef, u64), Exception>,
-    /// Workers as they are now.
+    /// Current state of the workers.
     pub workers: BTreeMap<WorkerId, Worker>,
-    /// History, in order.
+    /// New history events, in order.
     pub events: Vec<NewEvent>,
-    /// Stages of which this instance has nothing left: if nobody else has either, they are over, and with them perhaps
-    /// their jobs.
+    /// Stages in which this instance has no ranges left, with the Unix time in milliseconds. If no
+    /// other instance has any either, the stage is over, and its job may be over too.
     pub perhaps_over: BTreeMap<StageRef, i64>,
 }
 
 impl Changes {
-    /// Whether there is nothing to write.
+    /// Returns whether there is nothing to write.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Notes a range of this instance as it is now.
+    /// Records the current state of a range that this instance owns.
     pub fn put(&mut self, range: Range) {
         self.gone.remove(&range.id);
         self.free.remove(&range.id);
         self.ranges.insert(range.id, range);
     }
 
-    /// Notes a range that is nobody's from now on.
+    /// Records that this instance releases a range.
     pub fn give(&mut self, range: Range) {
         self.gone.remove(&range.id);
         self.ranges.remove(&range.id);
         self.free.insert(range.id, range);
     }
 
-    /// Notes that a range is no more.
+    /// Records that a range no longer exists.
     pub fn remove(&mut self, id: RangeId) {
         self.ranges.remove(&id);
         self.free.remove(&id);
         self.gone.insert(id);
     }
 
-    /// The ranges that the catalog must know as this instance's, or else somebody has taken them.
+    /// Returns the ranges that the catalog must know as owned by this instance. If it does not,
+    /// another instance has taken them.
     pub fn known(&self) -> impl Iterator<Item = RangeId> + '_ {
         self.ranges
             .keys()

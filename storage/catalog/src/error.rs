@@ -1,14 +1,14 @@
-//! What can go wrong with a catalog, and what to do about it.
+//! Errors of a catalog.
 
 use std::{
     io,
     path::{Path, PathBuf},
 };
 
-/// A catalog that cannot be opened, read or written.
+/// A failure to open, read or write a catalog.
 #[derive(Debug, thiserror::Error)]
 pub enum CatalogError {
-    /// Another coordinator has it.
+    /// Another coordinator has the catalog open.
     #[error(
         "catalog {} is held by another coordinator ({holder}); stop that one first, or give this one a catalog of its own",
         path.display()
@@ -16,10 +16,10 @@ pub enum CatalogError {
     Held {
         /// The database file.
         path: PathBuf,
-        /// Who has it, as it said itself.
+        /// The other coordinator, as it described itself.
         holder: String,
     },
-    /// A later program wrote it.
+    /// A later version of the program wrote the catalog.
     #[error(
         "catalog {place} has schema version {found}, but this program knows versions up to {known}; use a newer picofarm, or another catalog"
     )]
@@ -31,7 +31,8 @@ pub enum CatalogError {
         /// The latest schema version of this program.
         known: i64,
     },
-    /// A build of another state of the source wrote it: one of its steps has another text than this program's.
+    /// A development build from another state of the source wrote the catalog: the text of one of
+    /// its schema steps differs from this program's.
     #[error(
         "catalog {place}: schema step {step} is not the one of this picofarm: a development build whose steps were edited \
          later wrote it; open it with that build, or start with another catalog (finished results stay in their stores, and \
@@ -48,34 +49,34 @@ pub enum CatalogError {
     File {
         /// The database file.
         path: PathBuf,
-        /// What was tried.
+        /// The operation that failed.
         what: &'static str,
-        /// The system's answer.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// No room.
+    /// The disk is full.
     #[error("catalog {}: the disk is full; free some space: a coordinator that runs goes on by itself, one that did not start must be started again; no finished work is lost", path.display())]
     Full {
         /// The database file.
         path: PathBuf,
     },
-    /// Its file is not the one at its path any more.
+    /// The open file is no longer the one at its path.
     #[error("catalog {}: {what}", path.display())]
     Lost {
         /// The database file.
         path: PathBuf,
-        /// What became of it, and what to do.
+        /// What happened to the file, and what to do.
         what: String,
     },
-    /// What was to be written cannot be: not now and not later, by its content. Nothing was written.
+    /// The database rejects the content of a write, now and on every retry. Nothing was written.
     #[error("catalog {place} refuses what was to be written: {what}")]
     Refused {
         /// The database.
         place: String,
-        /// The database's words.
+        /// The database's error message.
         what: String,
     },
-    /// This program has no driver for it.
+    /// This program has no driver for the database.
     #[error(
         "catalog {place}: this picofarm was built without Postgres; build it with `--features postgres`, or name a SQLite file"
     )]
@@ -83,49 +84,49 @@ pub enum CatalogError {
         /// The database, without its password.
         place: String,
     },
-    /// No right to write.
+    /// The file or its folder is not writable.
     #[error("catalog {}: cannot be written (read-only file or folder); make it writable for this user or choose another path", path.display())]
     ReadOnly {
         /// The database file.
         path: PathBuf,
     },
-    /// Not a database of ours.
+    /// The database is not a picofarm catalog.
     #[error("catalog {place}: {what}; choose another one or restore it from a backup")]
     Unusable {
         /// The database.
         place: String,
-        /// What was found.
+        /// A description of the content found.
         what: String,
     },
-    /// Something changed behind the caller's back.
+    /// The database has changed since the caller read it.
     #[error("catalog conflict: {0}")]
     Conflict(String),
-    /// Any other answer of the database.
+    /// Any other error of the database.
     #[error("catalog {place}: {source}")]
     Database {
         /// The database.
         place: String,
-        /// The database's answer.
+        /// The database's error.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// The database's server does not let us in.
+    /// The database server rejects the connection.
     #[error("catalog {place}: {what}")]
     Server {
         /// The database, without its password.
         place: String,
-        /// What it answered, and how to correct it.
+        /// The server's answer, and how to correct the problem.
         what: String,
     },
-    /// This instance was thought lost, and others have taken over what it owned.
+    /// This instance was considered lost, and other instances have taken over its ranges.
     #[error("this coordinator was out of touch with its catalog for too long; it begins anew")]
     Fenced,
-    /// It was closed before.
+    /// The catalog was closed before.
     #[error("the catalog is closed")]
     Closed,
 }
 
 impl CatalogError {
-    /// The same in a few words without names of files and hosts, for anyone.
+    /// Returns a short description for any reader, without names of files and hosts.
     pub fn brief(&self) -> &'static str {
         match self {
             Self::Full { .. } => "the catalog's disk is full",
@@ -140,7 +141,7 @@ impl CatalogError {
         }
     }
 
-    /// The error a person can act on, for a failure of the file system while doing `what`.
+    /// Returns an actionable error for a file system failure during the operation `what`.
     pub fn file(path: &Path, what: &'static str, source: io::Error) -> Self {
         let path = path.to_owned();
         match source.kind() {

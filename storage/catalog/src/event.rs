@@ -1,4 +1,4 @@
-//! The history of jobs: lines to be written, and which are asked for.
+//! The history of jobs: new events and queries.
 
 use picofarm_proto::{
     ids::JobId,
@@ -7,29 +7,29 @@ use picofarm_proto::{
 
 use crate::{range::Run, rights::Sight};
 
-/// A line of history to be written; its sequence number is given by the catalog.
+/// A new history event; the catalog assigns its sequence number.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewEvent {
     /// Unix time, milliseconds.
     pub at_ms: i64,
     /// The job.
     pub job: JobId,
-    /// Position of the stage concerned, where one is.
+    /// Position of the stage concerned, if any.
     pub stage: Option<u32>,
-    /// What.
+    /// The kind of event.
     pub kind: EventKind,
-    /// The tasks concerned, where any are.
+    /// The tasks concerned, if any.
     pub tasks: Option<Run>,
-    /// Worker's name, where one is concerned.
+    /// Name of the worker concerned; empty if there is none.
     pub worker: String,
-    /// Seconds the task took, where it ended.
+    /// Duration of the task in seconds, if it ended.
     pub seconds: f64,
-    /// In words.
+    /// A message for people.
     pub message: String,
 }
 
 impl NewEvent {
-    /// Something about a job as a whole.
+    /// Returns an event that concerns a job as a whole.
     pub fn of(job: JobId, at_ms: i64, kind: EventKind, message: String) -> Self {
         Self {
             at_ms,
@@ -43,7 +43,7 @@ impl NewEvent {
         }
     }
 
-    /// The end of a job.
+    /// Returns the event of a job's end.
     pub fn ended(job: JobId, at_ms: i64, counts: &TaskCounts) -> Self {
         let mut message = format!(
             "{} of {} tasks done, {} dead",
@@ -56,22 +56,22 @@ impl NewEvent {
     }
 }
 
-/// Which part of the history.
+/// A query of the history.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EventQuery {
-    /// The job; `None` = all of them.
+    /// The job; `None` selects all jobs.
     pub job: Option<JobId>,
     /// Only events after this sequence number.
     pub after: u64,
-    /// At most this many.
+    /// The maximum number of events.
     pub limit: u32,
     /// Only events that concern this task.
     pub task: Option<u64>,
     /// Only events that concern this stage.
     pub stage: Option<u32>,
-    /// The last `limit` rather than the first.
+    /// Returns the last `limit` events instead of the first.
     pub newest: bool,
-    /// What tasks logged, too.
+    /// Includes the log messages of tasks.
     pub logs: bool,
     /// Only events of jobs that this reader may see.
     pub sight: Sight,

@@ -1,4 +1,4 @@
-//! What an instance finds, takes and learns.
+//! Data that an instance loads, claims and polls.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -13,112 +13,115 @@ use crate::{
     task::Exception,
 };
 
-/// A worker as last seen.
+/// The last known state of a worker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Worker {
-    /// The worker, across restarts.
+    /// The worker's id, which is stable across restarts.
     pub id: WorkerId,
     /// Its last known process.
     pub incarnation: Incarnation,
-    /// Name, for people.
+    /// Name for display.
     pub name: String,
     /// Unix time, milliseconds.
     pub last_seen_ms: i64,
 }
 
-/// What an instance finds when its life begins.
+/// The state that a new instance loads from the catalog.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
     /// The instance.
     pub instance: InstanceId,
-    /// Every active job, in order of submission.
+    /// All active jobs, in order of submission.
     pub jobs: Vec<Job>,
-    /// What the instance owns: ranges left by an earlier life of this process, and by instances that are lost.
+    /// The ranges that the instance owns: those of an earlier life of this process, and those of
+    /// lost instances.
     pub owned: Owned,
-    /// Every worker ever seen.
+    /// All workers ever seen.
     pub workers: Vec<Worker>,
 }
 
-/// Ranges that came into an instance's hands, with what it must know to go on with them.
+/// Ranges that an instance acquired, with the state needed to continue them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Owned {
     /// The ranges, leased and pending.
     pub ranges: Vec<Range>,
-    /// Failures of their tasks.
+    /// Failures of the tasks in these ranges.
     pub exceptions: Vec<Exception>,
 }
 
-/// A wish for pending tasks.
+/// A request for pending tasks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Want {
-    /// Of which stage.
+    /// The stage.
     pub stage: StageRef,
-    /// How many tasks.
+    /// The number of tasks.
     pub tasks: u64,
-    /// Only tasks that may run at this time, Unix milliseconds.
+    /// Only tasks that may run at this time, in Unix milliseconds.
     pub now_ms: i64,
-    /// Outputs that exist are not asked for.
+    /// If set, tasks with existing outputs are run again.
     pub force: bool,
-    /// Ranges under suspicion too, which go only to a worker with nothing else in hand.
+    /// Includes suspected ranges, which are only leased to a worker that runs nothing else.
     pub suspects: bool,
 }
 
-/// Pending tasks of an open stage that are nobody's.
+/// Unowned pending tasks of an open stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Free {
-    /// That may run at once, on any worker.
+    /// Tasks that may run at once, on any worker.
     pub ready: u64,
-    /// That may run at once, alone on a worker: workers were lost while they ran them.
+    /// Tasks that may run at once, but alone on a worker, because workers were lost while they ran
+    /// them.
     pub suspects: u64,
-    /// That may not run before a time.
+    /// Tasks that may not run before a given time.
     pub later: u64,
-    /// The first of these times, Unix milliseconds.
+    /// The earliest of these times, in Unix milliseconds.
     pub next_ms: Option<i64>,
 }
 
 /// The answer to a [`Want`].
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Claim {
-    /// Pending ranges that are the instance's now.
+    /// Pending ranges that the instance now owns.
     pub owned: Owned,
-    /// Tasks of them whose outputs exist already, as maximal runs in ascending order.
+    /// Tasks of these ranges whose outputs already exist, as maximal runs in ascending order.
     pub existing: Vec<Run>,
-    /// The tasks that are still nobody's.
+    /// The tasks that remain unowned.
     pub left: Free,
 }
 
-/// What an instance learns from time to time.
+/// State that an instance polls from the catalog.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct News {
-    /// Jobs that are active, and whether they are held.
+    /// The active jobs, and whether each is paused.
     pub active: BTreeMap<JobId, bool>,
-    /// Workers of other instances that have leases, by job.
+    /// Number of workers with leases from other instances, by job.
     pub busy: BTreeMap<JobId, u32>,
-    /// Leased ranges of other instances, of stages whose outputs another stage of an active job has, too.
+    /// Ranges that other instances have leased, in stages that share outputs with another stage of
+    /// an active job.
     pub shared: BTreeMap<StageRef, Vec<Run>>,
-    /// Pending tasks that are nobody's and whose stage is open.
+    /// Unowned pending tasks of open stages.
     pub free: BTreeMap<StageRef, Free>,
-    /// Ranges of instances that were lost.
+    /// Ranges taken over from lost instances.
     pub taken: Owned,
-    /// The leased ranges that are this instance's; `None` where nobody could have taken any.
+    /// The leased ranges that this instance owns; `None` if no other instance could have taken any.
     pub leased: Option<BTreeSet<RangeId>>,
-    /// Instances alive, this one too.
+    /// Number of live instances, including this one.
     pub instances: u32,
-    /// Workers connected to any of them.
+    /// Number of workers connected to any instance.
     pub workers: u32,
 }
 
-/// What came of a commit for whole stages and jobs.
+/// The effects of a commit on whole stages and jobs.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Settled {
-    /// Stages that may begin.
+    /// Stages that may now begin.
     pub opened: Vec<StageRef>,
     /// Jobs that have ended.
     pub ends: Vec<JobEnd>,
 }
 
 impl Settled {
-    /// Adds what came of another part.
+    /// Adds the effects of another part.
     pub fn join(&mut self, other: Self) {
         self.opened.extend(other.opened);
         self.ends.extend(other.ends);
@@ -130,7 +133,7 @@ impl Settled {
 pub struct JobEnd {
     /// The job.
     pub job: JobId,
-    /// Done or failed.
+    /// The final state: done or failed.
     pub state: JobState,
     /// Unix time, milliseconds.
     pub at_ms: i64,

@@ -1,4 +1,4 @@
-//! Jobs and their stages, as a catalog keeps them.
+//! Jobs and their stages, as stored in a catalog.
 
 use std::sync::Arc;
 
@@ -10,47 +10,47 @@ use picofarm_proto::{
 
 use crate::task::Exception;
 
-/// One submission.
+/// A submitted job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     /// Its id.
     pub id: JobId,
-    /// What tells whether two submissions are the same job: SHA-256 of the canonical spec, where need be with among whose
-    /// jobs an equal one is looked for, hexadecimal.
+    /// Hash that identifies equal submissions, in hexadecimal: SHA-256 of the canonical spec and,
+    /// if needed, of the group of users in which jobs with the same spec are considered equal.
     pub spec_hash: String,
-    /// What was submitted.
+    /// The submitted spec.
     pub spec: Arc<JobSpec>,
-    /// Where it stands.
+    /// The job's state.
     pub state: JobState,
     /// Unix time of submission, milliseconds.
     pub submitted_ms: i64,
     /// Unix time of the end, milliseconds.
     pub ended_ms: Option<i64>,
-    /// It is held: nothing of it is begun.
+    /// Whether the job is paused, so that none of its tasks are started.
     pub paused: bool,
-    /// Who submitted it.
+    /// The user who submitted it.
     pub user: String,
 }
 
-/// A stage of a job: its tasks are `0..tasks`.
+/// A stage of a job; its tasks are `0..tasks`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageRecord {
     /// Its name.
     pub id: StageRef,
-    /// Positions of the stages that it needs.
+    /// Positions of the stages that this stage depends on.
     pub needs: Vec<u32>,
-    /// It begins although tasks of those were given up.
+    /// Whether the stage begins even if tasks of those stages were given up.
     pub tolerate_dead: bool,
-    /// Outputs that exist do not count.
+    /// Whether existing outputs are ignored.
     pub force: bool,
-    /// Where its results go.
+    /// The result set that the stage writes.
     pub set: ResultSet,
     /// Number of tasks.
     pub tasks: u64,
 }
 
 impl Job {
-    /// The job's stages, in order.
+    /// Returns the job's stages, in order.
     pub fn stages(&self) -> Vec<StageRecord> {
         let stages = self.spec.stages.iter().enumerate();
         stages
@@ -73,30 +73,31 @@ impl Job {
     }
 }
 
-/// A job and how far it is.
+/// A job and its progress.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JobRecord {
     /// The job.
     pub job: Job,
     /// Its stages, in order.
     pub stages: Vec<StageCounts>,
-    /// How long its tasks took.
+    /// The duration of its tasks.
     pub timing: Timing,
-    /// Results that workers have reported and that the coordinator has not found in their store.
+    /// Number of results that workers have reported but the coordinator has not yet found in their
+    /// store.
     pub unverified: u64,
 }
 
-/// Where a stage stands.
+/// A stage's state and progress.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StageCounts {
     /// Whether its tasks may run.
     pub state: StageState,
-    /// Its tasks by state, as last committed.
+    /// Last committed number of its tasks in each state.
     pub counts: TaskCounts,
 }
 
 impl JobRecord {
-    /// Tasks of all stages by state.
+    /// Returns the number of tasks in each state, over all stages.
     pub fn counts(&self) -> TaskCounts {
         let mut counts = TaskCounts::default();
         for stage in &self.stages {
@@ -106,19 +107,21 @@ impl JobRecord {
     }
 }
 
-/// Where the results of a job's tasks live and what shapes them: two jobs with the same set share outputs.
+/// The place of a job's results and the hash of everything that determines them. Jobs with the same
+/// result set share outputs.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct ResultSet {
     /// URL or path of the store.
     pub store: String,
     /// Folder of the data set.
     pub dataset: String,
-    /// Hash of everything that shapes a result but the task's index.
+    /// Hash of everything that determines a result, except the task's index.
     pub stage_key: StageKey,
 }
 
 impl ResultSet {
-    /// The set a stage's tasks write to. What is no data set has a place that none can have.
+    /// Returns the result set that a stage writes. A stage that does not write a data set gets a
+    /// place that no data set can have.
     pub fn of(stage: &StageSpec) -> Self {
         let results = stage.task.results();
         Self {
@@ -129,10 +132,10 @@ impl ResultSet {
     }
 }
 
-/// Computed outputs and the seconds they took together.
+/// Number, total duration and total size of computed outputs.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Timing {
-    /// How many.
+    /// Number of outputs.
     pub tasks: u64,
     /// Sum of their seconds.
     pub seconds: f64,
@@ -141,21 +144,21 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// Mean seconds a task; `None` before the first.
+    /// Returns the mean number of seconds per task; `None` if there is none yet.
     pub fn mean(&self) -> Option<f64> {
         (self.tasks > 0).then(|| self.seconds / self.tasks as f64)
     }
 }
 
-/// What a job's tasks wait for, as far as the catalog knows.
+/// The reasons why a job's tasks wait, as far as the catalog knows.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Holdups {
     /// Pending tasks of open stages that may run at once.
     pub ready: u64,
     /// Pending tasks that may not run before a time.
     pub waiting: u64,
-    /// The first of these times, Unix milliseconds.
+    /// The earliest of these times, in Unix milliseconds.
     pub next_ms: Option<i64>,
-    /// The tasks that failed most often, a few of them.
+    /// A few of the tasks that failed most often.
     pub failed: Vec<Exception>,
 }

@@ -1,17 +1,20 @@
-//! What coordinators must remember: jobs, ranges, outputs, failures and history, as plain data and one trait, [`Catalog`].
-//! The databases that keep it are behind the trait, in crates of their own; nothing here reads or writes anything.
+//! The durable state of coordinators: jobs, ranges, outputs, failures and history, as plain data
+//! behind the trait [`Catalog`]. Other crates implement the trait for each database; this crate
+//! performs no input or output.
 //!
 //! # Instances
-//! A *instance* is one life of a coordinator on a catalog. Each range that is pending or leased is some instance's or nobody's;
-//! only its instance may write it. An instance *claims* pending ranges of nobody's ([`Catalog::claim`]), leases them out from
-//! memory, and gives them back when it has no use for them. What is done or dead is nobody's and stays in the catalog.
+//! An *instance* is one life of a coordinator on a catalog. A pending or leased range is either
+//! owned by one instance or unowned; only its owner may write it. An instance *claims* unowned
+//! pending ranges ([`Catalog::claim`]), leases them from memory, and releases them when it no
+//! longer needs them. Done and dead ranges are unowned and stay in the catalog.
 //!
-//! On Postgres an instance is a row that its process renews ([`Catalog::beat`]). Every transaction that writes locks that row
-//! first; an instance whose row has run out or is gone writes nothing ([`CatalogError::Fenced`]). Its ranges pass to whoever
-//! finds it lost, leases and all. A worker that comes to another coordinator brings its leases along
-//! ([`Catalog::adopt`]); the former owner finds out when it beats, or when it tries to write them
-//! ([`CatalogError::Conflict`]). So nobody needs to be elected, and a process that was stopped and wakes up does no harm.
-//! SQLite has one instance, which holds a lock on the file.
+//! On Postgres, an instance is a row that its process renews ([`Catalog::beat`]). Every write
+//! transaction first locks that row; an instance whose row has expired or is gone cannot write
+//! ([`CatalogError::Fenced`]). Its ranges, with their leases, pass to the instance that detects the
+//! loss. A worker that moves to another coordinator keeps its leases ([`Catalog::adopt`]); the
+//! former owner learns this from its next beat, or from the [`CatalogError::Conflict`] of its next
+//! write. Therefore no election is needed, and a stopped process that wakes up does no harm. SQLite
+//! has a single instance, which locks the file.
 
 mod changes;
 mod error;
@@ -45,83 +48,91 @@ pub use rights::{AuditQuery, NewAudit, OwnedPlace, Owner, Rights, Sight};
 pub use submission::{Gone, Outcome, Recorded, Submission};
 pub use task::{Exception, Output, TaskRecord};
 
-/// A catalog that can be opened: where it lies. Its text never shows a password.
+/// The location of a catalog that can be opened. Its text never shows a password.
 #[async_trait]
 pub trait CatalogSource: fmt::Display + fmt::Debug + Send + Sync {
-    /// Opens the catalog, creating what is missing. `holder` tells people who has it.
+    /// Opens the catalog, creating it if it is missing. `holder` describes this coordinator to
+    /// people.
     ///
     /// # Errors
-    /// A [`CatalogError`] that says what to do.
+    /// A [`CatalogError`] with instructions for the user.
     async fn open(&self, holder: &str) -> Result<Arc<dyn Catalog>, CatalogError>;
 }
 
-/// Whose specs are to be read.
+/// Selects the jobs for which to read specs.
 #[derive(Debug, Clone, Copy)]
 pub enum Specs<'a> {
-    /// One job's: [`Catalog::job`].
+    /// One job: [`Catalog::job`].
     Job(JobId),
-    /// That of the latest job with a spec hash: [`Catalog::job_with`].
+    /// The latest job with a spec hash: [`Catalog::job_with`].
     With(&'a str),
-    /// Those of jobs that write into a data set (store, name): [`Catalog::jobs_at`].
+    /// Jobs that write into a data set (store, name): [`Catalog::jobs_at`].
     At(&'a str, &'a str),
-    /// Those of the latest jobs that a reader may see: [`Catalog::recent`].
+    /// The latest jobs that a reader may see: [`Catalog::recent`].
     Recent(u32, &'a Sight),
 }
 
-/// Durable memory of coordinators. All methods may be called concurrently; each is one transaction.
+/// Durable storage for coordinators. All methods may be called concurrently; each is one
+/// transaction.
 ///
 /// # Errors
-/// All methods give a [`CatalogError`] when the database cannot be read or written; then nothing changed.
+/// All methods return a [`CatalogError`] if the database cannot be read or written; in that case
+/// nothing has changed.
 #[async_trait]
 pub trait Catalog: Rights {
-    /// Begins a life: founds an instance, which takes over what the last life of this process owned and what instances left
-    /// that are lost.
+    /// Starts a new instance, which takes over the ranges of this process's last instance and of
+    /// lost instances.
     async fn load(&self) -> Result<Snapshot, CatalogError>;
 
-    /// Says that the instance lives and has this many workers connected; to be called about once a
-    /// second. What may run is told of `now_ms`.
+    /// Renews the instance, reports its number of connected workers, and returns the changes made
+    /// by others. It must be called about once a second. `now_ms` decides which tasks count as
+    /// ready to run.
     ///
     /// # Errors
-    /// [`CatalogError::Fenced`] when it was thought lost; a new life must begin.
+    /// [`CatalogError::Fenced`] if the instance was considered lost; the caller must load a new
+    /// one.
     async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError>;
 
-    /// Returns when another instance may have changed something: a hint to beat early. Safe to cancel.
+    /// Returns when another instance may have changed something, as a hint to beat early.
+    /// Cancel-safe.
     async fn changed(&self);
 
-    /// Makes pending ranges of nobody's the instance's: for each wish up to as many tasks as it names, in the order in
-    /// which they may run. Ranges that another instance is just claiming are passed over.
+    /// Takes ownership of unowned pending ranges. For each request, it claims at most the requested
+    /// number of tasks, in the order in which they may run. Ranges that another instance is
+    /// claiming at the moment are skipped.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`].
     async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError>;
 
-    /// Makes a worker's leases the instance's, whosever they were.
+    /// Takes ownership of a worker's leases, regardless of their owner.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`].
     async fn adopt(&self, worker: WorkerId) -> Result<Owned, CatalogError>;
 
-    /// Makes all of `changes` durable, or none of them; returns after the commit, with the stages that opened and the
-    /// jobs that ended by it.
+    /// Commits all of `changes` or none of them. It returns after the commit, with the stages that
+    /// it opened and the jobs that it ended.
     ///
     /// # Errors
-    /// [`CatalogError::Fenced`]; [`CatalogError::Conflict`] when the database holds something the caller did not know
-    /// of (another manifest for a task, a range that is another instance's now); [`CatalogError::Refused`] when something of it
-    /// cannot be written by its content, see [`culprits`].
+    /// [`CatalogError::Fenced`]; [`CatalogError::Conflict`] if the database contains something
+    /// unknown to the caller (another manifest for a task, or a range that another instance now
+    /// owns); [`CatalogError::Refused`] if the content of a row cannot be written, see
+    /// [`culprits`].
     async fn commit(&self, changes: &Changes) -> Result<Settled, CatalogError>;
 
-    /// Writes the outputs, failed tasks, workers and history of `changes` and undoes that: says what the database has
-    /// against their content, if anything.
+    /// Writes the outputs, failed tasks, workers and history of `changes` and rolls back. Returns
+    /// the database's objection to their content, if any.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`].
     async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError>;
 
-    /// Records a job with its ranges, which are nobody's, and the first lines of its history. `false` where a job with
-    /// the same spec is active or done: then nothing is recorded.
+    /// Records a job with its unowned ranges and the first events of its history. Returns `false`
+    /// and records nothing if a job with the same spec is active or done.
     ///
     /// # Errors
-    /// [`CatalogError::Refused`] when something of it cannot be written by its content.
+    /// [`CatalogError::Refused`] if part of the content cannot be written.
     async fn submit(
         &self,
         job: &Job,
@@ -133,26 +144,29 @@ pub trait Catalog: Rights {
         Ok(self.record(&submission).await? == Outcome::New)
     }
 
-    /// Records a job, and drops the records of outputs that are gone.
+    /// Records a job, and deletes the records of outputs that are gone.
     async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError>;
 
-    /// The outputs of tasks below `count` that are recorded in `set`, ascending.
+    /// Returns the recorded outputs of `set` for tasks below `count`, in ascending order.
     async fn recorded(&self, set: &ResultSet, count: u64) -> Result<Vec<Recorded>, CatalogError>;
 
-    /// Notes that the store holds these outputs as they are recorded; a record of another manifest is left alone.
+    /// Marks these outputs as found in the store. A record with another manifest is left unchanged.
     async fn mark_checked(&self, set: &ResultSet, outputs: &[Recorded])
     -> Result<(), CatalogError>;
 
-    /// Drops the record of an output that the store does not hold; `false` where there was none with this manifest.
+    /// Deletes the record of an output that the store does not have. Returns `false` if there was
+    /// no record with this manifest.
     async fn drop_output(&self, gone: &Gone) -> Result<bool, CatalogError>;
 
-    /// Where a job stands; `None` where there is none. Unlike [`Self::job`] it does not read the spec.
+    /// Returns a job's state, or `None` if there is no such job. Unlike [`Self::job`], it does not
+    /// read the spec.
     async fn state(&self, job: JobId) -> Result<Option<JobState>, CatalogError>;
 
-    /// Stops an active job; `false` where it is not active. `why` goes into its history.
+    /// Cancels an active job. Returns `false` if it is not active. `why` goes into its history.
     async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError>;
 
-    /// Holds an active job, or lets it go on; `false` where that changes nothing. `who` goes into its history.
+    /// Pauses or resumes an active job. Returns `false` if that changes nothing. `who` goes into
+    /// its history.
     async fn pause(
         &self,
         job: JobId,
@@ -161,71 +175,77 @@ pub trait Catalog: Rights {
         now_ms: i64,
     ) -> Result<bool, CatalogError>;
 
-    /// Removes some of the jobs that ended before this Unix time (milliseconds) with their history, and says whether there is
-    /// more to do: one short transaction, since others wait for it. When no such job is left, it removes outputs: they let
-    /// others reuse a result, so they leave only with the last job of their result set, that is when the set has had no job
-    /// for the same age. (The results themselves stay in their store, and are found there when they are wanted again.)
+    /// Deletes some of the jobs that ended before this Unix time (milliseconds), with their
+    /// history, and returns whether there is more to delete. Each call is one short transaction,
+    /// because others wait for it. If no such job is left, it deletes outputs. Outputs allow other
+    /// jobs to reuse a result, so they are only deleted with the last job of their result set, when
+    /// the set has had no job for the same period. (The results themselves stay in their store, and
+    /// are found there when they are needed again.)
     async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError>;
 
-    /// Active jobs of a user.
+    /// Returns the number of a user's active jobs.
     async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError>;
 
-    /// Makes the given-up tasks of a job that is active or failed pending again, with fresh budgets; returns how many.
+    /// Makes the dead tasks of an active or failed job pending again, with full retry budgets.
+    /// Returns their number.
     ///
     /// # Errors
-    /// [`CatalogError::Conflict`] where another job with the same spec is active or done.
+    /// [`CatalogError::Conflict`] if another job with the same spec is active or done.
     async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError>;
 
-    /// A job and how far it is.
+    /// Returns a job and its progress.
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError>;
 
-    /// Writes some ten pages for good or takes them back, to see that there is room: on a full disk the smallest writes may
-    /// still succeed, and those of a submission or a commit do not.
+    /// Writes about ten pages, permanently or in a transaction with a rollback, to check for free
+    /// space. On a full disk the smallest writes may still succeed while submissions and commits
+    /// fail.
     ///
     /// # Errors
     /// The catalog cannot be written.
     async fn try_room(&self) -> Result<(), CatalogError>;
 
-    /// Bytes of the specs that a read would bring into memory, as they are stored: cheap, so that a reader can be refused
-    /// before they are read.
+    /// Returns the stored size in bytes of the specs that a read would load into memory. The check
+    /// is cheap, so that a caller can be refused before the specs are read.
     async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError>;
 
-    /// Tasks of all active jobs by state, in one go.
+    /// Returns the number of tasks in each state over all active jobs, in one query.
     async fn active_tasks(&self) -> Result<TaskCounts, CatalogError>;
 
-    /// A page of the list of jobs, without their specs.
+    /// Returns a page of the list of jobs, without their specs.
     async fn page(&self, query: &JobQuery) -> Result<Page, CatalogError>;
 
-    /// The latest job with this spec hash.
+    /// Returns the latest job with this spec hash.
     async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError>;
 
-    /// The latest jobs that this reader may see, the last first.
+    /// Returns the latest jobs that this reader may see, newest first.
     async fn recent(&self, most: u32, sight: &Sight) -> Result<Vec<Job>, CatalogError>;
 
-    /// Jobs that write into a data set and are active or have written something, the latest first.
+    /// Returns the jobs that write into a data set and are active or have written something, newest
+    /// first.
     async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError>;
 
-    /// The tasks below `count` whose outputs exist in `set`, as maximal runs in ascending order.
+    /// Returns the tasks below `count` with an existing output in `set`, as maximal runs in
+    /// ascending order.
     async fn output_runs(&self, set: &ResultSet, count: u64) -> Result<Vec<Run>, CatalogError>;
 
-    /// The manifest hash committed for each task asked for, in the same order.
+    /// Returns the committed manifest hash of each given task, in the same order.
     async fn manifests(
         &self,
         tasks: &[(StageRef, u64)],
     ) -> Result<Vec<Option<[u8; 32]>>, CatalogError>;
 
-    /// How long the computed (not adopted) outputs of `set` took.
+    /// Returns the number, duration and size of the computed (not adopted) outputs of `set`.
     async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError>;
 
-    /// What the tasks of a job wait for at this time.
+    /// Returns the reasons why a job's tasks wait at this time.
     async fn holdups(&self, job: JobId, now_ms: i64) -> Result<Holdups, CatalogError>;
 
-    /// What is known of one task.
+    /// Returns the record of one task.
     async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError>;
 
-    /// History, oldest first.
+    /// Returns history events, oldest first.
     async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError>;
 
-    /// Lets go of what the instance owns, as far as that is possible, and of the database.
+    /// Releases the instance's ranges as far as possible, and closes the database.
     async fn close(&self);
 }

@@ -1,40 +1,40 @@
-//! Many jobs at a time: a page of the list of them, and what is forgotten.
+//! Operations on many jobs: pages of the job list, and deletion of old jobs.
 
 use picofarm_proto::model::{JobState, JobSummary};
 
 use crate::Sight;
 
-/// Which jobs of the list.
+/// A query of the job list.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct JobQuery {
-    /// Whose.
+    /// The jobs that the reader may see.
     pub sight: Sight,
-    /// Only those recorded before the last of another page ([`Page::next`]).
+    /// Only jobs recorded before this position, which is [`Page::next`] of another page.
     pub before: Option<i64>,
-    /// At most this many.
+    /// The maximum number of jobs.
     pub limit: u32,
-    /// Only those that stand so.
+    /// Only jobs in this state.
     pub state: Option<JobState>,
-    /// Only this user's.
+    /// Only jobs of this user.
     pub user: Option<String>,
-    /// Only those of this name, or whose id begins so.
+    /// Only jobs with this name, or with an id that begins with this text.
     pub find: Option<String>,
 }
 
-/// Part of the list.
+/// A page of the job list.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Page {
-    /// The last recorded first.
+    /// The jobs, newest first.
     pub jobs: Vec<JobSummary>,
-    /// Where the next page begins; `None` where this is the last.
+    /// The position of the next page; `None` on the last page.
     pub next: Option<i64>,
 }
 
-/// What one transaction of forgetting did.
+/// The result of one transaction that deletes old records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Forgotten {
-    /// Jobs that are gone.
+    /// Number of deleted jobs.
     pub jobs: u32,
-    /// There may be more to forget.
+    /// Whether there may be more to delete.
     pub more: bool,
 }

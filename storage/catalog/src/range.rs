@@ -1,4 +1,4 @@
-//! Ranges of tasks, and their states.
+//! Ranges of tasks and their states.
 
 use picofarm_proto::ids::{Epoch, Incarnation, LeaseRef, RangeId, StageRef, WorkerId};
 
@@ -11,10 +11,10 @@ pub struct Run {
     pub hi: u64,
 }
 
-/// Consecutive tasks of a job in one state.
+/// Consecutive tasks of a stage in one state.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Range {
-    /// Its id; with the epoch, the name of a lease.
+    /// The range's id, which with the epoch identifies a lease.
     pub id: RangeId,
     /// The stage.
     pub stage: StageRef,
@@ -22,73 +22,73 @@ pub struct Range {
     pub lo: u64,
     /// One past the last task.
     pub hi: u64,
-    /// Grows at each grant.
+    /// Incremented at each lease.
     pub epoch: Epoch,
-    /// Workers lost with this range or one it was cut from; such a range is not merged with others, so that
-    /// a poison task is cornered by halving.
+    /// Number of workers lost while they ran this range or one that it was split from. A range with
+    /// crashes is not merged with others, so that halving isolates a poison task.
     pub crashes: u32,
-    /// What may happen to it.
+    /// The range's state.
     pub state: RangeState,
 }
 
 /// The state of a range.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RangeState {
-    /// Waits for a worker.
+    /// Waiting for a worker.
     Pending {
-        /// Not granted before this Unix time, milliseconds; 0 = at once.
+        /// Not leased before this Unix time in milliseconds; 0 means at once.
         not_before_ms: i64,
     },
-    /// A worker has it.
+    /// Leased to a worker.
     Leased(LeaseState),
-    /// Every output is committed.
+    /// All outputs are committed.
     Done {
-        /// The outputs were there before this job ran the tasks.
+        /// The outputs existed before this job ran the tasks.
         reused: bool,
     },
     /// Given up.
     Dead,
 }
 
-/// Who holds a range, until when, and how far it is.
+/// The holder of a lease, its expiry and its progress.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LeaseState {
     /// The worker.
     pub worker: WorkerId,
-    /// The process of the worker.
+    /// The worker process.
     pub incarnation: Incarnation,
-    /// Unix time at which the lease runs out, milliseconds.
+    /// Unix time in milliseconds at which the lease expires.
     pub until_ms: i64,
-    /// One for each task of the range.
+    /// One mark for each task of the range.
     pub marks: Vec<Mark>,
 }
 
-/// What became of one task of a leased range.
+/// The state of one task in a leased range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Mark {
-    /// To be run.
+    /// Not finished yet.
     Todo = 0,
     /// Committed, computed under this lease.
     Done = 1,
-    /// Committed, found in the store.
+    /// Committed, because the store already had the output.
     Reused = 2,
-    /// Failed under this lease; a range of its own has the task now.
+    /// Failed under this lease; the task now has a range of its own.
     Left = 3,
 }
 
 impl Range {
-    /// Number of tasks between `lo` and `hi`.
+    /// Returns the number of tasks.
     pub fn len(&self) -> u64 {
         self.hi - self.lo
     }
 
-    /// Never: a range holds at least one task.
+    /// Returns `false`, because a range has at least one task.
     pub fn is_empty(&self) -> bool {
         false
     }
 
-    /// Whether a task waits here or is under way.
+    /// Returns whether the task is pending or unfinished under a lease.
     pub fn has_to_do(&self, task: u64) -> bool {
         match &self.state {
             RangeState::Pending { .. } => (self.lo..self.hi).contains(&task),
@@ -100,8 +100,8 @@ impl Range {
         }
     }
 
-    /// Whether it may become one with a neighbour in the same state that may too: never those under suspicion, or
-    /// waiting for a time.
+    /// Returns whether the range may be merged with a neighbour in the same state. Suspected ranges
+    /// and ranges with a start time are never merged.
     pub fn merges(&self) -> bool {
         self.crashes == 0
             && match self.state {
@@ -111,7 +111,7 @@ impl Range {
             }
     }
 
-    /// The lease's name.
+    /// Returns the lease's identity.
     pub fn lease(&self) -> LeaseRef {
         LeaseRef {
             range: self.id,

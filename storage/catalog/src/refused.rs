@@ -1,36 +1,38 @@
-//! Finding what it is of a change set that a database refuses for its content.
+//! Finds the rows of a change set that a database rejects because of their content.
 //!
-//! # What is tried by itself
-//! Only rows that hold what others sent can be refused for their content: outputs (sizes, times), failed tasks (an error
-//! message), workers (a name) and lines of history (both). Ranges hold numbers that the coordinator made itself, and they
-//! belong together: a lease, the tasks that left it and its neighbours change at once or not at all. So a change set is never
-//! committed in parts. Instead its rows are tried in transactions that are undone, halving those that are refused until single
-//! rows are left. The caller changes or takes out these rows, with whatever follows from that for their tasks, and commits the
-//! whole again. Of `n` rows with one culprit that takes some `2 log2 n` short transactions.
+//! # Search
+//! Only rows with content from other programs can be rejected: outputs (sizes, times), failed tasks
+//! (an error message), workers (a name) and history events (both). Ranges contain only numbers that
+//! the coordinator computed, and they depend on each other: a lease, the tasks that left it and its
+//! neighbours change in one transaction or not at all. Therefore a change set is never committed in
+//! parts. Instead its rows are tried in transactions that are rolled back, and rejected sets are
+//! halved until single rows remain. The caller then changes or removes these rows, with the
+//! consequences for their tasks, and commits the whole set. For `n` rows with one culprit, this
+//! takes about `2 log2 n` short transactions.
 
 use picofarm_proto::ids::{StageRef, WorkerId};
 
 use crate::{Catalog, CatalogError, Changes};
 
-/// A row of a change set that can be refused.
+/// A row of a change set that can be rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Row {
-    /// Of [`Changes::outputs`], by position.
+    /// An output, by its position in [`Changes::outputs`].
     Output(usize),
-    /// Of [`Changes::exceptions`].
+    /// A failed task in [`Changes::exceptions`].
     Exception(StageRef, u64),
-    /// Of [`Changes::workers`].
+    /// A worker in [`Changes::workers`].
     Worker(WorkerId),
-    /// Of [`Changes::events`], by position.
+    /// An event, by its position in [`Changes::events`].
     Event(usize),
 }
 
-/// A row and why the database refuses it.
+/// A rejected row and the reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Culprit {
-    /// Which.
+    /// The row.
     pub row: Row,
-    /// The database's words.
+    /// The database's error message.
     pub why: String,
 }
 
@@ -47,7 +49,7 @@ fn rows(changes: &Changes) -> Vec<Row> {
         .collect()
 }
 
-/// A change set of these rows alone.
+/// Returns a change set of these rows alone.
 fn only(changes: &Changes, rows: &[Row]) -> Changes {
     let mut part = Changes::default();
     for row in rows {
@@ -67,16 +69,17 @@ fn only(changes: &Changes, rows: &[Row]) -> Changes {
     part
 }
 
-/// The rows of `changes` that the database refuses, in the order of the set; none where it is something else that it refuses.
+/// Returns the rows of `changes` that the database rejects, in the order of the set. The list is
+/// empty if the rejection has another cause.
 ///
 /// # Errors
-/// The catalog cannot be asked.
+/// The catalog cannot be queried.
 pub async fn culprits(
     catalog: &dyn Catalog,
     changes: &Changes,
 ) -> Result<Vec<Culprit>, CatalogError> {
     let mut found = Vec::new();
-    // The last is looked at first, so the second half goes in before the first.
+    // The stack's top is tried first, so the second half is pushed before the first.
     let mut suspects = vec![rows(changes)];
     while let Some(mut rows) = suspects.pop() {
         if rows.is_empty() {
@@ -96,13 +99,14 @@ pub async fn culprits(
     Ok(found)
 }
 
-/// What a trial of a change set shows: the words of a refusal, if it was refused by its content.
+/// Returns the reason of a rejection, if the trial of a change set was rejected because of its
+/// content.
 ///
 /// # Errors
 /// The trial itself failed.
 pub fn verdict(tried: Result<(), CatalogError>) -> Result<Option<String>, CatalogError> {
     match tried {
-        // Whether another result is there already, the commit finds.
+        // A conflict with another result is detected by the commit.
         Ok(()) | Err(CatalogError::Conflict(_)) => Ok(None),
         Err(CatalogError::Refused { what, .. }) => Ok(Some(what)),
         Err(error) => Err(error),

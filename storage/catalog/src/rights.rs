@@ -1,4 +1,4 @@
-//! Whose jobs are, who may see them, and the record of who did what.
+//! Job owners, visibility of jobs, and the audit log.
 
 use async_trait::async_trait;
 use picofarm_proto::{
@@ -8,12 +8,12 @@ use picofarm_proto::{
 
 use crate::{CatalogError, Job, ResultSet};
 
-/// Of whom a job is.
+/// The owner of a job.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Owner {
     /// Name of the caller that submitted it.
     pub user: String,
-    /// Its project; empty = none.
+    /// The owner's project; empty if there is none.
     pub project: String,
 }
 
@@ -26,36 +26,37 @@ impl From<&Job> for Owner {
     }
 }
 
-/// A folder of a store into which jobs write, and whose it is: the first submitter's.
+/// A folder of a store into which jobs write. It is owned by the first submitter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OwnedPlace {
     /// Its normal form (`picofarm_proto::model::Place`).
     pub place: String,
-    /// It is a named record in a data set, which may be another user's; otherwise a folder with everything in it.
+    /// Whether the place is a named record in a data set, which may have another owner; otherwise
+    /// it is a folder with all of its content.
     pub record: bool,
-    /// Whose it is.
+    /// The owner.
     pub owner: Owner,
     /// The owner's latest job that writes there.
     pub job: JobId,
 }
 
-/// Whose jobs a reader may see.
+/// The jobs that a reader may see.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Sight {
-    /// Everybody's.
+    /// All jobs.
     #[default]
     All,
-    /// One's own and those of some projects.
+    /// The reader's own jobs and those of some projects.
     Of {
         /// Name of the reader.
         user: String,
-        /// Names of projects, none of which holds a comma.
+        /// Names of projects; none contains a comma.
         projects: Vec<String>,
     },
 }
 
 impl Sight {
-    /// Whether a job of this owner may be seen.
+    /// Returns whether a job of this owner is visible.
     pub fn sees(&self, owner: &Owner) -> bool {
         match self {
             Self::All => true,
@@ -67,58 +68,61 @@ impl Sight {
     }
 }
 
-/// A line for the audit log; its sequence number is given by the catalog.
+/// A new entry of the audit log; the catalog assigns its sequence number.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewAudit {
     /// Unix time, milliseconds.
     pub at_ms: i64,
     /// Name of the caller, without NUL.
     pub who: String,
-    /// What was done or attempted.
+    /// The action that was taken or attempted.
     pub act: Act,
-    /// The job, where it concerns one.
+    /// The job concerned, if any.
     pub job: Option<JobId>,
-    /// What became of it.
+    /// The outcome of the action.
     pub outcome: Outcome,
-    /// In words, without NUL.
+    /// A message for people, without NUL.
     pub detail: String,
 }
 
-/// Which part of the audit log.
+/// A query of the audit log.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct AuditQuery {
-    /// Only lines with smaller sequence numbers.
+    /// Only entries with smaller sequence numbers.
     pub before: Option<u64>,
-    /// At most so many.
+    /// The maximum number of entries.
     pub limit: u32,
-    /// Only acts of this caller.
+    /// Only actions of this caller.
     pub who: Option<String>,
-    /// Only acts on this job.
+    /// Only actions on this job.
     pub job: Option<JobId>,
 }
 
-/// Whose jobs are, and who did what. The log is independent of coordinators' lives and of forgotten jobs.
+/// Owners of jobs, and the audit log. The log does not depend on the lives of coordinators, and it
+/// outlives deleted jobs.
 ///
 /// # Errors
-/// All methods give a [`CatalogError`] when the database cannot be read or written; then nothing changed.
+/// All methods return a [`CatalogError`] if the database cannot be read or written; in that case
+/// nothing has changed.
 #[async_trait]
 pub trait Rights: Send + Sync + 'static {
-    /// Of whom a job is; `None` where there is no such job.
+    /// Returns the owner of a job, or `None` if there is no such job.
     async fn owner(&self, job: JobId) -> Result<Option<Owner>, CatalogError>;
 
-    /// The owned places that are equal to this one, lie in it, or enclose it, by their normal form. Those of jobs that ended
-    /// without any result are left out.
+    /// Returns the owned places that are equal to this one, inside it, or around it, compared in
+    /// normal form. Places of jobs that ended without any result are omitted.
     async fn owned_near(&self, place: &str) -> Result<Vec<OwnedPlace>, CatalogError>;
 
-    /// Number of tasks of a user's largest stage with these results; 0 = the user has none.
+    /// Returns the number of tasks of the user's largest stage with these results, or 0 if there is
+    /// none.
     async fn largest_stage(&self, set: &ResultSet, user: &str) -> Result<u64, CatalogError>;
 
-    /// Appends lines to the audit log, all of them or none.
+    /// Appends entries to the audit log, all of them or none.
     async fn audit(&self, lines: &[NewAudit]) -> Result<(), CatalogError>;
 
-    /// Lines of the audit log, newest first.
+    /// Returns entries of the audit log, newest first.
     async fn audited(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, CatalogError>;
 
-    /// Removes lines older than this Unix time (milliseconds); returns how many.
+    /// Deletes entries older than this Unix time (milliseconds). Returns their number.
     async fn forget_audit(&self, before_ms: i64) -> Result<u64, CatalogError>;
 }

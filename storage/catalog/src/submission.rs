@@ -1,31 +1,33 @@
-//! A job as it is recorded, and recorded outputs as a store is asked about them.
+//! Submissions of jobs, and the comparison of recorded outputs with a store.
 
 use crate::{Job, NewEvent, OwnedPlace, Range, RangeState, ResultSet, Run, StageRecord};
 use picofarm_proto::ids::JobId;
 
-/// What becomes durable when a job is submitted.
+/// The data that is committed when a job is submitted.
 #[derive(Debug, Clone, Copy)]
 pub struct Submission<'a> {
     /// The job.
     pub job: &'a Job,
-    /// Its stages, as [`Job::stages`] gives them: hashing a large spec takes seconds, and must not happen in a transaction.
+    /// The job's stages, from [`Job::stages`]. They are computed before the transaction, because
+    /// hashing a large spec takes seconds.
     pub stages: &'a [StageRecord],
-    /// How it is laid out: ranges that are nobody's. Each output of a range that is done must be recorded as checked.
+    /// The job's initial ranges, all unowned. Each output of a done range must be recorded as
+    /// checked.
     pub ranges: &'a [Range],
-    /// The first lines of its history.
+    /// The first events of the job's history.
     pub events: &'a [NewEvent],
-    /// Outputs that are recorded and that the store does not hold: the records go.
+    /// Recorded outputs that the store does not have; their records are deleted.
     pub gone: &'a [Gone],
-    /// A job with the same spec that is done and whose results are gone: this one takes its place.
+    /// A done job with the same spec and lost results, which this job replaces.
     pub instead_of: Option<JobId>,
-    /// The places that the job writes into and that become its submitter's.
+    /// The places that the job writes into and that its submitter will own.
     pub places: &'a [OwnedPlace],
-    /// Normal forms of others' places near those, which the submitter may write into.
+    /// Normal forms of overlapping places of other owners, which the submitter may write into.
     pub permitted: &'a [String],
 }
 
 impl<'a> Submission<'a> {
-    /// A job that replaces nothing.
+    /// Returns a submission that replaces no job.
     pub fn new(
         job: &'a Job,
         stages: &'a [StageRecord],
@@ -44,7 +46,7 @@ impl<'a> Submission<'a> {
         }
     }
 
-    /// The tasks that are laid out as done, by result set.
+    /// Returns the tasks laid out as done, by result set.
     pub fn done(&self) -> Vec<(&'a ResultSet, Run)> {
         let done = self
             .ranges
@@ -62,36 +64,36 @@ impl<'a> Submission<'a> {
     }
 }
 
-/// What came of a submission.
+/// The outcome of a submission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     /// The job is recorded.
     New,
-    /// A job with the same spec is active or done; nothing is recorded.
+    /// A job with the same spec is active or done; nothing was recorded.
     Exists,
-    /// An output that the layout counts on is no longer recorded as checked, or a place has become another's; nothing is
-    /// recorded. Plan again.
+    /// An output of a done range is no longer recorded as checked, or another user now owns a
+    /// place; nothing was recorded. The caller must plan again.
     Changed,
 }
 
-/// An output that is recorded.
+/// A recorded output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Recorded {
     /// Task index.
     pub task: u64,
-    /// SHA-256 of the manifest, as a worker reported it.
+    /// SHA-256 of the manifest, as reported by a worker.
     pub manifest: [u8; 32],
-    /// The store was found to hold this manifest.
+    /// Whether the store is known to have this manifest.
     pub checked: bool,
 }
 
 /// A recorded output that is not in the store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Gone {
-    /// Whose result it is.
+    /// The result set of the output.
     pub set: ResultSet,
     /// Task index.
     pub task: u64,
-    /// The manifest that was looked for: a record of another one stays.
+    /// The missing manifest; a record with another manifest is left unchanged.
     pub manifest: [u8; 32],
 }

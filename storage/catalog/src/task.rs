@@ -1,4 +1,4 @@
-//! Single tasks: what they made, and how they failed.
+//! Single tasks: their outputs and failures.
 
 use picofarm_proto::ids::{Epoch, StageRef};
 
@@ -7,21 +7,21 @@ use crate::range::Range;
 /// A committed result.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Output {
-    /// The stage under which it was committed; its result set owns the output.
+    /// The stage under which it was committed; its result set has the output.
     pub stage: StageRef,
     /// Task index.
     pub task: u64,
     /// SHA-256 of the manifest.
     pub manifest: [u8; 32],
-    /// Bytes published.
+    /// Size of the published objects in bytes.
     pub bytes: u64,
-    /// Seconds it took.
+    /// Duration of the task in seconds.
     pub seconds: f64,
     /// The lease's epoch.
     pub epoch: Epoch,
-    /// Found in the store and not computed.
+    /// Whether it was found in the store instead of computed.
     pub adopted: bool,
-    /// The store was found to hold this manifest.
+    /// Whether the store is known to have this manifest.
     pub checked: bool,
 }
 
@@ -32,27 +32,27 @@ pub struct Exception {
     pub stage: StageRef,
     /// Task index.
     pub task: u64,
-    /// Failures of the task's own.
+    /// Number of failures of the task itself.
     pub failures: u32,
-    /// Workers lost while they ran it.
+    /// Number of workers lost while they ran it.
     pub crashes: u32,
-    /// Attempts that a worker gave back half-way.
+    /// Number of unfinished attempts that workers gave back.
     pub interruptions: u32,
-    /// The longest attempt that did not end, milliseconds.
+    /// Duration of the longest unfinished attempt in milliseconds.
     pub longest_ms: u64,
-    /// Given up.
+    /// Whether the task was given up.
     pub dead: bool,
-    /// The last failure, in words.
+    /// Message of the last failure.
     pub last_error: String,
 }
 
-/// All that is known of one task.
+/// The record of one task.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TaskRecord {
-    /// The range that has it; `None` where its job was stopped.
+    /// The range with the task; `None` if its job was cancelled.
     pub range: Option<Range>,
-    /// Its failures.
+    /// The task's failures.
     pub exception: Option<Exception>,
-    /// Its result.
+    /// The task's result.
     pub output: Option<Output>,
 }

@@ -1,20 +1,20 @@
-//! When stages may begin and when a job is over. Pure.
+//! Computes when stages may begin and when a job is over. Pure functions.
 
 use picofarm_proto::model::{JobState, StageState, TaskCounts};
 
-/// A stage as it is stored, with its tasks counted.
+/// A stored stage, with its tasks counted.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Node {
-    /// Positions of the stages that it needs, all of them before it.
+    /// Positions of the stages that it depends on, all smaller than its own.
     pub needs: Vec<u32>,
-    /// It begins although tasks of those were given up.
+    /// Whether it begins even if tasks of those stages were given up.
     pub tolerate_dead: bool,
-    /// Its tasks.
+    /// The number of its tasks in each state.
     pub counts: TaskCounts,
 }
 
-/// Where each stage stands, and the job's end if it has come: nothing is leased, and nothing that is pending can ever
-/// begin.
+/// Returns the state of each stage, and the job's final state if it has ended. A job has ended when
+/// nothing is leased and no pending task can ever begin.
 pub(crate) fn states(nodes: &[Node]) -> (Vec<StageState>, Option<JobState>) {
     let mut states: Vec<StageState> = Vec::with_capacity(nodes.len());
     for node in nodes {
@@ -99,7 +99,7 @@ mod tests {
         assert_eq!(now[1..], [StageState::Done, StageState::Open]);
     }
 
-    /// A node whose needs are not chosen yet.
+    /// Generates a node without its dependencies.
     fn one() -> impl Strategy<Value = (Vec<prop::sample::Index>, Node)> {
         let needs = prop::collection::vec(any::<prop::sample::Index>(), 0..3);
         let counts = (0u64..3, 0u64..3, 0u64..2, 0u64..2);
@@ -116,7 +116,7 @@ mod tests {
     fn nodes() -> impl Strategy<Value = Vec<Node>> {
         prop::collection::vec(one(), 1..8).prop_map(|all| {
             let choose = |(i, (needs, mut node)): (usize, (Vec<prop::sample::Index>, Node))| {
-                // Of those before it; the first has none.
+                // A node depends on earlier nodes only; the first one has none.
                 let needs = needs.iter().filter(|_| i > 0);
                 node.needs = needs.map(|n| n.index(i) as u32).collect();
                 node

@@ -1,5 +1,5 @@
-//! The databases behind [`picofarm_catalog::Catalog`]: SQLite for one coordinator and, with the feature `postgres`, Postgres
-//! for several. Rows never leave this crate.
+//! Implementations of [`picofarm_catalog::Catalog`]: SQLite for one coordinator and, with the
+//! feature `postgres`, Postgres for several. Rows never leave this crate.
 
 mod graph;
 mod listing;

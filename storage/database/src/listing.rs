@@ -1,13 +1,13 @@
-//! What the list of jobs and forgetting ask of both databases.
+//! Code shared by both databases for the job list and for the deletion of old jobs.
 
 use uuid::Uuid;
 
-/// Jobs or result sets looked at in one transaction of forgetting.
+/// The number of jobs or result sets examined in one deletion transaction.
 pub(crate) const JOBS: i64 = 200;
-/// Rows removed in one, at most: some ten milliseconds.
+/// The maximum number of rows deleted in one transaction, which takes about ten milliseconds.
 pub(crate) const ROWS: i64 = 4_000;
 
-/// The first and the last id that begin with this text, if it begins one.
+/// Returns the first and the last id with this prefix, if it is a prefix of an id.
 pub(crate) fn ids(text: &str) -> Option<(Uuid, Uuid)> {
     let digits: String = text.chars().filter(|c| *c != '-').collect();
     let hex =

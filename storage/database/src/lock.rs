@@ -1,5 +1,6 @@
-//! One coordinator for one SQLite catalog: an exclusive lock on a file beside the database. The system
-//! releases it when the process ends, however it ends.
+//! Ensures that one SQLite catalog has one coordinator, with an exclusive lock on a file next to
+//! the database. The operating system releases the lock when the process ends, even if it is
+//! killed.
 
 use std::{
     fs::{File, OpenOptions, TryLockError},
@@ -9,14 +10,14 @@ use std::{
 
 use picofarm_catalog::CatalogError;
 
-/// Held while the catalog is open.
+/// A lock held while the catalog is open.
 #[derive(Debug)]
 pub(crate) struct CatalogLock(
     #[expect(dead_code, reason = "the lock lives as long as the file")] File,
 );
 
 impl CatalogLock {
-    /// Takes the lock of the database at `path` for `holder`, words that tell people who has it.
+    /// Locks the database at `path`. `holder` is a description of this process for people.
     pub(crate) fn take(path: &Path, holder: &str) -> Result<Self, CatalogError> {
         let mut lock_path = path.as_os_str().to_owned();
         lock_path.push(".lock");
@@ -32,7 +33,7 @@ impl CatalogLock {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 let mut text = String::new();
-                // Who holds it is a courtesy; the lock itself is the fact.
+                // The name of the holder is informative only; the lock itself decides.
                 let _ = file.read_to_string(&mut text);
                 let holder = match text.trim() {
                     "" => "unknown".to_owned(),

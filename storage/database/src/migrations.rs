@@ -1,5 +1,6 @@
-//! The steps that bring a database's schema up to date. They are listed here, and not found by a macro in their folder: that
-//! macro connects the whole of SQLx to the compiler, which is most of what SQLx costs a build.
+//! The steps that upgrade a database's schema. They are listed here, because sqlx's macro that
+//! reads a folder of steps links all of sqlx into the compiler, which is most of sqlx's share of
+//! the build time.
 
 use std::sync::LazyLock;
 
@@ -22,7 +23,7 @@ macro_rules! steps {
     };
 }
 
-// Append only: a database remembers the checksum of every step it has run.
+// This list is append-only, because a database stores the checksum of every step it has run.
 const SQLITE_STEPS: &[Step] = steps!("sqlite":
     1 "0001_init",
     2 "0002_stages",
@@ -43,13 +44,13 @@ const POSTGRES_STEPS: &[Step] = steps!("postgres":
     8 "0008_interruptions",
 );
 
-/// For SQLite.
+/// The migrations for SQLite.
 pub(crate) static SQLITE: LazyLock<Migrator> = LazyLock::new(|| migrator(SQLITE_STEPS));
-/// For Postgres.
+/// The migrations for Postgres.
 #[cfg(feature = "postgres")]
 pub(crate) static POSTGRES: LazyLock<Migrator> = LazyLock::new(|| migrator(POSTGRES_STEPS));
 
-/// Each step in a transaction of its own.
+/// Returns a migrator that runs each step in its own transaction.
 fn migrator(steps: &[Step]) -> Migrator {
     let steps = steps.iter().map(|&(version, name, statements)| {
         let statements = statements.into_sql_str();
@@ -66,21 +67,21 @@ fn migrator(steps: &[Step]) -> Migrator {
     Migrator::with_migrations(steps.collect())
 }
 
-/// The latest version that a program knows.
+/// Returns the latest version that a program knows.
 pub(crate) fn latest(migrator: &Migrator) -> i64 {
     migrator.iter().map(|m| m.version).max().unwrap_or(0)
 }
 
-/// A first step as it was once committed, before steps were append-only.
+/// A first step that was committed before steps were append-only.
 pub(crate) struct FormerStep {
-    /// SHA-384 of its text, as the database remembers it.
+    /// SHA-384 of its text, as stored in the database.
     pub checksum: &'static str,
-    /// The statements that lead from its schema to today's first step.
+    /// The statements that upgrade from its schema to the current first step.
     pub upgrade: &'static str,
 }
 
 impl FormerStep {
-    /// Whether a database that remembers this checksum began with the former step.
+    /// Returns whether a database with this checksum began with the former step.
     pub(crate) fn matches(&self, checksum: &[u8]) -> bool {
         let hex: String = checksum.iter().map(|b| format!("{b:02x}")).collect();
         hex == self.checksum
@@ -92,19 +93,19 @@ pub(crate) const SQLITE_FORMER: FormerStep = FormerStep {
     checksum: "fd97ccc6a63d384b6f25a036178ea94d141da56f2a9aa38d0dbdb07d912de7042b7582aacb2274f0665cc57da2a31598",
     upgrade: include_str!("../migrations/former/sqlite_upgrade.sql"),
 };
-/// Postgres' first step in the same days.
+/// Postgres' first step in the same period.
 #[cfg(feature = "postgres")]
 pub(crate) const POSTGRES_FORMER: FormerStep = FormerStep {
     checksum: "29293c1424666f89f845bc2915996943590bc31d5e31e3052da3b239efe5d7b6957ade6534cf81d74883f8186e417d66",
     upgrade: include_str!("../migrations/former/postgres_upgrade.sql"),
 };
 
-/// The checksum of the first step, which replaces a former one's after the upgrade.
+/// Returns the checksum of the first step, which replaces the former one after the upgrade.
 pub(crate) fn first_checksum(migrator: &Migrator) -> &[u8] {
     migrator.iter().next().map_or(&[], |first| &first.checksum)
 }
 
-/// The error for a migration that failed; `classify` handles the database's own errors.
+/// Returns the error for a failed migration. `classify` converts the database's own errors.
 pub(crate) fn failed(
     place: String,
     migrator: &Migrator,

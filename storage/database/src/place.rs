@@ -1,4 +1,4 @@
-//! Where a catalog is: a SQLite file or a Postgres database.
+//! The location of a catalog: a SQLite file or a Postgres database.
 
 use std::{convert::Infallible, fmt, path::PathBuf, str::FromStr, sync::Arc};
 
@@ -8,20 +8,20 @@ use crate::SqliteCatalog;
 use async_trait::async_trait;
 use picofarm_catalog::{Catalog, CatalogError, CatalogSource};
 
-/// The place of a catalog. Its texts never show the password of a URL.
+/// The location of a catalog. Its texts never show the password of a URL.
 #[derive(Clone, PartialEq, Eq)]
 pub enum CatalogPlace {
-    /// A SQLite file, for one coordinator.
+    /// A SQLite file, used by one coordinator.
     Sqlite(PathBuf),
-    /// The URL of a Postgres database, for several.
+    /// The URL of a Postgres database, shared by several coordinators.
     Postgres(String),
 }
 
 #[async_trait]
 impl CatalogSource for CatalogPlace {
     /// # Errors
-    /// As `open` of [`SqliteCatalog`] and `PostgresCatalog`; [`CatalogError::NotBuilt`] for Postgres without the feature
-    /// `postgres`.
+    /// The errors of [`SqliteCatalog`]'s and `PostgresCatalog`'s `open`; [`CatalogError::NotBuilt`]
+    /// for Postgres if the feature `postgres` is disabled.
     async fn open(&self, holder: &str) -> Result<Arc<dyn Catalog>, CatalogError> {
         Ok(match self {
             Self::Sqlite(path) => Arc::new(SqliteCatalog::open(path, holder).await?),
@@ -39,7 +39,8 @@ impl CatalogSource for CatalogPlace {
 impl FromStr for CatalogPlace {
     type Err = Infallible;
 
-    /// A URL with the scheme `postgres` or `postgresql`, else a path.
+    /// Parses a text with the scheme `postgres` or `postgresql` as a URL, and any other text as a
+    /// path.
     fn from_str(text: &str) -> Result<Self, Infallible> {
         let postgres = ["postgres://", "postgresql://"];
         Ok(if postgres.iter().any(|scheme| text.starts_with(scheme)) {
@@ -61,7 +62,7 @@ impl fmt::Display for CatalogPlace {
         match self {
             Self::Sqlite(path) => path.display().fmt(f),
             Self::Postgres(url) => {
-                // Between the scheme and the last @ before the path stand user and password.
+                // User and password are between the scheme and the last @ before the path.
                 let (scheme, rest) = url.split_once("://").unwrap_or(("postgres", url));
                 let (address, path) = rest.split_at(rest.find(['/', '?']).unwrap_or(rest.len()));
                 let address = match address.rsplit_once('@') {

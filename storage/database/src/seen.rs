@@ -1,10 +1,10 @@
-//! Who may see a job, as a condition of SQL.
+//! The SQL condition that a reader may see a job.
 
 use std::borrow::Cow;
 
 use picofarm_catalog::Sight;
 
-/// What [`seen!`] compares the columns of a job with.
+/// Returns the values that [`seen!`] compares a job's columns with.
 pub(crate) fn columns(sight: &Sight) -> [Cow<'static, str>; 3] {
     match sight {
         Sight::All => ["all".into(), "".into(), "".into()],
@@ -16,8 +16,8 @@ pub(crate) fn columns(sight: &Sight) -> [Cow<'static, str>; 3] {
     }
 }
 
-/// The condition that a job may be seen, given the names of three arguments ([`columns`]). Both databases
-/// understand it: neither has arrays and `replace` is in both.
+/// The condition that a job is visible, given the names of three arguments ([`columns`]). Both
+/// databases understand it: it uses `replace` and no arrays, which SQLite does not have.
 macro_rules! seen {
     ($all:literal, $user:literal, $projects:literal) => {
         concat!(

@@ -1,11 +1,12 @@
-//! What SQLite and Postgres have in common: the codes in columns, and the queries, whose text both understand. The
-//! queries are a macro over the database's types because sqlx has no common type for a connection.
+//! Code shared by SQLite and Postgres: the codes in columns, and queries with SQL text that both
+//! understand. The queries are a macro over the database's types, because sqlx has no common type
+//! for a connection.
 
 use picofarm_proto::model::{EventKind, JobState, StageState};
 
 use picofarm_catalog::Mark;
 
-/// A column that holds what no version of this program wrote.
+/// Returns the error for a column with a value that no version of this program writes.
 pub(crate) fn bad(column: &'static str, what: impl std::fmt::Display) -> sqlx::Error {
     sqlx::Error::ColumnDecode {
         index: column.into(),
@@ -13,16 +14,16 @@ pub(crate) fn bad(column: &'static str, what: impl std::fmt::Display) -> sqlx::E
     }
 }
 
-/// The databases' integers are signed. Numbers that are written are below 2^63, see [`writable`]; one that is only asked for
-/// and is not stands for one that is nowhere.
+/// Converts a number to the databases' signed integers. Written numbers are below 2^63, see
+/// [`writable`]. A larger number in a query becomes the maximum, which no row has.
 pub(crate) fn int(value: u64) -> i64 {
     i64::try_from(value).unwrap_or(i64::MAX)
 }
 
-/// Whether all numbers of the outputs can be written as they are.
+/// Checks that all numbers of the outputs can be written exactly.
 ///
 /// # Errors
-/// The database's answer to one that cannot.
+/// The error that the database would return.
 pub(crate) fn writable(outputs: &[picofarm_catalog::Output]) -> Result<(), sqlx::Error> {
     for output in outputs {
         let most = i64::MAX as u64;
@@ -70,7 +71,7 @@ pub(crate) fn stage_state(code: i64) -> Result<StageState, sqlx::Error> {
         .ok_or_else(|| bad("state", code))
 }
 
-/// The stages that a stage needs, as they are stored: ordinals with commas between.
+/// Returns the stored form of the stages that a stage needs: ordinals separated by commas.
 pub(crate) fn needs_text(needs: &[u32]) -> String {
     let needs: Vec<String> = needs.iter().map(u32::to_string).collect();
     needs.join(",")
@@ -136,7 +137,7 @@ pub(crate) fn mark(byte: u8) -> Result<Mark, sqlx::Error> {
     })
 }
 
-/// A range's columns but id, stage, lo, hi, epoch and crashes.
+/// The columns of a range except id, stage, lo, hi, epoch and crashes.
 pub(crate) struct StateColumns {
     pub state: i64,
     pub not_before_ms: Option<i64>,
@@ -182,10 +183,10 @@ impl From<&picofarm_catalog::RangeState> for StateColumns {
     }
 }
 
-/// Checks that outputs that could not be written are there with the same manifests.
+/// Checks that outputs that already existed have the same manifests.
 ///
 /// # Errors
-/// What differs, in words.
+/// A description of the difference.
 pub(crate) fn equal_manifests(
     outputs: &[picofarm_catalog::Output],
     there: &[Option<[u8; 32]>],
@@ -201,10 +202,10 @@ pub(crate) fn equal_manifests(
     Ok(())
 }
 
-/// The words for a job that cannot become active again.
+/// The message for a job that cannot become active again.
 pub(crate) const LATER_JOB: &str = "another job with the same spec is active or done";
 
-/// A query of the history: which job, in which order.
+/// The text of a history query, for a job condition and an order.
 macro_rules! history {
     ($job:literal, $order:literal) => {
         concat!(
@@ -223,7 +224,8 @@ macro_rules! history {
 }
 pub(crate) use history;
 
-/// The queries, for one database: `queries!(SqliteConnection, SqliteRow)` makes a module `query`.
+/// Defines the queries for one database: `queries!(SqliteConnection, SqliteRow)` generates a module
+/// `query`.
 macro_rules! queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod query {
@@ -255,7 +257,7 @@ macro_rules! queries {
                 })
             }
 
-            /// A row of `task_range` with its stage's `job_id` and `ordinal`.
+            /// Parses a row of `task_range` with its stage's `job_id` and `ordinal`.
             pub(crate) fn range(row: &DbRow) -> Result<Range> {
                 let state = match row.try_get::<i64, _>("state")? {
                     sql::PENDING => RangeState::Pending {
@@ -304,7 +306,7 @@ macro_rules! queries {
                     .collect()
             }
 
-            /// Failures of the tasks in these ranges.
+            /// Returns the failures of the tasks in these ranges.
             pub(crate) async fn exceptions(c: &mut Connection, ranges: &[Range]) -> Result<Vec<Exception>> {
                 let mut found = Vec::new();
                 for range in ranges {
@@ -326,8 +328,9 @@ macro_rules! queries {
                 Ok(found)
             }
 
-            /// Runs of tasks in `lo..hi` whose outputs exist and were checked, by gaps and islands: within a run, task
-            /// minus its rank is constant. What a worker reported and nobody has looked at counts for no other job.
+            /// Returns runs of tasks in `lo..hi` with existing, checked outputs. The query uses
+            /// gaps and islands: within a run, the task minus its rank is constant. An output that
+            /// a worker reported but nobody has checked is not reused by another job.
             pub(crate) async fn runs_of_stage(c: &mut Connection, stage: StageRef, lo: u64, hi: u64) -> Result<Vec<Run>> {
                 let rows = sqlx::query(
                     "SELECT min(task) AS lo, max(task) + 1 AS hi FROM ( \
@@ -386,7 +389,7 @@ macro_rules! queries {
                     .collect()
             }
 
-            /// How many outputs of these tasks are recorded as checked.
+            /// Returns how many outputs of these tasks are recorded as checked.
             pub(crate) async fn checked(c: &mut Connection, set: &ResultSet, run: Run) -> Result<u64> {
                 let row = sqlx::query(
                     "SELECT count(*) AS outputs FROM output WHERE result_set = \
@@ -403,7 +406,7 @@ macro_rules! queries {
                 uint(&row, "outputs")
             }
 
-            /// Notes that the store holds an output as it is recorded.
+            /// Marks an output as found in the store.
             pub(crate) async fn mark_checked(c: &mut Connection, set: &ResultSet, output: &Recorded) -> Result<()> {
                 sqlx::query(
                     "UPDATE output SET checked = $6 WHERE result_set = \
@@ -421,7 +424,8 @@ macro_rules! queries {
                 Ok(())
             }
 
-            /// Drops the record of an output; `false` where there is none with this manifest.
+            /// Deletes the record of an output. Returns `false` if there is none with this
+            /// manifest.
             pub(crate) async fn drop_output(c: &mut Connection, gone: &Gone) -> Result<bool> {
                 let dropped = sqlx::query(
                     "DELETE FROM output WHERE result_set = \
@@ -507,7 +511,8 @@ macro_rules! queries {
                     })
                 });
                 Ok(TaskRecord {
-                    // A task that left a lease has a range of its own, beside the lease that it left.
+                    // A task that left a lease is in two ranges: its own, and the lease with the
+                    // mark `Left`.
                     range: ranges.into_iter().find(|range| match &range.state {
                         RangeState::Leased(lease) => {
                             lease.marks.get((task - range.lo) as usize) != Some(&Mark::Left)
@@ -533,7 +538,7 @@ macro_rules! queries {
                         Some(key)
                     }
                 };
-                // Four texts, so that each has an index that fits.
+                // There are four query texts, so that each can use a matching index.
                 let text = match (job, query.newest) {
                     (Some(_), false) => history!("event.job = $4", "ORDER BY sequence"),
                     (Some(_), true) => history!("event.job = $4", "ORDER BY sequence DESC"),

@@ -1,7 +1,8 @@
-//! The queries about jobs and stages, for one database: `job_queries!(SqliteConnection, SqliteRow)` makes a module
-//! `job_query` beside `query` (see [`crate::sql`]).
+//! Queries about jobs and stages, for one database: `job_queries!(SqliteConnection, SqliteRow)`
+//! generates a module `job_query`, which uses the module `query` (see [`crate::sql`]).
 
-/// The jobs with a stage in the data set `$2` of the store `$1` that are active or have written something.
+/// The condition for jobs with a stage in the data set `$2` of the store `$1` that are active or
+/// have written something.
 macro_rules! at {
     () => {
         "key IN (SELECT stage.job FROM stage \
@@ -54,7 +55,7 @@ macro_rules! job_queries {
                 rows.iter().map(job).collect()
             }
 
-            /// The active jobs, and whether they are held.
+            /// Returns the active jobs, and whether each is paused.
             pub(crate) async fn active(c: &mut Connection) -> Result<BTreeMap<JobId, bool>> {
                 let rows = sqlx::query("SELECT id, paused FROM job WHERE state = 0")
                     .fetch_all(c)
@@ -64,7 +65,7 @@ macro_rules! job_queries {
                     .collect()
             }
 
-            /// Pending tasks of open stages of active jobs that are nobody's.
+            /// Returns the unowned pending tasks of open stages of active jobs.
             pub(crate) async fn free(c: &mut Connection, now_ms: i64) -> Result<BTreeMap<StageRef, Free>> {
                 let rows = sqlx::query(concat!(
                     "SELECT job.id AS job_id, stage.ordinal, ",
@@ -82,7 +83,7 @@ macro_rules! job_queries {
                     .collect()
             }
 
-            /// The tasks of one stage that are nobody's.
+            /// Returns the unowned tasks of one stage.
             pub(crate) async fn free_of_stage(c: &mut Connection, key: i64, now_ms: i64) -> Result<Free> {
                 let row = sqlx::query(concat!(
                     "SELECT ",
@@ -125,7 +126,7 @@ macro_rules! job_queries {
                 })
             }
 
-            /// A job with its counts.
+            /// Returns a job with its counts.
             pub(crate) async fn record(c: &mut Connection, id: JobId) -> Result<Option<JobRecord>> {
                 let row = sqlx::query("SELECT * FROM job WHERE id = $1")
                     .bind(id.uuid())
@@ -148,14 +149,14 @@ macro_rules! job_queries {
                     timing: Timing {
                         tasks: uint(&row, "timed")?,
                         seconds: row.try_get("seconds")?,
-                        // A job's record keeps no bytes; the outputs have them.
+                        // A job's row has no total size; only its outputs do.
                         bytes: 0.0,
                     },
                     unverified: unverified(c, key).await?,
                 }))
             }
 
-            /// Results of a job that its store was not found to hold.
+            /// Returns the number of a job's results that were not found in their store.
             async fn unverified(c: &mut Connection, key: i64) -> Result<u64> {
                 let row = sqlx::query(
                     "SELECT count(*) AS results FROM stage JOIN output ON output.result_set = stage.result_set \
@@ -168,7 +169,7 @@ macro_rules! job_queries {
                 uint(&row, "results")
             }
 
-            /// The stages of a job that has ended, whose counts are final.
+            /// Returns the stages of a job that has ended, with their final counts.
             async fn final_stages(c: &mut Connection, key: i64) -> Result<Vec<StageCounts>> {
                 let rows = sqlx::query("SELECT * FROM stage WHERE job = $1 ORDER BY ordinal")
                     .bind(key)
@@ -192,7 +193,7 @@ macro_rules! job_queries {
                 rows.iter().map(stage).collect()
             }
 
-            /// The stages of a job with their tasks counted, in order.
+            /// Returns the stages of a job in order, with their tasks counted.
             async fn nodes(c: &mut Connection, key: i64) -> Result<Vec<(StageCounts, Node)>> {
                 let mut counts: BTreeMap<i64, TaskCounts> = BTreeMap::new();
                 let rows = sqlx::query(
@@ -260,9 +261,10 @@ macro_rules! job_queries {
                     .collect()
             }
 
-            /// Opens the stages of an active job that may begin, and ends the job if it is over; with the lines for its
-            /// history. The caller holds the job's row, so that of two instances that finish their last tasks at once the
-            /// second sees what the first wrote.
+            /// Opens the stages of an active job that may begin, and ends the job if it is over.
+            /// Returns these changes with the events for the history. The caller must lock the
+            /// job's row, so that if two instances finish their last tasks at the same time, the
+            /// second sees the changes of the first.
             pub(crate) async fn settle(
                 c: &mut Connection,
                 key: i64,
@@ -331,7 +333,7 @@ macro_rules! job_queries {
                 Ok((settled, events))
             }
 
-            /// Whether anything of a stage is pending or leased.
+            /// Returns whether a stage has pending or leased ranges.
             pub(crate) async fn is_open(c: &mut Connection, stage: i64) -> Result<bool> {
                 let open = sqlx::query("SELECT 1 FROM task_range WHERE stage = $1 AND state IN (0, 1) LIMIT 1")
                     .bind(stage)
@@ -340,7 +342,7 @@ macro_rules! job_queries {
                 Ok(open.is_some())
             }
 
-            /// Stops an active job; `false` where it is not active.
+            /// Cancels an active job. Returns `false` if it is not active.
             pub(crate) async fn cancel(c: &mut Connection, key: i64, now_ms: i64) -> Result<bool> {
                 let cancelled =
                     sqlx::query("UPDATE job SET state = $1, ended_ms = $2 WHERE key = $3 AND state = 0")
@@ -352,7 +354,7 @@ macro_rules! job_queries {
                 Ok(cancelled.rows_affected() > 0)
             }
 
-            /// Holds an active job or lets it go on; `false` where that changes nothing.
+            /// Pauses or resumes an active job. Returns `false` if that changes nothing.
             pub(crate) async fn pause(c: &mut Connection, key: i64, paused: bool) -> Result<bool> {
                 let changed = sqlx::query("UPDATE job SET paused = $1 WHERE key = $2 AND state = 0 AND paused <> $1")
                     .bind(paused)
@@ -362,7 +364,7 @@ macro_rules! job_queries {
                 Ok(changed.rows_affected() > 0)
             }
 
-            /// Where a job stands.
+            /// Returns the state of a job.
             pub(crate) async fn state(c: &mut Connection, id: JobId) -> Result<Option<JobState>> {
                 let state: Option<i64> = sqlx::query_scalar("SELECT state FROM job WHERE id = $1")
                     .bind(id.uuid())
@@ -371,7 +373,8 @@ macro_rules! job_queries {
                 state.map(sql::job_state).transpose()
             }
 
-            /// Marks a done job whose results are gone, so that another with its spec may be recorded.
+            /// Marks a done job with lost results, so that another job with the same spec may be
+            /// recorded.
             pub(crate) async fn supersede(c: &mut Connection, id: JobId) -> Result<()> {
                 sqlx::query("UPDATE job SET superseded = $1 WHERE id = $2 AND state = 1")
                     .bind(true)
@@ -381,7 +384,7 @@ macro_rules! job_queries {
                 Ok(())
             }
 
-            /// Active jobs of a user.
+            /// Returns the number of a user's active jobs.
             pub(crate) async fn jobs_of(c: &mut Connection, user: &str) -> Result<u64> {
                 let row = sqlx::query("SELECT count(*) AS jobs FROM job WHERE username = $1 AND state = 0")
                     .bind(user)
@@ -398,10 +401,11 @@ macro_rules! job_queries {
                 row.as_ref().map(job).transpose()
             }
 
-            /// Size of the specs of the latest jobs together, at most: they are in memory at once.
+            /// The maximum total size of the specs of the latest jobs, because they are in memory
+            /// at the same time.
             const RECENT_BYTES: i64 = 16 << 20;
 
-            /// The latest jobs, whatever became of them, the last first.
+            /// Returns the latest jobs in any state, newest first.
             pub(crate) async fn recent(c: &mut Connection, most: u32, sight: &Sight) -> Result<Vec<Job>> {
                 let [all, user, projects] = crate::seen::columns(sight);
                 let text = concat!(
@@ -465,7 +469,7 @@ macro_rules! job_queries {
                 Ok(bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0))
             }
 
-            /// Jobs with a stage in a data set that is active or has written something.
+            /// Returns jobs with a stage in a data set that are active or have written something.
             pub(crate) async fn jobs_at(c: &mut Connection, store: &str, dataset: &str) -> Result<Vec<Job>> {
                 let rows = sqlx::query(concat!("SELECT * FROM job WHERE ", at!(), " ORDER BY key DESC"))
                 .bind(store)
@@ -510,7 +514,7 @@ macro_rules! job_queries {
     };
 }
 
-/// The columns of a [`Free`](picofarm_catalog::Free), at the time of a parameter.
+/// The columns of a [`Free`](picofarm_catalog::Free); the parameter `$now` is the current time.
 macro_rules! free_columns {
     ($now:literal) => {
         concat!(

@@ -1,6 +1,7 @@
-//! The queries that deal with many jobs, for one database: pages of a list, and forgetting. They never read a spec.
-//! `listing_queries!(Sqlite, SqliteConnection, SqliteRow, "")` makes a module `listing_query` beside `job_query`; the last
-//! locks the rows that a query returns, where the database knows such a thing.
+//! Queries on many jobs, for one database: pages of the job list, and deletion of old jobs. They
+//! never read a spec. `listing_queries!(Sqlite, SqliteConnection, SqliteRow, "")` generates a
+//! module `listing_query`, which uses the module `job_query`. The last argument is the clause that
+//! locks the rows of a query, if the database has one.
 
 macro_rules! listing_queries {
     ($database:ty, $connection:ty, $row:ty, $lock:literal) => {
@@ -42,7 +43,7 @@ macro_rules! listing_queries {
                 .bind(all)
                 .bind(user)
                 .bind(projects)
-                // One more, to see whether there are more.
+                // One more row shows whether there is another page.
                 .bind(most + 1)
                 .fetch_all(&mut *c)
                 .await?;
@@ -71,7 +72,7 @@ macro_rules! listing_queries {
                 })
             }
 
-            /// The counts of a job that has ended, which are kept with it.
+            /// Returns the counts of a job that has ended, which are stored in its row.
             fn ended(row: &DbRow) -> Result<TaskCounts> {
                 let (total, done, dead) = (uint(row, "tasks")?, uint(row, "done")?, uint(row, "dead")?);
                 Ok(TaskCounts {
@@ -99,7 +100,7 @@ macro_rules! listing_queries {
                 })
             }
 
-            /// Tasks of these jobs by state, counted from their ranges.
+            /// Returns the number of tasks in each state of these jobs, counted from their ranges.
             async fn counts(c: &mut Connection, jobs: &[i64]) -> Result<BTreeMap<i64, TaskCounts>> {
                 if jobs.is_empty() {
                     return Ok(BTreeMap::new());
@@ -119,9 +120,9 @@ macro_rules! listing_queries {
                 counted(c, whole, leased).await
             }
 
-            /// Tasks of all active jobs by state.
+            /// Returns the number of tasks in each state over all active jobs.
             pub(crate) async fn active_tasks(c: &mut Connection) -> Result<TaskCounts> {
-                // They count as those of one job.
+                // All tasks are counted under one job key.
                 let whole = QueryBuilder::new(
                     "SELECT CAST(0 AS BIGINT) AS job, task_range.state, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM job \
                      JOIN stage ON stage.job = job.key JOIN task_range ON task_range.stage = stage.key \
@@ -136,7 +137,8 @@ macro_rules! listing_queries {
                 Ok(counts.into_values().next().unwrap_or_default())
             }
 
-            /// The counts that two queries give: of ranges by job and state, and of the leased ones by their marks.
+            /// Returns the counts of two queries: of ranges by job and state, and of leased ranges
+            /// by their marks.
             async fn counted(
                 c: &mut Connection,
                 mut whole: QueryBuilder<$database>,
@@ -177,7 +179,7 @@ macro_rules! listing_queries {
                 Ok(counts)
             }
 
-            /// A statement about a list of keys.
+            /// Builds a statement with a list of keys.
             fn of_jobs(before: &str, keys: &[i64], after: &str) -> QueryBuilder<$database> {
                 let mut text = QueryBuilder::new(before);
                 let mut list = text.separated(", ");
@@ -188,8 +190,9 @@ macro_rules! listing_queries {
                 text
             }
 
-            /// Removes some of what is to be forgotten: jobs that ended before this time with their history, and then outputs
-            /// of result sets that no job is left of. Few rows at a time, since others wait.
+            /// Deletes some old records: first jobs that ended before this time, with their
+            /// history, then outputs of result sets without any job. It deletes few rows per call,
+            /// because other writers wait.
             pub(crate) async fn forget(c: &mut Connection, before_ms: i64) -> Result<Forgotten> {
                 let keys: Vec<i64> = sqlx::query_scalar(
                     "SELECT key FROM job WHERE state <> 0 AND ended_ms < $1 ORDER BY ended_ms LIMIT $2",
@@ -202,7 +205,8 @@ macro_rules! listing_queries {
                     return forget_outputs(c).await;
                 }
                 let mut left = crate::listing::ROWS;
-                // A job goes last: where its rows are too many, the rest follows next time.
+                // The job itself is deleted last. If it has too many rows, the next call deletes
+                // the rest.
                 for (before, after) in [
                     (
                         "DELETE FROM event WHERE sequence IN (SELECT sequence FROM event WHERE job IN (",
@@ -249,8 +253,8 @@ macro_rules! listing_queries {
                 if sets.is_empty() {
                     return Ok(Forgotten::default());
                 }
-                // A job that was being recorded when the rows were looked for may have one of them; now that they are locked,
-                // no other can.
+                // A job that was being recorded during the search may use one of the sets. Now that
+                // the rows are locked, no other job can.
                 let used: Vec<i64> = of_jobs("SELECT DISTINCT result_set FROM stage WHERE result_set IN (", &sets, ")")
                     .build_query_scalar()
                     .fetch_all(&mut *c)

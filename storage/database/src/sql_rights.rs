@@ -1,5 +1,6 @@
-//! The queries about owners and the audit log, for one database: `rights_queries!(SqliteConnection, SqliteRow)` makes a
-//! module `rights_query` beside `query` (see [`crate::sql`]).
+//! Queries about owners and the audit log, for one database: `rights_queries!(SqliteConnection,
+//! SqliteRow)` generates a module `rights_query`, which uses the module `query` (see
+//! [`crate::sql`]).
 
 macro_rules! rights_queries {
     ($connection:ty, $row:ty) => {
@@ -33,9 +34,10 @@ macro_rules! rights_queries {
                 .transpose()
             }
 
-            /// Owned places that are equal to this one, lie in it, or enclose it.
+            /// Returns the owned places that are equal to this one, inside it, or around it.
             pub(crate) async fn owned_near(c: &mut Connection, place: &str) -> Result<Vec<OwnedPlace>> {
-                // A place ends with a slash, so those in it lie before the same text with the next character.
+                // A place ends with a slash, so every place inside it sorts before the same text
+                // with the next character.
                 let after = format!("{}0", place.trim_end_matches('/'));
                 let mut query = QueryBuilder::<<$connection as sqlx::Connection>::Database>::new(
                     "SELECT * FROM owned_place WHERE ((place >= ",
@@ -83,8 +85,9 @@ macro_rules! rights_queries {
                 })
             }
 
-            /// Those of the places that a job writes into which become its submitter's. `None` if another user has taken one
-            /// since the submitter was permitted to write there.
+            /// Returns the job's places that no other user owns, which its submitter will own.
+            /// Returns `None` if another user owns a place that the submitter is not permitted to
+            /// write into.
             pub(crate) async fn free_places<'a>(
                 c: &mut Connection,
                 places: &'a [OwnedPlace],
@@ -104,10 +107,11 @@ macro_rules! rights_queries {
                 Ok(Some(free))
             }
 
-            /// Records these places as their submitter's.
+            /// Records the submitter as the owner of these places.
             pub(crate) async fn take_places(c: &mut Connection, places: &[&OwnedPlace]) -> Result<()> {
                 for mine in places {
-                    // One of somebody else's that is still there is of a job that left nothing.
+                    // If the place still has another owner, it belongs to a job that left no
+                    // results.
                     sqlx::query("DELETE FROM owned_place WHERE place = $1 AND record = $2 AND username <> $3")
                         .bind(&mine.place)
                         .bind(mine.record)
@@ -129,7 +133,7 @@ macro_rules! rights_queries {
                 Ok(())
             }
 
-            /// Appends lines in one transaction.
+            /// Appends entries in one transaction.
             pub(crate) async fn audit(c: &mut Connection, lines: &[NewAudit]) -> Result<()> {
                 let mut tx = c.begin().await?;
                 for line in lines {

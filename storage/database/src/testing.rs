@@ -1,17 +1,18 @@
-//! Databases for tests: each test its own, on the server that PICOFARM_TEST_POSTGRES names.
+//! Databases for tests. Each test gets its own, on the server that PICOFARM_TEST_POSTGRES names.
 
 use sqlx::{Connection, PgConnection, SqliteConnection};
 use uuid::Uuid;
 
 use crate::CatalogPlace;
 
-/// The variable that holds the URL of a server on which tests may create databases.
+/// The environment variable with the URL of a server on which tests may create databases.
 pub const VARIABLE: &str = "PICOFARM_TEST_POSTGRES";
 
-/// The URL of a new, empty Postgres database; `None`, with a word on stderr, where no server is named.
+/// Returns the URL of a new, empty Postgres database. If no server is configured, prints a note to
+/// stderr and returns `None`.
 ///
 /// # Panics
-/// When a server is named and no database can be made on it.
+/// If a server is configured but no database can be created on it.
 pub async fn postgres() -> Option<String> {
     let Ok(server) = std::env::var(VARIABLE) else {
         eprintln!("SKIPPED: {VARIABLE} names no Postgres server; tests/run starts one");
@@ -32,10 +33,10 @@ pub async fn postgres() -> Option<String> {
     Some(format!("{base}/{name}?{options}"))
 }
 
-/// Lets an instance's time run out, as if its process had been stopped for too long.
+/// Expires an instance, as if its process had been stopped for too long.
 ///
 /// # Panics
-/// When the database cannot be written.
+/// If the database cannot be written.
 pub async fn lose_instance(url: &str, instance: picofarm_proto::ids::InstanceId) {
     let mut connection = PgConnection::connect(url)
         .await
@@ -49,10 +50,10 @@ pub async fn lose_instance(url: &str, instance: picofarm_proto::ids::InstanceId)
     .expect("the instance is there");
 }
 
-/// Keeps everyone else from writing a SQLite catalog until the value is dropped, as a slow disk would.
+/// Blocks all other writes to a SQLite catalog until the value is dropped, as a slow disk would.
 ///
 /// # Panics
-/// When the file cannot be opened or somebody writes it for too long.
+/// If the file cannot be opened or another writer blocks it for too long.
 pub async fn hold_writes(path: &std::path::Path) -> SqliteConnection {
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(path);
     let options = options.busy_timeout(std::time::Duration::from_secs(10));
@@ -66,11 +67,12 @@ pub async fn hold_writes(path: &std::path::Path) -> SqliteConnection {
     connection
 }
 
-/// Makes a database refuse rows for their content, as a limit of its own would that nobody thought of: outputs of 666 bytes,
-/// error messages, lines of history and stores that begin with `poison`, and workers of that name.
+/// Makes a database reject rows because of their content, like an unforeseen limit of the database:
+/// outputs of 666 bytes; error messages, history events and stores that begin with `poison`; and
+/// workers of that name.
 ///
 /// # Panics
-/// When the database cannot be changed.
+/// If the database cannot be changed.
 pub async fn refuse_poison(place: &CatalogPlace) {
     let rules = [
         ("output", "bytes = 666"),

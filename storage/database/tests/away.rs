@@ -1,10 +1,10 @@
-//! A database that is not there says so.
+//! Tests the error for an unreachable database.
 
 use picofarm_database::PostgresCatalog;
 
 #[tokio::test]
 async fn a_port_that_refuses_is_not_called_an_overloaded_server() {
-    // A port that was free a moment ago.
+    // A port that was just released.
     let port = std::net::TcpListener::bind("127.0.0.1:0")
         .and_then(|listener| listener.local_addr())
         .unwrap()

@@ -1,4 +1,5 @@
-//! What every catalog promises, asked of SQLite and of Postgres alike; and what Postgres promises to several instances.
+//! Tests of the guarantees of every catalog, on SQLite and Postgres, and of Postgres' guarantees
+//! for several instances.
 
 use std::sync::Arc;
 
@@ -108,7 +109,7 @@ async fn submitted(catalog: &dyn Catalog, ranges: &[Range]) {
     assert!(catalog.submit(&job(), ranges, &[]).await.unwrap());
 }
 
-/// Claims everything there is.
+/// Claims everything available.
 async fn claim_all(catalog: &dyn Catalog) -> Vec<Range> {
     catalog
         .claim(&[want(99)])
@@ -171,7 +172,7 @@ async fn a_claim_takes_what_it_names_from_the_front_and_says_what_is_left(catalo
         ..Changes::default()
     };
     catalog.commit(&known).await.unwrap();
-    // What nobody has looked for in its store is not named.
+    // An output that was not checked in its store is not listed.
     let seen = [1, 3].map(|task| Recorded {
         task,
         manifest: [task as u8; 32],
@@ -257,7 +258,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         ..Changes::default()
     };
     catalog.commit(&first).await.unwrap();
-    // Another manifest for a task that has one.
+    // Another manifest for a task that already has one.
     let mut other = Changes {
         outputs: vec![
             output(1),
@@ -274,7 +275,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         matches!(refused, Err(CatalogError::Conflict(_))),
         "{refused:?}"
     );
-    // A range that the catalog does not know as ours.
+    // A range that the catalog does not know as owned by this instance.
     let mut stale = Changes {
         outputs: vec![output(2)],
         ..Changes::default()
@@ -288,7 +289,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
     assert_eq!(catalog.load().await.unwrap().owned.ranges, [mine]);
     let runs = catalog.output_runs(&set(), 9).await;
     assert_eq!(runs.unwrap(), [Run { lo: 0, hi: 1 }]);
-    // The same manifest again is no news.
+    // The same manifest again changes nothing.
     let again = Changes {
         outputs: vec![output(0)],
         ..Changes::default()
@@ -331,7 +332,7 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
         (9, 8, 1)
     );
     assert_eq!(record.job.ended_ms, Some(50));
-    // The same job may be submitted again; then the first cannot come back.
+    // The same job may be submitted again; then the first one cannot be reactivated.
     let twin = Job {
         id: JobId::from_uuid(Uuid::from_u128(2)),
         ..job()
@@ -446,7 +447,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
             (EventKind::Committed, Some(2), Some(2), Some(3))
         ]
     );
-    // The last ones, of whichever job, in order still.
+    // The last events of all jobs, still in order.
     query = EventQuery {
         job: None,
         limit: 2,
@@ -459,7 +460,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     let tasks: Vec<_> = last.iter().map(|e| (e.job, e.task)).collect();
     assert_eq!(tasks, [(job().id, Some(2)), (job().id, Some(1))]);
     assert!(last[0].sequence < last[1].sequence);
-    // What tasks logged is for those who ask for it.
+    // Log messages of tasks are only returned on request.
     let changes = Changes {
         events: vec![event(EventKind::Log, Some(Run { lo: 1, hi: 2 }))],
         ..Changes::default()
@@ -584,7 +585,7 @@ async fn every_kind_of_spec_is_read_back_as_written(catalog: &dyn Catalog) {
     }
 }
 
-/// Each promise as a test of each catalog.
+/// Generates a test of each guarantee for each catalog.
 macro_rules! promises {
     ($($name:ident)*) => {
         mod sqlite {
@@ -639,7 +640,7 @@ async fn a_catalog_survives_its_process() {
     assert_eq!(catalog.load().await.unwrap().owned.ranges, mine);
 }
 
-/// Two instances on a database, and its URL.
+/// Returns two instances on one database, and its URL.
 async fn two() -> Option<(PostgresCatalog, PostgresCatalog, String)> {
     let url = testing::postgres().await?;
     let (a, b) = tokio::join!(
@@ -692,7 +693,7 @@ async fn a_lost_instance_is_fenced_and_its_ranges_belong_to_another() {
         a.claim(&[want(1)]).await,
         Err(CatalogError::Fenced)
     ));
-    // In its next life it has nothing, and what it remembers is refused.
+    // In its next life it owns nothing, and changes to its former ranges are refused.
     assert_eq!(a.load().await.unwrap().owned.ranges, []);
     assert!(matches!(
         a.commit(&late).await,

@@ -1,4 +1,4 @@
-//! Jobs of several stages, held jobs, and jobs that are forgotten: asked of SQLite and of Postgres alike.
+//! Tests of multi-stage jobs, paused jobs and deleted jobs, on SQLite and Postgres.
 
 use std::sync::Arc;
 
@@ -12,7 +12,8 @@ use picofarm_proto::{
 };
 use uuid::Uuid;
 
-/// render (3 tasks) → noise (3 tasks) → split (1 task); and another rendering (2 tasks) that nobody needs.
+/// render (3 tasks) → noise (3 tasks) → split (1 task), and another rendering (2 tasks) that no
+/// stage depends on.
 fn job() -> Job {
     let text = r#"{"name": "n", "stage": [
         {"scenes": {"kind": "primitive", "count": 3}, "output": {"store": "s", "dataset": "a"}},
@@ -74,7 +75,7 @@ async fn claim(catalog: &dyn Catalog, stage: u32) -> Vec<Range> {
     claim.owned.ranges
 }
 
-/// Does every task of a stage; returns the stages that opened and the jobs that ended.
+/// Finishes every task of a stage. Returns the stages that opened and the jobs that ended.
 async fn done(catalog: &dyn Catalog, stage: u32, state: RangeState) -> (Vec<u32>, Vec<JobState>) {
     let mut changes = Changes::default();
     for range in claim(catalog, stage).await {
@@ -132,7 +133,7 @@ async fn what_needs_a_dead_task_is_not_begun_until_it_is_tried_again(catalog: &d
     use StageState::{Blocked, Done, Failed, Open};
     submitted(catalog).await;
     assert_eq!(done(catalog, 0, RangeState::Dead).await, (vec![], vec![]));
-    // The rendering that nobody needs goes on to its end, and with it the job.
+    // The independent rendering continues to its end, and then the job ends.
     let ended = done(catalog, 2, DONE).await;
     assert_eq!(ended, (vec![], vec![JobState::Failed]));
     assert_eq!(states(catalog).await, [Failed, Blocked, Done, Blocked]);
@@ -145,7 +146,7 @@ async fn what_needs_a_dead_task_is_not_begun_until_it_is_tried_again(catalog: &d
     assert_eq!(catalog.retry(job().id, 60).await.unwrap(), 3);
     assert_eq!(states(catalog).await, [Open, Blocked, Done, Blocked]);
     assert_eq!(done(catalog, 0, DONE).await, (vec![1], vec![]));
-    // A stage that tolerates it begins all the same.
+    // A stage that tolerates dead tasks begins anyway.
     assert_eq!(done(catalog, 1, RangeState::Dead).await, (vec![3], vec![]));
     assert_eq!(
         done(catalog, 3, DONE).await,
@@ -221,7 +222,8 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
     assert_eq!(catalog.job(job().id).await.unwrap(), None);
     let set = ResultSet::of(&job().spec.stages[0]);
     assert_eq!(catalog.output_runs(&set, 9).await.unwrap().len(), 1);
-    // The same job again finds what its store was seen to hold when its tasks are claimed, unless it must not look.
+    // When the same job's tasks are claimed again, it finds the outputs that were checked in the
+    // store, unless it must ignore them.
     let seen = Recorded {
         task: 1,
         manifest: [1; 32],
@@ -250,7 +252,7 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
     assert_eq!((second.existing[0].lo, second.existing[0].hi), (1, 2));
 }
 
-/// Each promise as a test of each catalog.
+/// Generates a test of each guarantee for each catalog.
 macro_rules! promises {
     ($($name:ident)*) => {
         mod sqlite {

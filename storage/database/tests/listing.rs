@@ -1,5 +1,5 @@
-//! Pages of the list of jobs, and forgetting, asked of SQLite and of Postgres alike. The test that is left out by itself prints
-//! how long they take: `cargo test -p picofarm-database --test listing -- --ignored --nocapture`.
+//! Tests of pages of the job list and of deletion, on SQLite and Postgres. The ignored test prints
+//! their durations: `cargo test -p picofarm-database --test listing -- --ignored --nocapture`.
 
 use std::{
     sync::Arc,
@@ -129,7 +129,7 @@ async fn pages_hold_every_job_once_the_last_first_and_filters_leave_out_the_othe
 #[tokio::test]
 async fn outputs_leave_with_the_last_job_of_their_result_set_and_not_before() {
     each(async |catalog| {
-        // The second shares the first's results.
+        // The second job shares the first job's results.
         let first = job(1, "ada");
         let mut second = job(2, "ada");
         second.spec = first.spec.clone();
@@ -159,7 +159,7 @@ async fn outputs_leave_with_the_last_job_of_their_result_set_and_not_before() {
         forget().await;
         assert_eq!(catalog.output_runs(&set, 9).await.unwrap(), []);
         assert_eq!(catalog.page(&query(9)).await.unwrap().jobs, []);
-        // The same again is a job like any other.
+        // Submitted again, the same job is treated like any other.
         submit(catalog, &job(1, "ada")).await;
         assert_eq!(listed(catalog, &query(9)).await, ["job 1"]);
     })

@@ -1,4 +1,4 @@
-//! The audit log and the owners of jobs: asked of SQLite and of Postgres alike.
+//! Tests of the audit log and of job owners, on SQLite and Postgres.
 
 use std::sync::Arc;
 
@@ -82,7 +82,7 @@ async fn the_log_has_its_own_age_and_outlives_jobs(catalog: &dyn Catalog) {
 
 async fn readers_see_what_they_may(catalog: &dyn Catalog) {
     catalog.load().await.unwrap();
-    // `_` and `%` are no wildcards, and one project's name may begin another's.
+    // `_` and `%` are not wildcards, and one project's name may be a prefix of another's.
     let jobs = [
         job(1, "ada", ""),
         job(2, "ada", "a_b"),
@@ -139,7 +139,7 @@ async fn readers_see_what_they_may(catalog: &dyn Catalog) {
             };
             let events = catalog.events(&query).await.unwrap();
             let mut said: Vec<_> = events.into_iter().map(|event| event.job).collect();
-            // Each has its beginning and, without tasks, its end.
+            // Each job has a first event and, because it has no tasks, also its end.
             said.dedup();
             assert_eq!(said, seen, "{sight:?}");
         }

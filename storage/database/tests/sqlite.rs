@@ -1,4 +1,4 @@
-//! A SQLite catalog is a file: who may open it, and what is left alone.
+//! Tests of a SQLite catalog as a file: who may open it, and which files are not touched.
 
 use picofarm_catalog::{Catalog, CatalogError};
 use picofarm_database::SqliteCatalog;
@@ -32,7 +32,7 @@ async fn a_closed_catalog_is_free_whoever_still_has_it() {
     let first = open(&folder).await;
     first.close().await;
     let second = open(&folder).await;
-    // What is closed twice stays closed, and takes nothing from the second.
+    // Closing a catalog twice has no effect on the second one.
     first.close().await;
     let path = folder.path().join("a/b/c.db");
     let error = SqliteCatalog::open(&path, "the third").await.err().unwrap();

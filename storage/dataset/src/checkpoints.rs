@@ -1,10 +1,12 @@
-//! Checkpoints of tasks that run for long: `checkpoints/<key>/<step>.ckpt`, each with its own checksum. Whoever runs such a
-//! task finds the newest one that is whole. The newest two are kept, so that one which is damaged costs no more than the
-//! time between them; all are deleted when the result is published.
+//! Checkpoints of long-running tasks: `checkpoints/<key>/<step>.ckpt`, each with its own checksum.
+//! A worker that takes over such a task resumes from the newest intact checkpoint. The newest two
+//! are retained, so that a damaged one costs no more than the time between them. All are deleted
+//! when the result is published.
 //!
-//! A large one comes in pieces, which are written and read several at once, while the task goes on:
-//! `<step>.<piece>.part` for all but the first, and last the first as `<step>.ckpt`, with the checksums of all. So what has a
-//! `.ckpt` was written whole, and pieces of two writings are never mixed.
+//! A large checkpoint is split into pieces, which are written and read concurrently while the task
+//! continues. All pieces but the first are stored as `<step>.<piece>.part`. The first piece is
+//! stored last, as `<step>.ckpt`, with the checksums of all pieces. Therefore a checkpoint with a
+//! `.ckpt` object was written completely, and pieces of two writers are never mixed.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,33 +23,33 @@ use sha2::{Digest, Sha256};
 use crate::error::DatasetError;
 use crate::store::objects;
 
-/// First bytes of a checkpoint; the SHA-256 (32 bytes) of all that follows, the number of further pieces (4 bytes, little
-/// endian), the SHA-256 of each, and the first piece follow.
+/// First bytes of a checkpoint. They are followed by the SHA-256 (32 bytes) of the remaining bytes,
+/// the number of further pieces (4 bytes, little endian), the SHA-256 of each, and the first piece.
 const MAGIC: &[u8; 8] = b"pfckpt2\n";
-/// Bytes before what the checksum is of.
+/// Number of bytes before the checksummed part.
 const HEAD: usize = MAGIC.len() + SHA;
-/// Bytes of a SHA-256.
+/// Size of a SHA-256 in bytes.
 const SHA: usize = 32;
-/// Checkpoints that are kept.
+/// Number of checkpoints to retain.
 const KEPT: usize = 2;
-/// Pieces that are on their way at once: each is in memory meanwhile.
+/// Maximum number of pieces transferred concurrently; each is in memory meanwhile.
 const AT_ONCE: usize = 4;
-/// Folder of checkpoints, beside what is published.
+/// Folder of the checkpoints, next to the published objects.
 pub(crate) const FOLDER: &str = "checkpoints";
 
-/// What a checkpoint holds, piece by piece; made while pieces before are on their way.
+/// The pieces of a checkpoint. Each is generated while earlier pieces are being transferred.
 pub type Pieces = Box<dyn Iterator<Item = Bytes> + Send>;
 
-/// A checkpoint as it is listed.
+/// A listed checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Checkpoint {
-    /// The task: of a model, its training.
+    /// Key of the task; for a model, of its training.
     pub training_key: String,
-    /// Steps done.
+    /// Number of completed steps.
     pub step: u64,
-    /// Its size.
+    /// Size in bytes.
     pub bytes: u64,
-    /// Whether it was written to its end. What was not is left over, or under way.
+    /// Whether it was written completely. Otherwise it is a leftover or still being written.
     pub finished: bool,
     pub(crate) objects: Vec<ObjectMeta>,
 }
@@ -60,20 +62,22 @@ pub struct Checkpoints {
 }
 
 impl Checkpoints {
-    /// Those of the task with this key, beside what is published at `prefix`.
+    /// Returns the checkpoints of the task with this key, next to the objects published at
+    /// `prefix`.
     pub(crate) fn new(store: Arc<dyn ObjectStore>, prefix: &Path, key: &str) -> Self {
         let folder = objects::path_of(prefix, &format!("{FOLDER}/{key}"));
         Self { store, folder }
     }
 
-    /// Stores what the task is after `step` steps, create-only, and deletes all but the newest two up to it. A whole
-    /// checkpoint of that step that is there already stands; a damaged one is replaced.
+    /// Stores the task's state after `step` steps, create-only, and deletes all older checkpoints
+    /// but the newest two up to this step. An intact checkpoint of the same step is left unchanged;
+    /// a damaged one is replaced.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
     ///
     /// # Panics
-    /// Where `content` has no piece.
+    /// If `content` has no piece.
     pub async fn put(&self, step: u64, content: Pieces) -> Result<(), DatasetError> {
         if self.read(step).await?.is_none() {
             self.write(step, content).await?;
@@ -83,7 +87,8 @@ impl Checkpoints {
         let finished = there.iter().rev().filter(|c| c.finished);
         let oldest = finished.take(KEPT).last().map_or(step, |c| c.step);
         for old in there.iter().filter(|c| c.step < oldest) {
-            // What has no head is no checkpoint: it goes first.
+            // The head is deleted first, so that an interrupted deletion leaves no seemingly
+            // complete checkpoint.
             for object in &old.objects {
                 self.remove(&object.location).await?;
             }
@@ -114,7 +119,7 @@ impl Checkpoints {
             }
             sums.push(sum);
             let path = self.part(step, sums.len());
-            // Pieces that lie there are of a writing that was cut off, or damaged.
+            // Existing pieces are damaged or left by an interrupted write.
             under_way.push(async move {
                 let put = self.store.put(&path, piece.into()).await;
                 put.map_err(|e| self.failed("write", &path, e))
@@ -136,7 +141,8 @@ impl Checkpoints {
         };
         match put(PutMode::Create).await {
             Ok(_) => Ok(()),
-            // Damaged, or another worker's, who came to the same step meanwhile: one of both stands whole.
+            // The object is damaged, or another worker has reached the same step. Either way, one
+            // intact checkpoint remains.
             Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => {
                 if self.read(step).await?.is_none() {
                     let replaced = put(PutMode::Overwrite).await;
@@ -148,7 +154,7 @@ impl Checkpoints {
         }
     }
 
-    /// The newest whole checkpoint: its step and its pieces. Damaged ones are passed over.
+    /// Returns the step and the pieces of the newest intact checkpoint. Damaged ones are skipped.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -157,7 +163,8 @@ impl Checkpoints {
         for checkpoint in all.iter().rev().filter(|c| c.finished) {
             match self.read(checkpoint.step).await? {
                 Some(pieces) => return Ok(Some((checkpoint.step, pieces))),
-                // Another worker may have written a newer one and deleted this one meanwhile.
+                // Another worker may have written a newer checkpoint and deleted this one in the
+                // meantime.
                 None => {
                     let object = self.head(checkpoint.step);
                     tracing::warn!(%object, "a checkpoint is damaged or gone; the one before is used");
@@ -167,7 +174,7 @@ impl Checkpoints {
         Ok(None)
     }
 
-    /// The pieces of a checkpoint if all are whole.
+    /// Returns the pieces of a checkpoint, or `None` if one is damaged or missing.
     pub(crate) async fn read(&self, step: u64) -> Result<Option<Vec<Bytes>>, DatasetError> {
         let bytes = objects::get(&*self.store, &self.head(step)).await?;
         let Some((first, sums)) = bytes.and_then(whole) else {
@@ -194,7 +201,7 @@ impl Checkpoints {
         Ok(Some(pieces))
     }
 
-    /// Deletes all.
+    /// Deletes all checkpoints of the task.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -234,7 +241,8 @@ impl Checkpoints {
     }
 }
 
-/// The checkpoints among objects, by task and step, ascending. The head of each is the first of its objects.
+/// Returns the checkpoints among the objects, ascending by task and step. The head of each is its
+/// first object.
 pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
     let mut found: BTreeMap<(String, u64), Vec<(bool, ObjectMeta)>> = BTreeMap::new();
     for object in objects {
@@ -256,7 +264,7 @@ pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
     found.into_iter().map(checkpoint).collect()
 }
 
-/// Task and step of an object of a checkpoint, and whether it is the head.
+/// Returns the task and step of a checkpoint's object, and whether it is the head.
 pub(crate) fn place(object: &ObjectMeta) -> Option<(String, u64, bool)> {
     let parts: Vec<_> = object.location.parts().collect();
     let [.., folder, training_key, file] = &parts[..] else {
@@ -273,14 +281,15 @@ pub(crate) fn place(object: &ObjectMeta) -> Option<(String, u64, bool)> {
     Some((training_key.as_ref().to_owned(), digits.parse().ok()?, head))
 }
 
-/// End of the names of all pieces but the first.
+/// Suffix of the names of all pieces but the first.
 pub(crate) const PART: &str = ".part";
 
 fn sha(bytes: &[u8]) -> [u8; SHA] {
     Sha256::digest(bytes).into()
 }
 
-/// The first piece of a checkpoint whose head has its checksum, and the checksums of the others.
+/// Returns the first piece of a checkpoint and the checksums of the other pieces, if the head
+/// matches its checksum.
 fn whole(bytes: Bytes) -> Option<(Bytes, Vec<[u8; SHA]>)> {
     if bytes.len() < HEAD + 4 || bytes[..MAGIC.len()] != *MAGIC {
         return None;

@@ -1,8 +1,9 @@
-//! Histograms and ground truth at rest: one Zarr v3 group a data set, one object a scene and quantity, published
-//! create-only into an object store and readable by zarr-python and xarray without our code.
+//! Storage of histograms and ground truth: one Zarr v3 group per data set, and one object per scene
+//! and quantity. Objects are published create-only into an object store, and zarr-python and xarray
+//! can read them without our code.
 //!
-//! A scene counts as published once `manifests/<scene>.json` exists. Objects and manifests are pure functions of the
-//! task, so whoever runs a task again writes the same bytes.
+//! A scene is published once `manifests/<scene>.json` exists. Objects and manifests are pure
+//! functions of the task, so running a task again writes the same bytes.
 
 mod checkpoints;
 mod coding;
@@ -21,7 +22,7 @@ mod store;
 mod verdict;
 mod verify;
 
-/// What a program says that was built without the feature `formats`, and how to get one with it.
+/// The message of a program built without the feature `formats`, and how to build one with it.
 #[cfg(not(feature = "formats"))]
 const WITHOUT_FORMATS: &str = "this picofarm was built without OpenEXR and HDF5";
 #[cfg(not(feature = "formats"))]

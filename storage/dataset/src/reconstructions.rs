@@ -1,8 +1,10 @@
-//! Reconstructions of scenes: a folder of their own in a store, beside the data set whose scenes they are. Each scene has
-//! `scenes/<scene>/` with `density.zarr` (a Zarr v3 group), `mesh.glb`, `mesh.ply` and `metrics.json`.
+//! Reconstructions of scenes: a separate folder in a store, next to the data set with the scenes.
+//! Each scene has `scenes/<scene>/` with `density.zarr` (a Zarr v3 group), `mesh.glb`, `mesh.ply`
+//! and `metrics.json`.
 //!
-//! They are published as scenes are: objects first, `manifests/<scene>.json` last, all create-only and pure functions of the
-//! task. A task that runs for long keeps `checkpoints/<task key>/` until then.
+//! They are published like scenes: objects first, `manifests/<scene>.json` last, all create-only
+//! and pure functions of the task. A long-running task stores checkpoints in `checkpoints/<task
+//! key>/` until then.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -26,46 +28,47 @@ use crate::store::objects;
 use crate::verify::object::{intact, looked_at};
 use crate::verify::report::{Fault, Problem, Verification, VerifyMode, Watch};
 
-/// Version of these folders and of their manifests.
+/// Format version of these folders and their manifests.
 const FORMAT: u32 = 1;
 
-/// What a reconstruction is. A pure function of the task: no times, no machine.
+/// The contents of a reconstruction. It is a pure function of the task, without times or machine
+/// names.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ReconstructionManifest {
-    /// Version of this form; filled in.
+    /// Format version of the manifest. Set on publishing.
     pub format: u32,
-    /// Scene index, that of the source's scene.
+    /// Scene index, equal to the source scene's.
     pub scene: u64,
-    /// Key of the task that made it: scene, predictions, settings and code.
+    /// Key of the task that produced it: scene, predictions, settings and code.
     pub task_key: String,
-    /// Version of the reconstruction.
+    /// Code version of the reconstruction.
     pub code: String,
-    /// The scene.
+    /// The source scene.
     pub source: SceneUsed,
-    /// What was predicted of it, where that was used.
+    /// The predictions used, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub predictions: Option<SceneUsed>,
-    /// Settings.
+    /// Settings of the reconstruction.
     pub settings: Value,
-    /// Its objects; filled in.
+    /// Its objects. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::layout::manifest::seal`] says of the rest.
+    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
 
 impl ReconstructionManifest {
-    /// Size of all objects together.
+    /// Returns the total size of all objects in bytes.
     pub fn total_bytes(&self) -> u64 {
         self.objects.iter().map(|o| o.size).sum()
     }
 
-    /// SHA-256 of its bytes as they lie in the store, hexadecimal.
+    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
     pub fn sha256(&self) -> String {
         sha256_hex(&self.to_bytes())
     }
 
-    /// The manifest as it lies in the store.
+    /// Returns the bytes to store.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self).expect("a manifest has only string keys");
         bytes.push(b'\n');
@@ -92,10 +95,10 @@ pub struct Reconstructions {
 }
 
 impl Reconstructions {
-    /// Creates the folder at `prefix`, or opens it if it is there.
+    /// Creates the folder at `prefix`, or opens an existing one.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where something else lies there; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if the location contains something else; [`DatasetError::Store`].
     pub async fn create_or_open(
         store: Arc<dyn ObjectStore>,
         prefix: Path,
@@ -110,7 +113,7 @@ impl Reconstructions {
             },
         }));
         if objects::get(&*store, &root).await?.is_none() {
-            // Another worker may be faster.
+            // Another worker may create it first.
             objects::create(&*store, &root, ours).await?;
         }
         Self::open(store, prefix).await
@@ -119,7 +122,8 @@ impl Reconstructions {
     /// Opens the folder at `prefix`.
     ///
     /// # Errors
-    /// [`DatasetError::NoDataset`]; [`DatasetError::Invalid`] where something else lies there; [`DatasetError::Store`].
+    /// [`DatasetError::NoDataset`]; [`DatasetError::Invalid`] if the location contains something
+    /// else; [`DatasetError::Store`].
     pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
         let root = objects::path_of(&prefix, METADATA);
         let shown = || objects::shown(&*store, &root);
@@ -147,12 +151,12 @@ impl Reconstructions {
         }
     }
 
-    /// Where they lie, for a message.
+    /// Returns their location for messages.
     pub fn place(&self) -> String {
         self.shown(&self.prefix)
     }
 
-    /// The scenes whose reconstructions are published, ascending.
+    /// Returns the scenes with a published reconstruction, ascending.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -160,7 +164,7 @@ impl Reconstructions {
         scenes_in(&*self.store, &self.path("manifests")).await
     }
 
-    /// The manifest of a scene's reconstruction.
+    /// Returns the manifest of a scene's reconstruction.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -175,12 +179,13 @@ impl Reconstructions {
         }
     }
 
-    /// The checkpoints of a task that makes one of a scene.
+    /// Returns the checkpoints of a reconstruction task.
     pub fn checkpoints_of(&self, task_key: &str) -> Checkpoints {
         Checkpoints::new(self.store.clone(), &self.prefix, task_key)
     }
 
-    /// One of a scene's objects, by its name below the scene's folder, checked against its manifest.
+    /// Reads one of a scene's objects, by its name in the scene's folder, and checks it against the
+    /// manifest.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -197,12 +202,12 @@ impl Reconstructions {
         self.intact(entry).await
     }
 
-    /// The manifest of a scene that this very task has published, after checking that each of its objects has the stated
-    /// SHA-256. `None` where it is not published.
+    /// Returns the manifest of a scene that this task has published, after checking the SHA-256 of
+    /// each object. Returns `None` if the scene is not published.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where another task has published it; [`DatasetError::Damaged`] where an object is missing or
-    /// changed ([`Self::restore`] puts it back); [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if another task has published it; [`DatasetError::Damaged`] if an
+    /// object is missing or changed ([`Self::restore`] repairs it); [`DatasetError::Store`].
     pub async fn finished(
         &self,
         scene: u64,
@@ -222,12 +227,14 @@ impl Reconstructions {
         Ok(Some(manifest))
     }
 
-    /// Publishes a scene's reconstruction, or puts back what is missing or changed of it. `files` by their names below the
-    /// scene's folder; the manifest's format, objects and checksum are filled in.
+    /// Publishes a scene's reconstruction, or restores its missing or changed objects. `files` are
+    /// named relative to the scene's folder. The manifest's format, objects and checksum are set
+    /// here.
     ///
     /// # Errors
-    /// [`DatasetError::Conflict`] where an object exists with other bytes; [`DatasetError::Diverged`] where another one came
-    /// out than the manifest says; [`DatasetError::Damaged`] where nothing proves what was there; [`DatasetError::Store`].
+    /// [`DatasetError::Conflict`] if an object exists with different bytes;
+    /// [`DatasetError::Diverged`] if the result differs from the manifest's;
+    /// [`DatasetError::Damaged`] if nothing proves the original content; [`DatasetError::Store`].
     pub async fn restore(
         &self,
         manifest: ReconstructionManifest,
@@ -272,7 +279,7 @@ impl Reconstructions {
         Ok(ours)
     }
 
-    /// Refuses what another task has published.
+    /// Returns an error if another task has published this reconstruction.
     fn check_owner(
         &self,
         found: &ReconstructionManifest,
@@ -295,7 +302,8 @@ impl Reconstructions {
         intact(&*self.store, &self.path(&object.key), object).await
     }
 
-    /// Checks what is published. `watch` hears how many scenes are checked of how many.
+    /// Checks the published reconstructions. `watch` is called with the number of checked scenes
+    /// and of all scenes.
     ///
     /// # Errors
     /// [`DatasetError::Store`].

@@ -1,5 +1,6 @@
-//! Reports about models: `reports/<name>/` in a store, beside its data sets and models: `report.html`, `report.json`, and
-//! `manifest.json`, written last, all create-only. A name belongs to one report.
+//! Reports about models: `reports/<name>/` in a store, next to its data sets and models. A report
+//! consists of `report.html`, `report.json`, and `manifest.json`, which is written last, all
+//! create-only. Each name belongs to one report.
 
 use std::sync::Arc;
 
@@ -13,11 +14,11 @@ use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
 use crate::store::many::check_size;
 use crate::store::objects;
 
-/// The folder of reports in a store; no data set has this name.
+/// The folder of reports in a store. No data set can have this name.
 pub const REPORTS: &str = "reports";
-/// The object that makes a report one.
+/// Name of the manifest, which marks a report as published.
 const MANIFEST: &str = "manifest.json";
-/// Version of manifests of reports.
+/// Format version of report manifests.
 const FORMAT: u32 = 1;
 
 /// The reports of a store.
@@ -27,22 +28,22 @@ pub struct Reports {
     folder: Path,
 }
 
-/// What a report is. A pure function of its task: no times, no machine.
+/// The contents of a report. It is a pure function of its task, without times or machine names.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ReportManifest {
-    /// Version of this form; filled in.
+    /// Format version of the manifest. Set on publishing.
     pub format: u32,
     /// The report's name.
     pub name: String,
-    /// Key of the task that made it: models, evaluations, settings and code.
+    /// Key of the task that produced it: models, evaluations, settings and code.
     pub task_key: String,
-    /// Version of networks and metrics.
+    /// Code version of networks and metrics.
     pub code: String,
-    /// The models that it tells of, in its order.
+    /// The reported models, in order.
     pub models: Vec<ReportedModel>,
-    /// Its objects; keys below the report's folder. Filled in.
+    /// Its objects, with keys relative to the report's folder. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::layout::manifest::seal`] says of the rest.
+    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
@@ -50,30 +51,30 @@ pub struct ReportManifest {
 /// A model in a report.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ReportedModel {
-    /// Its name.
+    /// Name of the model.
     pub name: String,
-    /// SHA-256 of its manifest, hexadecimal.
+    /// SHA-256 of the model's manifest, in hexadecimal.
     pub manifest_sha256: String,
-    /// Key of the evaluation whose figures are shown; `None` where it was not evaluated.
+    /// Key of the reported evaluation; `None` if the model was not evaluated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluation: Option<String>,
-    /// SHA-256 of the record of the training's speed, hexadecimal; `None` where nothing is.
+    /// SHA-256 of the record of the training's speed, in hexadecimal; `None` if there is no record.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed: Option<String>,
 }
 
 impl ReportManifest {
-    /// Size of all objects together.
+    /// Returns the total size of all objects in bytes.
     pub fn total_bytes(&self) -> u64 {
         self.objects.iter().map(|o| o.size).sum()
     }
 
-    /// SHA-256 of its bytes as they lie in the store, hexadecimal.
+    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
     pub fn sha256(&self) -> String {
         sha256_hex(&self.to_bytes())
     }
 
-    /// The manifest as it lies in the store.
+    /// Returns the bytes to store.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self).expect("a manifest has only string keys");
         bytes.push(b'\n');
@@ -86,7 +87,7 @@ impl ReportManifest {
 }
 
 impl Reports {
-    /// The reports of the store at `prefix`.
+    /// Returns the reports of the store at `prefix`.
     pub fn new(store: Arc<dyn ObjectStore>, prefix: &Path) -> Self {
         Self {
             store,
@@ -94,17 +95,17 @@ impl Reports {
         }
     }
 
-    /// Where a report lies, for a message.
+    /// Returns a report's location for messages.
     pub fn place(&self, name: &str) -> String {
         objects::shown(&*self.store, &self.folder.clone().join(name))
     }
 
-    /// The manifest of a report that this very task has published, after checking that each of its objects exists with the
-    /// stated size; `None` where it is not published.
+    /// Returns the manifest of a report that this task has published, after checking the size of
+    /// each object. Returns `None` if the report is not published.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the name is another report's; [`DatasetError::Damaged`] where an object is missing or
-    /// has another size; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if the name belongs to another report; [`DatasetError::Damaged`]
+    /// if an object is missing or has another size; [`DatasetError::Store`].
     pub async fn finished(
         &self,
         name: &str,
@@ -130,11 +131,12 @@ impl Reports {
         Ok(Some(manifest))
     }
 
-    /// Publishes a report: `objects` first, the manifest last, whose format, objects and checksum are filled in.
+    /// Publishes a report: `objects` first, the manifest last. The manifest's format, objects and
+    /// checksum are set here.
     ///
     /// # Errors
-    /// [`DatasetError::Conflict`] where an object exists with other bytes: another report of this name was made, or begun;
-    /// [`DatasetError::Store`].
+    /// [`DatasetError::Conflict`] if an object exists with different bytes, because another report
+    /// of this name was published or begun; [`DatasetError::Store`].
     pub async fn publish(
         &self,
         manifest: ReportManifest,

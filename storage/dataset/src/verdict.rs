@@ -1,17 +1,17 @@
-//! What a result is worth, as one line: beside the answers that need no network, or beside a guess.
+//! One-line assessments of results, compared with trivial answers or with a guess.
 
 use serde::Serialize;
 use serde_json::Value;
 
-/// Loss of a held-out ray of a reconstruction that stops half the light everywhere: what a guess has.
+/// Loss of a held-out ray for a guess: a reconstruction that absorbs half of the light everywhere.
 pub const GUESS: f64 = std::f64::consts::LN_2;
 
 /// One line about a result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Verdict {
-    /// Whether somebody should look before the result is used.
+    /// Whether a person should check the result before use.
     pub doubtful: bool,
-    /// The line.
+    /// The text of the line.
     pub text: String,
 }
 
@@ -30,8 +30,8 @@ impl Verdict {
         }
     }
 
-    /// Of an evaluation's figures (`mae_m`, or `iou`, and `baselines`), for a model that predicts `kind` (`tof`, `shadow`,
-    /// `specular`).
+    /// Assesses the metrics of an evaluation (`mae_m` or `iou`, and `baselines`), for a model that
+    /// predicts `kind` (`tof`, `shadow`, `specular`).
     pub fn of_evaluation(kind: &str, metrics: &Value) -> Self {
         let (name, figure) = match kind {
             "tof" => ("mae_m", "depth MAE"),
@@ -47,7 +47,8 @@ impl Verdict {
         };
         let trivial = metrics["baselines"].as_object().into_iter().flatten();
         let trivial = trivial.filter_map(|(answer, m)| Some((answer, m[name].as_f64()?)));
-        // Worst first, so that the best of equals is the first by name.
+        // `min_by` with a reversed comparison returns the first by name among equals, unlike
+        // `max_by`.
         let best = trivial.min_by(|a, b| match less_is_better {
             true => a.1.total_cmp(&b.1),
             false => b.1.total_cmp(&a.1),
@@ -74,7 +75,7 @@ impl Verdict {
         }
     }
 
-    /// Of a reconstruction's `metrics.json`.
+    /// Assesses the `metrics.json` of a reconstruction.
     pub fn of_reconstruction(metrics: &Value) -> Self {
         let agreement = &metrics["agreement"];
         let reasons = agreement["reasons"].as_array().into_iter().flatten();
@@ -98,7 +99,8 @@ impl Verdict {
         }
     }
 
-    /// Of an imported scene, by what the check of its files found: of all, or a list with an entry for each capture.
+    /// Assesses an imported scene from the check of its files: one entry for all captures, or a
+    /// list with one entry per capture.
     pub fn of_import(check: &Value) -> Self {
         let entries = match check {
             Value::Array(entries) => &entries[..],
@@ -124,7 +126,8 @@ impl Verdict {
         }
     }
 
-    /// Of predictions of a scene, by what their manifest says of their agreement; `None` where nothing could be compared.
+    /// Assesses the predictions of a scene from the agreement in their manifest. Returns `None` if
+    /// nothing could be compared.
     pub fn of_agreement(agreement: &Value) -> Option<Self> {
         let reasons = agreement["reasons"].as_array()?;
         let reasons: Vec<&str> = reasons.iter().filter_map(Value::as_str).collect();
@@ -137,7 +140,7 @@ impl Verdict {
     }
 }
 
-/// A trivial answer in words.
+/// Returns a trivial answer's name for display.
 fn answer_name<'a>(kind: &str, answer: &'a str) -> &'a str {
     match (kind, answer) {
         ("shadow", "all") => "\"all lit\"",

@@ -1,5 +1,5 @@
-//! Exports hold the same values in fewer files, and zarr-python reads them.
-//! The comparison runs where `PICOFARM_PYTHON` names a Python with numpy, zarr and xarray.
+//! Tests that exports contain the same values in fewer files, and that zarr-python can read them.
+//! The comparison runs if `PICOFARM_PYTHON` names a Python with numpy, zarr and xarray.
 
 mod common;
 
@@ -130,7 +130,7 @@ async fn python_reads_of_tar_and_hdf5_files_what_the_data_set_holds() {
             assert_eq!((done.scenes, done.files), (21, written.len() as u64));
             let source = folder.path().join("source").into_os_string();
             reads(&python, "read_files.py", &[source, place.clone().into()]);
-            // Again: the same bytes, so nothing conflicts.
+            // A repeated export writes the same bytes, so there is no conflict.
             assert_eq!(export_as(format, &dataset, &scenes, &place).await, done);
             assert!(files(&place) == written);
         }

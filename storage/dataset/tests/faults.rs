@@ -1,4 +1,5 @@
-//! Publication under lost and repeated answers, and beside a collector at every moment.
+//! Tests of publishing with lost and repeated answers, and with a collector running at every
+//! moment.
 
 mod common;
 
@@ -34,7 +35,7 @@ async fn objects(store: &dyn ObjectStore) -> Objects {
     all
 }
 
-/// A data set with these scenes published, its memory and its objects.
+/// Returns a data set with these scenes published, its memory and its objects.
 async fn whole(scenes: &[u64]) -> (Arc<InMemory>, Dataset, Objects) {
     let spec = spec(Profile::default());
     let memory = Arc::new(InMemory::new());
@@ -122,7 +123,8 @@ proptest! {
                     memory.delete(&Path::from(key.as_str())).await.unwrap();
                 }
             }
-            // Never ours to delete: neither inside, nor outside, nor of a scene there is no room for.
+            // Foreign objects are never deleted, whether inside or outside of the data set, or of a
+            // scene beyond its capacity.
             for key in ["sets/a/notes.txt", "sets/a/depth/c/0/0/1", "sets/a/depth/c/9/0/0", "sets/b/x", "sets/y"] {
                 memory.put(&Path::from(key), key.into()).await.unwrap();
             }
@@ -190,7 +192,8 @@ async fn a_probe_ends_in_time_where_a_store_stalls_and_leaves_nothing() {
     }
 }
 
-/// A worker was killed before the manifest of scene 0; another publishes the scene at `moment` of a collection.
+/// A worker was killed before it wrote the manifest of scene 0; another one publishes the scene at
+/// `moment` of a collection.
 async fn published_while_collecting(moment: Moment) {
     let (memory, dataset, all) = whole(&[0, 1]).await;
     memory

@@ -1,4 +1,5 @@
-//! No byte of what is no histogram changes unseen: splits, recipes, snapshots, manifests, metadata, records of models.
+//! Tests that every changed byte outside of histograms is detected: in splits, recipes, snapshots,
+//! manifests, metadata and records of models.
 
 mod common;
 
@@ -38,7 +39,7 @@ fn split() -> Vec<u8> {
     }))
 }
 
-/// One scene, a split, a recipe and a snapshot.
+/// Returns a data set with one scene, a split, a recipe and a snapshot.
 async fn whole() -> (Arc<InMemory>, Dataset) {
     let memory = Arc::new(InMemory::new());
     let spec = spec(Profile::default());
@@ -74,7 +75,7 @@ async fn a_flipped_byte_of_any_small_object_is_named_or_means_nothing() {
             continue;
         }
         let path = Path::from(key.as_str());
-        // Metadata are many and compared as a whole.
+        // Metadata is large, and compared as a whole.
         let step = if metadata { 7 } else { 1 };
         for at in (0..bytes.len()).step_by(step) {
             let mut changed = bytes.clone();
@@ -88,7 +89,7 @@ async fn a_flipped_byte_of_any_small_object_is_named_or_means_nothing() {
             if report.problems.iter().any(|p| p.object == *key) {
                 continue;
             }
-            // Spaces between the words of metadata, and the date in gzip's header.
+            // Exceptions: spaces between the words of metadata, and the date in gzip's header.
             let same = match key.contains("/snapshots/") {
                 true => opened.snapshot("v1").await.unwrap() == snapshot,
                 false => metadata && json(&changed) == json(bytes),
@@ -144,7 +145,7 @@ async fn a_changed_split_is_not_read_and_says_how_to_make_it_again() {
     let moved = String::from_utf8(bytes.clone()).unwrap();
     let moved = moved.replace("\"0102\"", "\"0201\"");
     assert_ne!(moved.as_bytes(), bytes);
-    // Another version under its name, or another split, is no better.
+    // Another version under its name, or another split, is also detected.
     let other = dataset.create_split("other", 1, split()).await.unwrap();
     assert!(other);
     for (name, bytes) in [("default", moved.into_bytes()), ("other", bytes)] {

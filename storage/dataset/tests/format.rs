@@ -1,5 +1,5 @@
-//! The bytes on disk: metadata, manifest and the hashes of a fixed scene's objects must stay as they are, since data
-//! sets outlive programs. A change here needs a new format or encoder version.
+//! Tests that the bytes on disk do not change: metadata, manifest and the hashes of a fixed scene's
+//! objects. Data sets outlive programs, so a change here requires a new format or encoder version.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! Captures of single spots: PlatoNeRF's, and bounce-flash lidar's in MATLAB files.
+//! Tests of importing single-spot captures: PlatoNeRF's, and bounce-flash lidar's in MATLAB files.
 
 mod common;
 
@@ -14,14 +14,14 @@ use serde_json::{Value, json};
 
 const SIDE: usize = 32;
 const BINS: usize = 120;
-/// Where laser beams go, x right, y down, z forward; they meet the wall z = 2.
+/// Directions of laser beams, x right, y down, z forward; they hit the wall z = 2.
 const BEAMS: [[f64; 2]; 3] = [[0.3, -0.2], [-0.5, 0.1], [0.05, 0.6]];
 
 fn norm(a: [f64; 3]) -> f64 {
     a.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
-/// A wall at z = 2 seen at 90°, lit by one beam.
+/// Returns the histogram of a wall at z = 2 seen at 90°, lit by one beam.
 fn wall(beam: [f64; 2]) -> Vec<u16> {
     let spot = [beam[0] * 2.0, beam[1] * 2.0, 2.0];
     let mut h = vec![0u16; SIDE * SIDE * BINS];
@@ -39,7 +39,7 @@ fn wall(beam: [f64; 2]) -> Vec<u16> {
     h
 }
 
-/// Three captures as PlatoNeRF lays them out.
+/// Writes three captures in PlatoNeRF's layout.
 fn platonerf(folder: &Path) -> Value {
     std::fs::create_dir_all(folder.join("train")).unwrap();
     let frames: Vec<Value> = BEAMS
@@ -52,7 +52,8 @@ fn platonerf(folder: &Path) -> Value {
                 "file_path": format!("./train/{i:03}"),
                 "transform_matrix": [[-1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
                 "light_origin": [0.0, 0.0, 0.0],
-                // Not a unit vector: what the laser looks at, x right, y up, z backward.
+                // The laser's target relative to the laser, x right, y up, z backward; not a unit
+                // vector.
                 "light_direction": [beam[0] * 3.0, -beam[1] * 3.0, -3.0],
                 "wall_idx_cam": 0, "wall_idx_light": 0,
             })
@@ -188,7 +189,8 @@ fn platonerfs_axes_angles_and_gate_are_checked_by_light_of_one_bounce() {
     );
 }
 
-/// A scan of 8×6 pixels of a wall at z = 2, counts with the spot at pixel (row 2, column 5) from the top left.
+/// Writes a scan of 8×6 pixels of a wall at z = 2, and counts with the spot at pixel
+/// (row 2, column 5) from the top left.
 fn collection(folder: &Path) -> Vec<f64> {
     let (columns, rows, bins) = (8usize, 6usize, 700usize);
     let (mut theta, mut phi) = (Vec::new(), Vec::new());
@@ -221,7 +223,7 @@ fn collection(folder: &Path) -> Vec<f64> {
     counts
 }
 
-/// Of a bin in the made-up counts, a path of 1.5 m.
+/// The t0 for which bin 651 of the made-up counts is a path of 1.5 m.
 const T0: f64 = 651.0 * 8e-12 - 1.5 / 299_792_458.0;
 
 fn lidar(t0_s: f64) -> ImportOptions {
@@ -238,7 +240,7 @@ fn lidar(t0_s: f64) -> ImportOptions {
 async fn matlab_captures_are_put_upright_and_their_spot_is_found() {
     let folder = tempfile::tempdir().unwrap();
     let counts = collection(folder.path());
-    // Bin 650 is 651 from 1: a path of 1.5 m in all.
+    // Bin 650 is bin 651 when counted from 1: a path of 1.5 m in total.
     let (width, c) = (8e-12, 299_792_458.0);
     let t0 = T0;
     let source = open(folder.path(), lidar(t0)).unwrap();

@@ -1,4 +1,5 @@
-//! Our own layout of `.npy` files is read as it says it is, and refused where the histograms say otherwise.
+//! Tests that our own layout of `.npy` files is imported according to its description, and refused
+//! if the histograms contradict it.
 
 mod common;
 
@@ -11,7 +12,7 @@ use picofarm_dataset::import::*;
 use picofarm_dataset::*;
 use serde_json::{Value, json};
 
-/// Writes `room` as scene `folder`, with spots 0, 7, 14, …; gives its description.
+/// Writes `room` as scene `folder`, with spots 0, 7, 14, …. Returns its description.
 fn write(room: &Room, folder: &Path) -> Value {
     std::fs::create_dir_all(folder).unwrap();
     let (w, h, n) = (room.width, room.height, 15);
@@ -104,7 +105,7 @@ fn masks_in_another_order_of_rows_columns_or_spots_are_refused() {
         .unwrap();
         let said = refusal(folder.path(), &description);
         assert!(
-            // Shadows of half the image, turned round, are also those of the other polarity.
+            // Shadows of half the image, when reversed, also look like the other polarity.
             said.contains("lit.npy: polarity of the visibility masks")
                 || said.contains("lit.npy: order of the visibility masks") && said.contains(words),
             "{words}: {said}"
@@ -112,7 +113,7 @@ fn masks_in_another_order_of_rows_columns_or_spots_are_refused() {
     }
 }
 
-/// What docs/exchange.md states of the errors that the check lets pass.
+/// Tests the statements in docs/exchange.md on the errors that the check does not detect.
 #[test]
 fn the_check_tells_gates_and_fields_of_view_apart_from_a_small_error_on() {
     let folder = tempfile::tempdir().unwrap();
@@ -207,7 +208,7 @@ async fn a_scene_is_read_and_found_again() {
     assert_eq!(plan["check"]["peak_shift_m"], 0.0, "{plan}");
     println!("{plan:#}");
 
-    // Another file of the same size is found by its contents only; of another size, at once.
+    // Another file of the same size is detected only by its contents; one of another size, at once.
     let file = folder.path().join("b/depth.npy");
     let whole = std::fs::read(&file).unwrap();
     let mut other = whole.clone();
@@ -327,7 +328,7 @@ fn what_does_not_fit_is_refused_by_file_and_field() {
         (
             "units",
             &|d| {
-                // The gate stays what it was: lengths alone shrink.
+                // The gate stays the same: only lengths shrink.
                 d["length_unit"] = json!("cm");
                 d["histogram"]["gate_start"] = json!(room.gate[0] * 100.0);
                 d["histogram"]["bin_width"] = json!(room.gate[1] * 100.0);
@@ -357,7 +358,7 @@ fn what_does_not_fit_is_refused_by_file_and_field() {
             assert!(error.contains(part), "{name}: {error}");
         }
     }
-    // Depth along the rays, spots right: only the histograms tell.
+    // With depth along the rays and correct spots, only the histograms reveal the error.
     let half = room.width as f32 / 2.0;
     let range: Vec<f32> = room
         .depth
@@ -415,13 +416,13 @@ fn lengths_of_beams_are_read_or_stated_or_listed_as_missing_where_a_mirror_is_se
             .any(|c| c.contains("straight lines"))
     };
     assert!(!unknown(&scene) && said(&scene), "{:?}", scene.conversions);
-    // Without a mirror, nothing folds a beam.
+    // Without a mirror, no beam is reflected.
     let none = vec![0u8; room.width * room.height];
     let mirrors = folder.path().join("mirror.npy");
     std::fs::write(&mirrors, npy("|u1", &[room.height, room.width], &none)).unwrap();
     let scene = import(&description, ImportOptions::default()).unwrap();
     assert!(!unknown(&scene) && said(&scene), "{:?}", scene.missing);
-    // Where nobody says what is a mirror, nobody knows.
+    // If the mirrors are not given, they are unknown.
     description.as_object_mut().unwrap().remove("specular");
     let scene = import(&description, ImportOptions::default()).unwrap();
     assert!(unknown(&scene), "{:?}", scene.missing);

@@ -1,4 +1,5 @@
-//! An import reads nothing but what lies where it may: neither by names in its files nor by links in its folders.
+//! Tests that an import reads only permitted files, whether they are named in its files or reached
+//! by links in its folders.
 
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
@@ -35,7 +36,7 @@ impl Place {
         symlink(self.dir.path().join("secret.npy"), link).unwrap();
     }
 
-    /// Names of the secret as a file in the scene's folder may spell them.
+    /// Returns names of the secret that a file in the scene's folder may use.
     fn tricks(&self) -> Vec<String> {
         let whole = self.dir.path().join("secret.npy").display().to_string();
         vec![
@@ -49,7 +50,7 @@ impl Place {
         ]
     }
 
-    /// What an import within `prefix` says.
+    /// Returns the error of an import within `prefix`.
     fn said(&self, format: Format, prefix: Option<&Path>) -> String {
         let opener = prefix.map_or(Opener::anywhere(), |p| Opener::anywhere().within([p]));
         let options = ImportOptions::default();
@@ -145,7 +146,8 @@ fn a_folder_that_is_a_link_and_a_root_outside_are_refused() {
     let prefix = place.data();
     let said = place.said(Format::Npy, Some(&prefix));
     assert!(said.contains("elsewhere is not opened"), "{said}");
-    // Without prefixes, links are the reader's own business; what is no JSON is not quoted all the same.
+    // Without prefixes, links are the reader's own responsibility; nevertheless, content other than
+    // JSON is not quoted.
     let said = place.said(Format::Npy, None);
     assert!(said.contains("scene.json"), "{said}");
     let said = place.said(Format::Npy, Some(&other));

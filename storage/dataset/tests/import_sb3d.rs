@@ -1,4 +1,5 @@
-//! The paper's layout: what is exported comes back within half precision, and the paper's own files are read.
+//! Tests of the paper's layout: an export is imported again within half precision, and the paper's
+//! own files can be read.
 
 mod common;
 
@@ -16,7 +17,7 @@ use picofarm_dataset::*;
 const SIDE: usize = 40;
 const BINS: usize = 180;
 
-/// A data set of one scene, a room lit by 100 spots, with both subsets.
+/// Returns a data set of one scene, a room lit by 100 spots, with both subsets.
 async fn source(room: &Room) -> Dataset {
     let spec = DatasetSpec {
         scenes: 1,
@@ -85,7 +86,7 @@ async fn source(room: &Room) -> Dataset {
 async fn export(dataset: &Dataset, to: &Path) -> Exported {
     let (store, prefix) = open_store(to.to_str().unwrap()).unwrap();
     let mut done = None;
-    // Again: equal files count as written.
+    // In a repeated export, equal files count as written.
     for _ in 0..2 {
         let mut export =
             Exporter::new(ExportFormat::Sb3d, dataset, &[0], &*store, prefix.clone()).unwrap();
@@ -117,7 +118,7 @@ async fn what_is_exported_comes_back_within_half_precision() {
     let room = Room::new(SIDE, BINS);
     let before = source(&room).await;
     let done = export(&before, folder.path()).await;
-    // Its own, and the card, the table and the Croissant metadata.
+    // Its own files, and the card, the table and the Croissant metadata.
     assert_eq!(done.files, 8 + 3);
     let (after, scene) = import(folder.path(), ImportOptions::default())
         .await
@@ -184,7 +185,7 @@ async fn the_papers_own_files_are_checked_against_one_another() {
     assert!((16_384.0..=32_768.0).contains(&brightest));
     let spots = after.read_spots(0).await.unwrap();
     assert_eq!(spots[7].unwrap().position, room.lights[7]);
-    // 25 spots alone.
+    // Only 25 spots.
     let few = ImportOptions {
         spots: Some(25),
         ..gate.clone()
@@ -206,7 +207,7 @@ async fn the_papers_own_files_are_checked_against_one_another() {
             assert!(error.contains(part), "{error}");
         }
     };
-    // The paper's bins, which these are not.
+    // The default is the paper's bins, which these are not.
     refused(ImportOptions::default(), &["lidar_100.exr"]).await;
     let shadow = ImportOptions {
         visibility: Some(Polarity::Shadow),
@@ -280,7 +281,8 @@ async fn openexr_reads_what_we_export_and_we_read_what_it_writes() {
     export(&before, folder.path()).await;
     let h = before.read_transient(0).await.unwrap();
     std::fs::write(folder.path().join("h.bin"), bytemuck::cast_slice(&h)).unwrap();
-    // Compares, and writes the scene anew as the paper's code does, with DWAA, into a folder of its own.
+    // The script compares the scene, and writes it again like the paper's code, with DWAA, into a
+    // separate folder.
     let script = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
         .join("../../tests/interop/sb3d.py");
     let anew = folder.path().join("anew");
@@ -308,13 +310,13 @@ async fn openexr_reads_what_we_export_and_we_read_what_it_writes() {
         "{:?}",
         scene.conversions
     );
-    // What OpenEXR itself decodes of its file.
+    // The values that OpenEXR itself decodes from its file.
     let raw = std::fs::read(anew.join("decoded.bin")).unwrap();
     let decoded: Vec<f32> = bytemuck::pod_collect_to_vec(&raw);
     let found = after.read_transient(0).await.unwrap();
     let brightest = decoded.iter().fold(0.0f32, |m, x| m.max(*x));
     for (a, b) in decoded.iter().zip(&found) {
-        // Both decoders use 32-bit cosines, in another order.
+        // Both decoders use 32-bit cosines, but in a different order.
         let bound = (a.abs() * 2f32.powi(-9)).max(brightest * 2f32.powi(-20));
         assert!((a.max(0.0) - b).abs() <= bound, "{a} was read as {b}");
     }

@@ -1,4 +1,5 @@
-//! Two-bounce times and detections that lie beside bounce-flash lidar's captures, or beside our own layout's arrays.
+//! Tests of two-bounce times and detections next to bounce-flash lidar's captures, or next to the
+//! arrays of our own layout.
 
 mod common;
 
@@ -16,9 +17,9 @@ const C: f64 = 299_792_458.0;
 const COLUMNS: usize = 8;
 const ROWS: usize = 6;
 const PIXELS: usize = COLUMNS * ROWS;
-/// Where the laser is: x left, y up, z forward.
+/// The laser's position: x left, y up, z forward.
 const LASER: [f64; 3] = [0.257, 0.0, 0.0];
-/// Spots on the wall z = 2, likewise.
+/// Spots on the wall z = 2, in the same axes.
 const SPOTS: [[f64; 3]; 3] = [[0.4, 0.3, 2.0], [-0.5, 0.2, 2.0], [0.1, 0.35, 2.0]];
 
 fn norm(a: [f64; 3]) -> f64 {
@@ -29,14 +30,15 @@ fn away(a: [f64; 3], b: [f64; 3]) -> f64 {
     norm([a[0] - b[0], a[1] - b[1], a[2] - b[2]])
 }
 
-/// The point of the wall that a pixel of the files sees: from the left (x large) and from the bottom.
+/// Returns the point of the wall that a pixel of the files sees: from the left (x large) and from
+/// the bottom.
 fn seen(pixel: usize) -> [f64; 3] {
     let x = 0.7 - 0.2 * (pixel % COLUMNS) as f64;
     let y = -0.5 + 0.2 * (pixel / COLUMNS) as f64;
     [x, y, 2.0]
 }
 
-/// Light's way from the laser by the spot to the point to the camera.
+/// Returns the path from the laser via the spot and the point to the camera.
 fn path(spot: [f64; 3], point: [f64; 3]) -> f64 {
     away(spot, LASER) + away(spot, point) + norm(point)
 }
@@ -45,14 +47,14 @@ fn lit(spot: usize, pixel: usize) -> bool {
     !(pixel + spot).is_multiple_of(5)
 }
 
-/// What lies in the files of times and detections.
+/// The content of the files of times and detections.
 struct Given {
     t2: Vec<f64>,
     has: Vec<f64>,
     points: Vec<f64>,
 }
 
-/// The spots' y times `sign`.
+/// Returns the files' content, with the spots' y multiplied by `sign`.
 fn given(sign: f64) -> Given {
     let pairs = (0..PIXELS).flat_map(|p| (0..3).map(move |s| (s, p)));
     let rows = [SPOTS[0], SPOTS[1], SPOTS[2], [0.0; 3]];
@@ -92,7 +94,7 @@ fn write(folder: &Path, given: &Given, spots: i32) {
     );
 }
 
-/// Three captures of the wall; the spots alone are bright.
+/// Writes three captures of the wall; only the spots are bright.
 fn collection(folder: &Path) {
     let angles: Vec<(f64, f64)> = (0..PIXELS)
         .map(|p| {
@@ -251,7 +253,7 @@ fn times_that_do_not_fit_are_refused_by_file_and_array() {
     ]);
 }
 
-/// Our own layout with two-bounce paths in millimetres and without depth.
+/// Writes our own layout with two-bounce paths in millimetres and without depth.
 fn own(folder: &Path) -> (Value, Vec<f32>) {
     let room = Room::new(16, 200);
     let (w, h) = (room.width, room.height);
@@ -330,8 +332,9 @@ async fn our_own_layout_may_have_two_bounce_paths_and_no_depth() {
     );
 }
 
-/// Our own layout with true paths of six spots, in the order `order`; `late` metres are added to them, and x of the spots is
-/// times `x`. With `depth` it has that too.
+/// Writes our own layout with true paths of six spots, in the order `order`. `late` metres are
+/// added to the paths, and x of the spots is multiplied by `x`. With `depth`, depth is also
+/// written.
 fn bounced(folder: &Path, order: [u32; 6], late: f32, x: f32, depth: bool) -> Source {
     let spots = [3u32, 17, 34, 51, 68, 86];
     let room = Room::new(16, 637);

@@ -1,4 +1,5 @@
-//! Every damage of every object is named and repaired; nothing is overwritten without proof; snapshots stay what they were.
+//! Tests that every damage to every object is reported and repaired, that nothing is overwritten
+//! without proof, and that snapshots do not change.
 
 mod common;
 
@@ -35,7 +36,7 @@ fn encoded(dataset: &Dataset, scene: u64) -> EncodedScene {
         .unwrap()
 }
 
-/// Three scenes, a recipe, a split and a snapshot.
+/// Returns a data set with three scenes, a recipe, a split and a snapshot.
 async fn whole() -> (Arc<InMemory>, Dataset, Objects) {
     let memory = Arc::new(InMemory::new());
     let prefix = Path::from("sets/a");
@@ -108,14 +109,14 @@ proptest! {
                 _ => memory.put(&path, bytes.into()).await.map(drop).unwrap(),
             }
             let Ok(opened) = Dataset::open(memory.clone(), Path::from("sets/a")).await else {
-                // Only the root's metadata are needed to open it.
+                // Opening it needs only the root's metadata.
                 assert_eq!(key, "sets/a/zarr.json");
                 let restored = restore_root(memory.clone(), Path::from("sets/a"), dataset.spec()).await;
                 restored.unwrap();
                 assert_eq!(objects(&*memory).await, all);
                 return;
             };
-            // A record that is gone is missed by nobody but its owner.
+            // A missing record is only noticed by its owner.
             let record = ["/recipes/", "/snapshots/", "/splits/"].iter().any(|f| key.contains(f));
             let options = VerifyOptions { complete: true, ..VerifyOptions::new(VerifyMode::Full) };
             let report = opened.verify_with(&options).await.unwrap();
@@ -124,13 +125,13 @@ proptest! {
                 assert_eq!(said.next(), None);
                 return;
             }
-            // gzip has bits that mean nothing: those of its date.
+            // gzip has bits without meaning: those of its date.
             if key.contains("/snapshots/") && harm == 0 && report.problems.iter().all(|p| p.object != *key) {
                 let found = opened.snapshot("v1").await.unwrap();
                 assert_eq!(found, named(&dataset, "v1").await, "a bit that means something was not named");
                 return;
             }
-            // Metadata without their last line end say the same.
+            // Metadata without its final newline is equivalent.
             let says = |bytes: &[u8]| serde_json::from_slice::<serde_json::Value>(bytes).ok();
             if key.ends_with("/zarr.json") && harm == 1 && says(&cut) == says(&all[key]) {
                 assert_eq!(said.next(), None);
@@ -175,7 +176,7 @@ async fn another_scene_is_an_alarm_and_overwrites_nothing() {
         .unwrap();
     let refused = dataset.restore(other.clone(), None).await.unwrap_err();
     assert!(refused.to_string().contains("nothing proves"), "{refused}");
-    // Nor is the right scene believed then: the snapshot has to say so.
+    // The correct scene is not accepted either in that case: the snapshot must confirm it.
     let right = encoded(&dataset, 1);
     dataset.restore(right.clone(), None).await.unwrap_err();
     let snapshot = dataset.snapshot("v1").await.unwrap();
@@ -209,13 +210,13 @@ async fn manifests_from_before_there_were_checksums_stay_as_they_are() {
         dataset.publish_encoded(encoded(&dataset, 0)).await.unwrap(),
         older
     );
-    // A broken object below it is repaired, the manifest stays.
+    // A broken object of the scene is repaired; the manifest is not changed.
     let object = Path::from("sets/a/rgb/c/0/0/0/0");
     memory.put(&object, "broken".into()).await.unwrap();
     let restored = dataset.restore(encoded(&dataset, 0), None).await.unwrap();
     assert_eq!(restored.written, ["sets/a/rgb/c/0/0/0/0"]);
     assert_eq!(dataset.manifest(0).await.unwrap(), older);
-    // A changed one has no checksum to show it, but the scene that it names does not exist.
+    // A changed manifest has no checksum to reveal it, but its scene does not exist.
     let mut changed = older;
     changed.objects[3].sha256 = "0".repeat(64);
     memory.put(&key, changed.to_bytes().into()).await.unwrap();
@@ -266,7 +267,7 @@ async fn a_snapshot_pins_what_there_was_and_says_what_changed() {
     assert!(dataset.verify_with(&options).await.unwrap().is_sound());
     let kept = objects(&*memory).await;
     assert!(all.iter().all(|(key, bytes)| kept.get(key) == Some(bytes)));
-    // A name is given once; the same again is no change.
+    // A name is used only once; creating the same snapshot again changes nothing.
     assert_eq!(dataset.create_snapshot(&first).await.unwrap(), None);
     let error = dataset.create_snapshot(&now.named("v1", "later")).await;
     assert!(error.unwrap_err().to_string().contains("another snapshot"));

@@ -1,5 +1,5 @@
-//! zarr-python and xarray read our data sets and render groups with the same values, without our code.
-//! Runs where `PICOFARM_PYTHON` names a Python with numpy, zarr and xarray.
+//! Tests that zarr-python and xarray read the same values from our data sets and render groups,
+//! without our code. They run if `PICOFARM_PYTHON` names a Python with numpy, zarr and xarray.
 
 mod common;
 

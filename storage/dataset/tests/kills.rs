@@ -1,6 +1,6 @@
-//! `kill -9` in the middle of any put, of publishers and repairers, alone and two at a time: no torn object is ever
-//! visible, the next run completes everything, and what the killed leave is bounded and collected. `PICOFARM_KILLS=200`
-//! kills 200 times instead of 20.
+//! Tests of `kill -9` in the middle of any put, of publishers and repairers, one or two at a time:
+//! no torn object is ever visible, the next run completes everything, and leftovers of the killed
+//! processes are bounded and collected. `PICOFARM_KILLS=200` kills 200 times instead of 20.
 
 mod common;
 
@@ -13,15 +13,15 @@ use std::time::{Duration, Instant};
 use common::*;
 use picofarm_dataset::*;
 
-/// Where the process at work puts its scenes.
+/// The variable with the folder in which the killed process publishes its scenes.
 const PLACE: &str = "PICOFARM_TEST_PUBLISH";
 const SCENES: u64 = 4;
-/// Puts of one process at a time.
+/// Number of concurrent puts of one process.
 const PUTS: usize = 8;
 
 type Objects = BTreeMap<String, Vec<u8>>;
 
-/// Publishes every scene, and repairs those that are broken.
+/// Publishes every scene, and repairs broken ones.
 async fn publish_all(folder: &Folder) {
     let spec = spec(Profile::default());
     let (store, prefix) = open_store(folder.to_str().unwrap()).unwrap();
@@ -40,7 +40,7 @@ async fn publish_all(folder: &Folder) {
     }
 }
 
-/// Also what a process of its own does, which is killed; see [`PLACE`].
+/// This is also run in a separate process, which is killed; see [`PLACE`].
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn publishing_and_repairing_ends_with_every_scene() {
     if let Some(place) = std::env::var_os(PLACE) {
@@ -62,7 +62,7 @@ async fn publishing_and_repairing_ends_with_every_scene() {
     assert_eq!(objects(folder.path()).0, whole);
 }
 
-/// What is visible, and the unfinished files.
+/// Returns the visible objects and the unfinished files.
 fn objects(folder: &Folder) -> (Objects, Vec<PathBuf>) {
     let (mut visible, mut unfinished) = (Objects::new(), Vec::new());
     let mut folders = vec![folder.to_owned()];
@@ -90,7 +90,8 @@ fn start(place: &Folder) -> Child {
     command.spawn().unwrap()
 }
 
-/// Waits until it is about to publish, then a while, then kills it; whether it had not ended by itself.
+/// Waits until the process is about to publish, then for `wait`, and kills it. Returns whether it
+/// was still running.
 fn kill_after(mut child: Child, place: &Folder, wait: Duration) -> bool {
     let ready = place.with_extension(child.id().to_string());
     let begun = Instant::now();
@@ -122,7 +123,7 @@ async fn killed_in_the_middle_of_any_put_nothing_torn_is_visible_and_the_next_ru
         round += 1;
         let mut harmed: Option<(String, Vec<u8>)> = None;
         let mut here = 0;
-        // Until a run comes through, or the round has seen enough.
+        // Repeats until a run finishes or the round has enough kills.
         for _ in 0..12 {
             if killed == kills {
                 break;
@@ -171,7 +172,7 @@ async fn killed_in_the_middle_of_any_put_nothing_torn_is_visible_and_the_next_ru
             if !all_ran {
                 break;
             }
-            // Somebody damages an object: the next one has to repair it.
+            // An object is damaged: the next process must repair it.
             let published = |k: &&String| {
                 k.starts_with("depth/c/")
                     && visible.contains_key(&format!("manifests/{}.json", &k[8..9]))
@@ -181,7 +182,7 @@ async fn killed_in_the_middle_of_any_put_nothing_torn_is_visible_and_the_next_ru
                 && let Some(key) = visible.keys().find(published)
             {
                 let torn = visible[key][..visible[key].len() / 2].to_vec();
-                // A file of its own: the object may be linked to an unfinished one.
+                // The object may be linked to an unfinished file, so a separate file is written.
                 fs::remove_file(place.join(key)).unwrap();
                 fs::write(place.join(key), &torn).unwrap();
                 harmed = Some((key.clone(), torn));

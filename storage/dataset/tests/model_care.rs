@@ -1,5 +1,5 @@
-//! Models are checked, repaired and removed: every flipped byte is found, what is put back has the recorded SHA-256, and a
-//! removal that is killed anywhere goes on to the same end.
+//! Tests of checking, repairing and removing models: every flipped byte is found, restored objects
+//! have the recorded SHA-256, and a removal killed at any point continues to the same end.
 
 mod common;
 
@@ -66,7 +66,8 @@ async fn put_evaluation(models: &Models, model: &ModelManifest) {
     assert_eq!(models.evaluations(&model.name).await.unwrap(), [evaluation]);
 }
 
-/// A model of each kind of object: manifest, weights, history, an evaluation, a checkpoint and a speed.
+/// Publishes a model with each kind of object: manifest, weights, history, an evaluation, a
+/// checkpoint and a speed.
 async fn whole(models: &Models) -> ModelManifest {
     let made = models
         .publish(new_model("m", "k", &[]), true)
@@ -120,7 +121,7 @@ async fn every_flipped_cut_or_added_byte_and_every_missing_object_is_found() {
         (2, 1, 1)
     );
     for (at, bytes) in objects(&store).await {
-        // How fast it was is no result, and has no checksum.
+        // The speed is not a result, and has no checksum.
         if at.ends_with("speed.json") {
             continue;
         }
@@ -192,7 +193,7 @@ async fn what_is_damaged_is_not_adopted_and_training_again_puts_it_back() {
                 matches!(found, Err(DatasetError::Damaged { .. })),
                 "{found:?}"
             );
-            // Other bits, as a graphics processor gives, put nothing back.
+            // Different bits, as from a GPU, restore nothing.
             let mut other = new_model("m", "k", &[]);
             other.objects[0].1 = Bytes::from_static(b"other bits");
             let said = models.publish(other, false).await;
@@ -213,7 +214,7 @@ async fn what_is_damaged_is_not_adopted_and_training_again_puts_it_back() {
 async fn repair_takes_only_bytes_of_the_recorded_hash_and_names_what_stays() {
     let (store, models) = in_memory();
     whole(&models).await;
-    // The same weights, another history.
+    // The same weights, with another history.
     models
         .publish(new_model("twin", "other", &[]), true)
         .await
@@ -256,7 +257,7 @@ async fn repair_takes_only_bytes_of_the_recorded_hash_and_names_what_stays() {
         broken[&at("history")],
         "nothing is invented"
     );
-    // With the right bytes it is whole again, and a second run finds nothing.
+    // With the correct bytes it is intact again, and a second run finds no problems.
     let right = before[&at("history")].clone();
     let done = models.repair("m", &[right], false).await.unwrap();
     assert!(done.left.is_empty() && done.written.len() == 1, "{done:?}");
@@ -317,7 +318,7 @@ async fn who_builds_on_a_model_is_found() {
     let found = models.dependents("m").await.unwrap();
     assert_eq!(found.models, ["n"]);
     assert_eq!(found.predictions, ["a/store/seen"]);
-    // A manifest that cannot be read may build on anything.
+    // An unreadable manifest may depend on any model.
     put(&store, "a/store/models/p/manifest.json", "{").await;
     let found = models.dependents("m").await.unwrap();
     assert_eq!(found.models, ["n", "p (its manifest cannot be read)"]);
@@ -333,7 +334,7 @@ async fn a_removal_killed_anywhere_goes_on_to_the_same_end() {
             .publish(new_model("n", "kn", &[]), true)
             .await
             .unwrap();
-        // Of another training under the name, which goes on.
+        // A checkpoint of another training under the name, which continues.
         models
             .put_checkpoint("m", "later", 1, pieces(&[b"c"]))
             .await
@@ -350,7 +351,7 @@ async fn a_removal_killed_anywhere_goes_on_to_the_same_end() {
             .catch_unwind()
             .await
             .is_err();
-        // A model is there and whole, or it is not there.
+        // A model either exists and is intact, or does not exist.
         let there = models.look("m").await.unwrap();
         let check = models.verify("m").await.unwrap();
         assert!(
@@ -358,7 +359,7 @@ async fn a_removal_killed_anywhere_goes_on_to_the_same_end() {
             "cut {cut}: {:?}",
             check.problems
         );
-        // Killed after the note went, there is nothing left to do.
+        // If it was killed after the note was deleted, nothing is left to do.
         if killed && check.removing {
             models.remove("m", false).await.unwrap();
         }

@@ -1,5 +1,5 @@
-//! Models at rest: what is published stays, whatever killed trainings left beside it; checkpoints that are torn or
-//! damaged are passed over; and collection takes only what nobody needs.
+//! Tests of stored models: published models are retained despite the leftovers of killed trainings,
+//! torn or damaged checkpoints are skipped, and collection deletes only unneeded objects.
 
 mod common;
 
@@ -98,7 +98,7 @@ async fn a_name_is_one_trainings_and_its_other_bits_are_adopted_or_an_alarm() {
         matches!(exact, Err(DatasetError::Conflict { .. })),
         "{exact:?}"
     );
-    // Nothing of the losers stays but, after the alarm, what proves it.
+    // Nothing of the losers remains except, after the alarm, the evidence.
     let mut after = files(dir.path());
     after.retain(|path| !before.contains(path));
     assert_eq!(after.len(), 2, "{after:?}");
@@ -107,7 +107,8 @@ async fn a_name_is_one_trainings_and_its_other_bits_are_adopted_or_an_alarm() {
 #[tokio::test]
 async fn what_a_killed_training_left_is_in_nobodys_way() {
     let (dir, models) = local();
-    // Objects of other settings and of the same, without a manifest; a manifest's unfinished file.
+    // Objects of other settings and of the same ones, without a manifest, and an unfinished file of
+    // a manifest.
     models
         .publish(model("m", "other", b"x"), false)
         .await
@@ -194,7 +195,7 @@ async fn the_newest_two_checkpoints_are_kept_and_none_after_the_end() {
         .map(|c| c.step)
         .collect();
     assert_eq!(steps, [30, 1_000_000_000_000, 1]);
-    // A worker that was slow takes nothing away from one that is further.
+    // A slow worker deletes nothing of a worker at a later step.
     models
         .put_checkpoint("m", "k", 25, pieces(&[b""]))
         .await
@@ -243,7 +244,8 @@ async fn a_checkpoint_in_pieces_counts_when_its_head_lies_there_and_each_piece_i
     assert!(step == 7 && found == many);
     assert_eq!(files(dir.path()).len(), 18);
     assert_eq!(models.verify("m").await.unwrap().checkpoints, 2);
-    // Each of its objects, damaged or gone: the one before counts, a check says so, and writing it again mends it.
+    // If any of its objects is damaged or missing, the previous checkpoint is used, the check
+    // reports it, and writing it again repairs it.
     let of_7 = |path: &&PathBuf| path.to_str().unwrap().contains("/000000000007.");
     for path in files(dir.path()).iter().filter(of_7) {
         for gone in [false, true] {
@@ -266,7 +268,8 @@ async fn a_checkpoint_in_pieces_counts_when_its_head_lies_there_and_each_piece_i
             assert!(step == 7 && found == many, "{path:?}");
         }
     }
-    // Cut off before its head: nobody takes it for a checkpoint, and the next one clears it away.
+    // The write was interrupted before the head: it is not taken for a checkpoint, and the next one
+    // deletes it.
     put(9).await;
     let head = files(dir.path())
         .into_iter()
@@ -372,7 +375,7 @@ async fn a_pin_is_the_id_of_a_snapshot_of_the_scenes() {
     assert!(missing.contains("scene 1"), "{missing}");
 }
 
-/// What happens to the files of checkpoints.
+/// Damage to the files of checkpoints.
 #[derive(Debug, Clone)]
 enum Harm {
     None,
@@ -397,7 +400,8 @@ proptest! {
     ) {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let store: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
-        // Written by workers that did not know of each other: each into a store of its own, so that none tidies up.
+        // The checkpoints are written by independent workers, each into a separate store, so that
+        // none deletes older ones.
         let mut expected = None;
         for (step, (content, harm)) in &steps {
             let own: Arc<dyn ObjectStore> = Arc::new(InMemory::new());

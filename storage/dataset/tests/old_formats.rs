@@ -1,4 +1,5 @@
-//! Data sets of format 1, as an earlier version wrote them, stay readable, verifiable and can grow.
+//! Tests that data sets of format 1, written by an earlier version, can still be read, verified and
+//! extended.
 
 mod common;
 
@@ -8,7 +9,8 @@ use std::path::Path;
 use common::*;
 use picofarm_dataset::*;
 
-/// Unpacks `format-1.zip`: the data sets `sqrt` (with `transient_spots`), `plain` and `counts`, each with scene 1.
+/// Unpacks `format-1.zip`: the data sets `sqrt` (with `transient_spots`), `plain` and `counts`,
+/// each with scene 1.
 fn unpack(to: &Path) {
     let bytes = include_bytes!("fixtures/format-1.zip");
     let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).unwrap();
@@ -73,7 +75,7 @@ async fn data_sets_of_format_1_are_read_verified_and_grow() {
         let found = dataset.verify(VerifyMode::Full).await.unwrap();
         assert!(found.problems.is_empty(), "{name}: {:?}", found.problems);
 
-        // A scene is added in the old format, and the data set stays one that old programs read.
+        // A scene is added in the old format, and old programs can still read the data set.
         let more = DatasetSpec { scenes: 6, ..spec };
         let grown = Dataset::create_or_open(store, prefix, &more).await.unwrap();
         let alone: Vec<Vec<f32>> = (0..9).map(|i| Scene::new(&spec, i).transient).collect();

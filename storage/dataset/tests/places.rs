@@ -1,4 +1,4 @@
-//! Where data sets may lie: creation, growth, wrong places, and stores that cannot be trusted.
+//! Tests of locations of data sets: creation, growth, wrong locations, and untrustworthy stores.
 
 mod common;
 
@@ -205,7 +205,7 @@ async fn a_safe_store_passes_the_probe_and_nothing_is_left() {
         .unwrap();
 }
 
-/// A store that takes every put for an overwrite, as some S3 servers do.
+/// A store that treats every put as an overwrite, as some S3 servers do.
 #[derive(Debug)]
 struct Forgetful(LocalFileSystem);
 
@@ -285,7 +285,7 @@ async fn a_store_without_conditional_puts_fails_the_probe() {
 #[cfg(target_os = "linux")]
 #[tokio::test]
 async fn a_place_that_cannot_be_written_is_named_with_a_hint() {
-    // Not even root may create files there.
+    // Even root may not create files there.
     let (store, prefix) = open_store("/sys/picofarm-dataset").unwrap();
     let error = Dataset::create_or_open(store.clone(), prefix.clone(), &spec(Profile::default()))
         .await
@@ -299,7 +299,7 @@ async fn a_place_that_cannot_be_written_is_named_with_a_hint() {
         probe(&*store, &prefix, PROBE_WITHIN).await,
         Err(DatasetError::Store { .. })
     ));
-    // Below a file.
+    // A path below a file.
     let file = tempfile::NamedTempFile::new().unwrap();
     let (store, prefix) = open_store(file.path().join("set").to_str().unwrap()).unwrap();
     let error = Dataset::create_or_open(store, prefix, &spec(Profile::default()))

@@ -1,5 +1,6 @@
-//! What models predict of scenes: published once, read back, grown, kept apart from data sets; and read by zarr-python.
-//! The last runs where `PICOFARM_PYTHON` names a Python with numpy, zarr and xarray.
+//! Tests that predictions are published once, read back, grown, and kept apart from data sets, and
+//! that zarr-python can read them. The last test runs if `PICOFARM_PYTHON` names a Python with
+//! numpy, zarr and xarray.
 
 mod common;
 
@@ -96,7 +97,7 @@ async fn what_was_published_reads_back_and_is_known_again_by_its_task() {
     assert_eq!(there.finished(2, "k").await.unwrap().unwrap(), made);
     let keys: Vec<&str> = made.objects.iter().map(|o| &*o.key).collect();
     assert_eq!(keys, ["depth/c/2/0/0", "lit/c/2/0/0/0", "specular/c/2/0/0"]);
-    // A second publication, by whomever, changes nothing.
+    // A second publication, by any process, changes nothing.
     let before = files(folder.path());
     let again = open(folder.path(), &spec(4)).await.unwrap();
     publish(&again, 2, "k").await;
@@ -128,7 +129,7 @@ async fn what_is_missing_or_changed_is_found_out_and_repaired() {
     std::fs::write(&lit, flipped).unwrap();
     let said = there.read(0).await.unwrap_err().to_string();
     assert!(said.contains("SHA-256") && said.contains("lit"), "{said}");
-    // A flipped bit of the same size is no reason to adopt it either.
+    // An object of the same size with a flipped bit is not adopted either.
     let said = there.finished(0, "k").await.unwrap_err().to_string();
     assert!(said.contains("SHA-256") && said.contains("lit"), "{said}");
     std::fs::write(&lit, bytes).unwrap();
@@ -190,7 +191,7 @@ async fn a_group_grows_with_its_source_and_its_form_stays() {
     );
     let grown = open(folder.path(), &spec(5)).await.unwrap();
     publish(&grown, 4, "k").await;
-    // Who still knows the smaller one does not shrink it.
+    // A process with the smaller spec does not shrink it.
     let late = open(folder.path(), &spec(2)).await.unwrap();
     assert_eq!(late.spec().scenes, 5);
     let metadata = std::fs::read(folder.path().join("lit/zarr.json")).unwrap();
@@ -283,7 +284,7 @@ async fn what_is_damaged_is_put_back_where_it_is_proved_to_be_the_same() {
     let again = there.encode(manifest(0, "k"), &predicted(0)).unwrap();
     assert_eq!(there.restore(&again).await.unwrap(), Vec::<String>::new());
     for (path, bytes) in &before {
-        // Metadata of the group is not a scene's.
+        // The group's metadata does not belong to a scene.
         if path.ends_with("zarr.json") {
             continue;
         }
@@ -308,7 +309,7 @@ async fn what_is_damaged_is_put_back_where_it_is_proved_to_be_the_same() {
     let strange = there.encode(manifest(0, "other"), &predicted(0)).unwrap();
     let said = there.restore(&strange).await.unwrap_err().to_string();
     assert!(said.contains("choose another folder"), "{said}");
-    // Nor is anything where the manifest is broken and an object is other than now.
+    // Nothing is restored if the manifest is broken and an object differs from the new one.
     std::fs::write(folder.path().join("manifests/0.json"), b"{").unwrap();
     let said = there.restore(&again).await.unwrap_err();
     assert!(matches!(said, DatasetError::Damaged { .. }), "{said}");

@@ -1,4 +1,5 @@
-//! What each profile promises: how far what is read may be from what was written, and that the manifest says so.
+//! Tests of each profile's guarantee: the maximum error of the values read, and that the manifest
+//! states it.
 
 mod common;
 
@@ -50,7 +51,7 @@ async fn errors_stay_within_the_promise_and_the_manifest_states_them() {
         for (at, (found, given)) in h.iter().zip(&scene.transient).enumerate() {
             let n = f64::from(*given) * f64::from(scene.scale);
             let error = f64::from(found - given) * f64::from(scene.scale) / n.max(1.0).sqrt();
-            // Listed exactly, whatever the code's error there.
+            // Listed exactly, whatever the code's error is there.
             if at == bright && overflows {
                 assert_eq!(found, given);
             }
@@ -147,7 +148,7 @@ async fn any_part_equals_the_same_part_of_the_whole() {
     }
 }
 
-/// Where the inner chunks of a shard lie, from its index.
+/// Returns the byte ranges of a shard's inner chunks, from its index.
 fn chunks_of(shard: &[u8], chunks: usize) -> Vec<Range<u64>> {
     let index = &shard[shard.len() - 4 - chunks * 16..shard.len() - 4];
     let number = |b: &[u8]| u64::from_le_bytes(b.try_into().unwrap());

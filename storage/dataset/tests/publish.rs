@@ -1,4 +1,4 @@
-//! Publishing: create-only, repeatable, safe under races and kills.
+//! Tests of publishing: create-only, repeatable, safe under races and kills.
 
 mod common;
 
@@ -72,7 +72,7 @@ async fn publishing_something_else_is_a_conflict_that_names_the_object() {
     assert_eq!(object, "sets/a/depth/c/1/0/0");
     assert_eq!(*stored, manifest.objects[2].sha256);
     assert_ne!(stored, ours);
-    // Equal objects, other provenance: the manifest itself.
+    // Equal objects with another provenance: the manifest itself conflicts.
     scene.depth[3] -= 1.0;
     let mut other = provenance();
     other.seed += 1;
@@ -200,7 +200,7 @@ async fn racing_publishers_of_the_same_task_all_succeed_and_of_different_ones_co
         assert!(matches!(error, DatasetError::Conflict { .. }), "{error}");
     }
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
-    // Where each of them came upon another's object, nobody won, and what they wrote is nobody's.
+    // If each encountered an object of the other, none succeeded, and their objects are orphans.
     let left = dataset.collect(Duration::ZERO, false).await.unwrap();
     assert_eq!(left.orphans.is_empty(), winners == 1, "{left:?}");
 }
@@ -220,7 +220,7 @@ async fn what_broken_puts_have_left_is_replaced_when_the_scene_is_published_agai
         let mut flipped = whole.to_vec();
         flipped[whole.len() / 2] ^= 0x10;
         for broken in [flipped, whole[..whole.len() / 2].to_vec(), Vec::new()] {
-            // With the manifest that proves what was there, and before there was one.
+            // With the manifest that proves the original content, and before it exists.
             for published in [true, false] {
                 if !published {
                     store.delete(&file).await.unwrap();
@@ -234,7 +234,7 @@ async fn what_broken_puts_have_left_is_replaced_when_the_scene_is_published_agai
     }
     store.put(&file, "{".into()).await.unwrap();
     assert_eq!(publish().await.unwrap(), manifest);
-    // Where somebody names its folder as a store, that has an identity.
+    // If the data set's folder itself is used as a store, it has an identity.
     identify_store(&*store, dataset.prefix()).await.unwrap();
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
 }
@@ -277,7 +277,7 @@ async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
 }
 
-/// A manifest of scene 0 that was made up, with its checksum.
+/// Returns a made-up manifest of scene 0, with its checksum.
 fn made_up(true_manifest: &Manifest) -> Manifest {
     let mut made_up = true_manifest.clone();
     for object in &mut made_up.objects {
@@ -311,7 +311,7 @@ async fn a_made_up_manifest_gives_way_to_the_scene_and_a_true_one_does_not() {
         let replaced = dataset.replace_unfounded(encode(1)).await.unwrap().unwrap();
         assert_eq!(replaced, honest);
         assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
-        // Another result of the same scene does not replace one that is whole.
+        // Another result of the same scene does not replace an intact one.
         assert_eq!(dataset.replace_unfounded(encode(2)).await.unwrap(), None);
         assert_eq!(dataset.published(0).await.unwrap(), Some(honest));
     }

@@ -1,4 +1,4 @@
-//! Render groups: exact, all or nothing, and never over something else.
+//! Tests of render groups: they are exact, written atomically, and never overwrite other files.
 
 use picofarm_dataset::{RenderArray, RenderGroup, write_render_group};
 use proptest::prelude::*;
@@ -64,7 +64,7 @@ fn arrays_of_every_rank_come_back_bit_for_bit_through_zarrs() {
 fn nothing_is_overwritten_and_a_failure_leaves_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let one = [array("a", &[1], &["x"], &[1.0])];
-    // An empty folder is taken, a full one and a file are not.
+    // An empty folder is accepted; a non-empty one and a file are not.
     write_render_group(folder.path(), &one, &Map::new()).unwrap();
     let error = write_render_group(folder.path(), &one, &Map::new())
         .unwrap_err()

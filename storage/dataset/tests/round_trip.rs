@@ -1,4 +1,4 @@
-//! What is published is read back: exactly, or within the code's error.
+//! Tests that published values are read back exactly, or within the code's error.
 
 mod common;
 
@@ -210,7 +210,7 @@ async fn unusable_values_are_named() {
             scenes: 4
         }
     ));
-    // Saturation everywhere is a wrong scale, not something to list.
+    // Saturation everywhere indicates a wrong scale, and is not listed.
     let large = DatasetSpec {
         height: 64,
         width: 64,

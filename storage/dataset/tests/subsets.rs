@@ -1,5 +1,5 @@
-//! Transients of subsets of the spots and of each spot alone lie beside the transient: same codec, same scale, in the
-//! manifest, and as safe.
+//! Tests of transients of subsets of the spots and of each single spot: they use the same codec and
+//! scale as the main transient, are listed in the manifest, and are as safe.
 
 mod common;
 
@@ -25,7 +25,7 @@ fn rich(profile: Profile) -> DatasetSpec {
     }
 }
 
-/// Histograms of each spot alone.
+/// Returns histograms of each single spot.
 fn planes(spec: &DatasetSpec) -> Vec<Vec<f32>> {
     let mut random = Lcg(5);
     let plane = |_| {
@@ -118,7 +118,7 @@ async fn subsets_come_back_as_they_were_and_the_data_set_is_sound() {
             Profile::PlainF32 { .. } | Profile::CountsU16 => assert!(exact.is_empty()),
         }
 
-        // Opened again, it is the same data set; damage to a subset is found.
+        // Opened again, it is the same data set, and damage to a subset is detected.
         let again = Dataset::open(store.clone(), dataset.prefix().clone())
             .await
             .unwrap();

@@ -1,4 +1,5 @@
-//! Verification finds and names what is broken, missing or foreign; the summary adds up.
+//! Tests that verification reports broken, missing and foreign objects, and that the summary is
+//! correct.
 
 mod common;
 
@@ -86,7 +87,8 @@ async fn broken_missing_and_foreign_objects_are_named() {
         texts[4]
     );
 
-    // The flipped bit is noticed on reading, by the inner chunk's crc32c or the decoder; the rest still reads.
+    // The flipped bit is detected when reading, by the inner chunk's crc32c or the decoder; the
+    // rest can still be read.
     assert!(matches!(
         dataset.read_transient(1).await,
         Err(DatasetError::Damaged { object, .. }) if object == "sets/a/transient/c/1/0/0/0"

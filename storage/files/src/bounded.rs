@@ -1,15 +1,15 @@
-//! Reading what is packed, within a bound: what a header announces is no reason to allocate.
+//! Reads packed data within a size limit. Sizes in headers are not trusted for allocation.
 
 use std::io::{Error, Read};
 
-/// Most bytes allocated before any is read, whatever is announced.
+/// Maximum number of bytes allocated before the first read, whatever size is announced.
 const AT_FIRST: u64 = 1 << 20;
 
-/// Everything that `reader` gives, if that is at most `most` bytes. Memory grows with what was read, not with what is
-/// announced.
+/// Reads `reader` to its end, up to `most` bytes. Memory use grows with the data read and is
+/// independent of announced sizes.
 ///
 /// # Errors
-/// More than `most` bytes (`InvalidData`), or what the reader says.
+/// `InvalidData` if there are more than `most` bytes; any error of the reader.
 pub fn read_bounded(reader: impl Read, most: u64) -> Result<Vec<u8>, Error> {
     let mut out = Vec::new();
     reader.take(most.saturating_add(1)).read_to_end(&mut out)?;
@@ -22,11 +22,11 @@ pub fn read_bounded(reader: impl Read, most: u64) -> Result<Vec<u8>, Error> {
     Ok(out)
 }
 
-/// The same for an entry whose size is announced: a larger announcement is refused before anything is read, and so is one
-/// that is not kept.
+/// Like [`read_bounded`], for an entry with an announced size. An announcement above the limit is
+/// refused before anything is read, and so is content with another size than announced.
 ///
 /// # Errors
-/// As [`read_bounded`]; another size than announced.
+/// Those of [`read_bounded`]; a size other than the announced one.
 pub fn read_entry(reader: impl Read, announced: u64, most: u64) -> Result<Vec<u8>, Error> {
     let refused = |what: String| Err(Error::new(std::io::ErrorKind::InvalidData, what));
     if announced > most {

@@ -1,34 +1,34 @@
-//! Why a file is not opened.
+//! The reasons why a file is not opened.
 
 use std::path::{Path, PathBuf};
 
-/// A file that is not opened, or cannot be read.
+/// A failure to open or read a file.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
-    /// It lies elsewhere than in the folders allowed.
+    /// The file is outside the allowed folders.
     #[error("{} is not opened: it lies outside {allowed}", path.display())]
     Outside {
-        /// The file as it was named.
+        /// The path as given.
         path: PathBuf,
-        /// Where files may lie.
+        /// The allowed folders.
         allowed: String,
     },
-    /// A name that is no plain path.
+    /// The name is not a plain path.
     #[error(
         "{name:?} is not opened: {why}; write a path with / between its parts, relative to the file that names it"
     )]
     Name {
         /// The name.
         name: String,
-        /// What is wrong with it.
+        /// The problem with the name.
         why: &'static str,
     },
-    /// The system refuses.
+    /// The operating system returned an error.
     #[error("cannot read {}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// The system's account.
+        /// The operating system's error.
         source: std::io::Error,
     },
 }
@@ -41,7 +41,8 @@ impl FileError {
         }
     }
 
-    /// As the system's error, for readers that know no other: refusals are of kind `PermissionDenied`.
+    /// Converts to a system error, for readers that support no other type. Refusals have the kind
+    /// `PermissionDenied`.
     pub fn into_io(self) -> std::io::Error {
         match self {
             Self::Io { source, .. } => source,

@@ -1,5 +1,6 @@
-//! The one way to files whose names come from elsewhere: from a job, a scene file, an import, a furniture list. A file is
-//! opened only if it lies below the folders allowed, wherever links lead.
+//! The only way to open files with names from elsewhere: from a job, a scene file, an import or a
+//! furniture list. A file is opened only if it is inside the allowed folders, after resolving
+//! symbolic links.
 
 mod bounded;
 mod error;

@@ -1,4 +1,4 @@
-//! Which files may be opened, and the opening.
+//! Restricts which files may be opened, and opens them.
 
 use std::{
     fs::{File, OpenOptions},
@@ -9,27 +9,28 @@ use std::{
 
 use crate::{FileError, read_bounded};
 
-/// Longest name of a file, bytes: no system opens longer ones, and finding where a path leads
-/// takes time for each part.
+/// Maximum length of a file name in bytes. No system opens longer names, and resolving a path takes
+/// time for each component.
 const MAX_NAME: usize = 4096;
 
-/// Opens files that lie below the folders it was given, wherever links lead; regular files only.
+/// Opens regular files inside the given folders, after resolving symbolic links.
 ///
-/// Hard links cannot be distinguished from files: who may write to a folder decides what lies in it.
+/// Hard links cannot be distinguished from files, so anyone who may write to an allowed folder
+/// decides what can be opened in it.
 #[derive(Debug, Clone, Default)]
 pub struct Opener {
-    /// A file must lie in one folder of every set.
+    /// A file must be inside one folder of every set.
     sets: Vec<Arc<[PathBuf]>>,
 }
 
 impl Opener {
-    /// One that opens every file.
+    /// Returns an opener without restrictions.
     pub fn anywhere() -> Self {
         Self::default()
     }
 
-    /// One that opens what this one does, and of that only what lies in one of `folders`. Folders count as they really
-    /// lie; one that is not there holds nothing.
+    /// Returns an opener with the same restrictions, and additionally restricted to files inside
+    /// `folders`. Folders are resolved to their real paths; a missing folder contains nothing.
     #[must_use]
     pub fn within<P: AsRef<Path>>(&self, folders: impl IntoIterator<Item = P>) -> Self {
         let mut sets = self.sets.clone();
@@ -37,11 +38,11 @@ impl Opener {
         Self { sets }
     }
 
-    /// The path that a file in `folder` means by `name`.
+    /// Resolves `name` relative to `folder`.
     ///
     /// # Errors
-    /// [`FileError::Name`] for URLs, for names with a backslash or a NUL, and for names of more
-    /// than 4096 bytes.
+    /// [`FileError::Name`] for URLs, for names with a backslash or a NUL, and for names longer than
+    /// 4096 bytes.
     pub fn named(folder: &Path, name: &str) -> Result<PathBuf, FileError> {
         let why = if name.len() > MAX_NAME {
             "it is longer than 4096 bytes"
@@ -64,13 +65,14 @@ impl Opener {
     /// Opens a regular file.
     ///
     /// # Errors
-    /// [`FileError::Outside`], also where nothing of that name exists outside; [`FileError::Io`].
+    /// [`FileError::Outside`], even if no such file exists outside; [`FileError::Io`].
     pub fn open(&self, path: &Path) -> Result<File, FileError> {
         self.check(path)?;
         let failed = |e| FileError::io(path, e);
         let place = path.canonicalize().map_err(failed)?;
         self.allows(path, &place)?;
-        // A device or pipe must not be waited for, nor a link followed that was not there a moment ago.
+        // Do not block on a device or pipe, and do not follow a symbolic link created after the
+        // check.
         let flags = rustix::fs::OFlags::NONBLOCK | rustix::fs::OFlags::NOFOLLOW;
         let mut options = OpenOptions::new();
         options.read(true);
@@ -80,15 +82,16 @@ impl Opener {
             let what = "is not a file; expected one, and no folder, pipe or device";
             return Err(failed(Error::new(ErrorKind::InvalidInput, what)));
         }
-        // Folders on the way may have been swapped since: what counts is the file that is open.
+        // Folders on the path may have been swapped since the check, so the open file itself is
+        // checked.
         self.allows(path, &opened(&file, &place).map_err(failed)?)?;
         Ok(file)
     }
 
-    /// A regular file of at most `most` bytes.
+    /// Reads a regular file of at most `most` bytes.
     ///
     /// # Errors
-    /// As [`Self::open`]; a larger file.
+    /// Those of [`Self::open`]; a file larger than `most`.
     pub fn read(&self, path: &Path, most: u64) -> Result<Vec<u8>, FileError> {
         let file = self.open(path)?;
         let failed = |e| FileError::io(path, e);
@@ -100,7 +103,7 @@ impl Opener {
         read_bounded(file, most).map_err(failed)
     }
 
-    /// Whether a path lies where files may be opened; it need not exist.
+    /// Checks that a path is inside the allowed folders. It need not exist.
     ///
     /// # Errors
     /// [`FileError::Outside`].
@@ -128,22 +131,22 @@ impl Opener {
     }
 }
 
-/// Where a path really lies. Of one that does not exist: where its existing part does, so that nothing is said of what
-/// exists elsewhere.
+/// Returns the real path. For a path that does not exist, resolves its existing part, so that the
+/// answer reveals nothing about files elsewhere.
 fn real(path: &Path) -> PathBuf {
     let mut there = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let mut rest = Vec::new();
     loop {
         if let Ok(place) = there.canonicalize() {
             return rest.iter().rev().fold(place, |place, part: &PathBuf| {
-                // What does not exist has no links: `..` means what it says.
+                // A path that does not exist has no links, so `..` removes a component.
                 match part.as_os_str() == ".." {
                     true => place.parent().unwrap_or(Path::new("/")).to_owned(),
                     false => place.join(part),
                 }
             });
         }
-        // A link that leads nowhere is followed as far as it goes.
+        // A dangling link is followed as far as possible.
         if let Ok(target) = std::fs::read_link(&there)
             && rest.len() < 40
         {
@@ -166,7 +169,8 @@ fn real(path: &Path) -> PathBuf {
     }
 }
 
-/// Where an open file lies: what the system says, or else what its path still leads to.
+/// Returns the path of an open file, from the operating system if possible, or otherwise by
+/// resolving its path again.
 fn opened(file: &File, place: &Path) -> Result<PathBuf, Error> {
     use std::os::{fd::AsRawFd, unix::fs::MetadataExt};
     let link = format!("/proc/self/fd/{}", file.as_raw_fd());
@@ -262,7 +266,7 @@ mod tests {
         for name in ["loop", "sub", "nothing"] {
             assert!(files.open(&p.mine.join(name)).is_err(), "{name}");
         }
-        // Both sets must hold it.
+        // Both sets must contain the file.
         let both = files.within([p.mine.join("sub")]);
         assert!(both.open(&p.mine.join("sub/b")).is_ok());
         assert!(both.open(&p.mine.join("a")).is_err());

@@ -1,10 +1,11 @@
 //! Animated GIFs.
 
-/// An animation of frames of `size` (w, h), at most 65,535 a side. A frame holds an index into `palette` (r, g, b of 256 colours)
-/// a pixel, row by row; each is shown for `delay` hundredths of a second, and after the last the first.
+/// Encodes an animation of frames of `size` (w, h), at most 65,535 per side. A frame has an index
+/// into `palette` (r, g, b of 256 colours) per pixel, row by row. Each frame is shown for `delay`
+/// hundredths of a second, in an endless loop.
 ///
 /// # Panics
-/// Where a frame has not w·h pixels, or the size is 0 or too large.
+/// If a frame does not have w·h pixels, or the size is 0 or too large.
 pub fn animation(
     size: (usize, usize),
     palette: &[u8],

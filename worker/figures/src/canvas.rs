@@ -1,4 +1,4 @@
-//! A picture to draw on: scaled images and small captions.
+//! A picture to draw on, with scaled images and small captions.
 
 use std::io::Cursor;
 
@@ -6,15 +6,15 @@ use font8x8::UnicodeFonts;
 
 use crate::rgb_png;
 
-/// Most pixels of a picture that is read.
+/// Maximum number of pixels of a decoded picture.
 const MOST_PIXELS: usize = 1 << 24;
 
 /// 8-bit RGB, row-major.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Canvas {
-    /// Columns.
+    /// Width in pixels.
     pub width: usize,
-    /// Rows.
+    /// Height in pixels.
     pub height: usize,
     pixels: Vec<[u8; 3]>,
 }
@@ -23,7 +23,7 @@ pub struct Canvas {
 pub const TEXT: usize = 8;
 
 impl Canvas {
-    /// An empty picture of one colour.
+    /// Returns a picture of one colour.
     pub fn new(width: usize, height: usize, colour: [u8; 3]) -> Self {
         Self {
             width,
@@ -32,15 +32,15 @@ impl Canvas {
         }
     }
 
-    /// Colours a pixel; those outside of the picture are left out.
+    /// Sets a pixel; pixels outside of the picture are ignored.
     pub fn set(&mut self, x: usize, y: usize, colour: [u8; 3]) {
         if x < self.width && y < self.height {
             self.pixels[y * self.width + x] = colour;
         }
     }
 
-    /// Draws an image of `size` (w, h) into a square of `cell` pixels at (x, y): box-filtered where it
-    /// shrinks, nearest where it grows.
+    /// Draws an image of `size` (w, h) into a square of `cell` pixels at (x, y): box-filtered if it
+    /// shrinks, nearest neighbour if it grows.
     pub fn image(
         &mut self,
         at: (usize, usize),
@@ -74,7 +74,8 @@ impl Canvas {
         }
     }
 
-    /// The part of `size` (w, h) whose upper left corner is at (x, y); `None` where it leaves the picture.
+    /// Returns the part of `size` (w, h) with its upper left corner at (x, y); `None` if it exceeds
+    /// the picture.
     pub fn part(&self, (x, y): (usize, usize), (w, h): (usize, usize)) -> Option<Self> {
         if x + w > self.width || y + h > self.height {
             return None;
@@ -99,7 +100,7 @@ impl Canvas {
         }
     }
 
-    /// A small cross.
+    /// Draws a small cross.
     pub fn cross(&mut self, x: usize, y: usize, colour: [u8; 3]) {
         for d in 0..7 {
             self.set((x + d).wrapping_sub(3), y, colour);
@@ -107,16 +108,16 @@ impl Canvas {
         }
     }
 
-    /// The picture as a PNG.
+    /// Encodes the picture as a PNG.
     pub fn png(&self) -> Vec<u8> {
         let pixels = self.pixels.as_flattened();
         rgb_png(self.width as u32, self.height as u32, pixels)
     }
 
-    /// A picture that [`Self::png`] has written.
+    /// Decodes a picture written by [`Self::png`].
     ///
     /// # Errors
-    /// What is wrong with it: no PNG of 8-bit RGB, or more than 16 million pixels.
+    /// A description of the problem: not a PNG of 8-bit RGB, or more than 16 million pixels.
     pub fn from_png(bytes: &[u8]) -> Result<Self, String> {
         let damaged = |e: png::DecodingError| format!("is no readable PNG ({e})");
         let mut reader = png::Decoder::new(Cursor::new(bytes))

@@ -28,12 +28,12 @@ fn polynomial(c: &[[f32; 3]; 7], t: f32) -> [u8; 3] {
     })
 }
 
-/// Black through purple and orange to pale yellow.
+/// Returns a colour from black through purple and orange to pale yellow.
 pub fn inferno(t: f32) -> [u8; 3] {
     polynomial(&INFERNO, t)
 }
 
-/// Violet through green to yellow.
+/// Returns a colour from violet through green to yellow.
 pub fn viridis(t: f32) -> [u8; 3] {
     polynomial(&VIRIDIS, t)
 }

@@ -1,5 +1,5 @@
-//! What pictures and pages of results are made with: a canvas, colour maps, PNG, GIF; numbers and texts in HTML. [`scene`]
-//! draws stored scenes; the rest knows nothing of what is shown.
+//! Tools for pictures and pages of results: a canvas, colour maps, PNG, GIF; numbers and texts in
+//! HTML. [`scene`] draws stored scenes; the rest is independent of the content.
 
 mod animation;
 mod canvas;

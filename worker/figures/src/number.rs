@@ -1,6 +1,6 @@
-//! Numbers as people read them.
+//! Formats numbers for people.
 
-/// With about so many digits that count; no exponent between 0.001 and 999,999.
+/// Formats with about `count` significant digits, without an exponent between 0.0001 and 999,999.
 pub fn digits(value: f64, count: i32) -> String {
     if !value.is_finite() {
         return "–".to_owned();
@@ -16,7 +16,7 @@ pub fn digits(value: f64, count: i32) -> String {
     format!("{value:.*}", (count - 1 - power).clamp(0, 9) as usize)
 }
 
-/// Without the zeros that say nothing.
+/// Formats without insignificant zeros.
 pub fn short(value: f64) -> String {
     let text = digits(value, 6);
     let (number, exponent) = text
@@ -29,7 +29,7 @@ pub fn short(value: f64) -> String {
     exponent.map_or_else(|| number.to_owned(), |e| format!("{number}e{e}"))
 }
 
-/// With a prefix: 356.4 M.
+/// Formats with an SI prefix: 356.4 M.
 pub fn prefixed(value: f64) -> String {
     let prefixes = [
         (1e15, " P"),
@@ -46,7 +46,7 @@ pub fn prefixed(value: f64) -> String {
     short((value * 100.0).round() / 100.0)
 }
 
-/// The same without the zeros that say nothing: 20 M.
+/// Like [`prefixed`], without insignificant zeros: 20 M.
 pub fn prefixed_short(value: f64) -> String {
     let text = prefixed(value);
     match text.split_once(' ') {
@@ -58,7 +58,7 @@ pub fn prefixed_short(value: f64) -> String {
     }
 }
 
-/// Seconds as hours and minutes.
+/// Formats seconds as hours and minutes.
 pub fn duration(seconds: f64) -> String {
     if !(seconds.is_finite() && seconds >= 0.0) {
         return "–".to_owned();
@@ -74,7 +74,7 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
-/// A whole number with its thousands apart.
+/// Formats a whole number with separated thousands.
 pub fn thousands(value: u64) -> String {
     let text = value.to_string();
     let mut out = String::new();
@@ -87,12 +87,12 @@ pub fn thousands(value: u64) -> String {
     out
 }
 
-/// Metres, to a tenth of a millimetre where they are few.
+/// Formats metres with three significant digits.
 pub fn metres(value: f64) -> String {
     digits(value, 3)
 }
 
-/// A share such as IoU: four places.
+/// Formats a share such as IoU with four decimal places.
 pub fn share(value: f64) -> String {
     if value.is_finite() {
         format!("{value:.4}")

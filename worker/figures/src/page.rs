@@ -1,11 +1,11 @@
-//! What all pages of reports have: how they look, and pictures inside of them.
+//! Common parts of all report pages: their style, and embedded pictures.
 
 use base64::{Engine, engine::general_purpose::STANDARD};
 
-/// How a page looks: light and dark, on screen and on paper.
+/// The style sheet: light and dark, for screen and paper.
 pub const STYLE: &str = include_str!("page.css");
 
-/// A PNG as a URL that holds it.
+/// Returns a data URL with a PNG.
 pub fn data_url(png: &[u8]) -> String {
     format!("data:image/png;base64,{}", STANDARD.encode(png))
 }

@@ -1,9 +1,9 @@
-//! Pictures as PNG.
+//! PNG encoding.
 
-/// An 8-bit RGB PNG of `width` × `height` pixels, rows from the top.
+/// Encodes an 8-bit RGB PNG of `width` × `height` pixels, rows from the top.
 ///
 /// # Panics
-/// Where `rgb` has not three bytes a pixel, or there is no pixel.
+/// If `rgb` does not have three bytes per pixel, or there is no pixel.
 pub fn rgb_png(width: u32, height: u32, rgb: &[u8]) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, width, height);

@@ -1,4 +1,4 @@
-//! Pictures of stored scenes, for people: a contact sheet and light in flight.
+//! Pictures of stored scenes: a contact sheet and light in flight.
 
 mod flight;
 mod sheet;
@@ -8,13 +8,13 @@ pub use sheet::sheet;
 
 /// One stored scene, decoded. Images are `[row][column]`.
 pub struct View {
-    /// Number.
+    /// Scene index.
     pub scene: u64,
-    /// Columns.
+    /// Image width in pixels.
     pub width: usize,
-    /// Rows.
+    /// Image height in pixels.
     pub height: usize,
-    /// Bins of a histogram.
+    /// Number of bins of a histogram.
     pub bins: usize,
     /// Path length at the first bin's start, metres.
     pub gate_start_m: f64,
@@ -22,7 +22,7 @@ pub struct View {
     pub bin_width_m: f64,
     /// `[row][column][bin]`.
     pub transient: Vec<f32>,
-    /// Along the axis, metres; 0 = nothing.
+    /// z-depth in metres; 0 = nothing.
     pub depth: Vec<f32>,
     /// sRGB, `[row][column][3]`.
     pub rgb: Vec<u8>,
@@ -30,17 +30,17 @@ pub struct View {
     pub specular: Vec<u8>,
     /// `[spot][row][column]`, 1 = lit.
     pub visibility: Vec<u8>,
-    /// Film position in pixels of each spot; `None` if there is none or it lies behind the camera.
+    /// Image position in pixels of each spot; `None` if there is none or it is behind the camera.
     pub spots: Vec<Option<[f32; 2]>>,
 }
 
 impl View {
-    /// How many pixels.
+    /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.width * self.height
     }
 
-    /// Sum over the bins `lo..hi` for each pixel.
+    /// Returns the sum over the bins `lo..hi` for each pixel.
     pub fn slice(&self, lo: usize, hi: usize) -> Vec<f32> {
         self.transient
             .chunks_exact(self.bins)
@@ -48,12 +48,13 @@ impl View {
             .collect()
     }
 
-    /// Time of a bin's start, nanoseconds after the pulse.
+    /// Returns the time of a bin's start, in nanoseconds after the pulse.
     pub fn nanoseconds(&self, bin: usize) -> f64 {
         (self.gate_start_m + bin as f64 * self.bin_width_m) / 0.299_792_458
     }
 
-    /// Energy of each bin over the image, leaving out the brightest pixels: the one-bounce spots.
+    /// Returns the energy of each bin over the image, without the brightest pixels: the one-bounce
+    /// spots.
     pub fn energy_by_bin(&self) -> Vec<f64> {
         let intensity = self.slice(0, self.bins);
         let limit = quantile(&intensity, 0.99);
@@ -72,7 +73,7 @@ impl View {
     }
 }
 
-/// The q-quantile of the values (0 for none).
+/// Returns the q-quantile of the values (0 for none).
 pub fn quantile(values: &[f32], q: f64) -> f32 {
     if values.is_empty() {
         return 0.0;

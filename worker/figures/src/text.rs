@@ -1,8 +1,8 @@
-//! Text from outside, made harmless.
+//! Escapes untrusted text.
 
 use std::fmt::{self, Display, Write};
 
-/// Displays with everything escaped that HTML would understand; control and directional characters become U+FFFD.
+/// Displays text with HTML escaped; control and directional characters become U+FFFD.
 pub struct Safe<T>(pub T);
 
 impl<T: Display> Display for Safe<T> {
@@ -23,7 +23,7 @@ impl Write for Escape<'_, '_> {
                 '"' => self.0.write_str("&quot;")?,
                 '\'' => self.0.write_str("&#39;")?,
                 '\n' | '\t' => self.0.write_char(c)?,
-                // Directional characters would show the text in another order.
+                // Directional characters would change the visible order of the text.
                 '\u{61c}'
                 | '\u{200e}'
                 | '\u{200f}'
@@ -58,7 +58,7 @@ mod tests {
     proptest! {
         #[test]
         fn nothing_that_is_escaped_opens_a_tag_or_ends_an_attribute(text in "\\PC*[<>&\"']\\PC*") {
-            // Those become U+FFFD.
+            // These characters become U+FFFD.
             prop_assume!(!text.contains(['\u{2028}', '\u{2029}']));
             let safe = Safe(&text).to_string();
             prop_assert!(!safe.contains(['<', '>', '"', '\'']));

@@ -1,4 +1,4 @@
-//! Where a process listens: what comes is asked for its secret, and handed on.
+//! The listening socket of a process: it authenticates incoming connections and passes them on.
 
 use std::{
     io,
@@ -18,12 +18,12 @@ use uuid::Uuid;
 
 use crate::message::{Address, Message, Payload, Wish, receive, send};
 
-/// How long a connection may take to say who it is, and to be answered.
+/// Timeout for the introduction of a connection and its answer.
 const INTRODUCTION: Duration = Duration::from_secs(10);
-/// Connections that may say who they are at a time.
+/// Maximum number of concurrent unauthenticated connections.
 const MOST_UNIDENTIFIED: usize = 64;
 
-/// Whoever came.
+/// An authenticated connection.
 pub struct Arrived {
     pub wish: Wish,
     pub stream: TcpStream,
@@ -39,7 +39,7 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// Listens on a host, at a port that is free where it names none.
+    /// Listens on a host, at a free port if none is given.
     pub fn open(host: &str, training: &str) -> io::Result<Self> {
         let (name, port) = match host.rsplit_once(':') {
             Some((name, port)) if !name.contains(':') || name.ends_with(']') => {
@@ -83,17 +83,17 @@ impl Endpoint {
         })
     }
 
-    /// Where others reach it.
+    /// Returns the address at which others reach it.
     pub fn address(&self) -> &Address {
         &self.address
     }
 
-    /// From now on those who want to take part are welcome, or not.
+    /// Sets whether processes that want to take part are accepted from now on.
     pub fn lead(&self, leads: bool) {
         self.leads.store(leads, Ordering::SeqCst);
     }
 
-    /// Whoever came since.
+    /// Returns the next connection that has arrived.
     pub fn arrived(&self) -> Option<Arrived> {
         self.arrived.try_recv().ok()
     }
@@ -102,7 +102,7 @@ impl Endpoint {
 impl Drop for Endpoint {
     fn drop(&mut self) {
         self.closed.store(true, Ordering::SeqCst);
-        // Wakes whoever accepts.
+        // Wakes the accepting thread.
         let _ = TcpStream::connect_timeout(&self.local, Duration::from_secs(1));
     }
 }
@@ -148,7 +148,7 @@ impl Acceptor {
         }
     }
 
-    /// Asks a connection who it is, and hands it on.
+    /// Authenticates a connection, and passes it on.
     fn ask(&self, mut stream: TcpStream) -> io::Result<()> {
         stream.set_nodelay(true)?;
         stream.set_read_timeout(Some(INTRODUCTION))?;
@@ -184,7 +184,7 @@ impl Acceptor {
     }
 }
 
-/// Goes to another process.
+/// Connects to another process.
 pub fn visit(to: &Address, training: &str, wish: Wish) -> io::Result<TcpStream> {
     let mut last = io::Error::other(format!("{} has no address", to.address));
     for address in to.address.to_socket_addrs()? {

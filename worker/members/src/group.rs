@@ -1,4 +1,4 @@
-//! A process among those that train one network.
+//! A process in a group that trains one network.
 
 use std::{
     collections::VecDeque,
@@ -29,16 +29,16 @@ use crate::{
     message::{Address, Message, Wish},
 };
 
-/// How often somebody who waits asks whether it shall stop.
+/// Interval at which a waiting process checks whether to stop.
 const ASK: Duration = Duration::from_millis(100);
-/// How long all may take to be connected with one another.
+/// Timeout for connecting all processes with one another.
 const CONNECTED_WITHIN: Duration = Duration::from_secs(20);
-/// How often a process that is alone looks whether others have called anew.
+/// Interval at which a lone process checks for newer calls of others.
 const LOOK: Duration = Duration::from_secs(20);
-/// Most processes.
+/// Maximum number of processes.
 const MOST: usize = 1024;
 
-/// A process among those that train one network. Dropping it leaves the others.
+/// A process in a group that trains one network. Dropping it leaves the group.
 pub struct Members<'a> {
     rendezvous: &'a dyn Rendezvous,
     stopped: &'a dyn Fn() -> bool,
@@ -48,7 +48,7 @@ pub struct Members<'a> {
     breaker: Arc<Breaker>,
     heard: Receiver<(u64, Heard)>,
     hears: Sender<(u64, Heard)>,
-    /// Those who came to add up before it was known that they would.
+    /// Connections for the all-reduce that arrived before this process knew of the agreement.
     early: Vec<(u64, usize, TcpStream)>,
     role: Role,
     mesh: Option<Mesh>,
@@ -58,23 +58,23 @@ pub struct Members<'a> {
 }
 
 enum Role {
-    /// Not among them yet.
+    /// Not in the group yet.
     None,
     Leads(Leads),
     Follows {
         link: Link,
-        /// What the leading process said last and nobody has done yet.
+        /// The last message of the leading process that was not handled yet.
         said: Option<(Message, Vec<u8>)>,
     },
 }
 
 struct Leads {
-    /// Its call.
+    /// Number of its call.
     number: u64,
     others: Vec<Other>,
-    /// Those who came and take part from the next agreement on.
+    /// Processes that have arrived and take part from the next agreement on.
     coming: Vec<Other>,
-    /// Somebody was lost.
+    /// Whether a process was lost.
     lost: bool,
     looked: Instant,
 }
@@ -82,11 +82,11 @@ struct Leads {
 struct Other {
     link: Link,
     address: Address,
-    /// What it said and nobody has read yet.
+    /// Messages of the process that were not read yet.
     said: VecDeque<(Message, Vec<u8>)>,
 }
 
-/// How a message was waited for.
+/// The result of waiting for a message.
 enum Waited {
     Said(Message, Vec<u8>),
     Lost,
@@ -98,10 +98,11 @@ fn failed(what: impl Into<String>) -> ModelError {
 }
 
 impl<'a> Members<'a> {
-    /// A process that listens at `host`, where others reach it, and takes part in the training of this key.
+    /// Returns a process that listens at `host`, where others reach it, and takes part in the
+    /// training with this key.
     ///
     /// # Errors
-    /// [`ModelError::Group`] where it cannot listen there.
+    /// [`ModelError::Group`] if it cannot listen there.
     pub fn new(
         rendezvous: &'a dyn Rendezvous,
         host: &str,
@@ -134,7 +135,7 @@ impl<'a> Members<'a> {
         })
     }
 
-    /// Tells the others that what came out is kept.
+    /// Tells the others that the result is stored.
     pub fn over(&mut self) {
         self.greet();
         if let Role::Leads(leads) = &mut self.role {
@@ -144,7 +145,7 @@ impl<'a> Members<'a> {
         }
     }
 
-    /// Goes to whoever leads, or leads.
+    /// Joins the leading process, or becomes it.
     fn find(&mut self) -> Result<(), ModelError> {
         self.mesh = None;
         self.breaker.break_off();
@@ -189,7 +190,8 @@ impl<'a> Members<'a> {
                 secret: own.secret,
                 machine: self.machine.clone(),
             };
-            // Before the call, so that nobody who hears it is sent away.
+            // This must happen before the call is made, so that no process that reads the call is
+            // rejected.
             self.endpoint.lead(true);
             if self.rendezvous.make(number + 1, &call).map_err(failed)? {
                 self.role = Role::Leads(Leads {
@@ -210,7 +212,7 @@ impl<'a> Members<'a> {
         Link::open(self.links, stream, self.hears.clone(), self.breaker.clone())
     }
 
-    /// Takes in whoever came.
+    /// Handles newly arrived connections.
     fn greet(&mut self) {
         while let Some(arrived) = self.endpoint.arrived() {
             match arrived.wish {
@@ -221,7 +223,7 @@ impl<'a> Members<'a> {
                     let Ok(link) = self.link(arrived.stream) else {
                         continue;
                     };
-                    // Dropped, whoever came asks again.
+                    // A dropped connection makes the process ask again.
                     if let Role::Leads(leads) = &mut self.role
                         && leads.others.len() + leads.coming.len() + 1 < MOST
                     {
@@ -238,7 +240,7 @@ impl<'a> Members<'a> {
             .retain(|(generation, ..)| *generation >= self.generation);
     }
 
-    /// As the leading process, takes note of what came.
+    /// On the leading process, records incoming messages.
     fn note(&mut self) {
         while let Ok((id, heard)) = self.heard.try_recv() {
             self.noted(id, heard);
@@ -267,7 +269,7 @@ impl<'a> Members<'a> {
         }
     }
 
-    /// As the leading process, waits for the next thing that a link says.
+    /// On the leading process, waits for the next message of a link.
     fn answer_of(&mut self, id: u64) -> Waited {
         loop {
             let Role::Leads(leads) = &mut self.role else {
@@ -287,7 +289,7 @@ impl<'a> Members<'a> {
         }
     }
 
-    /// As another process, waits for what the leading one says.
+    /// On another process, waits for a message of the leading one.
     fn said(&mut self) -> Waited {
         let Role::Follows { link, said } = &mut self.role else {
             return Waited::Lost;
@@ -309,14 +311,14 @@ impl<'a> Members<'a> {
         }
     }
 
-    /// Keeps what the leading process said for [`Group::agree`].
+    /// Stores a message of the leading process for [`Group::agree`].
     fn put_back(&mut self, message: Message, payload: Vec<u8>) {
         if let Role::Follows { said, .. } = &mut self.role {
             *said = Some((message, payload));
         }
     }
 
-    /// Connects with all others.
+    /// Connects with all other processes.
     fn connect(&mut self, rank: usize, all: &[Address]) -> io::Result<Mesh> {
         let generation = self.generation;
         let mut peers: Vec<Option<TcpStream>> = all.iter().map(|_| None).collect();
@@ -346,7 +348,8 @@ impl<'a> Members<'a> {
         Mesh::new(rank, peers, &self.breaker)
     }
 
-    /// As the leading process: all who are there, brought to where the furthest stands. `None`: once more.
+    /// On the leading process, brings all members to the state of the most advanced one. Returns
+    /// `None` if this must be repeated.
     fn gather(&mut self, member: &mut dyn Member) -> Result<Option<Next>, ModelError> {
         self.mesh = None;
         self.breaker.break_off();
@@ -368,7 +371,7 @@ impl<'a> Members<'a> {
         let coming = std::mem::take(&mut leads.coming);
         leads.others.extend(coming);
         leads.lost = false;
-        // Their agreement ends.
+        // Ends their current agreement.
         for other in &leads.others {
             other.link.say(&Message::Where, &[]);
         }
@@ -378,7 +381,7 @@ impl<'a> Members<'a> {
             loop {
                 match self.answer_of(id) {
                     Waited::Said(Message::Stands(at), _) => stand.push((id, at)),
-                    // Of the agreement before.
+                    // A message of the previous agreement.
                     Waited::Said(..) => continue,
                     Waited::Lost => {}
                     Waited::Stop => return Ok(Some(Next::Stop)),
@@ -432,7 +435,7 @@ impl<'a> Members<'a> {
         }
     }
 
-    /// As the leading process: who takes part from now on.
+    /// On the leading process, determines who takes part from now on.
     fn form(&mut self) -> Result<Option<Next>, ModelError> {
         self.generation += 1;
         let generation = self.generation;
@@ -484,7 +487,7 @@ impl<'a> Members<'a> {
         }))
     }
 
-    /// Whether others have called anew; then this process goes to them.
+    /// Returns whether others have made a newer call. In that case this process joins them.
     fn superseded(&mut self, number: u64) -> Result<bool, ModelError> {
         let newest = self.rendezvous.newest().map_err(failed)?;
         let superseded = newest.is_some_and(|(newest, _)| newest > number);
@@ -496,7 +499,8 @@ impl<'a> Members<'a> {
         Ok(superseded)
     }
 
-    /// As another process, does what the leading one says. `None`: the next thing.
+    /// On another process, handles a message of the leading one. Returns `None` to wait for the
+    /// next message.
     fn follow(&mut self, member: &mut dyn Member) -> Result<Option<Next>, ModelError> {
         let (message, payload) = match self.said() {
             Waited::Said(message, payload) => (message, payload),
@@ -541,7 +545,7 @@ impl<'a> Members<'a> {
                     }
                 }
             }
-            // Of an agreement that is over.
+            // A message of a previous agreement.
             _ => {}
         }
         Ok(None)
@@ -598,7 +602,7 @@ impl Group for Members<'_> {
                         return Ok(true);
                     }
                     leads.looked = Instant::now();
-                    // A place that cannot be reached now is asked again.
+                    // If the place is unreachable now, it is tried again later.
                     return match self.superseded(number) {
                         Ok(superseded) => Ok(!superseded),
                         Err(_) => Ok(true),

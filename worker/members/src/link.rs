@@ -1,4 +1,5 @@
-//! The connection between the leading process and another one: messages both ways, and a sign of life every other second.
+//! The connection between the leading process and another one: messages in both directions, and a
+//! keepalive every other second.
 
 use std::{
     io,
@@ -19,23 +20,23 @@ use crate::{
     message::{Message, Payload, receive, send},
 };
 
-/// How often a sign of life is sent.
+/// Interval between keepalives.
 const BEAT: Duration = Duration::from_secs(2);
-/// After so much silence the other one is lost.
+/// After this time without a message, the other process is lost.
 const SILENCE: Duration = Duration::from_secs(20);
 
-/// What comes over links.
+/// An event of a link.
 #[derive(Debug)]
 pub enum Heard {
-    /// A message, and bytes after it.
+    /// A message, and the bytes after it.
     Said(Message, Vec<u8>),
-    /// The other one is lost.
+    /// The other process is lost.
     Lost,
 }
 
-/// A link.
+/// A connection with another process.
 pub struct Link {
-    /// Tells links apart.
+    /// Id of the link.
     pub id: u64,
     out: Arc<Mutex<TcpStream>>,
     stream: TcpStream,
@@ -43,7 +44,8 @@ pub struct Link {
 }
 
 impl Link {
-    /// What comes goes to `heard`; where the other one is lost, what is being added up ends by `breaker`.
+    /// Opens a link. Its events are sent to `heard`. If the other process is lost, `breaker` aborts
+    /// the current all-reduce.
     pub fn open(
         id: u64,
         stream: TcpStream,
@@ -68,7 +70,7 @@ impl Link {
                     match receive(&mut from, Payload::State) {
                         Ok((Message::Alive, _)) => {}
                         Ok((message, payload)) => {
-                            // Whoever adds up would wait for what never comes.
+                            // A process in an all-reduce would wait for data that never arrives.
                             if matches!(message, Message::Where | Message::Failed { .. }) {
                                 breaker.break_off();
                             }
@@ -103,12 +105,12 @@ impl Link {
         Ok(link)
     }
 
-    /// Sends a message; `false` where the other one is lost.
+    /// Sends a message. Returns `false` if the other process is lost.
     pub fn say(&self, message: &Message, payload: &[u8]) -> bool {
         let mut to = self.out.lock().unwrap_or_else(PoisonError::into_inner);
         let sent = send(&mut *to, message, payload).is_ok();
         if !sent {
-            // Whoever reads from it hears of it.
+            // The reading thread notices this.
             let _ = self.stream.shutdown(Shutdown::Both);
         }
         sent

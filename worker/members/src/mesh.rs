@@ -1,4 +1,4 @@
-//! Every two processes are connected, and add up what all have of a step.
+//! Pairwise connections of all processes, and the all-reduce of a step over them.
 
 use std::{
     io::{self, Read, Write},
@@ -18,14 +18,14 @@ use picofarm_model::{
     train::group::{Block, Blocks, Compute, Part, add_values},
 };
 
-/// How often whoever adds up asks whether it shall stop.
+/// Interval at which an all-reduce checks whether to stop.
 const ASK: Duration = Duration::from_millis(100);
-/// Most blocks that a process has of a step, and most running statistics.
+/// Maximum number of blocks of a process in a step, and of running statistics.
 const MOST: u32 = 1 << 16;
-/// Values that are reserved before they are there.
+/// Maximum number of values to allocate before they arrive.
 const RESERVED: usize = 1 << 22;
 
-/// Ends what is being added up: every connection is closed, and whoever waits for one wakes up.
+/// Aborts an all-reduce: every connection is closed, so that all waiting threads wake up.
 #[derive(Default)]
 pub struct Breaker(Mutex<Vec<TcpStream>>);
 
@@ -48,7 +48,7 @@ impl Breaker {
     }
 }
 
-/// Closes all connections where a panic passes, so that nobody waits for what does not come.
+/// Closes all connections on a panic, so that no process waits for data that never arrives.
 struct BrokenBy<'a>(&'a Breaker);
 
 impl Drop for BrokenBy<'_> {
@@ -62,16 +62,16 @@ impl Drop for BrokenBy<'_> {
 /// Connections of one process with all others.
 pub struct Mesh {
     rank: usize,
-    /// By rank; none with itself.
+    /// By rank; `None` at its own.
     peers: Vec<Option<TcpStream>>,
 }
 
 impl Mesh {
-    /// Of connections by rank, none at its own.
+    /// Returns a mesh of connections by rank, with none at its own.
     pub fn new(rank: usize, peers: Vec<Option<TcpStream>>, breaker: &Breaker) -> io::Result<Self> {
         let mut handles = Vec::new();
         for stream in peers.iter().flatten() {
-            // The leading process watches who is alive.
+            // The leading process monitors liveness, so there are no timeouts here.
             stream.set_read_timeout(None)?;
             stream.set_write_timeout(None)?;
             handles.push(stream.try_clone()?);
@@ -80,13 +80,14 @@ impl Mesh {
         Ok(Self { rank, peers })
     }
 
-    /// Processes.
+    /// Returns the number of processes.
     pub fn len(&self) -> usize {
         self.peers.len()
     }
 
-    /// The sums over all processes of what each computes of a step of so many batches, part by part: a part is added up while the
-    /// next is computed. Also what `compute` gave; where that is an error, all others are told by the end of their connections.
+    /// Returns the sums over all processes of their parts of a step with this number of batches. A
+    /// part is summed while the next one is computed. Also returns the result of `compute`; if that
+    /// is an error, the others notice it by their closed connections.
     pub fn sums(
         &self,
         step: u64,
@@ -105,11 +106,11 @@ impl Mesh {
                 let stopped = || stop.load(Ordering::SeqCst);
                 let parts = handed.iter();
                 let sums = parts.map(|part| self.sum(step, batches, part, breaker, &stopped));
-                // Nobody waits for it where computing panicked.
+                // There is no receiver if computing panicked.
                 let _ = done.send(sums.collect::<io::Result<Vec<Part>>>());
             });
             let computed = compute(&mut |part| {
-                // Where adding up failed already, nobody takes it: known below.
+                // There is no receiver if summing has already failed, which is reported below.
                 let _ = hand.send(part);
             });
             drop(hand);
@@ -133,10 +134,10 @@ impl Mesh {
         })
     }
 
-    /// The sum over all processes of what each has of a part of a step.
+    /// Returns the sum over all processes of a part of a step.
     ///
     /// # Errors
-    /// Where a connection ends, or what comes is of another step.
+    /// If a connection ends, or the received data belong to another step.
     fn sum(
         &self,
         step: u64,
@@ -148,7 +149,7 @@ impl Mesh {
         let (n, len) = (self.len(), part.len);
         let slice = |rank: usize| slice(len, rank, n);
         let head = Head::of(step, &part);
-        // Of all others what they have of this process's slice.
+        // Receives this process's slice from all others.
         let found = self.with_all(
             breaker,
             stopped,
@@ -185,7 +186,7 @@ impl Mesh {
         let ours = sum
             .total(&mut |a, b| add_values(a, &b))
             .expect("a step has batches");
-        // To all others the sum of this process's slice, and running statistics.
+        // Sends the sum of this process's slice, and running statistics, to all others.
         let moved = match self.rank == first {
             true => statistics(&part.moved),
             false => Vec::new(),
@@ -228,13 +229,14 @@ impl Mesh {
         })
     }
 
-    /// Writes to all others and reads from them at the same time; what was read, by rank.
+    /// Writes to all others and reads from them concurrently. Returns the data read, by rank.
     fn with_all<T: Send>(
         &self,
         breaker: &Breaker,
         stopped: &dyn Fn() -> bool,
         write: impl Fn(&mut io::BufWriter<&TcpStream>, usize) -> io::Result<()> + Sync,
-        // Not through a buffer: what it holds beyond what is read would be lost to whoever reads next.
+        // Reading is unbuffered, because a buffer would lose the bytes that belong to the next
+        // reader.
         read: impl Fn(&mut &TcpStream, usize) -> io::Result<T> + Sync,
     ) -> io::Result<Vec<T>> {
         let broken = AtomicBool::new(false);
@@ -293,7 +295,7 @@ impl Mesh {
     }
 }
 
-/// The values that the process of a rank adds up.
+/// Returns the range of values that the process with this rank sums.
 fn slice(len: usize, rank: usize, of: usize) -> Range<usize> {
     let at = |rank: usize| (len as u128 * rank as u128 / of as u128) as usize;
     at(rank)..at(rank + 1)
@@ -303,7 +305,7 @@ fn bad(what: &str) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidData, what)
 }
 
-/// Which batches a process has of a part of a step, and of how many values.
+/// The batches of a process in a part of a step, and the number of values.
 struct Head {
     step: u64,
     len: u64,
@@ -355,7 +357,7 @@ impl Head {
         })
     }
 
-    /// The sums of its blocks, each of so many values.
+    /// Reads the sums of its blocks, each of `len` values.
     fn blocks(self, from: &mut impl Read, len: usize) -> io::Result<Vec<Block<Vec<f32>>>> {
         let blocks = self.blocks.into_iter();
         blocks
@@ -383,7 +385,7 @@ fn count(from: &mut impl Read) -> io::Result<u32> {
     }
 }
 
-/// So many values; what never comes takes no memory.
+/// Reads `len` values. Values that never arrive are not allocated.
 fn values(from: &mut impl Read, len: usize) -> io::Result<Vec<f32>> {
     let mut values: Vec<f32> = Vec::with_capacity(len.min(RESERVED));
     while values.len() < len {
@@ -399,7 +401,7 @@ fn values(from: &mut impl Read, len: usize) -> io::Result<Vec<f32>> {
     Ok(values)
 }
 
-/// Running statistics as bytes.
+/// Serializes running statistics.
 fn statistics(moved: &[(usize, Vec<f32>)]) -> Vec<u8> {
     let mut bytes = (moved.len() as u32).to_le_bytes().to_vec();
     for (which, values) in moved {

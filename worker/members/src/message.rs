@@ -1,4 +1,4 @@
-//! What processes say to one another, and how it is written: a header of JSON, and bytes after it.
+//! Messages between processes, and their format: a JSON header, and bytes after it.
 
 use std::io::{self, Read, Write};
 
@@ -7,96 +7,97 @@ use serde::{Deserialize, Serialize};
 
 /// First bytes of every message.
 const MAGIC: &[u8; 4] = b"pfm2";
-/// Longest header: the list of all members is the longest.
+/// Maximum size of a header in bytes. The list of all members is the longest.
 const MOST_HEADER: u32 = 1 << 20;
-/// Most bytes after a header: a training's whole state.
+/// Maximum number of bytes after a header, for a training's whole state.
 const MOST_PAYLOAD: u64 = 1 << 37;
-/// Bytes that are reserved before they are there.
+/// Maximum number of bytes to allocate before they arrive.
 const RESERVED: u64 = 1 << 24;
 
 /// A message.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Message {
-    /// The first of every connection.
+    /// The first message of every connection.
     Hello {
-        /// What whoever is called wants to be shown.
+        /// The secret required by the called process.
         secret: String,
-        /// The training, by its key.
+        /// Key of the training.
         training: String,
-        /// What the connection is for.
+        /// The purpose of the connection.
         wish: Wish,
     },
-    /// The answer: it is heard.
+    /// The connection is accepted.
     Welcome,
-    /// The answer: it is not.
+    /// The connection is rejected.
     Refused {
-        /// Why.
+        /// The reason.
         why: String,
     },
-    /// Somebody is there.
+    /// A keepalive.
     Alive,
-    /// By the leading process: where do you stand? Nobody goes on until there is a new [`Message::Form`].
+    /// From the leading process: asks for the state of progress. All processes wait for a new
+    /// [`Message::Form`].
     Where,
-    /// By the leading process: send your state.
+    /// From the leading process: asks for the process's state.
     SendState,
     /// A training's state, as bytes after the header.
     State,
-    /// By the leading process: who takes part from now on.
+    /// From the leading process: the members from now on.
     Form {
         /// Number of this agreement.
         generation: u64,
-        /// The rank of whoever gets this.
+        /// The receiver's rank.
         rank: usize,
-        /// All, by rank.
+        /// All members, by rank.
         members: Vec<Address>,
     },
-    /// By the leading process: go on.
+    /// From the leading process: continue.
     Go,
-    /// By the leading process: an epoch is over.
+    /// From the leading process: an epoch is over.
     Epoch {
-        /// How it ended.
+        /// The result of the epoch.
         line: Line,
-        /// Of the leading process's numbers.
+        /// Digest of the leading process's numbers.
         digest: u64,
     },
-    /// By the leading process: everything is done and kept.
+    /// From the leading process: the training is finished and stored.
     Over,
-    /// To the leading process: where one stands.
+    /// To the leading process: the state of progress.
     Stands(Standing),
     /// To the leading process: connected with all others.
     Formed {
-        /// Of this agreement.
+        /// The agreement.
         generation: u64,
     },
-    /// To the leading process: somebody was lost.
+    /// To the leading process: a process was lost.
     Failed {
-        /// Of this agreement.
+        /// The agreement.
         generation: u64,
     },
 }
 
-/// What a connection is for.
+/// The purpose of a connection.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Wish {
     /// To take part.
     Join(Address),
-    /// To add up.
+    /// To sum gradients.
     Add {
-        /// Of this agreement.
+        /// The agreement.
         generation: u64,
-        /// Who calls.
+        /// Rank of the calling process.
         rank: usize,
     },
 }
 
-/// Where a process is reached.
+/// The address of a process.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Address {
     /// Address and port.
     pub address: String,
-    /// What it wants to be shown.
+    /// The secret that it requires.
     pub secret: String,
 }
 
@@ -140,7 +141,7 @@ pub fn receive(from: &mut impl Read, most_payload: Payload) -> io::Result<(Messa
     Ok((message, read(from, payload)?))
 }
 
-/// What may follow a header.
+/// The content allowed after a header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Payload {
     /// Nothing.
@@ -149,7 +150,7 @@ pub enum Payload {
     State,
 }
 
-/// Reads so many bytes; what is stated but never comes takes no memory.
+/// Reads `len` bytes. Bytes that are announced but never arrive are not allocated.
 fn read(from: &mut impl Read, len: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::with_capacity(len.min(RESERVED) as usize);
     from.take(len).read_to_end(&mut bytes)?;
@@ -179,7 +180,7 @@ mod tests {
             receive(&mut from, Payload::None).unwrap(),
             (Message::Go, Vec::new())
         );
-        // Whoever has not said who it is sends no state.
+        // A process that has not introduced itself cannot send a state.
         assert!(receive(&mut &bytes[..], Payload::None).is_err());
     }
 

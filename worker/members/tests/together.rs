@@ -1,6 +1,6 @@
-//! Processes that train together come to the bits of one that trains alone, however many they are, whoever comes, leaves or
-//! dies on the way. Here each process is a thread with connections of its own; real processes are killed in the tests of
-//! the whole farm.
+//! Tests that processes that train together compute the bits of a single process, for any number of
+//! processes, and even if some arrive, leave or die. Here each process is a thread with its own
+//! connections; the tests of the whole farm kill real processes.
 
 #[path = "../../model/tests/common/mod.rs"]
 #[expect(dead_code, reason = "other tests need more of it")]
@@ -79,7 +79,7 @@ fn alone(plan: &Plan) -> Trained {
     training.finish()
 }
 
-/// What one process does: what came out where it led at the end.
+/// Runs one process. Returns its result, if it was the leading process at the end.
 fn process(
     board: &Board,
     plan: &Plan,
@@ -116,7 +116,7 @@ fn any_number_of_processes_comes_to_the_bits_of_one() {
         let plan = of_steps(accumulate);
         let expected = alone(&plan);
         let board = Board::default();
-        // Nobody goes on before all are there.
+        // No process continues before all have arrived.
         let together = AtomicU64::new(0);
         let found: Vec<(Ended, Option<Trained>)> = thread::scope(|scope| {
             let mut running = Vec::new();
@@ -149,7 +149,8 @@ fn any_number_of_processes_comes_to_the_bits_of_one() {
     }
 }
 
-/// After a step of this length no loss is a number. Whoever computes one ends, and nobody waits.
+/// With this step length the loss becomes NaN or infinite. A process that computes it ends, and no
+/// other waits.
 #[test]
 fn a_step_that_cannot_be_computed_ends_the_training_of_all() {
     let plan = Plan {
@@ -165,7 +166,7 @@ fn a_step_that_cannot_be_computed_ends_the_training_of_all() {
             let mut members = Members::new(&board, "127.0.0.1", "t", "here", &never).unwrap();
             let ended = training.run_among(&mut members, &mut |_, _| {
                 steps.fetch_add(1, Ordering::SeqCst);
-                // Time for the other one to come.
+                // This gives the other process time to arrive.
                 thread::sleep(Duration::from_millis(500));
                 Control::Continue
             });
@@ -194,7 +195,8 @@ fn processes_come_and_leave_between_steps_and_no_bit_changes() {
     let step = AtomicU64::new(0);
     let found: Vec<Option<Trained>> = thread::scope(|scope| {
         let mut running = Vec::new();
-        // Each begins at one step and leaves at another; the first one, which leads, leaves as well.
+        // Each process begins at one step and leaves at another, including the first one, which
+        // leads.
         for (from, to) in [
             (0, 22),
             (3, 40),
@@ -211,7 +213,7 @@ fn processes_come_and_leave_between_steps_and_no_bit_changes() {
                 let (ended, kept) = process(board, plan, &|| false, &mut |training, _| {
                     let at = training.learner().steps();
                     step.fetch_max(at, Ordering::SeqCst);
-                    // Long enough for others to come.
+                    // Long enough for others to arrive.
                     thread::sleep(Duration::from_millis(10));
                     match at >= to {
                         true => Control::Stop,
@@ -244,7 +246,7 @@ fn an_early_end_is_the_same_for_all_and_keeps_the_same_epoch() {
         ..of_steps(2)
     };
     ends_early(&plan);
-    // Within epochs, too.
+    // The same within epochs.
     ends_early(&Plan {
         validate_every: 1,
         early_stop: 3,
@@ -300,7 +302,7 @@ fn connections_without_the_secret_disturb_nothing() {
                         bytes.extend(text);
                         bytes
                     }
-                    // Says nothing, and stays.
+                    // Sends nothing, and stays connected.
                     _ => Vec::new(),
                 };
                 let _ = stream.write_all(&bytes);
@@ -333,7 +335,7 @@ fn connections_without_the_secret_disturb_nothing() {
 fn a_call_that_nobody_answers_is_followed_by_another() {
     let plan = of_steps(2);
     let board = Board::default();
-    // A machine that is gone, and one that listens and says nothing.
+    // An unreachable machine, and one that listens but sends nothing.
     let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     for address in [
         "127.0.0.1:1".to_owned(),
@@ -359,7 +361,7 @@ fn whoever_is_asked_to_stop_stops_although_others_keep_it_waiting() {
     let board = Board::default();
     let (stop, over) = (AtomicBool::new(false), AtomicBool::new(false));
     thread::scope(|scope| {
-        // The leading process takes its time with a step.
+        // The leading process is slow in a step.
         let slow = scope.spawn(|| {
             process(
                 &board,
@@ -394,7 +396,7 @@ fn whoever_is_asked_to_stop_stops_although_others_keep_it_waiting() {
 
 #[test]
 fn scenes_are_read_by_whoever_has_them_and_no_more() {
-    /// Counts what is read.
+    /// Counts the scenes that are read.
     struct Counted(Vec<Arc<picofarm_model::scene::Scene>>, AtomicU64);
     impl Scenes for Counted {
         fn len(&self) -> usize {
@@ -440,7 +442,8 @@ fn scenes_are_read_by_whoever_has_them_and_no_more() {
         let running = [scope.spawn(go), scope.spawn(go)];
         running.map(|r| r.join().unwrap()).into()
     });
-    // 20 epochs of 24 scenes, half of them each; what was made ready when the other came is made ready again.
+    // 20 epochs of 24 scenes, half of them by each process. Scenes prepared when the other process
+    // arrived are prepared again.
     for count in &counts {
         assert!((200..=330).contains(count), "{counts:?}");
     }

@@ -1,4 +1,4 @@
-//! How a program reaches a coordinator: TLS, proof of who it is, and what to say when that does not work.
+//! TLS, credentials and diagnostics of connections to a coordinator.
 
 use std::{
     error::Error as _,
@@ -25,20 +25,21 @@ use tonic::{
     transport::{Certificate, ClientTlsConfig, Endpoint, Identity},
 };
 
-/// What a client or worker has to show, and whom it trusts.
+/// Credentials of a client or worker, and the certificate authorities it trusts.
 #[derive(Debug, Clone, Default)]
 pub struct Access {
-    /// Certificate authorities that vouch for the coordinator (PEM); without, those of the system.
+    /// Certificate authorities (PEM) for the coordinator's certificate; by default, those of the
+    /// system.
     pub ca: Option<PathBuf>,
-    /// Own certificate (PEM), for coordinators that want one.
+    /// Client certificate (PEM), for coordinators that require one.
     pub certificate: Option<PathBuf>,
     /// Its private key (PEM).
     pub key: Option<PathBuf>,
-    /// Proof of who calls.
+    /// Bearer token that identifies the caller.
     pub token: Option<Secret>,
 }
 
-/// Why a coordinator cannot be reached with these settings.
+/// A reason why a coordinator cannot be reached with these settings.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
     /// The URL cannot be used.
@@ -48,23 +49,23 @@ pub enum AccessError {
     Url {
         /// The URL.
         url: String,
-        /// Why.
+        /// The reason.
         why: String,
     },
-    /// Settings that do not go together.
+    /// Inconsistent settings.
     #[error("{0}")]
     Settings(String),
-    /// A file that cannot be used.
+    /// An unusable file.
     #[error(transparent)]
     Credentials(#[from] CredentialError),
 }
 
-/// A coordinator's address with everything needed to call it.
+/// A coordinator's address, and everything needed to call it.
 #[derive(Debug, Clone)]
 pub struct Target {
-    /// How to connect.
+    /// The connection settings.
     pub endpoint: Endpoint,
-    /// Shows the token with each call.
+    /// Adds the token to each call.
     pub bearer: Bearer,
     uri: Uri,
     access: Access,
@@ -75,10 +76,10 @@ pub struct Target {
 pub struct Bearer(Option<Arc<MetadataValue<Ascii>>>);
 
 impl Bearer {
-    /// Sends this text as the header `authorization` instead of a token.
+    /// Returns a value that sends this text as the header `authorization` instead of a token.
     ///
     /// # Errors
-    /// [`AccessError::Settings`]: the text has characters that a header must not have.
+    /// [`AccessError::Settings`]: the text has characters that are not allowed in a header.
     pub fn plain(text: &str) -> Result<Self, AccessError> {
         let value = text.parse().map_err(|_| {
             AccessError::Settings(format!("{text:?} cannot be sent; expected ASCII letters"))
@@ -102,9 +103,10 @@ impl Access {
     /// Checks the URL and reads the files.
     ///
     /// # Errors
-    /// [`AccessError`]: a URL or file that cannot be used, or a token that would cross a network unprotected.
+    /// [`AccessError`] for an unusable URL or file, or a token that would be sent over a network
+    /// without TLS.
     pub fn target(&self, url: &str) -> Result<Target, AccessError> {
-        // Before anything else: no message may repeat it.
+        // This is checked first, because no message may repeat a password.
         if url.contains('@') {
             return Err(AccessError::Settings(
                 "the coordinator's URL names a user or a password (before an @), which is never sent; leave it out, and give \
@@ -182,7 +184,7 @@ impl Access {
         Ok(tls)
     }
 
-    /// The same as [`Access::tls`] for a look at the handshake itself.
+    /// Returns the settings of [`Access::tls`] for rustls, to probe the handshake directly.
     fn rustls(&self) -> Option<ClientConfig> {
         let mut roots = RootCertStore::empty();
         roots.add_parsable_certificates(match &self.ca {
@@ -217,7 +219,7 @@ impl Access {
                     "the token holds characters that no token has; copy it again".into(),
                 )
             })?;
-        // Neither shown by Debug nor kept in HTTP/2's tables of headers.
+        // The token is neither shown by Debug nor stored in HTTP/2's header tables.
         value.set_sensitive(true);
         Ok(Bearer(Some(Arc::new(value))))
     }
@@ -228,20 +230,21 @@ fn loopback(host: &str) -> bool {
     host == "localhost" || host.parse().is_ok_and(|ip: IpAddr| ip.is_loopback())
 }
 
-/// How long looking for what is wrong may take.
+/// Timeout for diagnosing a failure.
 const PROBE: Duration = Duration::from_secs(3);
 
-/// Why a connection did not come about.
+/// A reason why a connection failed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Trouble {
-    /// Nothing answers: it may tomorrow.
+    /// No answer. This may be temporary.
     Down(String),
-    /// What answers and this program do not trust or understand each other: somebody must repair a setting.
+    /// The server and this program do not trust or understand each other, so a setting must be
+    /// corrected.
     Mismatch(String),
 }
 
 impl Target {
-    /// What went wrong with a connection or a call, as far as it is known.
+    /// Diagnoses a failed connection or call.
     pub async fn trouble(
         &self,
         error: &(dyn std::error::Error + Send + Sync + 'static),
@@ -249,7 +252,8 @@ impl Target {
         if let Some(error) = rustls_error(error) {
             return Trouble::Mismatch(self.tls_trouble(error));
         }
-        // A client certificate is refused after the handshake, and its alert is lost in the connection's background.
+        // A client certificate is refused after the handshake, and its alert is lost in the
+        // connection's background task.
         if self.uri.scheme_str() == Some("https")
             && let Some(error) = self.handshake_error().await
         {
@@ -324,7 +328,8 @@ impl Target {
         }
     }
 
-    /// What rustls says of a handshake and the first answer after it; `None` if it is content or nothing answers.
+    /// Returns rustls's error of a handshake and the first answer after it; `None` if there is no
+    /// error or no answer.
     async fn handshake_error(&self) -> Option<rustls::Error> {
         let ask = async {
             let config = self.access.rustls()?;
@@ -349,7 +354,7 @@ impl Target {
         TcpStream::connect(&addresses[..]).await.ok()
     }
 
-    /// Whether a plain HTTP/2 greeting is answered as only TLS does: with an alert.
+    /// Returns whether a plain HTTP/2 greeting is answered with a TLS alert.
     async fn speaks_tls(&self) -> bool {
         let ask = async {
             let mut stream = self.connect(80).await?;
@@ -362,19 +367,19 @@ impl Target {
             Some(answer)
         };
         let answer = tokio::time::timeout(PROBE, ask).await;
-        // Record type alert (or handshake), TLS major version.
+        // Record type alert (or handshake), and TLS major version.
         matches!(answer, Ok(Some([0x15 | 0x16, 0x03])))
     }
 }
 
-/// What rustls says at the bottom of an error.
+/// Returns the rustls error at the root of an error chain.
 fn rustls_error<'a>(error: &'a (dyn std::error::Error + 'static)) -> Option<&'a rustls::Error> {
     let mut next = Some(error);
     while let Some(error) = next {
         if let Some(found) = error.downcast_ref::<rustls::Error>() {
             return Some(found);
         }
-        // An io::Error passes over the error it holds: its source is that error's source.
+        // An io::Error skips the error inside it: its source is that error's source.
         next = match error.downcast_ref::<std::io::Error>() {
             Some(io) => io
                 .get_ref()
@@ -385,7 +390,8 @@ fn rustls_error<'a>(error: &'a (dyn std::error::Error + 'static)) -> Option<&'a 
     None
 }
 
-/// An error and its sources on one line: tonic's own text is only "transport error".
+/// Formats an error and its sources on one line, because tonic's own text is only "transport
+/// error".
 pub(crate) fn causes(error: &(dyn std::error::Error + 'static)) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
@@ -396,7 +402,8 @@ pub(crate) fn causes(error: &(dyn std::error::Error + 'static)) -> String {
     text
 }
 
-/// Whether a failed call failed for want of a connection, so that [`Target::trouble`] can tell why.
+/// Returns whether a call failed because of its connection, so that [`Target::trouble`] can
+/// diagnose it.
 pub fn lost_connection(status: &Status) -> bool {
     status.source().is_some()
 }

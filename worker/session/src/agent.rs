@@ -1,4 +1,5 @@
-//! The worker's one loop: connection, executor, clock and shutdown meet here, around the [`Assignments`].
+//! The worker's main loop: it drives connection, executor, clock and shutdown around the
+//! [`Assignments`].
 
 use std::{
     future::Future,
@@ -29,36 +30,37 @@ use crate::{
     suspend::Suspends,
 };
 
-/// A running task this close to its end may finish after the shutdown signal.
+/// A running task with at most this remaining time may finish after the shutdown signal.
 const FINISH_WITHIN: Duration = Duration::from_millis(1500);
-/// How long a worker that is drained waits for its task.
+/// Maximum time that a draining worker waits for its task.
 const LONGEST_TASK: Duration = Duration::from_secs(30 * 86_400);
-/// How long a task may take to stop before the worker leaves without it.
+/// Maximum time for a task to stop before the worker leaves without it.
 const STOP_WITHIN: Duration = Duration::from_secs(10);
-/// The same of a task that keeps what it has done: some gigabytes may go to a store that is far.
+/// The same limit for a task that saves its progress, because it may send gigabytes to a remote
+/// store.
 const SAVE_WITHIN: Duration = Duration::from_secs(300);
-/// How long the last words may wait for their acknowledgement.
+/// Maximum time to wait for acknowledgements before leaving.
 const GOODBYE_WITHIN: Duration = Duration::from_secs(3);
-/// A session that lasted this long was a good one: the next reconnect begins with a short wait.
+/// After a session of at least this duration, the next reconnect begins with a short wait.
 const GOOD_SESSION: Duration = Duration::from_secs(10);
-/// How long at most before the next coordinator of the list is tried: the workers of one that is lost shall not all
-/// come to the other in the same moment.
+/// Maximum wait before the next coordinator of the list is tried, so that the workers of a lost
+/// coordinator do not all reconnect at the same moment.
 const NEXT_COORDINATOR: Duration = Duration::from_millis(300);
-/// How often what the task in hand has logged is sent.
+/// Interval for sending the log of the running task.
 const TELL: Duration = Duration::from_secs(1);
 const SHUTDOWN: &str = "the worker is shutting down";
 
 /// Runs a worker with this executor until `shutdown` or a refusal.
 ///
 /// # Errors
-/// [`AgentError`]: a setting that cannot be used, or the coordinator refuses this worker. An unreachable
-/// coordinator is no error: the worker tries again for ever.
+/// [`AgentError`]: an unusable setting, or the coordinator refuses this worker. An unreachable
+/// coordinator is not an error: the worker retries forever.
 pub fn run_with(
     config: AgentConfig,
     executor: Arc<dyn Executor>,
     shutdown: CancellationToken,
 ) -> Pin<Box<dyn Future<Output = Result<Summary, AgentError>> + Send>> {
-    // Boxed, so that a crate that awaits it does not compile the session again.
+    // The future is boxed, so that a crate that awaits it does not compile the session again.
     Box::pin(work(config, executor, shutdown))
 }
 
@@ -130,7 +132,7 @@ async fn work(
 type Opening = Pin<Box<dyn Future<Output = Result<(Welcome, Box<Session>), LinkError>> + Send>>;
 
 enum Link {
-    /// Not connected; try at this time.
+    /// Not connected; the next attempt is at this time.
     Down(Instant),
     Opening(Opening),
     Up {
@@ -149,7 +151,7 @@ enum Event {
 }
 
 impl Link {
-    /// What the connection brings next. Safe to cancel.
+    /// Returns the connection's next event. Cancel-safe.
     async fn event(&mut self) -> Event {
         match self {
             Link::Down(until) => {
@@ -167,21 +169,21 @@ impl Link {
     }
 }
 
-/// How to leave.
+/// How quickly to leave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Haste {
-    /// Now.
+    /// At once.
     Stop,
-    /// When the task in hand is finished.
+    /// After the running task.
     Finish,
 }
 
-/// The way out.
+/// The state of a shutdown.
 struct Leaving {
     haste: Haste,
     /// The running task is asked to stop at this time.
     stop_at: Instant,
-    /// Leave whatever still runs or waits.
+    /// The worker leaves at this time, regardless of running tasks or missing acknowledgements.
     give_up: Instant,
     released: bool,
 }
@@ -189,29 +191,30 @@ struct Leaving {
 struct Agent {
     assignments: Assignments,
     runner: Runner,
-    /// Of the task in hand.
+    /// The control of the running task.
     control: Option<Arc<Control>>,
-    /// What tasks have logged.
+    /// Unsent log lines of tasks.
     unsent: Unsent,
-    /// When the log of the task in hand is to be looked at.
+    /// The next time to send the log of the running task.
     tell_at: Instant,
-    /// The coordinators to choose from.
+    /// The configured coordinators.
     targets: Vec<Target>,
-    /// Which of them is in use or to be tried next.
+    /// Index of the coordinator in use or to be tried next.
     at: usize,
     suspends: Suspends,
-    /// This worker has been let in before: what looks like a wrong setting may pass.
+    /// Whether this worker has been admitted before, in which case an apparently wrong setting may
+    /// be temporary.
     welcomed: bool,
     hello: WorkerHello,
     link: Link,
     away_since: Option<Instant>,
     retry: Backoff,
-    /// Waits after interruptions that come from this machine or the store.
+    /// Waits after interruptions caused by this machine or the store.
     relief: Backoff,
     leaving: Option<Leaving>,
-    /// The worker ends when it has been idle for so long.
+    /// The worker ends after being idle for this time.
     exit_idle: Option<Duration>,
-    /// Since when nothing is in hand and a coordinator is there who could give something.
+    /// Since when the worker is idle while connected to a coordinator.
     idle_since: Option<Instant>,
     summary: Summary,
     coordinator: String,
@@ -242,7 +245,8 @@ impl Agent {
         }
     }
 
-    /// Where the machine was suspended, leases are older than the clock says, and a heartbeat asks at once which live on.
+    /// After a suspend, leases are older than the clock indicates, so a heartbeat asks at once
+    /// which are still valid.
     fn after_suspend(&mut self, now: Instant) {
         let Some(long) = self.suspends.new_one() else {
             return;
@@ -261,7 +265,7 @@ impl Agent {
         &self.targets[self.at]
     }
 
-    /// Starts the next task if the hand is free, and sends what is to be said.
+    /// Starts the next task if none is running, and sends pending messages.
     fn work(&mut self, now: Instant) {
         if let Some(task) = self.assignments.begin(now) {
             info!(job = %task.job, task = task.index, "task starts");
@@ -292,7 +296,7 @@ impl Agent {
         }
     }
 
-    /// Ends a worker that has waited for work too long.
+    /// Ends a worker that has been idle for too long.
     fn idle(&mut self, now: Instant) {
         let connected = matches!(self.link, Link::Up { .. });
         if self.assignments.in_hand().is_some() || self.leaving.is_some() || !connected {
@@ -306,7 +310,7 @@ impl Agent {
         }
     }
 
-    /// Ends a worker whose time is over.
+    /// Ends a worker at the end of its time.
     fn end_in_time(&mut self, now: Instant) {
         let over = self.assignments.ends_at().is_some_and(|at| now >= at);
         let stopping = self
@@ -319,7 +323,7 @@ impl Agent {
         }
     }
 
-    /// When the loop must look again although nothing came.
+    /// Returns the time at which the loop must run again even without an event.
     fn wake(&self, now: Instant) -> Instant {
         let leaving = self.leaving.iter().flat_map(|l| [l.stop_at, l.give_up]);
         let idle = self.idle_since.zip(self.exit_idle);
@@ -395,7 +399,7 @@ impl Agent {
         Ok(())
     }
 
-    /// The connection is gone, or did not come about.
+    /// Handles a lost or failed connection.
     fn lost(&mut self, now: Instant, error: LinkError) -> Result<(), AgentError> {
         let reason = match error {
             LinkError::Mismatch(reason) if self.welcomed => reason,
@@ -413,7 +417,7 @@ impl Agent {
         if matches!(self.link, Link::Up { since, .. } if now - since > GOOD_SESSION) {
             self.retry.reset();
         }
-        // The next coordinator of the list at once; the first again only after a wait.
+        // The next coordinator of the list is tried at once; the first one again only after a wait.
         self.at = (self.at + 1) % self.targets.len();
         let wait = match self.at {
             0 => self.retry.next(random()),
@@ -494,7 +498,7 @@ impl Agent {
         let now = Instant::now();
         self.control = None;
         let hand = self.assignments.ended(now, &result);
-        // Sent ahead of the report on it, after which nothing is heard of it any more.
+        // The lines are sent before the report, because log lines after it are ignored.
         let lines = self.runner.log().end();
         self.unsent.push(hand.lease, hand.task.index, lines);
         let (job, task, seconds) = (
@@ -521,7 +525,7 @@ impl Agent {
                     "task interrupted; the worker hands its leases back and waits before taking more");
                 self.assignments.pause(now + wait, why);
             }
-            // The coordinator takes back what needs the store, and gives other work.
+            // The coordinator takes back tasks that need the store, and sends other work.
             Err(TaskError::Store(why)) => {
                 self.summary.failed += 1;
                 warn!(%job, task, why, "the task waits for its store; the worker takes other work");
@@ -537,7 +541,7 @@ impl Agent {
         }
     }
 
-    /// The shutdown signal came, or the coordinator's wish.
+    /// Begins to leave, because of a shutdown signal or the coordinator's request.
     fn begin_leaving(&mut self, haste: Haste) {
         let now = Instant::now();
         self.assignments.drain();
@@ -579,7 +583,7 @@ impl Agent {
         });
     }
 
-    /// How long the task in hand still needs, if it goes on as it went so far.
+    /// Estimates the remaining time of the running task from its progress so far.
     fn remaining(&self, now: Instant) -> Option<Duration> {
         let since = self.assignments.in_hand()?.since;
         let fraction = self.control.as_ref()?.fraction();
@@ -587,7 +591,7 @@ impl Agent {
         Duration::try_from_secs_f64(left).ok()
     }
 
-    /// Takes the next step of the way out; `true` when the worker may go.
+    /// Takes the next step of leaving. Returns `true` when the worker may end.
     fn leave(&mut self, now: Instant) -> bool {
         let Some(leaving) = &mut self.leaving else {
             return false;
@@ -609,7 +613,8 @@ impl Agent {
             leaving.give_up = now + GOODBYE_WITHIN;
             self.assignments.release_all(SHUTDOWN);
         }
-        // A lease under way would be nobody's until it expires: it is awaited and handed back.
+        // A lease in transit would be blocked until it expires, so the worker waits for it and
+        // gives it back.
         let all_said = self.assignments.unacknowledged() == 0 && !self.assignments.expects_lease();
         all_said || now >= leaving.give_up
     }

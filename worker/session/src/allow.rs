@@ -1,4 +1,5 @@
-//! Which places a worker may touch: what lies outside its store prefixes is refused before anything is opened.
+//! Restricts the places that a worker may access: a task with places outside the store prefixes is
+//! refused before anything is opened.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -7,11 +8,12 @@ use picofarm_proto::model::StageSpec;
 
 use crate::AgentError;
 
-/// Where tasks may write their output and read their input. Without any prefix: anywhere.
+/// The places where tasks may write output and read input. Without any prefix, all places are
+/// allowed.
 #[derive(Debug, Clone, Default)]
 pub struct StorePrefixes(Vec<Place>);
 
-/// What the operator's prefixes leave of this machine's files.
+/// Returns an opener for this machine's files inside the operator's prefixes.
 pub fn opener(prefixes: &StorePrefixes) -> Opener {
     if prefixes.0.is_empty() {
         return Opener::anywhere();
@@ -20,7 +22,7 @@ pub fn opener(prefixes: &StorePrefixes) -> Opener {
     Opener::anywhere().within(local.map(|p| p.parts.iter().collect::<PathBuf>()))
 }
 
-/// A place in a store, for comparison part by part.
+/// A place in a store, compared by path components.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Place {
     /// Scheme and host; empty for this machine's files.
@@ -30,7 +32,7 @@ struct Place {
 
 impl StorePrefixes {
     /// # Errors
-    /// A prefix that cannot be used.
+    /// An unusable prefix.
     pub fn new(prefixes: &[String]) -> Result<Self, AgentError> {
         let place = |prefix: &String| {
             Place::of(prefix).map_err(|why| AgentError::Config {
@@ -47,10 +49,10 @@ impl StorePrefixes {
             .map(Self)
     }
 
-    /// Checks that task `index` of a stage touches only allowed places.
+    /// Checks that task `index` of a stage accesses only allowed places.
     ///
     /// # Errors
-    /// Why not, with the field.
+    /// The reason, with the field.
     pub fn check(&self, stage: &StageSpec, index: u64) -> Result<(), String> {
         stage.check_places().map_err(|e| e.to_string())?;
         if self.0.is_empty() {
@@ -60,7 +62,7 @@ impl StorePrefixes {
             self.allowed("source.store", &source.store)?;
             self.allowed("source.dataset", &below(&source.store, &source.dataset))?;
         }
-        // Models lie in the source's store, and are put there.
+        // Models are in the source's store, and are also written there.
         let results = stage.task.results();
         self.allowed(results.field, results.store)?;
         if let Some((store, dataset)) = stage.task.writes() {
@@ -70,7 +72,7 @@ impl StorePrefixes {
         inputs.try_for_each(|(field, path)| self.allowed(&field, path))
     }
 
-    /// Whether a path or URL lies below one of them.
+    /// Returns whether a path or URL is inside one of the prefixes.
     pub fn hold(&self, text: &str) -> bool {
         Place::of(text).is_ok_and(|place| self.0.iter().any(|prefix| place.lies_in(prefix)))
     }
@@ -87,7 +89,7 @@ impl StorePrefixes {
     }
 }
 
-/// A folder in a store: on this machine it may be a link.
+/// Returns the path of a folder in a store. On this machine it may be a link.
 fn below(store: &str, folder: &str) -> String {
     format!("{}/{folder}", store.trim_end_matches('/'))
 }
@@ -121,7 +123,8 @@ impl Place {
         Ok(Self { store, parts })
     }
 
-    /// A file as it really lies: links in the part that exists are followed, so that none leads out of a prefix.
+    /// Returns the real path of a file: links in its existing part are followed, so that none leads
+    /// out of a prefix.
     fn local(path: &Path) -> Result<Self, String> {
         let up = |c: Component<'_>| matches!(c, Component::ParentDir);
         if path.components().any(up) {

@@ -1,5 +1,5 @@
-//! What the worker holds: its leases, the task in hand, the reports not yet acknowledged. Pure: the time is
-//! passed in, and what is to be sent is returned. See the parent module for the reasoning.
+//! The worker's leases, its running task, and its unacknowledged reports. Pure: the time is passed
+//! in, and messages to send are returned. See the parent module for the reasoning.
 
 use std::{
     collections::{BTreeSet, VecDeque},
@@ -19,11 +19,11 @@ use crate::{
     outbox::Outbox,
 };
 
-/// A further lease is asked for when the work at hand will last no longer than this, so that short tasks do not
-/// wait for the coordinator and long ones are not hoarded.
+/// The worker asks for another lease when its remaining work will take at most this time. Thus
+/// short tasks do not wait for the coordinator, and long ones are not hoarded.
 const AHEAD: Duration = Duration::from_secs(2);
 
-/// A lease and what is left of it.
+/// A lease and its remaining tasks.
 #[derive(Debug)]
 struct Held {
     lease: LeaseRef,
@@ -34,24 +34,25 @@ struct Held {
     next: u64,
     hi: u64,
     skip: BTreeSet<u64>,
-    /// When its present life began: at the sending of the heartbeat that renewed it, or at its receipt; by a clock that
-    /// goes on while the machine is suspended.
+    /// Start of its current lifetime: when the renewing heartbeat was sent, or when the lease was
+    /// received. It is adjusted for suspends of the machine.
     renewed_at: Instant,
     ttl: Duration,
 }
 
 impl Held {
-    /// From here on no task of it may be started: two thirds of its life are over.
+    /// Returns the time after which none of its tasks may be started: after two thirds of its
+    /// lifetime.
     fn fence(&self) -> Instant {
         self.renewed_at + self.ttl * 2 / 3
     }
 
-    /// When it ends unless it is renewed.
+    /// Returns the time at which it expires unless it is renewed.
     fn end(&self) -> Instant {
         self.renewed_at + self.ttl
     }
 
-    /// Moves `next` to a task that is to be run, or to `hi`.
+    /// Advances `next` to a task that must be run, or to `hi`.
     fn pass_skipped(&mut self) {
         while self.next < self.hi && self.skip.contains(&self.next) {
             self.next += 1;
@@ -59,27 +60,27 @@ impl Held {
     }
 }
 
-/// The task in hand.
+/// The running task.
 #[derive(Debug)]
 pub(crate) struct InHand {
     /// Its lease.
     pub(crate) lease: LeaseRef,
-    /// What runs.
+    /// The task itself.
     pub(crate) task: Task,
-    /// Where it is in a trace: at first where its lease is, then its own place.
+    /// Its parent in a trace: at first that of its lease, then its own span.
     pub(crate) traceparent: String,
-    /// Since when.
+    /// The time at which it started.
     pub(crate) since: Instant,
 }
 
-/// A heartbeat whose answer is awaited.
+/// An unanswered heartbeat.
 #[derive(Debug)]
 struct Beat {
     sent: Instant,
-    /// How long the machine was suspended since.
+    /// Duration of suspends since it was sent.
     slept: Duration,
     leases: Vec<LeaseRef>,
-    /// It went out right after the withdrawal of all credit.
+    /// Whether it was sent right after all credit was withdrawn.
     withdrawal: bool,
 }
 
@@ -89,21 +90,22 @@ pub(crate) struct Assignments {
     leases: Vec<Held>,
     in_hand: Option<InHand>,
     outbox: Outbox,
-    /// Heartbeats of this connection without an answer, oldest first. Each answer belongs to the oldest.
+    /// Unanswered heartbeats of this connection, oldest first. Each answer belongs to the oldest.
     beats: VecDeque<Beat>,
-    /// A lease has been asked for on this connection and not received yet.
+    /// Whether a lease was requested on this connection and has not arrived yet.
     asked: bool,
-    /// How long the last finished task took, and its stage: it tells nothing of another stage's tasks.
+    /// Duration of the last finished task, and its stage, because it does not predict tasks of
+    /// another stage.
     pace: Option<(StageKey, Duration)>,
-    /// No new work before this time.
+    /// No new work is started before this time.
     paused_until: Option<Instant>,
-    /// When the worker must end, where that is known.
+    /// When the worker must end, if known.
     ends_at: Option<Instant>,
     draining: bool,
 }
 
 impl Assignments {
-    /// An empty assignments.
+    /// Returns assignments without leases.
     pub(crate) fn new() -> Self {
         Self {
             leases: Vec::new(),
@@ -118,38 +120,41 @@ impl Assignments {
         }
     }
 
-    /// Leases to name in hello and heartbeat: those with work left, in hand or unacknowledged.
+    /// Returns the leases to list in hello and heartbeat: those with remaining, running or
+    /// unacknowledged tasks.
     pub(crate) fn held(&self) -> Vec<LeaseRef> {
         self.leases.iter().map(|h| h.lease).collect()
     }
 
-    /// The task in hand.
+    /// Returns the running task.
     pub(crate) fn in_hand(&self) -> Option<&InHand> {
         self.in_hand.as_ref()
     }
 
-    /// Reports without an acknowledgement.
+    /// Returns the number of unacknowledged reports.
     pub(crate) fn unacknowledged(&self) -> usize {
         self.outbox.len()
     }
 
-    /// Finished tasks without an acknowledgement.
+    /// Returns the number of unacknowledged finished tasks.
     pub(crate) fn unacknowledged_outputs(&self) -> usize {
         self.outbox.finished()
     }
 
-    /// The connection is gone: what was sent over it must be sent again.
+    /// Handles a lost connection: everything sent over it must be sent again.
     pub(crate) fn disconnected(&mut self) {
         self.outbox.rewind();
         self.beats.clear();
         self.asked = false;
     }
 
-    /// The machine was suspended for so long, which the monotonic clock does not count: leases are older than it says. Those
-    /// that are renewed in time by that clock alone may be others' by now.
+    /// Handles a suspend of the machine. The monotonic clock does not count this time, so leases
+    /// are older than it indicates. By that clock they may seem to be renewed in time although
+    /// other workers already have them.
     pub(crate) fn suspended(&mut self, long: Duration) {
         for held in &mut self.leases {
-            // Where the clock began less than that ago, as old as can be said; the fence is then passed by the time to live.
+            // If the clock began later than that, the lease is made as old as possible; its zero
+            // lifetime then puts it past the fence.
             match held.renewed_at.checked_sub(long) {
                 Some(before) => held.renewed_at = before,
                 None => held.ttl = Duration::ZERO,
@@ -158,32 +163,32 @@ impl Assignments {
         for beat in &mut self.beats {
             beat.slept += long;
         }
-        // Its end is a time of day.
+        // Its end is a wall-clock time.
         self.ends_at = self.ends_at.map(|at| at.checked_sub(long).unwrap_or(at));
     }
 
-    /// The worker must end then.
+    /// Sets the time at which the worker must end.
     pub(crate) fn must_end(&mut self, at: Instant) {
         self.ends_at = Some(at);
     }
 
-    /// When the worker must end, where that is known.
+    /// Returns the time at which the worker must end, if known.
     pub(crate) fn ends_at(&self) -> Option<Instant> {
         self.ends_at
     }
 
-    /// Milliseconds until the worker must end, at least 1, where that is known.
+    /// Returns the milliseconds until the worker must end, at least 1, if known.
     pub(crate) fn ends_in_ms(&self, now: Instant) -> Option<u64> {
         let left = self.ends_at?.saturating_duration_since(now);
         Some(u64::try_from(left.as_millis()).unwrap_or(u64::MAX).max(1))
     }
 
-    /// When the oldest unanswered heartbeat was sent.
+    /// Returns when the oldest unanswered heartbeat was sent.
     pub(crate) fn silent_since(&self) -> Option<Instant> {
         self.beats.front().map(|b| b.sent)
     }
 
-    /// A lease arrives. `false` if it is held already.
+    /// Adds a received lease. Returns `false` if the worker already has it.
     pub(crate) fn granted(&mut self, now: Instant, lease: Lease) -> bool {
         self.asked = false;
         if self.leases.iter().any(|h| h.lease == lease.lease) {
@@ -211,7 +216,7 @@ impl Assignments {
         true
     }
 
-    /// A lease arrived that cannot be used: it goes back.
+    /// Returns an unusable lease to the coordinator.
     pub(crate) fn unusable(&mut self, lease: Option<LeaseRef>, why: &str) {
         self.asked = false;
         if let Some(lease) = lease {
@@ -222,8 +227,9 @@ impl Assignments {
         }
     }
 
-    /// The answer to the oldest unanswered heartbeat: `named` live on. Returns the leases that the heartbeat
-    /// named and the answer does not: they are lost, and only a task already running goes on.
+    /// Handles the answer to the oldest unanswered heartbeat: the leases `named` are renewed.
+    /// Returns the leases that the heartbeat listed and the answer does not. These are lost, and
+    /// only a task already running continues.
     pub(crate) fn renewed(
         &mut self,
         now: Instant,
@@ -232,10 +238,10 @@ impl Assignments {
     ) -> Vec<LeaseRef> {
         let beat = self.beats.pop_front();
         if beat.as_ref().is_some_and(|b| b.withdrawal) {
-            // Answers keep their order: whatever was granted before the withdrawal has arrived.
+            // Messages keep their order, so every lease granted before the withdrawal has arrived.
             self.asked = false;
         }
-        // `None` where that is longer ago than the clock can say: then nothing is renewed by it.
+        // `None` if that time is before the clock's start; then nothing is renewed.
         let begun = beat
             .as_ref()
             .map_or(Some(now), |b| b.sent.checked_sub(b.slept));
@@ -253,8 +259,9 @@ impl Assignments {
         lost
     }
 
-    /// A lease is revoked. `true` if the task in hand belongs to it and must stop: only while the lease was
-    /// live, for then the work is not wanted. One that had run out is merely lost.
+    /// Handles a revoked lease. Returns `true` if the running task belongs to it and must stop.
+    /// This is the case only if the lease was still live, because then its work is not wanted. A
+    /// lease that had already expired is merely lost.
     pub(crate) fn revoked(&mut self, now: Instant, lease: LeaseRef) -> bool {
         let live = self
             .leases
@@ -264,7 +271,7 @@ impl Assignments {
         live && self.in_hand.as_ref().is_some_and(|t| t.lease == lease)
     }
 
-    /// Tasks of a lease from `hi` on are another worker's.
+    /// Handles a lease with tasks from `hi` on moved to another worker.
     pub(crate) fn trimmed(&mut self, lease: LeaseRef, hi: u64) {
         if let Some(held) = self.leases.iter_mut().find(|h| h.lease == lease) {
             held.hi = held.hi.min(hi);
@@ -273,14 +280,14 @@ impl Assignments {
         self.tidy();
     }
 
-    /// An acknowledgement arrived. Returns the report it answers.
+    /// Handles an acknowledgement. Returns the report that it answers.
     pub(crate) fn acknowledged(&mut self, lease: LeaseRef, index: u64) -> Option<Report> {
         let report = self.outbox.acknowledge(lease, index);
         self.tidy();
         report
     }
 
-    /// Takes the next task that may be started, if the hand is free.
+    /// Takes the next task that may be started, if none is running.
     pub(crate) fn begin(&mut self, now: Instant) -> Option<Task> {
         if self.in_hand.is_some() || self.draining || self.paused(now) {
             return None;
@@ -306,15 +313,16 @@ impl Assignments {
         Some(task)
     }
 
-    /// The task in hand has a place of its own in a trace.
+    /// Records the running task's own span in a trace.
     pub(crate) fn traced(&mut self, traceparent: String) {
         if let Some(hand) = &mut self.in_hand {
             hand.traceparent = traceparent;
         }
     }
 
-    /// The task in hand ended. What is to be reported goes to the outbox: every finished task, even if its lease
-    /// is lost (the output stands); failures only where the lease is still held.
+    /// Handles the end of the running task. Its report goes to the outbox: every finished task,
+    /// even if its lease is lost (the output is valid anyway), and failures only if the worker
+    /// still has the lease.
     pub(crate) fn ended(&mut self, now: Instant, result: &Result<Output, TaskError>) -> InHand {
         let hand = self
             .in_hand
@@ -354,13 +362,13 @@ impl Assignments {
         hand
     }
 
-    /// Gives every lease with work left back and takes no more until `until`.
+    /// Gives back every lease with remaining tasks, and accepts no work until `until`.
     pub(crate) fn pause(&mut self, until: Instant, reason: &str) {
         self.paused_until = Some(until);
         self.release_all(reason);
     }
 
-    /// The end of a pause that is still to come.
+    /// Returns the end of the current pause.
     pub(crate) fn paused_until(&self) -> Option<Instant> {
         self.paused_until
     }
@@ -372,12 +380,12 @@ impl Assignments {
         self.paused_until.is_some()
     }
 
-    /// From now on no task is started and no lease asked for.
+    /// From now on, no task is started and no lease requested.
     pub(crate) fn drain(&mut self) {
         self.draining = true;
     }
 
-    /// Gives back every lease that has work left or in hand.
+    /// Gives back every lease with remaining or running tasks.
     pub(crate) fn release_all(&mut self, reason: &str) {
         let in_hand = self.in_hand.as_ref().map(|t| t.lease);
         let open: Vec<_> = self
@@ -391,7 +399,8 @@ impl Assignments {
         }
     }
 
-    /// Gives back every lease with work left but for the one in hand, of which the rest is given back with it.
+    /// Gives back every lease with remaining tasks, except that of the running task; its remaining
+    /// tasks are given back when this ends.
     pub(crate) fn release_waiting(&mut self, reason: &str) {
         let in_hand = self.in_hand.as_ref().map(|t| t.lease);
         let open: Vec<_> = self
@@ -413,8 +422,9 @@ impl Assignments {
         });
     }
 
-    /// Whether to ask for a lease: none is on its way, and the work at hand is over or soon will be. After a stage of short
-    /// tasks, one of another stage may take days: while any is held, no more is asked for.
+    /// Returns whether to ask for a lease: none is in transit, and the work is finished or soon
+    /// will be. After a stage of short tasks, a task of another stage may take days. Therefore no
+    /// lease is requested while the worker has tasks of another stage.
     fn wants(&self) -> bool {
         let waiting: u64 = self.leases.iter().map(|h| h.hi - h.next).sum();
         let left = waiting + u64::from(self.in_hand.is_some());
@@ -431,7 +441,8 @@ impl Assignments {
         !self.asked && !self.draining && (left == 0 || soon_over)
     }
 
-    /// What is to be sent now: reports not yet sent on this connection, and the wish for a lease.
+    /// Returns the messages to send now: reports not yet sent on this connection, and a request for
+    /// a lease.
     pub(crate) fn outgoing(&mut self, now: Instant) -> Vec<Outgoing> {
         let mut messages: Vec<_> = self
             .outbox
@@ -446,8 +457,8 @@ impl Assignments {
         messages
     }
 
-    /// Takes back what was asked for: the credit, and a heartbeat whose answer shows that no lease is under way
-    /// any more.
+    /// Withdraws a request for a lease. Returns the zero credit and a heartbeat; the answer to this
+    /// heartbeat proves that no lease is in transit.
     pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Vec<Outgoing> {
         if !self.asked {
             return Vec::new();
@@ -459,12 +470,12 @@ impl Assignments {
         vec![Outgoing::Credit(0), heartbeat]
     }
 
-    /// Whether a lease may be under way to this worker.
+    /// Returns whether a lease may be in transit to this worker.
     pub(crate) fn expects_lease(&self) -> bool {
         self.asked
     }
 
-    /// The heartbeat to send now.
+    /// Returns the heartbeat to send now.
     pub(crate) fn heartbeat(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Outgoing {
         let leases = self.held();
         self.beats.push_back(Beat {
@@ -491,7 +502,7 @@ impl Assignments {
         }
     }
 
-    /// Forgets leases that are worked off and about which nothing waits for an acknowledgement.
+    /// Drops leases that are finished and have no unacknowledged reports.
     fn tidy(&mut self) {
         let in_hand = self.in_hand.as_ref().map(|t| t.lease);
         let outbox = &self.outbox;

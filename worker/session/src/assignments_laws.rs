@@ -1,4 +1,5 @@
-//! Laws of the [`Assignments`] under any order of grants, renewals, losses, disconnects and results.
+//! Property tests of the [`Assignments`] under any order of grants, renewals, losses, disconnects
+//! and results.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -37,7 +38,7 @@ enum Step {
     /// The machine is suspended: the monotonic clock stands still.
     Suspend(u64),
     Heartbeat,
-    /// Answer the oldest heartbeat; the bits choose which leases live on.
+    /// Answer the oldest heartbeat; the bits select the leases that are renewed.
     Renew(u8),
     Revoke(usize),
     Send,
@@ -111,7 +112,7 @@ fn result(kind: u8) -> Result<Output, TaskError> {
     }
 }
 
-/// Whether the worker asks for another lease now.
+/// Returns whether the worker asks for another lease now.
 fn asks(assignments: &mut Assignments, now: Instant) -> bool {
     let sent = assignments.outgoing(now);
     sent.iter().any(|m| matches!(m, Outgoing::Credit(1)))
@@ -128,7 +129,8 @@ fn after_a_stage_of_short_tasks_one_task_of_another_is_enough() {
     assert!(assignments.granted(start, of(1, 0)));
     assignments.begin(start).expect("a task is there");
     assignments.ended(start, &result(2));
-    // The next of the same stage is soon over: another is asked for, and that is of a second stage.
+    // The next task of the same stage will end soon, so another lease is requested; this one is of
+    // a second stage.
     assert!(asks(&mut assignments, start), "nothing to do");
     assert!(assignments.granted(start, of(2, 0)));
     assert!(asks(&mut assignments, start), "it is soon over");
@@ -154,7 +156,7 @@ proptest! {
     ) {
         let mut assignments = Assignments::new();
         let mut now = Instant::now();
-        // Of suspends, which `now` does not count.
+        // Duration of suspends, which `now` does not count.
         let mut slept = Duration::ZERO;
         let mut epoch = 0;
         let mut renewed: BTreeMap<LeaseRef, Instant> = BTreeMap::new();
@@ -217,7 +219,7 @@ proptest! {
                         named.into_iter().partition(|l| bits >> (l.epoch.0 % 8) & 1 == 1);
                     assignments.renewed(now, &kept, TTL);
                     for lease in kept {
-                        // A lease lost earlier does not come back.
+                        // A lease that was lost earlier is not restored.
                         renewed.entry(lease).and_modify(|at| *at = (*at).max(sent));
                     }
                     for lease in gone {
@@ -264,7 +266,7 @@ proptest! {
             }
             prop_assert_eq!(assignments.unacknowledged_outputs(), finished.len());
         }
-        // Whatever was never acknowledged goes out once more after a reconnect.
+        // All unacknowledged reports are sent again after a reconnect.
         assignments.disconnected();
         let said: BTreeSet<_> = assignments
             .outgoing(now)

@@ -1,9 +1,9 @@
-//! How long to wait before trying again: exponential, capped, jittered so that a thousand workers do not
-//! come back in the same instant.
+//! Wait times between retries: exponential, capped, and jittered so that a thousand workers do not
+//! return at the same moment.
 
 use std::time::Duration;
 
-/// Growing waits between `first` and `longest`.
+/// Increasing waits between `first` and `longest`.
 #[derive(Debug, Clone)]
 pub struct Backoff {
     first: Duration,
@@ -12,7 +12,7 @@ pub struct Backoff {
 }
 
 impl Backoff {
-    /// Waits from `first`, doubling up to `longest`.
+    /// Returns waits from `first`, doubling up to `longest`.
     pub const fn new(first: Duration, longest: Duration) -> Self {
         Self {
             first,
@@ -21,7 +21,8 @@ impl Backoff {
         }
     }
 
-    /// The next wait: between half of the doubled wait and all of it, by `random` in [0, 1).
+    /// Returns the next wait: between half of the doubled wait and all of it. `random` is in [0,
+    /// 1).
     pub fn next(&mut self, random: f64) -> Duration {
         let full = self
             .first
@@ -31,13 +32,13 @@ impl Backoff {
         full.mul_f64(0.5 + 0.5 * random)
     }
 
-    /// It worked: begin anew.
+    /// Resets the waits after a success.
     pub fn reset(&mut self) {
         self.tries = 0;
     }
 }
 
-/// A random number in [0, 1), for jitter.
+/// Returns a random number in [0, 1), for jitter.
 pub fn random() -> f64 {
     let bits = uuid::Uuid::new_v4().as_u128() as u32;
     f64::from(bits) / (f64::from(u32::MAX) + 1.0)

@@ -1,4 +1,4 @@
-//! A worker's settings, its summary at the end, and why it may end early.
+//! A worker's settings, its final summary, and the reasons for an early end.
 
 use std::{
     path::PathBuf,
@@ -13,46 +13,47 @@ use crate::{Access, AccessError};
 /// Settings of one worker process.
 #[derive(Debug, Clone)]
 pub struct AgentConfig {
-    /// URL of the coordinator, e.g. `http://127.0.0.1:7717`; of several on one catalog, with commas between them. The
-    /// worker goes to the next one when it loses one.
+    /// URL of the coordinator, e.g. `http://127.0.0.1:7717`, or a comma-separated list of
+    /// coordinators on one catalog. If the worker loses one, it connects to the next.
     pub coordinator: String,
-    /// Name, for people: host and process.
+    /// Name for display: host and process.
     pub name: String,
-    /// Identity across restarts; `None` makes one for this process.
+    /// Identity across restarts; `None` generates one for this process.
     pub worker_id: Option<WorkerId>,
-    /// How the process of this worker before this one ended, where that is known; empty otherwise.
+    /// How this worker's previous process ended, if known; otherwise empty.
     pub ended: String,
-    /// Threads of the render pool, at least 1.
+    /// Number of threads in the render pool, at least 1.
     pub threads: usize,
-    /// Memory that tasks may take, MiB; 0 = not known, which meets no stage that asks for any.
+    /// Memory for tasks in MiB; 0 = unknown, which satisfies no stage with a memory requirement.
     pub memory_mib: u64,
-    /// Where that number comes from, for the log.
+    /// Source of that number, for the log.
     pub memory_from: String,
-    /// Graphics processors that tasks may use.
+    /// GPUs that tasks may use.
     pub gpus: Gpus,
-    /// Where other workers reach this one, which train a network together with it: an address of this machine, and a port
-    /// where it must be a certain one.
+    /// Address at which other workers reach this one to train a network together: an address of
+    /// this machine, optionally with a port.
     pub peers: String,
-    /// Labels that stages may ask for.
+    /// Labels that stages may require.
     pub labels: Vec<String>,
-    /// The worker ends when it has had nothing to do for so long, while connected; `None` = never.
+    /// The worker ends after being idle for this time while connected; `None` = never.
     pub exit_idle: Option<Duration>,
-    /// The worker stops work then, as at a signal; it tells the coordinator, which grants what it
-    /// can finish by then. `None` = not known.
+    /// The worker stops at this time, as on a signal. It reports the time to the coordinator, which
+    /// grants only tasks that can finish by then. `None` = unknown.
     pub ends_at: Option<SystemTime>,
-    /// Folders to look in for furniture, besides the usual ones.
+    /// Additional folders with furniture.
     pub asset_dirs: Vec<PathBuf>,
-    /// What this worker has to show, and whom it trusts.
+    /// The worker's credentials, and the certificate authorities it trusts.
     pub access: Access,
-    /// Paths or URLs that tasks' outputs and scene files must lie in; without any, they may lie anywhere.
+    /// Paths or URLs that must contain tasks' outputs and scene files; without any, all places are
+    /// allowed.
     pub store_prefixes: Vec<String>,
 }
 
 impl AgentConfig {
-    /// Every limit of the fields above.
+    /// Checks the limits of all fields.
     ///
     /// # Errors
-    /// [`AgentError::Config`] names the first field that cannot be used.
+    /// [`AgentError::Config`] names the first unusable field.
     pub fn check(&self) -> Result<(), AgentError> {
         let fail = |field, what: &str| {
             Err(AgentError::Config {
@@ -75,42 +76,42 @@ impl AgentConfig {
     }
 }
 
-/// What a worker did in its life.
+/// Statistics of a worker's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Summary {
-    /// Tasks computed and published.
+    /// Number of tasks computed and published.
     pub computed: u64,
-    /// Tasks whose output was already in the store.
+    /// Number of tasks with an output already in the store.
     pub adopted: u64,
-    /// Tasks that failed.
+    /// Number of failed tasks.
     pub failed: u64,
-    /// Times the session was lost and opened again.
+    /// Number of times the session was lost and opened again.
     pub reconnects: u64,
-    /// Finished tasks that no coordinator acknowledged before the end. Their outputs are in the store, so
-    /// whoever gets those tasks next adopts them.
+    /// Number of finished tasks that no coordinator acknowledged before the end. Their outputs are
+    /// in the store, so the next workers with these tasks adopt them.
     pub unacknowledged: u64,
 }
 
-/// Why a worker ended.
+/// A reason why a worker ended.
 #[derive(Debug, thiserror::Error)]
 pub enum AgentError {
-    /// A setting that cannot be used.
+    /// An unusable setting.
     #[error("{field}: {what}")]
     Config {
         /// The setting.
         field: &'static str,
-        /// What was expected.
+        /// The expected value.
         what: String,
     },
-    /// The coordinator's URL, or what is needed to reach it, cannot be used.
+    /// The coordinator's URL, or a setting for connecting to it, is unusable.
     #[error("coordinator: {0}")]
     Access(#[from] AccessError),
-    /// The coordinator will not have this worker, and asking again would not help.
+    /// The coordinator refuses this worker, and retrying would not help.
     #[error("the coordinator at {coordinator} refused this worker: {reason}")]
     Refused {
-        /// Its URL.
+        /// The coordinator's URL.
         coordinator: String,
-        /// Its words.
+        /// The coordinator's message.
         reason: String,
     },
     /// The render threads could not be started.
@@ -118,9 +119,9 @@ pub enum AgentError {
         "cannot start {threads} render threads: {reason}; lower `threads` or raise the process limit"
     )]
     Threads {
-        /// How many were asked for.
+        /// The requested number of threads.
         threads: usize,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }

@@ -1,4 +1,5 @@
-//! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
+//! The interface between the session and the work: an [`Executor`] runs one task at a time and
+//! returns its result.
 
 use std::{
     collections::BTreeMap,
@@ -21,48 +22,48 @@ use picofarm_proto::{
 pub struct Task {
     /// The job.
     pub job: JobId,
-    /// Its stage; of lists as much as the lease's tasks need.
+    /// The stage. Its lists contain only the entries that the lease's tasks need.
     pub spec: Arc<StageSpec>,
     /// The stage's key.
     pub stage: StageKey,
-    /// Task index; where tasks are scenes, also the scene's index in the data set.
+    /// Task index; if tasks are scenes, also the scene's index in the data set.
     pub index: u64,
 }
 
 impl Task {
-    /// Names the result.
+    /// Returns the key of the task's result.
     pub fn key(&self) -> TaskKey {
         task_key(&self.stage, self.index)
     }
 }
 
-/// A finished task: its output is in the store for good.
+/// A finished task, with its output durably in the store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Output {
-    /// SHA-256 of the manifest, hexadecimal.
+    /// SHA-256 of the manifest, in hexadecimal.
     pub manifest_sha256: String,
-    /// Bytes published.
+    /// Size of the published objects in bytes.
     pub bytes: u64,
-    /// It was there already and nothing was computed.
+    /// Whether the output already existed, so that nothing was computed.
     pub adopted: bool,
 }
 
-/// Why a task did not finish; the text is for people.
+/// A reason why a task did not finish. The text is for people.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TaskError {
-    /// Its own input or settings: trying again elsewhere will not help.
+    /// Its own input or settings are wrong, so retrying elsewhere will not help.
     #[error("{0}")]
     User(String),
-    /// The executor broke down.
+    /// The executor crashed.
     #[error("{0}")]
     Crash(String),
-    /// Nothing is wrong with the task, but with this machine.
+    /// The task is valid, but this machine has a problem.
     #[error("{0}")]
     Interrupted(String),
-    /// Nothing is wrong with the task: its store cannot be reached, or takes nothing.
+    /// The task is valid, but its store is unreachable or not writable.
     #[error("{0}")]
     Store(String),
-    /// Nothing is wrong with the task: its store answers, but an object in it is damaged or missing.
+    /// The task is valid and its store reachable, but an object in it is damaged or missing.
     #[error("{0}")]
     Damaged(String),
     /// [`Control::stop`] was called.
@@ -70,37 +71,38 @@ pub enum TaskError {
     Stopped,
 }
 
-/// Runs tasks. Called on a thread of the worker's own rayon pool, one task at a time; it may block. A panic
-/// counts as [`TaskError::Crash`] and the worker lives on.
+/// Runs tasks. It is called on a thread of the worker's own rayon pool, one task at a time, and may
+/// block. A panic counts as [`TaskError::Crash`], and the worker continues.
 pub trait Executor: Send + Sync + 'static {
-    /// The kinds of task that it runs, each with the version of its code.
+    /// Returns the supported kinds of tasks, each with its code version.
     fn kinds(&self) -> BTreeMap<String, String>;
 
-    /// Fingerprints of the furniture at hand.
+    /// Returns the fingerprints of the available furniture.
     fn assets(&self) -> Vec<String>;
 
-    /// The graphics processors that it has opened, as they call themselves.
+    /// Returns the names of the GPUs in use.
     fn gpus(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Runs `task` to its end, reporting its progress to `control`, and stops when asked to.
+    /// Runs `task` to its end, reports its progress to `control`, and stops on request.
     ///
     /// # Errors
-    /// [`TaskError`], by who is to blame.
+    /// [`TaskError`], by the cause of the failure.
     fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError>;
 }
 
-/// Between the session and the running task: how far it is, and whether it is still wanted.
+/// The link between the session and the running task: its progress, and whether it must stop.
 pub struct Control {
     begun: Instant,
-    /// Bits of an f32 in [0, 1]: for non-negative floats the order of the bits is that of the values.
+    /// Bits of an f32 in [0, 1]. For non-negative floats, the bits have the same order as the
+    /// values.
     fraction: AtomicU32,
     at: Mutex<TaskAt>,
     stop: AtomicBool,
-    /// What it has done is not wanted either.
+    /// Whether the task's progress is not wanted either.
     unwanted: AtomicBool,
-    /// The identities of stores by their places.
+    /// The expected identities of stores, by place.
     stores: BTreeMap<String, String>,
 }
 
@@ -118,7 +120,7 @@ impl Default for Control {
 }
 
 impl Control {
-    /// For a task that expects these identities of stores, by their places.
+    /// Returns a control for a task that expects these identities of stores, by place.
     pub fn expecting(stores: &BTreeMap<String, String>) -> Self {
         Self {
             stores: stores.clone(),
@@ -126,24 +128,24 @@ impl Control {
         }
     }
 
-    /// The identity that the store at a place must have, if the task expects one.
+    /// Returns the identity that the store at a place must have, if the task expects one.
     pub fn identity(&self, place: &str) -> Option<&str> {
         let identity = self.stores.get(place.trim_end_matches('/'))?;
         Some(identity)
     }
 
-    /// The places of stores that must have an identity.
+    /// Returns the places of stores with an expected identity.
     pub fn identified(&self) -> impl Iterator<Item = &str> {
         self.stores.keys().map(String::as_str)
     }
 
-    /// How long the task has been running.
+    /// Returns how long the task has been running.
     pub fn elapsed(&self) -> Duration {
         self.begun.elapsed()
     }
 
-    /// Tells how far the task is, in [0, 1]; a smaller value than before changes nothing. `false` if the
-    /// task shall stop.
+    /// Sets the task's progress, in [0, 1]; a smaller value than before changes nothing. Returns
+    /// `false` if the task must stop.
     pub fn at(&self, fraction: f32) -> bool {
         let bits = fraction.clamp(0.0, 1.0).to_bits();
         if !fraction.is_nan() {
@@ -152,7 +154,7 @@ impl Control {
         !self.stopped()
     }
 
-    /// Says what the task is at: in words, and in figures with names.
+    /// Sets a description of the task's current activity: a text, and named figures.
     pub fn say(&self, text: String, figures: &[(&str, f64)]) {
         let figures = figures
             .iter()
@@ -164,34 +166,35 @@ impl Control {
         *self.at.lock().expect("no panic while locked") = at.limited();
     }
 
-    /// How far the task is, and what it is at.
+    /// Returns the task's progress and current activity.
     pub fn progress(&self) -> (f32, TaskAt) {
         let at = self.at.lock().expect("no panic while locked").clone();
         (self.fraction(), at)
     }
 
-    /// Share done in [0, 1].
+    /// Returns the completed fraction in [0, 1].
     pub fn fraction(&self) -> f32 {
         f32::from_bits(self.fraction.load(Ordering::Relaxed))
     }
 
-    /// Asks the task to stop as soon as it can.
+    /// Asks the task to stop as soon as possible.
     pub fn stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// Asks the task to stop as soon as it can, and to save nothing: it is another worker's, or nobody's.
+    /// Asks the task to stop as soon as possible without saving its progress, because another
+    /// worker has the task or nobody wants it.
     pub fn give_up(&self) {
         self.unwanted.store(true, Ordering::Relaxed);
         self.stop();
     }
 
-    /// Whether nobody waits for what it has done.
+    /// Returns whether the task's progress is unwanted.
     pub fn unwanted(&self) -> bool {
         self.unwanted.load(Ordering::Relaxed)
     }
 
-    /// Whether the task shall stop.
+    /// Returns whether the task must stop.
     pub fn stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }

@@ -1,6 +1,6 @@
-//! The session of a worker with the coordinator: the connection, the leases it holds, the reports that are not yet
-//! acknowledged, and the thread on which tasks run. It knows the wire; what tasks do is behind [`Executor`], and no kind of
-//! task is known here.
+//! A worker's session with the coordinator: the connection, the leases, the unacknowledged reports,
+//! and the thread that runs tasks. This crate knows the wire protocol, but no kinds of tasks; these
+//! are behind [`Executor`].
 
 mod access;
 mod agent;

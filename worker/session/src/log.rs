@@ -1,6 +1,6 @@
-//! What a task logs, on its way to the coordinator. The threads of a worker's pool work for one task at a time, so whatever
-//! one of them logs belongs to the task in hand. [`task_logs`] must be among the layers of the program's subscriber;
-//! without it, tasks' lines stay on this machine.
+//! Forwards tasks' log lines to the coordinator. The threads of a worker's pool work for one task
+//! at a time, so all of their lines belong to the running task. [`task_logs`] must be among the
+//! layers of the program's subscriber; without it, tasks' lines stay on this machine.
 
 use std::{
     cell::RefCell,
@@ -25,7 +25,8 @@ use tracing_subscriber::{
     registry::LookupSpan,
 };
 
-/// Whose lines belong to a task, from INFO upwards. Libraries' do not: nobody knows what they tell.
+/// Targets with lines that are forwarded, from INFO upwards. Those of other libraries are not,
+/// because their content is unknown.
 const OURS: [&str; 6] = [
     "picofarm_agent",
     "picofarm_dataset",
@@ -34,18 +35,18 @@ const OURS: [&str; 6] = [
     "picofarm_session",
     "picofarm_transient",
 ];
-/// Kept back of a task's allowance for the line that says how many were left out.
+/// Bytes of a task's allowance reserved for the line with the number of omitted lines.
 const NOTE_BYTES: usize = 128;
-/// Messages that wait at most while no coordinator is there.
+/// Maximum number of messages queued while no coordinator is connected.
 const UNSENT: usize = 64;
 
 thread_local! {
-    /// Where this thread's lines go.
+    /// The collector of this thread's lines.
     static HERE: RefCell<Option<Arc<Collector>>> = const { RefCell::new(None) };
 }
 
-/// The layer that hands workers' threads' lines to their workers. It costs other threads a look at a thread-local for
-/// each line from INFO upwards.
+/// Returns the layer that forwards lines of workers' threads to their workers. On other threads, it
+/// costs a lookup of a thread-local for each line from INFO upwards.
 pub fn task_logs<S>() -> impl Layer<S>
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
@@ -66,7 +67,7 @@ impl<S: Subscriber> Layer<S> for Tap {
     }
 }
 
-/// A line as it was written.
+/// A log line.
 #[derive(Debug)]
 pub(crate) struct Line {
     at: Instant,
@@ -74,7 +75,7 @@ pub(crate) struct Line {
     text: String,
 }
 
-/// Takes the lines of one task after the other.
+/// Collects the lines of one task after another.
 #[derive(Default)]
 pub(crate) struct Collector(Mutex<Kept>);
 
@@ -86,12 +87,12 @@ struct Kept {
 }
 
 impl Collector {
-    /// From now on, this thread's lines go here.
+    /// From now on, collects this thread's lines.
     pub(crate) fn serve(self: &Arc<Self>) {
         HERE.with_borrow_mut(|here| *here = Some(self.clone()));
     }
 
-    /// A task begins.
+    /// Starts a new task.
     pub(crate) fn begin(&self) {
         let mut kept = Kept::default();
         let note = kept.allowance.take(NOTE_BYTES);
@@ -99,12 +100,12 @@ impl Collector {
         *self.kept() = kept;
     }
 
-    /// The lines since the last call.
+    /// Returns the lines since the last call.
     pub(crate) fn take(&self) -> Vec<Line> {
         std::mem::take(&mut self.kept().lines)
     }
 
-    /// The last lines of the task.
+    /// Returns the last lines of the task.
     pub(crate) fn end(&self) -> Vec<Line> {
         let mut kept = self.kept();
         let mut lines = std::mem::take(&mut kept.lines);
@@ -163,7 +164,7 @@ impl Visit for Text {
     }
 }
 
-/// Lines that no coordinator has got yet. Best effort: the oldest give way.
+/// Lines that have not been sent to a coordinator. Best effort: the oldest are dropped.
 #[derive(Default)]
 pub(crate) struct Unsent(VecDeque<(LeaseRef, u64, Vec<Line>)>);
 
@@ -179,7 +180,7 @@ impl Unsent {
         self.0.push_back((lease, index, lines));
     }
 
-    /// What to send now.
+    /// Returns the messages to send now.
     pub(crate) fn drain(&mut self, now: Instant) -> impl Iterator<Item = TaskLog> {
         self.0.drain(..).map(move |(lease, index, lines)| {
             let line = |line: Line| LogLine {
@@ -213,7 +214,7 @@ mod tests {
         lines.iter().map(text).collect()
     }
 
-    /// Runs `work` on a thread that serves the collector.
+    /// Runs `work` on a thread that the collector serves.
     fn on_a_worker(collector: &Arc<Collector>, work: impl FnOnce() + Send) {
         std::thread::scope(|s| {
             s.spawn(|| {

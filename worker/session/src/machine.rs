@@ -1,30 +1,31 @@
-//! What this machine, or the part of it that this process was given, has: memory and cores. A container's or a job's limit
-//! counts, and not the whole machine.
+//! The memory and cores available to this process. The limits of a container or batch job count,
+//! and not the whole machine's.
 
 use std::{
     fmt, fs,
     path::{Path, PathBuf},
 };
 
-/// Share of the memory that tasks may take; the rest is for the program itself, the store's caches, and what estimates
-/// leave out.
+/// Share of the memory that tasks may use. The rest is for the program itself, the store's caches,
+/// and errors of estimates.
 const SHARE: f64 = 0.75;
-/// What control groups of version 1 say where there is no limit is about 2^63; nothing that counts is above this.
+/// Control groups of version 1 report about 2^63 if there is no limit; all real limits are below
+/// this.
 const NO_LIMIT: u64 = 1 << 60;
 const MIB: u64 = 1 << 20;
 
-/// Who says how much memory there is.
+/// The source of a memory limit.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum MemoryLimit {
-    /// The whole machine's.
+    /// The whole machine's memory.
     Machine,
     /// The limit of a control group: a container's, a service's, or a job step's.
     ControlGroup(PathBuf),
-    /// What Slurm gave the job: the variable that says so.
+    /// The job's memory under Slurm, with the name of its variable.
     Slurm(&'static str),
-    /// The address space that this process may have (`ulimit -v`).
+    /// The address space limit of this process (`ulimit -v`).
     AddressSpace,
-    /// An argument.
+    /// A command line argument.
     Argument,
 }
 
@@ -42,41 +43,43 @@ impl fmt::Display for MemoryLimit {
     }
 }
 
-/// How much memory there is, and who says so.
+/// The available memory, and the source of this limit.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Memory {
-    /// Bytes.
+    /// Size in bytes.
     pub bytes: u64,
-    /// What decided.
+    /// The limit that applies.
     pub limit: MemoryLimit,
 }
 
 impl Memory {
-    /// The memory of this process: the least of the machine's, its control groups', its job's under Slurm and its own
-    /// limit. `None` where the system tells nothing.
+    /// Returns the memory of this process: the minimum of the machine's, its control groups', its
+    /// Slurm job's and its own limit. Returns `None` if the system does not report it.
     pub fn here() -> Option<Self> {
         Self::below(Path::new("/"), &|name| std::env::var(name).ok())
     }
 
-    /// The same of a file system below `root` and of variables. Pure but for reading files.
+    /// Like [`Self::here`], for a file system at `root` and given variables. Pure except for
+    /// reading files.
     fn below(root: &Path, variable: &dyn Fn(&str) -> Option<String>) -> Option<Self> {
         let all = [machine(root), slurm(variable), address_space(root)];
         let mut found: Vec<Self> = all.into_iter().flatten().collect();
         found.extend(control_groups(root));
-        // The first of equal ones: the machine itself.
+        // The first of equal ones is the machine itself.
         found.into_iter().min_by_key(|memory| memory.bytes)
     }
 
-    /// What tasks may take of it, MiB.
+    /// Returns the share of it that tasks may use, in MiB.
     pub fn for_tasks_mib(&self) -> u64 {
         match self.limit {
-            // That is meant for tasks alone.
+            // An argument is meant for tasks alone.
             MemoryLimit::Argument => self.bytes / MIB,
             _ => (SHARE * self.bytes as f64) as u64 / MIB,
         }
     }
 
-    /// What tasks may take, with an argument that says so: never more than there is.
+    /// Returns the memory for tasks, limited by an optional argument. The result never exceeds the
+    /// available memory.
     pub fn for_tasks(asked_gib: Option<f64>) -> Option<Self> {
         Self::least(Self::here(), asked_gib)
     }
@@ -106,22 +109,22 @@ impl fmt::Display for Memory {
     }
 }
 
-/// MiB of memory that tasks may take here; 0 where the system does not tell.
+/// Returns the memory for tasks on this machine in MiB; 0 if the system does not report it.
 pub fn memory_mib() -> u64 {
     Memory::here().map_or(0, |memory| memory.for_tasks_mib())
 }
 
-/// Cores that this process may use: those that it is bound to, no more than its control group's share of time, and no
-/// more than Slurm gave its task.
+/// Returns the number of cores that this process may use: those it is bound to, limited by its
+/// control group's CPU quota and by Slurm's allocation for its task.
 pub fn cores() -> usize {
-    // Affinity and the quotas of both versions of control groups are in it.
+    // This includes affinity and the quotas of both versions of control groups.
     let here = std::thread::available_parallelism().map_or(1, usize::from);
     least_cores(here, &|name| std::env::var(name).ok())
 }
 
 fn least_cores(here: usize, variable: &dyn Fn(&str) -> Option<String>) -> usize {
     let of = |name| variable(name).and_then(|text| text.trim().parse::<usize>().ok());
-    // A site that does not bind tasks to cores gives each what it asked for on trust.
+    // A site that does not bind tasks to cores relies on each using only what it requested.
     let given = of("SLURM_CPUS_PER_TASK").or_else(|| of("SLURM_CPUS_ON_NODE"));
     match given {
         Some(given) if given > 0 => here.min(given),
@@ -154,7 +157,7 @@ fn address_space(root: &Path) -> Option<Memory> {
 
 fn slurm(variable: &dyn Fn(&str) -> Option<String>) -> Option<Memory> {
     let of = |name| variable(name).and_then(|text| megabytes(&text));
-    // 0 stands for all that the node has.
+    // 0 means all of the node's memory.
     if let Some(bytes) = of("SLURM_MEM_PER_NODE").filter(|n| *n > 0) {
         return Some(Memory {
             bytes,
@@ -170,7 +173,7 @@ fn slurm(variable: &dyn Fn(&str) -> Option<String>) -> Option<Memory> {
     })
 }
 
-/// A size as Slurm writes it: megabytes, or a number with its unit.
+/// Parses a size in Slurm's format: megabytes, or a number with a unit.
 fn megabytes(text: &str) -> Option<u64> {
     let text = text.trim();
     let (number, unit) = match text.chars().last()? {
@@ -183,7 +186,8 @@ fn megabytes(text: &str) -> Option<u64> {
     number.parse::<u64>().ok()?.checked_mul(unit)
 }
 
-/// The least limit of the control groups that this process is in, of both versions: its own and those above.
+/// Returns the smallest limit of this process's control groups, of both versions: its own and their
+/// ancestors.
 fn control_groups(root: &Path) -> Option<Memory> {
     let read = |path: &str| fs::read_to_string(root.join(path)).unwrap_or_default();
     let (groups, mounts) = (read("proc/self/cgroup"), read("proc/self/mountinfo"));
@@ -217,7 +221,8 @@ fn control_groups(root: &Path) -> Option<Memory> {
     least
 }
 
-/// The path of this process' control group in the hierarchy of a controller; without a name, that of version 2.
+/// Returns the path of this process's control group in a controller's hierarchy; without a name, in
+/// that of version 2.
 fn own(groups: &str, controller: &str) -> String {
     let found = groups.lines().find_map(|line| {
         let mut parts = line.splitn(3, ':');
@@ -231,16 +236,16 @@ fn own(groups: &str, controller: &str) -> String {
     found.unwrap_or_else(|| "/".into())
 }
 
-/// Where a hierarchy of control groups is mounted.
+/// The mount point of a hierarchy of control groups.
 struct Mount<'a> {
     controller: &'a str,
-    /// The part of the hierarchy that is mounted there.
+    /// The mounted part of the hierarchy.
     part: String,
     point: PathBuf,
 }
 
 impl<'a> Mount<'a> {
-    /// Finds it in `/proc/self/mountinfo` by file system and option.
+    /// Finds it in `/proc/self/mountinfo` by file system type and option.
     fn find(mounts: &str, kind: &str, controller: &'a str) -> Option<Self> {
         mounts.lines().find_map(|line| {
             let (place, rest) = line.split_once(" - ")?;
@@ -258,8 +263,8 @@ impl<'a> Mount<'a> {
         })
     }
 
-    /// The folder of a group. A container may see a hierarchy from its own group down only, and may be given a path that
-    /// lies outside: then what it sees is its own.
+    /// Returns the folder of a group. A container may only see the hierarchy below its own group,
+    /// and may be given a path outside it. In that case the visible root is its own group.
     fn folder(&self, group: &str) -> PathBuf {
         let inside = match &*self.part {
             "/" => Some(group),
@@ -354,13 +359,13 @@ mod tests {
 
     #[test]
     fn a_container_that_sees_only_its_own_group_finds_its_limit() {
-        // With a namespace of its own …
+        // With its own namespace …
         let own = Fake::new()
             .file("proc/self/cgroup", "0::/\n")
             .file("proc/self/mountinfo", V2)
             .file("sys/fs/cgroup/memory.max", "1073741824\n");
         assert_eq!(own.found().bytes, 1 << 30);
-        // … and without one, where its group's path is the host's.
+        // … and without one, so that its group's path is the host's.
         let mount = V1.replace("0:26 / ", "0:26 /docker/abc ");
         let host = Fake::new()
             .file("proc/self/cgroup", "5:cpuset:/\n4:memory:/docker/abc\n")

@@ -1,4 +1,5 @@
-//! The session's messages in checked types; protobuf goes no further than this file and its parent.
+//! The session's messages as checked types. Protobuf types are only used in this file and its
+//! parent.
 
 use picofarm_proto::{
     ids::LeaseRef,
@@ -6,27 +7,27 @@ use picofarm_proto::{
     wire::{self, session_request, session_response},
 };
 
-/// What the worker says.
+/// A message from the worker.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Outgoing {
-    /// It can take this many more leases.
+    /// The worker accepts this number of further leases.
     Credit(u32),
-    /// It lives, holds these leases and is so far with its task.
+    /// The worker is alive, has these leases and has made this progress.
     Heartbeat {
-        /// Leases held.
+        /// The worker's leases.
         leases: Vec<LeaseRef>,
-        /// The task in hand.
+        /// Progress of the running task.
         progress: Vec<TaskProgress>,
-        /// Milliseconds until the worker must end; 0 = not known.
+        /// Milliseconds until the worker must end; 0 = unknown.
         ends_in_ms: u64,
     },
-    /// What the task in hand has logged.
+    /// Log lines of the running task.
     Log(TaskLog),
-    /// Something that must be acknowledged.
+    /// A report that must be acknowledged.
     Report(Report),
 }
 
-/// What must be acknowledged.
+/// A report that must be acknowledged.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Report {
     /// A task is finished and published.
@@ -37,53 +38,53 @@ pub(crate) enum Report {
     Release {
         /// The lease.
         lease: LeaseRef,
-        /// Why, for people.
+        /// The reason, for people.
         reason: String,
     },
 }
 
-/// What the coordinator says.
+/// A message from the coordinator.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Incoming {
-    /// Work.
+    /// A new lease.
     Lease(Box<Lease>),
-    /// A lease whose content cannot be used, with the reason.
+    /// A lease with unusable content, with the reason.
     UnusableLease(Option<LeaseRef>, String),
-    /// Answer to a report.
+    /// The answer to a report.
     Acknowledge {
-        /// The lease it was about.
+        /// The report's lease.
         lease: LeaseRef,
         /// The task; 0 for a release.
         index: u64,
-        /// Whether it counts.
+        /// Whether the report was accepted.
         accepted: bool,
-        /// Why not.
+        /// The reason for a rejection.
         reason: String,
     },
-    /// Answer to a heartbeat: these live on.
+    /// The answer to a heartbeat: these leases are renewed.
     Renewed {
-        /// Leases still held.
+        /// The renewed leases.
         leases: Vec<LeaseRef>,
-        /// Their time to live.
+        /// Their lifetime in milliseconds.
         ttl_ms: u32,
     },
-    /// A lease is not wanted any more.
+    /// A lease is no longer wanted.
     Revoke {
         /// The lease.
         lease: LeaseRef,
-        /// Why, for people.
+        /// The reason, for people.
         reason: String,
     },
-    /// Of this lease, tasks from `hi` on are another worker's.
+    /// The tasks of this lease from `hi` on were moved to another worker.
     Trim {
         /// The lease.
         lease: LeaseRef,
-        /// Its new end.
+        /// The new end of its tasks.
         hi: u64,
     },
-    /// Finish what is in hand, and end.
+    /// Finish the running task, and end.
     Drain,
-    /// A message that says nothing this version understands.
+    /// A message that this version does not understand.
     Unknown(String),
 }
 
@@ -116,7 +117,8 @@ impl From<Outgoing> for wire::SessionRequest {
 }
 
 impl Incoming {
-    /// Every message maps to something; what cannot be used says why.
+    /// Converts a message. Every message maps to a variant; an unusable one maps to a variant with
+    /// the reason.
     pub(crate) fn from_wire(response: wire::SessionResponse) -> Self {
         use session_response::Message as M;
         let lease = |r: Option<wire::LeaseRef>| r.and_then(|r| LeaseRef::try_from(r).ok());

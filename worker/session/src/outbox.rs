@@ -1,5 +1,5 @@
-//! Reports that no coordinator has acknowledged yet, in the order they were made. After a reconnect all of
-//! them are sent again; the coordinator takes a repeated report for what it is.
+//! Reports that no coordinator has acknowledged yet, in order of creation. After a reconnect all of
+//! them are sent again; the coordinator recognizes repeated reports.
 
 use std::collections::VecDeque;
 
@@ -7,16 +7,16 @@ use picofarm_proto::ids::LeaseRef;
 
 use crate::message::Report;
 
-/// The reports and which of them went out on the present connection.
+/// The reports, and which of them were sent on the current connection.
 #[derive(Debug, Default)]
 pub(crate) struct Outbox {
     reports: VecDeque<Report>,
-    /// The first `sent` reports are on the wire.
+    /// The first `sent` reports have been sent.
     sent: usize,
 }
 
 impl Report {
-    /// The lease a report is about.
+    /// Returns the lease of a report.
     pub(crate) fn lease(&self) -> LeaseRef {
         match self {
             Report::Done(done) => done.lease,
@@ -25,8 +25,8 @@ impl Report {
         }
     }
 
-    /// Whether an acknowledgement of (lease, index) can mean this report. A release has no index and is
-    /// answered with 0.
+    /// Returns whether an acknowledgement of (lease, index) may belong to this report. A release
+    /// has no index and is answered with 0.
     fn answered_by(&self, lease: LeaseRef, index: u64) -> bool {
         let own = match self {
             Report::Done(done) => done.index,
@@ -43,19 +43,20 @@ impl Outbox {
         self.reports.push_back(report);
     }
 
-    /// Reports to send now, oldest first; they then count as sent.
+    /// Returns the reports to send now, oldest first, and marks them as sent.
     pub(crate) fn unsent(&mut self) -> Vec<Report> {
         let unsent = self.reports.range(self.sent..).cloned().collect();
         self.sent = self.reports.len();
         unsent
     }
 
-    /// The connection is gone: whatever was sent may not have arrived.
+    /// Handles a lost connection: sent reports may not have arrived.
     pub(crate) fn rewind(&mut self) {
         self.sent = 0;
     }
 
-    /// Takes the oldest sent report that (lease, index) answers; `None` for a repeated acknowledgement.
+    /// Removes the oldest sent report that (lease, index) answers. Returns `None` for a repeated
+    /// acknowledgement.
     pub(crate) fn acknowledge(&mut self, lease: LeaseRef, index: u64) -> Option<Report> {
         let at = self
             .reports
@@ -66,17 +67,17 @@ impl Outbox {
         self.reports.remove(at)
     }
 
-    /// Whether a report about `lease` waits.
+    /// Returns whether there is a report about `lease`.
     pub(crate) fn mentions(&self, lease: LeaseRef) -> bool {
         self.reports.iter().any(|r| r.lease() == lease)
     }
 
-    /// Reports that wait.
+    /// Returns the number of reports.
     pub(crate) fn len(&self) -> usize {
         self.reports.len()
     }
 
-    /// Finished tasks among them.
+    /// Returns the number of reports of finished tasks.
     pub(crate) fn finished(&self) -> usize {
         let done = |r: &&Report| matches!(r, Report::Done(_));
         self.reports.iter().filter(done).count()

@@ -1,9 +1,10 @@
-//! The thread that runs tasks, with its own rayon pool. A plain thread and not one of tokio's: a task that
-//! will not stop must not keep the process from ending.
+//! The thread that runs tasks, with its own rayon pool. It is a plain thread instead of a tokio
+//! thread, because a task that does not stop must not prevent the process from ending.
 //!
-//! A task that is asked to stop looks up often, but not everywhere: a library decodes a file, an optimiser takes a step. So
-//! it is given a moment, and then left: the session hears that it was stopped, and the next task waits until the one that
-//! was left has noticed. What it may still write in between is what any worker may write: whole, and the same bytes.
+//! A task checks for stop requests often, but not everywhere: a library may be decoding a file, or
+//! an optimiser taking a step. Therefore it is given a moment, and then abandoned: the session is
+//! told that it stopped, and the next task waits until the abandoned one has noticed. Until then it
+//! may still write, but only what any worker may write: whole objects with the same bytes.
 
 use std::{
     any::Any,
@@ -22,22 +23,22 @@ use crate::{
     AgentError, Control, Executor, Output, Task, TaskError, allow::StorePrefixes, log::Collector,
 };
 
-/// How long a task may take to notice that it shall stop before it is left.
+/// Maximum time for a task to notice a stop request before it is abandoned.
 const NOTICE: Duration = Duration::from_millis(500);
-/// How often it is looked at whether a task shall stop.
+/// Interval for checking whether a task must stop.
 const LOOK: Duration = Duration::from_millis(20);
 
 type Job = (Task, Arc<Control>, Span);
 type Ended = Result<Output, TaskError>;
 
-/// Hands tasks to the executor, one at a time.
+/// Passes tasks to the executor, one at a time.
 pub(crate) struct Runner {
     jobs: std::sync::mpsc::Sender<Job>,
     results: mpsc::UnboundedReceiver<Ended>,
     log: Arc<Collector>,
 }
 
-/// What runs a task.
+/// Everything needed to run a task.
 struct Means {
     executor: Arc<dyn Executor>,
     allowed: StorePrefixes,
@@ -45,7 +46,8 @@ struct Means {
 }
 
 impl Runner {
-    /// Starts the thread and a pool of `threads`. Tasks that touch what is not `allowed` fail without being run.
+    /// Starts the thread and a pool of `threads`. Tasks that access places other than those
+    /// `allowed` fail without being run.
     pub(crate) fn start(
         executor: Arc<dyn Executor>,
         threads: usize,
@@ -74,7 +76,7 @@ impl Runner {
                 let mut left: Option<Receiver<Ended>> = None;
                 for (task, control, span) in inbox {
                     if let Some(left) = left.take() {
-                        // It ends sooner or later; its result is nobody's.
+                        // It ends sooner or later; its result is discarded.
                         let _ = left.recv();
                     }
                     ours.begin();
@@ -97,19 +99,20 @@ impl Runner {
         Ok(Self { jobs, results, log })
     }
 
-    /// Begins `task`, within `span`. Its result comes from [`Runner::finished`].
+    /// Begins `task`, within `span`. [`Runner::finished`] returns its result.
     pub(crate) fn begin(&self, task: Task, control: Arc<Control>, span: Span) {
         self.jobs
             .send((task, control, span))
             .expect("the executor's thread lives as long as its runner: it catches every panic");
     }
 
-    /// What the task in hand logs.
+    /// Returns the log of the running task.
     pub(crate) fn log(&self) -> &Collector {
         &self.log
     }
 
-    /// Waits for the task in hand. Safe to cancel; pends for ever while none is.
+    /// Waits for the end of the running task. Cancel-safe; it never returns while no task is
+    /// running.
     pub(crate) async fn finished(&mut self) -> Ended {
         self.results
             .recv()
@@ -118,7 +121,7 @@ impl Runner {
     }
 }
 
-/// Runs a task on the pool; its result comes once.
+/// Runs a task on the pool. Its result is sent exactly once.
 fn begin(means: &Arc<Means>, task: Task, control: Arc<Control>, span: Span) -> Receiver<Ended> {
     let (outbox, result) = channel();
     let theirs = means.clone();
@@ -134,16 +137,16 @@ fn begin(means: &Arc<Means>, task: Task, control: Arc<Control>, span: Span) -> R
             executor.run(&task, &control)
         }))
         .unwrap_or_else(|panic| Err(TaskError::Crash(said(panic.as_ref()))));
-        // Its time ends here, and not with the answer to its report.
+        // The span's time ends here, and not with the answer to the report.
         drop(span);
-        // Nobody listens where it was left and the worker is gone.
+        // There is no receiver if the task was abandoned and the worker has ended.
         let _ = outbox.send(ended);
     });
     result
 }
 
-/// Waits for a task's end; `None` where it was asked to stop and has not noticed. One that saves what it has done may take
-/// its time, if anybody wants that.
+/// Waits for a task's end. Returns `None` if it was asked to stop and has not noticed. A task that
+/// saves its progress may take longer, if the progress is wanted.
 fn wait(running: &Receiver<Ended>, control: &Control, saves: bool) -> Option<Ended> {
     let mut asked: Option<Instant> = None;
     loop {
@@ -162,7 +165,7 @@ fn wait(running: &Receiver<Ended>, control: &Control, saves: bool) -> Option<End
     }
 }
 
-/// What a panic said.
+/// Returns the message of a panic.
 fn said(panic: &(dyn Any + Send)) -> String {
     let text = panic
         .downcast_ref::<&str>()

@@ -1,24 +1,26 @@
-//! One connection to the coordinator: opening it, saying hello, passing messages.
+//! One connection to the coordinator: opening it, the hello, and passing messages.
 //!
-//! # Why nothing is lost, and why the outbox may live in memory
-//! The order of every task is compute → publish → report → commit. *Publish* ends with the manifest, which
-//! is written last, create-only, and is a pure function of the task's key. From that moment the task is
-//! finished for good: the manifest **is** the durable outbox. If this process is killed before the report
-//! is acknowledged, the lease expires, somebody else gets the task, finds the manifest under the task's
-//! key and adopts it instead of rendering again. The reports kept in memory ([`crate::outbox`]) only spare that
-//! detour when the process lives and the connection does not.
+//! # Why nothing is lost, and why the outbox may be in memory
+//! The order of every task is compute → publish → report → commit. *Publish* ends with the
+//! manifest, which is written last, create-only, and is a pure function of the task's key. From
+//! that moment the task is finished: the manifest **is** the durable outbox. If this process is
+//! killed before the report is acknowledged, the lease expires, and another worker gets the task.
+//! It finds the manifest under the task's key and adopts it instead of rendering again. The reports
+//! in memory ([`crate::outbox`]) only avoid that detour if the process survives and the connection
+//! does not.
 //!
 //! # Self-fencing
-//! A lease that has not been renewed for two thirds of its time to live, on this machine's monotonic
-//! clock, is *fenced*: no further task of it is **started** until the coordinator renews it ([`crate::assignments`]). A
-//! task already running goes on and may publish, because publishing cannot do harm: the put is create-only
-//! and an honest rival would have written the same bytes. What fencing prevents is waste: a worker cut off
-//! from the farm working through a range that has long been given to another.
+//! A lease that has not been renewed for two thirds of its lifetime, on this machine's monotonic
+//! clock, is *fenced*: none of its tasks is **started** until the coordinator renews it
+//! ([`crate::assignments`]). A running task continues and may publish. Publishing does no harm,
+//! because the put is create-only and an honest rival would have written the same bytes. Fencing
+//! prevents waste: a worker cut off from the farm would otherwise work through a range that another
+//! worker has had for a long time.
 //!
-//! A lease that a heartbeat's answer leaves out, or that is revoked after its time has run out here, is *lost*
-//! (a laptop that slept, a coordinator long away): its waiting tasks are dropped and its running task goes on,
-//! since its result can still be adopted. A lease revoked while its time still runs is not *wanted* any more
-//! (a cancelled job): its running task is stopped.
+//! A lease is *lost* if a heartbeat's answer does not list it, or if it is revoked after it expired
+//! here (a laptop that slept, a coordinator that was unreachable for long). Its waiting tasks are
+//! dropped and its running task continues, because its result can still be adopted. A lease revoked
+//! before it expires is no longer *wanted* (a cancelled job): its running task is stopped.
 
 use std::time::Duration;
 
@@ -35,21 +37,21 @@ use crate::{
     message::{Incoming, Outgoing},
 };
 
-/// How long a connection, and then the welcome, may take.
+/// Timeout for connecting, and then for the welcome.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
 /// A connection that does not answer a ping within this time is dead.
 const KEEPALIVE: Duration = Duration::from_secs(10);
-/// A lease carries its job's spec; one that lists 100,000 scene files needs some 20 MB.
+/// A lease contains its job's spec; one with 100,000 scene files needs some 20 MB.
 const MAX_MESSAGE: usize = 256 << 20;
 
-/// Why a session did not open, or ended.
+/// A reason why a session did not open, or ended.
 #[derive(Debug)]
 pub(crate) enum LinkError {
-    /// Try again later.
+    /// Retry later.
     Down(String),
-    /// Somebody must repair a setting here or there.
+    /// A setting on one of the two sides must be corrected.
     Mismatch(String),
-    /// Trying again would not help.
+    /// Retrying would not help.
     Refused(String),
 }
 
@@ -60,7 +62,8 @@ impl From<Status> for LinkError {
             message => message.to_owned(),
         };
         match status.code() {
-            // Aborted: another process took this worker's id. Coming back would only throw that one out.
+            // Aborted: another process uses this worker's id. Reconnecting would only evict that
+            // one.
             Code::Aborted
             | Code::FailedPrecondition
             | Code::InvalidArgument
@@ -74,12 +77,12 @@ impl From<Status> for LinkError {
     }
 }
 
-/// What the coordinator demands of a session.
+/// The coordinator's parameters for a session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Welcome {
-    /// Between two heartbeats.
+    /// Interval between heartbeats.
     pub(crate) heartbeat: Duration,
-    /// Life of a lease between renewals.
+    /// Lifetime of a lease between renewals.
     pub(crate) lease: Duration,
 }
 
@@ -89,14 +92,14 @@ pub(crate) struct Session {
     from: Streaming<wire::SessionResponse>,
 }
 
-/// The coordinators of a list of URLs with commas between them.
+/// Returns the coordinators of a comma-separated list of URLs.
 pub(crate) fn targets(urls: &str, access: &Access) -> Result<Vec<Target>, AgentError> {
     urls.split(',')
         .map(|url| target(url.trim(), access))
         .collect()
 }
 
-/// Checks a coordinator's URL and what is needed to reach it, and sets how connections to it behave.
+/// Checks a coordinator's URL and the access settings, and configures connections to it.
 fn target(url: &str, access: &Access) -> Result<Target, AgentError> {
     let mut target = access.target(url)?;
     target.endpoint = target
@@ -118,7 +121,8 @@ impl From<Trouble> for LinkError {
     }
 }
 
-/// Why a call at the start of a session failed: the coordinator's words, or what is wrong with the connection.
+/// Returns the reason why a call at the start of a session failed: the coordinator's message, or a
+/// diagnosis of the connection.
 async fn failed(target: &Target, status: Status) -> LinkError {
     if lost_connection(&status) {
         target.trouble(&status).await.into()
@@ -127,7 +131,7 @@ async fn failed(target: &Target, status: Status) -> LinkError {
     }
 }
 
-/// Connects, says hello and waits for the welcome.
+/// Connects, sends the hello and waits for the welcome.
 pub(crate) async fn open(
     target: Target,
     hello: WorkerHello,
@@ -188,12 +192,13 @@ async fn open_patiently(
 }
 
 impl Session {
-    /// Queues a message. A dead connection shows in [`Session::receive`], so nothing is said here.
+    /// Queues a message. Errors are not reported here, because a dead connection is detected by
+    /// [`Session::receive`].
     pub(crate) fn send(&self, message: Outgoing) {
         let _ = self.to.send(message.into());
     }
 
-    /// The next message that can be understood. Safe to cancel.
+    /// Returns the next message that can be understood. Cancel-safe.
     pub(crate) async fn receive(&mut self) -> Result<Incoming, LinkError> {
         match self.from.message().await? {
             Some(response) => Ok(Incoming::from_wire(response)),

@@ -1,26 +1,26 @@
-//! How long the machine was suspended. The monotonic clock, by which everything here is timed, stands still meanwhile; the
-//! coordinator's does not.
+//! Detects suspends of the machine. During a suspend, the monotonic clock that times everything
+//! here stands still, while the coordinator's does not.
 
 use std::time::Duration;
 
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-/// Differences below this are those of two clocks that are read one after the other.
+/// Smaller differences come from reading two clocks one after the other.
 const NOTHING: Duration = Duration::from_millis(200);
 
-/// Notices suspends.
+/// A detector of suspends.
 #[derive(Debug)]
 pub(crate) struct Suspends {
     known: Duration,
 }
 
 impl Suspends {
-    /// From now on.
+    /// Starts the detection.
     pub(crate) fn new() -> Self {
         Self { known: suspended() }
     }
 
-    /// How long the machine was suspended since this was last asked; `None` where it was not.
+    /// Returns the duration of suspends since the last call; `None` if there were none.
     pub(crate) fn new_one(&mut self) -> Option<Duration> {
         self.slept(suspended())
     }
@@ -35,7 +35,7 @@ impl Suspends {
     }
 }
 
-/// How long the machine has been suspended since it was started.
+/// Returns the total duration of suspends since the machine was started.
 fn suspended() -> Duration {
     let monotonic = duration(clock_gettime(ClockId::Monotonic));
     duration(clock_gettime(ClockId::Boottime)).saturating_sub(monotonic)

@@ -1,4 +1,4 @@
-//! Committed steps never change, and catalogs of every earlier level are upgraded.
+//! Tests that committed steps never change, and that catalogs of every earlier level are upgraded.
 
 use std::path::{Path, PathBuf};
 
@@ -91,8 +91,8 @@ fn spec() -> JobSpec {
     serde_json::from_str(SPEC).unwrap()
 }
 
-/// Statements that add a job with nine tasks, of which four are done and one has an output, in the first schema.
-/// `blob` writes bytes in hexadecimal as the database reads them.
+/// Returns statements that add a job with nine tasks, four of them done and one with an output, in
+/// the first schema. `blob` formats bytes, given in hexadecimal, as a literal of the database.
 fn rows(blob: fn(&str) -> String, id: fn(u128) -> String, no: &str) -> String {
     let spec = SPEC.replace('\'', "''");
     let set = ResultSet::of(&self::spec().stages[0]);
@@ -137,7 +137,8 @@ async fn is_readable(catalog: &dyn Catalog, level: &str) {
     assert!(catalog.cancel(id, "enough", 6).await.unwrap(), "{level}");
 }
 
-/// Every level that was ever committed: the steps of today up to each, and the former first step alone and with the second.
+/// Returns every level that was ever committed: the current steps up to each one, and the former
+/// first step, alone and followed by the second.
 fn levels(engine: &str, steps: &[Step]) -> Vec<(String, Vec<Step>)> {
     let of_today = (1..=steps.len()).map(|k| (format!("{engine}, level {k}"), steps[..k].to_vec()));
     let first = (1, "0001_init", former(engine));

@@ -1,4 +1,4 @@
-//! Postgres' answers in words a person can act on.
+//! Actionable error messages for Postgres.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use sqlx::{Connection, PgConnection, postgres::PgConnectOptions};
 
 use picofarm_catalog::CatalogError;
 
-/// Where the database is, without its password.
+/// Returns the location of the database, without its password.
 pub(super) fn place(options: &PgConnectOptions) -> String {
     let database = options.get_database().unwrap_or("");
     match options.get_socket() {
@@ -20,7 +20,7 @@ pub(super) fn place(options: &PgConnectOptions) -> String {
     }
 }
 
-/// A URL that cannot be read. The URL itself may hold a password and is not repeated.
+/// Returns the error for an invalid URL. The URL may contain a password, so it is not repeated.
 pub(super) fn bad_url(_: &str, error: &sqlx::Error) -> CatalogError {
     CatalogError::Server {
         place: "postgres://…".into(),
@@ -30,8 +30,8 @@ pub(super) fn bad_url(_: &str, error: &sqlx::Error) -> CatalogError {
     }
 }
 
-/// Why no connection came about. A pool tries again while a port refuses, and in the end only says that time is up: one
-/// attempt of our own tells why.
+/// Returns the reason why no connection was made. A pool retries while a port refuses, and finally
+/// reports only a timeout, so one direct attempt determines the reason.
 pub(super) async fn unconnected(
     place: &str,
     options: &PgConnectOptions,
@@ -47,7 +47,7 @@ pub(super) async fn unconnected(
     classify(place, error)
 }
 
-/// The error a person can act on. Codes: Postgres, appendix A.
+/// Returns an actionable error. Codes: Postgres, appendix A.
 pub(super) fn classify(place: &str, error: sqlx::Error) -> CatalogError {
     let place = place.to_owned();
     let server = |what: String| CatalogError::Server {
@@ -103,7 +103,7 @@ pub(super) fn classify(place: &str, error: sqlx::Error) -> CatalogError {
         Some("57P01" | "57P02" | "57P03") => {
             server(format!("{said}; the server is stopping or starting"))
         }
-        // Of the content: data exceptions, limits of the program, NOT NULL and CHECK.
+        // Errors of the content: data exceptions, program limits, NOT NULL and CHECK.
         Some(code) if code.starts_with("22") || code.starts_with("54") => {
             CatalogError::Refused { place, what: said }
         }

@@ -1,4 +1,5 @@
-//! Hints: an instance that has news wakes the others by NOTIFY, at most a few times a second.
+//! Hints: an instance that has changed something wakes the others by NOTIFY, at most a few times a
+//! second.
 
 use std::{
     sync::Mutex,
@@ -7,12 +8,12 @@ use std::{
 
 use sqlx::{PgPool, postgres::PgListener};
 
-/// At most one hint to the others in this time.
+/// The minimum time between two hints to the others.
 const HINTS: Duration = Duration::from_millis(100);
-/// The channel of the hints.
+/// The NOTIFY channel of the hints.
 const CHANNEL: &str = "picofarm";
 
-/// Both ends of the channel.
+/// Sender and receiver of hints.
 pub(super) struct Hints {
     pool: PgPool,
     heard: tokio::sync::Mutex<Option<PgListener>>,
@@ -20,7 +21,7 @@ pub(super) struct Hints {
 }
 
 impl Hints {
-    /// Listens from now on.
+    /// Starts listening.
     pub(super) async fn new(pool: PgPool) -> Result<Self, sqlx::Error> {
         let listener = listen(&pool).await?;
         Ok(Self {
@@ -30,7 +31,7 @@ impl Hints {
         })
     }
 
-    /// Wakes the others, unless they have just been woken.
+    /// Wakes the other instances, unless they have just been woken.
     pub(super) async fn give(&self) {
         {
             let mut sent_at = self.sent.lock().expect("no panic while locked");
@@ -48,7 +49,7 @@ impl Hints {
         }
     }
 
-    /// Waits for a hint of another instance.
+    /// Waits for a hint from another instance.
     pub(super) async fn heard(&self) {
         let mut hints = self.heard.lock().await;
         loop {
@@ -64,7 +65,7 @@ impl Hints {
         }
     }
 
-    /// Hears nothing more, so that the pool can be closed.
+    /// Stops listening, so that the pool can be closed.
     pub(super) fn end(&self) {
         if let Ok(mut hints) = self.heard.try_lock() {
             hints.take();

@@ -1,4 +1,5 @@
-//! The life of an instance: founded, renewed, lost, left; what falls to it from others.
+//! The lifecycle of an instance: its creation, renewal, loss and end, and the ranges it inherits
+//! from others.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,8 +13,9 @@ use super::{
 };
 use picofarm_catalog::{Range, Run};
 
-/// Holds the instance's row until the transaction ends, so that nobody can find it lost meanwhile. A row whose time is over
-/// but that nobody has removed will do: what the instance owns is still its own.
+/// Locks the instance's row until the transaction ends, so that no other instance can declare it
+/// lost in the meantime. An expired row is sufficient if it was not deleted, because the instance
+/// still owns its ranges.
 pub(super) async fn fence(c: &mut PgConnection, instance: InstanceId) -> Result<()> {
     let alive: Option<i32> =
         sqlx::query_scalar("SELECT 1 FROM instance WHERE id = $1 FOR KEY SHARE")
@@ -23,8 +25,8 @@ pub(super) async fn fence(c: &mut PgConnection, instance: InstanceId) -> Result<
     alive.map(|_| ()).ok_or(WriteError::Fenced)
 }
 
-/// Fills some pages of a table of its own: those of other tables may have room left where the disk has none. The caller's
-/// transaction takes it back, or ends with it.
+/// Fills some pages of a separate table, because other tables may have free pages when the disk is
+/// full. The caller's transaction rolls this back, or the table is dropped at its end.
 pub(super) async fn try_room(c: &mut PgConnection) -> Sql<()> {
     // 64 rows of 1 KiB, which are too short to be compressed.
     for step in [
@@ -37,7 +39,7 @@ pub(super) async fn try_room(c: &mut PgConnection) -> Sql<()> {
     Ok(())
 }
 
-/// Founds an instance, which inherits from a former life of the same process.
+/// Creates an instance, which inherits the ranges of a former life of the same process.
 pub(super) async fn found(
     c: &mut PgConnection,
     instance: InstanceId,
@@ -63,7 +65,7 @@ pub(super) async fn found(
     Ok(())
 }
 
-/// Prolongs the instance's time; `false` where it was found lost.
+/// Extends the instance's lifetime. Returns `false` if it was declared lost.
 pub(super) async fn renew(
     c: &mut PgConnection,
     instance: InstanceId,
@@ -82,8 +84,8 @@ pub(super) async fn renew(
     Ok(renewed.rows_affected() == 1)
 }
 
-/// Takes over the ranges of instances whose time is over, or that are no more. An instance that writes just now holds its row,
-/// so this waits for it and then sees what it wrote.
+/// Takes over the ranges of instances that have expired or are gone. An instance with a write in
+/// progress has its row locked, so this call waits for it and then sees its changes.
 pub(super) async fn take_lost(c: &mut PgConnection, instance: InstanceId) -> Sql<Vec<Range>> {
     sqlx::query("DELETE FROM instance WHERE until < clock_timestamp()")
         .execute(&mut *c)
@@ -98,7 +100,7 @@ pub(super) async fn take_lost(c: &mut PgConnection, instance: InstanceId) -> Sql
     ranges(&rows)
 }
 
-/// Instances alive and their workers.
+/// Returns the number of live instances and of their workers.
 pub(super) async fn count_instances(c: &mut PgConnection) -> Sql<(u32, u32)> {
     let row = sqlx::query(
         "SELECT count(*) AS instances, CAST(coalesce(sum(workers), 0) AS BIGINT) AS workers FROM instance \
@@ -113,7 +115,7 @@ pub(super) async fn count_instances(c: &mut PgConnection) -> Sql<(u32, u32)> {
     Ok((number("instances")?, number("workers")?))
 }
 
-/// The leased ranges that are this instance's.
+/// Returns the leased ranges that this instance owns.
 pub(super) async fn leased(c: &mut PgConnection, instance: InstanceId) -> Sql<BTreeSet<RangeId>> {
     let ids: Vec<Uuid> =
         sqlx::query_scalar("SELECT id FROM task_range WHERE owner = $1 AND state = 1")
@@ -123,7 +125,7 @@ pub(super) async fn leased(c: &mut PgConnection, instance: InstanceId) -> Sql<BT
     Ok(ids.into_iter().map(RangeId::from_uuid).collect())
 }
 
-/// Workers of other instances that have leases, by job.
+/// Returns the number of workers with leases from other instances, by job.
 pub(super) async fn busy(c: &mut PgConnection, instance: InstanceId) -> Sql<BTreeMap<JobId, u32>> {
     let rows = sqlx::query(
         "SELECT job.id, count(DISTINCT worker) AS workers FROM task_range JOIN stage ON stage.key = task_range.stage \
@@ -140,7 +142,8 @@ pub(super) async fn busy(c: &mut PgConnection, instance: InstanceId) -> Sql<BTre
         .collect()
 }
 
-/// Leased ranges of other instances, of stages whose outputs another stage of an active job has, too.
+/// Returns the ranges that other instances have leased, in stages that share outputs with another
+/// stage of an active job.
 pub(super) async fn shared(
     c: &mut PgConnection,
     instance: InstanceId,
@@ -166,7 +169,8 @@ pub(super) async fn shared(
     Ok(shared)
 }
 
-/// Gives everything up that is not leased, and the instance. Its leases find a new one.
+/// Releases every range that is not leased, and deletes the instance. Other instances take over its
+/// leases.
 pub(super) async fn leave(c: &mut PgConnection, instance: InstanceId) -> Sql<()> {
     sqlx::query("UPDATE task_range SET owner = NULL WHERE owner = $1 AND state = 0")
         .bind(instance.uuid())

@@ -1,4 +1,4 @@
-//! Jobs as a whole: recorded, ended, cancelled, tried again.
+//! Operations on whole jobs: record, end, cancel and retry.
 
 use std::collections::HashMap;
 
@@ -17,8 +17,9 @@ use super::{
 use crate::sql::{self, int};
 use picofarm_catalog::{NewEvent, Outcome, RangeState, Settled, StageRecord, Submission};
 
-/// Where a stage is over, opens those that waited for it and ends the job if that was the last. The job's row is locked
-/// first: of two instances that finish their last tasks at once, the second sees what the first wrote.
+/// If a stage is over, opens the stages that waited for it, and ends the job if it was the last.
+/// The job's row is locked first, so that if two instances finish their last tasks at the same
+/// time, the second sees the changes of the first.
 pub(super) async fn stage_over(
     writer: &mut Writer<'_>,
     stage: StageRef,
@@ -31,7 +32,7 @@ pub(super) async fn stage_over(
     settle(writer, stage.job, at_ms).await
 }
 
-/// Locks the row of a job; whether it is active.
+/// Locks the row of a job. Returns whether the job is active.
 async fn hold(writer: &mut Writer<'_>, key: i64) -> Result<bool> {
     let state: Option<i64> = sqlx::query_scalar("SELECT state FROM job WHERE key = $1 FOR UPDATE")
         .bind(key)
@@ -47,7 +48,7 @@ async fn settle(writer: &mut Writer<'_>, id: JobId, at_ms: i64) -> Result<Settle
     Ok(settled)
 }
 
-/// Records a job; `spec` is its spec as JSON.
+/// Records a job. `spec` is its spec in JSON.
 pub(super) async fn record(
     writer: &mut Writer<'_>,
     submission: &Submission<'_>,
@@ -59,7 +60,7 @@ pub(super) async fn record(
         }
     }
     if !submission.places.is_empty() {
-        // Two submitters at two coordinators must not both take a folder and one inside it.
+        // Two submitters at two coordinators must not both take a folder and its subfolder.
         sqlx::query("LOCK TABLE owned_place IN SHARE ROW EXCLUSIVE MODE")
             .execute(&mut *writer.c)
             .await?;
@@ -110,11 +111,12 @@ pub(super) async fn record(
     Ok(Outcome::New)
 }
 
-/// Records a stage of the job with this key; returns its own.
+/// Records a stage of the job with this key. Returns the stage's key.
 async fn insert_stage(c: &mut PgConnection, job: i64, stage: &StageRecord) -> Result<i64> {
     let set = &stage.set;
     sqlx::query(
-        // The update locks the row: who forgets results meanwhile waits, rather than take it from under this stage.
+        // The update locks the row, so that a concurrent deletion of results waits instead of
+        // deleting the row that this stage refers to.
         "INSERT INTO result_set (store, dataset, stage_key) VALUES ($1, $2, $3) \
          ON CONFLICT (store, dataset, stage_key) DO UPDATE SET store = excluded.store",
     )
@@ -178,7 +180,7 @@ pub(super) async fn pause(
 
 pub(super) async fn retry(writer: &mut Writer<'_>, job: JobId, now_ms: i64) -> Result<u64> {
     let key = writer.job(job).await?;
-    // The job's row first, as whoever ends it does.
+    // The job's row is locked first, as in the transaction that ends a job.
     hold(writer, key).await?;
     let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
         "DELETE FROM task_range WHERE state = 4 AND stage IN (SELECT key FROM stage WHERE job = $1) RETURNING {RANGE}"

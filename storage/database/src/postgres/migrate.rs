@@ -1,4 +1,4 @@
-//! Brings a database's schema up to date.
+//! Upgrades a database's schema.
 
 use picofarm_catalog::CatalogError;
 use sqlx::PgPool;
@@ -6,15 +6,15 @@ use sqlx::PgPool;
 use super::errors;
 use crate::migrations;
 
-/// Runs what migrations are missing.
+/// Runs the missing migrations.
 ///
 /// # Errors
-/// [`CatalogError::Newer`] where a later program wrote it.
+/// [`CatalogError::Newer`] if a later version of the program wrote the database.
 pub(super) async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogError> {
     upgrade_former(pool)
         .await
         .map_err(|e| errors::classify(place, e))?;
-    // Several coordinators may start at once: the migrator takes an advisory lock.
+    // Several coordinators may start at the same time, so the migrator takes an advisory lock.
     migrations::POSTGRES.run(pool).await.map_err(|error| {
         migrations::failed(place.to_owned(), &migrations::POSTGRES, error, |e| {
             errors::classify(place, e)
@@ -22,7 +22,7 @@ pub(super) async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogErr
     })
 }
 
-/// Upgrades a catalog whose first step was written before steps were append-only.
+/// Upgrades a catalog with a first step from before steps were append-only.
 async fn upgrade_former(pool: &PgPool) -> Result<(), sqlx::Error> {
     let mut tx = pool.begin().await?;
     let exists: bool = sqlx::query_scalar("SELECT to_regclass('_sqlx_migrations') IS NOT NULL")
@@ -37,7 +37,7 @@ async fn upgrade_former(pool: &PgPool) -> Result<(), sqlx::Error> {
     if !checksum.is_some_and(|checksum| former.matches(&checksum)) {
         return tx.rollback().await;
     }
-    // Another coordinator may do the same at this moment.
+    // Another coordinator may be doing the same.
     sqlx::query("LOCK TABLE _sqlx_migrations IN EXCLUSIVE MODE")
         .execute(&mut *tx)
         .await?;

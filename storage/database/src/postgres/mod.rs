@@ -1,9 +1,11 @@
-//! The catalog in Postgres, for several coordinators at once; see the crate's documentation for instances.
+//! The catalog in Postgres, for several concurrent coordinators; see the crate's documentation for
+//! instances.
 //!
-//! Transactions are short and touch few rows: a lease is a row, not a task. Rows of nobody's are taken with
-//! `SKIP LOCKED`, so that instances do not wait for each other. Who waits for news is woken by NOTIFY, which is sent outside
-//! of transactions and at most a few times a second (a NOTIFY in each transaction would put all of them in one queue),
-//! and asks once a second anyway.
+//! Transactions are short and touch few rows, because a lease is one row for many tasks. Unowned
+//! rows are taken with `SKIP LOCKED`, so that instances do not wait for each other. Instances that
+//! wait for changes are woken by NOTIFY, and also poll once a second. NOTIFY is sent outside of
+//! transactions and at most a few times a second, because a NOTIFY in each transaction would put
+//! all of them into one queue.
 
 mod errors;
 mod hints;
@@ -47,42 +49,46 @@ crate::sql_listing::listing_queries!(
 crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_rights::rights_queries!(sqlx::PgConnection, super::PgRow);
 
-/// Connections of one coordinator: one hears hints, two write, the others read; more than its heavy reads take at a time.
+/// Connections of one coordinator: one receives hints, two write, and the others read. Their number
+/// exceeds the coordinator's concurrent heavy reads.
 const CONNECTIONS: u32 = 10;
-/// How long a connection may take to come about.
+/// Timeout for establishing a connection.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// An instance that has not beaten for so long is lost.
+/// An instance that has not beaten for this time is lost.
 const INSTANCE_SECONDS: f64 = 5.0;
 
 /// A catalog in a Postgres database.
 pub struct PostgresCatalog {
     /// The database, without its password.
     place: String,
-    /// Who we are, for people.
+    /// The name of this coordinator, for people.
     name: String,
     pool: PgPool,
-    /// The present life.
+    /// The current instance.
     instance: Mutex<Option<InstanceId>>,
     keys: tokio::sync::Mutex<writer::Keys>,
     hints: Hints,
 }
 
 impl PostgresCatalog {
-    /// Connects to the database at `url` (`postgres://user:password@host/database?sslmode=verify-full`; what it leaves
-    /// out is taken from the usual PG variables) and brings its schema up to date. `name` tells people who this is.
+    /// Connects to the database at `url`
+    /// (`postgres://user:password@host/database?sslmode=verify-full`; missing parts are taken from
+    /// the usual PG variables) and upgrades its schema. `name` describes this coordinator to
+    /// people.
     ///
     /// # Errors
-    /// [`CatalogError::Server`] when it cannot be reached, [`CatalogError::Newer`] when a later program wrote it.
+    /// [`CatalogError::Server`] if it cannot be reached, [`CatalogError::Newer`] if a later version
+    /// of the program wrote it.
     pub async fn open(url: &str, name: &str) -> Result<Self, CatalogError> {
         let options: PgConnectOptions = url.parse().map_err(|e| errors::bad_url(url, &e))?;
         let options = options
             .application_name("picofarm")
             .disable_statement_logging()
             .options([
-                // A coordinator that hangs in a transaction must not hold up the others.
+                // A coordinator that hangs in a transaction must not block the others.
                 ("idle_in_transaction_session_timeout", "30s"),
                 ("lock_timeout", "20s"),
-                // A server that is gone shall be noticed.
+                // Keepalives detect a server that has disappeared.
                 ("tcp_keepalives_idle", "10"),
             ]);
         let place = errors::place(&options);
@@ -129,7 +135,7 @@ impl PostgresCatalog {
             .ok_or(CatalogError::Fenced)
     }
 
-    /// Runs `work` in one transaction, on behalf of an instance that is alive.
+    /// Runs `work` in one transaction, for a live instance.
     async fn write<T>(
         &self,
         work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
@@ -137,7 +143,7 @@ impl PostgresCatalog {
         self.transaction(true, work).await
     }
 
-    /// As [`Self::write`]; undone at the end if not `keep`.
+    /// Like [`Self::write`], but rolls back if `keep` is false.
     async fn transaction<T>(
         &self,
         keep: bool,
@@ -154,7 +160,7 @@ impl PostgresCatalog {
                 instance: instance.uuid(),
                 keys: &mut keys,
             };
-            // Dropping the transaction undoes it.
+            // On an error, dropping the transaction rolls it back.
             let done = work(&mut writer).await?;
             match keep {
                 true => tx.commit().await?,
@@ -273,7 +279,7 @@ impl Catalog for PostgresCatalog {
     }
 
     async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError> {
-        // Before the transaction: a large spec takes a while.
+        // This happens before the transaction, because a large spec takes a while.
         let spec = serde_json::to_string(&*submission.job.spec).expect("a spec is plain data");
         let outcome = self
             .write(async |writer| jobs::record(writer, submission, &spec).await)
@@ -294,7 +300,7 @@ impl Catalog for PostgresCatalog {
         set: &ResultSet,
         outputs: &[Recorded],
     ) -> Result<(), CatalogError> {
-        // Short transactions: others wait for them.
+        // The transactions are short, because others wait for them.
         for some in outputs.chunks(1_000) {
             self.write(async |writer| {
                 for output in some {
@@ -474,14 +480,14 @@ impl Catalog for PostgresCatalog {
     async fn close(&self) {
         let instance = self.instance.lock().expect("no panic while locked").take();
         if let Some(instance) = instance {
-            // What is not given back now, others find when the instance is lost.
+            // If a range is not released now, others take it when the instance is lost.
             if let Ok(mut c) = self.pool.acquire().await
                 && let Err(error) = instance::leave(&mut c, instance).await
             {
                 tracing::debug!(%error, "the instance was not given up in order");
             }
         }
-        // The pool waits for every connection, the listener's too.
+        // The pool waits for every connection, including the listener's.
         self.hints.end();
         self.pool.close().await;
     }

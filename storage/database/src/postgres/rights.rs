@@ -1,5 +1,5 @@
-//! Owners of jobs and the audit log, in Postgres. The log is written without a coordinator's life: a line that a fenced
-//! coordinator writes is true as well.
+//! Owners of jobs and the audit log, in Postgres. Audit entries are written outside of a
+//! coordinator's life, because an entry from a fenced coordinator is also true.
 
 use async_trait::async_trait;
 use picofarm_proto::{ids::JobId, model::AuditEntry};

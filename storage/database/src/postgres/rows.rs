@@ -1,4 +1,4 @@
-//! Rows of ranges, outputs and history: in bulk, as arrays.
+//! Rows of ranges, outputs and history, written in bulk as arrays.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -9,7 +9,7 @@ use sqlx::{PgConnection, Row};
 use super::writer::{Result, Sql, WriteError, Writer};
 use crate::sql::{self, StateColumns, int};
 
-/// Writes the rows of a change set that hold what others sent.
+/// Writes the rows of a change set that contain data from other programs.
 pub(super) async fn write_rows(writer: &mut Writer<'_>, changes: &Changes) -> Result<()> {
     insert_outputs(writer, &changes.outputs).await?;
     for exception in changes.exceptions.values() {
@@ -90,8 +90,8 @@ pub(super) async fn insert_ranges(
     Ok(())
 }
 
-/// Writes a range of nobody's, merged with its neighbours in the same state, as far as no other instance has them in its
-/// hands just now.
+/// Writes an unowned range, merged with its neighbours in the same state unless another instance
+/// has them locked.
 pub(super) async fn give(writer: &mut Writer<'_>, key: i64, range: &Range) -> Result<()> {
     let mut range = range.clone();
     let columns = StateColumns::from(&range.state);
@@ -155,7 +155,7 @@ async fn insert_outputs(writer: &mut Writer<'_>, outputs: &[Output]) -> Result<(
     Ok(())
 }
 
-/// The manifests of many tasks in one query for each stage.
+/// Returns the manifests of many tasks, with one query per stage.
 pub(super) async fn manifests(
     c: &mut PgConnection,
     tasks: &[(StageRef, u64)],

@@ -1,4 +1,4 @@
-//! What an instance takes and what it changes: through its [`Writer`], behind the fence.
+//! Claims and commits of an instance. All writes go through its [`Writer`], behind the fence.
 
 use picofarm_catalog::{Changes, Claim, Owned, Range, Settled, Want};
 use picofarm_proto::ids::RangeId;
@@ -11,7 +11,7 @@ use super::{
 };
 use crate::sql::int;
 
-/// Pending ranges looked at for one wish.
+/// The number of pending ranges examined for one request.
 const LOOK_AT: i64 = 256;
 pub(super) async fn claim(writer: &mut Writer<'_>, wants: &[Want]) -> Result<Vec<Claim>> {
     let mut claims = Vec::with_capacity(wants.len());
@@ -95,7 +95,7 @@ pub(super) async fn changes(writer: &mut Writer<'_>, changes: &Changes) -> Resul
     Ok(settled)
 }
 
-/// Removes the former state of every range that changes, having checked that it is this instance's.
+/// Deletes the former state of every changed range, after checking that this instance owns it.
 async fn replace_known(writer: &mut Writer<'_>, changes: &Changes) -> Result<()> {
     let known: Vec<Uuid> = changes.known().map(RangeId::uuid).collect();
     if known.is_empty() {

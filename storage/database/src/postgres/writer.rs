@@ -1,4 +1,4 @@
-//! Where an instance writes, and the integer keys of stages there.
+//! The write transaction of an instance, and the integer keys of stages in it.
 
 use std::collections::HashMap;
 
@@ -9,11 +9,11 @@ use uuid::Uuid;
 
 use super::query;
 
-/// A range with the names of its job and stage.
+/// The columns of a range, with the names of its job and stage.
 pub(super) const RANGE: &str = "task_range.*, (SELECT id FROM job JOIN stage ON stage.job = job.key WHERE stage.key = task_range.stage) AS job_id, \
                      (SELECT ordinal FROM stage WHERE stage.key = task_range.stage) AS ordinal";
 
-/// Why nothing was written.
+/// The reason why nothing was written.
 pub(super) enum WriteError {
     Fenced,
     Conflict(String),
@@ -29,7 +29,7 @@ impl From<sqlx::Error> for WriteError {
 pub(super) type Result<T> = std::result::Result<T, WriteError>;
 pub(super) type Sql<T> = std::result::Result<T, sqlx::Error>;
 
-/// Integer keys of stages, remembered: they never change.
+/// A cache of the integer keys of stages, which never change.
 #[derive(Default)]
 pub(super) struct Keys(HashMap<StageRef, StageKeys>);
 
@@ -40,7 +40,7 @@ pub(super) struct StageKeys {
     pub result_set: i64,
 }
 
-/// Where an instance writes: inside a transaction that has passed the fence.
+/// A write transaction of an instance that has passed the fence.
 pub(super) struct Writer<'a> {
     pub c: &'a mut PgConnection,
     pub instance: Uuid,
@@ -76,7 +76,7 @@ impl Writer<'_> {
     }
 }
 
-/// Rows of [`RANGE`] as ranges.
+/// Parses rows of [`RANGE`] as ranges.
 pub(super) fn ranges(rows: &[PgRow]) -> Sql<Vec<Range>> {
     rows.iter().map(query::range).collect()
 }

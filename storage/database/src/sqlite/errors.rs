@@ -1,4 +1,4 @@
-//! SQLite's result codes in words. Codes: <https://www.sqlite.org/rescode.html>.
+//! Messages for SQLite's result codes. Codes: <https://www.sqlite.org/rescode.html>.
 
 use std::path::Path;
 
@@ -11,11 +11,12 @@ const FULL: i32 = 13;
 const CANTOPEN: i32 = 14;
 const TOOBIG: i32 = 18;
 const CONSTRAINT: i32 = 19;
-/// Constraints on what a row holds, of which no later state of the database changes anything: CHECK, NOT NULL, a trigger's
-/// refusal, a value of another type.
+/// Constraints on the content of a row, which fail in every state of the database: CHECK, NOT NULL,
+/// a trigger's RAISE, and a value of the wrong type.
 const CONTENT: [i32; 4] = [275, 1299, 1811, 3091];
 const NOTADB: i32 = 26;
-/// The log's index could not grow; seen on a full disk where SQLITE_FULL might be expected.
+/// The index of the write-ahead log could not grow. SQLite returns this on a full disk, where one
+/// might expect SQLITE_FULL.
 const IOERR_SHMSIZE: i32 = 4874;
 
 fn said(error: &sqlx::Error) -> String {
@@ -24,7 +25,7 @@ fn said(error: &sqlx::Error) -> String {
         .map_or_else(|| error.to_string(), |e| e.message().to_owned())
 }
 
-/// The error a person can act on.
+/// Returns an actionable error.
 pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
     let path = path.to_owned();
     if let sqlx::Error::ColumnDecode { index, source } = &error {

@@ -1,10 +1,12 @@
-//! Whether the files of an open database are still those at its path. On Unix a file that is deleted or replaced lives on for
-//! those who have it open: SQLite would go on writing into it, and nobody would ever read what it wrote.
+//! Checks whether the files of an open database are still those at its path. On Unix, a deleted or
+//! replaced file continues to exist for processes that have it open. SQLite would continue to write
+//! into it, and nobody would ever read those writes.
 //!
-//! Such a catalog is not used: nothing is answered that only such a file holds, and the coordinator is not ready. It goes on
-//! by itself when the very same files are back (moved away and back again). A file of another content in their place is left
-//! alone: it may be a copy that is still being written, or older than what was promised to workers. Whoever put it there
-//! starts the coordinator again.
+//! Such a catalog is not used: no request is answered from it, and the coordinator is not ready.
+//! The coordinator continues by itself when the original files are back (moved away and back
+//! again). It does not touch another file at the same path, because this may be an incomplete copy,
+//! or older than what workers have been promised. The administrator who put it there must restart
+//! the coordinator.
 
 use std::{
     io,
@@ -12,7 +14,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Device and number of a file.
+/// Device and inode number of a file.
 type Identity = (u64, u64);
 
 /// The files of an open database.
@@ -20,7 +22,7 @@ type Identity = (u64, u64);
 pub(super) struct Files {
     path: PathBuf,
     main: Option<Identity>,
-    /// The write-ahead log: what was committed last is there alone.
+    /// The write-ahead log, which contains the latest commits.
     log: Option<Identity>,
 }
 
@@ -39,7 +41,7 @@ fn log_of(path: &Path) -> PathBuf {
 }
 
 impl Files {
-    /// The files that have just been opened.
+    /// Records the identities of the files that were just opened.
     pub(super) fn of(path: &Path) -> Result<Self, String> {
         Ok(Self {
             path: path.to_owned(),
@@ -51,7 +53,7 @@ impl Files {
     /// Checks that the files at the path are those that were opened.
     ///
     /// # Errors
-    /// What is not, and what to do about it.
+    /// A description of the difference, and what to do about it.
     pub(super) fn check(&self) -> Result<(), String> {
         let now = identity(&self.path)?;
         if now.is_none() {

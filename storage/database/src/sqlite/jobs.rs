@@ -1,4 +1,4 @@
-//! Jobs as a whole: recorded, ended, cancelled, tried again.
+//! Operations on whole jobs: record, end, cancel and retry.
 
 use std::collections::HashMap;
 
@@ -16,7 +16,7 @@ use super::{
 use crate::sql::{self, int};
 use picofarm_catalog::{NewEvent, Outcome, RangeState, Settled, StageRecord, Submission};
 
-/// Where a stage is over, opens those that waited for it and ends the job if that was the last.
+/// If a stage is over, opens the stages that waited for it, and ends the job if it was the last.
 pub(super) async fn stage_over(
     c: &mut SqliteConnection,
     keys: &mut Keys,
@@ -46,7 +46,7 @@ async fn settle(
     Ok(settled)
 }
 
-/// Records a job; `spec` is its spec as JSON.
+/// Records a job. `spec` is its spec in JSON.
 pub(super) async fn record(
     c: &mut SqliteConnection,
     keys: &mut Keys,
@@ -102,7 +102,7 @@ pub(super) async fn record(
     Ok(Outcome::New)
 }
 
-/// Records a stage of the job with this key; returns its own.
+/// Records a stage of the job with this key. Returns the stage's key.
 async fn insert_stage(c: &mut SqliteConnection, job: i64, stage: &StageRecord) -> Result<i64> {
     let set = &stage.set;
     sqlx::query(

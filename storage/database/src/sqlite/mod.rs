@@ -1,6 +1,6 @@
-//! The catalog in one SQLite file, for one coordinator. All writes go through one connection, one transaction at a time:
-//! the coordinator's actor puts whatever has arrived meanwhile into the next one, so one fsync serves many messages.
-//! Reads have connections of their own.
+//! The catalog in one SQLite file, for one coordinator. All writes go through one connection, one
+//! transaction at a time. The coordinator's actor collects all changes that arrive in the meantime
+//! into the next transaction, so one fsync serves many messages. Reads have their own connections.
 
 mod errors;
 mod files;
@@ -43,7 +43,8 @@ crate::sql_listing::listing_queries!(sqlx::Sqlite, sqlx::SqliteConnection, super
 crate::sql_jobs::job_queries!(sqlx::SqliteConnection, super::SqliteRow);
 crate::sql_rights::rights_queries!(sqlx::SqliteConnection, super::SqliteRow);
 
-/// Read-only connections: more than the coordinator's heavy reads take at a time, so that its short ones need not wait.
+/// The number of read-only connections. It exceeds the coordinator's concurrent heavy reads, so
+/// that short reads need not wait.
 const READERS: u32 = 8;
 
 /// A catalog in one SQLite file, for exactly one coordinator.
@@ -52,19 +53,21 @@ pub struct SqliteCatalog {
     /// `None` once closed.
     writer: Mutex<Option<writer::Writer>>,
     readers: SqlitePool,
-    /// A reader opens the file anew, and shall not open another.
+    /// Checked by each reader, because it opens the file by its path and must not open another
+    /// file.
     files: files::Files,
-    /// Until the catalog is closed, whoever still has it. Last, so that otherwise it is dropped after the connections.
+    /// Held until the catalog is closed, even if others still have a reference to it. It is the
+    /// last field, so that it is dropped after the connections.
     lock: std::sync::Mutex<Option<CatalogLock>>,
 }
 
 impl SqliteCatalog {
-    /// Opens the catalog at `path`, creating the file and its folder, and brings its schema up to date.
-    /// `holder` tells people who has it, e.g. `pid 17, 127.0.0.1:7070`.
+    /// Opens the catalog at `path`, creating the file and its folder, and upgrades its schema.
+    /// `holder` describes this process to people, e.g. `pid 17, 127.0.0.1:7070`.
     ///
     /// # Errors
-    /// [`CatalogError::Held`] when another coordinator uses it, [`CatalogError::Newer`] when a later program
-    /// wrote it, others when the file cannot be used.
+    /// [`CatalogError::Held`] if another coordinator uses it, [`CatalogError::Newer`] if a later
+    /// version of the program wrote it, and other errors if the file cannot be used.
     pub async fn open(path: &Path, holder: &str) -> Result<Self, CatalogError> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)
@@ -76,7 +79,7 @@ impl SqliteCatalog {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
-            // A full temporary folder is no reason to fail; what is sorted here is small.
+            // A full temporary folder must not cause failures, and the sorted data is small.
             .pragma("temp_store", "MEMORY")
             .busy_timeout(Duration::from_secs(10))
             .disable_statement_logging();
@@ -140,7 +143,7 @@ impl SqliteCatalog {
         self.transaction(true, work).await
     }
 
-    /// As [`Self::write`]; undone at the end if not `keep`.
+    /// Like [`Self::write`], but rolls back if `keep` is false.
     async fn transaction<T>(
         &self,
         keep: bool,
@@ -171,7 +174,7 @@ async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), C
         })
 }
 
-/// Upgrades a catalog whose first step was written before steps were append-only.
+/// Upgrades a catalog with a first step from before steps were append-only.
 async fn upgrade_former(connection: &mut SqliteConnection) -> Result<(), sqlx::Error> {
     let mut tx = connection.begin().await?;
     let tables: i64 =
@@ -201,12 +204,13 @@ async fn upgrade_former(connection: &mut SqliteConnection) -> Result<(), sqlx::E
 impl Catalog for SqliteCatalog {
     async fn load(&self) -> Result<Snapshot, CatalogError> {
         let instance = InstanceId::from_uuid(Uuid::now_v7());
-        // A life begins with a write: where there is no room, it shall not begin, promise and fail in turn.
+        // A life begins with a write, so that on a full disk the coordinator does not start, make
+        // promises and then fail.
         self.write(async |c, _| Ok(write::found(c, instance).await?))
             .await?;
         let mut c = self.reader().await?;
         let read = async {
-            // One transaction, so that all tables are of one moment.
+            // One transaction gives a consistent state of all tables.
             let mut tx = c.begin().await?;
             let jobs = job_query::active_jobs(&mut tx).await?;
             let ranges = write::owned(&mut tx).await?;
@@ -255,7 +259,7 @@ impl Catalog for SqliteCatalog {
     }
 
     async fn adopt(&self, _: WorkerId) -> Result<Owned, CatalogError> {
-        // Every lease is this instance's already.
+        // This instance already owns every lease.
         Ok(Owned::default())
     }
 
@@ -277,7 +281,7 @@ impl Catalog for SqliteCatalog {
     }
 
     async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError> {
-        // Before the transaction: a large spec takes a while.
+        // This happens before the transaction, because a large spec takes a while.
         let spec = serde_json::to_string(&*submission.job.spec).expect("a spec is plain data");
         self.write(async |c, keys| jobs::record(c, keys, submission, &spec).await)
             .await
@@ -295,7 +299,7 @@ impl Catalog for SqliteCatalog {
         set: &ResultSet,
         outputs: &[Recorded],
     ) -> Result<(), CatalogError> {
-        // Short transactions: others wait for them.
+        // The transactions are short, because others wait for them.
         for some in outputs.chunks(1_000) {
             self.write(async |c, _| {
                 for output in some {
@@ -338,7 +342,7 @@ impl Catalog for SqliteCatalog {
 
     async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
         self.write(async |c, keys| {
-            // The database may use keys again that are free.
+            // The database may reuse the keys of deleted rows.
             *keys = writer::Keys::default();
             Ok(listing_query::forget(c, before_ms).await?)
         })

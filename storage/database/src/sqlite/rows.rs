@@ -9,10 +9,10 @@ use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 use super::writer::{Keys, Result, WriteError};
 use crate::sql::{self, StateColumns, int};
 
-/// Rows in one statement; SQLite takes 32,766 parameters and no row here has more than 13.
+/// Rows per statement. SQLite allows 32,766 parameters, and no row here has more than 13.
 pub(super) const ROWS: usize = 1000;
 
-/// Writes the rows of a change set that hold what others sent.
+/// Writes the rows of a change set that contain data from other programs.
 pub(super) async fn write_rows(
     c: &mut SqliteConnection,
     keys: &mut Keys,
@@ -85,7 +85,7 @@ pub(super) async fn insert_ranges(
     Ok(())
 }
 
-/// Writes a range of nobody's, merged with its neighbours in the same state.
+/// Writes an unowned range, merged with its neighbours in the same state.
 pub(super) async fn give(c: &mut SqliteConnection, key: i64, range: &Range) -> Result<()> {
     let mut range = range.clone();
     let columns = StateColumns::from(&range.state);
@@ -146,7 +146,7 @@ async fn insert_outputs(
     Ok(())
 }
 
-/// The manifests of many tasks, in one query for each stage.
+/// Returns the manifests of many tasks, with one query per stage.
 pub(super) async fn manifests(
     c: &mut SqliteConnection,
     tasks: &[(StageRef, u64)],

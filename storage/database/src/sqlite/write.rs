@@ -1,4 +1,4 @@
-//! What is taken and what is changed, in one transaction each.
+//! Claims and commits, each in one transaction.
 
 use picofarm_catalog::{Changes, Claim, Owned, Range, Settled, Want};
 use picofarm_proto::ids::{InstanceId, RangeId};
@@ -12,13 +12,13 @@ use super::{
 };
 use crate::sql::int;
 
-/// Pending ranges looked at for one wish.
+/// The number of pending ranges examined for one request.
 const LOOK_AT: i64 = 256;
 
-/// Bytes that a life writes when it begins, to see that a batch finds room.
+/// Bytes written at the start of a life, to check that there is space for a batch.
 const ROOM: i64 = 256 << 10;
 
-/// Notes whose life it is now.
+/// Records the instance of the current life.
 pub(super) async fn found(
     c: &mut SqliteConnection,
     instance: InstanceId,
@@ -31,10 +31,10 @@ pub(super) async fn found(
     Ok(())
 }
 
-/// Bytes that are written while a life lasts, to see that there is room.
+/// Bytes written during a life, to check for free space.
 const SOME_ROOM: i64 = 64 << 10;
 
-/// Writes a page for each 4 KiB of it anew.
+/// Rewrites one page for each 4 KiB of this space.
 pub(super) async fn try_room(c: &mut SqliteConnection) -> std::result::Result<(), sqlx::Error> {
     sqlx::query("UPDATE life SET room = zeroblob(?) WHERE key = 1")
         .bind(SOME_ROOM)
@@ -43,7 +43,7 @@ pub(super) async fn try_room(c: &mut SqliteConnection) -> std::result::Result<()
     Ok(())
 }
 
-/// The ranges in this instance's hands.
+/// Returns the ranges that this instance owns.
 pub(super) async fn owned(
     c: &mut SqliteConnection,
 ) -> std::result::Result<Vec<Range>, sqlx::Error> {
@@ -142,7 +142,7 @@ pub(super) async fn changes(
     Ok(settled)
 }
 
-/// Removes the former state of every range that changes, having checked that it is there.
+/// Deletes the former state of every changed range, after checking that it exists.
 async fn replace_known(c: &mut SqliteConnection, changes: &Changes) -> Result<()> {
     let known: Vec<RangeId> = changes.known().collect();
     for chunk in known.chunks(ROWS) {

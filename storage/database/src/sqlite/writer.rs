@@ -1,4 +1,4 @@
-//! The connection that writes, its transactions, and the integer keys of stages.
+//! The write connection, its transactions, and the integer keys of stages.
 
 use std::collections::HashMap;
 
@@ -7,10 +7,10 @@ use sqlx::{Connection, SqliteConnection, sqlite::SqliteConnectOptions};
 
 use super::files::Files;
 
-/// Why nothing was written.
+/// The reason why nothing was written.
 pub(super) enum WriteError {
     Conflict(String),
-    /// The files are not the database's any more.
+    /// The open files are no longer the database at the path.
     Lost(String),
     Sql(sqlx::Error),
 }
@@ -23,10 +23,10 @@ impl From<sqlx::Error> for WriteError {
 
 pub(super) type Result<T> = std::result::Result<T, WriteError>;
 
-/// The connection that writes.
+/// The write connection.
 pub(super) struct Writer {
     options: SqliteConnectOptions,
-    /// `None` after a transaction that did not end in order.
+    /// `None` after a transaction that did not end properly.
     connection: Option<SqliteConnection>,
     files: Files,
     keys: Keys,
@@ -46,29 +46,30 @@ impl Writer {
         }
     }
 
-    /// Checks that what is open is what lies at the path.
+    /// Checks that the open files are still those at the path.
     pub(super) fn check(&self) -> Result<()> {
         self.files.check().map_err(WriteError::Lost)
     }
 
-    /// Runs `work` in a transaction, which is kept if `keep` and undone else.
+    /// Runs `work` in a transaction, which is committed if `keep` is set and otherwise rolled back.
     ///
-    /// A connection whose transaction does not end in order (no room for the commit, and none for the rollback either) counts
-    /// it as open for ever: such a one is given up, and the next transaction has a new one.
+    /// If a transaction does not end properly (no space for the commit, nor for the rollback), its
+    /// connection considers it open forever. In that case the connection is dropped, and the next
+    /// transaction opens a new one.
     pub(super) async fn transaction<T>(
         &mut self,
         keep: bool,
         work: impl AsyncFnOnce(&mut SqliteConnection, &mut Keys) -> Result<T>,
     ) -> Result<T> {
         self.check()?;
-        // Whoever stops waiting half-way leaves none behind.
+        // The connection is taken out, so that a cancelled call leaves no open transaction.
         let mut connection = match self.connection.take() {
             Some(connection) => connection,
             None => SqliteConnection::connect_with(&self.options).await?,
         };
         let (done, ended) = run(&mut connection, &mut self.keys, keep, work).await;
         if done.is_err() {
-            // Keys of rows that are no more.
+            // The cache may contain keys of rows that no longer exist.
             self.keys = Keys::default();
         }
         match &ended {
@@ -80,7 +81,7 @@ impl Writer {
         }
         let done = done?;
         ended?;
-        // What was written into a file that is nowhere any more is not written.
+        // A write into a file that has left its path does not count.
         self.check()?;
         Ok(done)
     }
@@ -94,7 +95,7 @@ impl Writer {
     }
 }
 
-/// What came of the work, and of the end of its transaction.
+/// Returns the result of the work, and the result of ending its transaction.
 async fn run<T>(
     connection: &mut SqliteConnection,
     keys: &mut Keys,
@@ -116,7 +117,7 @@ async fn run<T>(
     (done, ended)
 }
 
-/// Integer keys of stages, remembered: they never change.
+/// A cache of the integer keys of stages, which never change.
 #[derive(Default)]
 pub(super) struct Keys(HashMap<StageRef, StageKeys>);
 

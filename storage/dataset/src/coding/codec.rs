@@ -1,4 +1,4 @@
-//! Chunks to bytes and back, through zarrs' codec chains built from the very metadata that is stored.
+//! Encodes and decodes chunks through zarrs' codec chains, built from the stored metadata.
 
 use std::borrow::Cow;
 use std::num::NonZeroU64;
@@ -12,7 +12,8 @@ use crate::error::DatasetError;
 use crate::layout::arrays::{Layout, index_codecs};
 use crate::layout::quantity::Element;
 
-/// The codecs of one kind of chunk. Deterministic: one thread a chunk, no state.
+/// The codecs of one kind of chunk. They are deterministic: single-threaded per chunk, and
+/// stateless.
 #[derive(Debug, Clone)]
 pub(crate) struct ChunkCodec {
     chain: CodecChain,
@@ -21,17 +22,17 @@ pub(crate) struct ChunkCodec {
     fill: FillValue,
     len_bytes: usize,
     name: &'static str,
-    /// Chunks are blosc's, with four bytes of checksum behind.
+    /// Whether chunks are compressed by blosc, followed by a checksum of four bytes.
     blosc: bool,
 }
 
-/// Bytes of blosc's header: versions, flags and size of a value (a byte each), then the sizes of what is packed, of a
-/// block, and of the whole.
+/// Size of blosc's header: versions, flags and element size (a byte each), then the uncompressed
+/// size, the block size and the compressed size.
 const BLOSC_HEADER: usize = 16;
 
 impl ChunkCodec {
-    /// Codec of an array's objects, or of the inner chunks of its shards, whose values are given in stored order: of
-    /// any order, only their number matters to it.
+    /// Returns the codec of an array's objects, or of the inner chunks of its shards. Values must
+    /// be in stored order; the codec uses only their number.
     pub fn new(layout: &Layout) -> Self {
         let shape = layout.inner.as_ref().unwrap_or(&layout.object_shape);
         Self::of_element(
@@ -55,7 +56,7 @@ impl ChunkCodec {
             Element::I16 => data_type::int16(),
             Element::U32 => data_type::uint32(),
         };
-        // The fill value plays no part in these codecs; only its size must fit.
+        // The fill value is not used by these codecs; only its size must match.
         let fill = FillValue::from(vec![0u8; element.size() as usize]);
         Self::from_parts(
             codecs,
@@ -67,7 +68,7 @@ impl ChunkCodec {
         )
     }
 
-    /// Codec of the index of a shard with `chunks` inner chunks.
+    /// Returns the codec of the index of a shard with `chunks` inner chunks.
     pub fn index(chunks: usize) -> Self {
         Self::from_parts(
             &index_codecs(),
@@ -79,7 +80,7 @@ impl ChunkCodec {
         )
     }
 
-    /// A codec of other chunks (see `render_group`).
+    /// Returns a codec of other chunks (see `render_group`).
     pub fn plain(codecs: &Value, shape: &[u64], element: Element) -> Self {
         Self::of_element(codecs, shape.iter().copied(), element, "array")
     }
@@ -113,7 +114,8 @@ impl ChunkCodec {
         }
     }
 
-    /// Whether a chunk announces as many bytes as the array's metadata give it: decoding makes room for what is announced.
+    /// Checks that a chunk announces the size given by the array's metadata, because decoding
+    /// allocates the announced size.
     fn check_announced(&self, bytes: &[u8]) -> Result<(), String> {
         if !self.blosc {
             return Ok(());

@@ -1,16 +1,17 @@
-//! Whole photon counts in 16 bits, without loss.
+//! Lossless 16-bit code of whole photon counts.
 //!
-//! A record holds h = N/scale in single precision, so that h·scale misses N by rounding alone: at most 0.016 below 2¹⁶.
+//! A record contains h = N/scale in single precision, so h·scale differs from N only by rounding:
+//! by at most 0.016 below 2¹⁶.
 
 use crate::coding::squareroot::{ErrorSums, SATURATED};
 
-/// Farther from a whole number than rounding can be.
+/// A distance from a whole number that rounding cannot explain.
 const WHOLE: f32 = 0.05;
 
-/// Codes `h` into counts. Says whether a bin saturated (2¹⁶ − 1 photons and more).
+/// Encodes `h` as counts. Returns whether a bin saturated (2¹⁶ − 1 photons or more).
 ///
 /// # Errors
-/// The first value that is negative, not finite, or no whole number of photons.
+/// The first value that is negative, not finite, or not a whole number of photons.
 pub(crate) fn encode_run(
     scale: f32,
     h: &[f32],
@@ -21,7 +22,7 @@ pub(crate) fn encode_run(
     let mut invalid = false;
     for (h, q) in h.iter().zip(&mut *q) {
         let n = h * scale;
-        // The cast floors and saturates: everything from 65535.0 upwards becomes SATURATED.
+        // The cast floors and saturates: every value from 65535.0 upwards becomes SATURATED.
         *q = (n + 0.5) as u16;
         saturated |= *q == SATURATED;
         invalid |= !fits(*h, n, *q);
@@ -42,7 +43,8 @@ fn fits(h: f32, n: f32, q: u16) -> bool {
     (0.0..=f32::MAX).contains(&h) && whole
 }
 
-/// Decodes counts into `h`; saturated ones become +∞ until the overflow list is applied. Says whether there are any.
+/// Decodes counts into `h`; saturated ones become +∞ until the overflow list is applied. Returns
+/// whether there are any.
 pub(crate) fn decode_run(scale: f32, q: &[u16], h: &mut [f32]) -> bool {
     let mut top = 0;
     for (q, h) in q.iter().zip(h) {

@@ -1,4 +1,4 @@
-//! How numbers become bytes: codec profiles, Zarr codec chains, shards and tiles.
+//! Encoding of numbers as bytes: codec profiles, Zarr codec chains, shards and tiles.
 
 pub(crate) mod codec;
 pub(crate) mod counts;

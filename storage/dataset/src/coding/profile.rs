@@ -1,4 +1,5 @@
-//! How transients are coded, by profile and format: element type, codecs, and what tells readers how to decode them.
+//! The encoding of transients by profile and format: element type, codecs, and instructions for
+//! readers.
 
 use serde_json::{Value, json};
 
@@ -6,25 +7,25 @@ use crate::coding::squareroot::SATURATED;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::spec::{DatasetSpec, Profile, decimal};
 
-/// Formats from this one on store the values of an inner chunk bin by bin: neighbouring pixels see the same light, and
-/// so compress better side by side than neighbouring bins do.
+/// From this format on, the values of an inner chunk are stored bin by bin. Neighbouring pixels see
+/// similar light, so they compress better next to each other than neighbouring bins do.
 const BINS_FIRST: u32 = 2;
-/// Bins of an inner chunk, from the same format on.
+/// Number of bins of an inner chunk, from the same format on.
 const INNER_BINS: u64 = 128;
 
-/// How the transients of a data set are coded.
+/// The encoding of a data set's transients.
 pub(crate) struct Coding {
     pub element: Element,
     pub attributes: Value,
     /// Whether an inner chunk's values are stored bin by bin.
     pub bins_first: bool,
-    /// Bins of an inner chunk.
+    /// Number of bins of an inner chunk.
     pub inner_bins: u64,
     shuffle: &'static str,
 }
 
 impl Coding {
-    /// Of the transient `quantity` in a data set of the given format.
+    /// Returns the encoding of the transient `quantity` in a data set of the given format.
     pub fn of(quantity: Quantity, spec: &DatasetSpec, format: u32) -> Self {
         let of = match quantity {
             Quantity::Transient => "",
@@ -97,13 +98,14 @@ impl Coding {
         }
     }
 
-    /// The filter of an inner chunk's blosc codec.
+    /// Returns the filter of an inner chunk's blosc codec.
     pub fn shuffle(&self) -> &'static str {
         self.shuffle
     }
 }
 
-/// What zarr-python needs to give h of scene `i` of the data set in the folder `location`.
+/// Returns the lines of zarr-python code that read h of scene `i` of the data set in the folder
+/// `location`.
 fn five_lines(quantity: Quantity, profile: Profile) -> Vec<String> {
     let name = quantity.name();
     let open = "g = zarr.open_group(location, mode='r')  # i is the scene's index".to_owned();
@@ -134,7 +136,7 @@ fn five_lines(quantity: Quantity, profile: Profile) -> Vec<String> {
     ]
 }
 
-/// The five lines with xarray in the root's attributes.
+/// Returns the five lines of xarray code for the root's attributes.
 pub(crate) fn decode_lines(spec: &DatasetSpec) -> Value {
     let open = "ds = xarray.open_zarr(location)  # i is the scene's index".to_owned();
     let lit = format!(

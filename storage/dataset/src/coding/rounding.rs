@@ -1,10 +1,10 @@
-//! Floats rounded to a share of the photon noise, so that they compress: what is left is the value itself, to be read
-//! without any formula.
+//! Floats rounded to a share of the photon noise, so that they compress well. The stored values are
+//! h itself and need no decoding formula.
 
 use crate::coding::squareroot::ErrorSums;
 
-/// Rounds h to a multiple of the largest power of two that keeps the error within a share of σ = √max(N, 1),
-/// N = h·scale photons.
+/// Rounds h to a multiple of the largest power of two with an error within a share of σ =
+/// √max(N, 1), N = h·scale photons.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rounding {
     /// Twice the share, in units of h.
@@ -13,7 +13,7 @@ pub(crate) struct Rounding {
 }
 
 impl Rounding {
-    /// `share` of σ, at `scale` photons per unit of h.
+    /// Rounds to `share` of σ, at `scale` photons per unit of h.
     pub fn new(share: f32, scale: f32) -> Self {
         let width = 2.0 * share / scale;
         Self { width, scale }
@@ -21,7 +21,7 @@ impl Rounding {
 
     fn round(self, h: f32) -> f32 {
         let sigma = (h * self.scale).max(1.0).sqrt();
-        // The exponent alone: a power of two, by which dividing is exact.
+        // Only the exponent remains: a power of two, so division by it is exact.
         let step = f32::from_bits((sigma * self.width).to_bits() & 0x7f80_0000);
         if !step.is_normal() {
             return h;
@@ -30,7 +30,7 @@ impl Rounding {
         if rounded.is_finite() { rounded } else { h }
     }
 
-    /// Rounds `h`, whose values are valid, into `to`, and adds to `error`.
+    /// Rounds the valid values `h` into `to`, and adds the errors to `error`.
     pub fn run(self, h: &[f32], to: &mut [f32], error: &mut ErrorSums) {
         for (h, to) in h.iter().zip(to) {
             *to = self.round(*h);

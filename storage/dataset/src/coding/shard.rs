@@ -1,8 +1,9 @@
 //! Zarr's sharding format: inner chunks one after another, then an index of (offset, size) pairs.
 //!
-//! zarrs' own sharding codec writes inner chunks in the order in which threads finish them and wants the whole
-//! shard in one buffer of codes. Here the order is row-major and each inner chunk is coded straight from the
-//! floats, so the bytes depend on nothing but the values; zarrs and zarr-python read the result.
+//! zarrs' own sharding codec writes inner chunks in the order in which threads finish them, and
+//! requires the whole shard in one buffer of codes. This module writes them in row-major order and
+//! encodes each inner chunk directly from the floats, so the bytes depend only on the values. zarrs
+//! and zarr-python can read the result.
 
 use std::ops::Range;
 
@@ -14,17 +15,17 @@ use crate::error::DatasetError;
 /// (offset, size) of an inner chunk; `None` = all fill value.
 pub(crate) type IndexEntry = Option<Range<u64>>;
 
-/// Bytes of an index of `chunks` entries, with its crc32c.
+/// Returns the size in bytes of an index of `chunks` entries, including its crc32c.
 pub(crate) fn index_len(chunks: usize) -> usize {
     chunks * 16 + 4
 }
 
-/// Puts coded inner chunks, in row-major order, and the index together.
+/// Joins encoded inner chunks, in row-major order, with their index.
 pub(crate) fn assemble(chunks: &[Vec<u8>]) -> Result<Vec<u8>, DatasetError> {
     put_together(chunks.iter().map(|chunk| Some(&chunk[..])))
 }
 
-/// The same where some chunks are all fill value.
+/// Like [`assemble`], with some chunks that are all fill value.
 pub(crate) fn assemble_some(chunks: &[Option<Bytes>]) -> Result<Vec<u8>, DatasetError> {
     put_together(chunks.iter().map(|chunk| chunk.as_deref()))
 }
@@ -49,7 +50,7 @@ fn put_together<'a>(
     Ok(shard)
 }
 
-/// Reads the index from the last [`index_len`] bytes of a shard of `shard_len` bytes.
+/// Parses the index from the last [`index_len`] bytes of a shard of `shard_len` bytes.
 pub(crate) fn parse_index(
     tail: &[u8],
     chunks: usize,

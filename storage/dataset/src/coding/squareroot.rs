@@ -1,13 +1,13 @@
-//! The square-root code: photon counts to 16 bits with an error that is a fixed share of the photon noise,
-//! its error statistics, and the choice of a scene's photon scale.
+//! The square-root code: photon counts as 16-bit codes with an error proportional to the photon
+//! noise, its error statistics, and the choice of a scene's photon scale.
 //!
-//! All arithmetic is IEEE single precision in a fixed order, so that the same histogram gives the same codes
-//! on every machine and numpy's float32 decodes to the same bits.
+//! All arithmetic is IEEE single precision in a fixed order, so that the same histogram gives the
+//! same codes on every machine, and numpy's float32 decodes to the same bits.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// The code that marks a saturated bin, whose exact value stands in the manifest's overflow list.
+/// The code of a saturated bin. Its exact value is in the manifest's overflow list.
 pub const SATURATED: u16 = u16::MAX;
 
 /// The square-root code with step Δ.
@@ -18,35 +18,35 @@ pub struct SquareRoot {
 }
 
 impl SquareRoot {
-    /// Step Δ (see [`crate::Profile`]) and photons per unit of h.
+    /// Returns the code with step Δ (see [`crate::Profile`]) and `scale` photons per unit of h.
     pub fn new(delta: f32, scale: f32) -> Self {
         Self { delta, scale }
     }
 
-    /// The code of h. `h` must be finite and not negative; [`SATURATED`] where 16 bits do not suffice
-    /// (above 4.3·10⁷ photons at Δ = 0.2).
+    /// Encodes h, which must be finite and not negative. Returns [`SATURATED`] if 16 bits do not
+    /// suffice (above 4.3·10⁷ photons at Δ = 0.2).
     #[inline]
     pub fn encode(self, h: f32) -> u16 {
         let q = (h * self.scale).sqrt() * (2.0 / self.delta) + 0.5;
-        // The cast floors and saturates: everything from 65535.0 upwards becomes SATURATED.
+        // The cast floors and saturates: every value from 65535.0 upwards becomes SATURATED.
         q as u16
     }
 
-    /// Photons of a code.
+    /// Returns the number of photons of a code.
     #[inline]
     pub fn photons(self, q: u16) -> f32 {
         let root = f32::from(q) * (self.delta * 0.5);
         root * root
     }
 
-    /// h of a code that is not [`SATURATED`].
+    /// Returns h of a code other than [`SATURATED`].
     #[inline]
     pub fn decode(self, q: u16) -> f32 {
         self.photons(q) / self.scale
     }
 
-    /// Codes `h` into `q`, adds to `error`, and says whether a bin saturated and whether all values were valid
-    /// (finite and not negative).
+    /// Encodes `h` into `q` and adds the errors to `error`. Returns whether a bin saturated and
+    /// whether all values were valid (finite and not negative).
     pub(crate) fn encode_run(self, h: &[f32], q: &mut [u16], error: &mut ErrorSums) -> RunFacts {
         const LANES: usize = 8;
         let mut invalid = [false; LANES];
@@ -88,7 +88,8 @@ impl SquareRoot {
         }
     }
 
-    /// Decodes `q` into `h`; saturated codes become +∞ until the overflow list is applied. Says whether there are any.
+    /// Decodes `q` into `h`; saturated codes become +∞ until the overflow list is applied. Returns
+    /// whether there are any.
     pub(crate) fn decode_run(self, q: &[u16], h: &mut [f32]) -> bool {
         let mut top = 0;
         for (q, h) in q.iter().zip(h) {
@@ -103,7 +104,7 @@ impl SquareRoot {
     }
 }
 
-/// What a run of values contained.
+/// Properties of a run of values.
 pub(crate) struct RunFacts {
     pub invalid: bool,
     pub saturated: bool,
@@ -118,7 +119,7 @@ pub(crate) struct ErrorSums {
 }
 
 impl ErrorSums {
-    /// A value of `n` photons that is stored as `stored`.
+    /// Adds a value of `n` photons with the stored value `stored`.
     pub fn add_value(&mut self, n: f32, stored: f32) {
         let square = (stored - n) * (stored - n) / n.max(1.0);
         self.squares += f64::from(square);
@@ -126,7 +127,7 @@ impl ErrorSums {
         self.count += 1;
     }
 
-    /// `count` values without error.
+    /// Adds `count` values without error.
     pub fn add_exact(&mut self, count: usize) {
         self.count += count as u64;
     }
@@ -137,7 +138,7 @@ impl ErrorSums {
         self.count += other.count;
     }
 
-    /// With `overflowed` values in the overflow list.
+    /// Returns the error, with `overflowed` values in the overflow list.
     pub fn finish(&self, overflowed: usize) -> EncodeError {
         EncodeError {
             overflowed: Some(overflowed as u64),
@@ -147,21 +148,24 @@ impl ErrorSums {
     }
 }
 
-/// Error of a scene's coded transient, in standard deviations of the photon noise, σ = √max(N, 1).
+/// Error of a scene's encoded transient, in standard deviations of the photon noise, σ =
+/// √max(N, 1).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct EncodeError {
-    /// The largest over all bins.
+    /// The maximum over all bins.
     pub max_sigma: f64,
     /// Root mean square over all bins.
     pub rms_sigma: f64,
-    /// Saturated bins: those in the overflow list. Manifests of encoder-1 do not say.
+    /// Number of saturated bins, which are in the overflow list. It is absent in manifests of
+    /// encoder-1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub overflowed: Option<u64>,
 }
 
-/// The scale (photons per unit of h) at which the median over the lit pixels of the brightest bin is `photons`
-/// (400 is the convention). `transient` is `[pixel][bin]`. The few pixels that see a spot directly are far brighter,
-/// which a median does not notice. 1 where no pixel has any light.
+/// Returns the scale (photons per unit of h) at which the median over the lit pixels of the
+/// brightest bin is `photons` (400 by convention). `transient` is `[pixel][bin]`. The few pixels
+/// that see a spot directly are far brighter, but do not affect the median. Returns 1 if no pixel
+/// has any light.
 pub fn photon_scale(transient: &[f32], bins: usize, photons: f32) -> f32 {
     let mut peaks: Vec<f32> = transient
         .par_chunks(bins.max(1))

@@ -1,18 +1,18 @@
-//! The inner chunks of a transient: which pixels and bins each holds, and the order of values inside.
+//! The inner chunks of a transient: their pixels and bins, and the order of values inside.
 
 use std::ops::Range;
 
 use crate::layout::arrays::Layout;
 use crate::layout::spec::DatasetSpec;
 
-/// Columns that are reordered at a time: their targets stay in the first cache.
+/// Number of columns reordered at a time. Their targets fit into the first-level cache.
 const BLOCK: usize = 32;
 
 /// The inner chunks of a transient: plane by plane, then by rows, columns and bins.
 pub(crate) struct Tiles {
-    /// Images, one below the other: row r of plane p counts as row p·rows + r.
+    /// Number of images, stacked vertically: row r of plane p has the index p·rows + r.
     planes: usize,
-    /// Size of one in pixels (rows, columns).
+    /// Size of one image in pixels (rows, columns).
     image: [usize; 2],
     /// Tile size: rows, columns, bins.
     side: [usize; 3],
@@ -24,9 +24,9 @@ pub(crate) struct Tiles {
 
 /// One row of a tile's pixels inside the image.
 pub(crate) struct Run {
-    /// First pixel, counted through all planes.
+    /// Index of the first pixel, counted through all planes.
     pub pixel: usize,
-    /// The same within the tile.
+    /// Index of the first pixel within the tile.
     pub tile: usize,
     /// Image row (counted through all planes), first column and number of columns.
     pub row: usize,
@@ -43,12 +43,12 @@ pub(crate) struct Part {
 }
 
 impl Part {
-    /// Values in it.
+    /// Returns the number of values in it.
     pub fn len(&self) -> usize {
         self.rows.len() * self.row_len()
     }
 
-    /// Values in a row of it.
+    /// Returns the number of values in one of its rows.
     pub fn row_len(&self) -> usize {
         self.columns.len() * self.bins.len()
     }
@@ -81,7 +81,7 @@ impl Tiles {
         self.planes * self.grid.iter().product::<usize>()
     }
 
-    /// All of the transient.
+    /// Returns the whole transient as a part.
     pub fn whole(&self) -> Part {
         Part {
             rows: 0..self.planes * self.image[0],
@@ -94,17 +94,17 @@ impl Tiles {
         self.side.iter().product()
     }
 
-    /// Bins of a histogram of the tile, those beyond the last one included.
+    /// Returns the number of bins of a histogram in a tile, including padding after the last bin.
     pub fn slab_len(&self) -> usize {
         self.side[2]
     }
 
-    /// The tiles of one range of bins.
+    /// Returns the tiles of one range of bins.
     pub fn of_slab(&self, slab: usize) -> impl Iterator<Item = usize> + use<> {
         (slab..self.count()).step_by(self.grid[2])
     }
 
-    /// Whether the tile has values of the part.
+    /// Returns whether the tile overlaps the part.
     pub fn touches(&self, tile: usize, part: &Part) -> bool {
         let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
         let left = self.left_of(tile);
@@ -113,12 +113,12 @@ impl Tiles {
             && overlap(&self.bins_of(tile), &part.bins)
     }
 
-    /// Which row of tiles a tile is in, counted through all planes.
+    /// Returns the tile's row in the grid of tiles, counted through all planes.
     pub fn row_of(&self, tile: usize) -> usize {
         tile / (self.grid[1] * self.grid[2])
     }
 
-    /// The image rows of a tile, cut at the image's edge.
+    /// Returns the image rows of a tile, cut at the image's edge.
     pub fn rows_of(&self, tile: usize) -> Range<usize> {
         let (plane, band) = (
             self.row_of(tile) / self.grid[0],
@@ -128,7 +128,7 @@ impl Tiles {
         top..(top + self.side[0]).min((plane + 1) * self.image[0])
     }
 
-    /// The bins of a tile, cut at the last one.
+    /// Returns the bins of a tile, cut at the last one.
     pub fn bins_of(&self, tile: usize) -> Range<usize> {
         let first = tile % self.grid[2] * self.side[2];
         first..(first + self.side[2]).min(self.bins)
@@ -150,7 +150,7 @@ impl Tiles {
         })
     }
 
-    /// A tile's values, histogram by histogram, in the order in which they are stored.
+    /// Reorders a tile's values from histogram by histogram to stored order.
     pub fn to_stored<T: bytemuck::Pod>(&self, values: Vec<T>) -> Vec<T> {
         if !self.bins_first {
             return values;
@@ -165,8 +165,8 @@ impl Tiles {
         stored
     }
 
-    /// What a tile stores of a run at one of its bins, from the tile's first: pixel by pixel. `scratch` holds it where it lies
-    /// otherwise.
+    /// Returns a run's values at one of the tile's bins, pixel by pixel. `bin` is relative to the
+    /// tile's first bin. If the stored values are not contiguous, they are copied to `scratch`.
     pub fn of_bin<'a, T: bytemuck::Pod>(
         &self,
         stored: &'a [T],
@@ -184,8 +184,8 @@ impl Tiles {
         scratch
     }
 
-    /// Some bins of some columns of a run, histogram by histogram, out of a tile as it is stored.
-    /// `columns` are the image's, `bins` the transient's.
+    /// Copies some bins of some columns of a run, histogram by histogram, from a stored tile.
+    /// `columns` are relative to the image, and `bins` to the transient.
     pub fn of_run<T: bytemuck::Pod>(
         &self,
         stored: &[T],
@@ -215,16 +215,17 @@ impl Tiles {
     }
 }
 
-/// Rows of `stride` values.
+/// A matrix with rows of `stride` values.
 struct Matrix<'a, T> {
     values: &'a [T],
     stride: usize,
 }
 
 impl<T: Copy> Matrix<'_, T> {
-    /// Writes the given columns as rows of `stride` values, of which it fills the first ones with the given rows.
+    /// Writes the given columns as rows of `stride` values. The first values of each are those of
+    /// the given rows.
     fn transpose(&self, rows: Range<usize>, columns: Range<usize>, to: &mut [T], stride: usize) {
-        // What is read lies side by side; what is written is the part that stays in the cache.
+        // Reads are contiguous; writes go to a block that stays in the cache.
         for c0 in columns.clone().step_by(BLOCK) {
             let c1 = (c0 + BLOCK).min(columns.end);
             let to = &mut to[(c0 - columns.start) * stride..];

@@ -1,4 +1,4 @@
-//! Single histogram images coded as data sets code them, without a store around them: for measurements.
+//! Encodes single histogram images like data sets do, but without a store, for measurements.
 
 use bytes::Bytes;
 
@@ -12,19 +12,19 @@ use crate::scenes::dataset::ArrayCodec;
 use crate::scenes::encode::encode_transient;
 use crate::scenes::window::Decoding;
 
-/// Codes the transients of data sets with these properties.
+/// Encodes transients as in data sets with these properties.
 #[derive(Debug)]
 pub struct TransientCodec {
     spec: DatasetSpec,
     array: ArrayCodec,
 }
 
-/// A coded transient.
+/// An encoded transient.
 #[derive(Debug, Clone)]
 pub struct CodedImage {
-    /// The shard: what is the scene's object in a data set.
+    /// The shard, which is the scene's object in a data set.
     pub shard: Bytes,
-    /// What stands in the manifest.
+    /// The error recorded in the manifest.
     pub error: EncodeError,
     /// Saturated bins: (flat index in `[row][column][bin]`, exact value).
     pub overflow: Vec<(u64, f32)>,
@@ -33,10 +33,10 @@ pub struct CodedImage {
 }
 
 impl TransientCodec {
-    /// Of the newest format.
+    /// Returns a codec of the newest format.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] names the property that is out of range.
+    /// [`DatasetError::Invalid`] names the property out of range.
     pub fn new(spec: &DatasetSpec) -> Result<Self, DatasetError> {
         spec.check()?;
         let layout = Quantity::Transient.layout(spec, FORMAT_VERSION);
@@ -47,10 +47,10 @@ impl TransientCodec {
         })
     }
 
-    /// Codes h, `[row][column][bin]`, on rayon's threads.
+    /// Encodes h, `[row][column][bin]`, on rayon threads.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the size is another, or a value is negative or not finite.
+    /// [`DatasetError::Invalid`] if the size differs, or a value is negative or not finite.
     pub fn encode(&self, h: &[f32], scale: f32) -> Result<CodedImage, DatasetError> {
         self.check(h.len())?;
         let coded = encode_transient(&self.spec, &self.array, &[h], scale)?;
@@ -62,10 +62,11 @@ impl TransientCodec {
         })
     }
 
-    /// Decodes into `target`, on rayon's threads.
+    /// Decodes into `target`, on rayon threads.
     ///
     /// # Errors
-    /// [`DatasetError::Codec`] where the bytes are damaged; [`DatasetError::Invalid`] where the target has another size.
+    /// [`DatasetError::Codec`] if the bytes are damaged; [`DatasetError::Invalid`] if the target
+    /// has another size.
     pub fn decode(&self, coded: &CodedImage, target: &mut [f32]) -> Result<(), DatasetError> {
         self.check(target.len())?;
         let decoding = Decoding {

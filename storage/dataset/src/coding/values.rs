@@ -1,4 +1,4 @@
-//! Values of h to what a tile stores and back, by profile.
+//! Converts values of h to a tile's stored values and back, by profile.
 
 use std::borrow::Cow;
 use std::ops::Range;
@@ -14,7 +14,7 @@ use crate::layout::spec::Profile;
 pub(crate) struct Source<'a> {
     pub name: &'a str,
     pub planes: &'a [&'a [f32]],
-    /// Pixels of a plane, bins of a pixel.
+    /// Number of pixels in a plane, and of bins in a pixel.
     pub pixels: usize,
     pub bins: usize,
     pub scale: f32,
@@ -27,18 +27,18 @@ impl Source<'_> {
     }
 }
 
-/// A tile's values in stored order, and what was lost.
+/// A tile's values in stored order, and the encoding losses.
 pub(crate) struct CodedValues {
     pub bytes: Vec<u8>,
     pub error: ErrorSums,
-    /// Saturated bins: (flat index, exact value), in no order.
+    /// Saturated bins: (flat index, exact value), unordered.
     pub overflow: Vec<(u64, f32)>,
 }
 
-/// Codes a tile.
+/// Encodes a tile.
 ///
 /// # Errors
-/// [`DatasetError::Invalid`] names a value that the profile cannot hold.
+/// [`DatasetError::Invalid`] names a value that the profile cannot represent.
 pub(crate) fn code(
     profile: Profile,
     tiles: &Tiles,
@@ -100,8 +100,8 @@ pub(crate) fn code(
     })
 }
 
-/// A tile's values, histogram by histogram: `code` is given each histogram's bins, where they go, and the flat index of
-/// the first.
+/// Encodes a tile's values, histogram by histogram. `code` is called with each histogram's bins,
+/// their target, and the flat index of the first bin.
 fn each<T: bytemuck::Pod>(
     tiles: &Tiles,
     tile: usize,
@@ -158,7 +158,7 @@ fn invalid_count(source: &Source<'_>, h: f32, at: usize) -> DatasetError {
     )
 }
 
-/// Decodes what a tile stores into a part's values; saturated bins become +∞.
+/// Decodes a tile's stored values into a part's values. Saturated bins become +∞.
 pub(crate) struct Decoder<'a> {
     profile: Profile,
     scale: f32,
@@ -178,8 +178,8 @@ impl<'a> Decoder<'a> {
         }
     }
 
-    /// Decodes the values of `tile`, whose stored bytes are `raw`, that lie in `part`, into `target`, the part's values.
-    /// Says whether one of them is saturated.
+    /// Decodes those values of `tile` that are in `part` into `target`, the part's values. `raw`
+    /// are the tile's stored bytes. Returns whether one of them is saturated.
     pub fn decode(&mut self, tile: usize, raw: &[u8], part: &Part, target: &mut [f32]) -> bool {
         match self.profile {
             Profile::SqrtU16 { delta } => {
@@ -212,7 +212,8 @@ impl<'a> Decoder<'a> {
         }
     }
 
-    /// The same as images of `pixels` pixels, one for each of the tile's bins, of which `target` holds all.
+    /// Like [`Self::decode`], but decodes into images of `pixels` pixels, one for each of the
+    /// tile's bins, all in `target`.
     pub fn decode_planes(
         &mut self,
         tile: usize,
@@ -298,12 +299,12 @@ impl<'a> Decoder<'a> {
     }
 }
 
-/// The columns of a run that lie in the part.
+/// Returns the columns of a run inside the part.
 fn columns(run: &Run, part: &Part) -> Range<usize> {
     run.column.max(part.columns.start)..(run.column + run.columns).min(part.columns.end)
 }
 
-/// Bytes as values, copied only where they are not aligned.
+/// Casts bytes to values, copying them only if they are not aligned.
 fn values<T: bytemuck::Pod>(bytes: &[u8]) -> Cow<'_, [T]> {
     match bytemuck::try_cast_slice(bytes) {
         Ok(values) => Cow::Borrowed(values),

@@ -1,5 +1,5 @@
-//! What tells people and their tools what an export is: `README.md` (a data card as Hugging Face reads it), `scenes.csv`
-//! (a line a scene) and `croissant.json` (MLCommons Croissant 1.0).
+//! Documentation of an export for people and tools: `README.md` (a Hugging Face data card),
+//! `scenes.csv` (a line per scene) and `croissant.json` (MLCommons Croissant 1.0).
 
 use std::fmt::Write as _;
 
@@ -22,7 +22,7 @@ pub(super) struct Row {
     missing: Vec<String>,
 }
 
-/// Columns of `scenes.csv`: name, Croissant type, what it is.
+/// Columns of `scenes.csv`: name, Croissant type, description.
 const COLUMNS: [(&str, &str, &str); 8] = [
     ("index", "sc:Integer", "number of the scene in this export"),
     (
@@ -74,12 +74,12 @@ impl Row {
     }
 }
 
-/// The table of scenes, which is written after them.
+/// The table of scenes, written after the scenes.
 pub(super) const TABLE: &str = "scenes.csv";
-/// The metadata that every export has, written after the table.
+/// The metadata of every export, written after the table.
 pub(super) const CROISSANT: &str = "croissant.json";
 
-/// The files, in the order in which they are written.
+/// Returns the files, in the order of writing.
 pub(super) fn files(
     name: &str,
     format: ExportFormat,
@@ -102,7 +102,7 @@ fn table(rows: &[Row]) -> String {
     let mut text = COLUMNS.map(|c| c.0).join(",");
     text.push('\n');
     for r in rows {
-        // None of the texts can hold a comma: keys, versions and our own file names.
+        // None of the texts can contain a comma: they are keys, versions and our own file names.
         writeln!(
             text,
             "{},{},{},{},{},{},{},{}",
@@ -120,7 +120,7 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// What a scene's files are, as a pattern and a MIME type.
+/// Returns the pattern and the MIME type of a scene's files.
 fn contents(format: ExportFormat) -> (&'static str, &'static str) {
     match format {
         ExportFormat::Zarr => ("**/c/**", "application/vnd+zarr"),
@@ -140,7 +140,8 @@ fn description(spec: &DatasetSpec, scenes: usize) -> String {
     )
 }
 
-/// Croissant 1.0 (<https://docs.mlcommons.org/croissant/docs/croissant-spec.html>).
+/// Returns Croissant 1.0 metadata
+/// (<https://docs.mlcommons.org/croissant/docs/croissant-spec.html>).
 fn croissant(
     name: &str,
     format: ExportFormat,
@@ -242,7 +243,7 @@ fn context() -> Value {
     })
 }
 
-/// How to open it.
+/// Returns instructions for opening the export.
 fn open(format: ExportFormat) -> &'static str {
     match format {
         ExportFormat::Zarr => {

@@ -1,4 +1,4 @@
-//! OpenEXR.
+//! OpenEXR images.
 
 use std::io::Cursor;
 
@@ -10,7 +10,7 @@ use exr::prelude::{
 use super::sb3d::Samples;
 use crate::error::DatasetError;
 
-/// An OpenEXR file with one channel, Y.
+/// Encodes an OpenEXR file with one channel, Y.
 pub(super) fn image(size: (usize, usize), samples: Samples) -> Result<Vec<u8>, DatasetError> {
     let samples = match samples {
         Samples::Half(values) => FlatSamples::F16(values),

@@ -1,4 +1,5 @@
-//! A scene as an HDF5 file: an array a dataset, with shuffle and gzip, readable by h5py, MATLAB and Julia.
+//! Encodes a scene as an HDF5 file: one dataset per array, with shuffle and gzip, readable by h5py,
+//! MATLAB and Julia.
 
 use hdf5_pure::{AttrValue, DatasetBuilder, FileBuilder};
 
@@ -6,12 +7,12 @@ use super::plain::{Plain, PlainScene, Values};
 use crate::error::DatasetError;
 use crate::layout::spec::DatasetSpec;
 
-/// gzip: beyond it, files shrink by a few per cent and take twice the time.
+/// gzip level. Higher levels shrink files by a few per cent and take twice the time.
 const LEVEL: u32 = 4;
 /// Side of a chunk in pixels.
 const SIDE: usize = 32;
 
-/// The file's bytes: a pure function of the scene.
+/// Returns the file's bytes, which are a pure function of the scene.
 pub(super) fn file(scene: &PlainScene, spec: &DatasetSpec) -> Result<Vec<u8>, DatasetError> {
     let mut file = FileBuilder::new();
     for array in &scene.arrays {
@@ -28,7 +29,7 @@ pub(super) fn file(scene: &PlainScene, spec: &DatasetSpec) -> Result<Vec<u8>, Da
         dataset.set_attr("long_name", AttrValue::String(array.about.into()));
     }
     let manifest = serde_json::to_string(&scene.manifest).expect("a manifest is plain data");
-    // Too long for an attribute, where many bins are saturated.
+    // If many bins are saturated, the manifest is too long for an attribute.
     file.create_dataset("manifest")
         .with_vlen_strings(&[&manifest]);
     let gate = &spec.gate;
@@ -53,7 +54,7 @@ fn fill(dataset: &mut DatasetBuilder, values: &Values) {
     };
 }
 
-/// Images and what is larger is chunked, by pixels.
+/// Returns the chunk shape: images and larger arrays are chunked by pixels.
 fn chunks(array: &Plain) -> Option<Vec<u64>> {
     let pixels = match (array.name, &array.shape[..]) {
         ("visibility", &[_, h, w]) => (h, w, 1),

@@ -1,6 +1,7 @@
-//! Data sets for other people: packed into few files, or in a layout that their tools know. Every export ends with a data
-//! card, a table of its scenes and Croissant metadata (`card.rs`), and goes on where it was interrupted: files are put
-//! create-only, and equal ones count as written.
+//! Exports data sets for other people: packed into few files, or in a layout that their tools
+//! support. Every export ends with a data card, a table of its scenes and Croissant metadata
+//! (`card.rs`). An interrupted export can be resumed: files are put create-only, and equal ones
+//! count as written.
 
 mod card;
 #[cfg(feature = "formats")]
@@ -33,41 +34,41 @@ use without_formats::file as hdf5_file;
 
 use card::Row;
 
-/// Scenes in a tar file of [`ExportFormat::WebDataset`].
+/// Number of scenes in a tar file of [`ExportFormat::WebDataset`].
 const TAR: usize = 8;
 
-/// What was written.
+/// Statistics of a finished export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Exported {
-    /// Scenes.
+    /// Number of scenes.
     pub scenes: u64,
-    /// Files.
+    /// Number of files.
     pub files: u64,
-    /// Their bytes.
+    /// Total size in bytes.
     pub bytes: u64,
-    /// SHA-256 over the names and contents of the files, in the order in which they are written.
+    /// SHA-256 over the names and contents of the files, in the order of writing.
     pub sha256: [u8; 32],
 }
 
 /// Layouts of an export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ExportFormat {
-    /// Zarr v3 with 16 scenes a file: chunks are copied, nothing is decoded.
+    /// Zarr v3 with 16 scenes per file. Chunks are copied without decoding.
     #[default]
     Zarr,
-    /// The paper's release: a folder a scene, histograms as OpenEXR images in halves.
+    /// The paper's release: a folder per scene, with histograms as half-precision OpenEXR images.
     Sb3d,
-    /// Tar files of 8 scenes with an `.npz` and a `.json` each, for the `webdataset` library.
+    /// Tar files of 8 scenes, with an `.npz` and a `.json` each, for the `webdataset` library.
     WebDataset,
-    /// An HDF5 file a scene, with shuffle and gzip.
+    /// One HDF5 file per scene, with shuffle and gzip.
     Hdf5,
 }
 
 impl ExportFormat {
-    /// All of them.
+    /// All formats.
     pub const ALL: [Self; 4] = [Self::Zarr, Self::Sb3d, Self::WebDataset, Self::Hdf5];
 
-    /// Its name in job files and on the command line.
+    /// Returns its name in job files and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Zarr => "zarr",
@@ -77,10 +78,10 @@ impl ExportFormat {
         }
     }
 
-    /// The format called `name`.
+    /// Returns the format called `name`.
     ///
     /// # Errors
-    /// A message that lists the names there are.
+    /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|f| f.name() == name);
         found.ok_or_else(|| {
@@ -90,7 +91,7 @@ impl ExportFormat {
     }
 }
 
-/// An export under way, in any format.
+/// An export in progress, in any format.
 pub struct Exporter<'a> {
     format: ExportFormat,
     source: &'a Dataset,
@@ -99,7 +100,7 @@ pub struct Exporter<'a> {
     rows: Vec<Row>,
 }
 
-/// Where files go, and what went there.
+/// The destination, and a record of the files written.
 struct Out<'a> {
     store: &'a dyn ObjectStore,
     prefix: Path,
@@ -123,8 +124,9 @@ impl<'a> Exporter<'a> {
     /// Exports the given scenes, in that order, to `prefix`.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where there are no scenes, or the format has no place for the data set: a histogram for
-    /// each spot, other than 4, 25 or 100 spots in the paper's layout.
+    /// [`DatasetError::Invalid`] if there are no scenes, or the format does not support the data
+    /// set: per-spot histograms, or, in the paper's layout, a number of spots other than 4, 25 or
+    /// 100.
     pub fn new(
         format: ExportFormat,
         source: &'a Dataset,
@@ -156,7 +158,7 @@ impl<'a> Exporter<'a> {
         })
     }
 
-    /// Number of [`Self::step`]s.
+    /// Returns the number of [`Self::step`]s.
     pub fn steps(&self) -> usize {
         match self.format {
             ExportFormat::Zarr => self.scenes.len().div_ceil(packed::PACK),
@@ -165,12 +167,13 @@ impl<'a> Exporter<'a> {
         }
     }
 
-    /// Does step `k`; they are done in their order.
+    /// Performs step `k`. Steps must be performed in order.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] if the destination is a folder of another kind;
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`] naming the source's object at fault;
-    /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
+    /// [`DatasetError::NotPublished`] or [`DatasetError::Damaged`] for a faulty object of the
+    /// source; [`DatasetError::Conflict`] if the destination contains different files;
+    /// [`DatasetError::Store`].
     pub async fn step(&mut self, k: usize) -> Result<(), DatasetError> {
         if k == 0 {
             self.check_folder().await?;
@@ -192,7 +195,7 @@ impl<'a> Exporter<'a> {
                     self.out.put(&format!("{folder}/{name}"), bytes).await?;
                 }
                 let manifest = self.source.manifest(scene).await?;
-                // With the slash, or else readers of tables take it for a number.
+                // The slash prevents table readers from parsing the name as a number.
                 self.note(&manifest, &format!("{folder}/"));
             }
             ExportFormat::Hdf5 => {
@@ -217,8 +220,8 @@ impl<'a> Exporter<'a> {
         Ok(())
     }
 
-    /// Checks that the destination is empty, a finished export (it has the metadata that every export ends with), or one of
-    /// this format that was interrupted.
+    /// Checks that the destination is empty, contains a finished export (with the metadata of every
+    /// export), or an interrupted one of this format.
     async fn check_folder(&self) -> Result<(), DatasetError> {
         let (store, prefix) = (self.out.store, &self.out.prefix);
         let names = folder::names(store, prefix).await?;
@@ -231,7 +234,7 @@ impl<'a> Exporter<'a> {
         }
     }
 
-    /// Whether an export of this format writes such a name before its Croissant metadata.
+    /// Returns whether an export of this format writes such a name before its Croissant metadata.
     fn writes(&self, name: &str) -> bool {
         let scene = |text: &str| text.len() >= 6 && text.bytes().all(|b| b.is_ascii_digit());
         if name == card::TABLE {
@@ -255,7 +258,7 @@ impl<'a> Exporter<'a> {
         self.out.done.scenes += 1;
     }
 
-    /// Writes what belongs to the whole, after all steps.
+    /// Writes the files of the whole export, after all steps.
     ///
     /// # Errors
     /// [`DatasetError::Conflict`], [`DatasetError::Store`].

@@ -1,5 +1,5 @@
-//! A data set packed for sharing: several scenes an object, so that whole data sets stay below the 100,000 files that
-//! public hosts allow. Coded chunks are copied as they are, not decoded: nothing is lost and little is computed.
+//! Packs several scenes into each object, so that whole data sets stay below the limit of 100,000
+//! files on public hosts. Encoded chunks are copied without decoding: this is lossless and cheap.
 
 use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
@@ -17,16 +17,16 @@ use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::{ArrayCodec, Dataset, root_metadata};
 use crate::store::objects;
 
-/// Version of the packed layout.
+/// Format version of the packed layout.
 const EXPORT_VERSION: u32 = 1;
-/// Scenes in an object.
+/// Number of scenes in an object.
 pub(super) const PACK: usize = 16;
-/// Requests in flight.
+/// Number of concurrent requests.
 const CONCURRENCY: usize = 8;
-/// Name of the array of the scenes' indices in the source.
+/// Name of the array with the scenes' indices in the source.
 const SOURCE_SCENE: &str = "source_scene";
 
-/// The source can be packed.
+/// Checks that the source can be packed.
 pub(super) fn check(source: &Dataset) -> Result<(), DatasetError> {
     if source.spec.per_spot {
         let what = "a histogram for each spot is too large to pack; reprocess the data set into one with the spots \
@@ -36,7 +36,8 @@ pub(super) fn check(source: &Dataset) -> Result<(), DatasetError> {
     Ok(())
 }
 
-/// Writes the objects of pack `k`, which holds `scenes`: one for each quantity, and the scenes' manifests, which it returns.
+/// Writes the objects of pack `k` with `scenes`: one per quantity, and one with the scenes'
+/// manifests, which are returned.
 pub(super) async fn pack(
     source: &Dataset,
     scenes: &[u64],
@@ -59,7 +60,8 @@ pub(super) async fn pack(
         let key = format!("{}/c/{k}{zeros}", array.layout.quantity.name());
         out.put(&key, bytes.into()).await?;
     }
-    // Straight to text, as manifests are stored: by way of a Value, 32-bit floats would get the digits of 64 bits.
+    // The manifests are serialized directly to text, like stored ones. Converting them to a `Value`
+    // would give 32-bit floats the digits of 64-bit floats.
     let mut text = serde_json::to_vec_pretty(&manifests).expect("manifests are plain data");
     text.push(b'\n');
     out.put(&format!("manifests/{k}.json"), text.into()).await?;
@@ -67,13 +69,13 @@ pub(super) async fn pack(
     Ok(manifests)
 }
 
-/// Whether scenes of a data set are packed into something of this name, directly below the export.
+/// Returns whether packed scenes of a data set use this name, directly below the export's folder.
 pub(super) fn writes(source: &Dataset, name: &str) -> bool {
     let mut arrays = source.arrays.iter();
     name == "manifests" || arrays.any(|array| array.layout.quantity.name() == name)
 }
 
-/// Writes the metadata, the root's last: the group exists once all packs do.
+/// Writes the metadata, the root's last: the group exists only once all packs do.
 pub(super) async fn finish(
     source: &Dataset,
     scenes: &[u64],
@@ -129,7 +131,7 @@ async fn put_source_scenes(scenes: &[u64], out: &mut Out<'_>) -> Result<Value, D
 }
 
 impl Dataset {
-    /// A scene's object as it lies in the store, checked against the manifest.
+    /// Reads a scene's stored object and checks it against the manifest.
     async fn object(&self, array: &ArrayCodec, manifest: &Manifest) -> Result<Bytes, DatasetError> {
         let key = array.layout.key(manifest.scene);
         let path = self.path(&key);
@@ -144,7 +146,7 @@ impl Dataset {
     }
 }
 
-/// The chunks of several scenes' objects in one shard.
+/// Joins the chunks of several scenes' objects in one shard.
 fn packed(layout: &Layout, objects: &[Bytes]) -> Result<Vec<u8>, DatasetError> {
     let each = inner_chunks(layout);
     let mut chunks = Vec::with_capacity(PACK * each);
@@ -165,7 +167,7 @@ fn packed(layout: &Layout, objects: &[Bytes]) -> Result<Vec<u8>, DatasetError> {
     shard::assemble_some(&chunks)
 }
 
-/// Inner chunks of one scene.
+/// Returns the number of inner chunks of one scene.
 fn inner_chunks(layout: &Layout) -> usize {
     match &layout.inner {
         None => 1,
@@ -176,7 +178,7 @@ fn inner_chunks(layout: &Layout) -> usize {
     }
 }
 
-/// An array's `zarr.json`, with shards of [`PACK`] scenes.
+/// Returns an array's `zarr.json`, with shards of [`PACK`] scenes.
 fn metadata(layout: &Layout, scenes: u64) -> Value {
     let with_scenes = |first: u64, rest: &[u64]| -> Vec<u64> {
         std::iter::once(first).chain(rest.iter().copied()).collect()
@@ -194,7 +196,7 @@ fn metadata(layout: &Layout, scenes: u64) -> Value {
     rename_manifests(&metadata)
 }
 
-/// Texts that say where a scene's manifest is say where it is now.
+/// Replaces the location of a scene's manifest in texts by its location in the export.
 fn rename_manifests(value: &Value) -> Value {
     let now = format!("manifests/<i//{PACK}>.json[i%{PACK}]");
     match value {

@@ -1,4 +1,5 @@
-//! A scene as plain arrays: decoded, with the names, shapes, units and descriptions that files for other tools carry.
+//! A scene as plain decoded arrays, with the names, shapes, units and descriptions for files of
+//! other tools.
 
 use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
@@ -30,7 +31,7 @@ pub(super) struct PlainScene {
     pub arrays: Vec<Plain>,
 }
 
-/// What the arrays hold.
+/// Returns a description of the array.
 pub(super) fn about(quantity: Quantity) -> &'static str {
     match quantity {
         Quantity::Transient => {
@@ -66,8 +67,8 @@ pub(super) fn about(quantity: Quantity) -> &'static str {
 }
 
 impl Dataset {
-    /// All arrays of a scene, decoded; those of which the scene's source had nothing are left out, and what it did not say
-    /// of the spots is NaN.
+    /// Decodes all arrays of a scene. Arrays that the scene's source did not have are omitted, and
+    /// its unknown values for spots are NaN.
     pub(super) async fn plain(&self, scene: u64) -> Result<PlainScene, DatasetError> {
         let manifest = self.manifest(scene).await?;
         let spec = *self.spec();

@@ -1,9 +1,11 @@
-//! A data set in the layout of the paper's release: a folder a scene with histograms as OpenEXR images.
+//! Exports a data set in the layout of the paper's release: a folder per scene, with histograms as
+//! OpenEXR images.
 //!
-//! `lidar_<spots>.exr` holds one half channel "Y", a pixel a line and a bin a column. Halves hold 11 bits between
-//! 6·10⁻⁵ and 65,504, so that the histograms are multiplied by a power of two that brings the scene's brightest bin
-//! to 16,384 at least and 32,768 at most. It stands in `picofarm.json`, with gate, intrinsics, spots and scale, for
-//! which the layout has no place. Compression is ZIP, which loses nothing (the release's DWAA does).
+//! `lidar_<spots>.exr` has one half-precision channel "Y", with a line per pixel and a column per
+//! bin. Halves have 11 bits of precision between 6·10⁻⁵ and 65,504, so the histograms are
+//! multiplied by a power of two that scales the scene's brightest bin to between 16,384 and 32,768.
+//! The factor is stored in `picofarm.json`, together with gate, intrinsics, spots and scale, which
+//! are not part of the layout. Compression is lossless ZIP (the release uses lossy DWAA).
 
 use std::io::{Cursor, Write};
 
@@ -30,24 +32,24 @@ use crate::scenes::dataset::Dataset;
     expect(dead_code, reason = "nothing reads them")
 )]
 pub(super) enum Samples {
-    /// 16 bits.
+    /// 16-bit floats.
     Half(Vec<f16>),
-    /// 32 bits.
+    /// 32-bit floats.
     Float(Vec<f32>),
 }
 
-/// Name of the file with what the layout has no place for.
+/// Name of the file with the data that the layout does not have.
 pub(crate) const ASIDE: &str = "picofarm.json";
-/// The brightest bin becomes so large at most.
+/// The maximum value of the brightest bin.
 const BRIGHTEST: f32 = 32_768.0;
 
-/// What the paper's layout has no place for.
+/// The data that the paper's layout does not have.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Aside {
     /// Always `picofarm-sb3d-1`.
     pub format: String,
-    /// What the histograms were multiplied by: a power of two.
+    /// The factor of the histograms, a power of two.
     pub factor: f32,
     pub gate: Gate,
     /// fx, fy, cx, cy.
@@ -56,13 +58,13 @@ pub(crate) struct Aside {
     pub camera: [[f32; 4]; 4],
     /// Laser origin, camera frame, metres.
     pub laser: [f32; 3],
-    /// Position, normal and path from the laser of each spot; null where a beam meets nothing.
+    /// Position, normal and path from the laser of each spot; null if a beam hits nothing.
     pub spots: Vec<Option<[f32; 7]>>,
     /// Photons per unit of the histogram before multiplication.
     pub photons_per_unit: f32,
-    /// Key of the task that made the scene.
+    /// Key of the task that produced the scene.
     pub task_key: String,
-    /// What is not known of the scene, as [`crate::Manifest::missing`] has it.
+    /// The scene's missing quantities, from [`crate::Manifest::missing`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub missing: Vec<String>,
 }
@@ -84,8 +86,8 @@ impl Aside {
 }
 
 impl Dataset {
-    /// A scene's files in the layout of the paper's release, for a folder of its own. The last one names what the others
-    /// have no place for: a folder with it is whole.
+    /// Returns a scene's files in the layout of the paper's release, for a separate folder. The
+    /// last one contains the data that the others do not have, and marks the folder as complete.
     pub(super) async fn sb3d_files(
         &self,
         scene: u64,
@@ -109,7 +111,7 @@ impl Dataset {
                 subset => subset.spots_of_100().len(),
             };
             let h = self.read_histogram(scene, quantity).await?;
-            // Fewer spots are less light: the whole is the brightest.
+            // Fewer spots give less light, so the histogram of all spots is the brightest.
             let factor = *factor.get_or_insert_with(|| factor_of(&h));
             let halves: Vec<f16> = h.par_iter().map(|h| f16::from_f32(h * factor)).collect();
             drop(h);
@@ -174,7 +176,7 @@ impl Out {
     }
 }
 
-/// The layout has a place for the data set.
+/// Checks that the layout supports the data set.
 pub(super) fn check(spec: &DatasetSpec) -> Result<(), DatasetError> {
     if [4, 25, 100].contains(&spec.spots) {
         return Ok(());
@@ -186,7 +188,8 @@ pub(super) fn check(spec: &DatasetSpec) -> Result<(), DatasetError> {
     Err(DatasetError::invalid("spec.spots", what))
 }
 
-/// A scene has what the layout has files of: a file of fill values could not be distinguished from the truth.
+/// Checks that the scene has the layout's quantities, because a file of fill values could not be
+/// distinguished from the truth.
 fn check_known(scene: u64, missing: &[String]) -> Result<(), DatasetError> {
     let filed = ["depth", "specular", "visibility"];
     let lacking: Vec<&str> = filed
@@ -204,19 +207,19 @@ fn check_known(scene: u64, missing: &[String]) -> Result<(), DatasetError> {
     Err(DatasetError::invalid("scenes", what))
 }
 
-/// The power of two that brings the brightest value to (BRIGHTEST/2, BRIGHTEST].
+/// Returns the power of two that scales the brightest value to [BRIGHTEST/2, BRIGHTEST).
 fn factor_of(h: &[f32]) -> f32 {
     let brightest = h.iter().fold(0.0f32, |m, x| m.max(*x));
     if brightest == 0.0 {
         return 1.0;
     }
     let (_, exponent) = libm::frexpf(brightest);
-    // brightest ≤ 2^exponent, and more than half of it unless it is that half.
+    // 2^(exponent - 1) ≤ brightest < 2^exponent.
     let (_, most) = libm::frexpf(BRIGHTEST);
     libm::ldexpf(1.0, (most - 1 - exponent).clamp(-100, 100))
 }
 
-/// A grey PNG, 255 where the mask is 1.
+/// Encodes a grey PNG, 255 where the mask is 1.
 fn grey(width: usize, height: usize, mask: &[u8]) -> Result<Vec<u8>, DatasetError> {
     let failed = |e: png::EncodingError| DatasetError::codec("cannot encode a PNG", e);
     let mut bytes = Vec::new();
@@ -230,7 +233,8 @@ fn grey(width: usize, height: usize, mask: &[u8]) -> Result<Vec<u8>, DatasetErro
     Ok(bytes)
 }
 
-/// A `.npz` with one array. The same bytes at any time: entries carry no date of today.
+/// Encodes a `.npz` with one array. The bytes are reproducible, because entries have no current
+/// date.
 fn zipped(name: &str, array: &[u8]) -> Result<Vec<u8>, DatasetError> {
     let failed = |e: String| DatasetError::codec("cannot encode a .npz file", e);
     let mut writer = zip::ZipWriter::new(Cursor::new(Vec::new()));

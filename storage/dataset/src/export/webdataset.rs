@@ -1,5 +1,5 @@
-//! Scenes as WebDataset samples in a tar file: `000017.npz` with the arrays, which numpy reads, and `000017.json` with the
-//! scene's manifest and the data set's gate.
+//! Scenes as WebDataset samples in a tar file: `000017.npz` with the arrays, for numpy, and
+//! `000017.json` with the scene's manifest and the data set's gate.
 
 use std::io::{Cursor, Write};
 
@@ -10,10 +10,10 @@ use crate::error::DatasetError;
 use crate::import::npy;
 use crate::layout::spec::DatasetSpec;
 
-/// Deflate: a sample is read as a whole, and written once.
+/// Deflate level. A sample is read as a whole, and written once.
 const LEVEL: i64 = 4;
 
-/// A tar file being filled. The same samples give the same bytes.
+/// A tar file under construction. The same samples give the same bytes.
 pub(super) struct Tar(tar::Builder<Vec<u8>>);
 
 fn failed(e: impl ToString) -> DatasetError {
@@ -52,7 +52,7 @@ impl Tar {
     }
 }
 
-/// The arrays as `numpy.load` takes them.
+/// Encodes the arrays for `numpy.load`.
 fn npz(arrays: &[Plain]) -> Result<Vec<u8>, DatasetError> {
     let failed = |e: String| DatasetError::codec("cannot encode a .npz file", e);
     let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));

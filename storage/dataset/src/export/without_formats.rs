@@ -1,9 +1,9 @@
-//! Errors that say that this program was built without OpenEXR and HDF5.
+//! Error messages of a program built without OpenEXR and HDF5.
 
 use super::{ExportFormat, plain::PlainScene, sb3d::Samples};
 use crate::{BUILD_WITH_FORMATS, WITHOUT_FORMATS, error::DatasetError, layout::spec::DatasetSpec};
 
-/// Refuses what this program cannot write, before anything is written.
+/// Returns an error for a format that this program cannot write, before anything is written.
 ///
 /// # Errors
 /// [`DatasetError::Invalid`] at `format`.
@@ -14,7 +14,7 @@ pub(super) fn check(format: ExportFormat) -> Result<(), DatasetError> {
     }
 }
 
-/// Says so.
+/// Returns the error.
 ///
 /// # Errors
 /// Always.
@@ -22,7 +22,7 @@ pub(super) fn image(_: (usize, usize), _: Samples) -> Result<Vec<u8>, DatasetErr
     Err(missing())
 }
 
-/// Says so.
+/// Returns the error.
 ///
 /// # Errors
 /// Always.

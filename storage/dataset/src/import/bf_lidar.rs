@@ -1,11 +1,14 @@
-//! Bounce-flash lidar captures: `spot_<i>.mat` with `dataCube` (pixels × bins of 8 ps, photon counts) for each laser
-//! spot, and `detector_scan*.mat` with the grid (`num_u`, `num_v`) and the rays (`thetaMap`, `phiMap`).
+//! Bounce-flash lidar captures: `spot_<i>.mat` with `dataCube` (pixels × bins of 8 ps, photon
+//! counts) for each laser spot, and `detector_scan*.mat` with the grid (`num_u`, `num_v`) and the
+//! rays (`thetaMap`, `phiMap`).
 //!
-//! A ray is (cos θ, sin φ sin θ, cos φ sin θ), with x to the left, y up and z forward; pixel u + v·num_u. The grid is
-//! regular in the plane z = 1, so that a pinhole camera fits, which is checked. Bin k (from 1) stands for the time
-//! k · 8 ps − t0. Neither t0 nor the laser's place are in the files.
+//! A ray is (cos θ, sin φ sin θ, cos φ sin θ), with x to the left, y up and z forward; its pixel is
+//! u + v·num_u. The grid is regular in the plane z = 1, so a pinhole camera fits, and this is
+//! checked. Bin k (from 1) has the time k · 8 ps − t0. The files contain neither t0 nor the laser's
+//! position.
 //!
-//! Two-bounce times and detections that lie beside them are taken along where all captures become one scene: [`two_bounce`].
+//! If all captures become one scene, two-bounce times and detections next to them are imported,
+//! too: [`two_bounce`].
 
 mod scan;
 mod two_bounce;
@@ -25,11 +28,12 @@ use scan::{Scan, scan_file};
 
 const LIGHT_M_S: f64 = 299_792_458.0;
 const BIN_S: f64 = 8e-12;
-/// The gate that is kept, where no other is asked for.
+/// The default start of the gate.
 const START_M: f64 = 0.9;
 const BINS: usize = 1502;
 
-/// The captures of a folder, by number: `spot_<i>.mat`. Those through a filter (`_NDF`) are other measurements.
+/// Returns the captures of a folder, by number: `spot_<i>.mat`. Captures through a filter (`_NDF`)
+/// are other measurements.
 fn captures(folder: &Path) -> Result<Vec<(u64, PathBuf)>, ImportError> {
     let (_, all) = files::entries(folder)?;
     let mut found: Vec<(u64, PathBuf)> = all
@@ -103,7 +107,7 @@ pub(super) fn shape(item: &Item, options: &ImportOptions) -> Result<Shape, Impor
     Ok(shape)
 }
 
-/// The shape, and the first bin kept.
+/// Returns the shape, and the first bin to keep.
 fn shape_of(
     file: &Path,
     cube: &Mat,
@@ -194,7 +198,7 @@ pub(super) fn read(
     };
     let laser = [-laser[0], -laser[1], laser[2]];
     let paths = chosen(item)?;
-    // Of one capture alone they are of no use.
+    // With a single capture they are useless.
     let given = match item.capture {
         None => two_bounce::files_of(&item.folder)?,
         Some(_) => None,
@@ -292,9 +296,9 @@ pub(super) fn read(
             checks.push(given.check);
         }
     }
-    // The spots were found along straight beams.
+    // The spots were computed from straight beams.
     scene.judge_beams(true);
-    // They are counts.
+    // The values are photon counts.
     scene.scale = Some(1.0);
     scene.missing.extend([
         "depth", "range", "specular", "normal", "instance", "label", "rgb", "camera",

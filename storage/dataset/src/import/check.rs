@@ -1,9 +1,10 @@
-//! Do the histograms fit the geometry? Two-bounce light from a lit spot must arrive at its time of flight.
+//! Checks that the histograms fit the geometry: two-bounce light from a lit spot must arrive at its
+//! time of flight.
 //!
-//! For a sample of pixels, the energy at the predicted bin of each lit spot, relative to the pixel's whole, is
-//! averaged; so is the energy some bins before and after. If gate, units, depth, spots, masks and image axes are what
-//! they are taken for, the average has its peak at the predicted bin. Where another reading of the same files fits
-//! better, the import is refused.
+//! For a sample of pixels, the energy at the predicted bin of each lit spot, relative to the
+//! pixel's total, is averaged. The same is done for some bins before and after. If gate, units,
+//! depth, spots, masks and image axes are interpreted correctly, the average peaks at the predicted
+//! bin. If another interpretation of the same files fits better, the import is refused.
 
 use std::path::Path;
 
@@ -18,13 +19,13 @@ use super::profile::{
 use super::vector::norm;
 use crate::layout::record::Spot;
 
-/// Spots may lie so far off the surface that the depth image shows, relative to their depth.
+/// Maximum distance of spots from the surface in the depth image, relative to their depth.
 const OFF_SURFACE: f64 = 0.05;
 
-/// Checks a scene and tells what was found.
+/// Checks a scene. Returns the results.
 ///
 /// # Errors
-/// [`ImportError::Refused`] with the reading that fits better, where there is one.
+/// [`ImportError::Refused`], with the interpretation that fits better, if there is one.
 pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, ImportError> {
     let surface = on_surface(g, blame)?;
     let own = Reading::default();
@@ -43,7 +44,8 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
             hint,
         ));
     }
-    // Masks of the wrong polarity must not make the gate look wrong: they come last.
+    // The polarity of the masks is checked last, because wrong masks must not be reported as a
+    // wrong gate.
     let step = step(g) as f64 * g.shape.gate.bin_width_m;
     let peak = all.peak();
     let clear = all.at(peak) > all.background() * CONTRAST;
@@ -111,7 +113,8 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
     }))
 }
 
-/// The spot whose two-bounce light stands out least, and its energy at the prediction relative to that around.
+/// Returns the spot with the weakest two-bounce light, and its energy at the prediction relative to
+/// the surroundings.
 fn weakest_spot(g: &Geometry<'_>) -> Option<(usize, f64)> {
     let of = |(mask, spot): (usize, &Option<Spot>)| -> Option<(usize, f64)> {
         let one = profile_of(g, Reading::default(), Which::Lit, &[(mask, (*spot)?)]);
@@ -122,12 +125,12 @@ fn weakest_spot(g: &Geometry<'_>) -> Option<(usize, f64)> {
     all.min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-/// Few digits: the manifest is for people, too.
+/// Rounds to few digits, because people also read the manifest.
 fn round(x: f64) -> f64 {
     libm::round(x * 1e6) / 1e6
 }
 
-/// Whether another reading fits better.
+/// Returns an error if another interpretation fits better.
 fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportError> {
     let depth = Reading {
         other_depth: true,
@@ -233,7 +236,9 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
     }
 }
 
-/// How far the spots lie off the depth image, between a pixel's depth and its neighbours': the median of |Δz|/z, where a spot is in view of a laser at the camera.
+/// Returns the distance of the spots from the depth image, as the median of |Δz|/z, where z is
+/// between a pixel's depth and its neighbours'. This requires a laser at the camera, so that the
+/// spots are visible.
 fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, ImportError> {
     if norm(g.laser.map(f64::from)) > 0.02 {
         return Ok(None);
@@ -256,7 +261,8 @@ fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, Import
         if depth <= 0.0 || g.specular[row * w + column] != 0 {
             continue;
         }
-        // A pixel's depth is its centre's: the spot lies between those around it.
+        // A pixel's depth belongs to its centre, so the spot's depth is between those of the
+        // surrounding pixels.
         let rows = row.saturating_sub(1)..(row + 2).min(h);
         let near = rows.flat_map(|r| {
             let columns = column.saturating_sub(1)..(column + 2).min(w);

@@ -1,25 +1,25 @@
-//! Why something cannot be imported: which file, which field, what was expected, and how to correct it.
+//! Import errors: the file, the field, the expected value, and how to correct it.
 
 use std::path::Path;
 
 use crate::error::DatasetError;
 use crate::store::failure::io_hint;
 
-/// An import that was refused or failed.
+/// A refused or failed import.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
-    /// The files say something else than they must, or than what was asked for.
+    /// The content of the files is invalid, or differs from the request.
     #[error("{file}: {field}: expected {expected}, found {found}; {hint}")]
     Refused {
         /// The file or folder.
         file: String,
-        /// What in it: a field, an array, a property.
+        /// The field, array or property.
         field: String,
-        /// What it should be.
+        /// The expected value.
         expected: String,
-        /// What it is.
+        /// The actual value.
         found: String,
-        /// What to do: an option that overrides, or how to convert the file.
+        /// What to do: an option that overrides the value, or how to convert the file.
         hint: String,
     },
     /// A file cannot be decoded.
@@ -27,12 +27,12 @@ pub enum ImportError {
     Unreadable {
         /// The file.
         file: String,
-        /// What is wrong with it.
+        /// A description of the problem.
         what: String,
         /// How to repair or convert it.
         hint: String,
     },
-    /// An option that the format has no use for.
+    /// The format does not use this option.
     #[error(
         "{option}: {format} data say this themselves, or have no such thing; leave the option out"
     )]
@@ -42,24 +42,24 @@ pub enum ImportError {
         /// The format's name.
         format: &'static str,
     },
-    /// A file that may not be opened, or cannot be.
+    /// A file that must not be opened, or cannot be.
     #[error("{error}{}", file_hint(error))]
     File {
-        /// Which and why.
+        /// The file and the reason.
         #[from]
         error: picofarm_files::FileError,
     },
     /// A file operation failed.
     #[error("cannot {action} {path}{}: {source}", io_hint(source).map(|h| format!(" ({h})")).unwrap_or_default())]
     Io {
-        /// E.g. `read`.
+        /// The operation, e.g. `read`.
         action: &'static str,
         /// The path.
         path: String,
-        /// The system's account.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// The data set refused what was made of the files.
+    /// The data set rejected the converted scene.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
 }

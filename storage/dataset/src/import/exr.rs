@@ -1,4 +1,4 @@
-//! OpenEXR: any compression that the `exr` crate decodes, DWAA among them.
+//! Decodes OpenEXR with any compression that the `exr` crate supports, including DWAA.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -16,10 +16,11 @@ const MEND_EXR: &str = "convert it to scan lines of one resolution with ZIP comp
                         import OpenEXR; f = OpenEXR.File(path); f.header()['compression'] = OpenEXR.ZIP_COMPRESSION; \
                         f.write(path)";
 
-/// Values that a byte of an OpenEXR file stands for at most: images of one colour under the best of its compressions.
+/// Maximum number of values per byte of an OpenEXR file: an image of one colour under the best of
+/// its compressions.
 const RATIO: usize = 1 << 12;
 
-/// Width and height of an OpenEXR file's only layer.
+/// Returns the width and height of an OpenEXR file's only layer.
 pub(super) fn exr_size(file: &Path, files: &Files) -> Result<(usize, usize), ImportError> {
     let reader = std::io::BufReader::new(files.open(file)?);
     let meta = exr::meta::MetaData::read_from_buffered(reader, false);
@@ -31,9 +32,9 @@ pub(super) fn exr_size(file: &Path, files: &Files) -> Result<(usize, usize), Imp
     Ok((size.width(), size.height()))
 }
 
-/// Decodes an OpenEXR file on rayon's threads.
+/// Decodes an OpenEXR file on rayon threads.
 ///
-/// Room is made for at most [`RATIO`] times the file's size.
+/// It allocates at most [`RATIO`] values per byte of the file.
 pub(super) fn exr(file: &Path, bytes: &[u8]) -> Result<Exr, ImportError> {
     let failed = |e: exr::error::Error| ImportError::unreadable(file, e, MEND_EXR);
     let reader = exr::block::read(Cursor::new(bytes), false).map_err(failed)?;
@@ -85,7 +86,7 @@ pub(super) fn exr(file: &Path, bytes: &[u8]) -> Result<Exr, ImportError> {
         let what = format!("expected {} blocks, found {}", targets.len(), all.len());
         return Err(ImportError::unreadable(file, what, MEND_EXR));
     }
-    // Blocks may stand in any order in the file.
+    // The file may contain the blocks in any order.
     let mut slots: Vec<Option<Vec<&mut [f32]>>> = targets.into_iter().map(Some).collect();
     let mut work = Vec::with_capacity(all.len());
     for chunk in all {
@@ -165,7 +166,7 @@ mod tests {
         }
         let said = exr(Path::new("a.exr"), &bomb).unwrap_err().to_string();
         assert!(said.contains("a.exr"), "{said}");
-        // The library notices first that the chunks are too few for such an image.
+        // The library first notices that there are too few chunks for such an image.
         assert!(said.contains("chunk count"), "{said}");
     }
 }

@@ -1,4 +1,4 @@
-//! The files of a scene: read whole, and remembered with their SHA-256.
+//! The files of a scene, which are read as a whole and recorded with their SHA-256.
 
 use std::cell::RefCell;
 use std::fs::File;
@@ -11,21 +11,21 @@ use sha2::{Digest, Sha256};
 
 use super::ImportError;
 
-/// Largest file that is read whole, bytes.
+/// Maximum size in bytes of a file read as a whole.
 const MOST: u64 = 16 << 30;
 
-/// A file that a scene was made of.
+/// A source file of a scene.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct SourceFile {
-    /// Path below the imported folder, with `/` between its parts.
+    /// Path relative to the imported folder, with `/` as separator.
     pub name: String,
-    /// Size.
+    /// Size in bytes.
     pub bytes: u64,
-    /// SHA-256, hexadecimal.
+    /// SHA-256, in hexadecimal.
     pub sha256: String,
 }
 
-/// The files of one scene that were read so far.
+/// The files of one scene that have been read.
 pub(super) struct Files {
     root: PathBuf,
     opener: Opener,
@@ -41,7 +41,8 @@ impl Files {
         }
     }
 
-    /// The path of the file that a file in `folder` names: below the folder, without `..`.
+    /// Returns the path of a file named by a file in `folder`. It must be inside the folder,
+    /// without `..`.
     pub fn named(&self, folder: &Path, name: &str) -> Result<PathBuf, ImportError> {
         use std::path::Component::{CurDir, Normal};
         let path = Opener::named(folder, name)?;
@@ -56,19 +57,19 @@ impl Files {
         Ok(path)
     }
 
-    /// An open file.
+    /// Opens a file.
     pub fn open(&self, path: &Path) -> Result<File, ImportError> {
         Ok(self.opener.open(path)?)
     }
 
-    /// The bytes of a file; `what` it is for goes into the error.
+    /// Reads a file. Its purpose `what` is part of an error.
     pub fn bytes(&self, path: &Path) -> Result<Vec<u8>, ImportError> {
         let bytes = self.opener.read(path, MOST)?;
         self.remember(path, bytes.len() as u64, &Sha256::digest(&bytes));
         Ok(bytes)
     }
 
-    /// Remembers a file that its decoder reads by itself, piece by piece.
+    /// Records a file that its decoder reads by itself, piece by piece.
     pub fn hash(&self, path: &Path) -> Result<(), ImportError> {
         let failed = |e| ImportError::io("read", path, e);
         let mut file = self.open(path)?;
@@ -94,7 +95,7 @@ impl Files {
         });
     }
 
-    /// A path as provenance names it.
+    /// Formats a path for the provenance.
     pub fn name(&self, path: &Path) -> String {
         let below = path.strip_prefix(&self.root).unwrap_or(path);
         let parts: Vec<_> = below
@@ -104,7 +105,7 @@ impl Files {
         parts.join("/")
     }
 
-    /// All files read, by name, each once.
+    /// Returns all files read, by name, without duplicates.
     pub fn into_list(self) -> Vec<SourceFile> {
         let mut files = self.read.into_inner();
         files.sort();
@@ -113,7 +114,7 @@ impl Files {
     }
 }
 
-/// The entries of a folder by name: (folders, files).
+/// Returns the entries of a folder by name: (folders, files).
 pub(super) fn entries(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>), ImportError> {
     let failed = |e| ImportError::io("list", folder, e);
     let (mut folders, mut files) = (Vec::new(), Vec::new());

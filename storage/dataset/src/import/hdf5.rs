@@ -1,31 +1,31 @@
-//! HDF5 as MATLAB writes it: numeric arrays in the root group.
+//! Reads MATLAB's HDF5 files: numeric arrays in the root group.
 
 use std::path::Path;
 
 use hdf5_pure::{Error, File};
 
-/// An open file; arrays stay on disk until they are read.
+/// An open file. Arrays stay on disk until they are read.
 pub(super) struct Hdf5(Box<File>);
 
 impl Hdf5 {
     /// Opens a file.
     ///
     /// # Errors
-    /// What the library says.
+    /// The library's message.
     pub fn open(path: &Path) -> Result<Self, String> {
         let opened = File::open_streaming(path).map_err(said)?;
         Ok(Self(Box::new(opened)))
     }
 
-    /// Names of the arrays.
+    /// Returns the names of the arrays.
     pub fn names(&self) -> Vec<String> {
         self.0.root().datasets().unwrap_or_default()
     }
 
-    /// Shape of an array, slowest axis first; `None` where there is none of this name.
+    /// Returns the shape of an array, slowest axis first; `None` if there is none of this name.
     ///
     /// # Errors
-    /// What the library says.
+    /// The library's message.
     pub fn shape(&self, name: &str) -> Result<Option<Vec<u64>>, String> {
         let Ok(set) = self.0.dataset(name) else {
             return Ok(None);
@@ -33,18 +33,18 @@ impl Hdf5 {
         set.shape().map(Some).map_err(said)
     }
 
-    /// A whole array.
+    /// Reads a whole array.
     ///
     /// # Errors
-    /// What the library says.
+    /// The library's message.
     pub fn all(&self, name: &str) -> Result<Vec<f64>, String> {
         self.0.dataset(name).map_err(said)?.read_f64().map_err(said)
     }
 
-    /// `n` rows of the slowest axis from `first` on.
+    /// Reads `n` rows of the slowest axis, beginning at `first`.
     ///
     /// # Errors
-    /// What the library says.
+    /// The library's message.
     pub fn rows(&self, name: &str, first: u64, n: u64) -> Result<Vec<f64>, String> {
         let set = self.0.dataset(name).map_err(said)?;
         set.read_f64_rows(first, n).map_err(said)

@@ -29,8 +29,8 @@ pub(super) struct Exr {
     pub channels: Vec<Channel>,
 }
 
-/// The first channel of an 8-bit PNG of `width` × `height` pixels; grey is its only one. An image of another size is
-/// refused before it is unpacked.
+/// Reads the first channel of an 8-bit PNG of `width` × `height` pixels, which may be grey. An
+/// image of another size is refused before decompression.
 pub(super) fn png(
     file: &Path,
     bytes: &[u8],

@@ -1,23 +1,24 @@
-//! The orders in which the entries of visibility masks may stand.
+//! The possible orders of the entries in visibility masks.
 
-/// The order in which the masks' entries are taken.
+/// An order of the masks' entries.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) enum Masks {
-    /// As they stand.
+    /// The order in the file.
     #[default]
     AsTheyStand,
-    /// Rows for columns.
+    /// Rows and columns swapped.
     Transposed,
-    /// Columns, rows or both from their other end.
+    /// Columns, rows or both reversed.
     Turned([bool; 2]),
-    /// The last spot first.
+    /// Spots reversed.
     LastSpotFirst,
-    /// The spots of a square grid, rows for columns.
+    /// Rows and columns of the square grid of spots swapped.
     SpotsTransposed,
 }
 
 impl Masks {
-    /// Where the entry of a spot and a pixel (row, column) stands in masks of (spots, rows, columns).
+    /// Returns the index of the entry of a spot and a pixel (row, column), in masks of shape
+    /// (spots, rows, columns).
     pub fn place(
         self,
         spot: usize,
@@ -26,7 +27,7 @@ impl Masks {
     ) -> usize {
         let (spot, row, column) = match self {
             Self::AsTheyStand => (spot, row, column),
-            // Only where both sides are equal.
+            // Only if both sides are equal.
             Self::Transposed => (spot, column, row),
             Self::Turned([x, y]) => (spot, flipped(row, h, y), flipped(column, w, x)),
             Self::LastSpotFirst => (spots - 1 - spot, row, column),
@@ -38,7 +39,7 @@ impl Masks {
         (spot * h + row) * w + column
     }
 
-    /// The other orders that masks of this shape could have.
+    /// Returns the other possible orders of masks of this shape.
     pub(super) fn others(spots: usize, h: usize, w: usize) -> Vec<(Self, &'static str)> {
         let mut all = vec![
             (Self::Turned([true, false]), "columns from right to left"),
@@ -61,7 +62,7 @@ impl Masks {
     }
 }
 
-/// A position, counted from the other end if `flip`.
+/// Returns the position counted from the other end if `flip` is set.
 pub(super) fn flipped(at: usize, size: usize, flip: bool) -> usize {
     if flip { size - 1 - at } else { at }
 }

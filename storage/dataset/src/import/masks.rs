@@ -1,5 +1,6 @@
-//! Do the visibility masks fit the histograms? Two-bounce light of a spot arrives where its mask says lit, and not where it
-//! says shadow. Masks of the wrong polarity, order of spots, or order of rows and columns mix both.
+//! Checks that the visibility masks fit the histograms: two-bounce light of a spot arrives at
+//! pixels marked as lit, and not at those in shadow. With a wrong polarity, order of spots, or
+//! order of rows and columns, both are mixed.
 
 use super::ImportError;
 use super::mask_order::Masks;
@@ -7,10 +8,11 @@ use super::profile::{
     BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Profile, Reading, Which, profile,
 };
 
-/// Share of the lit pixels' light by which another order must separate lit from shadow to be believed.
+/// Share of the lit pixels' light by which another order must separate lit from shadow to be
+/// believed.
 const CLEAR: f64 = 0.25;
 
-/// Masks the wrong way round light up where no light arrives.
+/// Checks the polarity: masks with the wrong one mark pixels as lit where no light arrives.
 pub(super) fn polarity(
     g: &Geometry<'_>,
     blame: &Blame<'_>,
@@ -40,8 +42,9 @@ pub(super) fn polarity(
     ))
 }
 
-/// Whether the masks separate lit from shadow better in another order. By how much they do as they stand: the light that
-/// stands out at lit pixels, less that at pixels in shadow; `None` where there are no masks, or no shadows.
+/// Checks whether another order of the masks separates lit from shadow better. Returns the
+/// separation in the file's order: the excess light at lit pixels, minus that at pixels in shadow;
+/// `None` if there are no masks or no shadows.
 ///
 /// # Errors
 /// [`ImportError::Refused`] with the order that fits better.

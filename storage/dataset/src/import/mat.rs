@@ -1,4 +1,4 @@
-//! MATLAB's files: numeric arrays of version 5 (plain or compressed) and of version 7.3 (HDF5).
+//! Reads MATLAB files: numeric arrays of version 5 (plain or compressed) and of version 7.3 (HDF5).
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -33,7 +33,7 @@ enum Content {
 }
 
 impl Mat {
-    /// Opens a file; version 7.3 stays on disk until an array is read.
+    /// Opens a file. With version 7.3, arrays stay on disk until they are read.
     pub fn open(path: &Path, files: &Files) -> Result<Self, ImportError> {
         let mut head = Vec::new();
         let io = |e| ImportError::io("read", path, e);
@@ -57,7 +57,7 @@ impl Mat {
         })
     }
 
-    /// Dimensions of an array as MATLAB tells them.
+    /// Returns the dimensions of an array in MATLAB's order.
     pub fn dims(&self, name: &str) -> Result<Vec<usize>, ImportError> {
         match &self.content {
             Content::V5(arrays) => arrays
@@ -72,7 +72,7 @@ impl Mat {
         }
     }
 
-    /// A whole array.
+    /// Reads a whole array.
     pub fn matrix(&self, name: &str) -> Result<Matrix, ImportError> {
         let dims = self.dims(name)?;
         match &self.content {
@@ -85,7 +85,7 @@ impl Mat {
         }
     }
 
-    /// A single number.
+    /// Reads a single number.
     pub fn number(&self, name: &str) -> Result<f64, ImportError> {
         let matrix = self.matrix(name)?;
         match matrix.values[..] {
@@ -103,7 +103,8 @@ impl Mat {
         }
     }
 
-    /// Some columns of a matrix `[row, column]` as `[row][column]`, reading no more than needed.
+    /// Reads some columns of a matrix `[row, column]` as `[row][column]`, without reading the
+    /// others.
     pub fn columns(&self, name: &str, columns: Range<usize>) -> Result<Vec<f32>, ImportError> {
         let dims = self.dims(name)?;
         let rows = dims[0];
@@ -121,7 +122,7 @@ impl Mat {
                 }
             }
             Content::V73(file) => {
-                // HDF5 tells the axes the other way round: a column is a row there.
+                // HDF5 has the reverse order of axes: a column is a row there.
                 const AT_ONCE: usize = 64;
                 for first in columns.clone().step_by(AT_ONCE) {
                     let n = AT_ONCE.min(columns.end - first);
@@ -136,7 +137,8 @@ impl Mat {
         Ok(out)
     }
 
-    /// Refuses to make room for what is announced and too much: nothing of it need be in the file.
+    /// Returns an error if the announced size is too large to allocate, because the file need not
+    /// contain the announced data.
     fn check_size(&self, name: &str, dims: &[usize]) -> Result<(), ImportError> {
         let count = dims.iter().try_fold(1usize, |n, d| n.checked_mul(*d));
         if count.is_some_and(|count| count <= MAX_VALUES) {
@@ -165,22 +167,23 @@ impl Mat {
     }
 }
 
-/// Bytes at which an HDF5 file may begin, doubling from 512 on: before it stands what another program keeps there.
+/// Offsets at which HDF5 data may begin: 0, or 512 and its doubles. Other programs may store their
+/// own data before it.
 const HDF5_AT: std::ops::Range<u64> = 0..4096;
 
-/// Whether these first bytes of a file are HDF5's.
+/// Returns whether the file's first bytes contain the HDF5 signature.
 fn is_hdf5(head: &[u8]) -> bool {
     let begins = |at: u64| head[(at as usize).min(head.len())..].starts_with(b"\x89HDF\r\n\x1a\n");
     begins(HDF5_AT.start) || [512, 1024, 2048, HDF5_AT.end].into_iter().any(begins)
 }
 
-/// One element: type and contents.
+/// One element: its type and contents.
 struct Element<'a> {
     kind: u32,
     data: &'a [u8],
 }
 
-/// Reads elements one after the other.
+/// An iterator over elements.
 struct Elements<'a> {
     rest: &'a [u8],
     big: bool,
@@ -233,12 +236,12 @@ impl<'a> Elements<'a> {
 
 const MATRIX: u32 = 14;
 const COMPRESSED: u32 = 15;
-/// A compressed element may grow to so many bytes.
+/// Maximum size in bytes of a decompressed element.
 const MAX: u64 = 1 << 32;
-/// Most values that are read of an array.
+/// Maximum number of values of an array.
 const MAX_VALUES: usize = 1 << 28;
 
-/// The numeric arrays of a version 5 file; others (text, structures, cells) are passed over.
+/// Returns the numeric arrays of a version 5 file; others (text, structures, cells) are skipped.
 fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {
     let big = &bytes[126..128] == b"MI";
     let mut arrays = BTreeMap::new();
@@ -268,7 +271,7 @@ fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {
     Ok(arrays)
 }
 
-/// Unpacks a compressed element, whose first eight bytes announce what follows.
+/// Decompresses an element. Its first eight decompressed bytes are a tag with its size.
 fn inflate(packed: &[u8], big: bool) -> Result<Vec<u8>, String> {
     let failed = |e: std::io::Error| format!("a compressed element {e}");
     let mut reader = flate2::read::ZlibDecoder::new(packed);
@@ -280,7 +283,7 @@ fn inflate(packed: &[u8], big: bool) -> Result<Vec<u8>, String> {
     } else {
         u32::from_le_bytes(size)
     });
-    // Deflate packs no better: a larger announcement is none that is kept.
+    // Deflate cannot compress better, so a larger announcement is false.
     let most = (packed.len() as u64).saturating_mul(1032).min(MAX);
     let rest = picofarm_files::read_entry(reader.take(size), size, most).map_err(failed)?;
     Ok([&tag[..], &rest].concat())
@@ -293,7 +296,7 @@ fn matrix(data: &[u8], big: bool) -> Result<Option<(String, Matrix)>, String> {
     }
     let flags = numbers(&parts.expect()?, big)?;
     let class = flags.first().copied().unwrap_or(0.0) as u32 & 0xff;
-    // Double to 64-bit integers.
+    // From double to 64-bit integers.
     if !(6..=15).contains(&class) {
         return Ok(None);
     }
@@ -362,7 +365,7 @@ mod tests {
             zlib.finish().unwrap()
         };
         assert_eq!(inflate(&packed(64, 64), false).unwrap().len(), 72);
-        // What stands behind is not unpacked at all.
+        // Data after the announced size is not decompressed at all.
         assert_eq!(inflate(&packed(64, 64 << 20), false).unwrap().len(), 72);
         for (announced, holds) in [(4_000_000_000, 64), (1 << 20, 64)] {
             let said = inflate(&packed(announced, holds), false).unwrap_err();

@@ -1,8 +1,10 @@
-//! Other people's data in our layout. What the files say is read, what a format is known for is checked against them
-//! (see `check.rs`), and what does not fit is refused by name; nothing is guessed.
+//! Imports other people's data into our layout. The content of the files is checked against the
+//! known conventions of the format (see `check.rs`). Mismatches are refused with an error that
+//! names the field; nothing is guessed.
 //!
-//! [`import_scene`] is a pure function of the files and options. The manifest of an imported scene names the format,
-//! the files with their SHA-256, and everything that was converted or is missing.
+//! [`import_scene`] is a pure function of the files and options. The manifest of an imported scene
+//! contains the format, the files with their SHA-256, and a list of all conversions and missing
+//! quantities.
 
 mod bf_lidar;
 mod check;
@@ -43,10 +45,10 @@ use scene::Shape;
 
 use crate::layout::spec::{DatasetSpec, Profile, Wavelength};
 
-/// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
+/// Version of the import. It changes whenever the same files could give different bytes.
 pub const IMPORT_VERSION: &str = "import-4";
 
-/// Scenes in a folder that can be imported.
+/// A folder of importable scenes.
 #[derive(Debug, Clone)]
 pub struct Source {
     root: PathBuf,
@@ -57,13 +59,13 @@ pub struct Source {
     shape: Shape,
 }
 
-/// Where a scene of a source lies.
+/// The location of a source's scene.
 #[derive(Debug, Clone)]
 struct Item {
     name: String,
     /// The scene's folder.
     folder: PathBuf,
-    /// Which capture of the folder; `None` = all of it.
+    /// The capture in the folder; `None` = all captures.
     capture: Option<usize>,
     opener: Opener,
 }
@@ -82,20 +84,20 @@ impl Item {
         }
     }
 
-    /// The files of its folder.
+    /// Returns a reader of its folder's files.
     fn files(&self) -> Files {
         Files::new(&self.folder, &self.opener)
     }
 }
 
 impl Source {
-    /// Looks for scenes in `root` and its folders, in the order of their names; with `names`, these scenes in this
-    /// order. The first scene's files say what the data set's properties will be. `format` = `None`: whichever is
-    /// found.
+    /// Finds scenes in `root` and its folders, ordered by name. With `names`, uses only these
+    /// scenes in this order. The first scene's files determine the data set's properties. If
+    /// `format` is `None`, it is detected.
     ///
     /// # Errors
-    /// [`ImportError::Refused`] where there is nothing of the format, or of several; where the first scene's files or
-    /// the options do not fit the format; [`ImportError::Io`].
+    /// [`ImportError::Refused`] if there are no scenes of the format, or scenes of several; if the
+    /// first scene's files or the options do not fit the format; [`ImportError::Io`].
     pub fn open(
         root: &Path,
         format: Option<Format>,
@@ -105,7 +107,8 @@ impl Source {
         Self::open_within(root, format, options, names, &Opener::anywhere())
     }
 
-    /// As [`Self::open`], where only files that `opener` opens are read, wherever links in the folder lead.
+    /// Like [`Self::open`], but only reads files that `opener` permits, after resolving links in
+    /// the folder.
     ///
     /// # Errors
     /// Also [`ImportError::File`].
@@ -155,29 +158,29 @@ impl Source {
         })
     }
 
-    /// Its format.
+    /// Returns the format.
     pub fn format(&self) -> Format {
         self.format
     }
 
-    /// Number of scenes.
+    /// Returns the number of scenes.
     pub fn scenes(&self) -> u64 {
         self.items.len() as u64
     }
 
-    /// The index of the scene called `name`.
+    /// Returns the index of the scene called `name`.
     pub fn index_of(&self, name: &str) -> Option<u64> {
         let found = self.items.iter().position(|i| i.name == name);
         found.map(|i| i as u64)
     }
 
-    /// Name of a scene: its folder below the source's, and the capture in it.
+    /// Returns the name of a scene: its folder relative to the source, and its capture.
     pub fn name(&self, index: u64) -> Option<&str> {
         let item = self.items.get(usize::try_from(index).ok()?);
         item.map(|i| i.name.as_str())
     }
 
-    /// The data set that holds the scenes.
+    /// Returns the properties of a data set for the scenes.
     pub fn spec(&self, profile: Profile) -> DatasetSpec {
         DatasetSpec {
             scenes: self.scenes(),
@@ -194,7 +197,8 @@ impl Source {
     }
 }
 
-/// Reads, checks and converts a scene. Blocks; decodes on rayon's threads. Holds one scene in memory.
+/// Reads, checks and converts a scene. It blocks while rayon threads decode, and needs memory for
+/// one scene.
 ///
 /// # Errors
 /// [`ImportError`] naming file and field; there is no such scene.
@@ -288,7 +292,7 @@ fn looks_like(format: Format) -> &'static str {
     }
 }
 
-/// The folders that `is_scene`: the root itself, or those in it.
+/// Returns the folders for which `is_scene` is true: the root itself, or those in it.
 fn folders_with(
     root: &Path,
     opener: &Opener,
@@ -306,7 +310,7 @@ fn folders_with(
     Ok(scenes)
 }
 
-/// The named ones, in that order.
+/// Returns the named items, in that order.
 fn choose(root: &Path, items: Vec<Item>, names: &[String]) -> Result<Vec<Item>, ImportError> {
     let mut by_name: std::collections::BTreeMap<String, Item> =
         items.into_iter().map(|i| (i.name.clone(), i)).collect();

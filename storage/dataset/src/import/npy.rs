@@ -1,4 +1,5 @@
-//! NumPy's files: `.npy` of any numeric type, and `.npz` of them. Values come out as f32 in C order.
+//! Reads NumPy files: `.npy` of any numeric type, and `.npz` archives of them. Values are returned
+//! as f32 in C order.
 
 use std::io::{Cursor, Read};
 use std::path::Path;
@@ -23,16 +24,16 @@ pub(crate) struct Array {
 const FIXED: usize = 10;
 const HINT: &str = "save it again with numpy.save, as an array of numbers";
 
-/// What a header says.
+/// A parsed header.
 struct Header {
     shape: Vec<usize>,
     stored: String,
     fortran: bool,
-    /// Where the values begin.
+    /// Offset of the values.
     end: usize,
 }
 
-/// The shape of the array in a `.npy` file.
+/// Returns the shape of the array in a `.npy` file.
 pub(super) fn peek(file: &Path, files: &Files) -> Result<Vec<usize>, ImportError> {
     let failed = |e| ImportError::io("read", file, e);
     let opened = files.open(file)?;
@@ -44,7 +45,7 @@ pub(super) fn peek(file: &Path, files: &Files) -> Result<Vec<usize>, ImportError
     Ok(header(file, &head)?.shape)
 }
 
-/// Reads a `.npy` file.
+/// Parses a `.npy` file.
 pub(crate) fn parse(file: &Path, bytes: &[u8]) -> Result<Array, ImportError> {
     let damaged = |what: String| ImportError::unreadable(file, what, HINT);
     let Header {
@@ -105,7 +106,7 @@ fn header(file: &Path, bytes: &[u8]) -> Result<Header, ImportError> {
 
 /// Reads the array `name` of a `.npz` file.
 ///
-/// What it holds is unpacked only if it announces at most `values` numbers.
+/// It is decompressed only if it announces at most `values` numbers.
 pub(super) fn parse_npz(
     file: &Path,
     bytes: &[u8],
@@ -134,7 +135,7 @@ pub(super) fn parse_npz(
     let packed = archive
         .by_name(&entry)
         .map_err(|e| damaged(format!("{entry}: {e}")))?;
-    // The widest numbers, and a header.
+    // Space for the widest number type, and a header.
     let most = (values as u64).saturating_mul(8).saturating_add(1 << 20);
     let announced = packed.size();
     let inner = picofarm_files::read_entry(packed, announced, most)
@@ -142,7 +143,7 @@ pub(super) fn parse_npz(
     parse(&file.join(entry), &inner)
 }
 
-/// A `.npy` file of 32-bit floats or bytes, in C order.
+/// Writes a `.npy` file of 32-bit floats or bytes, in C order.
 pub(crate) fn write<T: bytemuck::Pod>(descr: &str, shape: &[usize], values: &[T]) -> Vec<u8> {
     let sides: String = shape.iter().map(|s| format!("{s}, ")).collect();
     let shape = match shape.len() {
@@ -180,7 +181,7 @@ fn shape(header: &str) -> Option<Vec<usize>> {
     sides.map(|s| s.parse().ok()).collect()
 }
 
-/// `count` numbers of the named type.
+/// Decodes `count` numbers of the named type.
 fn decode(stored: &str, data: &[u8], count: usize) -> Result<Vec<f32>, String> {
     macro_rules! numbers {
         ($type:ty, $to_f32:expr) => {{
@@ -222,7 +223,7 @@ fn decode(stored: &str, data: &[u8], count: usize) -> Result<Vec<f32>, String> {
     }
 }
 
-/// Column-major values as row-major ones.
+/// Converts column-major values to row-major order.
 pub(super) fn from_fortran(shape: &[usize], values: &[f32]) -> Vec<f32> {
     let mut strides = vec![1; shape.len()];
     for axis in 1..shape.len() {

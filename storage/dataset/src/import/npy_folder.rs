@@ -1,4 +1,5 @@
-//! Our own minimal layout: `scene.json`, which says everything, and the `.npy` files that it names.
+//! Imports our minimal layout: `scene.json` with a complete description, and the `.npy` files that
+//! it names.
 
 mod about;
 
@@ -20,7 +21,7 @@ use about::About;
 
 const SCENE: &str = "scene.json";
 
-/// `scene.json`. Nothing has a default: what is left out is not there.
+/// `scene.json`. There are no defaults: an omitted quantity does not exist.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Description {
@@ -32,13 +33,14 @@ struct Description {
     camera: Camera,
     /// Laser origin in the camera's axes.
     laser: [f64; 3],
-    /// `[spot][3]`: where the beams meet the scene, in the camera's axes; NaN where one meets nothing.
+    /// `[spot][3]`: where the beams hit the scene, in the camera's axes; NaN if one hits nothing.
     spots: Spots,
-    /// Without it the histogram cannot be checked.
+    /// Without depth, the histogram cannot be checked.
     depth: Option<Depth>,
     /// `[spot][row][column]`.
     visibility: Option<Visibility>,
-    /// `[spot][row][column]`: measured path of each spot's two-bounce light, in the length unit; 0 = not measured.
+    /// `[spot][row][column]`: measured path of each spot's two-bounce light, in the length unit;
+    /// 0 = not measured.
     two_bounce: Option<File>,
     /// `[row][column]`, 1 = mirror.
     specular: Option<File>,
@@ -50,7 +52,7 @@ struct Description {
     label: Option<File>,
     /// `[row][column][3]`, linear, 0 to 1.
     rgb_linear: Option<File>,
-    /// Photons per unit of the histogram, where known.
+    /// Photons per unit of the histogram, if known.
     photons_per_unit: Option<f32>,
 }
 
@@ -64,7 +66,8 @@ struct File {
 #[serde(deny_unknown_fields)]
 struct Spots {
     file: String,
-    /// `[spot]`: length of each beam from the laser, in the length unit; with the reflections, where mirrors fold it.
+    /// `[spot]`: length of each beam from the laser, in the length unit, including reflections in
+    /// mirrors.
     paths: Option<String>,
 }
 
@@ -90,7 +93,7 @@ struct Camera {
     cy: f64,
     /// Coordinates of the centre of the first pixel: 0 or 0.5.
     pixel_centre: f64,
-    /// Where x, y and z point: `right` or `left`, `down` or `up`, `forward` or `backward`.
+    /// The directions of x, y and z: `right` or `left`, `down` or `up`, `forward` or `backward`.
     axes: [String; 3],
     /// Camera-to-world matrix, points as columns, translation in the length unit.
     to_world: Option<[[f64; 4]; 4]>,
@@ -240,7 +243,7 @@ pub(super) fn read(
     }
     match &is.instance {
         None => scene.missing.push("instance"),
-        // 32-bit floats count so far exactly.
+        // 32-bit floats represent integers exactly up to this limit.
         Some(f) => scene.instance = about.counts(&f.file, &[h, w], (1 << 24) as f32, files)?,
     }
     match &is.label {
@@ -276,7 +279,7 @@ pub(super) fn read(
     Ok(scene)
 }
 
-/// Whether light comes when the geometry says.
+/// Checks that light arrives at the times predicted from the geometry.
 fn checked(
     about: &About,
     depth: &Depth,

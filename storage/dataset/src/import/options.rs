@@ -1,29 +1,30 @@
-//! What the person who imports says: the format, and what overrides what the files say or what the format is known for.
+//! Options of an import: the format, and overrides of values in the files or conventions of the
+//! format.
 
 use serde::{Deserialize, Serialize};
 
 use super::ImportError;
 
-/// Known ways to lay measured or rendered data out.
+/// Supported layouts of measured or rendered data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Format {
-    /// The paper's release: `lidar_{4,25,100}.exr`, `depth.exr`, `specular_mask.png`, `shadows_v1.npz` and
-    /// `lights_camera_frame.npy` in a folder for each scene.
+    /// The paper's release: `lidar_{4,25,100}.exr`, `depth.exr`, `specular_mask.png`,
+    /// `shadows_v1.npz` and `lights_camera_frame.npy` in a folder per scene.
     Sb3d,
-    /// PlatoNeRF's simulated captures: `transforms_train.json` and a `.npy` for each illumination spot.
+    /// PlatoNeRF's simulated captures: `transforms_train.json` and a `.npy` per illumination spot.
     Platonerf,
-    /// Bounce-flash lidar captures: `spot_*.mat` with a `dataCube` each, and `detector_scan*.mat`.
+    /// Bounce-flash lidar captures: `spot_*.mat`, each with a `dataCube`, and `detector_scan*.mat`.
     BfLidar,
-    /// `scene.json` and `.npy` files in a folder for each scene: our own minimal layout.
+    /// `scene.json` and `.npy` files in a folder per scene: our own minimal layout.
     Npy,
 }
 
 impl Format {
-    /// All of them.
+    /// All formats.
     pub const ALL: [Self; 4] = [Self::Sb3d, Self::Platonerf, Self::BfLidar, Self::Npy];
 
-    /// Its name on the command line and in provenance.
+    /// Returns its name on the command line and in provenance.
     pub fn name(self) -> &'static str {
         match self {
             Self::Sb3d => "sb3d",
@@ -33,10 +34,10 @@ impl Format {
         }
     }
 
-    /// The format called `name`.
+    /// Returns the format called `name`.
     ///
     /// # Errors
-    /// A message that lists the names there are.
+    /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|f| f.name() == name);
         found.ok_or_else(|| {
@@ -46,17 +47,17 @@ impl Format {
     }
 }
 
-/// What 1 means in a mask of visibility.
+/// The meaning of 1 in a visibility mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Polarity {
     /// The spot lights the pixel.
     Lit,
-    /// The pixel lies in shadow.
+    /// The pixel is in shadow.
     Shadow,
 }
 
-/// What a depth image holds.
+/// The content of a depth image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DepthKind {
@@ -66,18 +67,18 @@ pub enum DepthKind {
     Range,
 }
 
-/// How captures of single spots become scenes.
+/// The assignment of single-spot captures to scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Captures {
-    /// Each is a scene with one spot.
+    /// Each capture is a scene with one spot.
     #[default]
     Separate,
-    /// All of a folder are summed into one scene with all spots.
+    /// All captures of a folder are summed into one scene with all spots.
     Sum,
 }
 
-/// Overrides; what is `None` is taken from the files, or from the format's definition, and checked.
+/// Overrides. A `None` value is taken from the files or from the format's conventions, and checked.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ImportOptions {
@@ -96,32 +97,32 @@ pub struct ImportOptions {
     /// Metres in the unit of depth and positions.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub length_unit_m: Option<f64>,
-    /// What 1 means in the masks of visibility.
+    /// The meaning of 1 in visibility masks.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub visibility: Option<Polarity>,
-    /// What the depth image holds.
+    /// The content of the depth image.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthKind>,
-    /// Which of the paper's spot counts to take.
+    /// The paper's spot count to import.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub spots: Option<u32>,
-    /// Laser origin, metres, in the detector's frame as the files have it.
+    /// Laser origin in metres, in the detector frame of the files.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub laser_m: Option<[f64; 3]>,
-    /// Time of arrival at no distance, seconds.
+    /// Arrival time at zero distance, in seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub t0_s: Option<f64>,
-    /// How captures become scenes.
+    /// The assignment of captures to scenes.
     pub captures: Captures,
-    /// No mirror folds a beam: each goes straight from the laser to its spot.
+    /// No mirrors reflect the beams: each goes straight from the laser to its spot.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub straight_beams: bool,
-    /// Leave the cross-check of histograms against geometry out.
+    /// Skip the cross-check of histograms against geometry.
     pub unchecked: bool,
 }
 
 impl ImportOptions {
-    /// Refuses options without a use for the format, and values that cannot be.
+    /// Returns an error for options that the format does not use, and for invalid values.
     pub(super) fn check(&self, format: Format) -> Result<(), ImportError> {
         use Format::{BfLidar, Npy, Platonerf, Sb3d};
         let given: [(&'static str, bool, &[Format]); 12] = [

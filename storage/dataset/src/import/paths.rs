@@ -1,5 +1,5 @@
-//! Do two-bounce paths that files bring along fit depth and spots? With depth they follow from it; without, the paths of a
-//! pixel's spots must give one depth.
+//! Checks that two-bounce paths in the files fit depth and spots. With depth, the paths are
+//! computed from it; without, the paths of a pixel's spots must give a single depth.
 
 use std::path::Path;
 
@@ -11,24 +11,28 @@ use super::{
     vector::{distance, dot, norm},
 };
 
-/// Pixels in the sample, at most about.
+/// Approximate maximum number of pixels in the sample.
 const SAMPLE: usize = 2048;
-/// Spots that a pixel's paths need where no depth is known: fewer give one depth always.
+/// Minimum number of spots per pixel if no depth is known, because fewer always give a single
+/// depth.
 const FEWEST_SPOTS: usize = 3;
-/// Paths for a judgement, of all spots and of one.
+/// Minimum number of paths for a verdict, over all spots and for one.
 const FEWEST: usize = 50;
-/// The median difference that cannot be right: so many bins, and at least so many metres.
+/// Median differences above this are errors: this number of bins, and at least this number of
+/// metres.
 const RESIDUAL: [f64; 2] = [2.0, 0.1];
-/// The same of one spot's, which is also so many times that of all.
+/// The limit for a single spot's median difference, which must also be this multiple of the median
+/// over all spots to be an error.
 const SPOT: [f64; 2] = [3.0, 0.15];
 const SPOT_TIMES: f64 = 4.0;
-/// The same of what all paths have in common, where depth is known.
+/// The limit for the common offset of all paths if depth is known.
 const OFFSET: [f64; 2] = [1.5, 0.05];
 
-/// Compares the paths of a scene with its geometry: the figures, or null where too few can be compared.
+/// Compares the paths of a scene with its geometry. Returns the results, or null if too few can be
+/// compared.
 ///
 /// # Errors
-/// [`ImportError::Refused`] for paths that cannot be right.
+/// [`ImportError::Refused`] for paths that cannot be correct.
 pub(super) fn check(scene: &ImportedScene, file: &Path) -> Result<Value, ImportError> {
     let found = compare(scene);
     let mut all: Vec<f64> = found.iter().flatten().copied().collect();
@@ -87,7 +91,7 @@ fn has_depth(scene: &ImportedScene) -> bool {
     !scene.missing.contains(&"depth")
 }
 
-/// Of each spot, how much longer its paths are than geometry has them.
+/// Returns, for each spot, how much longer its paths are than the geometry predicts.
 fn compare(scene: &ImportedScene) -> Vec<Vec<f64>> {
     let shape = &scene.shape;
     let (w, h) = (shape.width as usize, shape.height as usize);
@@ -137,13 +141,13 @@ fn compare(scene: &ImportedScene) -> Vec<Vec<f64>> {
     late
 }
 
-/// The upper median; NaN of nothing.
+/// Returns the upper median; NaN for an empty slice.
 fn median(of: &mut [f64]) -> f64 {
     of.sort_by(f64::total_cmp);
     of.get(of.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-/// Few digits: the manifest is for people, too.
+/// Rounds to few digits, because people also read the manifest.
 fn round(x: f64) -> f64 {
     libm::round(x * 1e6) / 1e6
 }

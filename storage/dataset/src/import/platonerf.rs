@@ -1,10 +1,11 @@
-//! PlatoNeRF's simulated captures: `transforms_train.json` and, for each illumination spot, a `.npy` file
-//! `[row][column][bin]` of half floats.
+//! PlatoNeRF's simulated captures: `transforms_train.json` and, for each illumination spot, a
+//! `.npy` file `[row][column][bin]` of half floats.
 //!
-//! The field of view is in degrees (NeRF's own convention is radians). Light is given in a world with x right, y up,
-//! z backward; of the camera's matrix, rows x and z have the wrong sign, which their code turns round after loading.
-//! The files say no gate: 15 m from 0 in bins of 0.0384 m. Depth and shadows are not there. What can be checked is:
-//! light of one bounce is brightest where the laser points at.
+//! The field of view is in degrees (NeRF's own convention is radians). Lights are given in a world
+//! with x right, y up, z backward. In the camera's matrix, rows x and z have the wrong sign, which
+//! their code corrects after loading. The files do not contain the gate: 15 m from 0 in bins of
+//! 0.0384 m. They have no depth or shadows. What can be checked: one-bounce light is brightest at
+//! the laser's target.
 
 use std::path::{Path, PathBuf};
 
@@ -21,7 +22,7 @@ use crate::layout::record::Intrinsics;
 use crate::layout::spec::{Gate, Subsets};
 
 const TRANSFORMS: &str = "transforms_train.json";
-/// The brightest pixel may be so far from where the laser points at.
+/// Maximum distance in pixels of the brightest pixel from the laser's target.
 const NEAR_PX: f64 = 3.0;
 
 #[derive(Debug, Deserialize)]
@@ -42,7 +43,7 @@ struct Frame {
     wall_idx_light: Value,
 }
 
-/// A plane that spots lie on.
+/// A plane with spots.
 #[derive(Debug, Clone, Deserialize)]
 struct Wall {
     /// Normal.
@@ -160,7 +161,7 @@ fn shape_of(
     })
 }
 
-/// Horizontal field of view in degrees.
+/// Returns the horizontal field of view in degrees.
 fn fov(path: &Path, transforms: &Transforms, options: &ImportOptions) -> Result<f64, ImportError> {
     if let Some(degrees) = options.fov_deg {
         return Ok(degrees);
@@ -261,7 +262,7 @@ pub(super) fn read(
     scene.conversions = conversions;
     scene.laser = pose.in_camera(frames[0].light_origin).map(|x| x as f32);
     scene.set_spots(&positions);
-    // The spots were found along straight beams.
+    // The spots were computed from straight beams.
     scene.judge_beams(true);
     scene.camera = pose.ours();
     scene.missing.extend([
@@ -318,10 +319,10 @@ impl Pose {
         })
     }
 
-    /// A vector of the world in our camera axes.
+    /// Returns a vector of the world in our camera axes.
     fn turned(&self, v: [f64; 3]) -> [f64; 3] {
         let along = |axis: usize| (0..3).map(|r| self.rotation[r][axis] * v[r]).sum::<f64>();
-        // 0 - x: no negative zeros.
+        // 0 - x avoids negative zeros.
         [along(0), 0.0 - along(1), 0.0 - along(2)]
     }
 
@@ -329,7 +330,7 @@ impl Pose {
         self.turned([0, 1, 2].map(|k| p[k] - self.centre[k]))
     }
 
-    /// Camera-to-world for our camera axes.
+    /// Returns camera-to-world for our camera axes.
     fn ours(&self) -> [[f32; 4]; 4] {
         let mut m = super::scene::IDENTITY;
         for (row, out) in m.iter_mut().enumerate().take(3) {
@@ -340,13 +341,13 @@ impl Pose {
     }
 }
 
-/// Where light of one bounce comes from.
+/// The source of one-bounce light.
 struct Spotted {
-    /// Camera frame.
+    /// Position in the camera frame.
     position: [f64; 3],
     /// Path of the brightest bin.
     path_m: f64,
-    /// Column and row of the brightest pixel's centre, and where the spot projects to.
+    /// Column and row of the brightest pixel's centre, and the projection of the spot.
     brightest: [f64; 2],
     projected: [f64; 2],
 }
@@ -436,7 +437,8 @@ impl Spotted {
     }
 }
 
-/// The point of a ray from which light that came along it reaches the origin after `path` in all.
+/// Returns the point on a ray from which light that came along the ray reaches the origin after
+/// `path` in total.
 pub(super) fn along(origin: [f64; 3], d: [f64; 3], path: f64) -> [f64; 3] {
     let dot: f64 = origin.iter().zip(&d).map(|(a, b)| a * b).sum();
     let square: f64 = origin.iter().map(|x| x * x).sum();

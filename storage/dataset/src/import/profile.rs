@@ -1,4 +1,4 @@
-//! The energy of histograms around the bins at which geometry predicts two-bounce light.
+//! The energy of histograms around the bins predicted for two-bounce light by the geometry.
 
 use std::path::Path;
 
@@ -7,54 +7,55 @@ use super::scene::{Shape, direction};
 use super::vector::{distance, norm};
 use crate::layout::record::{Intrinsics, Spot};
 
-/// Pixels in the sample, at most about.
+/// Approximate maximum number of pixels in the sample.
 const SAMPLE: usize = 2048;
-/// Bins before and after the predicted one that are looked at.
+/// Number of bins examined before and after the predicted one.
 const REACH: isize = 20;
-/// The peak may be so many steps away from the prediction.
+/// Maximum distance of the peak from the prediction, in steps.
 pub(super) const TOLERANCE: isize = 1;
-/// A step is a bin, or as many bins as are about so long: pulses of real lasers are longer than their bins.
+/// Length of a step in metres. A step is at least one bin. It may be several, because pulses of
+/// real lasers are longer than their bins.
 const STEP_M: f64 = 0.0384;
-/// Pairs of pixel and spot for a judgement.
+/// Minimum number of pairs of pixel and spot for a verdict.
 pub(super) const MIN_PAIRS: usize = 200;
-/// The peak stands out from its surroundings by this factor at least.
+/// Minimum ratio of the peak to its surroundings.
 pub(super) const CONTRAST: f64 = 1.3;
-/// Another reading must fit better by this factor to be believed.
+/// Minimum ratio by which another interpretation must fit better to be believed.
 pub(super) const BETTER: f64 = 1.15;
 
-/// Everything a prediction needs.
+/// The inputs of a prediction.
 pub(super) struct Geometry<'a> {
     pub shape: &'a Shape,
     pub transient: &'a [f32],
-    /// z-depth.
+    /// z-depth in metres.
     pub depth: &'a [f32],
-    /// Whether it was computed from distances along the rays.
+    /// Whether the depth was computed from distances along the rays.
     pub of_range: bool,
     pub intrinsics: Intrinsics,
-    /// Metres, camera frame.
+    /// Laser origin in metres, in the camera frame.
     pub laser: [f32; 3],
     pub spots: &'a [Option<Spot>],
-    /// `[spot][row][column]`, 1 = lit; `None` where the files do not say.
+    /// `[spot][row][column]`, 1 = lit; `None` if unknown.
     pub visibility: Option<&'a [u8]>,
     pub specular: &'a [u8],
 }
 
-/// The files that are at fault if the check fails, and the options that would override them.
+/// The files to name if the check fails, and the options to override them.
 pub(super) struct Blame<'a> {
     pub histogram: &'a Path,
     pub depth: &'a Path,
     pub spots: &'a Path,
     pub visibility: &'a Path,
-    /// How geometry and gate are given in this format.
+    /// How the format specifies geometry and gate.
     pub hint: &'a str,
-    /// How the masks' polarity is given.
+    /// How the format specifies the masks' polarity.
     pub polarity: &'a str,
 }
 
-/// Another way to read the same files.
+/// Another interpretation of the same files.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Reading {
-    /// The depth image holds the other kind of depth.
+    /// The depth image contains the other kind of depth.
     pub other_depth: bool,
     pub flip_spots: [bool; 2],
     pub flip_image: [bool; 2],
@@ -72,25 +73,25 @@ impl Profile {
         self.energy[(shift + REACH) as usize] / self.pairs.max(1) as f64
     }
 
-    /// The shift with the most energy.
+    /// Returns the shift with the most energy.
     pub(super) fn peak(&self) -> isize {
         let all = -REACH..=REACH;
         all.max_by(|a, b| self.at(*a).total_cmp(&self.at(*b)))
             .expect("not empty")
     }
 
-    /// The best of the tolerated shifts.
+    /// Returns the highest energy among the tolerated shifts.
     pub fn hit(&self) -> f64 {
         let near = (-TOLERANCE..=TOLERANCE).map(|s| self.at(s));
         near.fold(0.0, f64::max)
     }
 
-    /// What stands out at the prediction.
+    /// Returns the excess energy at the prediction.
     pub fn excess(&self) -> f64 {
         self.hit() - self.background()
     }
 
-    /// Median of the shifts farther off.
+    /// Returns the median energy of more distant shifts.
     pub fn background(&self) -> f64 {
         let far = (-REACH..=REACH).filter(|s| s.abs() > 2 * TOLERANCE + 2);
         let mut far: Vec<f64> = far.map(|s| self.at(s)).collect();
@@ -99,7 +100,7 @@ impl Profile {
     }
 }
 
-/// Which pairs of pixel and spot.
+/// A selection of pairs of pixel and spot.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Which {
     All,
@@ -107,20 +108,20 @@ pub(super) enum Which {
     Dark,
 }
 
-/// Bins in a step.
+/// Returns the number of bins in a step.
 pub(super) fn step(g: &Geometry<'_>) -> usize {
     let width = g.shape.gate.bin_width_m;
     (libm::round(STEP_M / width) as usize).clamp(1, g.shape.gate.bins as usize)
 }
 
-/// The energy around the predictions in a sample of pixels.
+/// Computes the energy around the predictions in a sample of pixels.
 pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
     let spots = g.spots.iter().enumerate();
     let spots: Vec<(usize, Spot)> = spots.filter_map(|(i, s)| Some((i, (*s)?))).collect();
     profile_of(g, reading, which, &spots)
 }
 
-/// The same of these spots alone: each with the number of its mask.
+/// Like [`profile`], for these spots only, each with the index of its mask.
 pub(super) fn profile_of(
     g: &Geometry<'_>,
     reading: Reading,

@@ -1,4 +1,5 @@
-//! Imported scenes in a data set: coded with their provenance, and found again when an import goes on.
+//! Publishes imported scenes in a data set with their provenance, and finds them again when an
+//! import is resumed.
 
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
@@ -11,8 +12,8 @@ use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
 
 impl Source {
-    /// Codes an imported scene as scene `at` of the data set; publish it with [`Dataset::publish_encoded`]. Blocks;
-    /// works on rayon's threads.
+    /// Encodes an imported scene as scene `at` of the data set; publish it with
+    /// [`Dataset::publish_encoded`]. It blocks while rayon threads encode.
     ///
     /// # Errors
     /// [`ImportError::Dataset`].
@@ -40,12 +41,13 @@ impl Source {
         Ok(encoded?)
     }
 
-    /// The manifest of scene `at` of the data set if this import has published its scene `index` there before: from the
-    /// same files by name and size, with the same options. With `rehash`, the files' contents are compared too.
+    /// Returns the manifest of scene `at` of the data set if this import has already published its
+    /// scene `index` there: from the same files by name and size, with the same options. With
+    /// `rehash`, the files' contents are also compared.
     ///
     /// # Errors
-    /// [`ImportError::Refused`] where the data set holds something else under this index;
-    /// [`ImportError::Dataset`] where a published scene is damaged.
+    /// [`ImportError::Refused`] if the data set contains another scene at this index;
+    /// [`ImportError::Dataset`] if a published scene is damaged.
     pub async fn finished(
         &self,
         dataset: &Dataset,
@@ -56,7 +58,7 @@ impl Source {
         let manifest = match dataset.published(at).await {
             Ok(Some(manifest)) => manifest,
             Ok(None) => return Ok(None),
-            // Importing it again restores what is missing, or tells what is wrong.
+            // Importing it again restores missing objects, or reports the problem.
             Err(DatasetError::Damaged { .. }) => return Ok(None),
             Err(error) => return Err(error.into()),
         };

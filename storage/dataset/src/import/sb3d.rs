@@ -1,10 +1,13 @@
-//! The paper's release: a folder a scene with `lidar_{4,25,100}.exr` (one half channel "Y", a pixel a line, a bin a
-//! column), `depth.exr`, `specular_mask.png`, `shadows_v1.npz` and `lights_camera_frame.npy`.
+//! The paper's release: a folder per scene with `lidar_{4,25,100}.exr` (one half-precision channel
+//! "Y", a line per pixel, a column per bin), `depth.exr`, `specular_mask.png`, `shadows_v1.npz` and
+//! `lights_camera_frame.npy`.
 //!
-//! The files say neither gate nor intrinsics, nor which way round their masks and axes are. What the paper and its
-//! code use is taken and then checked against the histograms: path from 1 m in bins of 0.0384 m; 90° across the
-//! width; camera and laser at the origin, x right, y down; masks 1 = lit; z-depth in metres; the 4 and 25 spots are
-//! those of [`Quantity::spots_of_100`]. Where our own export has left `picofarm.json`, that says most of it.
+//! The files contain neither gate nor intrinsics, nor the orientation of their masks and axes. The
+//! conventions of the paper and its code are used and then checked against the histograms: path
+//! from 1 m in bins of 0.0384 m; 90° across the width; camera and laser at the origin, x right, y
+//! down; masks 1 = lit; z-depth in metres; the 4 and 25 spots are those of
+//! [`Quantity::spots_of_100`]. If our own export has left a `picofarm.json`, it provides most of
+//! these.
 
 use std::path::{Path, PathBuf};
 
@@ -23,7 +26,7 @@ const DEPTH: &str = "depth.exr";
 const SPECULAR: &str = "specular_mask.png";
 const SHADOWS: &str = "shadows_v1.npz";
 const LIGHTS: &str = "lights_camera_frame.npy";
-/// Grey level from which a pixel is a mirror (the paper's code: 0.1 of white).
+/// Minimum grey level of a mirror pixel (the paper's code: 0.1 of white).
 const MIRROR: u8 = 26;
 const GRID: usize = 100;
 /// The paper's gate; the number of bins is read from the files.
@@ -49,7 +52,7 @@ pub(super) fn find(root: &Path, opener: &Opener) -> Result<Vec<Item>, ImportErro
     super::folders_with(root, opener, |folder| !counts_there(folder).is_empty())
 }
 
-/// Which histograms become the scene's: its own, and the subsets'.
+/// Returns the spot count of the scene's own histogram, and the subsets to import.
 fn chosen(item: &Item, options: &ImportOptions) -> Result<(u32, Subsets), ImportError> {
     let there = counts_there(&item.folder);
     let most = there.last().copied();
@@ -79,7 +82,7 @@ fn chosen(item: &Item, options: &ImportOptions) -> Result<(u32, Subsets), Import
     Ok((main, subsets))
 }
 
-/// What our own export says beside the paper's files.
+/// Reads the additional file of our own export.
 fn aside(item: &Item, files: &Files) -> Result<Option<Aside>, ImportError> {
     let path = item.folder.join(ASIDE);
     if !path.is_file() {
@@ -218,7 +221,7 @@ pub(super) fn read(
             (scene.laser, scene.camera) = (aside.laser, aside.camera);
             scene.scale = Some(aside.photons_per_unit);
             scene.spots = aside.spots();
-            // The layout's files tell of nothing else.
+            // The layout's files have no other quantities that may be unknown.
             let of_spots = ["spots.normal", "spots.path", "camera"].into_iter();
             let unknown = of_spots.filter(|name| aside.missing.iter().any(|m| m == name));
             scene.missing.extend(unknown);
@@ -256,14 +259,15 @@ pub(super) fn read(
     Ok(scene)
 }
 
-/// Takes back what our own export multiplied by, exactly: a power of two.
+/// Divides by the factor of our own export. The division is exact, because the factor is a power of
+/// two.
 fn unscale(h: &mut [f32], aside: Option<&Aside>) {
     if let Some(aside) = aside {
         h.iter_mut().for_each(|h| *h /= aside.factor);
     }
 }
 
-/// The histograms of a `lidar_*.exr`.
+/// Reads the histograms of a `lidar_*.exr`.
 fn histogram(
     file: &Path,
     shape: &Shape,
@@ -311,7 +315,8 @@ fn histogram(
     Ok(channel.values)
 }
 
-/// Light of fewer spots is less light (rendered anew, so give or take its noise).
+/// Checks that fewer spots have less light. They may have been rendered separately, so noise is
+/// tolerated.
 fn not_more(file: &Path, few: u32, h: &[f32], many: u32, all: &[f32]) -> Result<(), ImportError> {
     let sum = |h: &[f32]| h.iter().map(|x| f64::from(*x)).sum::<f64>();
     let (few_sum, all_sum) = (sum(h), sum(all));
@@ -327,7 +332,7 @@ fn not_more(file: &Path, few: u32, h: &[f32], many: u32, all: &[f32]) -> Result<
     ))
 }
 
-/// Depth from the only channel, or from one of several equal ones.
+/// Reads depth from the only channel, or from one of several equal ones.
 fn depth(file: &Path, files: &Files) -> Result<Vec<f32>, ImportError> {
     let mut exr = image::exr(file, &files.bytes(file)?)?;
     exr.channels
@@ -377,7 +382,8 @@ fn specular(file: &Path, scene: &mut ImportedScene, files: &Files) -> Result<(),
     Ok(())
 }
 
-/// Positions of the scene's spots; the file has those of the whole grid, or just these.
+/// Reads the positions of the scene's spots. The file contains those of the whole grid, or just
+/// these.
 fn lights(file: &Path, spots: u32, files: &Files) -> Result<Vec<[f32; 3]>, ImportError> {
     let array = npy::parse(file, &files.bytes(file)?)?;
     let n = array.shape.first().copied().unwrap_or(0);
@@ -396,7 +402,7 @@ fn lights(file: &Path, spots: u32, files: &Files) -> Result<Vec<[f32; 3]>, Impor
     Ok(of_grid(spots, n).into_iter().map(|s| all[s]).collect())
 }
 
-/// Which of the `n` entries of a file the spots are.
+/// Returns the indices of the spots among the `n` entries of a file.
 fn of_grid(spots: u32, n: usize) -> Vec<usize> {
     let some = match (spots, n) {
         (4, GRID) => Quantity::Transient4.spots_of_100(),

@@ -1,4 +1,4 @@
-//! A scene as read from files, in our units and axes, and ready to be coded.
+//! A scene read from files, in our units and axes, ready for encoding.
 
 use std::path::Path;
 
@@ -11,13 +11,13 @@ use crate::layout::quantity::Quantity;
 use crate::layout::record::{Intrinsics, SceneRecord, Spot, SubsetRecord};
 use crate::layout::spec::{Gate, Subsets};
 
-/// Photons in the median pixel's brightest bin: the convention for the stored scale.
+/// Photons in the median pixel's brightest bin, by convention for the stored scale.
 const PEAK_PHOTONS: f32 = 400.0;
-/// Negative energy, relative to the whole, that a lossy code may have left.
+/// Maximum negative energy, relative to the total, that a lossy code may have caused.
 const NEGATIVE: f64 = 0.01;
-/// The name under which lengths of beams are listed as missing.
+/// The name under which unknown lengths of beams are listed as missing.
 const PATHS: &str = "spots.path";
-/// Depths beyond are the sky.
+/// Larger depths are sky.
 const SKY_M: f32 = 1e4;
 
 /// Sizes that all scenes of a data set share.
@@ -27,7 +27,7 @@ pub(super) struct Shape {
     pub width: u32,
     pub spots: u32,
     pub subsets: Subsets,
-    /// Whether two-bounce paths came with it.
+    /// Whether the source has two-bounce paths.
     pub two_bounce: bool,
     pub gate: Gate,
 }
@@ -37,7 +37,7 @@ impl Shape {
         self.height as usize * self.width as usize
     }
 
-    /// The first field in which `other` differs: (field, ours, theirs).
+    /// Returns the first field that differs in `other`: (field, ours, theirs).
     pub fn difference(&self, other: &Self) -> Option<(&'static str, String, String)> {
         let pairs = [
             ("height", self.height.to_string(), other.height.to_string()),
@@ -63,18 +63,18 @@ impl Shape {
     }
 }
 
-/// A scene read, checked and converted.
+/// A scene that was read, checked and converted.
 #[derive(Debug, Clone)]
 pub struct ImportedScene {
     /// Its name in the source.
     pub name: String,
-    /// The files it was made of.
+    /// Its source files.
     pub files: Vec<SourceFile>,
-    /// What was converted, in words.
+    /// Descriptions of the conversions.
     pub conversions: Vec<String>,
     /// Quantities that the source does not have; they are stored as zeros.
     pub missing: Vec<&'static str>,
-    /// What the cross-check found; null where it was left out.
+    /// Results of the cross-check; null if it was skipped.
     pub check: Value,
     pub(super) shape: Shape,
     pub(super) transient: Vec<f32>,
@@ -86,19 +86,19 @@ pub struct ImportedScene {
     pub(super) label: Vec<u16>,
     pub(super) specular: Vec<u8>,
     pub(super) visibility: Vec<u8>,
-    /// `[spot][row][column]`, metres; empty where the shape has none.
+    /// `[spot][row][column]`, metres; empty if the shape has none.
     pub(super) two_bounce: Vec<f32>,
     pub(super) rgb: Vec<f32>,
     pub(super) spots: Vec<Option<Spot>>,
     pub(super) intrinsics: Intrinsics,
     pub(super) camera: [[f32; 4]; 4],
     pub(super) laser: [f32; 3],
-    /// Photons per unit of h; `None` = by the convention.
+    /// Photons per unit of h; `None` = by convention.
     pub(super) scale: Option<f32>,
 }
 
 impl ImportedScene {
-    /// A scene of nothing but its histogram and geometry.
+    /// Returns a scene with only its histogram and geometry.
     pub(super) fn new(
         name: &str,
         shape: Shape,
@@ -179,7 +179,7 @@ impl ImportedScene {
         Ok(())
     }
 
-    /// Sets spots, their beams taken as straight lines from the laser. Normals are not known.
+    /// Sets the spots, assuming straight beams from the laser. Normals are unknown.
     pub(super) fn set_spots(&mut self, positions: &[[f32; 3]]) {
         let laser = self.laser.map(f64::from);
         let spot = |p: &[f32; 3]| {
@@ -193,9 +193,10 @@ impl ImportedScene {
         self.missing.push("spots.normal");
     }
 
-    /// Says whether the straight beams of [`Self::set_spots`] are right, once the mirrors are known. They are where the
-    /// camera sees no mirror, and where `stated`; otherwise the lengths are listed as missing: a beam that a mirror folds
-    /// is longer than the straight line.
+    /// Decides whether the straight beams of [`Self::set_spots`] are correct, once the mirrors are
+    /// known. They are correct if the camera sees no mirror, or if `stated` is set. Otherwise the
+    /// lengths are listed as missing, because a beam reflected by a mirror is longer than the
+    /// straight line.
     pub(super) fn judge_beams(&mut self, stated: bool) {
         let mirrors = match self.missing.contains(&"specular") {
             true => None,
@@ -211,10 +212,11 @@ impl ImportedScene {
         ));
     }
 
-    /// Sets the lengths of the beams, metres; one that meets nothing has none.
+    /// Sets the lengths of the beams in metres; a beam that hits nothing has none.
     ///
     /// # Errors
-    /// The first beam that is shorter than the straight line, or has no length: its number, and the least that it could have.
+    /// The index of the first beam that is shorter than the straight line or has no length, and its
+    /// minimum length.
     pub(super) fn set_paths(&mut self, paths_m: &[f32]) -> Result<(), (usize, f32)> {
         for (beam, (spot, path)) in self.spots.iter_mut().zip(paths_m).enumerate() {
             let Some(spot) = spot else { continue };
@@ -228,7 +230,7 @@ impl ImportedScene {
         Ok(())
     }
 
-    /// The record that the encoder takes.
+    /// Calls `use_it` with the record for the encoder.
     pub(super) fn with_record<T>(&self, use_it: impl FnOnce(&SceneRecord<'_>) -> T) -> T {
         let subsets: Vec<SubsetRecord<'_>> = self
             .subsets
@@ -270,7 +272,7 @@ pub(super) const IDENTITY: [[f32; 4]; 4] = [
     [0.0, 0.0, 0.0, 1.0],
 ];
 
-/// Direction of a pixel's centre in the camera frame, with z = 1.
+/// Returns the direction of a pixel's centre in the camera frame, with z = 1.
 pub(super) fn direction(i: Intrinsics, row: usize, column: usize) -> [f64; 3] {
     [
         (column as f64 + 0.5 - f64::from(i.cx)) / f64::from(i.fx),
@@ -279,7 +281,7 @@ pub(super) fn direction(i: Intrinsics, row: usize, column: usize) -> [f64; 3] {
     ]
 }
 
-/// Intrinsics of a horizontal field of view, the axis in the image's middle.
+/// Returns the intrinsics of a horizontal field of view, with the axis in the image's centre.
 pub(super) fn of_fov(width: u32, height: u32, degrees: f64) -> Intrinsics {
     let f = f64::from(width) / 2.0 / libm::tan(degrees.to_radians() / 2.0);
     Intrinsics {
@@ -290,7 +292,8 @@ pub(super) fn of_fov(width: u32, height: u32, degrees: f64) -> Intrinsics {
     }
 }
 
-/// Histograms have no negative and no undefined bins: what a lossy code left of the former becomes 0.
+/// Checks that histograms have no negative or undefined bins. Small negative values left by a lossy
+/// code become 0.
 pub(super) fn clean(
     file: &Path,
     h: &mut [f32],

@@ -1,4 +1,4 @@
-//! Errors that say that this program was built without OpenEXR and HDF5.
+//! Error messages of a program built without OpenEXR and HDF5.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use super::files::Files;
 use super::image::Exr;
 use crate::{BUILD_WITH_FORMATS, WITHOUT_FORMATS};
 
-/// Says so.
+/// Returns the error.
 ///
 /// # Errors
 /// Always.
@@ -15,7 +15,7 @@ pub(super) fn exr_size(file: &Path, _: &Files) -> Result<(usize, usize), ImportE
     Err(missing(file))
 }
 
-/// Says so.
+/// Returns the error.
 ///
 /// # Errors
 /// Always.
@@ -23,16 +23,16 @@ pub(super) fn exr(file: &Path, _: &[u8]) -> Result<Exr, ImportError> {
     Err(missing(file))
 }
 
-/// A file that this program cannot read.
+/// Returns the error for a file that this program cannot read.
 pub(super) fn missing(file: &Path) -> ImportError {
     ImportError::unreadable(file, WITHOUT_FORMATS, BUILD_WITH_FORMATS)
 }
 
-/// There is none.
+/// An uninhabited type.
 pub(super) enum Hdf5 {}
 
 impl Hdf5 {
-    /// Says so.
+    /// Returns the error.
     ///
     /// # Errors
     /// Always.

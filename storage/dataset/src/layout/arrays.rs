@@ -1,4 +1,4 @@
-//! The arrays of a data set: names, shapes, types, codecs and the Zarr v3 metadata that describes them.
+//! The arrays of a data set: names, shapes, types, codecs and Zarr v3 metadata.
 
 use serde_json::{Value, json};
 
@@ -6,10 +6,10 @@ use crate::coding::profile::Coding;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::spec::DatasetSpec;
 
-/// Side of the transient's inner chunks in pixels (smaller where the image is smaller).
+/// Side of the transient's inner chunks in pixels (smaller if the image is smaller).
 pub const INNER_SIDE: u64 = 32;
 
-/// One array.
+/// The layout of one array.
 #[derive(Debug, Clone)]
 pub(crate) struct Layout {
     pub quantity: Quantity,
@@ -23,14 +23,14 @@ pub(crate) struct Layout {
     /// Whether the values of an inner chunk are stored bin by bin.
     pub bins_first: bool,
     dimensions: &'static [&'static str],
-    /// The filter of blosc.
+    /// The shuffle filter of blosc.
     shuffle: &'static str,
     fill_nan: bool,
     attributes: Value,
 }
 
 impl Quantity {
-    /// Its array in a data set of the given format.
+    /// Returns the layout of this quantity's array in a data set of the given format.
     pub(crate) fn layout(self, spec: &DatasetSpec, format: u32) -> Layout {
         use Element::{F32, I16, U8, U16, U32};
         let (h, w) = (u64::from(spec.height), u64::from(spec.width));
@@ -66,7 +66,7 @@ impl Quantity {
                     (F32, vec![h, w], IMAGE, a)
                 }
                 Self::Normal => {
-                    // CF's scale_factor: xarray decodes it by itself.
+                    // CF's scale_factor, which xarray decodes by itself.
                     let a = json!({"long_name": "unit normal, camera frame (x right, y down, z forward)", "scale_factor": 1.0 / 32767.0});
                     (I16, vec![h, w, 3], &["scene", "row", "column", "axis"], a)
                 }
@@ -160,7 +160,7 @@ impl Quantity {
 }
 
 impl Layout {
-    /// Images in an object; see [`DatasetSpec::planes`].
+    /// Returns the number of images in an object; see [`DatasetSpec::planes`].
     pub fn planes(&self) -> usize {
         match self.quantity {
             Quantity::TransientSpots => self.shape[0] as usize,
@@ -168,7 +168,7 @@ impl Layout {
         }
     }
 
-    /// Key of the scene's object, relative to the data set.
+    /// Returns the key of the scene's object, relative to the data set.
     pub fn key(&self, scene: u64) -> String {
         format!(
             "{}/c/{scene}{}",
@@ -177,11 +177,12 @@ impl Layout {
         )
     }
 
-    /// The codecs of an object, or of an inner chunk where there is a shard, in the array's order of axes.
+    /// Returns the codecs of an object, or of an inner chunk if there is a shard, in the array's
+    /// order of axes.
     pub fn chunk_codecs(&self) -> Value {
         let mut codecs = self.stored_codecs();
         if let (true, Some(inner)) = (self.bins_first, &self.inner) {
-            // The bins' axis, the last one, comes before the rows'.
+            // The last axis, bins, is moved before the rows.
             let axes = inner.len() + 1;
             let order: Vec<usize> = (0..axes - 3)
                 .chain([axes - 1, axes - 3, axes - 2])
@@ -193,7 +194,7 @@ impl Layout {
         codecs
     }
 
-    /// The same for values that are in stored order already.
+    /// Like [`Self::chunk_codecs`], for values that are already in stored order.
     pub fn stored_codecs(&self) -> Value {
         let mut codecs = image_codecs(self.element, self.shuffle);
         let few = matches!(
@@ -219,7 +220,7 @@ impl Layout {
         }
     }
 
-    /// The array's `zarr.json`.
+    /// Returns the array's `zarr.json`.
     pub fn metadata(&self, scenes: u64) -> Value {
         let with_scene = |first: u64, rest: &[u64]| -> Vec<u64> {
             std::iter::once(first).chain(rest.iter().copied()).collect()
@@ -248,7 +249,7 @@ impl Layout {
     }
 }
 
-/// The codecs of images: values as bytes, compressed, with a checksum.
+/// Returns the codecs of images: values as bytes, compressed, with a checksum.
 pub(crate) fn image_codecs(element: Element, shuffle: &str) -> Value {
     let typesize = element.size();
     let bytes = match typesize {
@@ -261,7 +262,7 @@ pub(crate) fn image_codecs(element: Element, shuffle: &str) -> Value {
     json!([bytes, blosc, {"name": "crc32c"}])
 }
 
-/// The codecs of a shard's index.
+/// Returns the codecs of a shard's index.
 pub(crate) fn index_codecs() -> Value {
     json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}])
 }

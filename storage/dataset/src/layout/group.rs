@@ -1,5 +1,5 @@
-//! Metadata of groups whose arrays have a leading scene axis: created array by array, the root last, and grown. And what
-//! a root says that its group is.
+//! Metadata of groups with arrays that have a leading scene axis: creation array by array with the
+//! root last, growth, and detection of a group's kind from its root.
 
 use bytes::Bytes;
 use object_store::ObjectStore;
@@ -12,19 +12,19 @@ use crate::store::objects;
 /// Name of the metadata objects.
 pub(crate) const METADATA: &str = "zarr.json";
 
-/// Metadata as they are stored.
+/// Formats metadata for storage.
 pub(crate) fn pretty(value: &Value) -> Bytes {
     let mut text = serde_json::to_vec_pretty(value).expect("a JSON value can be written");
     text.push(b'\n');
     text.into()
 }
 
-/// Whether a group's root is that of predictions.
+/// Returns whether a group's root belongs to predictions.
 pub(crate) fn is_predictions(root: &Value) -> bool {
     root["attributes"]["picofarm"]["predictions"].is_u64()
 }
 
-/// Whether a group's root is that of reconstructions.
+/// Returns whether a group's root belongs to reconstructions.
 pub(crate) fn is_reconstructions(root: &Value) -> bool {
     root["attributes"]["picofarm"]["reconstructions"].is_u64()
 }

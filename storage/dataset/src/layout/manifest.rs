@@ -1,4 +1,4 @@
-//! A scene's manifest: the durable record that it is complete, what it consists of and where it came from.
+//! A scene's manifest: the durable record of its completion, its objects and its provenance.
 
 use std::collections::BTreeMap;
 
@@ -12,15 +12,19 @@ use crate::layout::quantity::Quantity;
 use crate::layout::record::Provenance;
 use crate::layout::spec::Profile;
 
-/// Version of the layout on disk. Data sets of older formats stay in theirs: they are read, and scenes are added.
+/// Format version of the layout on disk. Data sets of older formats retain theirs: they can be
+/// read, and scenes can be added.
 ///
-/// 1: histograms lie pixel by pixel in inner chunks of all bins. 2: bin by bin, in inner chunks of 128 bins.
+/// 1: histograms are stored pixel by pixel, in inner chunks of all bins. 2: bin by bin, in inner
+/// chunks of 128 bins.
 pub const FORMAT_VERSION: u32 = 2;
 
-/// Version of the bytes the encoder makes. Changes whenever the same record could give other bytes.
+/// Version of the encoder's output. It changes whenever the same record could produce different
+/// bytes.
 pub const ENCODER_VERSION: &str = "encoder-2";
 
-/// The encoder named in the root of a data set of the given format: the first one that wrote it.
+/// Returns the encoder named in the root of a data set of the given format, which is the first one
+/// that wrote it.
 pub(crate) fn encoder_of(format: u32) -> &'static str {
     match format {
         1 => "encoder-1",
@@ -33,23 +37,24 @@ pub(crate) fn encoder_of(format: u32) -> &'static str {
 pub struct ObjectEntry {
     /// Key relative to the data set.
     pub key: String,
-    /// Bytes.
+    /// Size in bytes.
     pub size: u64,
-    /// SHA-256 of the bytes, hexadecimal.
+    /// SHA-256 of the bytes, in hexadecimal.
     pub sha256: String,
 }
 
-/// How a further transient was coded.
+/// The encoding of an additional transient.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SubsetCoding {
-    /// Error of the code.
+    /// The encoding error.
     pub error: EncodeError,
-    /// Saturated bins: (flat index in `[row][column][bin]`, of `transient_spots` in `[spot][row][column][bin]`; exact
-    /// value of h), by index.
+    /// Saturated bins: (flat index in `[row][column][bin]`, for `transient_spots` in
+    /// `[spot][row][column][bin]`; exact value of h), by index.
     pub overflow: Vec<(u64, f32)>,
 }
 
-/// What a published scene consists of. A pure function of the task: its bytes come out the same in every run.
+/// The contents of a published scene. It is a pure function of the task, so every run produces the
+/// same bytes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// [`FORMAT_VERSION`] at the time of writing.
@@ -62,31 +67,32 @@ pub struct Manifest {
     pub encoder: String,
     /// Photons per unit of h.
     pub scale: f32,
-    /// Error of the coded transient.
+    /// Error of the encoded transient.
     pub error: EncodeError,
-    /// Where the scene came from.
+    /// The origin of the scene.
     pub provenance: Provenance,
     /// Saturated bins: (flat index in `[row][column][bin]`, exact value of h), by index.
     pub overflow: Vec<(u64, f32)>,
-    /// The same of the further transients, by the names of their arrays.
+    /// Encodings of the additional transients, by array name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub subsets: BTreeMap<String, SubsetCoding>,
     /// The scene's objects.
     pub objects: Vec<ObjectEntry>,
-    /// What [`seal`] says of the rest, so that a flipped bit shows; `None` in manifests from before there was one.
+    /// Checksum of the other fields, from [`seal`], to detect flipped bits; `None` in manifests
+    /// from before it existed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
 
 impl Manifest {
-    /// Itself with the checksum that belongs to it.
+    /// Returns the manifest with its checksum set.
     pub fn sealed(mut self) -> Self {
         self.checksum = None;
         self.checksum = Some(sha256_hex(&self.to_bytes()));
         self
     }
 
-    /// Whether both say the same; whether they have a checksum does not count.
+    /// Returns whether both are equal except for the checksum.
     pub fn same_as(&self, other: &Self) -> bool {
         let bare = |manifest: &Self| Self {
             checksum: None,
@@ -95,30 +101,31 @@ impl Manifest {
         bare(self) == bare(other)
     }
 
-    /// Key of a scene's manifest, relative to the data set.
+    /// Returns the key of a scene's manifest, relative to the data set.
     pub fn key(scene: u64) -> String {
         format!("manifests/{scene}.json")
     }
 
-    /// Size of all objects together.
+    /// Returns the total size of all objects in bytes.
     pub fn total_bytes(&self) -> u64 {
         self.objects.iter().map(|o| o.size).sum()
     }
 
-    /// Names of quantities that the scene's source did not have, and that are stored as fill values: of imports, and of what
-    /// was made of them. Empty where everything is known.
+    /// Returns the names of quantities that the scene's source did not have and that are stored as
+    /// fill values. This concerns imports and scenes derived from them. The list is empty if all
+    /// quantities are known.
     pub fn missing(&self) -> Vec<String> {
         let listed = self.provenance.plan["missing"].as_array();
         let names = listed.into_iter().flatten().filter_map(Value::as_str);
         names.map(str::to_owned).collect()
     }
 
-    /// The entry of an object.
+    /// Returns the entry of an object.
     pub fn object(&self, key: &str) -> Option<&ObjectEntry> {
         self.objects.iter().find(|o| o.key == key)
     }
 
-    /// Saturated bins of a transient.
+    /// Returns the saturated bins of a transient.
     pub fn overflow_of(&self, quantity: Quantity) -> &[(u64, f32)] {
         match quantity {
             Quantity::Transient => &self.overflow,
@@ -126,7 +133,7 @@ impl Manifest {
         }
     }
 
-    /// The manifest as it lies in the store.
+    /// Returns the bytes to store.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self)
             .expect("a manifest has only string keys and finite numbers");
@@ -156,14 +163,16 @@ impl Manifest {
         }
         match &manifest.checksum {
             Some(checksum) => drop(unseal(bytes, checksum).map_err(damaged)?),
-            // Of old programs; but one whose word "checksum" was changed is no such.
+            // Older programs wrote no checksum. A manifest with a damaged name of the member
+            // `checksum` must not count as one of these.
             None => no_strange_member(bytes, &manifest).map_err(damaged)?,
         }
         Ok(manifest)
     }
 }
 
-/// Gives pretty JSON of an object a last member `checksum`: the SHA-256, hexadecimal, of its bytes without that member.
+/// Appends to an object's pretty JSON a last member `checksum`: the SHA-256, in hexadecimal, of its
+/// bytes without that member.
 pub(crate) fn seal(json: &[u8]) -> Vec<u8> {
     let body = json
         .strip_suffix(END)
@@ -171,7 +180,7 @@ pub(crate) fn seal(json: &[u8]) -> Vec<u8> {
     [body, tail(&sha256_hex(json)).as_bytes()].concat()
 }
 
-/// The JSON below its `checksum`, if it is what was sealed; otherwise what is wrong.
+/// Returns the JSON without its `checksum`, if it matches; otherwise a description of the problem.
 pub(crate) fn unseal(sealed: &[u8], checksum: &str) -> Result<Vec<u8>, String> {
     let Some(body) = sealed.strip_suffix(tail(checksum).as_bytes()) else {
         return Err(
@@ -187,7 +196,7 @@ pub(crate) fn unseal(sealed: &[u8], checksum: &str) -> Result<Vec<u8>, String> {
     }
 }
 
-/// Whether an object's JSON has no member but those that it is written with.
+/// Returns an error if an object's JSON has members other than those of `written`.
 fn no_strange_member(bytes: &[u8], written: &impl Serialize) -> Result<(), String> {
     let members = |value: serde_json::Result<serde_json::Value>| match value {
         Ok(serde_json::Value::Object(members)) => members,
@@ -203,10 +212,10 @@ fn no_strange_member(bytes: &[u8], written: &impl Serialize) -> Result<(), Strin
     }
 }
 
-/// The document of ours in a sealed object; see [`seal`].
+/// Returns the document in a sealed object; see [`seal`].
 ///
 /// # Errors
-/// What is wrong with it: changed, or never sealed.
+/// A description of the problem: the object was changed, or never sealed.
 pub(crate) fn unsealed(bytes: &[u8]) -> Result<Vec<u8>, String> {
     #[derive(Deserialize)]
     struct Head {
@@ -225,10 +234,10 @@ pub(crate) fn unsealed(bytes: &[u8]) -> Result<Vec<u8>, String> {
     }
 }
 
-/// Reads a sealed object as a document.
+/// Parses a sealed object as a document.
 ///
 /// # Errors
-/// [`DatasetError::Damaged`]: `what` it is no more.
+/// [`DatasetError::Damaged`] if it is not a valid `what`.
 pub(crate) fn read_unsealed<T: DeserializeOwned>(
     bytes: &[u8],
     what: &str,
@@ -239,15 +248,15 @@ pub(crate) fn read_unsealed<T: DeserializeOwned>(
     read.map_err(|what| DatasetError::Damaged { object, what })
 }
 
-/// Reads a document of ours whose last member is its `checksum`, as [`seal`] writes it: `what` it is, in words, and the newest
-/// `format` of it that this program knows.
+/// Parses a document with a last member `checksum`, as written by [`seal`]. `what` is its
+/// description, and `format` is the newest version that this program supports.
 pub(crate) fn read_sealed<T: DeserializeOwned>(
     bytes: &[u8],
     what: &str,
     format: u32,
     object: &str,
 ) -> Result<T, DatasetError> {
-    /// What every such document has.
+    /// The members common to all such documents.
     #[derive(Deserialize)]
     struct Head {
         format: u32,
@@ -278,7 +287,7 @@ fn tail(checksum: &str) -> String {
     format!(",\n  \"checksum\": \"{checksum}\"\n}}\n")
 }
 
-/// SHA-256 in hexadecimal.
+/// Returns the SHA-256 in hexadecimal.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }

@@ -1,4 +1,4 @@
-//! What a data set consists of: its spec, its arrays and their metadata, scenes as records, and manifests.
+//! The structure of a data set: its spec, arrays and metadata, scene records, and manifests.
 
 pub(crate) mod arrays;
 pub(crate) mod group;

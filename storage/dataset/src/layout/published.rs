@@ -1,4 +1,4 @@
-//! Which scenes are published: those with a manifest.
+//! The published scenes: those with a manifest.
 
 use futures::TryStreamExt;
 use object_store::ObjectStore;
@@ -8,7 +8,7 @@ use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::store::objects;
 
-/// The scenes that have a manifest in a folder, ascending.
+/// Returns the scenes with a manifest in a folder, ascending.
 pub(crate) async fn scenes_in(
     store: &dyn ObjectStore,
     folder: &Path,
@@ -29,7 +29,7 @@ pub(crate) async fn scenes_in(
     Ok(scenes)
 }
 
-/// The scene whose manifest has this key.
+/// Returns the scene of the manifest with this key.
 pub(crate) fn manifest_scene(key: &str) -> Option<u64> {
     let scene = key
         .strip_prefix("manifests/")?

@@ -19,14 +19,17 @@ pub enum Quantity {
     Label,
     /// 1 = mirror, u8 `[row][column]`.
     Specular,
-    /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 = lit.
+    /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 =
+    /// lit.
     Visibility,
-    /// Measured optical path of the two-bounce light of each spot in metres, f32 `[spot][row][column]`, 0 = not measured. Only
-    /// data sets whose source gave it have it.
+    /// Measured optical path of the two-bounce light of each spot in metres, f32
+    /// `[spot][row][column]`, 0 = not measured. It exists only in data sets from sources that
+    /// provide it.
     TwoBouncePath,
     /// sRGB-encoded colour, u8 `[row][column][3]`.
     Rgb,
-    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN = no spot.
+    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres. NaN
+    /// = no spot.
     Spots,
     /// fx, fy, cx, cy in pixels, f32.
     Intrinsics,
@@ -34,13 +37,14 @@ pub enum Quantity {
     Camera,
     /// Laser origin in the camera frame in metres, f32 `[3]`.
     Laser,
-    /// Photons per unit of h, f32; NaN where the scene is missing.
+    /// Photons per unit of h, f32; NaN if the scene is missing.
     Scale,
-    /// h of the 4 of the 100 spots of [`Self::spots_of_100`] alone, coded as the transient, with the same scale.
+    /// h of the 4 of the 100 spots given by [`Self::spots_of_100`], encoded like the transient,
+    /// with the same scale.
     Transient4,
-    /// h of the 25 of the 100 spots of [`Self::spots_of_100`] alone, likewise.
+    /// h of the 25 of the 100 spots given by [`Self::spots_of_100`], encoded likewise.
     Transient25,
-    /// h of each spot alone: `[spot][row][column][bin]`, likewise.
+    /// h of each single spot: `[spot][row][column][bin]`, encoded likewise.
     TransientSpots,
 }
 
@@ -110,7 +114,7 @@ impl Quantity {
         Self::TransientSpots,
     ];
 
-    /// Whether it is a transient, coded with the data set's profile.
+    /// Returns whether it is a transient, encoded with the data set's profile.
     pub fn is_transient(self) -> bool {
         matches!(
             self,
@@ -118,7 +122,8 @@ impl Quantity {
         )
     }
 
-    /// Which of the 100 spots of a 10×10 grid (row by row) make up this transient; empty for other quantities.
+    /// Returns which of the 100 spots of a 10×10 grid (row by row) this transient includes; empty
+    /// for other quantities.
     pub fn spots_of_100(self) -> &'static [u32] {
         match self {
             Self::Transient4 => &SPOTS_4,
@@ -127,7 +132,7 @@ impl Quantity {
         }
     }
 
-    /// Name of the Zarr array.
+    /// Returns the name of the Zarr array.
     pub fn name(self) -> &'static str {
         match self {
             Self::Transient => "transient",

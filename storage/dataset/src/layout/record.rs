@@ -1,4 +1,4 @@
-//! A scene as the renderer hands it over, before coding.
+//! The output of the renderer for one scene, before encoding.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -36,7 +36,7 @@ pub struct Spot {
 pub struct SceneRecord<'a> {
     /// h: `[row][column][bin]`, 1/(m² sr), finite and not negative.
     pub transient: &'a [f32],
-    /// The further transients of the data set ([`DatasetSpec::quantities`]), in that order.
+    /// The additional transients of the data set ([`DatasetSpec::quantities`]), in that order.
     pub subsets: &'a [SubsetRecord<'a>],
     /// z-depth, metres; 0 = nothing.
     pub depth: &'a [f32],
@@ -52,11 +52,12 @@ pub struct SceneRecord<'a> {
     pub specular: &'a [u8],
     /// `[spot][row][column]`, 1 = lit.
     pub visibility: &'a [u8],
-    /// Measured two-bounce paths, metres, `[spot][row][column]`, 0 = not measured; empty where the data set has none.
+    /// Measured two-bounce paths, metres, `[spot][row][column]`, 0 = not measured; empty if the
+    /// data set has none.
     pub two_bounce: &'a [f32],
     /// Linear colour `[row][column][3]`; stored clamped to [0, 1] and sRGB-encoded in 8 bits.
     pub rgb: &'a [f32],
-    /// The spots; `None` where a beam meets nothing.
+    /// The spots; `None` if a beam hits nothing.
     pub spots: &'a [Option<Spot>],
     /// Intrinsics.
     pub intrinsics: Intrinsics,
@@ -64,31 +65,32 @@ pub struct SceneRecord<'a> {
     pub camera: [[f32; 4]; 4],
     /// Laser origin, camera frame, metres.
     pub laser: [f32; 3],
-    /// Photons per unit of h; see [`crate::photon_scale`]. The unit of the coding error in the square-root
-    /// profile, kept as information in the plain one.
+    /// Photons per unit of h; see [`crate::photon_scale`]. It is the unit of the coding error in
+    /// the square-root profile, and informative in the plain one.
     pub scale: f32,
 }
 
-/// The transient of a subset of the spots, or of each alone.
+/// The transient of a subset of the spots, or of each single spot.
 #[derive(Debug, Clone)]
 pub struct SubsetRecord<'a> {
     /// `Transient4`, `Transient25` or `TransientSpots`.
     pub quantity: Quantity,
-    /// h, each `[row][column][bin]`: as many as [`DatasetSpec::planes`].
+    /// h, each `[row][column][bin]`; the number of planes is [`DatasetSpec::planes`].
     pub planes: Vec<&'a [f32]>,
 }
 
-/// Where a scene came from: a pure function of the task (no times, no attempt, no lease epoch, no machine), since the
-/// manifest that holds it must come out the same when the task is run again.
+/// The origin of a scene. It is a pure function of the task (no times, attempts, lease epochs or
+/// machine names), because the manifest with it must be the same when the task is run again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// Key of the task that made it.
+    /// Key of the task that produced it.
     pub task_key: String,
     /// Version of the rendered values.
     pub renderer: String,
     /// Seed of all random numbers.
     pub seed: u64,
-    /// What the renderer decided and estimated (strategies, approximations, light outside the gate, noise).
+    /// Decisions and estimates of the renderer (strategies, approximations, light outside the gate,
+    /// noise).
     pub plan: Value,
 }
 
@@ -121,7 +123,7 @@ impl SceneRecord<'_> {
         Ok(())
     }
 
-    /// Lengths and values fit the specification.
+    /// Checks that lengths and values fit the specification.
     pub(crate) fn check(&self, spec: &DatasetSpec) -> Result<(), DatasetError> {
         let pixels = spec.pixels();
         let spots = spec.spots as usize;
@@ -209,7 +211,7 @@ impl SceneRecord<'_> {
 }
 
 impl Spot {
-    /// The spot as a row of the `spots` array.
+    /// Returns the spot as a row of the `spots` array.
     pub(crate) fn row(&self) -> [f32; 7] {
         let ([x, y, z], [nx, ny, nz]) = (self.position, self.normal);
         [x, y, z, nx, ny, nz, self.path_m]

@@ -1,4 +1,5 @@
-//! What a data set is: its size, gate and codec profile. Fixed at creation, except that scenes may be added.
+//! The properties of a data set: its size, gate and codec profile. They are fixed at creation,
+//! except that scenes may be added.
 
 pub use picofarm_settings::{Gate, Wavelength};
 use serde::{Deserialize, Serialize};
@@ -6,12 +7,12 @@ use serde::{Deserialize, Serialize};
 use crate::error::DatasetError;
 use crate::layout::quantity::Quantity;
 
-/// How transients are coded.
+/// The encoding of transients.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "name", rename_all = "kebab-case")]
 pub enum Profile {
-    /// Square-root code in u16: N = h·scale photons, q = round((2/Δ)·√N), decoded as N = (q·Δ/2)². The error
-    /// stays below (Δ/2 + Δ²/16) standard deviations of the photon noise, σ = √max(N, 1).
+    /// Square-root code in u16: N = h·scale photons, q = round((2/Δ)·√N), decoded as N = (q·Δ/2)².
+    /// The error stays below (Δ/2 + Δ²/16) standard deviations of the photon noise, σ = √max(N, 1).
     SqrtU16 {
         /// Δ: 0.2 or a power of two from 1/16 to 2.
         #[serde(serialize_with = "as_decimal")]
@@ -19,8 +20,8 @@ pub enum Profile {
     },
     /// 32-bit floats.
     PlainF32 {
-        /// Largest rounding error in standard deviations of the photon noise: a power of two from 1/16 to 1, or 0 for
-        /// none.
+        /// Largest rounding error in standard deviations of the photon noise: a power of two from
+        /// 1/16 to 1, or 0 for none.
         #[serde(
             default,
             skip_serializing_if = "is_zero",
@@ -28,8 +29,8 @@ pub enum Profile {
         )]
         round: f32,
     },
-    /// Whole photon counts in u16, lossless: N = h·scale, which must be whole; decoded as h = N/scale. What a sensor
-    /// with photon noise gives.
+    /// Lossless whole photon counts in u16, as produced by a sensor with photon noise: N = h·scale,
+    /// which must be whole; decoded as h = N/scale.
     CountsU16,
 }
 
@@ -39,7 +40,7 @@ impl Default for Profile {
     }
 }
 
-/// The number with the digits of an f32: 0.2 and not 0.20000000298023224.
+/// Returns the number with the digits of an f32: 0.2 instead of 0.20000000298023224.
 pub(crate) fn decimal(x: f32) -> f64 {
     x.to_string().parse().expect("floats are written as floats")
 }
@@ -55,18 +56,18 @@ fn is_zero(x: &f32) -> bool {
 /// The properties of a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DatasetSpec {
-    /// Number of scenes there is room for. May grow later, never shrinks.
+    /// Capacity in scenes. It may grow later, but never shrinks.
     pub scenes: u64,
     /// Image height in pixels.
     pub height: u32,
     /// Image width in pixels.
     pub width: u32,
-    /// Illumination spots of each scene.
+    /// Number of illumination spots in each scene.
     pub spots: u32,
-    /// Subsets of the spots that have transients of their own (`transient_4`, `transient_25`).
+    /// Subsets of the spots with their own transients (`transient_4`, `transient_25`).
     #[serde(default, skip_serializing_if = "Subsets::is_empty")]
     pub subsets: Subsets,
-    /// Each spot has a transient of its own (`transient_spots`).
+    /// Whether each spot has its own transient (`transient_spots`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub per_spot: bool,
     /// The laser's wavelength, nanometres. Without one, nobody said which it is.
@@ -75,13 +76,14 @@ pub struct DatasetSpec {
     /// Two-bounce paths came with the scenes (`two_bounce_path`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub two_bounce: bool,
-    /// The gate.
+    /// The time gate of the histograms.
     pub gate: Gate,
     /// Codec of the transients.
     pub profile: Profile,
 }
 
-/// A set of subsets of the 10×10 grid of spots, named by their sizes; see [`crate::Quantity::spots_of_100`].
+/// A set of subsets of the 10×10 grid of spots, named by their sizes; see
+/// [`crate::Quantity::spots_of_100`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
 pub struct Subsets {
@@ -90,16 +92,16 @@ pub struct Subsets {
 }
 
 impl Subsets {
-    /// None of them.
+    /// The empty set.
     pub const NONE: Self = Self {
         four: false,
         twenty_five: false,
     };
 
-    /// The subsets of the given sizes.
+    /// Returns the subsets of the given sizes.
     ///
     /// # Errors
-    /// A message that names a size there is no subset of.
+    /// A message that names an unknown size.
     pub fn of(sizes: &[u32]) -> Result<Self, String> {
         let mut subsets = Self::NONE;
         for size in sizes {
@@ -112,12 +114,12 @@ impl Subsets {
         Ok(subsets)
     }
 
-    /// Whether there are none.
+    /// Returns whether the set is empty.
     pub fn is_empty(&self) -> bool {
         *self == Self::NONE
     }
 
-    /// Their sizes, ascending.
+    /// Returns the sizes of the subsets, ascending.
     pub fn sizes(self) -> Vec<u32> {
         let all = [(self.four, 4), (self.twenty_five, 25)];
         all.into_iter().filter(|s| s.0).map(|s| s.1).collect()
@@ -143,12 +145,12 @@ impl Profile {
     pub const COARSE: Self = Self::SqrtU16 { delta: 1.0 };
     /// Floats rounded to a quarter of the photon noise.
     pub const PLAIN: Self = Self::PlainF32 { round: 0.25 };
-    /// Floats as they are.
+    /// Floats without rounding.
     pub const LOSSLESS: Self = Self::PlainF32 { round: 0.0 };
-    /// What [`Self::parse`] takes.
+    /// The names accepted by [`Self::parse`].
     pub const NAMES: [&str; 5] = ["sqrt-u16", "coarse", "plain-f32", "lossless", "counts-u16"];
 
-    /// What jobs call it.
+    /// Returns the profile's name in job specifications.
     pub fn name(&self) -> &'static str {
         match self {
             Self::SqrtU16 { delta: 1.0 } => "coarse",
@@ -159,10 +161,10 @@ impl Profile {
         }
     }
 
-    /// The profile that jobs call `name`.
+    /// Returns the profile with this name in job specifications.
     ///
     /// # Errors
-    /// A message that lists the names there are.
+    /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {
         match name {
             "sqrt-u16" => Ok(Self::default()),
@@ -190,7 +192,7 @@ impl std::fmt::Display for Profile {
 }
 
 impl DatasetSpec {
-    /// Numbers in range, so that every array's shape and key exist.
+    /// Checks that all numbers are in range, so that every array's shape and key exist.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] names the field.
@@ -259,12 +261,12 @@ impl DatasetSpec {
         Ok(())
     }
 
-    /// Pixels of one image.
+    /// Returns the number of pixels of one image.
     pub fn pixels(&self) -> usize {
         self.height as usize * self.width as usize
     }
 
-    /// Values in one scene's transient.
+    /// Returns the number of values in one scene's transient.
     pub fn transient_len(&self) -> usize {
         self.pixels() * self.gate.bins as usize
     }
@@ -277,7 +279,7 @@ impl DatasetSpec {
         }
     }
 
-    /// The quantities that its scenes have, in the order of their objects in a manifest.
+    /// Returns the quantities of its scenes, in the order of their objects in a manifest.
     pub fn quantities(&self) -> Vec<Quantity> {
         let has = |q: &Quantity| match q {
             Quantity::Transient4 => self.subsets.four,
@@ -289,7 +291,8 @@ impl DatasetSpec {
         Quantity::ALL.into_iter().filter(has).collect()
     }
 
-    /// The first field, other than the number of scenes, in which `asked` differs: (field, stored, asked).
+    /// Returns the first field, other than the number of scenes, that differs in `asked`: (field,
+    /// stored, asked).
     pub(crate) fn difference(&self, asked: &Self) -> Option<(&'static str, String, String)> {
         let pairs = [
             ("height", self.height.to_string(), asked.height.to_string()),

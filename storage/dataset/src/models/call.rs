@@ -1,6 +1,6 @@
-//! Calls of processes that train a model together, by which they find one another:
-//! `models/<name>/calls/<training key>/<number>.json`, each made once and never changed. They are deleted with the training's
-//! checkpoints.
+//! Calls, through which processes that train a model together find one another:
+//! `models/<name>/calls/<training key>/<number>.json`. Each is created once and never changes. They
+//! are deleted with the training's checkpoints.
 
 use bytes::Bytes;
 
@@ -12,10 +12,10 @@ use crate::store::objects;
 pub(super) const FOLDER: &str = "calls";
 
 impl Models {
-    /// The newest call of a training: its number and content.
+    /// Returns the number and the content of a training's newest call.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] for an invalid name; [`DatasetError::Store`].
     pub async fn newest_call(
         &self,
         name: &str,
@@ -29,15 +29,15 @@ impl Models {
             return Ok(None);
         };
         let path = self.path(name, &key(training_key, newest));
-        // The training may have ended meanwhile.
+        // The training may have ended in the meantime.
         let found = objects::get(&*self.store, &path).await?;
         Ok(found.map(|content| (newest, content)))
     }
 
-    /// Makes a call; `false` where there is one of this number.
+    /// Creates a call. Returns `false` if there already is one with this number.
     ///
     /// # Errors
-    /// As [`Self::newest_call`].
+    /// Those of [`Self::newest_call`].
     pub async fn make_call(
         &self,
         name: &str,
@@ -53,7 +53,7 @@ impl Models {
     /// Deletes the calls of a training.
     ///
     /// # Errors
-    /// As [`Self::newest_call`].
+    /// Those of [`Self::newest_call`].
     pub async fn delete_calls(&self, name: &str, training_key: &str) -> Result<(), DatasetError> {
         check_name(name)?;
         for object in self.list(&self.path(name, &folder(training_key))).await? {

@@ -1,4 +1,5 @@
-//! Checkpoints of trainings, below their model: `models/<name>/checkpoints/<training key>/`.
+//! Checkpoints of trainings, in the folder of their model: `models/<name>/checkpoints/<training
+//! key>/`.
 
 use bytes::Bytes;
 
@@ -7,10 +8,10 @@ use crate::checkpoints::{Checkpoint, Checkpoints, FOLDER, Pieces, found};
 use crate::error::DatasetError;
 
 impl Models {
-    /// The checkpoints of a training.
+    /// Returns the checkpoints of a training.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used.
+    /// [`DatasetError::Invalid`] for an invalid name.
     pub fn checkpoints_of(
         &self,
         name: &str,
@@ -21,10 +22,10 @@ impl Models {
         Ok(Checkpoints::new(self.store.clone(), &folder, training_key))
     }
 
-    /// As [`Checkpoints::put`], of a training.
+    /// Like [`Checkpoints::put`], for a training.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] for an invalid name; [`DatasetError::Store`].
     pub async fn put_checkpoint(
         &self,
         name: &str,
@@ -37,10 +38,10 @@ impl Models {
             .await
     }
 
-    /// As [`Checkpoints::newest`], of a training.
+    /// Like [`Checkpoints::newest`], for a training.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] for an invalid name; [`DatasetError::Store`].
     pub async fn newest_checkpoint(
         &self,
         name: &str,
@@ -49,10 +50,10 @@ impl Models {
         self.checkpoints_of(name, training_key)?.newest().await
     }
 
-    /// As [`Checkpoints::delete`], of a training, and its calls.
+    /// Like [`Checkpoints::delete`], for a training, and also deletes its calls.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] for an invalid name; [`DatasetError::Store`].
     pub async fn delete_checkpoints(
         &self,
         name: &str,
@@ -62,7 +63,7 @@ impl Models {
         self.checkpoints_of(name, training_key)?.delete().await
     }
 
-    /// The checkpoints of all trainings under a name, by training and step, ascending.
+    /// Returns the checkpoints of all trainings of a model, ascending by training and step.
     ///
     /// # Errors
     /// [`DatasetError::Store`].

@@ -1,9 +1,10 @@
-//! What nobody needs of a store's models: checkpoints of trainings that nobody goes on with, shards of evaluations that
-//! nobody joined, and objects that no manifest names.
+//! Garbage collection in a store's models: checkpoints of abandoned trainings, shards of
+//! evaluations that were never joined, and objects that no manifest lists.
 //!
-//! A checkpoint is never a result: whoever misses one trains again from the one before, or from the beginning. Objects are
-//! guarded as a scene's are: the manifest is looked at right before one is deleted and once more right after, and the
-//! publisher looks after its objects when its manifest stands.
+//! A checkpoint is never a result: if one is missing, the training resumes from the previous one or
+//! from the beginning. Objects are protected like a scene's: the manifest is looked up right before
+//! and right after an object is deleted, and the publisher checks its objects after writing the
+//! manifest.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime};
@@ -19,9 +20,10 @@ use crate::store::leftovers;
 use crate::store::objects;
 
 impl Models {
-    /// Finds what nobody needs and was last written at `limit` or earlier, `grace` before now: checkpoints of trainings
-    /// all of whose checkpoints are that old, shards of evaluations, calls of processes, objects that no manifest names, and unfinished files of killed writes.
-    /// Deletes it if `delete` says so.
+    /// Finds unneeded objects that were last written at `limit` or earlier, which is `grace` before
+    /// now: checkpoints of trainings with no newer checkpoint, shards of evaluations, calls of
+    /// processes, objects that no manifest lists, and unfinished files of killed writes. Deletes
+    /// them if `delete` is set.
     pub(crate) async fn collect(
         &self,
         limit: SystemTime,
@@ -44,9 +46,9 @@ impl Models {
                     found.push(self.orphan(&object));
                 }
             }
-            // Who joins an evaluation makes missing shards again.
+            // The task that joins an evaluation regenerates missing shards.
             let shards = self.list(&self.path(&name, super::shard::FOLDER)).await?;
-            // Whoever trains and finds no call makes one.
+            // A training process that finds no call creates one.
             let calls = self.list(&self.path(&name, super::call::FOLDER)).await?;
             for object in shards.into_iter().chain(calls).filter(old) {
                 if delete {
@@ -89,7 +91,7 @@ impl Models {
         Ok(found)
     }
 
-    /// `false` if a manifest names it by now.
+    /// Deletes an object. Returns `false` if a manifest lists it in the meantime.
     pub(super) async fn delete_object(
         &self,
         name: &str,
@@ -110,7 +112,8 @@ impl Models {
         Ok(true)
     }
 
-    /// Whether the model's manifest names an object. A manifest that cannot be read may name anything.
+    /// Returns whether the model's manifest lists an object. An unreadable manifest may list any
+    /// object.
     async fn names_object(&self, name: &str, key: &str) -> Result<bool, DatasetError> {
         let manifest = self.look(name).await?;
         Ok(manifest.is_some_and(|m| m.objects.iter().any(|object| object.key == key)))

@@ -1,4 +1,5 @@
-//! What evaluations found, beside the model: `models/<name>/evaluations/<key>.json`, create-only.
+//! Results of evaluations, in the folder of the model: `models/<name>/evaluations/<key>.json`,
+//! create-only.
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
@@ -9,14 +10,14 @@ use crate::error::DatasetError;
 use crate::layout::manifest::{seal, unseal};
 use crate::store::objects;
 
-/// A model's figures on scenes. A pure function of model, scenes and code.
+/// A model's metrics on scenes. It is a pure function of model, scenes and code.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
     /// Key of the evaluation: model, scenes and code.
     pub key: String,
     /// The model.
     pub model: String,
-    /// SHA-256 of its manifest, hexadecimal.
+    /// SHA-256 of the model's manifest, in hexadecimal.
     pub model_sha256: String,
     /// Folder of the data set in the same store.
     pub dataset: String,
@@ -24,26 +25,27 @@ pub struct Evaluation {
     pub data: String,
     /// The split.
     pub split: SplitUsed,
-    /// The side.
+    /// The side of the split.
     pub side: String,
     /// Number of scenes.
     pub scenes: u64,
-    /// Name of the histogram that the model saw.
+    /// Name of the model's input histogram.
     pub histogram: String,
-    /// For a shadow network that is given two-bounce times: `truth`, or the folder of the predictions that they follow from.
+    /// Source of the two-bounce times for a shadow network that uses them: `truth`, or the folder
+    /// of the predictions from which they are computed.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub times: String,
-    /// Whether histograms went through the sensor that the model was trained with.
+    /// Whether the sensor of the model's training was applied to the histograms.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sensor: bool,
-    /// Version of networks and metrics.
+    /// Code version of networks and metrics.
     pub code: String,
-    /// The figures.
+    /// The metrics.
     pub metrics: Value,
 }
 
 impl Evaluation {
-    /// Its bytes as they lie in the store: with their checksum, as [`crate::layout::manifest::seal`] has it.
+    /// Returns the bytes to store, with their checksum, see [`crate::layout::manifest::seal`].
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut sorted = self.clone();
         sorted.metrics.sort_all_objects();
@@ -65,8 +67,8 @@ impl Evaluation {
 }
 
 impl Models {
-    /// Stores an evaluation. `false` where it was there: then that one stands, even if a graphics processor came to
-    /// slightly other figures.
+    /// Stores an evaluation. Returns `false` if one already exists; it is retained even if its
+    /// metrics differ slightly, as they may on a GPU.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -76,7 +78,7 @@ impl Models {
         objects::create(&*self.store, &path, Bytes::from(evaluation.to_bytes())).await
     }
 
-    /// An evaluation of this key.
+    /// Reads the evaluation with this key.
     ///
     /// # Errors
     /// [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -96,7 +98,7 @@ impl Models {
         parsed.map(Some)
     }
 
-    /// The evaluations of a model, by key.
+    /// Returns the evaluations of a model, ordered by key.
     ///
     /// # Errors
     /// [`DatasetError::Damaged`], [`DatasetError::Store`].

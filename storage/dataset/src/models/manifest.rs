@@ -1,4 +1,4 @@
-//! A model's manifest: what it is, where it comes from, how good it is, and what it consists of.
+//! A model's manifest: its description, lineage, metrics and objects.
 
 use std::collections::BTreeMap;
 
@@ -8,123 +8,128 @@ use serde_json::Value;
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
 
-/// Version of manifests of models.
+/// Format version of model manifests.
 const FORMAT: u32 = 1;
 
-/// What a trained model is. A pure function of its training, where that is one: no times, no machine.
+/// The contents of a trained model. If the training is reproducible, it is a pure function of the
+/// training, without times or machine names.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ModelManifest {
-    /// Version of this form.
+    /// Format version of the manifest.
     pub format: u32,
     /// The model's name.
     pub name: String,
-    /// What it predicts: `tof`, `shadow` or `specular`.
+    /// The predicted quantity: `tof`, `shadow` or `specular`.
     pub kind: String,
-    /// Key of the training that made it: settings, data, split and code.
+    /// Key of the training that produced it: settings, data, split and code.
     pub training_key: String,
-    /// What was asked for, as `train` in a job file.
+    /// The requested settings: `train` in a job file.
     pub settings: Value,
-    /// What the model runtime made of it: network, input and gate, all that it takes to ask the model.
+    /// The model runtime's plan: network, input and gate, which suffice to run the model.
     pub plan: Value,
-    /// Where it comes from.
+    /// The origin of the model.
     pub lineage: Lineage,
-    /// How good it is: figures of the validation scenes at its end, and what else the training says of itself.
+    /// Metrics on the validation scenes at the end of the training, and other facts about the
+    /// training.
     pub metrics: Value,
-    /// Its objects; keys below the model's folder.
+    /// Its objects, with keys relative to the model's folder.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::layout::manifest::seal`] says of the rest.
+    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
 
-/// Where a model comes from.
+/// The origin of a model.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Lineage {
     /// Folder of the data set in the same store.
     pub dataset: String,
-    /// [`crate::Snapshot::id`] of the scenes that were learnt from and validated on: pins every byte of them.
+    /// [`crate::Snapshot::id`] of the training and validation scenes, which pins every byte of
+    /// them.
     pub data: String,
     /// The split.
     pub split: SplitUsed,
-    /// What was measured in them.
+    /// The measurement in these scenes.
     #[serde(default)]
     pub measurement: Measurement,
-    /// Scenes learnt from.
+    /// Number of training scenes.
     pub training_scenes: u64,
-    /// Scenes validated on.
+    /// Number of validation scenes.
     pub validation_scenes: u64,
-    /// Version of networks and training.
+    /// Code version of networks and training.
     pub code: String,
     /// Seed of all random numbers.
     pub seed: u64,
-    /// Models that it builds on, that whose predictions it learns from among them: name, and SHA-256 of the manifest.
+    /// Models used for the training, including a teacher with predictions as labels: name, and
+    /// SHA-256 of the manifest.
     pub models: BTreeMap<String, String>,
-    /// For shadows: the predictions that two-bounce times follow from, by their folder and what pins their bytes.
+    /// For shadows, the predictions from which two-bounce times are computed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub times: Option<DepthsUsed>,
-    /// Where it is another model's copy under a name of its own: how it was chosen.
+    /// If it is a promoted copy of another model, how it was selected.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub promoted: Option<Promoted>,
 }
 
-/// Predicted depths as they were used.
+/// The predicted depths that were used.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct DepthsUsed {
     /// Folder of the predictions in the same store.
     pub predictions: String,
-    /// [`crate::PinnedDepths::id`] of the scenes that were used.
+    /// [`crate::PinnedDepths::id`] of the scenes used.
     pub id: String,
 }
 
-/// What was measured in scenes, as far as experiments differ by it. All zero = not known.
+/// The measurement in scenes, as far as it distinguishes experiments. All zero = unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Measurement {
-    /// Rows of an image.
+    /// Number of image rows.
     pub rows: u32,
-    /// Columns of an image.
+    /// Number of image columns.
     pub columns: u32,
-    /// Spots that light at once.
+    /// Number of simultaneous spots.
     pub spots: u32,
-    /// Bounces at most; 0 = all.
+    /// Maximum number of bounces; 0 = all.
     pub max_bounces: u32,
-    /// Whether photons were counted, with their noise.
+    /// Whether photons were counted, with photon noise.
     pub photon_noise: bool,
 }
 
-/// How a model was chosen among others.
+/// The selection of a model among others.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Promoted {
-    /// The model.
+    /// Name of the selected model.
     pub model: String,
-    /// SHA-256 of its manifest, hexadecimal.
+    /// SHA-256 of its manifest, in hexadecimal.
     pub manifest_sha256: String,
-    /// Its values where it was a trial, by the parameters' names.
+    /// If it was a trial, its parameter values, by name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub values: BTreeMap<String, Value>,
-    /// Models that came to their end, itself among them.
+    /// Number of finished models, including this one.
     pub finished: u64,
-    /// Models that were begun.
+    /// Number of models begun.
     pub begun: u64,
 }
 
-/// A split as it was used.
+/// The split used.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SplitUsed {
     /// Its name.
     pub name: String,
     /// Its version.
     pub version: u64,
-    /// SHA-256 of that version, hexadecimal.
+    /// SHA-256 of that version, in hexadecimal.
     pub sha256: String,
 }
 
 impl ModelManifest {
-    /// The same with objects, and the checksum that belongs to it.
+    /// Returns the manifest with objects and checksum set.
     #[must_use]
     pub(super) fn with_objects(mut self, objects: Vec<ObjectEntry>) -> Self {
         self.format = FORMAT;
         self.objects = objects;
-        // A feature of serde_json, which any crate may switch on, decides on the order of members otherwise.
+        // Otherwise the order of members depends on a feature of serde_json, which any crate may
+        // enable.
         self.settings.sort_all_objects();
         self.plan.sort_all_objects();
         self.metrics.sort_all_objects();
@@ -133,23 +138,23 @@ impl ModelManifest {
         self
     }
 
-    /// The object of this file name.
+    /// Returns the object with this file name.
     pub fn object(&self, file: &str) -> Option<&ObjectEntry> {
         let named = |object: &&ObjectEntry| object.key.rsplit('/').next() == Some(file);
         self.objects.iter().find(named)
     }
 
-    /// Bytes of all objects together.
+    /// Returns the total size of all objects in bytes.
     pub fn total_bytes(&self) -> u64 {
         self.objects.iter().map(|o| o.size).sum()
     }
 
-    /// SHA-256 of its bytes as they lie in the store, hexadecimal.
+    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
     pub fn sha256(&self) -> String {
         sha256_hex(&self.to_bytes())
     }
 
-    /// The manifest as it lies in the store.
+    /// Returns the bytes to store.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self)
             .expect("a manifest has only string keys and finite numbers");

@@ -1,10 +1,11 @@
-//! Trained models: `models/<name>/` in a store, beside its data sets and not within one. A model outlives the data set
-//! that it learnt from and meets others, reprocessed or rendered later, which lie in the same store: so its name means the
-//! same to all of them.
+//! Trained models: `models/<name>/` in a store, next to its data sets. A model outlives the data
+//! set of its training and is applied to others in the same store, reprocessed or rendered later.
+//! Therefore its name has the same meaning for all of them.
 //!
-//! A model is published as scenes are: objects first, in a folder named after their content, then `manifest.json`,
-//! create-only. Trainings of other settings, killed half-way under the same name, leave objects in other folders and
-//! checkpoints under other keys: they are in nobody's way, and [`crate::Dataset::collect`] deletes them in the end.
+//! A model is published like a scene: objects first, in a folder named after their content, then
+//! `manifest.json`, create-only. Killed trainings with other settings under the same name leave
+//! objects in other folders and checkpoints under other keys. They do not interfere, and
+//! [`crate::Dataset::collect`] eventually deletes them.
 
 mod call;
 mod checkpoint;
@@ -38,9 +39,9 @@ pub use speed::TrainingSpeed;
 pub use sweep::{Rung, TrialEnd, TrialRecord};
 pub use verify::ModelCheck;
 
-/// The folder of models in a store; no data set has this name.
+/// The folder of models in a store. No data set can have this name.
 pub const MODELS: &str = "models";
-/// The object that makes a model one.
+/// Name of the manifest, which marks a model as published.
 const MANIFEST: &str = "manifest.json";
 
 /// The models of a store. Cheap to clone.
@@ -50,10 +51,10 @@ pub struct Models {
     folder: Path,
 }
 
-/// What is to be published.
+/// A model to be published.
 #[derive(Debug, Clone)]
 pub struct NewModel {
-    /// Its manifest; format, objects and checksum are filled in.
+    /// Its manifest. Format, objects and checksum are set on publishing.
     pub manifest: ModelManifest,
     /// Its objects: `weights.safetensors`, `history.jsonl`, …
     pub objects: Vec<(String, Bytes)>,
@@ -62,14 +63,15 @@ pub struct NewModel {
 /// A published model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Published {
-    /// Its manifest, as it lies in the store.
+    /// Its stored manifest.
     pub manifest: ModelManifest,
-    /// Another run of the same training was faster, and came to other bits (as graphics processors do): they stand.
+    /// Whether another run of the same training was published first and has different bits (as is
+    /// possible on GPUs), so that its model was adopted.
     pub adopted: bool,
 }
 
 impl Models {
-    /// The models of the store at `prefix`.
+    /// Returns the models of the store at `prefix`.
     pub fn new(store: Arc<dyn ObjectStore>, prefix: &Path) -> Self {
         Self {
             store,
@@ -77,12 +79,12 @@ impl Models {
         }
     }
 
-    /// Where a model lies, for a message.
+    /// Returns a model's location for messages.
     pub fn place(&self, name: &str) -> String {
         objects::shown(&*self.store, &self.folder.clone().join(name))
     }
 
-    /// The names of the models, ascending; of those that are still trained, too.
+    /// Returns the names of the models, ascending, including those still in training.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -91,7 +93,7 @@ impl Models {
         let listed = listed.map_err(|e| self.failed("list", &self.folder, e))?;
         let mut names = Vec::new();
         for path in &listed.common_prefixes {
-            // On a disk, the folder of a model that was removed stays.
+            // On a disk, the folder of a removed model remains.
             let on_disk = objects::folder(&*self.store, path).is_some();
             if on_disk && self.list(path).await?.is_empty() {
                 continue;
@@ -102,7 +104,8 @@ impl Models {
         Ok(names)
     }
 
-    /// The manifest of a model; `None` where there is none of this name, or it is still trained.
+    /// Returns the manifest of a model; `None` if there is none of this name, or it is still in
+    /// training.
     ///
     /// # Errors
     /// [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -114,10 +117,10 @@ impl Models {
         ModelManifest::parse(&bytes, name, &self.shown(&path)).map(Some)
     }
 
-    /// The manifest of a model that must be there.
+    /// Returns the manifest of a model that must exist.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] says which there are; those of [`Self::look`].
+    /// [`DatasetError::Invalid`] lists the existing models; those of [`Self::look`].
     pub async fn manifest(&self, name: &str) -> Result<ModelManifest, DatasetError> {
         check_name(name)?;
         if let Some(manifest) = self.look(name).await? {
@@ -145,12 +148,12 @@ impl Models {
         Err(DatasetError::invalid("model", what))
     }
 
-    /// The manifest of a model that this very training has published, after checking that each of its objects has the
-    /// stated SHA-256; `None` where it is not published.
+    /// Returns the manifest of a model that this training has published, after checking the SHA-256
+    /// of each object. Returns `None` if it is not published.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the name is another training's; [`DatasetError::Damaged`] where an object is missing
-    /// or changed; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if the name belongs to another training; [`DatasetError::Damaged`]
+    /// if an object is missing or changed; [`DatasetError::Store`].
     pub async fn finished(
         &self,
         name: &str,
@@ -164,7 +167,7 @@ impl Models {
         for object in &manifest.objects {
             let path = self.path(name, &object.key);
             let what = match objects::size(&*self.store, &path).await? {
-                // Reading it is cheap beside making it.
+                // Reading a model is cheap compared with training it.
                 Some(size) if size == object.size => {
                     let bytes = objects::require(&*self.store, &path).await?;
                     if sha256_hex(&bytes) == object.sha256 {
@@ -181,13 +184,14 @@ impl Models {
         Ok(Some(manifest))
     }
 
-    /// Publishes a model: objects first, the manifest last, all create-only; what exists with equal bytes counts as
-    /// written. Where its manifest stands and says the same, what is missing or changed of its objects is put back. Where another run of the same training came to other bits and was faster, its model stands, unless
-    /// `exact` asks for an error.
+    /// Publishes a model: objects first, the manifest last, all create-only. Existing objects with
+    /// equal bytes count as written. If an equal manifest exists, missing or changed objects are
+    /// restored. If another run of the same training published different bits first, its model is
+    /// retained, unless `exact` requests an error.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used or is another training's;
-    /// [`DatasetError::Conflict`] with `exact`, for other bits; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] for a name of another training, or an invalid name;
+    /// [`DatasetError::Conflict`] with `exact`, for different bits; [`DatasetError::Store`].
     pub async fn publish(&self, model: NewModel, exact: bool) -> Result<Published, DatasetError> {
         let NewModel { manifest, objects } = model;
         let name = manifest.name.clone();
@@ -207,7 +211,7 @@ impl Models {
         let path = self.path(&name, MANIFEST);
         let ours = manifest.to_bytes();
         if objects::get(&*self.store, &path).await?.as_deref() == Some(&ours[..]) {
-            // It was published before: what is damaged of it since is put back.
+            // It was published before; objects damaged since then are restored.
             self.restore(&manifest, &bytes).await?;
             return Ok(Published {
                 manifest,
@@ -221,7 +225,7 @@ impl Models {
                 return self.other_bits(&manifest, &stored, exact).await;
             }
         }
-        // A collector may have taken an object before there was a manifest to protect it.
+        // A collector may have deleted an object before the manifest protected it.
         self.put_objects(&manifest, &bytes).await?;
         Ok(Published {
             manifest,
@@ -229,7 +233,7 @@ impl Models {
         })
     }
 
-    /// Somebody else's manifest stands under the name: that of the same training, or of another.
+    /// Handles an existing manifest under the name, of the same training or of another one.
     async fn other_bits(
         &self,
         ours: &ModelManifest,
@@ -246,13 +250,13 @@ impl Models {
                 ours: sha256_hex(&ours.to_bytes()),
             });
         }
-        // Ours are in nobody's way, but of no use either.
+        // The new objects do not interfere, but they are not needed either.
         let named = |key: &str| theirs.objects.iter().any(|object| object.key == key);
         for object in ours.objects.iter().filter(|object| !named(&object.key)) {
             self.delete(&self.path(&ours.name, &object.key)).await?;
         }
         same?;
-        // What is damaged of it cannot be put back from other bits.
+        // Its damaged objects cannot be restored from different bits.
         self.finished(&ours.name, &ours.training_key).await?;
         Ok(Published {
             manifest: theirs,
@@ -260,7 +264,7 @@ impl Models {
         })
     }
 
-    /// The bytes of one of a model's objects, by its file name, checked against the manifest.
+    /// Reads one of a model's objects, by its file name, and checks it against the manifest.
     ///
     /// # Errors
     /// [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -319,7 +323,7 @@ impl Models {
         }
     }
 
-    /// Everything in a folder of a model.
+    /// Lists all objects in a folder of a model.
     async fn list(&self, folder: &Path) -> Result<Vec<object_store::ObjectMeta>, DatasetError> {
         let listed = self.store.list(Some(folder)).try_collect().await;
         listed.map_err(|e| self.failed("list", folder, e))
@@ -346,7 +350,8 @@ fn entry(file: &str, bytes: &Bytes) -> ObjectEntry {
     }
 }
 
-/// The folder of objects: 16 hexadecimal digits that follow from the training and from their bytes.
+/// Returns the name of the folder of objects: 16 hexadecimal digits, computed from the training and
+/// the objects' bytes.
 fn content(training_key: &str, entries: &[ObjectEntry]) -> String {
     let mut text = training_key.to_owned();
     for entry in entries {
@@ -357,7 +362,8 @@ fn content(training_key: &str, entries: &[ObjectEntry]) -> String {
     name
 }
 
-/// Whether an object's key below a model is that of one of its objects, and in which folder.
+/// Returns the folder of an object, if its key relative to the model belongs to one of the model's
+/// objects.
 fn object_folder(key: &str) -> Option<&str> {
     let (folder, file) = key.split_once('/')?;
     let hex = folder.len() == 16 && folder.bytes().all(|b| b.is_ascii_hexdigit());
@@ -375,7 +381,7 @@ fn check_name(name: &str) -> Result<(), DatasetError> {
     Err(DatasetError::invalid("model", what))
 }
 
-/// The key of an object below a folder.
+/// Returns the key of an object relative to a folder.
 fn key_below(folder: &Path, path: &Path) -> Option<String> {
     let parts: Vec<_> = path.prefix_match(folder)?.collect();
     let parts: Vec<&str> = parts.iter().map(AsRef::as_ref).collect();

@@ -1,5 +1,6 @@
-//! Removing a model: a note of what goes, then the manifest, then the objects, then the note. Whoever finds the note goes on
-//! from there. Nothing goes but what the note names, and no object that a manifest names.
+//! Removes a model: writes a note of the objects to delete, then deletes the manifest, the objects
+//! and the note. An interrupted removal can be continued from the note. Only objects in the note
+//! are deleted, and none that a manifest lists.
 
 use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
@@ -11,51 +12,51 @@ use crate::predictions::{ModelUsed, PredictionManifest, Predictions, TimesUsed};
 use crate::reports::REPORTS;
 use crate::store::objects;
 
-/// The object that says what is being removed.
+/// Name of the object with the note.
 pub(super) const REMOVING: &str = "removing.json";
-/// Manifests read at a time.
+/// Number of manifests read concurrently.
 const AT_ONCE: usize = 16;
 
-/// What goes.
+/// The objects to delete.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 struct Note {
-    /// SHA-256 of the manifest; empty where it could not be read.
+    /// SHA-256 of the manifest; empty if it could not be read.
     manifest_sha256: String,
     training_key: String,
-    /// Keys below the model.
+    /// Keys relative to the model.
     objects: Vec<String>,
 }
 
-/// What builds on a model.
+/// Objects that depend on a model.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Dependents {
-    /// Models that were trained with it.
+    /// Models trained with it.
     pub models: Vec<String>,
-    /// Groups of predictions that it made, or whose two-bounce times follow from it.
+    /// Groups of predictions made with it, or using two-bounce times computed from it.
     pub predictions: Vec<String>,
 }
 
 impl Dependents {
-    /// Whether nothing does.
+    /// Returns whether nothing depends on the model.
     pub fn is_empty(&self) -> bool {
         self.models.is_empty() && self.predictions.is_empty()
     }
 }
 
-/// What was removed of a model.
+/// The result of removing a model.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Removed {
-    /// Objects, in the order in which they went.
+    /// Deleted objects, in order of deletion.
     pub deleted: Vec<String>,
-    /// What still lies under the name: of other trainings, sweeps, and what nobody knows.
+    /// Objects that remain under the name: of other trainings, of sweeps, and unknown ones.
     pub left: Vec<String>,
 }
 
 impl Models {
-    /// What builds on a model. A manifest that cannot be read may build on anything.
+    /// Returns the dependents of a model. An unreadable manifest may depend on any model.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] for an invalid name; [`DatasetError::Store`].
     pub async fn dependents(&self, name: &str) -> Result<Dependents, DatasetError> {
         check_name(name)?;
         let sha256 = match self.look(name).await {
@@ -117,12 +118,12 @@ impl Models {
         Ok(found)
     }
 
-    /// Removes a model: its manifest first, then its objects, evaluations, checkpoints and speed. A removal that was
-    /// interrupted goes on. Who depends on it is not looked at: see [`Self::dependents`].
+    /// Removes a model: its manifest first, then its objects, evaluations, checkpoints and speed.
+    /// An interrupted removal is continued. Dependents are not checked: see [`Self::dependents`].
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where there is nothing of this name, or it is still trained (no manifest, and no removal
-    /// under way) and `unfinished` does not ask for its end; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if there is no such model, or if it is still in training (no
+    /// manifest, and no removal in progress) and `unfinished` is not set; [`DatasetError::Store`].
     pub async fn remove(&self, name: &str, unfinished: bool) -> Result<Removed, DatasetError> {
         check_name(name)?;
         let note_path = self.path(name, REMOVING);
@@ -165,7 +166,7 @@ impl Models {
         Ok(removed)
     }
 
-    /// What a removal that begins now takes.
+    /// Returns the note of a new removal.
     async fn note(&self, name: &str, unfinished: bool) -> Result<Note, DatasetError> {
         let folder = self.folder.clone().join(name);
         let there = self.list(&folder).await?;
@@ -186,7 +187,8 @@ impl Models {
                 objects: manifest.objects.into_iter().map(|o| o.key).collect(),
             }),
             Err(()) => {
-                // Nobody can say what it names: all that lies there goes.
+                // The objects of an unreadable manifest are unknown, so everything under the name
+                // is deleted.
                 let bytes = objects::require(&*self.store, &self.path(name, MANIFEST)).await?;
                 Ok(Note {
                     manifest_sha256: crate::layout::manifest::sha256_hex(&bytes),
@@ -200,7 +202,8 @@ impl Models {
                 objects: keys,
             }),
             Ok(None) => {
-                // Says which there are, and whether it is still trained.
+                // Returns an error that lists the existing models, and states whether this one is
+                // still in training.
                 self.manifest(name).await?;
                 Err(DatasetError::invalid(
                     "model",
@@ -211,11 +214,12 @@ impl Models {
     }
 
     fn note_of(&self, bytes: &[u8]) -> Option<Note> {
-        // One that was torn is written again: nothing went before it stood.
+        // A torn note is written again, because nothing is deleted before the note is complete.
         serde_json::from_slice(bytes).ok()
     }
 
-    /// Whether a manifest that stands now names an object: of the same training, run again since.
+    /// Returns whether the current manifest lists an object, because the same training was run
+    /// again in the meantime.
     async fn named(&self, name: &str, key: &str) -> Result<bool, DatasetError> {
         match self.look(name).await {
             Ok(manifest) => Ok(manifest.is_some_and(|m| m.objects.iter().any(|o| o.key == key))),
@@ -224,7 +228,7 @@ impl Models {
         }
     }
 
-    /// Evaluations, checkpoints and speed of what goes.
+    /// Deletes the evaluations, checkpoints and speed of the removed model.
     async fn remove_records(
         &self,
         name: &str,
@@ -232,7 +236,7 @@ impl Models {
         removed: &mut Removed,
     ) -> Result<(), DatasetError> {
         let all = note.training_key.is_empty();
-        // The same training, run again since, has the same evaluations and speed.
+        // If the same training was run again, it has the same evaluations and speed.
         if self
             .look(name)
             .await
@@ -283,7 +287,7 @@ impl Models {
         Ok(())
     }
 
-    /// Reports that say something of a model; they stay as they are.
+    /// Returns the reports that mention a model. They are not changed by its removal.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -319,7 +323,7 @@ impl Models {
     }
 }
 
-/// The models that predictions were made with.
+/// Returns the models used for predictions.
 fn used(manifest: &PredictionManifest) -> impl Iterator<Item = &ModelUsed> {
     let times = match &manifest.two_bounce_times {
         Some(TimesUsed::Model(model)) => Some(model),

@@ -1,5 +1,6 @@
-//! Putting back what is broken of a model, from bytes that have the recorded SHA-256: another model's object, or what can be
-//! computed again. What cannot be put back is left alone and named.
+//! Restores broken objects of a model from bytes with the recorded SHA-256: from another model's
+//! object, or from objects that can be recomputed. Objects that cannot be restored are reported and
+//! not touched.
 
 use bytes::Bytes;
 
@@ -9,20 +10,21 @@ use crate::layout::manifest::{ObjectEntry, sha256_hex};
 use crate::store::objects;
 use crate::verify::report::{Fault, Problem};
 
-/// What was done to a model.
+/// The result of repairing a model.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ModelRepair {
-    /// Objects that were written again, each from bytes of the recorded SHA-256.
+    /// Restored objects, each from bytes with the recorded SHA-256.
     pub written: Vec<String>,
-    /// Damaged records that were deleted, because a job makes them again: evaluations, checkpoints, speeds.
+    /// Deleted damaged records, which a job can regenerate: evaluations, checkpoints, speeds.
     pub deleted: Vec<String>,
-    /// What stays broken.
+    /// Remaining problems.
     pub left: Vec<Problem>,
 }
 
 impl Models {
-    /// Puts back what can be: objects of the manifest from `made` or from other models of the store, if their SHA-256 is the
-    /// manifest's. Deletes damaged evaluations, checkpoints and speeds: jobs make them again. With `dry`, it only says so.
+    /// Restores objects of the manifest from `made` or from other models of the store, if their
+    /// SHA-256 matches the manifest. Deletes damaged evaluations, checkpoints and speeds, which
+    /// jobs can regenerate. With `dry`, it only reports this.
     ///
     /// # Errors
     /// Those of [`Self::verify`].
@@ -68,7 +70,7 @@ impl Models {
         Ok(done)
     }
 
-    /// Bytes with an object's SHA-256, wherever they are.
+    /// Returns bytes with an object's SHA-256, from any source.
     async fn find_bytes(
         &self,
         name: &str,
@@ -98,7 +100,7 @@ impl Models {
         Ok(None)
     }
 
-    /// One atomic put over whatever is there, read back.
+    /// Overwrites an object with one atomic put, and reads it back.
     pub(super) async fn replace(
         &self,
         path: &object_store::path::Path,
@@ -115,7 +117,7 @@ impl Models {
         }
     }
 
-    /// Puts back what is broken of a model whose manifest stands and says what `ours` does.
+    /// Restores the broken objects of a model with an existing manifest equal to `ours`.
     pub(super) async fn restore(
         &self,
         ours: &ModelManifest,

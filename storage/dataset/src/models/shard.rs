@@ -1,5 +1,6 @@
-//! Shards of evaluations, on their way to who joins them: `models/<name>/shards/<evaluation key>/<shard>-of-<shards>.zst`.
-//! Nobody else needs them; they are deleted when the evaluation is stored.
+//! Shards of evaluations, in transit to the worker that joins them:
+//! `models/<name>/shards/<evaluation key>/<shard>-of-<shards>.zst`. They have no other use, and are
+//! deleted when the evaluation is stored.
 
 use bytes::Bytes;
 
@@ -10,17 +11,17 @@ use crate::store::objects;
 
 /// The folder of the shards.
 pub(super) const FOLDER: &str = "shards";
-/// Bytes that a shard has at most: some kilobytes a scene.
+/// Maximum size of a shard in bytes. A scene takes some kilobytes.
 const MOST: u64 = 1 << 30;
 
-/// Names a shard of an evaluation.
+/// The name of a shard of an evaluation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ShardName {
     /// The model.
     pub model: String,
     /// Key of the evaluation.
     pub evaluation: String,
-    /// Which shard, and of how many.
+    /// The shard's index and the number of shards.
     pub shard: (u32, u32),
 }
 
@@ -32,7 +33,7 @@ impl ShardName {
 }
 
 impl Models {
-    /// Puts a shard, over a damaged one if need be.
+    /// Stores a shard, replacing a damaged one.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -42,7 +43,7 @@ impl Models {
         objects::overwrite(&*self.store, &path, packed.into()).await
     }
 
-    /// A shard; `None` where there is none, or a damaged one.
+    /// Reads a shard. Returns `None` if it is missing or damaged.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -60,7 +61,7 @@ impl Models {
         }
     }
 
-    /// Deletes a shard, if it is there.
+    /// Deletes a shard, if it exists.
     ///
     /// # Errors
     /// [`DatasetError::Store`].

@@ -1,5 +1,6 @@
-//! How fast a model was trained: `models/<name>/speed.json`, create-only. A time belongs to a machine and a model's bytes to
-//! none, so it lies beside the manifest and not in it, and nobody misses it where it is not there.
+//! Speed of a model's training: `models/<name>/speed.json`, create-only. A speed depends on the
+//! machine and the model's bytes do not, so it is stored separately from the manifest, and it is
+//! optional.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,24 +11,24 @@ use crate::store::objects;
 
 pub(super) const FILE: &str = "speed.json";
 
-/// How fast a model was trained, by the worker that ended it.
+/// The speed of a model's training, measured by the worker that finished it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrainingSpeed {
     /// Key of the training.
     pub training_key: String,
-    /// Training examples a second, validation not among the time.
+    /// Training examples per second, excluding the time for validation.
     pub samples_per_s: f64,
     /// Share of that time in which the network waited for data.
     pub data_wait_share: f64,
-    /// Threads of the worker.
+    /// Number of threads of the worker.
     pub threads: usize,
-    /// The graphics processor that it was computed on, as it calls itself; none for the CPU.
+    /// Name of the GPU used; none for the CPU.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gpu: Option<String>,
 }
 
 impl TrainingSpeed {
-    /// SHA-256 of its bytes, hexadecimal.
+    /// Returns the SHA-256 of its bytes, in hexadecimal.
     pub fn sha256(&self) -> String {
         sha256_hex(&self.to_bytes())
     }
@@ -40,7 +41,7 @@ impl TrainingSpeed {
 }
 
 impl Models {
-    /// Stores how fast a model was trained; a record that is there stands.
+    /// Stores the speed of a training. An existing record is retained.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -51,7 +52,7 @@ impl Models {
         Ok(())
     }
 
-    /// How fast a model was trained, if the record is of this training.
+    /// Returns the speed of a model's training, if the record belongs to this training.
     ///
     /// # Errors
     /// [`DatasetError::Store`], [`DatasetError::Damaged`].

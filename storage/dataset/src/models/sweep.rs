@@ -1,5 +1,6 @@
-//! What trials of a sweep tell of themselves: `models/<sweep>/sweeps/<id>/`, create-only. `rungs/<epochs>/<trial>.json` is
-//! how good a trial was after so many epochs, for the others to compare with; `trials/<trial>.json` how it ended.
+//! Records of a sweep's trials: `models/<sweep>/sweeps/<id>/`, create-only.
+//! `rungs/<epochs>/<trial>.json` is a trial's loss after a number of epochs, for comparison with
+//! the others; `trials/<trial>.json` is its final state.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,65 +16,66 @@ use crate::error::DatasetError;
 use crate::layout::manifest::{read_unsealed, seal, sha256_hex};
 use crate::store::objects;
 
-/// Folder of sweeps below a name.
+/// Folder of sweeps in a model's folder.
 const FOLDER: &str = "sweeps";
-/// Objects that are read at a time.
+/// Number of objects read concurrently.
 const AT_ONCE: usize = 16;
 
-/// How a trial ended. A pure function of its training and of where it stopped.
+/// The final state of a trial. It is a pure function of the training and of the point where it
+/// stopped.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrialRecord {
     /// The sweep's name.
     pub sweep: String,
-    /// Which sweep of that name.
+    /// Id of the sweep among those of this name.
     pub id: String,
     /// The trial's number.
     pub index: u64,
-    /// Its values, by the parameters' names.
+    /// Its parameter values, by name.
     pub values: BTreeMap<String, Value>,
-    /// By the parameters' names: the values that each may have, as in the job file. Empty where it does not say.
+    /// The candidate values of each parameter, by name, as in the job file. Empty if unknown.
     pub over: BTreeMap<String, Value>,
-    /// The name of its model; there is one only where it came to its end.
+    /// Name of its model, which exists only if the trial finished.
     pub model: String,
-    /// What it predicts: `tof`, `shadow` or `specular`.
+    /// The predicted quantity: `tof`, `shadow` or `specular`.
     pub kind: String,
     /// Key of the training.
     pub training_key: String,
-    /// How it ended.
+    /// The outcome.
     pub end: TrialEnd,
-    /// Epochs done.
+    /// Number of completed epochs.
     pub epochs: u64,
-    /// How bad it was at the end, on the validation scenes: mean absolute error in metres, or one less IoU.
+    /// Final loss on the validation scenes: mean absolute error in metres, or one minus IoU.
     pub loss: Option<f64>,
-    /// A line for each epoch, as in a model's `history.jsonl`.
+    /// One entry per epoch, as in a model's `history.jsonl`.
     pub history: Vec<Value>,
 }
 
-/// How a trial ended.
+/// The outcome of a trial.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TrialEnd {
-    /// It came to its end.
+    /// The training finished.
     Finished,
-    /// It fell behind others.
+    /// It was stopped because others were better.
     Pruned,
-    /// Its numbers became infinite or none: what did.
+    /// The named quantity became infinite or NaN.
     Diverged(String),
 }
 
-/// How good a trial was at a rung.
+/// A trial's loss at a rung.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Rung {
     /// The trial's number.
     pub index: u64,
-    /// Epochs done.
+    /// Number of completed epochs.
     pub epochs: u64,
-    /// As [`TrialRecord::loss`].
+    /// The loss, see [`TrialRecord::loss`].
     pub loss: f64,
 }
 
 impl TrialRecord {
-    /// Its bytes as they lie in the store.
+    /// Returns the bytes to store.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut sorted = self.clone();
         let values = sorted.values.values_mut();
@@ -84,17 +86,18 @@ impl TrialRecord {
         json(&sorted)
     }
 
-    /// SHA-256 of its bytes, hexadecimal.
+    /// Returns the SHA-256 of its bytes, in hexadecimal.
     pub fn sha256(&self) -> String {
         sha256_hex(&self.to_bytes())
     }
 }
 
 impl Models {
-    /// Stores how a trial ended, and says what stands: another run of the same trial may have been faster.
+    /// Stores the final state of a trial. Returns the stored record, because another run of the
+    /// same trial may have been stored first.
     ///
     /// # Errors
-    /// [`DatasetError::Store`], [`DatasetError::Damaged`] for another's that cannot be read.
+    /// [`DatasetError::Store`], [`DatasetError::Damaged`] if another run's record cannot be read.
     pub async fn put_trial(&self, trial: &TrialRecord) -> Result<TrialRecord, DatasetError> {
         let path = self.sweep_path(
             &trial.sweep,
@@ -106,7 +109,7 @@ impl Models {
         self.parse(&path, &stands)
     }
 
-    /// How a trial ended, if it has.
+    /// Returns the final state of a trial, if it has ended.
     ///
     /// # Errors
     /// [`DatasetError::Store`], [`DatasetError::Damaged`].
@@ -121,7 +124,7 @@ impl Models {
         found.map(|bytes| self.parse(&path, &bytes)).transpose()
     }
 
-    /// Stores how good a trial is at a rung; a record that is there stands, and is the same.
+    /// Stores a trial's loss at a rung. An existing record is retained, and is the same.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -132,7 +135,7 @@ impl Models {
         Ok(())
     }
 
-    /// How good all trials were that have reached the rung after so many epochs.
+    /// Returns the losses of all trials that have reached the rung after this number of epochs.
     ///
     /// # Errors
     /// [`DatasetError::Store`], [`DatasetError::Damaged`].
@@ -146,7 +149,7 @@ impl Models {
         self.read_all(&folder).await
     }
 
-    /// The sweeps of a name.
+    /// Returns the sweeps of a name.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -159,7 +162,8 @@ impl Models {
         Ok(ids.map(str::to_owned).collect())
     }
 
-    /// How the trials of a sweep ended, and how good those were at rungs that came to any, in order.
+    /// Returns the final states of a sweep's trials, and the losses of trials that reached a rung,
+    /// in order.
     ///
     /// # Errors
     /// [`DatasetError::Store`], [`DatasetError::Damaged`].
@@ -177,7 +181,7 @@ impl Models {
         Ok((trials, rungs))
     }
 
-    /// All documents below a folder.
+    /// Reads all documents in a folder.
     async fn read_all<T: DeserializeOwned>(&self, folder: &Path) -> Result<Vec<T>, DatasetError> {
         let paths = self.list(folder).await?.into_iter().map(|o| o.location);
         stream::iter(paths)

@@ -1,4 +1,5 @@
-//! Checking a model: manifest, each object's size and SHA-256, evaluations, checkpoints, and records of trials.
+//! Checks a model: manifest, each object's size and SHA-256, evaluations, checkpoints, and records
+//! of trials.
 
 use std::collections::BTreeSet;
 
@@ -15,45 +16,46 @@ use crate::layout::manifest::sha256_hex;
 use crate::store::objects;
 use crate::verify::report::{Fault, Problem};
 
-/// What a check of a model found.
+/// The result of checking a model.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ModelCheck {
-    /// Its manifest, where it can be read; a model that is still trained has none.
+    /// Its manifest, if it is readable. A model still in training has none.
     pub manifest: Option<ModelManifest>,
-    /// Objects of the manifest that were checked.
+    /// Number of the manifest's objects checked.
     pub objects: u64,
-    /// Their bytes.
+    /// Their total size in bytes.
     pub bytes: u64,
-    /// Evaluations that were checked.
+    /// Number of evaluations checked.
     pub evaluations: u64,
-    /// Checkpoints that were checked.
+    /// Number of checkpoints checked.
     pub checkpoints: u64,
-    /// What is wrong, ordered by key.
+    /// The problems, ordered by key.
     pub problems: Vec<Problem>,
-    /// Objects that the manifest does not name: of a killed training; `dataset gc` deletes them.
+    /// Objects that the manifest does not list, left by a killed training; `dataset gc` deletes
+    /// them.
     pub unused: Vec<String>,
-    /// Somebody began to remove the model, and did not come to the end.
+    /// Whether a removal of the model was begun but not finished.
     pub removing: bool,
 }
 
 impl ModelCheck {
-    /// Whether nothing is wrong.
+    /// Returns whether there are no problems.
     pub fn is_sound(&self) -> bool {
         self.problems.is_empty() && !self.removing
     }
 }
 
 impl Models {
-    /// Checks everything that lies under a model's name.
+    /// Checks everything under a model's name.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where nothing does; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if there is nothing; [`DatasetError::Store`].
     pub async fn verify(&self, name: &str) -> Result<ModelCheck, DatasetError> {
         check_name(name)?;
         let folder = self.folder.clone().join(name);
         let there = self.list(&folder).await?;
         if there.is_empty() {
-            // Says which there are.
+            // Returns an error that lists the existing models.
             self.manifest(name).await?;
         }
         let mut check = ModelCheck::default();
@@ -102,7 +104,7 @@ impl Models {
         Ok(check)
     }
 
-    /// Checks what no manifest names.
+    /// Checks the objects that no manifest lists.
     async fn check_other(
         &self,
         name: &str,
@@ -143,7 +145,7 @@ impl Models {
                         None => bad("its content has not the checkpoint's checksums"),
                     }
                 }
-                // Checked with its head; without one, it is left over.
+                // A piece is checked together with its head; without a head, it is a leftover.
                 Some((key, step, false)) => {
                     let head = self.checkpoints_of(name, &key)?.head(step);
                     if !all.contains(&head) {
@@ -152,7 +154,8 @@ impl Models {
                     None
                 }
             },
-            // Of an evaluation or a training that goes on or was given up; who reads a damaged one makes it again.
+            // It belongs to an unfinished or abandoned evaluation or training. A reader of a
+            // damaged one regenerates it.
             Some((super::shard::FOLDER | super::call::FOLDER, _)) => {
                 check.unused.push(at.clone());
                 None
@@ -184,7 +187,7 @@ impl Models {
     }
 }
 
-/// An evaluation that lies in another's place.
+/// Returns a fault if an evaluation is stored under the name or key of another.
 fn misplaced(found: &Evaluation, name: &str, key: &str) -> Option<Fault> {
     let here = found.key == key && found.model == name;
     (!here).then(|| Fault::BadRecord(format!("is that of {:?}, key {}", found.model, found.key)))

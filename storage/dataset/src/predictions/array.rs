@@ -7,7 +7,7 @@ use crate::coding::codec::ChunkCodec;
 use crate::layout::arrays::image_codecs;
 use crate::layout::quantity::Element;
 
-/// An array. One object holds a scene.
+/// An array with one object per scene.
 #[derive(Debug)]
 pub(super) struct Plate {
     pub name: &'static str,
@@ -20,7 +20,7 @@ pub(super) struct Plate {
     pub codec: ChunkCodec,
 }
 
-/// Those of predictions of this kind, in the order of their objects in a manifest.
+/// Returns the arrays of such predictions, in the order of their objects in a manifest.
 pub(super) fn plates(spec: &PredictionSpec) -> Vec<Plate> {
     let (h, w, n) = (
         u64::from(spec.height),
@@ -76,17 +76,17 @@ impl Plate {
         }
     }
 
-    /// Key of a scene's object, relative to the group.
+    /// Returns the key of a scene's object, relative to the group.
     pub fn key(&self, scene: u64) -> String {
         format!("{}/c/{scene}{}", self.name, "/0".repeat(self.shape.len()))
     }
 
-    /// Bytes of a scene's values.
+    /// Returns the size of a scene's values in bytes.
     pub fn bytes(&self) -> usize {
         (self.shape.iter().product::<u64>() * self.element.size()) as usize
     }
 
-    /// The array's `zarr.json`.
+    /// Returns the array's `zarr.json`.
     pub fn metadata(&self, scenes: u64) -> Value {
         let with_scene = |first: u64| -> Vec<u64> {
             let rest = self.shape.iter().copied();

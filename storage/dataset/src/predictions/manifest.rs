@@ -1,4 +1,5 @@
-//! The manifest of what models predict of a scene: that it is whole, what it consists of, what it was made of.
+//! The manifest of a scene's predictions: the record of their completion, their objects and their
+//! origin.
 
 use std::collections::BTreeMap;
 
@@ -8,71 +9,72 @@ use serde_json::Value;
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
 
-/// Version of groups of predictions and of their manifests.
+/// Format version of groups of predictions and of their manifests.
 pub(super) const FORMAT: u32 = 1;
 
-/// What is predicted of a scene. A pure function of the task: its bytes come out the same in every run.
+/// The predictions of a scene. It is a pure function of the task, so every run produces the same
+/// bytes.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct PredictionManifest {
-    /// Version of this form; filled in.
+    /// Format version of the manifest. Set on encoding.
     pub format: u32,
-    /// Scene index, that of the source's scene.
+    /// Scene index, equal to the source scene's.
     pub scene: u64,
-    /// Key of the task that made it: scene, models and code.
+    /// Key of the task that produced it: scene, models and code.
     pub task_key: String,
-    /// Version of networks and encoder.
+    /// Code version of networks and encoder.
     pub code: String,
-    /// The scene that the models saw.
+    /// The models' input scene.
     pub source: SceneUsed,
-    /// The models, by what they predict: `tof`, `shadow`, `specular`.
+    /// The models, by predicted quantity: `tof`, `shadow`, `specular`.
     pub models: BTreeMap<String, ModelUsed>,
-    /// What the two-bounce times that a shadow network was given follow from: `truth`, or a model's depths. `None` where none
-    /// was given any.
+    /// Source of the two-bounce times used by a shadow network: `truth`, or a model's depths.
+    /// `None` if none were used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub two_bounce_times: Option<TimesUsed>,
-    /// Whether what is predicted agrees with itself and with the spots, with figures and `reasons`; null where nothing was
-    /// compared.
+    /// Whether the predictions agree with each other and with the spots, with figures and
+    /// `reasons`; null if nothing was compared.
     #[serde(default, skip_serializing_if = "Value::is_null")]
     pub agreement: Value,
-    /// Its objects; filled in.
+    /// Its objects. Set on encoding.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::layout::manifest::seal`] says of the rest.
+    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
 
-/// A scene as it was used.
+/// A reference to a scene used as input.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SceneUsed {
-    /// Folder of its data set.
+    /// Folder of the scene's data set.
     pub dataset: String,
-    /// Key of the task that made it.
+    /// Key of the task that produced it.
     pub task_key: String,
-    /// SHA-256 of its manifest, hexadecimal: pins every byte of it.
+    /// SHA-256 of its manifest, in hexadecimal, which pins every byte of it.
     pub manifest_sha256: String,
 }
 
-/// A model as it was used.
+/// A reference to a model that was used.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ModelUsed {
     /// Its name.
     pub name: String,
-    /// SHA-256 of its manifest, hexadecimal.
+    /// SHA-256 of its manifest, in hexadecimal.
     pub manifest_sha256: String,
-    /// Name of the histogram that it saw.
+    /// Name of its input histogram.
     pub histogram: String,
     /// The spots of `transient_spots` that were summed for it; empty for other histograms.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
 }
 
-/// What two-bounce times follow from.
+/// The source of two-bounce times.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TimesUsed {
     /// The ground truth's depths and paths.
     Truth,
-    /// Depths that a model predicts.
+    /// Depths predicted by a model.
     Model(ModelUsed),
 }
 
@@ -83,17 +85,17 @@ impl PredictionManifest {
         self
     }
 
-    /// Size of all objects together.
+    /// Returns the total size of all objects in bytes.
     pub fn total_bytes(&self) -> u64 {
         self.objects.iter().map(|o| o.size).sum()
     }
 
-    /// SHA-256 of its bytes as they lie in the store, hexadecimal.
+    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
     pub fn sha256(&self) -> String {
         sha256_hex(&self.to_bytes())
     }
 
-    /// The manifest as it lies in the store.
+    /// Returns the bytes to store.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self).expect("a manifest has only string keys");
         bytes.push(b'\n');

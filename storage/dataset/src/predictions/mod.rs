@@ -1,8 +1,9 @@
-//! What models predict of scenes: a Zarr v3 group of its own in a store, beside the data set whose scenes they saw, with the
-//! same number of scenes, one object a scene and array: `depth`, `lit`, `specular`, as far as there are models for them.
+//! Predictions of scenes by models: a separate Zarr v3 group in a store, next to the data set of
+//! the input scenes. It has the same number of scenes, and one object per scene and array: `depth`,
+//! `lit` and `specular`, as far as there are models for them.
 //!
-//! A scene's predictions are published as scenes are: objects first, `manifests/<scene>.json` last, all create-only and pure
-//! functions of the task.
+//! A scene's predictions are published like scenes: objects first, `manifests/<scene>.json` last,
+//! all create-only and pure functions of the task.
 
 mod array;
 mod manifest;
@@ -31,45 +32,45 @@ use manifest::FORMAT;
 
 pub use manifest::{ModelUsed, PredictionManifest, SceneUsed, TimesUsed};
 
-/// What is predicted of how many scenes.
+/// The predicted quantities and the number of scenes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PredictionSpec {
-    /// Scenes that there is room for.
+    /// Capacity in scenes.
     pub scenes: u64,
-    /// Rows.
+    /// Image height in pixels.
     pub height: u32,
-    /// Columns.
+    /// Image width in pixels.
     pub width: u32,
-    /// Whether depth is.
+    /// Whether depth is predicted.
     pub depth: bool,
-    /// Which of the source's spots have masks, in the order of `lit`; none = no masks.
+    /// Spots of the source with predicted masks, in the order of `lit`; empty = no masks.
     pub spots: Vec<u32>,
-    /// Whether mirrors are.
+    /// Whether mirrors are predicted.
     pub specular: bool,
 }
 
-/// What is predicted of one scene: as much as the group has arrays for.
+/// The predictions of one scene, for the group's arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Predicted {
     /// z-depth, metres: `[row][column]`.
     pub depth_m: Vec<f32>,
-    /// Probability times 255 that a spot lights what is seen: `[spot][row][column]`.
+    /// Probability times 255 that a spot lights the visible point: `[spot][row][column]`.
     pub lit: Vec<u8>,
     /// Probability times 255 of a mirror: `[row][column]`.
     pub specular: Vec<u8>,
 }
 
-/// Depths of scenes as they are used.
+/// A pinned list of scenes' depths.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PinnedDepths {
-    /// Pins every byte of them, and the order of the scenes, hexadecimal.
+    /// Hash that pins every byte of the depths, and the order of the scenes, in hexadecimal.
     pub id: String,
-    /// The model that predicted them; `None` for no scene.
+    /// The model that predicted them; `None` if there are no scenes.
     pub model: Option<ModelUsed>,
 }
 
-/// Predictions of one scene, ready to be published.
+/// Encoded predictions of one scene, ready to be published.
 #[derive(Debug, Clone)]
 pub struct EncodedPredictions {
     /// Their manifest.
@@ -87,10 +88,12 @@ pub struct Predictions {
 }
 
 impl Predictions {
-    /// Creates the group at `prefix`, or opens it if it is there; it grows to `spec.scenes` as data sets do.
+    /// Creates the group at `prefix`, or opens an existing one. It grows to `spec.scenes` as data
+    /// sets do.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where something else lies there; [`DatasetError::SpecMismatch`]; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if the location contains something else;
+    /// [`DatasetError::SpecMismatch`]; [`DatasetError::Store`].
     pub async fn create_or_open(
         store: Arc<dyn ObjectStore>,
         prefix: Path,
@@ -108,7 +111,7 @@ impl Predictions {
                 if objects::create(&*store, &root, pretty(&asked.root())).await? {
                     return Ok(asked);
                 }
-                // Another worker was faster.
+                // Another worker created it first.
                 let bytes = objects::require(&*store, &root).await?;
                 parse_root(&bytes, &asked.shown(&root))?
             }
@@ -135,7 +138,8 @@ impl Predictions {
     /// Opens the group at `prefix`.
     ///
     /// # Errors
-    /// [`DatasetError::NoDataset`]; [`DatasetError::Invalid`] where something else lies there; [`DatasetError::Store`].
+    /// [`DatasetError::NoDataset`]; [`DatasetError::Invalid`] if the location contains something
+    /// else; [`DatasetError::Store`].
     pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
         let root = objects::path_of(&prefix, METADATA);
         let Some(bytes) = objects::get(&*store, &root).await? else {
@@ -147,7 +151,7 @@ impl Predictions {
         Ok(Self::assume(store, prefix, spec))
     }
 
-    /// The same, or `None` where none lie at `prefix`.
+    /// Like [`Self::open`], but returns `None` if there are no predictions at `prefix`.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`], [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -173,17 +177,17 @@ impl Predictions {
         }
     }
 
-    /// What is predicted.
+    /// Returns the predicted quantities.
     pub fn spec(&self) -> &PredictionSpec {
         &self.spec
     }
 
-    /// Where it lies, for a message.
+    /// Returns its location for messages.
     pub fn place(&self) -> String {
         self.shown(&self.prefix)
     }
 
-    /// The scenes whose predictions are published, ascending.
+    /// Returns the scenes with published predictions, ascending.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -191,7 +195,7 @@ impl Predictions {
         scenes_in(&*self.store, &self.path("manifests")).await
     }
 
-    /// The manifest of a scene's predictions.
+    /// Returns the manifest of a scene's predictions.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -206,12 +210,13 @@ impl Predictions {
         }
     }
 
-    /// The manifest of a scene that this very task has published, after checking that each of its objects has the stated
-    /// SHA-256: predictions are small, and reading them is cheap beside making them. `None` where it is not published.
+    /// Returns the manifest of a scene that this task has published, after checking the SHA-256 of
+    /// each object. This check is acceptable because predictions are small, and cheap to read
+    /// compared with making them. Returns `None` if the scene is not published.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where another task has published it; [`DatasetError::Damaged`] where an object is missing or
-    /// changed ([`Self::restore`] puts it back); [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if another task has published it; [`DatasetError::Damaged`] if an
+    /// object is missing or changed ([`Self::restore`] repairs it); [`DatasetError::Store`].
     pub async fn finished(
         &self,
         scene: u64,
@@ -231,7 +236,7 @@ impl Predictions {
         Ok(Some(manifest))
     }
 
-    /// Refuses what another task has published.
+    /// Returns an error if another task has published these predictions.
     fn check_owner(&self, found: &PredictionManifest, task_key: &str) -> Result<(), DatasetError> {
         if found.task_key == task_key {
             return Ok(());
@@ -251,11 +256,12 @@ impl Predictions {
         intact(&*self.store, &path, object).await.map(|_| ())
     }
 
-    /// Codes what is predicted of the scene that `manifest` names; its format, objects and checksum are filled in.
+    /// Encodes the predictions of the scene in `manifest`. The manifest's format, objects and
+    /// checksum are set here.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the values are not those of the group's arrays, or a depth is not finite;
-    /// [`DatasetError::SceneOutOfRange`].
+    /// [`DatasetError::Invalid`] if the values do not match the group's arrays, or a depth is not
+    /// finite; [`DatasetError::SceneOutOfRange`].
     pub fn encode(
         &self,
         manifest: PredictionManifest,
@@ -309,10 +315,11 @@ impl Predictions {
         })
     }
 
-    /// Publishes coded predictions, as [`crate::Dataset::publish_encoded`] does scenes.
+    /// Publishes encoded predictions like [`crate::Dataset::publish_encoded`] publishes scenes.
     ///
     /// # Errors
-    /// [`DatasetError::Conflict`] where an object exists with other bytes; [`DatasetError::Store`].
+    /// [`DatasetError::Conflict`] if an object exists with different bytes;
+    /// [`DatasetError::Store`].
     pub async fn publish(&self, encoded: &EncodedPredictions) -> Result<(), DatasetError> {
         let manifest = &encoded.manifest;
         let paths = manifest.objects.iter().map(|o| self.path(&o.key));
@@ -323,12 +330,15 @@ impl Predictions {
         put_again(&*self.store, &all).await
     }
 
-    /// What pins every byte of the depths of these scenes, in order, and the model that predicted them. `seen` are the scenes'
-    /// manifests as SHA-256, which the model must have seen ([`crate::Pinned::manifests`]). No object is looked at.
+    /// Returns a hash that pins every byte of the depths of these scenes, in order, and the model
+    /// that predicted them. `seen` contains the SHA-256 of the scenes' manifests
+    /// ([`crate::Pinned::manifests`]), which the model's inputs must match. Objects are not
+    /// checked.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where there are no depths, or those of another scene or of several models;
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if there are no depths, or if they belong to another scene or to
+    /// several models; [`DatasetError::NotPublished`], [`DatasetError::Damaged`],
+    /// [`DatasetError::Store`].
     pub async fn pin_depths(
         &self,
         scenes: &[u64],
@@ -384,10 +394,11 @@ impl Predictions {
         })
     }
 
-    /// The depth that is predicted of a scene, metres, `[row][column]`, checked against its manifest.
+    /// Returns the predicted depth of a scene in metres, `[row][column]`, checked against its
+    /// manifest.
     ///
     /// # Errors
-    /// As [`Self::read`]; [`DatasetError::Invalid`] where there are no depths.
+    /// Those of [`Self::read`]; [`DatasetError::Invalid`] if there are no depths.
     pub async fn read_depth(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
         let Some(plate) = self.plates.iter().find(|plate| plate.name == "depth") else {
             let what = format!("{} holds no depths", self.place());
@@ -398,7 +409,7 @@ impl Predictions {
         Ok(bytemuck::pod_collect_to_vec(&values))
     }
 
-    /// A scene's values of an array, checked against its manifest.
+    /// Returns a scene's values of an array, checked against its manifest.
     async fn values(
         &self,
         plate: &Plate,
@@ -418,10 +429,11 @@ impl Predictions {
         plate.codec.decode(&bytes)
     }
 
-    /// What is predicted of a scene, checked against its manifest.
+    /// Returns the predictions of a scene, checked against its manifest.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`],
+    /// [`DatasetError::Store`].
     pub async fn read(&self, scene: u64) -> Result<Predicted, DatasetError> {
         let manifest = self.manifest(scene).await?;
         let mut predicted = Predicted::default();
@@ -465,7 +477,7 @@ impl Predictions {
     }
 }
 
-/// The first field in which two differ that have to be the same, and its values.
+/// Returns the first field that must be equal but differs, with both values.
 fn difference(
     stored: &PredictionSpec,
     asked: &PredictionSpec,

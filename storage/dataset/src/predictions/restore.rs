@@ -1,4 +1,4 @@
-//! Putting back what is missing or changed of a scene's predictions, from the same predicted again.
+//! Restores missing or changed objects of a scene's predictions from a repeated prediction.
 
 use bytes::Bytes;
 use object_store::path::Path;
@@ -10,13 +10,15 @@ use crate::repair::put_back::put_back;
 use crate::store::objects;
 
 impl Predictions {
-    /// Puts back what is missing or changed of a scene's predictions, made again: the only path on which an object of theirs
-    /// is overwritten. The standing manifest proves that they are what was there; where it is broken itself, the objects that
-    /// are left do, each of which must be equal. Gives the objects that were written.
+    /// Restores missing or changed objects of a scene's predictions from regenerated ones. Only
+    /// this code overwrites them. The existing manifest proves that they equal the originals. If
+    /// the manifest itself is broken, the remaining objects are the proof, and each must be equal.
+    /// Returns the objects written.
     ///
     /// # Errors
-    /// [`DatasetError::Diverged`] where other predictions came out than the manifest says, and [`DatasetError::Damaged`] where
-    /// nothing proves what was there; nothing was written then. [`DatasetError::Store`].
+    /// [`DatasetError::Diverged`] if the predictions differ from the manifest, and
+    /// [`DatasetError::Damaged`] if nothing proves the original content; in both cases nothing was
+    /// written. [`DatasetError::Store`].
     pub async fn restore(&self, encoded: &EncodedPredictions) -> Result<Vec<String>, DatasetError> {
         let ours = &encoded.manifest;
         let manifest_path = self.path(&Manifest::key(ours.scene));

@@ -1,4 +1,4 @@
-//! Checking predictions: metadata, manifests, and that each object is there and is what its manifest says.
+//! Checks predictions: metadata, manifests, and the existence and content of each object.
 
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
@@ -12,12 +12,12 @@ use crate::verify::metadata_fault;
 use crate::verify::object::looked_at;
 use crate::verify::report::{Fault, Problem, Verification, VerifyMode, Watch};
 
-/// Scenes checked at a time.
+/// Number of scenes checked concurrently.
 const SCENES: usize = 4;
 
 impl Predictions {
-    /// Checks what is published; with `complete`, a scene without a manifest is a problem. `watch` hears how many scenes are
-    /// checked of how many.
+    /// Checks the published predictions. With `complete`, a scene without a manifest is a problem.
+    /// `watch` is called with the number of checked scenes and of all scenes.
     ///
     /// # Errors
     /// [`DatasetError::Store`].

@@ -1,4 +1,5 @@
-//! Reading render groups back. Only what `write_render_group` wrote is read; every chunk must be there and whole.
+//! Reads render groups. Only groups written by `write_render_group` are supported; every chunk must
+//! exist and be intact.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -13,9 +14,9 @@ use crate::layout::group::METADATA;
 use crate::render_group::write::{chunk_key, codecs, grid, key_encoding, runs, unravel};
 use crate::scenes::read::Stored;
 
-/// Chunks decoded at a time: bounds the memory beside the array's own.
+/// Number of chunks decoded concurrently. It bounds the memory in addition to the array's own.
 const BATCH: u64 = 16;
-/// Most values of a chunk; more would be damaged metadata.
+/// Maximum number of values of a chunk; more indicate damaged metadata.
 const MAX_CHUNK: u64 = 1 << 28;
 /// Most bytes of a metadata file: attributes say how the render was made, which takes some kilobytes.
 const MAX_METADATA: u64 = 64 << 20;
@@ -30,10 +31,11 @@ pub struct RenderGroup {
 }
 
 impl RenderGroup {
-    /// Opens the group in `dir`; changes nothing.
+    /// Opens the group in `dir` without changing it.
     ///
     /// # Errors
-    /// [`DatasetError::Io`] where there is none, [`DatasetError::Invalid`] where its metadata cannot be read.
+    /// [`DatasetError::Io`] if there is none, [`DatasetError::Invalid`] if its metadata cannot be
+    /// read.
     pub fn open(dir: &Path) -> Result<Self, DatasetError> {
         let path = dir.join(METADATA);
         let mut root = metadata(&path)?;
@@ -53,21 +55,22 @@ impl RenderGroup {
         })
     }
 
-    /// The group's attributes.
+    /// Returns the group's attributes.
     pub fn attributes(&self) -> &Map<String, Value> {
         &self.attributes
     }
 
-    /// Whether it has an array of this name.
+    /// Returns whether it has an array of this name.
     pub fn has(&self, name: &str) -> bool {
         self.dir.join(name).join(METADATA).is_file()
     }
 
-    /// Shape and values (row-major) of an array.
+    /// Returns the shape and the values (row-major) of an array.
     ///
     /// # Errors
-    /// [`DatasetError::Io`] where it or one of its chunks is missing, [`DatasetError::Invalid`] where it has another type
-    /// or was not written by `write_render_group`, [`DatasetError::Codec`] where a chunk is damaged.
+    /// [`DatasetError::Io`] if it or one of its chunks is missing, [`DatasetError::Invalid`] if it
+    /// has another type or was not written by `write_render_group`, [`DatasetError::Codec`] if a
+    /// chunk is damaged.
     pub fn read<T: Stored + Send + Sync>(
         &self,
         name: &str,
@@ -105,7 +108,7 @@ impl RenderGroup {
         }
         let grid = grid(&shape, &chunk);
         let chunks: u64 = grid.iter().product();
-        // Found before room is made for what the shape promises.
+        // All chunks must exist before memory for the announced shape is allocated.
         for at in (0..chunks).map(|at| unravel(at, &grid)) {
             let path = folder.join(chunk_key(&at));
             fs::metadata(&path).map_err(|e| DatasetError::io("read", &path, e))?;
@@ -156,7 +159,7 @@ fn metadata(path: &Path) -> Result<Value, DatasetError> {
     })
 }
 
-/// Positive sizes whose product can be addressed.
+/// Parses positive sizes with a product that fits into the address space.
 fn sizes(path: &Path, value: &Value) -> Result<Vec<u64>, DatasetError> {
     let sizes: Option<Vec<u64>> = value
         .as_array()

@@ -1,5 +1,5 @@
-//! Small Zarr v3 groups of plain arrays in a local folder, for single renders and comparisons; see `render_read` for
-//! the way back.
+//! Small Zarr v3 groups of plain arrays in a local folder, for single renders and comparisons; see
+//! `read` for the reader.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,7 +16,7 @@ use crate::layout::group::{METADATA, pretty};
 use crate::layout::quantity::Element;
 use crate::scenes::read::Stored;
 
-/// Values of the largest chunk.
+/// Number of values of the largest chunk.
 const CHUNK_VALUES: u64 = 1 << 20;
 
 /// An array of a render group.
@@ -26,18 +26,19 @@ pub struct RenderArray<'a, T = f32> {
     pub name: &'a str,
     /// Shape.
     pub shape: &'a [u64],
-    /// A name for each dimension; dimensions of equal name must have equal length, as xarray demands.
+    /// A name for each dimension; dimensions of equal name must have equal length, as xarray
+    /// requires.
     pub dimension_names: &'a [&'a str],
-    /// Values in row-major order; any bits are kept.
+    /// Values in row-major order; all bit patterns are preserved.
     pub data: &'a [T],
 }
 
-/// Writes a Zarr v3 group of plain arrays with `attributes` to the new folder `dir`. All or nothing: the group is
-/// written beside `dir` and renamed into place.
+/// Writes a Zarr v3 group of plain arrays with `attributes` to the new folder `dir`. The write is
+/// atomic: the group is written to a temporary folder next to `dir` and renamed.
 ///
 /// # Errors
-/// [`DatasetError::Invalid`] for unfit arrays and where `dir` exists and is not empty (nothing is overwritten);
-/// [`DatasetError::Io`].
+/// [`DatasetError::Invalid`] for unsuitable arrays, and if `dir` exists and is not empty (nothing
+/// is overwritten); [`DatasetError::Io`].
 pub fn write_render_group<T: Stored + Send + Sync>(
     dir: &Path,
     arrays: &[RenderArray<'_, T>],
@@ -59,11 +60,12 @@ pub fn write_render_group<T: Stored + Send + Sync>(
         uuid::Uuid::new_v4()
     ));
     let written = write_into(&partial, arrays, attributes).and_then(|()| {
-        // Replaces an empty folder; fails on one that was filled meanwhile.
+        // The rename replaces an empty folder, and fails if it was filled in the meantime.
         fs::rename(&partial, &dir).map_err(|e| DatasetError::io("create", &dir, e))
     });
     if written.is_err() {
-        // The first error is the one to tell; what cannot be removed shows in the folder.
+        // The first error is the one to report. Leftovers that cannot be removed remain visible in
+        // the folder.
         let _ = fs::remove_dir_all(&partial);
     }
     written
@@ -135,10 +137,11 @@ fn write_into<T: Stored + Send + Sync>(
     })
 }
 
-/// The objects of the group that [`write_render_group`] writes, by their keys below its folder, ascending.
+/// Returns the objects that [`write_render_group`] writes, with keys relative to its folder,
+/// ascending.
 ///
 /// # Errors
-/// [`DatasetError::Invalid`] for unfit arrays.
+/// [`DatasetError::Invalid`] for unsuitable arrays.
 pub fn encode_render_group<T: Stored + Send + Sync>(
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
@@ -153,7 +156,8 @@ pub fn encode_render_group<T: Stored + Send + Sync>(
     Ok(objects.into_inner().expect("no panic while locked"))
 }
 
-/// Hands the objects of a group over one by one, from any thread; the root's metadata comes last.
+/// Passes the objects of a group to `put` one by one, from any thread; the root's metadata comes
+/// last.
 fn encode<T: Stored + Send + Sync>(
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
@@ -197,7 +201,7 @@ fn encode<T: Stored + Send + Sync>(
     put(METADATA.to_owned(), pretty(&root))
 }
 
-/// How the chunks of a render group's arrays are coded.
+/// Returns the codecs of a render group's chunks.
 pub(crate) fn codecs(element: Element) -> Value {
     json!([
         {"name": "bytes", "configuration": {"endian": "little"}},
@@ -208,18 +212,18 @@ pub(crate) fn codecs(element: Element) -> Value {
     ])
 }
 
-/// How their chunks are named.
+/// Returns the encoding of their names.
 pub(crate) fn key_encoding() -> Value {
     json!({"name": "default", "configuration": {"separator": "/"}})
 }
 
-/// Number of chunks along each dimension.
+/// Returns the number of chunks along each dimension.
 pub(crate) fn grid(shape: &[u64], chunk: &[u64]) -> Vec<u64> {
     let sizes = shape.iter().zip(chunk);
     sizes.map(|(s, c)| s.div_ceil(*c)).collect()
 }
 
-/// The name of a chunk below its array's folder.
+/// Returns the name of a chunk, relative to its array's folder.
 pub(crate) fn chunk_key(at: &[u64]) -> String {
     let mut key = "c".to_owned();
     for index in at {
@@ -235,7 +239,8 @@ fn write(path: &PathBuf, bytes: &[u8]) -> Result<(), DatasetError> {
     fs::write(path, bytes).map_err(|e| DatasetError::io("write", path, e))
 }
 
-/// The whole shape, its longest dimension but the last halved until a chunk is small enough.
+/// Returns the chunk shape: the array's shape, with its longest dimension except the last halved
+/// until the chunk is small enough.
 fn chunk_shape(shape: &[u64]) -> Vec<u64> {
     let mut chunk = shape.to_vec();
     while chunk.iter().product::<u64>() > CHUNK_VALUES {
@@ -260,7 +265,7 @@ pub(crate) fn unravel(mut index: u64, shape: &[u64]) -> Vec<u64> {
     at
 }
 
-/// The values of a chunk, 0 outside the array.
+/// Returns the values of a chunk, 0 outside the array.
 fn gather<T: Stored>(array: &RenderArray<'_, T>, chunk: &[u64], at: &[u64]) -> Vec<T> {
     let mut values = vec![T::zeroed(); chunk.iter().product::<u64>() as usize];
     for run in runs(array.shape, chunk, at) {
@@ -269,16 +274,16 @@ fn gather<T: Stored>(array: &RenderArray<'_, T>, chunk: &[u64], at: &[u64]) -> V
     values
 }
 
-/// Contiguous values that a chunk and its array share.
+/// Contiguous values shared by a chunk and its array.
 pub(crate) struct Run {
-    /// Where they start in the chunk.
+    /// Start in the chunk.
     pub chunk: usize,
-    /// Where they start in the array.
+    /// Start in the array.
     pub array: usize,
     pub len: usize,
 }
 
-/// The runs of chunk `at`, those outside the array left out.
+/// Returns the runs of chunk `at` inside the array.
 pub(crate) fn runs<'a>(
     shape: &'a [u64],
     chunk: &'a [u64],

@@ -1,18 +1,21 @@
-//! Collection: finding and deleting what belongs to no published scene.
+//! Garbage collection: finds and deletes objects that belong to no published scene.
 //!
-//! A killed worker leaves objects without a manifest. They are not rubbish by themselves: whoever renders the scene
-//! next finds them equal and publishes them. So only old ones are deleted, and a published scene never loses an
-//! object, whenever its manifest appears:
+//! A killed worker leaves objects without a manifest. They may still be useful: the next worker
+//! that renders the scene finds them equal and publishes them. Therefore only old ones are deleted,
+//! and a published scene never loses an object, whenever its manifest appears:
 //!
-//! - a scene that a snapshot names is spared although its manifest was lost;
-//! - objects are listed first, manifests after them, and the scene's manifest is looked for once more right before the
-//!   deletion of an object;
-//! - the publisher looks after its objects once more when its manifest stands ([`Dataset::publish_encoded`]);
-//! - the collector looks for the manifest once more when an object is gone, and puts it back if there is one.
+//! - a scene in a snapshot is not touched even if its manifest was lost;
+//! - objects are listed first and manifests after them, and the scene's manifest is looked up again
+//!   right before an object is deleted;
+//! - the publisher checks its objects again after writing the manifest
+//!   ([`Dataset::publish_encoded`]);
+//! - the collector looks up the manifest again after deleting an object, and restores the object if
+//!   there is one.
 //!
-//! So a deletion before the manifest is noticed by the publisher, one after it by the collector. What remains is a
-//! collector killed or cut off in the instant between a deletion and its last look, which had found no manifest an instant before;
-//! then `verify` names the object, and publishing the scene again restores it.
+//! Thus the publisher notices a deletion before the manifest, and the collector one after it. The
+//! remaining risk is a collector that is killed or disconnected between a deletion and its last
+//! lookup, after finding no manifest just before. In that case `verify` reports the object, and
+//! publishing the scene again restores it.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -32,26 +35,27 @@ use crate::scenes::parts::part_scene;
 use crate::store::objects;
 use crate::store::{PROBE, leftovers, probe_leftovers};
 
-/// The shortest grace period where workers may be writing: longer than publishing a scene ever takes.
+/// The minimum grace period while workers may be writing. It is longer than publishing a scene ever
+/// takes.
 pub const MIN_GRACE: Duration = Duration::from_secs(3600);
 
-/// Deletions in flight. Each holds its object in memory.
+/// Number of concurrent deletions. Each has its object in memory.
 const CONCURRENCY: usize = 4;
 
-/// Something that belongs to no published scene.
+/// An object that belongs to no published scene.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Orphan {
     /// Full key (its path, in a local store).
     pub object: String,
-    /// Its size.
+    /// Size in bytes.
     pub bytes: u64,
-    /// The scene it would belong to; `None` for parts on their way, models, and what a killed probe or a killed local write
-    /// left.
+    /// The scene it would belong to; `None` for parts in transit, models, and objects left by a
+    /// killed probe or local write.
     pub scene: Option<u64>,
 }
 
 impl Orphan {
-    /// Why it is rubbish.
+    /// Returns the reason why it can be deleted.
     pub fn why(&self) -> &'static str {
         let name = self.object.rsplit('/').next().unwrap_or_default();
         match self.scene {
@@ -69,28 +73,28 @@ impl Orphan {
     }
 }
 
-/// What [`Dataset::collect`] found.
+/// The result of [`Dataset::collect`].
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Collection {
-    /// Orphans past the grace period, ordered by key; deleted, if that was asked for.
+    /// Orphans past the grace period, ordered by key; deleted, if requested.
     pub orphans: Vec<Orphan>,
-    /// Objects without a manifest that were left alone because they are younger.
+    /// Number of objects without a manifest that were retained because they are too young.
     pub young: u64,
-    /// Orphans that were left alone because their scene was published in the meantime.
+    /// Number of orphans that were retained because their scene was published in the meantime.
     pub published: u64,
-    /// Objects without a manifest that were left alone because a snapshot names their scene: its manifest was lost, and
-    /// `repair` can put it back.
+    /// Number of objects without a manifest that were retained because a snapshot lists their
+    /// scene. The manifest was lost, and `repair` can restore it.
     pub pinned: u64,
 }
 
 impl Collection {
-    /// Bytes of the orphans.
+    /// Returns the total size of the orphans in bytes.
     pub fn bytes(&self) -> u64 {
         self.orphans.iter().map(|o| o.bytes).sum()
     }
 }
 
-/// A candidate.
+/// A candidate for deletion.
 enum Found {
     Object(ObjectMeta, Option<u64>),
     /// An unfinished file of a local store.
@@ -98,16 +102,17 @@ enum Found {
 }
 
 impl Dataset {
-    /// Finds what belongs to no published scene nor to one that a snapshot names, and was last written `grace` ago or
-    /// earlier: objects of scenes without a manifest, parts of scenes that nobody joined, and what killed probes and
-    /// killed local writes left; and of the store's models, checkpoints that nobody goes on with and objects that no
-    /// manifest names. Deletes it if `delete` says so. Never touches
-    /// an object that a manifest names, or that it does not know. With less than [`MIN_GRACE`] no worker may be writing
-    /// to this data set.
+    /// Finds objects that were last written at least `grace` ago and belong neither to a published
+    /// scene nor to a scene in a snapshot: objects of scenes without a manifest, parts of scenes
+    /// that were never joined, and leftovers of killed probes and local writes. In the store's
+    /// models, finds abandoned checkpoints and objects not listed in any manifest. Deletes them if
+    /// `delete` is set. Objects listed in a manifest, and unknown objects, are never touched. With
+    /// a period below [`MIN_GRACE`], no worker may be writing to this data set.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] where a snapshot cannot be read, so that it is unknown what it names;
-    /// [`DatasetError::Store`], [`DatasetError::Io`]. What was deleted until then stays deleted; collect again.
+    /// [`DatasetError::Damaged`] if a snapshot cannot be read, so that its scenes are unknown;
+    /// [`DatasetError::Store`], [`DatasetError::Io`]. Objects deleted before the error stay
+    /// deleted; the collection can be repeated.
     pub async fn collect(&self, grace: Duration, delete: bool) -> Result<Collection, DatasetError> {
         let now = match delete {
             true => self.store_time().await?,
@@ -138,15 +143,16 @@ impl Dataset {
         Ok(report)
     }
 
-    /// Objects of scenes without a manifest that no snapshot names either, written before `limit`. Counts the younger
-    /// ones.
+    /// Finds objects written before `limit`, of scenes without a manifest that are not in a
+    /// snapshot either. Counts the younger ones.
     async fn unpublished(
         &self,
         limit: SystemTime,
         report: &mut Collection,
     ) -> Result<Vec<Found>, DatasetError> {
         let failed = |e| DatasetError::store("list", self.shown(&self.prefix), e);
-        // What is published stays published: these need not be kept until the manifests are listed once more.
+        // Published scenes stay published, so their objects need not be remembered until the
+        // manifests are listed again.
         let seen = self.scenes_present().await?;
         let mut objects: Vec<(u64, ObjectMeta)> = Vec::new();
         let mut listing = self.store.list(Some(&self.prefix));
@@ -174,7 +180,8 @@ impl Dataset {
         let all = objects.len() + parts.len();
         let old = |object: &ObjectMeta| SystemTime::from(object.last_modified) <= limit;
         objects.retain(|(_, object)| old(object));
-        // No manifest names a part, before or after its scene is published: who misses one renders it again.
+        // No manifest lists a part, before or after its scene is published. A worker that misses a
+        // part renders it again.
         parts.retain(old);
         report.young = (all - objects.len() - parts.len()) as u64;
         let scenes = objects.into_iter();
@@ -183,7 +190,7 @@ impl Dataset {
         Ok(scenes.chain(parts).collect())
     }
 
-    /// The scenes that some snapshot names.
+    /// Returns the scenes in any snapshot.
     async fn pinned(&self) -> Result<BTreeSet<u64>, DatasetError> {
         let mut pinned = BTreeSet::new();
         for name in self.snapshots().await? {
@@ -192,7 +199,7 @@ impl Dataset {
         Ok(pinned)
     }
 
-    /// What killed probes left beside the data set, and killed local writes in it.
+    /// Finds leftovers of killed probes next to the data set, and of killed local writes in it.
     async fn leavings(
         &self,
         limit: SystemTime,
@@ -218,14 +225,15 @@ impl Dataset {
         Ok(found)
     }
 
-    /// The prefix that the data set lies in, where stores are probed; `None` if it is the root of its store.
+    /// Returns the data set's parent, where stores are probed; `None` if the data set is the root
+    /// of its store.
     fn parent(&self) -> Option<Path> {
         let parts: Vec<_> = self.prefix.parts().collect();
         let (_, parent) = parts.split_last()?;
         Some(parent.iter().cloned().collect())
     }
 
-    /// Deletes an orphan, if it still is one; `None` if it is not.
+    /// Deletes an orphan, if it still is one. Returns `None` otherwise.
     async fn collect_one(
         &self,
         found: Found,
@@ -261,7 +269,7 @@ impl Dataset {
         }))
     }
 
-    /// `false` if a manifest protects it, or it was written anew.
+    /// Deletes an object. Returns `false` if a manifest protects it, or it was rewritten.
     async fn delete_orphan(
         &self,
         path: &Path,
@@ -285,7 +293,7 @@ impl Dataset {
         Ok(true)
     }
 
-    /// The bytes of an object that was not written again since it was listed.
+    /// Reads an object, if it was not rewritten since it was listed.
     async fn still_old(
         &self,
         path: &Path,
@@ -311,7 +319,8 @@ impl Dataset {
         Ok(objects::size(&*self.store, &manifest).await?.is_some())
     }
 
-    /// The time by the clock that stamps this store's objects, which need not agree with ours.
+    /// Returns the time of the clock that sets the timestamps of this store's objects, which may
+    /// differ from the local clock.
     async fn store_time(&self) -> Result<SystemTime, DatasetError> {
         let name = format!("{PROBE}{}-time", uuid::Uuid::new_v4());
         let parent = self.parent().unwrap_or_default();

@@ -1,5 +1,5 @@
-//! Whether a store holds results as they were reported: by the SHA-256 of a manifest's bytes, and by the sizes of the
-//! objects that it names. Reads and looks up; changes nothing.
+//! Checks whether a store has results as they were reported: by the SHA-256 of a manifest's bytes,
+//! and by the sizes of its objects. It only reads and changes nothing.
 
 use std::sync::Arc;
 
@@ -18,49 +18,50 @@ use crate::scenes::parts::PartName;
 use crate::store::many::CONCURRENCY;
 use crate::store::objects;
 
-/// Larger objects are no manifests, bytes: whoever made them shall not fill this process's memory.
+/// Maximum size of a manifest in bytes, so that a huge object cannot exhaust the memory.
 const LARGEST: u64 = 64 << 20;
-/// Larger scenes are not read to be compared, bytes.
+/// Maximum size of a scene in bytes for a comparison of its content.
 const LARGEST_SCENE: u64 = 256 << 20;
 
-/// Objects of a scene that are together no larger are read and compared with their SHA-256, bytes.
+/// Maximum total size in bytes of a scene's objects that are checked by SHA-256.
 pub(crate) const SMALL: u64 = 256 << 10;
 
-/// What a store holds of a result.
+/// The state of a result in the store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Held {
-    /// What was reported.
+    /// The reported result.
     Equal,
-    /// No manifest, or not all of its objects.
+    /// The manifest or some of its objects are missing.
     Gone,
-    /// Another manifest, or objects that are not the manifest's.
+    /// Another manifest, or objects that do not match the manifest.
     Other,
 }
 
-/// A store that is asked about results.
+/// A store to check for results.
 #[derive(Debug, Clone)]
 pub struct Holdings {
     store: Arc<dyn ObjectStore>,
     prefix: Path,
 }
 
-/// What every manifest has.
+/// The members common to all manifests.
 #[derive(Deserialize)]
 struct Named {
     objects: Vec<ObjectEntry>,
-    /// Only manifests of a data set's scenes have it.
+    /// Present only in manifests of a data set's scenes.
     #[serde(default)]
     provenance: Option<serde::de::IgnoredAny>,
 }
 
 impl Holdings {
-    /// The store at `prefix`.
+    /// Returns the store at `prefix`.
     pub fn new(store: Arc<dyn ObjectStore>, prefix: Path) -> Self {
         Self { store, prefix }
     }
 
-    /// Scenes of a data set, or what is predicted of scenes: by index and SHA-256 of the manifest, in this order. `thorough`
-    /// says of which the objects are looked up, too.
+    /// Checks scenes of a data set, or predictions of scenes, given by index and SHA-256 of the
+    /// manifest. Returns the states in this order. `thorough` selects the scenes with a lookup of
+    /// their objects, too.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -85,7 +86,7 @@ impl Holdings {
         in_order(looks).await
     }
 
-    /// A trained or promoted model.
+    /// Checks a trained or promoted model.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -95,7 +96,7 @@ impl Holdings {
             .await
     }
 
-    /// A report.
+    /// Checks a report.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -105,7 +106,7 @@ impl Holdings {
             .await
     }
 
-    /// How a trial of a sweep ended.
+    /// Checks the record of a sweep's trial.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -123,7 +124,7 @@ impl Holdings {
         }
     }
 
-    /// A split: any of its versions.
+    /// Checks a split, in any of its versions.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -153,7 +154,7 @@ impl Holdings {
         })
     }
 
-    /// Parts of scenes: each is there, or its scene is.
+    /// Checks parts of scenes: each part exists, or its scene does.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -179,8 +180,8 @@ impl Holdings {
         in_order(looks).await
     }
 
-    /// Scenes written as one binary glTF file each, by the SHA-256 over the file's name and the SHA-256 of its bytes. The
-    /// files are read.
+    /// Checks scenes written as one binary glTF file each, by the SHA-256 over the file's name and
+    /// the SHA-256 of its bytes. The files are read.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -242,7 +243,7 @@ impl Holdings {
         Ok(Held::Equal)
     }
 
-    /// An object that is not larger than `most`; a larger one is read as if it were empty.
+    /// Reads an object of at most `most` bytes. A larger one is treated as empty.
     async fn read(&self, path: &Path, most: u64) -> Result<Option<bytes::Bytes>, DatasetError> {
         match objects::size(&*self.store, path).await? {
             None => Ok(None),
@@ -252,7 +253,7 @@ impl Holdings {
     }
 }
 
-/// Waits for all, some at a time, and keeps their order.
+/// Awaits all lookups, some of them concurrently, and returns the results in order.
 async fn in_order(
     looks: Vec<impl Future<Output = Result<Held, DatasetError>>>,
 ) -> Result<Vec<Held>, DatasetError> {

@@ -1,4 +1,4 @@
-//! What lies in a data set, as a listing tells: sizes by array and scene, in eight bytes an object.
+//! A listing of a data set: sizes by array and scene, in eight bytes per object.
 
 use futures::{StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
@@ -14,16 +14,17 @@ use crate::{
     scenes::{snapshot, splits},
 };
 
-/// No object.
+/// Size of a missing object.
 const ABSENT: u64 = u64::MAX;
 
-/// A listed data set. Manifests were listed before everything else: whatever one of them names was there when the rest
-/// was listed, however many workers publish meanwhile.
+/// A listing of a data set. Manifests are listed before everything else, so that every object of a
+/// listed manifest already existed when the objects were listed, even if workers publish
+/// concurrently.
 #[derive(Debug, Default)]
 pub(crate) struct Listing {
     /// Scenes with a manifest, ascending.
     pub manifests: Vec<u64>,
-    /// Of each array: size by scene.
+    /// For each array, sizes by scene.
     sizes: Vec<Vec<u64>>,
     /// Keys of metadata.
     pub metadata: Vec<String>,
@@ -31,23 +32,23 @@ pub(crate) struct Listing {
     pub records: Vec<String>,
     /// Keys of parts of scenes.
     pub parts: Vec<String>,
-    /// Keys that nothing of this data set has.
+    /// Keys that do not belong to the data set.
     pub foreign: Vec<String>,
 }
 
 impl Listing {
-    /// Size of a scene's object in the array of this position.
+    /// Returns the size of a scene's object in the array at this position.
     pub fn size(&self, array: usize, scene: u64) -> Option<u64> {
         let size = self.sizes[array].get(usize::try_from(scene).ok()?)?;
         (*size != ABSENT).then_some(*size)
     }
 
-    /// Whether the scene has a manifest.
+    /// Returns whether the scene has a manifest.
     pub fn is_published(&self, scene: u64) -> bool {
         self.manifests.binary_search(&scene).is_ok()
     }
 
-    /// One more than the largest scene of which an object was found.
+    /// Returns one more than the largest scene with an object.
     pub fn end(&self) -> u64 {
         self.sizes.iter().map(Vec::len).max().unwrap_or(0) as u64
     }
@@ -63,7 +64,7 @@ impl Listing {
 }
 
 impl Dataset {
-    /// Lists the data set; its arrays at the same time.
+    /// Lists the data set, with its arrays concurrently.
     pub(crate) async fn listing(&self) -> Result<Listing, DatasetError> {
         let mut listing = Listing {
             sizes: vec![Vec::new(); self.arrays.len()],
@@ -115,7 +116,7 @@ impl Dataset {
         } else if snapshot::is_snapshot(&key) || recipe::is_recipe(&key) || splits::is_split(&key) {
             listing.records.push(key);
         } else if key != IDENTITY {
-            // The identity is there where the data set's folder was named as a store.
+            // The identity exists if the data set's folder was itself used as a store.
             listing.foreign.push(key);
         }
     }
@@ -128,7 +129,7 @@ impl Dataset {
         name.is_some_and(|name| arrays.any(|a| a.layout.quantity.name() == name))
     }
 
-    /// The array (by position) and the scene whose object has this key.
+    /// Returns the array (by position) and the scene of the object with this key.
     pub(crate) fn object_place(&self, key: &str) -> Option<(usize, u64)> {
         let mut parts = key.split('/');
         let name = parts.next()?;

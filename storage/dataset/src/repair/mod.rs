@@ -1,4 +1,4 @@
-//! What keeps a store whole: finding orphaned and lost objects, and making them again.
+//! Repair of stores: finds orphaned and lost objects, and regenerates them.
 
 pub(crate) mod collect;
 pub(crate) mod held;

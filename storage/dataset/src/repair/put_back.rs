@@ -1,4 +1,4 @@
-//! Putting back objects that are missing or changed, from the same made again: the only path on which they are overwritten.
+//! Restores missing or changed objects from a regenerated copy. Only this code overwrites them.
 
 use bytes::Bytes;
 use object_store::ObjectStore;
@@ -7,13 +7,14 @@ use object_store::path::Path;
 use crate::error::DatasetError;
 use crate::store::objects;
 
-/// Puts back what is missing or changed of `objects`, which were made again, and the manifest where it is not `readable`.
-/// A readable manifest has proved already that they are what was there; where it is broken itself, the objects that are left
-/// do, each of which must be equal. Gives what was written.
+/// Restores the missing or changed ones of `objects`, which were regenerated, and the manifest if
+/// it is not `readable`. A readable manifest has already proved that they equal the originals.
+/// Without one, the remaining objects are the proof, and each must be equal. Returns the keys
+/// written.
 ///
 /// # Errors
-/// [`DatasetError::Damaged`] where nothing proves what was there (nothing was written then), or where the store does not give
-/// back what was written; [`DatasetError::Store`].
+/// [`DatasetError::Damaged`] if nothing proves the original content (then nothing was written), or
+/// if the store returns other bytes than those written; [`DatasetError::Store`].
 pub(crate) async fn put_back(
     store: &dyn ObjectStore,
     (manifest_path, manifest): (Path, Bytes),

@@ -1,6 +1,6 @@
-//! Recipes beside a data set: how its scenes are made again, `recipes/<key>.json` or, where scenes are made of files of
-//! their own, `recipes/<key>/<scene>.json`. Create-only, never changed; the first to write one wins. What they say is
-//! proved by what comes out: the same task key, the same bytes.
+//! Recipes of a data set, for regenerating its scenes: `recipes/<key>.json` or, if each scene has
+//! its own source files, `recipes/<key>/<scene>.json`. They are create-only and never change; the
+//! first writer wins. A recipe is proved by its output: the same task key, and the same bytes.
 
 use futures::TryStreamExt;
 use object_store::ObjectStore;
@@ -12,24 +12,24 @@ use crate::layout::manifest::{seal, unseal};
 use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 
-/// Version of recipes.
+/// Format version of recipes.
 const FORMAT: u64 = 1;
 
 /// A stored recipe.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recipe {
-    /// The key that it is stored under.
+    /// The key under which it is stored.
     pub key: String,
-    /// The only scene that it is for.
+    /// The only scene to which it applies.
     pub scene: Option<u64>,
-    /// What it says.
+    /// The recipe itself.
     pub content: Value,
-    /// Where it lies, for messages.
+    /// Its location for messages.
     pub place: String,
 }
 
 impl Dataset {
-    /// Stores a recipe create-only; `false` where there is one already.
+    /// Stores a recipe create-only. Returns `false` if there already is one.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -40,7 +40,7 @@ impl Dataset {
         content: &Value,
     ) -> Result<bool, DatasetError> {
         let path = self.path(&recipe_key(key, scene));
-        // Of one for all scenes this is the usual case, and a look costs less than a write.
+        // A recipe for all scenes usually exists already, and a lookup is cheaper than a write.
         if objects::size(&*self.store, &path).await?.is_some() {
             return Ok(false);
         }
@@ -50,7 +50,7 @@ impl Dataset {
         objects::create(&*self.store, &path, sealed.into()).await
     }
 
-    /// The recipe of `scene` under `key`: its own, or that of all.
+    /// Returns the recipe of `scene` under `key`: its own, or the one for all scenes.
     ///
     /// # Errors
     /// [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -75,7 +75,7 @@ impl Dataset {
         Ok(None)
     }
 
-    /// The keys under which there are recipes, ascending.
+    /// Returns the keys of all recipes, ascending.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -102,7 +102,7 @@ fn recipe_key(key: &str, scene: Option<u64>) -> String {
     }
 }
 
-/// What a stored recipe says.
+/// Parses a stored recipe.
 pub(crate) fn parse(bytes: &[u8]) -> Result<Value, String> {
     let sealed: Value = serde_json::from_slice(bytes).map_err(|e| format!("not JSON: {e}"))?;
     let checksum = sealed["checksum"].as_str().ok_or("it has no checksum")?;
@@ -117,7 +117,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<Value, String> {
     }
 }
 
-/// Whether a key relative to the data set is that of a recipe.
+/// Returns whether a key relative to the data set belongs to a recipe.
 pub(crate) fn is_recipe(key: &str) -> bool {
     let hex = |text: &str| text.len() == 64 && text.bytes().all(|b| b.is_ascii_hexdigit());
     let parts: Vec<&str> = key.split('/').collect();

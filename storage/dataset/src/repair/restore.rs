@@ -1,8 +1,9 @@
-//! Putting back what is broken of a published scene, from the scene made again.
+//! Restores broken objects of a published scene from the regenerated scene.
 //!
-//! The only path on which an object of a scene is overwritten. Nothing is, unless what was made again is proved to be
-//! what was there: by the manifest, whose checksum shows that it is intact; where the manifest itself is what is broken,
-//! by a snapshot that names its SHA-256, or by the objects that are still there, each of which must be equal.
+//! Only this code overwrites a scene's objects. It writes nothing unless the regenerated scene is
+//! proved to equal the original. The proof is the manifest, if its checksum shows that it is
+//! intact. If the manifest itself is broken, the proof is a snapshot with its SHA-256, or the
+//! remaining objects, which must all be equal.
 
 use futures::{StreamExt, TryStreamExt, stream};
 
@@ -14,19 +15,19 @@ use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
 use crate::store::objects;
 
-/// Objects looked at a time.
+/// Number of objects checked concurrently.
 const CONCURRENCY: usize = 4;
 
-/// What [`Dataset::restore`] did.
+/// The result of [`Dataset::restore`].
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Restored {
-    /// Full keys of the objects that were written, in the manifest's order; the manifest last.
+    /// Full keys of the objects written, in the manifest's order, with the manifest last.
     pub written: Vec<String>,
-    /// SHA-256 of the scene's manifest, hexadecimal.
+    /// SHA-256 of the scene's manifest, in hexadecimal.
     pub manifest_sha256: String,
 }
 
-/// How a stored object compares.
+/// The result of comparing a stored object.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Found {
     Missing,
@@ -35,13 +36,14 @@ enum Found {
 }
 
 impl Dataset {
-    /// Writes those objects of a scene, made again, that are missing or broken, each in one atomic put, and the manifest
-    /// last; leaves the others alone. `witness` is the SHA-256 (hexadecimal) of the scene's manifest in a snapshot.
+    /// Writes the regenerated objects of a scene that are missing or broken, each in one atomic
+    /// put, and the manifest last. Other objects are not touched. `witness` is the SHA-256 (in
+    /// hexadecimal) of the scene's manifest in a snapshot.
     ///
     /// # Errors
-    /// [`DatasetError::Diverged`] where the scene came out other than the manifest (or the snapshot) says: an alarm;
-    /// nothing was written. [`DatasetError::Damaged`] where the manifest is broken and nothing proves that this is the
-    /// same scene. [`DatasetError::Store`].
+    /// [`DatasetError::Diverged`], an alarm, if the scene differs from the manifest (or the
+    /// snapshot); nothing was written. [`DatasetError::Damaged`] if the manifest is broken and
+    /// nothing proves that this is the same scene. [`DatasetError::Store`].
     pub async fn restore(
         &self,
         scene: EncodedScene,
@@ -97,12 +99,12 @@ impl Dataset {
         Ok(restored)
     }
 
-    /// Writes the arrays' metadata that the root's specification asks for over those that differ or are missing; gives
-    /// their full keys.
+    /// Overwrites differing or missing metadata of arrays according to the root's specification.
+    /// Returns the full keys written.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] where the root contradicts itself, so that it cannot be relied on: see
-    /// [`restore_root`](crate::restore_root); [`DatasetError::Store`].
+    /// [`DatasetError::Damaged`] if the root contradicts itself, so that it cannot be relied on:
+    /// see [`restore_root`](crate::restore_root); [`DatasetError::Store`].
     pub async fn restore_metadata(&self) -> Result<Vec<String>, DatasetError> {
         if !self.root_agrees().await? {
             return Err(DatasetError::Damaged {
@@ -123,7 +125,7 @@ impl Dataset {
         Ok(written)
     }
 
-    /// The stored manifest, if it can be relied on.
+    /// Returns the stored manifest, if it can be relied on.
     fn authority(
         &self,
         stored: Option<&[u8]>,
@@ -135,12 +137,12 @@ impl Dataset {
             return None;
         }
         let object = self.shown(&self.path(&Manifest::key(ours.scene)));
-        // One without a checksum proves nothing, unless it says the same.
+        // A manifest without a checksum proves nothing, unless it is equal to the regenerated one.
         let usable = self.usable_manifest(bytes, ours.scene, &object).ok();
         usable.filter(|m| m.checksum.is_some() || witness.is_some() || m.same_as(ours))
     }
 
-    /// What was made again is what the manifest names.
+    /// Checks that the regenerated objects match the manifest.
     fn check_equal(&self, stored: &Manifest, ours: &Manifest) -> Result<(), DatasetError> {
         for (stored, ours) in stored.objects.iter().zip(&ours.objects) {
             if stored.sha256 != ours.sha256 {
@@ -154,7 +156,8 @@ impl Dataset {
         Ok(())
     }
 
-    /// Without a manifest: the histogram must be there, and whatever is there must be equal.
+    /// Without a manifest, checks that the histogram exists, and that all existing objects are
+    /// equal.
     fn check_alike(&self, ours: &Manifest, found: &[Found]) -> Result<(), DatasetError> {
         let transient = self.array(Quantity::Transient).layout.key(ours.scene);
         for (object, found) in ours.objects.iter().zip(found) {
@@ -174,7 +177,7 @@ impl Dataset {
         Ok(())
     }
 
-    /// One atomic put over whatever is there, read back.
+    /// Overwrites an object with one atomic put, and reads it back.
     pub(crate) async fn replace(
         &self,
         path: &object_store::path::Path,
@@ -192,7 +195,8 @@ impl Dataset {
     }
 }
 
-/// The manifest's bytes: as they are written now, or in the older form if that is what the witness saw.
+/// Returns the manifest's bytes: in the current form, or in the older form if this matches the
+/// witness.
 fn as_witnessed(manifest: &Manifest, witness: Option<&str>) -> Result<Vec<u8>, DatasetError> {
     let now = manifest.to_bytes();
     let Some(witness) = witness else {

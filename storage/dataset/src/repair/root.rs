@@ -1,4 +1,5 @@
-//! A data set whose root `zarr.json` is broken or lost: found again from a recipe and the arrays' own metadata.
+//! Recovers a data set with a broken or lost root `zarr.json` from a recipe and the arrays'
+//! metadata.
 
 use std::sync::Arc;
 
@@ -14,16 +15,16 @@ use crate::repair::recipe::Recipe;
 use crate::scenes::dataset::{Dataset, root_metadata};
 use crate::store::objects;
 
-/// What lies beside the root.
+/// The objects that remain without the root.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Remains {
     /// The recipes.
     pub recipes: Vec<Recipe>,
-    /// A scene with a readable manifest, and the key of the task that made it.
+    /// A scene with a readable manifest, and the key of the task that produced it.
     pub scene: Option<(u64, String)>,
 }
 
-/// Looks at a data set that cannot be opened.
+/// Examines a data set that cannot be opened.
 ///
 /// # Errors
 /// [`DatasetError::Store`], [`DatasetError::Damaged`].
@@ -64,10 +65,11 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
 }
 
 impl Dataset {
-    /// Whether the root's metadata agree with themselves: the properties that they state lead to all that they say.
+    /// Returns whether the root's metadata is consistent: it equals the metadata derived from the
+    /// properties that it states.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] where it is missing by now; [`DatasetError::Store`].
+    /// [`DatasetError::Damaged`] if it has gone missing; [`DatasetError::Store`].
     pub async fn root_agrees(&self) -> Result<bool, DatasetError> {
         let bytes = objects::require(&*self.store, &self.path(METADATA)).await?;
         let stored: Option<Value> = serde_json::from_slice(&bytes).ok();
@@ -75,12 +77,13 @@ impl Dataset {
     }
 }
 
-/// Writes the root's metadata of a data set with these properties; the number of scenes is that of the arrays. Every
-/// array's metadata that can be read must be those of `spec`, and at least one must.
+/// Writes the root's metadata of a data set with these properties; the number of scenes is taken
+/// from the arrays. All readable metadata of arrays must match `spec`, and at least one array's
+/// must be readable.
 ///
 /// # Errors
-/// [`DatasetError::Damaged`] where the arrays do not prove that it is this data set; nothing is written then.
-/// [`DatasetError::Store`].
+/// [`DatasetError::Damaged`] if the arrays do not prove that it is this data set; in that case
+/// nothing is written. [`DatasetError::Store`].
 pub async fn restore_root(
     store: Arc<dyn ObjectStore>,
     prefix: Path,
@@ -121,8 +124,8 @@ pub async fn restore_root(
     Dataset::open(store, prefix).await
 }
 
-/// The format in which the arrays were laid out: that of the first transient whose metadata are those of one, else the
-/// newest. Formats differ in nothing but transients.
+/// Returns the format of the arrays: that of the first transient with valid metadata, or otherwise
+/// the newest. Formats differ only in transients.
 async fn format_of(
     store: &Arc<dyn ObjectStore>,
     prefix: &Path,

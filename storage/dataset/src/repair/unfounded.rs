@@ -1,7 +1,9 @@
-//! Replacing a published scene whose manifest is not true: it names objects that are missing or have other bytes.
+//! Replaces a published scene with a false manifest: one that lists objects that are missing or
+//! have other bytes.
 //!
-//! A worker that makes up a manifest would otherwise hold its scene for ever, because objects are only created. Equal
-//! scenes never come here, and a scene whose objects all agree with its manifest is left alone.
+//! Without this, a worker with a made-up manifest would block its scene forever, because objects
+//! are create-only. Equal scenes never reach this code, and a scene with objects that all match its
+//! manifest is not touched.
 
 use crate::error::DatasetError;
 use crate::layout::manifest::{Manifest, sha256_hex};
@@ -11,8 +13,8 @@ use crate::scenes::encode::EncodedScene;
 use crate::store::objects;
 
 impl Dataset {
-    /// Replaces what is stored of a scene by `scene`, if a manifest is stored that its objects contradict. Returns the new
-    /// manifest, or `None` if nothing was written.
+    /// Replaces the stored scene by `scene`, if its manifest contradicts its objects. Returns the
+    /// new manifest, or `None` if nothing was written.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -46,7 +48,8 @@ impl Dataset {
         Ok(Some(manifest))
     }
 
-    /// Whether the objects of a scene have the bytes that its manifest names. Larger scenes are not read, and pass.
+    /// Returns whether the objects of a scene match its manifest. Larger scenes are not read, and
+    /// pass.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -54,7 +57,7 @@ impl Dataset {
         Ok(manifest.total_bytes() > SMALL || self.is_founded(manifest).await?)
     }
 
-    /// Whether every object that a manifest names has the bytes that it names.
+    /// Returns whether every object has the bytes listed in the manifest.
     async fn is_founded(&self, manifest: &Manifest) -> Result<bool, DatasetError> {
         for object in &manifest.objects {
             let there = objects::get(&*self.store, &self.path(&object.key)).await?;

@@ -1,4 +1,4 @@
-//! Creating, opening and growing a data set.
+//! Creates, opens and grows data sets.
 
 use std::sync::Arc;
 
@@ -24,12 +24,12 @@ pub struct Dataset {
     pub(crate) store: Arc<dyn ObjectStore>,
     pub(crate) prefix: Path,
     pub(crate) spec: DatasetSpec,
-    /// The layout's version, [`FORMAT_VERSION`] at the time of creation.
+    /// Format version of the layout: [`FORMAT_VERSION`] at the time of creation.
     pub(crate) format: u32,
     pub(crate) arrays: Arc<[ArrayCodec]>,
 }
 
-/// An array and the codec of its chunks.
+/// An array and its chunk codec.
 #[derive(Debug)]
 pub(crate) struct ArrayCodec {
     pub layout: Layout,
@@ -37,7 +37,7 @@ pub(crate) struct ArrayCodec {
 }
 
 impl Dataset {
-    /// Creates the data set at `prefix`, or opens it if it is there.
+    /// Creates the data set at `prefix`, or opens an existing one.
     ///
     /// The metadata are written create-only, the root last: a data set exists once its root `zarr.json` does.
     /// Where the stored number of scenes is smaller than `spec.scenes`, the data set grows: the first number of
@@ -48,8 +48,8 @@ impl Dataset {
     /// scene of the larger one is made (published scenes are never touched).
     ///
     /// # Errors
-    /// [`DatasetError::SpecMismatch`] names the first differing field and both values; [`DatasetError::Invalid`];
-    /// [`DatasetError::Store`].
+    /// [`DatasetError::SpecMismatch`] names the first differing field and both values;
+    /// [`DatasetError::Invalid`]; [`DatasetError::Store`].
     pub async fn create_or_open(
         store: Arc<dyn ObjectStore>,
         prefix: Path,
@@ -69,7 +69,7 @@ impl Dataset {
                 {
                     return Ok(new);
                 }
-                // Another process was faster.
+                // Another process created it first.
                 parse_root(
                     &objects::require(&*store, &root).await?,
                     &objects::shown(&*store, &root),
@@ -108,8 +108,8 @@ impl Dataset {
     /// Opens the data set at `prefix`.
     ///
     /// # Errors
-    /// [`DatasetError::NoDataset`], [`DatasetError::Damaged`] where the root is not a data set of ours,
-    /// [`DatasetError::Store`].
+    /// [`DatasetError::NoDataset`], [`DatasetError::Damaged`] if the root is not a picofarm data
+    /// set, [`DatasetError::Store`].
     pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
         let mut rereads = Rereads::new(&*store);
         loop {
@@ -132,17 +132,17 @@ impl Dataset {
         Ok(Self::assume(store, prefix, spec, format))
     }
 
-    /// The data set's properties as stored.
+    /// Returns the data set's stored properties.
     pub fn spec(&self) -> &DatasetSpec {
         &self.spec
     }
 
-    /// Where it lies in its store.
+    /// Returns its path in the store.
     pub fn prefix(&self) -> &Path {
         &self.prefix
     }
 
-    /// The same for a message.
+    /// Returns its location for messages.
     pub fn place(&self) -> String {
         self.shown(&self.prefix)
     }
@@ -167,13 +167,13 @@ impl Dataset {
         }
     }
 
-    /// An array that every data set has.
+    /// Returns an array that every data set has.
     pub(crate) fn array(&self, quantity: Quantity) -> &ArrayCodec {
         self.array_of(quantity)
             .expect("only transients of subsets may be missing")
     }
 
-    /// The array of any quantity.
+    /// Returns the array of any quantity.
     pub(crate) fn array_of(&self, quantity: Quantity) -> Result<&ArrayCodec, DatasetError> {
         let found = self.arrays.iter().find(|a| a.layout.quantity == quantity);
         found.ok_or_else(|| {
@@ -186,14 +186,14 @@ impl Dataset {
         objects::path_of(&self.prefix, key)
     }
 
-    /// The key of a path below the prefix, relative to it.
+    /// Returns the key of a path relative to the prefix.
     pub(crate) fn relative(&self, path: &Path) -> String {
         let parts = path.parts().skip(self.prefix.parts().count());
         let parts: Vec<String> = parts.map(|part| part.as_ref().to_string()).collect();
         parts.join("/")
     }
 
-    /// A path for a message.
+    /// Formats a path for messages.
     pub(crate) fn shown(&self, path: &Path) -> String {
         objects::shown(&*self.store, path)
     }
@@ -212,7 +212,7 @@ impl Dataset {
         })
     }
 
-    /// Writes an array's metadata while there is no root.
+    /// Writes an array's metadata before the root exists.
     async fn create_array_metadata(&self, layout: &Layout) -> Result<(), DatasetError> {
         let path = self.metadata_path(layout);
         create_metadata(&*self.store, &path, self.spec.scenes, |n| {
@@ -222,7 +222,7 @@ impl Dataset {
     }
 }
 
-/// The root's `zarr.json`: attributes and, consolidated, the metadata of all arrays.
+/// Returns the root's `zarr.json`: attributes and the consolidated metadata of all arrays.
 pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
     let arrays: Map<String, Value> = spec
         .quantities()
@@ -248,7 +248,7 @@ pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
     })
 }
 
-/// The data set's properties and format.
+/// Parses the data set's properties and format.
 fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetError> {
     let damaged = |what: String| DatasetError::Damaged {
         object: object.to_string(),

@@ -1,4 +1,4 @@
-//! Scenes made of other scenes: another histogram, the same ground truth.
+//! Scenes derived from other scenes: another histogram with the same ground truth.
 
 use std::collections::BTreeMap;
 
@@ -11,20 +11,22 @@ use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::{Content, EncodedScene, assemble, intensity};
 use crate::store::objects;
 
-/// Everything of a published scene that is neither a histogram nor made from one: depth, range, normals, instances,
-/// labels, specular, visibility, two-bounce paths, RGB, spots, intrinsics, pose and laser, as stored.
+/// All of a published scene except histograms and data computed from them: depth, range, normals,
+/// instances, labels, specular, visibility, two-bounce paths, RGB, spots, intrinsics, pose and
+/// laser, as stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SceneTruth {
     spec: DatasetSpec,
-    /// Native-endian values.
+    /// Values of each quantity, in native byte order.
     arrays: BTreeMap<Quantity, Vec<u8>>,
 }
 
 impl Dataset {
-    /// The ground truth of a published scene, each object checked against its manifest.
+    /// Reads the ground truth of a published scene, and checks each object against its manifest.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`],
+    /// [`DatasetError::Store`].
     pub async fn read_truth(&self, scene: u64) -> Result<SceneTruth, DatasetError> {
         let manifest = self.manifest(scene).await?;
         let mut arrays = BTreeMap::new();
@@ -46,12 +48,13 @@ impl Dataset {
         })
     }
 
-    /// Codes a scene with the given histogram (`[row][column][bin]` of this data set's gate) and photon scale, and
-    /// the ground truth of another data set's scene. Blocks its thread while coding on rayon's threads.
+    /// Encodes a scene with the given histogram (`[row][column][bin]` of this data set's gate) and
+    /// photon scale, and the ground truth of another data set's scene. Blocks its thread while
+    /// rayon threads encode.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where this data set has another image size, other spots or further transients, or a
-    /// value is unusable; [`DatasetError::SceneOutOfRange`].
+    /// [`DatasetError::Invalid`] if this data set has another image size, other spots or additional
+    /// transients, or if a value is unusable; [`DatasetError::SceneOutOfRange`].
     pub fn encode_derived(
         &self,
         scene: u64,
@@ -111,10 +114,10 @@ impl Dataset {
 }
 
 impl SceneTruth {
-    /// The truth with only the given spots, in the given order.
+    /// Returns the ground truth with only the given spots, in the given order.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where there is no such spot, or none is chosen.
+    /// [`DatasetError::Invalid`] if a spot does not exist, or none is chosen.
     pub fn of_spots(mut self, chosen: &[u32]) -> Result<Self, DatasetError> {
         let spots = self.spec.spots;
         if chosen.is_empty() || chosen.iter().any(|s| *s >= spots) {

@@ -1,5 +1,5 @@
-//! A scene's record to the bytes of its objects. Deterministic: the same record gives the same bytes, whatever
-//! the number of threads.
+//! Encodes a scene's record into its objects. The encoding is deterministic: the same record gives
+//! the same bytes for any number of threads.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,8 @@ use crate::layout::record::{Provenance, SceneRecord, SubsetRecord};
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::{ArrayCodec, Dataset};
 
-/// Saturated bins allowed in a scene: the few pixels that see a spot have them, more mean a wrong scale.
+/// Maximum number of saturated bins in a scene. The few pixels that see a spot saturate; more
+/// indicate a wrong scale.
 const MAX_OVERFLOW: usize = 1 << 16;
 
 /// A scene ready to be published.
@@ -25,7 +26,7 @@ const MAX_OVERFLOW: usize = 1 << 16;
 pub struct EncodedScene {
     /// Its manifest.
     pub manifest: Manifest,
-    /// Bytes of each of the manifest's objects, in the same order.
+    /// Bytes of each object in the manifest, in the same order.
     pub(crate) bytes: Vec<Bytes>,
 }
 
@@ -53,7 +54,8 @@ pub(crate) struct Content<'a> {
     pub scale: f32,
 }
 
-/// Codes the histograms, and the native-endian bytes that `small` gives for each other quantity.
+/// Encodes the histograms, and the native-endian bytes that `small` returns for each other
+/// quantity.
 pub(crate) fn assemble(
     dataset: &Dataset,
     scene: u64,
@@ -166,7 +168,7 @@ pub(crate) fn encode_transient(
     })
 }
 
-/// Native-endian bytes of a quantity other than the transient.
+/// Returns the native-endian bytes of a quantity other than the transient.
 fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>) -> Vec<u8> {
     match quantity {
         Quantity::Transient
@@ -214,7 +216,7 @@ fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>)
     }
 }
 
-/// Native-endian bytes of Σ_b h.
+/// Returns the native-endian bytes of Σ_b h.
 pub(crate) fn intensity(transient: &[f32], bins: u32) -> Vec<u8> {
     let sums: Vec<f32> = transient
         .par_chunks(bins as usize)
@@ -223,7 +225,7 @@ pub(crate) fn intensity(transient: &[f32], bins: u32) -> Vec<u8> {
     bytemuck::cast_slice(&sums).to_vec()
 }
 
-/// Linear value, clamped to [0, 1], to 8-bit sRGB (IEC 61966-2-1).
+/// Converts a linear value, clamped to [0, 1], to 8-bit sRGB (IEC 61966-2-1).
 fn srgb_u8(linear: f32) -> u8 {
     let c = f64::from(linear.clamp(0.0, 1.0));
     let s = if c <= 0.003_130_8 {

@@ -1,4 +1,4 @@
-//! Data sets and their scenes: created, published, read, listed by splits and snapshots.
+//! Data sets and their scenes: creating, publishing, reading, and listing by splits and snapshots.
 
 pub(crate) mod dataset;
 pub(crate) mod derive;

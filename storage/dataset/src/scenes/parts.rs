@@ -1,6 +1,7 @@
-//! Parts of scenes that several workers render together, on their way to who joins them: `parts/<scene>/<task key>/<part>-of-<ranges>.zst`
-//! in the data set. Nobody else needs them; they are deleted when the scene is published, and
-//! [`Dataset::collect`] deletes what a killed job left.
+//! Parts of scenes that several workers render together, in transit to the worker that joins them:
+//! `parts/<scene>/<task key>/<part>-of-<ranges>.zst` in the data set. They have no other use, and
+//! are deleted when the scene is published. [`Dataset::collect`] deletes parts left by a killed
+//! job.
 
 use bytes::Bytes;
 use object_store::path::Path;
@@ -10,19 +11,19 @@ use crate::error::DatasetError;
 use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 
-/// The folder of the parts.
+/// The folder of the parts in a data set.
 const FOLDER: &str = "parts";
-/// zstd level: a part is read once.
+/// zstd level. It is low because each part is read only once.
 const LEVEL: i32 = 1;
 
-/// Names a part of a scene.
+/// The name of a part of a scene.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PartName {
     /// The scene.
     pub scene: u64,
-    /// Key of the task that joins it, hexadecimal.
+    /// Key of the joining task, in hexadecimal.
     pub task_key: String,
-    /// Which part, and of how many.
+    /// The part's index and the number of parts.
     pub part: (u32, u32),
 }
 
@@ -36,7 +37,7 @@ impl PartName {
     }
 }
 
-/// The scene that an object belongs to, if it is a part of one.
+/// Returns the scene of an object, if the object is a part.
 pub(crate) fn part_scene(key: &str) -> Option<u64> {
     let rest = key.strip_prefix(FOLDER)?.strip_prefix('/')?;
     let (scene, name) = rest.split_once('/')?;
@@ -44,7 +45,7 @@ pub(crate) fn part_scene(key: &str) -> Option<u64> {
 }
 
 impl Dataset {
-    /// Puts a part, over a damaged one if need be.
+    /// Stores a part, replacing a damaged one.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -54,7 +55,7 @@ impl Dataset {
         objects::overwrite(&*self.store, &path, packed.into()).await
     }
 
-    /// A part; `None` where there is none, or a damaged one.
+    /// Reads a part. Returns `None` if it is missing or damaged.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -72,7 +73,8 @@ impl Dataset {
         }
     }
 
-    /// Bytes that a part of a scene has at most: sums, squares and draws of every histogram there is, in 64 bits.
+    /// Returns the maximum size in bytes of a scene's part: 64-bit sums, squares and draws of every
+    /// histogram.
     fn most_of_a_part(&self) -> u64 {
         const HISTOGRAMS: u64 = 8;
         let spec = self.spec();
@@ -86,7 +88,7 @@ impl Dataset {
         values * histograms * HISTOGRAMS * 8 + (64 << 20)
     }
 
-    /// Deletes a part, if it is there.
+    /// Deletes a part, if it exists.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -99,14 +101,14 @@ impl Dataset {
     }
 }
 
-/// Packs a part, with a checksum, so that whoever reads it knows that it is whole.
+/// Compresses a part with a checksum, so that a reader can detect corruption.
 pub(crate) fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
     let mut packer = zstd::bulk::Compressor::new(LEVEL)?;
     packer.include_checksum(true)?;
     packer.compress(bytes)
 }
 
-/// Unpacks a part that says how large it is, and is no larger than `most`.
+/// Decompresses a part that states its size, which must be at most `most`.
 pub(crate) fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
     let invalid = |what: &str| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
     let size = zstd::zstd_safe::get_frame_content_size(packed);
@@ -128,7 +130,7 @@ mod tests {
         let said = unpack(&bomb, 1 << 20).unwrap_err().to_string();
         assert!(said.contains("announces 67108864 bytes"), "{said}");
         assert_eq!(unpack(&bomb, 64 << 20).unwrap().len(), 64 << 20);
-        // Without a size in its header.
+        // A stream without a size in its header.
         let streamed = zstd::encode_all(&vec![0; 1 << 20][..], 1).unwrap();
         assert!(unpack(&streamed, 2 << 20).is_err());
     }

@@ -1,4 +1,5 @@
-//! Publishing scenes: create-only objects, then the manifest, which is the durable record of completion.
+//! Publishes scenes: create-only objects first, then the manifest, which is the durable record of
+//! completion.
 
 use bytes::Bytes;
 use object_store::path::Path;
@@ -12,11 +13,12 @@ use crate::store::many::{all, check_size, put_again, put_all};
 use crate::store::objects;
 
 impl Dataset {
-    /// Codes a scene on rayon's threads. Pure and blocking: from async code, call it through `spawn_blocking` and
-    /// hand the result to [`Self::publish_encoded`].
+    /// Encodes a scene on rayon threads. The function is pure and blocking: call it from async code
+    /// through `spawn_blocking`, and pass the result to [`Self::publish_encoded`].
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] names the field and index of an unusable value; [`DatasetError::SceneOutOfRange`].
+    /// [`DatasetError::Invalid`] names the field and index of an unusable value;
+    /// [`DatasetError::SceneOutOfRange`].
     pub fn encode(
         &self,
         scene: u64,
@@ -27,15 +29,16 @@ impl Dataset {
         encode_scene(self, scene, record, provenance)
     }
 
-    /// Publishes a coded scene. Objects first, the manifest last, all create-only; an object that exists with equal
-    /// bytes counts as written, so that a scene half-written by a killed worker is completed and publishing twice
-    /// succeeds. When it returns, each object was there at a time when the manifest already protected it from
-    /// [`Self::collect`]. An object that a broken put has left is replaced: where the scene's manifest names these bytes
-    /// and no others, or where there is no manifest and the object is damaged by its own checksums.
+    /// Publishes an encoded scene: objects first, the manifest last, all create-only. An existing
+    /// object with equal bytes counts as written, so a scene left half-written by a killed worker
+    /// is completed, and publishing twice succeeds. When the call returns, each object existed at a
+    /// time when the manifest already protected it from [`Self::collect`]. An object left by a
+    /// broken put is replaced in two cases: if the scene's manifest names exactly the new bytes, or
+    /// if there is no manifest and the object fails its own checksums.
     ///
     /// # Errors
-    /// [`DatasetError::Conflict`] where an object exists with other bytes, and nothing proves that they are wrong (nothing
-    /// stored is changed); [`DatasetError::Store`].
+    /// [`DatasetError::Conflict`] if an object exists with different bytes and nothing proves them
+    /// wrong (nothing stored is changed); [`DatasetError::Store`].
     pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
         match self.publish_once(scene.clone()).await {
             Err(conflict @ DatasetError::Conflict { .. }) => self.heal(scene, conflict).await,
@@ -43,7 +46,7 @@ impl Dataset {
         }
     }
 
-    /// Replaces what a broken put has left of a scene, and publishes it.
+    /// Replaces a scene's objects left by a broken put, and publishes it.
     async fn heal(
         &self,
         scene: EncodedScene,
@@ -90,7 +93,8 @@ impl Dataset {
         self.publish_once(scene).await
     }
 
-    /// Whether an object's own checksums hold, and it may be another result of the same task.
+    /// Returns whether an object passes its own checksums, so that it may be another result of the
+    /// same task.
     fn is_whole(&self, manifest: &Manifest, key: &str, bytes: &Bytes) -> bool {
         let array = self
             .arrays
@@ -125,7 +129,8 @@ impl Dataset {
         Ok(manifest)
     }
 
-    /// The stored manifest, where it says the same in the form it had before manifests had a checksum.
+    /// Returns the stored manifest if it is equal except for the checksum, which older manifests do
+    /// not have.
     async fn older_form(
         &self,
         path: &Path,
@@ -136,7 +141,7 @@ impl Dataset {
         Ok(parsed.ok().filter(|stored| stored.same_as(ours)))
     }
 
-    /// Codes and publishes a scene; blocks its thread while coding.
+    /// Encodes and publishes a scene. Blocks its thread while encoding.
     ///
     /// # Errors
     /// Those of [`Self::encode`] and [`Self::publish_encoded`].
@@ -150,12 +155,13 @@ impl Dataset {
         self.publish_encoded(encoded).await
     }
 
-    /// The manifest of a scene published before, by whomever, after checking that each of its objects exists with
-    /// the stated size; `None` where the scene is not published. Lets a worker adopt work finished before a crash.
+    /// Returns the manifest of a published scene, after checking the existence and size of each
+    /// object. Returns `None` if the scene is not published. This allows a worker to adopt work
+    /// that was finished before a crash.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] where the manifest is there but an object is missing (publishing again restores it)
-    /// or has another size; [`DatasetError::Store`].
+    /// [`DatasetError::Damaged`] if the manifest exists but an object is missing (publishing again
+    /// restores it) or has another size; [`DatasetError::Store`].
     pub async fn published(&self, scene: u64) -> Result<Option<Manifest>, DatasetError> {
         self.check_scene(scene)?;
         let path = self.path(&Manifest::key(scene));

@@ -1,4 +1,4 @@
-//! Reading published scenes back.
+//! Reads published scenes.
 
 use std::ops::Range;
 
@@ -14,7 +14,7 @@ use crate::layout::record::{Intrinsics, Spot};
 use crate::scenes::dataset::{ArrayCodec, Dataset};
 use crate::store::objects::{self, Rereads};
 
-/// A type in which an array may be stored.
+/// An element type of stored arrays.
 pub trait Stored: bytemuck::Pod + sealed::Stored {}
 
 mod sealed {
@@ -34,7 +34,8 @@ macro_rules! stored {
 stored!(f32 => F32, u8 => U8, u16 => U16, i16 => I16, u32 => U32);
 
 impl Dataset {
-    /// The manifest of a published scene (its objects are not looked at; see [`Self::published`]).
+    /// Returns the manifest of a published scene, without checking its objects (see
+    /// [`Self::published`]).
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -61,7 +62,7 @@ impl Dataset {
         }
     }
 
-    /// Indices of the published scenes, ascending.
+    /// Returns the indices of the published scenes, ascending.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -71,8 +72,8 @@ impl Dataset {
         Ok(scenes)
     }
 
-    /// h of a scene, decoded, with the exact values of saturated bins: `[row][column][bin]`. Blocks its thread
-    /// while decoding on rayon's threads.
+    /// Returns the decoded h of a scene, with the exact values of saturated bins:
+    /// `[row][column][bin]`. Blocks its thread while rayon threads decode.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
@@ -84,7 +85,8 @@ impl Dataset {
     /// `[spot][row][column][bin]`. Blocks its thread while decoding on rayon's threads.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the data set has no such transient; those of [`Self::read_transient`].
+    /// [`DatasetError::Invalid`] if the data set has no such transient; those of
+    /// [`Self::read_transient`].
     pub async fn read_histogram(
         &self,
         scene: u64,
@@ -96,11 +98,11 @@ impl Dataset {
         Ok(target)
     }
 
-    /// The same into `target`, which becomes as long as needed and is overwritten: whoever reads scene after scene is
-    /// spared a fresh 167 MB for each.
+    /// Like [`Self::read_histogram`], but decodes into `target`, which is resized and overwritten.
+    /// Reusing the buffer for many scenes avoids allocating 167 MB for each.
     ///
     /// # Errors
-    /// Those of [`Self::read_histogram`]; what `target` holds then is worth nothing.
+    /// Those of [`Self::read_histogram`]; the content of `target` is then unspecified.
     pub async fn read_histogram_into(
         &self,
         scene: u64,
@@ -116,7 +118,7 @@ impl Dataset {
             .await
     }
 
-    /// Fetches a scene's shard and decodes it into `target`, which becomes as long as needed.
+    /// Fetches a scene's shard and decodes it into `target`, which is resized.
     async fn decode_into(
         &self,
         scene: u64,
@@ -146,19 +148,21 @@ impl Dataset {
         let bytes = objects::require(&*self.store, &path).await?;
         let len = array.layout.planes() * self.spec.transient_len();
         if target.len() != len {
-            // Fresh pages come zeroed from the system; growing would touch them twice.
+            // A new allocation is zeroed by the operating system; resizing would touch its pages
+            // twice.
             *target = vec![0.0; len];
         }
         decode(self, &manifest, array, &bytes, target)
             .map_err(|e| e.in_object(|| self.shown(&path)))
     }
 
-    /// h of a scene as images, one for each bin: `[bin][row][column]`, as networks take it. Bins lie so in what is stored, too:
-    /// nothing changes places on the way. `target` is treated as in [`Self::read_histogram_into`].
+    /// Reads h of a scene as one image per bin: `[bin][row][column]`, the order that networks
+    /// expect. The stored order is the same, so no values are reordered. `target` is treated as in
+    /// [`Self::read_histogram_into`].
     ///
     /// # Errors
-    /// Those of [`Self::read_histogram`]; [`DatasetError::Invalid`] for a transient of several images, such as
-    /// [`Quantity::TransientSpots`].
+    /// Those of [`Self::read_histogram`]; [`DatasetError::Invalid`] for a transient of several
+    /// images, such as [`Quantity::TransientSpots`].
     pub async fn read_planes_into(
         &self,
         scene: u64,
@@ -174,8 +178,9 @@ impl Dataset {
             .await
     }
 
-    /// h of many scenes, in the order asked for, while up to `ahead` of them are being fetched and decoded. For
-    /// training loops; a scene that cannot be read gives its error and the next one follows.
+    /// Returns a stream of h of many scenes, in the given order, with up to `ahead` of them being
+    /// fetched and decoded concurrently. It is meant for training loops. If a scene cannot be read,
+    /// the stream returns its error and continues with the next scene.
     ///
     /// # Panics
     /// Outside of a tokio runtime.
@@ -193,7 +198,7 @@ impl Dataset {
             .buffered(ahead.max(1))
     }
 
-    /// A scene's transient, decoded on a thread of its own.
+    /// Reads a scene's transient and decodes it on a separate thread.
     async fn read_apart(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
         let mut rereads = Rereads::new(&*self.store);
         loop {
@@ -217,11 +222,12 @@ impl Dataset {
         decoded.await.map_err(broken)?
     }
 
-    /// A window of h: `[row][column][bin]` for the given rows and columns. Fetches and decodes only the inner
-    /// chunks it touches.
+    /// Returns a window of h: `[row][column][bin]` for the given rows and columns. Fetches and
+    /// decodes only the inner chunks that overlap it.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the window is empty or leaves the image; those of [`Self::read_transient`].
+    /// [`DatasetError::Invalid`] if the window is empty or exceeds the image; those of
+    /// [`Self::read_transient`].
     pub async fn read_transient_crop(
         &self,
         scene: u64,
@@ -232,11 +238,13 @@ impl Dataset {
             .await
     }
 
-    /// The same of the given bins alone. Fetches and decodes only the inner chunks that it touches, of 32×32 pixels and
-    /// 128 bins (of all bins in data sets of format 1).
+    /// Like [`Self::read_transient_crop`], restricted to the given bins. Fetches and decodes only
+    /// the inner chunks that overlap the part, which have 32×32 pixels and 128 bins (all bins in
+    /// data sets of format 1).
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where a range is empty or leaves the transient; those of [`Self::read_transient`].
+    /// [`DatasetError::Invalid`] if a range is empty or exceeds the transient; those of
+    /// [`Self::read_transient`].
     pub async fn read_transient_part(
         &self,
         scene: u64,
@@ -268,10 +276,11 @@ impl Dataset {
             .await
     }
 
-    /// h of one spot alone, from `transient_spots`: `[row][column][bin]`. Fetches and decodes nothing of the other spots.
+    /// Returns h of a single spot, from `transient_spots`: `[row][column][bin]`. Does not fetch or
+    /// decode the other spots.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where the data set has no such transient or no such spot; those of
+    /// [`DatasetError::Invalid`] if the data set has no such transient or no such spot; those of
     /// [`Self::read_transient`].
     pub async fn read_spot(&self, scene: u64, spot: u32) -> Result<Vec<f32>, DatasetError> {
         let array = self.array_of(Quantity::TransientSpots)?;
@@ -293,10 +302,11 @@ impl Dataset {
         self.read_part(&manifest, array, part).await
     }
 
-    /// The stored values of a quantity that is no transient, in the shape [`Quantity`] states.
+    /// Returns the stored values of a quantity other than a transient, in the shape given at
+    /// [`Quantity`].
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where `T` is not the stored type or a transient is asked for;
+    /// [`DatasetError::Invalid`] if `T` is not the stored type or the quantity is a transient;
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
     pub async fn read<T: Stored>(
         &self,
@@ -336,7 +346,7 @@ impl Dataset {
     ) -> Result<Vec<T>, DatasetError> {
         let path = self.path(&array.layout.key(scene));
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
-            // Tells a scene that is not there from one that lost an object.
+            // Distinguishes an unpublished scene from one with a missing object.
             self.manifest_once(scene).await?;
             return Err(DatasetError::Damaged {
                 object: self.shown(&path),
@@ -348,7 +358,7 @@ impl Dataset {
         Ok(bytemuck::pod_collect_to_vec(&values))
     }
 
-    /// Unit normals, camera frame: `[row][column][3]`.
+    /// Returns the unit normals in the camera frame: `[row][column][3]`.
     ///
     /// # Errors
     /// See [`Self::read`].
@@ -357,7 +367,7 @@ impl Dataset {
         Ok(codes.into_iter().map(|n| f32::from(n) / 32767.0).collect())
     }
 
-    /// Visibility, 1 = lit: `[spot][row][column]`.
+    /// Returns the visibility, 1 = lit: `[spot][row][column]`.
     ///
     /// # Errors
     /// See [`Self::read`].
@@ -372,7 +382,7 @@ impl Dataset {
         Ok((0..self.spec.spots as usize).flat_map(spot).collect())
     }
 
-    /// The spots in the camera frame; `None` where a beam meets nothing.
+    /// Returns the spots in the camera frame; `None` if a beam hits nothing.
     ///
     /// # Errors
     /// See [`Self::read`].
@@ -381,7 +391,7 @@ impl Dataset {
         Ok(rows.chunks_exact(7).map(Spot::from_row).collect())
     }
 
-    /// Intrinsics.
+    /// Returns the camera intrinsics.
     ///
     /// # Errors
     /// See [`Self::read`].

@@ -1,6 +1,7 @@
-//! Snapshots of a data set: `snapshots/<name>.json.gz`, which scenes there were with which manifests. Create-only and
-//! never changed; since a manifest names its objects by SHA-256, a snapshot pins every byte. Growth of the data set does
-//! not change it, and [`Dataset::collect`] spares whatever belongs to a scene that it names.
+//! Snapshots of a data set: `snapshots/<name>.json.gz`, a list of scenes and their manifests. A
+//! snapshot is create-only and never changes. Because a manifest contains the SHA-256 of its
+//! objects, a snapshot pins every byte. It is not affected when the data set grows, and
+//! [`Dataset::collect`] does not delete objects of its scenes.
 
 use std::io::{Read, Write};
 
@@ -18,40 +19,41 @@ use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 use crate::verify::report::Watch;
 
-/// Version of snapshots.
+/// Format version of snapshots.
 const FORMAT: u32 = 1;
-/// Manifests read at a time.
+/// Number of manifests read concurrently.
 const CONCURRENCY: usize = 32;
-/// A snapshot is so many times its packed size at most: it consists of hashes, which do not pack well.
+/// Maximum ratio of a snapshot's size to its packed size. Snapshots consist of hashes, which
+/// compress poorly.
 const RATIO: u64 = 64;
 
-/// Scenes of a data set, pinned.
+/// A pinned list of scenes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Pinned {
-    /// What pins every byte of them, and their order, hexadecimal.
+    /// Hash that pins every byte of the scenes, and their order, in hexadecimal.
     pub id: String,
-    /// Scenes of which something is not known, with [`Manifest::missing`], in their order.
+    /// Scenes with missing quantities, from [`Manifest::missing`], in the scenes' order.
     pub missing: Vec<(u64, Vec<String>)>,
-    /// SHA-256 of each scene's manifest, in their order.
+    /// SHA-256 of each scene's manifest, in the scenes' order.
     pub manifests: Vec<[u8; 32]>,
 }
 
-/// Which scenes a data set had, and which manifests.
+/// The scenes of a data set at one time, and their manifests.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
-    /// Its name; empty for one that is not stored.
+    /// Its name; empty if it is not stored.
     pub name: String,
-    /// When it was made, as its maker says.
+    /// Creation time, as given by its creator.
     pub created: String,
-    /// The data set's properties then.
+    /// The data set's properties at that time.
     pub spec: DatasetSpec,
-    /// Bytes of all objects, without manifests.
+    /// Total size of all objects in bytes, without manifests.
     pub bytes: u64,
-    /// By scene, ascending: SHA-256 of the manifest.
+    /// Scenes and the SHA-256 of their manifests, ascending by scene.
     manifests: Vec<(u64, [u8; 32])>,
 }
 
-/// The form in which it is stored.
+/// The stored form of a snapshot.
 #[derive(Serialize, Deserialize)]
 struct Stored {
     format: u32,
@@ -61,30 +63,30 @@ struct Stored {
     /// [`Snapshot::id`].
     id: String,
     bytes: u64,
-    /// Intervals of scenes, the ends not included.
+    /// Half-open intervals of scenes.
     scenes: Vec<(u64, u64)>,
-    /// Hexadecimal, in the order of the scenes.
+    /// SHA-256 of the manifests in hexadecimal, in the order of the scenes.
     manifest_sha256: Vec<String>,
 }
 
-/// A scene, the SHA-256 of its manifest, and its bytes.
+/// A scene, the SHA-256 of its manifest, and its size in bytes.
 type Looked = (u64, [u8; 32], u64);
 
-/// How two snapshots differ; scenes ascending.
+/// The difference between two snapshots, with scenes ascending.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Difference {
-    /// Only in the second.
+    /// Scenes only in the second.
     pub added: Vec<u64>,
-    /// Only in the first.
+    /// Scenes only in the first.
     pub removed: Vec<u64>,
-    /// In both, with different manifests.
+    /// Scenes in both, with different manifests.
     pub changed: Vec<u64>,
-    /// In both, alike.
+    /// Number of scenes that are equal in both.
     pub same: u64,
 }
 
 impl Snapshot {
-    /// The same under a name, made at the given time.
+    /// Returns the snapshot with a name and a creation time.
     #[must_use]
     pub fn named(self, name: impl Into<String>, created: impl Into<String>) -> Self {
         Self {
@@ -94,22 +96,22 @@ impl Snapshot {
         }
     }
 
-    /// Its scenes, ascending.
+    /// Returns its scenes, ascending.
     pub fn scenes(&self) -> impl Iterator<Item = u64> {
         self.manifests.iter().map(|(scene, _)| *scene)
     }
 
-    /// Number of its scenes.
+    /// Returns the number of its scenes.
     pub fn len(&self) -> u64 {
         self.manifests.len() as u64
     }
 
-    /// Whether it has no scene.
+    /// Returns whether it has no scenes.
     pub fn is_empty(&self) -> bool {
         self.manifests.is_empty()
     }
 
-    /// SHA-256 of a scene's manifest, hexadecimal.
+    /// Returns the SHA-256 of a scene's manifest, in hexadecimal.
     pub fn manifest_sha256(&self, scene: u64) -> Option<String> {
         let at = self
             .manifests
@@ -118,8 +120,9 @@ impl Snapshot {
         Some(hex::encode(self.manifests[at].1))
     }
 
-    /// What it pins, in a line that can be quoted: SHA-256 over each scene (8 bytes, little-endian) and the SHA-256 of
-    /// its manifest (32 bytes). Equal ids, equal bytes of every object; name and time do not count.
+    /// Returns an id that can be cited: the SHA-256 over each scene (8 bytes, little-endian) and
+    /// the SHA-256 of its manifest (32 bytes). Snapshots with equal ids have equal bytes in every
+    /// object; name and time are not part of the id.
     pub fn id(&self) -> String {
         let mut hash = Sha256::new();
         for (scene, manifest) in &self.manifests {
@@ -129,7 +132,7 @@ impl Snapshot {
         hex::encode(hash.finalize())
     }
 
-    /// What became different from `self` to `later`.
+    /// Returns the changes from `self` to `later`.
     pub fn difference(&self, later: &Self) -> Difference {
         let mut found = Difference::default();
         for (scene, manifest) in &later.manifests {
@@ -169,7 +172,7 @@ impl Snapshot {
         packed.finish().expect("memory can be written")
     }
 
-    /// The snapshot in an object, if it is whole.
+    /// Parses the content of a snapshot object, and checks that it is intact.
     pub(crate) fn parse(bytes: &[u8]) -> Result<Self, String> {
         let mut json = Vec::new();
         let mut packed = GzDecoder::new(bytes);
@@ -223,11 +226,11 @@ impl Snapshot {
 }
 
 impl Dataset {
-    /// The data set as it is now, in a snapshot that is not stored yet.
+    /// Returns an unstored snapshot of the data set's current state.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] names an unusable manifest, or an object that is missing or has another size;
-    /// [`DatasetError::Store`].
+    /// [`DatasetError::Damaged`] names an unusable manifest, or an object that is missing or has
+    /// another size; [`DatasetError::Store`].
     pub async fn present(&self, watch: Watch<'_>) -> Result<Snapshot, DatasetError> {
         let listing = self.listing().await?;
         let scenes: Vec<u64> = listing
@@ -275,14 +278,15 @@ impl Dataset {
         })
     }
 
-    /// What pins every byte of these scenes, and their order: [`Snapshot::id`] of them alone, if they are ascending; and
-    /// what is not known of them. Their objects are not looked at.
+    /// Returns a pin of these scenes and their order, with their missing quantities. If the scenes
+    /// are ascending, the id is the [`Snapshot::id`] of these scenes alone. Objects are not
+    /// checked.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`] names a scene that is not there; [`DatasetError::Damaged`] for a manifest that cannot be
-    /// read; [`DatasetError::Store`].
+    /// [`DatasetError::NotPublished`] names a missing scene; [`DatasetError::Damaged`] for an
+    /// unreadable manifest; [`DatasetError::Store`].
     pub async fn pin(&self, scenes: &[u64]) -> Result<Pinned, DatasetError> {
-        /// A manifest's hash, and what the scene lacks.
+        /// A manifest's hash, and the scene's missing quantities.
         type Look = Result<([u8; 32], Vec<String>), DatasetError>;
         let look = |scene: u64| -> BoxFuture<'_, Look> {
             async move {
@@ -317,10 +321,12 @@ impl Dataset {
         })
     }
 
-    /// Stores a snapshot create-only under its name; gives its size. `None`: one with the same id has this name already.
+    /// Stores a snapshot create-only under its name. Returns its size, or `None` if the name
+    /// already has a snapshot with the same id.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] for a name that cannot be used or that another snapshot has; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if the name is invalid or belongs to another snapshot;
+    /// [`DatasetError::Store`].
     pub async fn create_snapshot(&self, snapshot: &Snapshot) -> Result<Option<u64>, DatasetError> {
         check_name(&snapshot.name)?;
         let bytes = snapshot.to_bytes();
@@ -342,10 +348,11 @@ impl Dataset {
         Err(DatasetError::invalid("snapshot", what))
     }
 
-    /// A stored snapshot.
+    /// Reads a stored snapshot.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where there is none of this name; [`DatasetError::Damaged`]; [`DatasetError::Store`].
+    /// [`DatasetError::Invalid`] if there is none of this name; [`DatasetError::Damaged`];
+    /// [`DatasetError::Store`].
     pub async fn snapshot(&self, name: &str) -> Result<Snapshot, DatasetError> {
         check_name(name)?;
         let path = self.path(&key(name));
@@ -367,7 +374,7 @@ impl Dataset {
         })
     }
 
-    /// The names of the stored snapshots, ascending.
+    /// Returns the names of the stored snapshots, ascending.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -384,7 +391,7 @@ impl Dataset {
         Ok(names)
     }
 
-    /// Where a snapshot lies, for a message.
+    /// Returns a snapshot's location for messages.
     pub fn snapshot_place(&self, name: &str) -> String {
         self.shown(&self.path(&key(name)))
     }
@@ -414,7 +421,7 @@ fn name_of(key: &str) -> Option<&str> {
     is_name(name).then_some(name)
 }
 
-/// Whether a key relative to the data set is that of a snapshot.
+/// Returns whether a key relative to the data set belongs to a snapshot.
 pub(crate) fn is_snapshot(key: &str) -> bool {
     name_of(key).is_some()
 }

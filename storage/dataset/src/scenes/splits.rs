@@ -1,4 +1,5 @@
-//! Splits beside a data set: `splits/<name>/v<k>.json`, create-only and never changed, each with its checksum.
+//! Stored splits of a data set: `splits/<name>/v<k>.json`. Each version is create-only, never
+//! changes, and has a checksum.
 
 use futures::TryStreamExt;
 use object_store::ObjectStore;
@@ -9,7 +10,7 @@ use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 
 impl Dataset {
-    /// The versions of a split that are stored, ascending.
+    /// Returns the stored versions of a split, ascending.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -28,11 +29,11 @@ impl Dataset {
         Ok(versions)
     }
 
-    /// A version of a split, as it was given to [`Self::create_split`].
+    /// Reads a version of a split, with the content given to [`Self::create_split`].
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] where it is missing or was changed: scenes may have moved from one side to another;
-    /// [`DatasetError::Store`].
+    /// [`DatasetError::Damaged`] if it is missing or changed, because scenes may have moved from
+    /// one side to another; [`DatasetError::Store`].
     pub async fn read_split(&self, name: &str, version: u64) -> Result<Vec<u8>, DatasetError> {
         let path = self.path(&split_key(name, version));
         let bytes = objects::require(&*self.store, &path).await?;
@@ -45,7 +46,8 @@ impl Dataset {
         })
     }
 
-    /// Stores a version of a split, pretty JSON, create-only. `false` where it exists already: somebody else was faster.
+    /// Stores a version of a split as pretty JSON, create-only. Returns `false` if it already
+    /// exists because another process created it first.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -59,21 +61,21 @@ impl Dataset {
         objects::create(&*self.store, &path, seal(&bytes).into()).await
     }
 
-    /// Where a version of a split lies, for a message.
+    /// Returns the location of a version of a split for messages.
     pub fn split_place(&self, name: &str, version: u64) -> String {
         self.shown(&self.path(&split_key(name, version)))
     }
 }
 
-/// Key of a version of a split, relative to the data set.
+/// Returns the key of a version of a split, relative to the data set.
 fn split_key(name: &str, version: u64) -> String {
     format!("splits/{name}/v{version}.json")
 }
 
-/// What the object under `key`, relative to the data set, holds as a split.
+/// Returns the split's JSON from the object at `key`, which is relative to the data set.
 ///
 /// # Errors
-/// It was changed, or is another split.
+/// If the object was changed, or belongs to another split.
 pub(crate) fn check(key: &str, bytes: &[u8]) -> Result<Vec<u8>, String> {
     let json = unsealed(bytes)?;
     let record: serde_json::Value =
@@ -88,7 +90,7 @@ pub(crate) fn check(key: &str, bytes: &[u8]) -> Result<Vec<u8>, String> {
     }
 }
 
-/// Whether a key relative to the data set is that of a split.
+/// Returns whether a key relative to the data set belongs to a split.
 pub(crate) fn is_split(key: &str) -> bool {
     let mut parts = key.split('/');
     let folder = parts.next() == Some("splits");

@@ -1,4 +1,4 @@
-//! A data set in numbers.
+//! Statistics of a data set.
 
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
@@ -8,34 +8,36 @@ use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
 
-/// Requests in flight.
+/// Number of concurrent requests.
 const CONCURRENCY: usize = 16;
 
-/// A data set in numbers.
+/// Statistics of a data set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Summary {
-    /// Its properties; `spec.scenes` is the number of scenes there is room for.
+    /// Its properties; `spec.scenes` is its capacity.
     pub spec: DatasetSpec,
-    /// Published scenes.
+    /// Number of published scenes.
     pub scenes: u64,
-    /// Bytes of their objects.
+    /// Total size of their objects in bytes.
     pub bytes: u64,
     /// Largest coding error of any bin of any scene, in σ.
     pub max_sigma: f64,
-    /// Smallest and largest root-mean-square coding error of a scene, in σ; `None` while nothing is published.
+    /// Smallest and largest root-mean-square coding error of a scene, in σ; `None` if nothing is
+    /// published.
     pub rms_sigma: Option<(f64, f64)>,
-    /// Saturated bins kept in overflow lists.
+    /// Number of saturated bins in overflow lists.
     pub overflow: u64,
-    /// Median over the scenes of the Monte Carlo error that the renderer states (`error.median_relative` in the
-    /// provenance's plan: median over pixels of standard error / h); `None` where no scene states one.
+    /// Median over the scenes of the Monte Carlo error stated by the renderer
+    /// (`error.median_relative` in the provenance's plan: median over pixels of standard error /
+    /// h); `None` if no scene states one.
     pub noise: Option<f64>,
-    /// Mean over the scenes of the rays that the renderer traced, which its time follows (`rays` in the provenance's plan); `None`
-    /// where no scene states them.
+    /// Mean over the scenes of the number of rays traced by the renderer (`rays` in the
+    /// provenance's plan), which determines the rendering time; `None` if no scene states it.
     pub rays: Option<f64>,
 }
 
 impl Dataset {
-    /// Sums the data set up from its manifests.
+    /// Computes the statistics of the data set from its manifests.
     ///
     /// # Errors
     /// [`DatasetError::Damaged`] names an unusable manifest; [`DatasetError::Store`].

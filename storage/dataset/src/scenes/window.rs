@@ -1,4 +1,4 @@
-//! Parts of a transient: fetching the inner chunks that hold them, and nothing else, and decoding these.
+//! Reads parts of a transient. Only the inner chunks that overlap the part are fetched and decoded.
 
 use std::ops::Range;
 
@@ -15,11 +15,12 @@ use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::{ArrayCodec, Dataset};
 use crate::store::objects::Rereads;
 
-/// Inner chunks so close to each other are fetched by one request, with the bytes between them.
+/// Inner chunks with a gap of at most this many bytes are fetched in one request, including the
+/// gap.
 const GAP: u64 = 16 * 1024;
 
 impl Dataset {
-    /// A part of an array.
+    /// Reads a part of an array.
     pub(crate) async fn read_part(
         &self,
         manifest: &Manifest,
@@ -56,7 +57,7 @@ impl Dataset {
         Ok(target)
     }
 
-    /// The coded bytes of the wanted tiles; `None` = all fill value.
+    /// Fetches the encoded bytes of the wanted tiles; `None` = all fill value.
     async fn fetch_tiles(
         &self,
         manifest: &Manifest,
@@ -93,7 +94,7 @@ impl Dataset {
             .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
             .collect();
         let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
-        // The store's own way would fetch up to a megabyte between two chunks.
+        // The store's default would fetch gaps of up to a megabyte.
         let fetch = |range| self.store.get_range(&path, range);
         let parts = object_store::coalesce_ranges(&only, fetch, GAP);
         let parts = parts.await.map_err(fetch_error)?;
@@ -109,7 +110,7 @@ impl Dataset {
             .collect())
     }
 
-    /// h of a whole scene from the bytes of its shard.
+    /// Decodes h of a whole scene from the bytes of its shard.
     pub(crate) fn decode_shard(
         &self,
         manifest: &Manifest,
@@ -122,7 +123,7 @@ impl Dataset {
         Ok(target)
     }
 
-    /// The same into a target of that size, which is overwritten.
+    /// Like [`Self::decode_shard`], but overwrites a target of that size.
     pub(crate) fn decode_shard_into(
         &self,
         manifest: &Manifest,
@@ -135,7 +136,7 @@ impl Dataset {
         self.complete(manifest, whole)
     }
 
-    /// The same as images, one for each bin: `[bin][row][column]`.
+    /// Like [`Self::decode_shard_into`], but as one image per bin: `[bin][row][column]`.
     pub(crate) fn decode_planes_into(
         &self,
         manifest: &Manifest,
@@ -147,7 +148,7 @@ impl Dataset {
         self.complete(manifest, whole)
     }
 
-    /// Whether a shard can be decoded, whatever it says.
+    /// Returns whether a shard can be decoded, whatever its values are.
     pub(crate) fn shard_is_whole(
         &self,
         manifest: &Manifest,
@@ -179,11 +180,11 @@ impl Dataset {
     }
 }
 
-/// Whether each saturated bin had its exact value.
+/// Whether the exact value of each saturated bin is known.
 #[must_use]
 pub(crate) struct Complete(pub bool);
 
-/// What it takes to decode a transient.
+/// The context for decoding a transient.
 pub(crate) struct Decoding<'a> {
     pub spec: &'a DatasetSpec,
     pub array: &'a ArrayCodec,
@@ -192,7 +193,7 @@ pub(crate) struct Decoding<'a> {
 }
 
 impl Decoding<'_> {
-    /// A whole transient from the bytes of its shard, into a target of its size, which is overwritten.
+    /// Decodes a whole transient from the bytes of its shard, overwriting a target of its size.
     pub fn shard(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
         let chunks = Self::chunks(&tiles, bytes)?;
@@ -203,8 +204,8 @@ impl Decoding<'_> {
         self.part(&tiles, chunks, &tiles.whole(), target)
     }
 
-    /// The same as images, one for each bin. What tiles of the same bins hold lies side by side there: these are decoded at once,
-    /// those of other bins beside them.
+    /// Like [`Self::shard`], but as one image per bin. Tiles with the same bins write to adjacent
+    /// memory, so one thread decodes them; different ranges of bins are decoded in parallel.
     pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
         let chunks = Self::chunks(&tiles, bytes)?;
@@ -236,7 +237,7 @@ impl Decoding<'_> {
         Ok(Complete(complete))
     }
 
-    /// The coded bytes of each tile of a shard; `None` = all fill value.
+    /// Returns the encoded bytes of each tile of a shard; `None` = all fill value.
     fn chunks(tiles: &Tiles, bytes: &Bytes) -> Result<Vec<Option<Bytes>>, DatasetError> {
         let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
             let what = format!("{} bytes are too few", bytes.len());
@@ -247,8 +248,9 @@ impl Decoding<'_> {
         Ok(index.into_iter().map(|entry| entry.map(bytes_of)).collect())
     }
 
-    /// Decodes tiles into a part's values and applies the overflow list. Bands of tiles are decoded at once, each
-    /// straight into its rows. A tile without bytes is all fill value, which the target holds already.
+    /// Decodes tiles into a part's values and applies the overflow list. Bands of tiles are decoded
+    /// in parallel, each directly into its rows. A tile without bytes is all fill value, which the
+    /// target already contains.
     fn part(
         &self,
         tiles: &Tiles,

@@ -1,9 +1,9 @@
-//! Reports on failures of a store.
+//! Descriptions of store failures.
 
-/// An error of a store in words.
+/// A description of a store's error.
 pub(crate) struct Failure {
-    /// What happened.
+    /// A description of the failure.
     pub account: String,
-    /// How to repair it, where known.
+    /// How to fix it, if known.
     pub hint: Option<&'static str>,
 }

@@ -1,4 +1,4 @@
-//! What a store's error means: a short account of it, free of secrets, and the hint that goes with it.
+//! Short descriptions of store errors without secrets, with hints.
 
 use std::io;
 
@@ -9,7 +9,7 @@ use super::identity::Mismatch;
 use super::service::Service;
 
 impl Failure {
-    /// The account of an error of any store; of an object store's with its service.
+    /// Describes an error of any store. `service` is given for object stores.
     pub(crate) fn of(error: &Error, service: Option<Service>) -> Self {
         let chain = chain(error);
         if let Some(mismatch) = Mismatch::among(&chain) {
@@ -44,7 +44,7 @@ impl Failure {
     }
 }
 
-/// Whether an error says that the whole bucket, not only the object, is missing.
+/// Returns whether the whole bucket is missing, and not only the object.
 pub(crate) fn no_bucket(error: &Error) -> bool {
     #[cfg(feature = "clouds")]
     return super::clouds::failure::no_bucket(&chain(error));
@@ -55,7 +55,7 @@ pub(crate) fn no_bucket(error: &Error) -> bool {
     }
 }
 
-/// Whether a request or its answer broke off, or arrived otherwise than it was sent.
+/// Returns whether a request or its answer was interrupted, or was corrupted in transit.
 #[cfg(feature = "clouds")]
 pub(super) fn breaks_off(error: &Error) -> bool {
     let chain = chain(error);
@@ -68,7 +68,7 @@ fn chain(error: &Error) -> Vec<&(dyn std::error::Error + 'static)> {
     std::iter::successors(Some(first), |&e| e.source()).collect()
 }
 
-/// The hint for an error of a file system.
+/// Returns the hint for a file system error.
 pub(crate) fn io_hint(error: &io::Error) -> Option<&'static str> {
     match error.kind() {
         io::ErrorKind::PermissionDenied => {

@@ -1,4 +1,4 @@
-//! Whether a folder that a task is to write into is empty or of the task's own kind.
+//! Checks whether the output folder of a task is empty or contains only the task's own files.
 
 use object_store::ObjectStore;
 use object_store::path::Path;
@@ -6,7 +6,7 @@ use object_store::path::Path;
 use crate::error::DatasetError;
 use crate::store::objects::shown;
 
-/// The names directly below `prefix`, without hidden ones.
+/// Returns the names directly below `prefix`, without hidden ones.
 pub(crate) async fn names(
     store: &dyn ObjectStore,
     prefix: &Path,
@@ -19,8 +19,8 @@ pub(crate) async fn names(
     Ok(names.filter(|name| !name.starts_with('.')).collect())
 }
 
-/// Checks that everything directly below `prefix` has a name that the task itself gives, so that it writes into no data of
-/// others. Hidden names are ignored.
+/// Checks that everything directly below `prefix` has a name that the task itself uses, so that it
+/// does not write into other data. Hidden names are ignored.
 ///
 /// # Errors
 /// [`DatasetError::Invalid`] at `field` that names a foreign entry; [`DatasetError::Store`].
@@ -40,7 +40,7 @@ pub async fn check_own_folder(
     }
 }
 
-/// The error for a folder with an entry that the task does not write.
+/// Returns the error for a folder with an entry that the task does not write.
 pub(crate) fn foreign(
     store: &dyn ObjectStore,
     prefix: &Path,

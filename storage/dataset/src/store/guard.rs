@@ -1,4 +1,4 @@
-//! A store whose identity is checked while it is used.
+//! A store that checks its identity during use.
 
 use std::fmt;
 use std::ops::Range;
@@ -26,7 +26,7 @@ struct Inner {
     store: Arc<dyn ObjectStore>,
     prefix: Path,
     identity: Uuid,
-    /// How long a look counts.
+    /// Validity period of a check.
     fresh: Duration,
     seen: Mutex<Option<Instant>>,
 }
@@ -58,7 +58,8 @@ impl Guarded {
         checked
     }
 
-    /// The answer, unless something is missing because the store is another one.
+    /// Returns the answer. If an object is missing, checks first that the store is the expected
+    /// one.
     async fn found<T>(&self, answer: Result<T>) -> Result<T> {
         if let Err(Error::NotFound { .. }) = &answer {
             self.check().await?;
@@ -66,7 +67,7 @@ impl Guarded {
         answer
     }
 
-    /// What a list gives, after a check.
+    /// Returns the list's items, after a check.
     fn checked<T: Send + 'static>(
         &self,
         list: BoxStream<'static, Result<T>>,
@@ -177,7 +178,7 @@ mod tests {
             .await
             .unwrap();
 
-        // Another empty folder, one that is gone, and one that is another store.
+        // Another empty folder, a missing folder, and another store.
         let gone = other.path().join("gone");
         let foreign = other.path().join("foreign");
         let (store, prefix) = place(&foreign);
@@ -208,7 +209,7 @@ mod tests {
         }
         assert!(!gone.exists(), "the store's folder was made");
 
-        // It vanishes while it is used.
+        // The store disappears during use.
         std::fs::rename(mounted.path(), other.path().join("moved")).unwrap();
         std::fs::create_dir(mounted.path()).unwrap();
         let error = objects::create(&*guarded, &object, "late".into()).await;

@@ -1,9 +1,11 @@
-//! A store's identity: a small object in its root with a random number, as restic's config and Ceph's fsid. A folder that
-//! is not mounted, or another store at the same place, has none or another one.
+//! A store's identity: a small object in its root with a random number, like restic's config and
+//! Ceph's fsid. An unmounted folder, or another store at the same location, has no identity or a
+//! different one.
 //!
-//! Only a submission creates it, and only create-only: the submission is the first that uses a store, it knows for which
-//! job, and its person sees what it reports. A worker never does: one whose folder is not mounted could not tell that from
-//! a new store. The identity is no part of task keys or of published bytes.
+//! Only a submission creates it, and only create-only: the submission is the first user of a store,
+//! it knows the job, and its user sees the report. A worker never creates it, because it cannot
+//! distinguish an unmounted folder from a new store. The identity is not part of task keys or of
+//! published bytes.
 
 use std::fmt;
 use std::sync::Arc;
@@ -18,15 +20,15 @@ use super::guard::Guarded;
 use super::objects;
 use crate::error::DatasetError;
 
-/// Its key in the store's root.
+/// Key of the identity in the store's root.
 pub(crate) const IDENTITY: &str = ".picofarm-store.json";
-/// The field that has the number.
+/// The JSON field with the number.
 const FIELD: &str = "picofarm_store";
-/// How long a look at the identity of a store over a network counts. Folders are looked at before each write: there it costs
-/// next to nothing, and only folders are unmounted.
+/// Validity period of a check of a network store. Folders are checked before each write, because
+/// this costs next to nothing there, and only folders can be unmounted.
 pub(super) const FRESH: Duration = Duration::from_secs(10);
 
-/// A store that is not the expected one.
+/// The error for a store with another identity than expected.
 #[derive(Debug)]
 pub(crate) struct Mismatch(String);
 
@@ -39,7 +41,7 @@ impl fmt::Display for Mismatch {
 impl std::error::Error for Mismatch {}
 
 impl Mismatch {
-    /// That of an error of a store.
+    /// Returns the mismatch in a chain of store errors, if any.
     pub(crate) fn among<'a>(
         chain: &[&'a (dyn std::error::Error + 'static)],
     ) -> Option<&'a Mismatch> {
@@ -74,10 +76,10 @@ fn damaged(store: &dyn ObjectStore, prefix: &Path) -> DatasetError {
     }
 }
 
-/// The identity of the store at `prefix`; `None` where it has none.
+/// Returns the identity of the store at `prefix`; `None` if it has none.
 ///
 /// # Errors
-/// [`DatasetError::Damaged`] where its object cannot be read as one; [`DatasetError::Store`].
+/// [`DatasetError::Damaged`] if its object cannot be parsed; [`DatasetError::Store`].
 pub async fn store_identity(
     store: &dyn ObjectStore,
     prefix: &Path,
@@ -89,11 +91,11 @@ pub async fn store_identity(
     Ok(Some(identity))
 }
 
-/// The identity of the store at `prefix`, which it is given if it has none. Of several that do this at a time, all get the
-/// same. For submissions only: see above.
+/// Returns the identity of the store at `prefix`, creating it if necessary. Concurrent callers get
+/// the same identity. Only for submissions: see above.
 ///
 /// # Errors
-/// As [`store_identity`].
+/// Those of [`store_identity`].
 pub async fn identify_store(store: &dyn ObjectStore, prefix: &Path) -> Result<Uuid, DatasetError> {
     if let Some(identity) = store_identity(store, prefix).await? {
         return Ok(identity);
@@ -103,13 +105,14 @@ pub async fn identify_store(store: &dyn ObjectStore, prefix: &Path) -> Result<Uu
     if objects::create(store, &key(prefix), Bytes::from(text)).await? {
         return Ok(identity);
     }
-    // Another one was first.
+    // Another process created it first.
     let theirs = store_identity(store, prefix).await?;
     theirs.ok_or_else(|| damaged(store, prefix))
 }
 
-/// The store at `prefix` for somebody who expects its identity: writes fail where it has none or another one, and so do
-/// reads of what is missing. A folder that is gone is not made again.
+/// Returns the store at `prefix` with checks of its identity: if the identity is missing or
+/// different, writes fail, and so do reads of missing objects. A missing folder is not created
+/// again.
 pub fn expect_identity(
     store: Arc<dyn ObjectStore>,
     prefix: &Path,
@@ -131,7 +134,7 @@ pub async fn check_identity(
     checked.map_err(|e| DatasetError::store("use", objects::shown(store, prefix), e))
 }
 
-/// The same with an error of stores.
+/// Like [`check_identity`], with a store error.
 pub(super) async fn check(
     store: &dyn ObjectStore,
     prefix: &Path,

@@ -1,4 +1,4 @@
-//! Stores in a local folder: their paths, and the unfinished files that killed writers leave in them.
+//! Stores in a local folder: their paths, and the unfinished files left by killed writers.
 
 use std::fs::Metadata;
 use std::io::ErrorKind;
@@ -10,7 +10,7 @@ use object_store::path::Path;
 use super::probe::PROBE;
 use crate::error::DatasetError;
 
-/// The path of a local location.
+/// Returns the path of a local location.
 pub(super) fn local_path(url_or_path: &str) -> Result<PathBuf, DatasetError> {
     let unsupported = |what: &str| DatasetError::UnsupportedStore {
         url: url_or_path.to_string(),
@@ -45,8 +45,8 @@ pub(super) fn local_path(url_or_path: &str) -> Result<PathBuf, DatasetError> {
     std::path::absolute(&path).map_err(|e| DatasetError::io("resolve", &path, e))
 }
 
-/// The URL that was probably meant where a text begins like one, but lacks slashes: `s3:/bucket/x` would be a folder
-/// called `s3:`.
+/// Returns the URL that was probably meant if a text begins like one but has too few slashes:
+/// `s3:/bucket/x` would be a folder named `s3:`.
 fn mistyped(text: &str) -> Option<String> {
     let (scheme, rest) = text.split_once(':')?;
     let slashes = match &*scheme.to_ascii_lowercase() {
@@ -64,9 +64,10 @@ fn mistyped(text: &str) -> Option<String> {
     })
 }
 
-/// The unfinished files that killed writers left in a local data set, of at least the given age, with their sizes. A
-/// put to a local store writes `name#1` beside the object and links it when complete, so a kill leaves such a file; it
-/// is invisible to the store, disturbs nobody and only takes up space. Give an age longer than any put takes.
+/// Returns the unfinished files left by killed writers in a local data set, of at least the given
+/// age, with their sizes. A put to a local store writes `name#1` next to the object and links it
+/// when complete, so a kill leaves such a file. It is invisible to the store and harmless, but
+/// takes up space. The age must be longer than any put takes.
 ///
 /// # Errors
 /// [`DatasetError::Io`].
@@ -89,7 +90,7 @@ pub(crate) fn leftovers(
     Ok(found)
 }
 
-/// The same for what killed probes left of their own in the store's folder itself: `.probe-…#1`.
+/// Like [`leftovers`], for files of killed probes in the store's folder itself: `.probe-…#1`.
 ///
 /// # Errors
 /// [`DatasetError::Io`].
@@ -116,7 +117,7 @@ fn entries(folder: &Folder) -> Result<Vec<(PathBuf, Metadata)>, DatasetError> {
         let path = entry.path();
         match entry.metadata() {
             Ok(meta) => found.push((path, meta)),
-            // Finished while we looked.
+            // The file was finished in the meantime.
             Err(e) if e.kind() == ErrorKind::NotFound => {}
             Err(e) => return Err(DatasetError::io("look up", &path, e)),
         }

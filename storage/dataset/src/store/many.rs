@@ -1,4 +1,4 @@
-//! Several objects at a time.
+//! Concurrent requests for several objects.
 
 use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
@@ -8,10 +8,10 @@ use object_store::path::Path;
 use crate::error::DatasetError;
 use crate::store::objects;
 
-/// Requests in flight for one scene.
+/// Number of concurrent requests for one scene.
 pub(crate) const CONCURRENCY: usize = 8;
 
-/// Puts objects create-only, some at a time; those that exist must have equal bytes.
+/// Puts objects create-only, some of them concurrently. Existing objects must have equal bytes.
 pub(crate) async fn put_all(
     store: &dyn ObjectStore,
     objects: &[(Path, Bytes)],
@@ -23,9 +23,9 @@ pub(crate) async fn put_all(
     all(objects.iter().map(put).collect()).await
 }
 
-/// The same for those that are gone when the manifest stands. A collector may have taken an object before there was a
-/// manifest to protect it: what a killed worker had left and was found equal, or what this process wrote before it stood
-/// still for long.
+/// Puts objects again that are missing after the manifest was written. A collector may have deleted
+/// an object before the manifest protected it: one left by a killed worker and found equal, or one
+/// that this process wrote before a long pause.
 pub(crate) async fn put_again(
     store: &dyn ObjectStore,
     objects: &[(Path, Bytes)],
@@ -42,7 +42,7 @@ pub(crate) async fn put_again(
     all(objects.iter().map(again).collect()).await
 }
 
-/// Waits for all, some at a time; the first error ends it.
+/// Awaits all requests, some of them concurrently. Returns the first error at once.
 pub(crate) async fn all(
     requests: Vec<impl Future<Output = Result<(), DatasetError>>>,
 ) -> Result<(), DatasetError> {
@@ -51,7 +51,7 @@ pub(crate) async fn all(
     Ok(())
 }
 
-/// Checks that an object is there and as large as expected.
+/// Checks that an object exists and has the expected size.
 pub(crate) async fn check_size(
     store: &dyn ObjectStore,
     path: Path,

@@ -1,4 +1,5 @@
-//! Stores from a path or URL, the check that a store is safe for several writers, and what killed writers leave.
+//! Stores from a path or URL, the check that a store is safe for several writers, and leftovers of
+//! killed writers.
 
 pub(crate) mod account;
 mod bandwidth;
@@ -35,12 +36,15 @@ pub use writable::{Writable, check_writable, local_ground};
 
 use place::Place;
 
-/// The store and the prefix in it for a local path, a `file://` URL, `s3://bucket/prefix`, `gs://bucket/prefix` (Google) or
-/// `az://container/prefix` (Azure). Neither folder, nor prefix need exist. Nothing is asked of the store yet.
+/// Returns the store, and the prefix in it, for a local path, a `file://` URL,
+/// `s3://bucket/prefix`, `gs://bucket/prefix` (Google) or `az://container/prefix` (Azure). The
+/// folder or prefix need not exist. No request is sent to the store yet.
 ///
-/// Local writes are flushed to the disk before they count, so that a manifest that exists after a power cut has its
-/// objects. Other stores need the feature `clouds`, and take place and credentials from the environment, as docs/stores.md lists. A store from here keeps its
-/// connections and the limit of its requests in flight: open once, use for long. See [`limit_bandwidth`] too.
+/// Local writes are flushed to the disk before they count, so that after a power failure an
+/// existing manifest has its objects. Other stores need the feature `clouds`, and take location and
+/// credentials from the environment, as documented in docs/stores.md. A store keeps its connections
+/// and its limit of concurrent requests, so it should be opened once and reused. See also
+/// [`limit_bandwidth`].
 ///
 /// # Errors
 /// [`DatasetError::UnsupportedStore`] for other schemes and for paths that cannot be object keys;
@@ -61,7 +65,7 @@ pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), Dat
     Ok((Arc::new(LocalFileSystem::new().with_fsync(true)), prefix))
 }
 
-/// Whether a location can be understood; says nothing of whether it can be reached from here.
+/// Checks that a location can be parsed. Does not check whether it can be reached.
 ///
 /// # Errors
 /// [`DatasetError::UnsupportedStore`].

@@ -1,4 +1,5 @@
-//! Single objects: create-only puts, gets and sizes, with errors that name the object.
+//! Operations on single objects: create-only puts, gets and sizes, with errors that name the
+//! object.
 
 use std::time::Duration;
 
@@ -10,16 +11,17 @@ use crate::error::DatasetError;
 use crate::layout::manifest::sha256_hex;
 use crate::store::failure::no_bucket;
 
-/// Create-only puts of an object that is refused as existing and yet is not there.
+/// Number of attempts to create an object that the store reports as existing although it is
+/// missing.
 const ATTEMPTS: usize = 4;
-/// Between them.
+/// Pause between these attempts.
 const PAUSE: Duration = Duration::from_millis(250);
 
-/// Before an object of a store over a network is read again that does not read as it should, milliseconds.
+/// Pauses in milliseconds before an unexpected result from a network store is read again.
 const REREAD_MS: [u64; 4] = [200, 400, 800, 1600];
 
-/// Reads again what does not read as it should: on the way from a store over a network answers come late, old, cut or
-/// changed. A folder is read once.
+/// Repeats reads with an unexpected result, because answers from a network store may be late,
+/// stale, truncated or corrupted. Reads from a folder are not repeated.
 pub(crate) struct Rereads {
     remote: bool,
     done: usize,
@@ -33,12 +35,13 @@ impl Rereads {
         }
     }
 
-    /// How long to wait before reading again; `None` where that is of no use, or has been none.
+    /// Returns how long to wait before the next read; `None` if a repetition is useless, or there
+    /// have been enough.
     pub(crate) fn pause<T>(&mut self, read: &Result<T, DatasetError>) -> Option<Duration> {
         let error = read.as_ref().err().filter(|_| self.remote)?;
         let most = match error {
             DatasetError::Damaged { .. } | DatasetError::Codec { .. } => REREAD_MS.len(),
-            // Which may be true: nothing names them but whoever asks.
+            // The result may be true, because only the caller names these objects.
             DatasetError::NotPublished { .. } | DatasetError::NoDataset { .. } => 2,
             _ => 0,
         };
@@ -49,15 +52,16 @@ impl Rereads {
     }
 }
 
-/// Full path of a key relative to `prefix`.
+/// Returns the full path of a key relative to `prefix`.
 pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
     key.split('/')
         .fold(prefix.clone(), |path, part| path.join(part))
 }
 
-/// A path as a person would look for it: with the leading `/` for local stores, whose keys are paths from the root.
+/// Formats a path for people: with the leading `/` for local stores, because their keys are paths
+/// from the root.
 pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
-    // The store's root is known only from how it displays itself.
+    // The store's root is only known from its `Display` text.
     let named = |kind: &str| {
         let name = store.to_string();
         let (_, rest) = name.split_once(kind)?;
@@ -77,13 +81,13 @@ pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
     }
 }
 
-/// The folder that a path of a local store stands for; `None` for other stores.
+/// Returns the folder of a path in a local store; `None` for other stores.
 pub(crate) fn folder(store: &dyn ObjectStore, path: &Path) -> Option<std::path::PathBuf> {
     let local = store.to_string().starts_with("LocalFileSystem(file://");
     local.then(|| shown(store, path).into())
 }
 
-/// Puts create-only. `false`: it exists already.
+/// Puts an object create-only. Returns `false` if it already exists.
 pub(crate) async fn create(
     store: &dyn ObjectStore,
     path: &Path,
@@ -97,7 +101,7 @@ pub(crate) async fn create(
     }
 }
 
-/// Puts create-only; an object that exists must have equal bytes.
+/// Puts an object create-only. An existing object must have equal bytes.
 pub(crate) async fn create_or_match(
     store: &dyn ObjectStore,
     path: &Path,
@@ -108,12 +112,13 @@ pub(crate) async fn create_or_match(
         if create(store, path, bytes.clone()).await? {
             return Ok(());
         }
-        // Never trust the server's own checksum: read it back.
+        // The server's own checksum is not trusted: read the object back.
         found = get(store, path).await?;
         if found.is_some() {
             break;
         }
-        // Refused because of another request in flight (S3's 409), or collected since.
+        // The put was refused because of a concurrent request (S3's 409), or the object was
+        // collected since.
         tokio::time::sleep(PAUSE).await;
     }
     let Some(stored) = found else {
@@ -136,11 +141,11 @@ pub(crate) async fn create_or_match(
     })
 }
 
-/// Puts files create-only, in their order: where the last one names the others, whoever sees it finds them. Files that
-/// exist must have equal bytes. For what is no data set.
+/// Puts files create-only, in order. If the last file refers to the others, a reader that sees it
+/// finds them all. Existing files must have equal bytes. This is for outputs other than data sets.
 ///
 /// # Errors
-/// [`DatasetError::Conflict`] for other bytes, [`DatasetError::Store`].
+/// [`DatasetError::Conflict`] for different bytes, [`DatasetError::Store`].
 pub async fn publish_files(
     store: &dyn ObjectStore,
     prefix: &Path,
@@ -152,7 +157,7 @@ pub async fn publish_files(
     Ok(())
 }
 
-/// Puts in any case (for metadata that grows).
+/// Puts an object, overwriting an existing one (for metadata that grows).
 pub(crate) async fn overwrite(
     store: &dyn ObjectStore,
     path: &Path,
@@ -228,7 +233,7 @@ pub(crate) async fn get(
     }
 }
 
-/// The bytes of an object that must be there.
+/// Returns the bytes of an object that must exist.
 pub(crate) async fn require(store: &dyn ObjectStore, path: &Path) -> Result<Bytes, DatasetError> {
     get(store, path)
         .await?
@@ -238,7 +243,7 @@ pub(crate) async fn require(store: &dyn ObjectStore, path: &Path) -> Result<Byte
         })
 }
 
-/// The size; `None` where there is no such object.
+/// Returns the size; `None` if there is no such object.
 pub(crate) async fn size(
     store: &dyn ObjectStore,
     path: &Path,

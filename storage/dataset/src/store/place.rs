@@ -5,7 +5,7 @@ use object_store::path::Path;
 use super::service::Service;
 use crate::error::DatasetError;
 
-/// A bucket and the prefix in it.
+/// A bucket, and a prefix in it.
 #[derive(Debug, PartialEq)]
 pub(super) struct Place {
     pub service: Service,
@@ -14,10 +14,11 @@ pub(super) struct Place {
 }
 
 impl Place {
-    /// `None` where `url` is not of an object store.
+    /// Parses a URL. Returns `None` if it does not name an object store.
     ///
     /// # Errors
-    /// [`DatasetError::UnsupportedStore`] where it is, but cannot be used; what could be a secret is not repeated.
+    /// [`DatasetError::UnsupportedStore`] if it does, but is invalid. Parts that may be secret are
+    /// not repeated.
     pub(super) fn parse(url: &str) -> Result<Option<Self>, DatasetError> {
         let Some((service, rest)) = Service::of(url) else {
             return Ok(None);

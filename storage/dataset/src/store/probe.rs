@@ -1,4 +1,4 @@
-//! The check that a store is safe for several writers.
+//! Checks that a store is safe for several writers.
 
 use std::time::Duration;
 
@@ -10,34 +10,35 @@ use object_store::{ObjectStore, ObjectStoreExt};
 use crate::error::DatasetError;
 use crate::store::objects;
 
-/// Longest that a store is waited for, where nobody waits for the answer.
+/// Timeout for a store if nobody waits for the answer.
 pub const PROBE_WITHIN: Duration = Duration::from_secs(30);
-/// Longest that deleting the probe's objects is waited for.
+/// Timeout for deleting the probe's objects.
 const DELETE_WITHIN: Duration = Duration::from_secs(5);
-/// Writers racing.
+/// Number of concurrent writers.
 const RACERS: usize = 16;
-/// Repetitions when an answer was lost on the way.
+/// Number of attempts if an answer was lost.
 const ATTEMPTS: usize = 3;
-/// What the probe's objects are called, beside the data sets.
+/// Prefix of the names of the probe's objects, which are next to the data sets.
 pub(crate) const PROBE: &str = ".probe-";
 
-/// What an attempt found.
+/// The result of one attempt.
 enum Finding {
     Safe,
-    /// The promise that was broken.
+    /// The violated guarantee.
     Broken(String),
-    /// A put succeeded, but its answer was lost, so that its repetition was refused: nothing is shown either way.
+    /// A put succeeded but its answer was lost, so its repetition was refused: this proves nothing.
     Unclear,
 }
 
-/// Checks that the store keeps the promise on which publishing rests: of several create-only puts to one key exactly
-/// one succeeds, and its bytes stay. One after the other, then sixteen at once. Leaves nothing behind, also where the store
-/// does not answer `within` that time; only puts that a stalled server carries out later stay, for
-/// [`crate::Dataset::collect`].
+/// Checks the guarantee that publishing relies on: of several create-only puts to one key, exactly
+/// one succeeds, and its bytes are retained. It tries sequential puts first, then sixteen
+/// concurrent ones. It leaves no objects, even if the store does not answer `within` this time.
+/// Only puts that a stalled server executes later remain, for [`crate::Dataset::collect`].
 ///
 /// # Errors
-/// [`DatasetError::UnsafeStore`] says which promise was broken; [`DatasetError::Store`] where the store refuses
-/// altogether (read-only, full, no permission), loses answer after answer or does not answer in time.
+/// [`DatasetError::UnsafeStore`] names the violated guarantee; [`DatasetError::Store`] if the store
+/// refuses every request (read-only, full, no permission), loses answer after answer, or does not
+/// answer in time.
 pub async fn probe(
     store: &dyn ObjectStore,
     prefix: &Path,
@@ -64,7 +65,7 @@ pub async fn probe(
             let seconds = DELETE_WITHIN.as_secs();
             Err(failed(format!("it did not delete within {seconds} s")))
         });
-        // The probe's own finding comes first.
+        // The probe's own result takes precedence.
         let finding = result?;
         deleted?;
         match finding {
@@ -83,7 +84,7 @@ pub async fn probe(
     )))
 }
 
-/// Deletes objects that may not be there, each of them whatever becomes of the others.
+/// Deletes objects that may not exist. A failure does not prevent the other deletion.
 async fn delete(store: &dyn ObjectStore, paths: [&Path; 2]) -> Result<(), DatasetError> {
     let mut result = Ok(());
     for path in paths {
@@ -107,7 +108,7 @@ async fn probe_at(
     race: &Path,
 ) -> Result<Finding, DatasetError> {
     let broken = |what: &str| Ok(Finding::Broken(what.into()));
-    // Different from any other writer's, so that one can recognise one's own.
+    // The body differs from any other writer's, so that a writer recognizes its own.
     let body = |i: usize| Bytes::from(format!("writer {i:02} of {sequential}\n").repeat(64));
     if !objects::create(store, sequential, body(0)).await? {
         return match objects::get(store, sequential).await? {

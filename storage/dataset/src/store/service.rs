@@ -1,9 +1,9 @@
-//! The services whose protocols object stores speak.
+//! The protocols of object stores.
 
-/// Whose protocol an object store speaks.
+/// The protocol of an object store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Service {
-    /// Amazon's, and servers that speak it.
+    /// Amazon S3, and compatible servers.
     S3,
     /// Google Cloud Storage.
     Gcs,
@@ -14,14 +14,14 @@ pub(crate) enum Service {
 impl Service {
     const ALL: [Self; 3] = [Self::S3, Self::Gcs, Self::Azure];
 
-    /// Of a URL, and what stands behind its scheme.
+    /// Parses the scheme of a URL. Returns the service and the rest of the URL.
     pub(crate) fn of(url: &str) -> Option<(Self, &str)> {
         let (scheme, rest) = url.split_once("://")?;
         let service = Self::ALL.into_iter().find(|s| s.scheme() == scheme)?;
         Some((service, rest))
     }
 
-    /// Of its URLs.
+    /// Returns the scheme of its URLs.
     pub(crate) fn scheme(self) -> &'static str {
         match self {
             Self::S3 => "s3",
@@ -30,7 +30,7 @@ impl Service {
         }
     }
 
-    /// Where keys and addresses belong, which are no part of a URL.
+    /// Returns the variables for keys and addresses, which are not part of a URL.
     pub(super) fn secrets(self) -> &'static str {
         match self {
             Self::S3 => "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL",

@@ -1,5 +1,5 @@
-//! A store over a network that stumbles: requests that break off or are refused for a moment are repeated, answers that are
-//! too short are asked for again, and what arrives otherwise than it was sent is put again.
+//! A wrapper for unreliable network stores: interrupted or temporarily refused requests and
+//! truncated answers are repeated, and corrupted objects are put again.
 
 use std::fmt;
 use std::future::Future;
@@ -19,14 +19,14 @@ use object_store::{
 
 use super::failure;
 
-/// Before a request is repeated, milliseconds.
+/// Pauses before a request is repeated, in milliseconds.
 const PAUSES_MS: [u64; 6] = [50, 100, 200, 400, 800, 1600];
-/// A request that has taken so long is not repeated: whoever asks decides.
+/// A request that has taken this long is not repeated; the caller decides.
 const REPEAT_WITHIN: Duration = Duration::from_secs(20);
-/// Deletions at a time.
+/// Number of concurrent deletions.
 const DELETIONS: usize = 8;
 
-/// The store behind the repetitions.
+/// A store with repeated requests.
 #[derive(Debug)]
 pub(super) struct Steady<T> {
     store: Arc<T>,
@@ -50,7 +50,8 @@ impl<T: ObjectStore> Steady<T> {
         }
     }
 
-    /// Repeats a request, which is told how often it was repeated, while it fails for a moment.
+    /// Repeats a request while it fails temporarily. The request gets the number of repetitions so
+    /// far.
     async fn repeat<R, F: Future<Output = Result<R>>>(
         &self,
         request: impl Fn(usize) -> F,
@@ -74,7 +75,7 @@ impl<T: ObjectStore> Steady<T> {
         }
     }
 
-    /// Puts once; the answer to an earlier try may have been lost.
+    /// Puts an object once. The answer to an earlier attempt may have been lost.
     async fn put_once(
         &self,
         location: &Path,
@@ -90,7 +91,7 @@ impl<T: ObjectStore> Steady<T> {
                 let found = self.get_opts(location, GetOptions::default()).await?;
                 let found = found.bytes().await?;
                 return match found == *bytes {
-                    // The try before was carried out.
+                    // The earlier attempt was executed.
                     true => Ok(PutResult {
                         e_tag: None,
                         version: None,
@@ -104,7 +105,8 @@ impl<T: ObjectStore> Steady<T> {
         Ok(put)
     }
 
-    /// Whether a put has arrived as it was sent. Where the service's tag is no MD5 of the content, only the size is compared.
+    /// Returns whether a put arrived uncorrupted. If the service's tag does not look like an MD5 of
+    /// the content, only the size is compared.
     async fn arrived(&self, location: &Path, bytes: &Bytes, put: &PutResult) -> Result<bool> {
         if put.e_tag.as_deref().and_then(md5_of) == Some(Md5::digest(bytes).into()) {
             return Ok(true);
@@ -116,21 +118,22 @@ impl<T: ObjectStore> Steady<T> {
         if put.e_tag.as_deref().and_then(md5_of).is_none() {
             return Ok(true);
         }
-        // Of an encrypted object the tag has the form of an MD5 and is none.
+        // For an encrypted object, the tag looks like an MD5 but is not one.
         let found = self.get_opts(location, GetOptions::default()).await?;
         Ok(found.bytes().await? == *bytes)
     }
 }
 
-/// The MD5 that an entity tag is.
+/// Returns the MD5 in an entity tag.
 fn md5_of(tag: &str) -> Option<[u8; 16]> {
     let mut md5 = [0; 16];
     hex::decode_to_slice(tag.trim_matches('"'), &mut md5).ok()?;
     Some(md5)
 }
 
-/// Whether an error may pass in a moment: a connection that broke off, or a refusal, which services give for a moment while
-/// keys are renewed. Servers in trouble were asked again already.
+/// Returns whether an error may be temporary: an interrupted connection, or a refusal, because
+/// services refuse for a moment while keys are renewed. Requests with server errors were already
+/// repeated.
 fn passes(error: &Error) -> bool {
     match error {
         Error::Unauthenticated { .. } | Error::PermissionDenied { .. } => true,
@@ -146,7 +149,7 @@ fn wrong(location: &Path, what: &str) -> Error {
     }
 }
 
-/// An answer that cannot be right.
+/// An answer that cannot be correct.
 #[derive(Debug)]
 pub(super) struct Broken(String);
 
@@ -189,7 +192,7 @@ impl<T: ObjectStore> ObjectStore for Steady<T> {
                 return Err(wrong(location, what));
             }
             tracing::warn!(object = %location, "the store has other bytes than were sent; they are put again");
-            // The object is this writer's: its create-only put succeeded.
+            // The object belongs to this writer, because its create-only put succeeded.
             let again = PutOptions {
                 mode: PutMode::Overwrite,
                 ..options.clone()
@@ -199,7 +202,7 @@ impl<T: ObjectStore> ObjectStore for Steady<T> {
         Ok(done)
     }
 
-    // Nothing here is put in parts.
+    // Multipart uploads are not used.
     async fn put_multipart_opts(
         &self,
         location: &Path,
@@ -208,7 +211,7 @@ impl<T: ObjectStore> ObjectStore for Steady<T> {
         self.store.put_multipart_opts(location, options).await
     }
 
-    /// The answer has its whole body: one that breaks off half-way is asked for again, too.
+    /// The answer has its whole body: a truncated one is requested again, too.
     async fn get_opts(&self, location: &Path, options: GetOptions) -> Result<GetResult> {
         self.repeat(async |_| {
             let found = self.store.get_opts(location, options.clone()).await?;
@@ -250,7 +253,8 @@ impl<T: ObjectStore> ObjectStore for Steady<T> {
             .boxed()
     }
 
-    /// Asked for again where the first answer does not come; the store repeats the requests of later pages itself.
+    /// Repeats the request if the first answer does not arrive; the store itself repeats the
+    /// requests of later pages.
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {
         let (this, prefix) = (self.clone(), prefix.cloned());
         let list = async move {
@@ -296,17 +300,17 @@ mod tests {
     use super::*;
     use crate::store::probe;
 
-    /// What a request comes to grief by.
+    /// A fault of a request.
     #[derive(Debug, Clone, Copy, PartialEq)]
     enum Fault {
         None,
-        /// Carried out, and refused.
+        /// The request is executed, and refused.
         Forbidden,
-        /// A byte of a put is another one, and an answer's body is short.
+        /// A byte of a put is changed, and an answer's body is truncated.
         Bytes,
     }
 
-    /// Does wrong what is next in a list, over and over.
+    /// Injects the faults of a list, repeatedly.
     #[derive(Debug)]
     struct Faulty {
         store: InMemory,
@@ -449,7 +453,7 @@ mod tests {
             let listed: Vec<_> = store.list(None).try_collect().await.unwrap();
             assert_eq!(listed.len(), 20);
         }
-        // The promise of create-only puts can be shown although answers are lost.
+        // The guarantee of create-only puts can be verified although answers are lost.
         probe(
             &store(&[no, none, none]),
             &Path::from("p"),

@@ -1,4 +1,4 @@
-//! Whether a location can be written to, found out without making it.
+//! Checks whether a location is writable without creating it.
 
 use std::{
     path::{Path as Folder, PathBuf},
@@ -8,19 +8,20 @@ use std::{
 use super::{local::local_path, open_store, place::Place, probe};
 use crate::error::DatasetError;
 
-/// A location that can be written to.
+/// A writable location.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Writable {
-    /// It is there, and safe for several writers.
+    /// It exists, and is safe for several writers.
     There,
-    /// The folder does not exist; whoever writes first makes it, in this one, which can be written to.
+    /// The folder does not exist. The first writer creates it in this existing, writable folder.
     New(PathBuf),
 }
 
-/// Looks whether a location can be written to, and waits for it so long at most. Leaves nothing behind, and does not make a folder that does not exist.
+/// Checks whether a location is writable, with a timeout. Leaves no files, and does not create a
+/// missing folder.
 ///
 /// # Errors
-/// As [`super::open_store`] and [`probe`].
+/// Those of [`super::open_store`] and [`probe`].
 pub async fn check_writable(location: &str, within: Duration) -> Result<Writable, DatasetError> {
     if let Some(ground) = local_ground(location)?
         && ground != local_path(location)?
@@ -32,7 +33,7 @@ pub async fn check_writable(location: &str, within: Duration) -> Result<Writable
     Ok(Writable::There)
 }
 
-/// The deepest folder that exists of a local location, itself where it does; `None` for stores over a network.
+/// Returns the deepest existing folder of a local location; `None` for network stores.
 ///
 /// # Errors
 /// [`DatasetError::UnsupportedStore`].
@@ -45,7 +46,7 @@ pub fn local_ground(location: &str) -> Result<Option<PathBuf>, DatasetError> {
     Ok(Some(there.unwrap_or(Folder::new("/")).to_owned()))
 }
 
-/// Makes a file in a folder and deletes it.
+/// Creates a file in a folder and deletes it.
 fn try_file(folder: &Folder) -> Result<(), DatasetError> {
     let path = folder.join(format!("{}{}", super::PROBE, uuid::Uuid::new_v4()));
     let failed = |e| DatasetError::io("write to", folder, e);

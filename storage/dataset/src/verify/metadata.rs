@@ -1,4 +1,4 @@
-//! Checking what is no scene: metadata, snapshots, recipes, splits.
+//! Checks everything other than scenes: metadata, snapshots, recipes and splits.
 
 use serde_json::Value;
 
@@ -15,7 +15,7 @@ use crate::{
 };
 
 impl Dataset {
-    /// Metadata must be those that the specification asks for.
+    /// Checks that the metadata is as the specification requires.
     pub(super) async fn verify_metadata(
         &self,
         report: &mut Verification,
@@ -35,7 +35,7 @@ impl Dataset {
         Ok(())
     }
 
-    /// Keys and contents of the metadata that the specification asks for, the root's first.
+    /// Returns keys and contents of the metadata that the specification requires, the root's first.
     pub(crate) fn metadata(&self) -> Vec<(String, Value)> {
         let root = crate::scenes::dataset::root_metadata(&self.spec, self.format);
         let arrays = self.arrays.iter().map(|array| {
@@ -47,7 +47,7 @@ impl Dataset {
             .collect()
     }
 
-    /// Snapshots, recipes and splits must be what was written.
+    /// Checks that snapshots, recipes and splits are unchanged.
     pub(super) async fn verify_records(
         &self,
         listing: &Listing,

@@ -1,7 +1,8 @@
-//! Checking a data set against its manifests: fast by a listing, or in full by every object's content.
+//! Checks a data set against its manifests: fast by a listing, or in full by the content of every
+//! object.
 //!
-//! Memory is bounded: eight bytes an object for the listing, a few scenes' manifests at a time, and in full as many
-//! objects as are decoded at once.
+//! Memory use is bounded: eight bytes per object for the listing, a few scenes' manifests at a
+//! time, and in full mode the objects that are decoded concurrently.
 
 mod metadata;
 pub(crate) mod object;
@@ -23,28 +24,29 @@ use crate::store::objects;
 pub(crate) use metadata::metadata_fault;
 pub use report::{Fault, Problem, Verification, VerifyMode, Watch};
 
-/// Manifests read at a time.
+/// Number of manifests read concurrently.
 const MANIFESTS: usize = 32;
-/// Objects of a scene read at a time.
+/// Number of a scene's objects read concurrently.
 const OBJECTS: usize = 4;
-/// Scenes checked in full at a time, at most: each holds a histogram, decoded.
+/// Maximum number of scenes checked in full concurrently; each needs memory for a decoded
+/// histogram.
 const SCENES: usize = 4;
 
-/// What to check.
+/// Options of a check.
 #[derive(Clone, Copy)]
 pub struct VerifyOptions<'a> {
-    /// How thoroughly.
+    /// The thoroughness.
     pub mode: VerifyMode,
-    /// Every scene that there is room for is expected: one without a manifest is a problem.
+    /// Whether a scene without a manifest is a problem, up to the data set's capacity.
     pub complete: bool,
-    /// Only the scenes of this snapshot, which must be as they were then.
+    /// If set, checks only the scenes of this snapshot, which must be unchanged since then.
     pub snapshot: Option<&'a Snapshot>,
-    /// Called with the progress now and then.
+    /// Called regularly with the progress.
     pub watch: Watch<'a>,
 }
 
 impl VerifyOptions<'_> {
-    /// Everything there is, without progress.
+    /// Returns options to check all scenes, without progress.
     pub fn new(mode: VerifyMode) -> Self {
         Self {
             mode,
@@ -56,18 +58,18 @@ impl VerifyOptions<'_> {
 }
 
 impl Dataset {
-    /// Checks the data set and names each object that is broken, missing or foreign.
+    /// Checks the data set and reports each broken, missing or foreign object.
     ///
     /// # Errors
-    /// [`DatasetError::Store`] where the store fails; faults of the data are in the report.
+    /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.
     pub async fn verify(&self, mode: VerifyMode) -> Result<Verification, DatasetError> {
         self.verify_with(&VerifyOptions::new(mode)).await
     }
 
-    /// The same, with these options.
+    /// Like [`Self::verify`], with options.
     ///
     /// # Errors
-    /// [`DatasetError::Store`] where the store fails; faults of the data are in the report.
+    /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.
     pub async fn verify_with(
         &self,
         options: &VerifyOptions<'_>,
@@ -105,10 +107,10 @@ impl Dataset {
         Ok(report)
     }
 
-    /// Checks these scenes alone.
+    /// Checks only these scenes.
     ///
     /// # Errors
-    /// [`DatasetError::Store`] where the store fails; faults of the data are in the report.
+    /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.
     pub async fn verify_only(
         &self,
         scenes: &[u64],
@@ -141,7 +143,7 @@ impl Dataset {
         }));
     }
 
-    /// Checks published scenes; gives back those without a usable manifest.
+    /// Checks published scenes. Returns those without a usable manifest.
     async fn verify_scenes(
         &self,
         scenes: &[u64],
@@ -246,7 +248,8 @@ impl Dataset {
         Ok(checked)
     }
 
-    /// The manifest, if it is of this data set and lists exactly the scene's objects.
+    /// Parses the manifest, and checks that it belongs to this data set and lists exactly the
+    /// scene's objects.
     pub(crate) fn usable_manifest(
         &self,
         bytes: &[u8],
@@ -279,7 +282,8 @@ impl Dataset {
         Ok(manifest)
     }
 
-    /// Reads an object (by its place in the manifest) and checks it on a thread for blocking work.
+    /// Reads an object (by its position in the manifest) and checks it on a thread for blocking
+    /// work.
     async fn content(
         &self,
         manifest: Arc<Manifest>,
@@ -312,7 +316,7 @@ impl Dataset {
         decoded.err().map(|e| Fault::Undecodable(e.to_string()))
     }
 
-    /// What no manifest names.
+    /// Reports the objects that no manifest lists.
     fn leftover(&self, listing: &Listing, unusable: &[u64], report: &mut Verification) {
         for scene in 0..listing.end() {
             let published = listing.is_published(scene);
@@ -346,12 +350,12 @@ impl Dataset {
 
 struct CheckedScene {
     scene: u64,
-    /// It has a usable manifest.
+    /// Whether it has a usable manifest.
     usable: bool,
     problems: Vec<Problem>,
-    /// Objects found.
+    /// Number of its objects.
     objects: u64,
-    /// Their bytes.
+    /// Their total size in bytes.
     bytes: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Whether an object is what a manifest says of it.
+//! Checks an object against its entry in a manifest.
 
 use bytes::Bytes;
 use object_store::ObjectStore;
@@ -9,7 +9,8 @@ use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, sha256_hex};
 use crate::store::objects::{self, Rereads};
 
-/// What is wrong with an object, or its bytes where they were read: not with [`VerifyMode::Fast`].
+/// Returns the object's fault, or its bytes if they were read. [`VerifyMode::Fast`] does not read
+/// them.
 ///
 /// # Errors
 /// [`DatasetError::Store`].
@@ -42,10 +43,10 @@ pub(crate) async fn looked_at(
     })
 }
 
-/// The bytes of an object that a manifest names.
+/// Reads an object and checks it against its manifest entry.
 ///
 /// # Errors
-/// [`DatasetError::Damaged`] where it is missing or another; [`DatasetError::Store`].
+/// [`DatasetError::Damaged`] if it is missing or differs; [`DatasetError::Store`].
 pub(crate) async fn intact(
     store: &dyn ObjectStore,
     path: &Path,

@@ -1,47 +1,47 @@
-//! What a check of a data set says.
+//! The report of a data set's check.
 
 use std::fmt;
 
-/// Called with the number of scenes checked, and of all.
+/// Called with the number of checked scenes and the number of all scenes.
 pub type Watch<'a> = &'a (dyn Fn(u64, u64) + Sync);
 
-/// How thoroughly to check.
+/// The thoroughness of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VerifyMode {
-    /// Metadata, manifests, and each object's presence and size. No object is read.
+    /// Checks metadata, manifests, and each object's existence and size. No object is read.
     Fast,
-    /// Also each object's SHA-256, and that it decodes.
+    /// Also checks each object's SHA-256, and that it can be decoded.
     Full,
 }
 
-/// What is wrong with an object.
+/// A fault of an object.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Fault {
-    /// Its scene is published, but it is not there.
+    /// The scene is published, but the object is missing.
     Missing,
     /// Its size differs from the manifest's.
     WrongSize {
-        /// The manifest's.
+        /// The manifest's size.
         expected: u64,
-        /// The store's.
+        /// The stored size.
         found: u64,
     },
-    /// Its SHA-256 differs from the manifest's (a manifest's own: from the snapshot's).
+    /// Its SHA-256 differs from the manifest's; for a manifest, from the snapshot's.
     WrongHash {
-        /// The manifest's.
+        /// The expected SHA-256.
         expected: String,
-        /// That of the stored bytes.
+        /// The SHA-256 of the stored bytes.
         found: String,
     },
-    /// It does not decode, or its content contradicts the manifest; the reason.
+    /// It cannot be decoded, or its content contradicts the manifest, for this reason.
     Undecodable(String),
-    /// Not the metadata the specification asks for; how they differ.
+    /// The metadata differs from the specification in this way.
     BadMetadata(String),
-    /// The manifest cannot be used; why.
+    /// The manifest is unusable for this reason.
     BadManifest(String),
-    /// A snapshot or recipe cannot be used; why.
+    /// A snapshot or recipe is unusable for this reason.
     BadRecord(String),
-    /// Nothing of this data set has this key.
+    /// The key does not belong to this data set.
     Foreign,
 }
 
@@ -50,39 +50,40 @@ pub enum Fault {
 pub struct Problem {
     /// Full key.
     pub object: String,
-    /// The scene it belongs to.
+    /// The object's scene, if any.
     pub scene: Option<u64>,
     /// The fault.
     pub fault: Fault,
 }
 
-/// What [`Dataset::verify`](crate::Dataset::verify) found.
+/// The result of [`Dataset::verify`](crate::Dataset::verify).
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Verification {
-    /// Published scenes that were checked.
+    /// Number of published scenes checked.
     pub scenes: u64,
-    /// Objects of published scenes that were checked.
+    /// Number of objects of published scenes checked.
     pub objects: u64,
-    /// Their bytes.
+    /// Their total size in bytes.
     pub bytes: u64,
-    /// What is wrong, ordered by key.
+    /// The problems, ordered by key.
     pub problems: Vec<Problem>,
-    /// Objects of scenes without a (usable) manifest: being written now, left by a killed worker and adopted when the
-    /// scene is published, or of a scene whose manifest was deleted. Ordered by key.
+    /// Objects of scenes without a (usable) manifest: being written at the moment, left by a killed
+    /// worker and adopted when the scene is published, or of a scene with a deleted manifest.
+    /// Ordered by key.
     pub unpublished: Vec<String>,
-    /// Scenes without a manifest of which objects are there, ascending; see [`Self::unpublished`].
+    /// Scenes without a manifest but with objects, ascending; see [`Self::unpublished`].
     pub unfinished: Vec<u64>,
 }
 
 impl Verification {
-    /// Whether nothing is wrong.
+    /// Returns whether there are no problems.
     pub fn is_sound(&self) -> bool {
         self.problems.is_empty()
     }
 }
 
 impl Fault {
-    /// A word for programs.
+    /// Returns an identifier of the fault for programs.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Missing => "missing",

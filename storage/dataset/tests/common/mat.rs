@@ -1,6 +1,6 @@
-//! MATLAB files of version 5.
+//! Writes MATLAB files of version 5.
 
-/// An element of a version 5 file.
+/// Encodes an element of a version 5 file.
 fn element(kind: u32, data: &[u8]) -> Vec<u8> {
     let mut bytes = kind.to_le_bytes().to_vec();
     bytes.extend((data.len() as u32).to_le_bytes());
@@ -9,7 +9,8 @@ fn element(kind: u32, data: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// A matrix of doubles, or of bytes stored for doubles as MATLAB does with small whole numbers.
+/// Encodes a matrix of doubles, or of bytes stored for doubles as MATLAB does for small whole
+/// numbers.
 pub fn matrix(name: &str, dims: [i32; 2], values: &[f64]) -> Vec<u8> {
     let small = values
         .iter()
@@ -31,7 +32,7 @@ pub fn matrix(name: &str, dims: [i32; 2], values: &[f64]) -> Vec<u8> {
     element(14, &parts)
 }
 
-/// A file of these arrays.
+/// Encodes a file of these arrays.
 pub fn version_5(arrays: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = b"MATLAB 5.0 MAT-file, made by a test".to_vec();
     bytes.resize(124, b' ');

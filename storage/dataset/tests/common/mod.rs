@@ -1,4 +1,4 @@
-//! What the test binaries share.
+//! Helpers shared by the test binaries.
 #![allow(
     dead_code,
     unused_imports,
@@ -13,7 +13,7 @@ pub mod tricky;
 
 pub use scene::*;
 
-/// A checkpoint of these pieces.
+/// Returns the pieces of a checkpoint.
 pub fn pieces(all: &[&[u8]]) -> picofarm_dataset::Pieces {
     let all: Vec<bytes::Bytes> = all.iter().map(|piece| piece.to_vec().into()).collect();
     Box::new(all.into_iter())

@@ -1,5 +1,5 @@
-//! A room whose histograms are known in closed form: a floor, a back wall, and a block that casts shadows. Light of
-//! two bounces arrives at its time of flight; that of more bounces is a tail.
+//! A room with histograms known in closed form: a floor, a back wall, and a block that casts
+//! shadows. Two-bounce light arrives at its time of flight; light of more bounces is a tail.
 
 use super::Lcg;
 
@@ -18,7 +18,8 @@ pub struct Room {
 }
 
 impl Room {
-    /// `spots` of a 10×10 grid at the back wall, seen through a field of view of 90°.
+    /// Returns a room with `spots` of a 10×10 grid on the back wall, seen with a field of view of
+    /// 90°.
     pub fn new(side: usize, bins: usize) -> Self {
         let (width, height) = (side, side);
         let half = side as f64 / 2.0;
@@ -90,14 +91,14 @@ impl Room {
         ]
     }
 
-    /// Path of two-bounce light.
+    /// Returns the path length of two-bounce light.
     pub fn path(&self, spot: usize, pixel: usize) -> f64 {
         let norm = |a: [f64; 3]| a.iter().map(|x| x * x).sum::<f64>().sqrt();
         let (l, x) = (self.lights[spot].map(f64::from), self.point(pixel));
         norm(l) + norm([x[0] - l[0], x[1] - l[1], x[2] - l[2]]) + norm(x)
     }
 
-    /// h of some of the spots: `[row][column][bin]`.
+    /// Returns h of some of the spots: `[row][column][bin]`.
     pub fn transient(&self, spots: &[u32]) -> Vec<f32> {
         let pixels = self.width * self.height;
         let mut h = vec![0.0f32; pixels * self.bins];

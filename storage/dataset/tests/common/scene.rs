@@ -1,4 +1,4 @@
-//! A small scene with every kind of value in it, and stores to put it in.
+//! A small scene with every kind of value, and stores for it.
 use std::sync::Arc;
 
 use object_store::ObjectStore;
@@ -7,7 +7,8 @@ use object_store::path::Path;
 use picofarm_dataset::*;
 use serde_json::json;
 
-/// 40×36 pixels: tiles at the right and the bottom are cut off; 9 spots: two bytes of bits.
+/// 40×36 pixels, so that tiles at the right and the bottom are cut off, and 9 spots, so that there
+/// are two bytes of bits.
 pub fn spec(profile: Profile) -> DatasetSpec {
     DatasetSpec {
         scenes: 4,
@@ -27,7 +28,7 @@ pub fn spec(profile: Profile) -> DatasetSpec {
     }
 }
 
-/// Owns what a record borrows.
+/// The owner of the data that a record borrows.
 pub struct Scene {
     pub transient: Vec<f32>,
     pub depth: Vec<f32>,
@@ -42,7 +43,7 @@ pub struct Scene {
     pub scale: f32,
 }
 
-/// A small generator of its own, so that golden bytes depend on nothing else.
+/// A separate small generator, so that the golden bytes depend on nothing else.
 pub struct Lcg(pub u64);
 
 impl Lcg {

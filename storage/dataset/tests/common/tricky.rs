@@ -1,4 +1,5 @@
-//! A store in memory that loses answers, repeats requests, and lets others act at the worst moment.
+//! An in-memory store that loses answers, repeats requests, and lets others act at the worst
+//! moment.
 
 use std::fmt;
 use std::sync::{Arc, Mutex};
@@ -10,20 +11,20 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::*;
 
-/// What becomes of a create-only put.
+/// The outcome of a create-only put.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
-    /// It is done and answered.
+    /// It is executed and answered.
     Good,
-    /// It is done, but the answer is lost.
+    /// It is executed, but the answer is lost.
     Lost,
     /// It never arrives.
     Dropped,
-    /// It is done, its answer is lost, and the client repeats it by itself.
+    /// It is executed, its answer is lost, and the client itself repeats it.
     Repeated,
 }
 
-/// When others may act.
+/// A moment at which others may act.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Moment {
     BeforePut,
@@ -34,10 +35,10 @@ pub enum Moment {
 type Decide = Box<dyn FnMut(&Path) -> Fate + Send>;
 type Act = Box<dyn Fn(Moment, Path) -> BoxFuture<'static, ()> + Send + Sync>;
 
-/// The store. Gets, lists and the rest are those of the memory below.
+/// The store. Gets, lists and other requests are passed to the memory store.
 pub struct Tricky {
     pub memory: Arc<InMemory>,
-    /// What was got: object, first byte and end.
+    /// The reads so far: object, first byte and end.
     pub got: Mutex<Vec<(Path, u64, u64)>>,
     decide: Mutex<Decide>,
     act: Arc<Act>,

@@ -1,15 +1,16 @@
-//! Light in flight: one scene's transient as an animated GIF, a few bins a frame.
+//! Light in flight: one scene's transient as an animated GIF, with a few bins per frame.
 
 use super::{View, quantile};
 use crate::{animation, inferno};
 
-/// Frames at most; bins are summed to stay below it.
+/// Maximum number of frames; bins are summed to stay within it.
 const FRAMES: usize = 160;
-/// Hundredths of a second a frame.
+/// Duration of a frame in hundredths of a second.
 const DELAY: u16 = 6;
 
-/// The animation. Exposure is common to all frames (the signal to the power 0.4), so brightness can
-/// be compared over time; the palette is the colour map itself, so no colour is approximated.
+/// Returns the animation. Exposure is common to all frames (the signal to the power 0.4), so
+/// brightness can be compared over time. The palette is the colour map itself, so no colour is
+/// approximated.
 pub fn flight(view: &View) -> Vec<u8> {
     let (first, last) = lively(&view.energy_by_bin());
     let step = (last - first).div_ceil(FRAMES).max(1);
@@ -26,8 +27,8 @@ pub fn flight(view: &View) -> Vec<u8> {
     animation((view.width, view.height), &palette, DELAY, &mut frames)
 }
 
-/// The bins between the first light and the arrival of 92 % of the energy: after that there is only a faint,
-/// even glow.
+/// Returns the bins between the first light and the arrival of 92 % of the energy. After that there
+/// is only a faint, even glow.
 fn lively(energy: &[f64]) -> (usize, usize) {
     let total: f64 = energy.iter().sum();
     let arrived = |share: f64| {
@@ -44,7 +45,7 @@ fn lively(energy: &[f64]) -> (usize, usize) {
     }
 }
 
-/// The value shown as white: a high quantile of the bright part of a few frames.
+/// Returns the value shown as white: a high quantile of the bright part of a few frames.
 fn exposure(view: &View, step: usize, first: usize, last: usize) -> f32 {
     let probes: Vec<f32> = (1..8)
         .map(|k| first + (last - first) * k / 16)

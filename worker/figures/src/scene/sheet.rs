@@ -1,4 +1,4 @@
-//! The contact sheet: one row a scene, one column a quantity.
+//! The contact sheet: one row per scene, one column per quantity.
 
 use super::{View, quantile};
 use crate::{Canvas, TEXT, inferno, viridis};
@@ -13,10 +13,10 @@ const BACKGROUND: [u8; 3] = [16, 16, 20];
 const INK: [u8; 3] = [210, 210, 215];
 const MARK: [u8; 3] = [255, 64, 64];
 
-/// Draws the sheet. Views are asked for one by one, since one may hold hundreds of megabytes.
+/// Draws the sheet. Views are read one by one, because one may need hundreds of megabytes.
 ///
 /// # Errors
-/// Whatever reading a scene gives.
+/// Any error of `read`.
 pub fn sheet<E>(scenes: &[u64], mut read: impl FnMut(u64) -> Result<View, E>) -> Result<Canvas, E> {
     let columns = 4 + 3 + SLICES.len();
     let width = SIDE + columns * (CELL + GAP);

@@ -1,4 +1,4 @@
-//! What becomes of tasks that do not notice that they shall stop.
+//! Tests of tasks that do not notice a stop request.
 
 use std::{collections::BTreeMap, sync::Mutex, sync::mpsc::Sender};
 
@@ -11,7 +11,8 @@ use uuid::Uuid;
 
 use super::*;
 
-/// Says when a task begins, and holds it, deaf to its control, until it is let go.
+/// An executor that reports when a task begins, and blocks it until it is released, ignoring its
+/// control.
 struct Deaf {
     begun: Mutex<Sender<u64>>,
     go: Mutex<Receiver<()>>,
@@ -88,7 +89,7 @@ async fn a_task_that_does_not_notice_is_left_and_the_next_one_waits_for_its_end(
         .begin(task(&spec, 1), first.clone(), Span::none());
     assert_eq!(bench.begun.recv(), Ok(1));
     first.stop();
-    // It is still held.
+    // The first task is still blocked.
     assert_eq!(bench.runner.finished().await, Err(TaskError::Stopped));
     bench.runner.begin(task(&spec, 2), second, Span::none());
     let early = bench.begun.recv_timeout(Duration::from_millis(200));

@@ -1,4 +1,4 @@
-//! The detector's scan: a ray for each pixel, and the pinhole camera that fits them.
+//! The detector's scan: a ray per pixel, and the pinhole camera that fits the rays.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ use super::super::scene::{Shape, direction};
 use super::super::vector::norm;
 use crate::layout::record::Intrinsics;
 
-/// Rays may deviate so far from a pinhole camera's.
+/// Maximum deviation of rays from the pinhole camera's, in pixels.
 const STRAY_PX: f64 = 0.5;
 
 pub(super) fn scan_file(folder: &Path) -> Result<Option<PathBuf>, ImportError> {
@@ -43,9 +43,9 @@ pub(super) struct Scan {
     pub file: PathBuf,
     pub width: usize,
     pub height: usize,
-    /// Whether columns and rows stand the other way round in the files.
+    /// Whether columns and rows are reversed in the files.
     turned: [bool; 2],
-    /// Ours.
+    /// Our intrinsics.
     pub intrinsics: Intrinsics,
     pub stray_px: f64,
 }
@@ -138,7 +138,7 @@ impl Scan {
         })
     }
 
-    /// Where our pixel stands in the files.
+    /// Returns the file's index of our pixel.
     pub fn source(&self, pixel: usize) -> usize {
         let turn = |at: usize, size: usize, turned: bool| if turned { size - 1 - at } else { at };
         let column = turn(pixel % self.width, self.width, self.turned[0]);
@@ -146,7 +146,7 @@ impl Scan {
         row * self.width + column
     }
 
-    /// The spot from light of one bounce.
+    /// Computes the spot's position from one-bounce light.
     pub fn spot(
         &self,
         file: &Path,
@@ -162,7 +162,7 @@ impl Scan {
         let d = direction(self.intrinsics, pixel / self.width, pixel % self.width);
         let d = d.map(|x| x / norm(d));
         let path = shape.gate.start_m + (bin as f64 + 0.5) * shape.gate.bin_width_m;
-        // Light's way turned round: from the detector along the pixel's ray, then to the laser.
+        // The light's way is reversed: from the detector along the pixel's ray, then to the laser.
         let from = laser.map(|x| -x);
         let relative = along(from, d, path);
         let position = [0, 1, 2].map(|k| relative[k] + laser[k]);
@@ -184,7 +184,7 @@ impl Scan {
     }
 }
 
-/// Slope and intercept of `values` over pixel centres.
+/// Returns slope and intercept of `values` over pixel centres.
 fn fit(values: &[f64], at: impl Fn(usize) -> usize) -> (f64, f64) {
     let n = values.len() as f64;
     let centre = |p: usize| at(p) as f64 + 0.5;

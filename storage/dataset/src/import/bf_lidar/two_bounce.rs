@@ -1,9 +1,10 @@
-//! What was found in the captures and lies beside them: `t2.mat` with `t2` (spots × pixels: seconds from the laser to the
-//! detector), `two_bounce_detections.mat` with `has_2B` (spots × pixels, 1 = lit) and `illum_pts` (a row a spot, and one for
-//! the camera).
+//! Two-bounce data derived from the captures and stored next to them: `t2.mat` with `t2` (spots ×
+//! pixels: seconds from the laser to the detector), and `two_bounce_detections.mat` with `has_2B`
+//! (spots × pixels, 1 = lit) and `illum_pts` (a row per spot, and one for the camera).
 //!
-//! The scan was turned upside down somewhere on the way, and in published files the spots were not. So both are tried: with
-//! the right one the depths of a pixel from its spots agree.
+//! The scan was turned upside down at some point in their processing, and in published files the
+//! spots were not. Therefore both orientations are tried: with the correct one, a pixel's depths
+//! computed from its spots agree.
 
 use std::path::{Path, PathBuf};
 
@@ -18,24 +19,24 @@ use crate::import::scene::direction;
 
 const TIMES: &str = "t2.mat";
 const DETECTIONS: &str = "two_bounce_detections.mat";
-/// Spots upside down must agree so many times better to be believed.
+/// Factor by which depths must agree better for upside-down spots to be believed.
 const BETTER: f64 = 2.0;
 
 /// Two-bounce paths and masks in our axes.
 pub(super) struct TwoBounce {
-    /// `[spot][row][column]`, metres; 0 where no light of two bounces was found.
+    /// `[spot][row][column]`, metres; 0 if no two-bounce light was found.
     pub paths_m: Vec<f32>,
     /// `[spot][row][column]`, 1 = lit.
     pub lit: Vec<u8>,
-    /// Places of the spots, camera frame, metres.
+    /// Positions of the spots in the camera frame, metres.
     pub spots: Vec<[f32; 3]>,
-    /// How well depths of a pixel agree, metres.
+    /// Agreement of a pixel's depths, metres.
     pub check: Value,
     /// Whether the spots had to be turned upside down.
     pub turned: bool,
 }
 
-/// The files, where both are there.
+/// Returns the files, if both exist.
 pub(super) fn files_of(folder: &Path) -> Result<Option<[PathBuf; 2]>, ImportError> {
     let both = [folder.join(TIMES), folder.join(DETECTIONS)];
     match [both[0].is_file(), both[1].is_file()] {
@@ -51,7 +52,7 @@ pub(super) fn files_of(folder: &Path) -> Result<Option<[PathBuf; 2]>, ImportErro
     }
 }
 
-/// Reads them for so many spots. `laser` is its place in the camera frame.
+/// Reads the files for this number of spots. `laser` is the laser's position in the camera frame.
 pub(super) fn read(
     [times, detections]: &[PathBuf; 2],
     scan: &Scan,
@@ -136,13 +137,14 @@ pub(super) fn read(
     })
 }
 
-/// A number, or null where there is none.
+/// Returns a number, or null if it is not finite.
 fn finite(x: f64) -> Value {
     if x.is_finite() { json!(x) } else { Value::Null }
 }
 
 impl Scan {
-    /// Median over the pixels of how far depths from their spots lie from their median, metres; NaN where no pixel has two.
+    /// Returns the median over the pixels of the deviation of depths, computed from their spots,
+    /// from the pixel's median depth, in metres; NaN if no pixel has two.
     fn spread_m(&self, spots: &[[f64; 3]], laser: [f64; 3], paths_m: &[f32]) -> f64 {
         let pixels = self.width * self.height;
         let lasers: Vec<f64> = spots.iter().map(|spot| distance(*spot, laser)).collect();
@@ -151,7 +153,8 @@ impl Scan {
             let ray = direction(self.intrinsics, pixel / self.width, pixel % self.width);
             let ray = ray.map(|x| x / norm(ray));
             let depths = spots.iter().enumerate().filter_map(|(s, spot)| {
-                // The rest of the path, spot to surface to camera, is that of an ellipsoid around both.
+                // The rest of the path, spot to surface to camera, defines an ellipsoid with spot
+                // and camera as foci.
                 let rest = f64::from(paths_m[s * pixels + pixel]) - lasers[s];
                 let depth = (rest * rest - dot(*spot, *spot)) / (2.0 * (rest - dot(ray, *spot)));
                 (rest > norm(*spot) && depth > 0.0).then_some(depth)
@@ -167,7 +170,7 @@ impl Scan {
     }
 }
 
-/// The upper median; NaN of nothing.
+/// Returns the upper median; NaN for an empty slice.
 fn median(of: &mut [f64]) -> f64 {
     if of.is_empty() {
         return f64::NAN;

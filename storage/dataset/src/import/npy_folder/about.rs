@@ -1,4 +1,4 @@
-//! `scene.json`, and the arrays that it names in the shapes that it says.
+//! `scene.json`, and the arrays that it names with their expected shapes.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ use crate::layout::spec::{Gate, Subsets};
 
 const LIGHT_M_S: f64 = 299_792_458.0;
 
-/// A scene's description, and where it lies.
+/// A scene's description, and its location.
 pub(super) struct About {
     pub folder: PathBuf,
     pub is: Description,
@@ -58,7 +58,8 @@ impl About {
         }
     }
 
-    /// For each of our axes (right, down, forward): which of theirs it is, and its sign.
+    /// Returns, for each of our axes (right, down, forward), the index of the file's axis and its
+    /// sign.
     pub fn axes(&self) -> Result<[(usize, f64); 3], ImportError> {
         let expected = "right or left, down or up, forward or backward, each once";
         let mut axes = [None; 3];
@@ -160,7 +161,7 @@ impl About {
         })
     }
 
-    /// The histogram with its axes in our order.
+    /// Returns the histogram with its axes in our order.
     pub fn row_column_bin(
         &self,
         file: &Path,
@@ -249,7 +250,7 @@ impl About {
         Ok(array.values.into_iter().map(|x| x as u32).collect())
     }
 
-    /// Camera-to-world from our camera axes.
+    /// Returns camera-to-world for our camera axes.
     pub fn pose(&self, m: &[[f64; 4]; 4], axes: &[(usize, f64); 3], unit: f64) -> [[f32; 4]; 4] {
         let mut pose = [[0.0; 4]; 4];
         for (row, out) in m.iter().zip(&mut pose).take(3) {

@@ -1,4 +1,5 @@
-//! Azure Blob Storage: `az://container/prefix`, with place and credentials from the usual `AZURE_…` variables.
+//! Azure Blob Storage: `az://container/prefix`, with location and credentials from the usual
+//! `AZURE_…` variables.
 
 use object_store::ClientConfigKey;
 use object_store::azure::{AzureConfigKey, MicrosoftAzure, MicrosoftAzureBuilder};
@@ -7,7 +8,7 @@ use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, ret
 use super::place::Place;
 use crate::error::DatasetError;
 
-/// A client of the container. Asks nothing of the server.
+/// Returns a client of the container, without sending a request.
 ///
 /// # Errors
 /// [`DatasetError::StoreSettings`] names the variable; values are not repeated.
@@ -19,7 +20,7 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<MicrosoftAzu
         .with_config(client(ClientConfigKey::Timeout), TIMEOUT)
         .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT);
     for (name, value) in settings.iter() {
-        // Variables that it does not know are other programs'.
+        // Unknown variables belong to other programs.
         if let Ok(key) = name.to_ascii_lowercase().parse() {
             builder = builder.with_config(key, value);
         }
@@ -36,7 +37,7 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<MicrosoftAzu
         })
 }
 
-/// What would otherwise fail late and with words that name no variable.
+/// Checks for errors that would otherwise occur late, with messages that name no variable.
 fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
     let wrong = |what: &str| Err(place.settings_error(what));
     if let Some(name) = settings.first(&["AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT"]) {
@@ -58,7 +59,7 @@ fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
             "AZURE_CLIENT_SECRET is set, but not both AZURE_CLIENT_ID and AZURE_TENANT_ID",
         );
     }
-    // Without any of these, Azure's own machines are asked for theirs when a request is made.
+    // Without any of these, the credentials of Azure's own machines are requested on first use.
     Ok(())
 }
 

@@ -1,4 +1,5 @@
-//! What is the same for every object store: its variables, how long and how often requests are tried, and how many at once.
+//! Settings common to all object stores: their variables, timeouts, retries, and the number of
+//! concurrent requests.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -8,19 +9,21 @@ use object_store::{BackoffConfig, RetryConfig};
 use super::place::Place;
 use crate::error::DatasetError;
 
-/// Requests in flight for one opened store.
+/// Number of concurrent requests of one opened store.
 pub(super) const CONCURRENCY: usize = 32;
-/// A request's time limit. Long enough for a shard of some gigabytes over a fast line, or 20 MB over a slow one.
+/// A request's timeout. It suffices for a shard of some gigabytes over a fast line, or 20 MB over a
+/// slow one.
 pub(super) const TIMEOUT: &str = "120s";
-/// Until a connection stands.
+/// Timeout for establishing a connection.
 pub(super) const CONNECT_TIMEOUT: &str = "5s";
-/// Retries of one request; whoever asks decides what to do when they are used up.
+/// Number of retries of one request. When they are used up, the caller decides.
 const RETRIES: usize = 6;
 /// No retry starts later than this after the first attempt.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// To be called before a client is made: it takes the provider of cryptography that the process has chosen, and panics
-/// where there is none. A program that has chosen keeps its own.
+/// Installs a cryptography provider. It must be called before a client is created, because the
+/// client uses the provider that the process has chosen, and panics if there is none. A provider
+/// that the program has already installed is kept.
 pub(super) fn choose_cryptography() {
     let _ = rustls::crypto::ring::default_provider().install_default();
 }
@@ -37,7 +40,7 @@ pub(super) fn retries() -> RetryConfig {
     }
 }
 
-/// The variables that tell of a place. Empty ones count as unset.
+/// The environment variables of a store. Empty ones count as unset.
 pub(super) struct Settings(BTreeMap<String, String>);
 
 impl Settings {
@@ -54,7 +57,7 @@ impl Settings {
         self.0.iter()
     }
 
-    /// Their names, for a message.
+    /// Returns their names for messages.
     pub(super) fn names(&self) -> String {
         let names: Vec<&str> = self.0.keys().map(String::as_str).collect();
         names.join(", ")
@@ -64,7 +67,7 @@ impl Settings {
         self.0.contains_key(name)
     }
 
-    /// The first of these names that is set.
+    /// Returns the first name with a value.
     pub(super) fn first<'a>(&self, names: &[&'a str]) -> Option<&'a str> {
         names.iter().copied().find(|name| self.has(name))
     }
@@ -78,10 +81,11 @@ impl Settings {
         matches!(&*value, "true" | "1" | "yes" | "y" | "on")
     }
 
-    /// Whether a server's URL can be used.
+    /// Checks that a server's URL is usable.
     ///
     /// # Errors
-    /// [`DatasetError::StoreSettings`] names the variable, `name`, or the one that allows plain HTTP.
+    /// [`DatasetError::StoreSettings`] names the variable, `name`, or the one that allows plain
+    /// HTTP.
     pub(super) fn check_server(
         &self,
         place: &Place,

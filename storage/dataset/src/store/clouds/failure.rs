@@ -1,11 +1,11 @@
-//! What an object store's error means.
+//! Descriptions of object store errors.
 
 use object_store::client::{HttpError, HttpErrorKind};
 
 use crate::store::account::Failure;
 use crate::store::service::Service;
 
-/// An error of an object store in words, from it and its causes; `None` for an error of another kind.
+/// Describes an object store's error from its chain of causes; `None` for an error of another kind.
 pub(in crate::store) fn failure(
     chain: &[&(dyn std::error::Error + 'static)],
     service: Service,
@@ -21,7 +21,7 @@ pub(in crate::store) fn failure(
     })
 }
 
-/// Whether an error says that the whole bucket, not only the object, is missing.
+/// Returns whether the whole bucket is missing, and not only the object.
 pub(in crate::store) fn no_bucket(chain: &[&(dyn std::error::Error + 'static)]) -> bool {
     let mut requests = chain.iter().filter_map(|e| Request::parse(&e.to_string()));
     requests.any(|r| {
@@ -32,7 +32,7 @@ pub(in crate::store) fn no_bucket(chain: &[&(dyn std::error::Error + 'static)]) 
     })
 }
 
-/// Whether a request or its answer broke off, or the server found that it arrived otherwise than it was sent.
+/// Returns whether a request or its answer was interrupted, or the server found it corrupted.
 pub(in crate::store) fn breaks_off(chain: &[&(dyn std::error::Error + 'static)]) -> bool {
     if chain.iter().any(|e| e.is::<HttpError>()) {
         return true;
@@ -45,12 +45,13 @@ pub(in crate::store) fn breaks_off(chain: &[&(dyn std::error::Error + 'static)])
     })
 }
 
-/// A request that failed, from the words of `object_store`, whose type for it is not public. Of a server's answer only
-/// its code and message are kept: some servers repeat tokens and signatures in the rest.
+/// A failed request, parsed from the message of `object_store`, because the error type is not
+/// public. Only the code and message of a server's answer are retained, because some servers repeat
+/// tokens and signatures in the rest.
 struct Request {
     /// Scheme, host and port.
     server: String,
-    /// Of the address, after the server.
+    /// The rest of the URL after the server.
     path: String,
     status: Option<u16>,
     code: Option<String>,
@@ -75,7 +76,7 @@ impl Request {
         })
     }
 
-    /// The server could not be asked.
+    /// Describes a request that the server did not answer.
     fn unanswered(&self, service: Service, kind: HttpErrorKind, cause: &str) -> Failure {
         let hints = hints(service);
         let (what, hint) = match kind {
@@ -95,15 +96,15 @@ impl Request {
         }
     }
 
-    /// Whether it was for credentials, where machines of the services get their credentials: nobody asks there who was
-    /// given any.
+    /// Returns whether it was a request for credentials to a service's metadata server. This is
+    /// only sent if no credentials are configured.
     fn asks_who(&self) -> bool {
         ["latest/", "computeMetadata/", "metadata/identity/"]
             .iter()
             .any(|start| self.path.starts_with(start))
     }
 
-    /// The server said no.
+    /// Describes a refusal by the server.
     fn refused(&self, service: Service) -> Failure {
         let hint = match (self.code.as_deref(), self.status) {
             _ if self.asks_who() => hints(service).anonymous,
@@ -136,7 +137,7 @@ impl Request {
                 "the server is full: free some space, then run it again"
             }
             (_, Some(401)) => hints(service).refused,
-            // Some servers say so too of a bucket that does not exist.
+            // Some servers return the same for a bucket that does not exist.
             (_, Some(403)) => {
                 "no permission: AWS_ACCESS_KEY_ID needs leave to read, write, list and delete in this bucket; does the \
                  bucket exist?"
@@ -199,7 +200,7 @@ fn hints(service: Service) -> Hints {
     }
 }
 
-/// The text of the first XML element of this name, cut to a line.
+/// Returns the text of the first XML element with this name, cut to one line.
 fn element(text: &str, name: &str) -> Option<String> {
     let (_, rest) = text.split_once(&format!("<{name}>"))?;
     let (content, _) = rest.split_once(&format!("</{name}>"))?;

@@ -1,4 +1,5 @@
-//! Google Cloud Storage: `gs://bucket/prefix`, with credentials from the usual `GOOGLE_…` variables, `gcloud`'s file or the machine.
+//! Google Cloud Storage: `gs://bucket/prefix`, with credentials from the usual `GOOGLE_…`
+//! variables, `gcloud`'s file or the machine.
 
 use std::fs::File;
 
@@ -9,14 +10,14 @@ use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, ret
 use super::place::Place;
 use crate::error::DatasetError;
 
-/// Variables that name a file of credentials.
+/// Variables with the path of a credentials file.
 const FILES: [&str; 3] = [
     "GOOGLE_APPLICATION_CREDENTIALS",
     "GOOGLE_SERVICE_ACCOUNT",
     "GOOGLE_SERVICE_ACCOUNT_PATH",
 ];
 
-/// A client of the bucket. Asks nothing of the server.
+/// Returns a client of the bucket, without sending a request.
 ///
 /// # Errors
 /// [`DatasetError::StoreSettings`] names the variable; values are not repeated.
@@ -45,7 +46,7 @@ pub(super) fn connect(
         .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT)
         .with_config(client(ClientConfigKey::AllowHttp), "false");
     for (name, value) in settings.iter() {
-        // Variables that it does not know are other programs'.
+        // Unknown variables belong to other programs.
         if let Ok(key) = name.to_ascii_lowercase().parse() {
             builder = builder.with_config(key, value);
         }

@@ -1,4 +1,4 @@
-//! A store whose requests wait until the bandwidth that was set has room for them.
+//! A store with requests that wait until the bandwidth limit permits them.
 
 use std::ops::Range;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -19,13 +19,13 @@ use super::super::bandwidth::{Bandwidth, bandwidth};
 
 static LIMITS: OnceLock<Limits> = OnceLock::new();
 
-/// The limits of this process.
+/// Returns the limits of this process.
 pub(super) fn limits() -> Limits {
     let new = || Limits::new(bandwidth(), &(Arc::new(WallClock) as _));
     LIMITS.get_or_init(new).clone()
 }
 
-/// A line each way.
+/// The limits in both directions.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Limits {
     upload: Option<Arc<Line>>,
@@ -54,7 +54,7 @@ impl Limits {
     }
 }
 
-/// What time it is, and waiting.
+/// A source of time, with sleeping.
 #[async_trait::async_trait]
 trait Clock: std::fmt::Debug + Send + Sync {
     fn now(&self) -> Instant;
@@ -75,8 +75,8 @@ impl Clock for WallClock {
     }
 }
 
-/// A line that carries so many bytes a second. Who comes books its bytes and starts when those booked before are through:
-/// a limit inside of a request, on its bytes, would let its time limit strike.
+/// A line with a limited number of bytes per second. A request books its bytes and starts when all
+/// bytes booked before have been transferred. A limit inside a request would trigger its timeout.
 #[derive(Debug)]
 struct Line {
     bytes_per_s: f64,
@@ -85,7 +85,7 @@ struct Line {
 }
 
 impl Line {
-    /// When these bytes may start.
+    /// Returns the time at which a transfer of these bytes may start.
     fn book(&self, bytes: u64) -> Instant {
         let mut free = self.free.lock().expect("nothing panics while it is held");
         let now = self.clock.now();
@@ -106,7 +106,7 @@ async fn carry(line: &Option<Arc<Line>>, bytes: u64) {
     }
 }
 
-/// A store behind the two lines.
+/// A store with bandwidth limits.
 #[derive(Debug)]
 pub(super) struct Limited<T> {
     inner: T,
@@ -137,7 +137,7 @@ impl<T: ObjectStore> ObjectStore for Limited<T> {
         self.inner.put_opts(location, payload, options).await
     }
 
-    // Nothing here is put in parts.
+    // Multipart uploads are not used.
     async fn put_multipart_opts(
         &self,
         location: &Path,
@@ -153,7 +153,8 @@ impl<T: ObjectStore> ObjectStore for Limited<T> {
             Some(GetRange::Suffix(bytes)) => Some(*bytes),
             Some(GetRange::Offset(_)) | None => None,
         };
-        // Of a whole object the size is known when it comes: then it starts at once, and the next one waits for it.
+        // The size of a whole object is known only when the answer arrives, so it starts at once
+        // and the next request waits for it.
         carry(&self.limits.download, known.unwrap_or(0)).await;
         let result = self.inner.get_opts(location, options).await?;
         if let (None, Some(line), GetResultPayload::Stream(_)) =
@@ -212,7 +213,7 @@ mod tests {
 
     const MB: usize = 1_000_000;
 
-    /// Its time is that until which somebody waited last.
+    /// A simulated clock. Its time is the latest time that anyone has waited for.
     #[derive(Debug)]
     struct Simulated {
         start: Instant,
@@ -292,7 +293,8 @@ mod tests {
         }
         store.get_range(&key(0), 0..1_000_000).await.unwrap();
         assert_eq!(clock.seconds(), 3.0);
-        // A megabyte is still under way; then four of the whole object, for which the head waits.
+        // A megabyte is still in transit, then four of the whole object, so the head request waits
+        // for both.
         store.get(&key(0)).await.unwrap().bytes().await.unwrap();
         assert_eq!(clock.seconds(), 4.0);
         store.head(&key(0)).await.unwrap();

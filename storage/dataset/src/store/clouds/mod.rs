@@ -1,4 +1,4 @@
-//! Object stores over a network: S3, Google's and Azure's.
+//! Network object stores: S3, Google's and Azure's.
 
 mod azure;
 mod client;
@@ -20,7 +20,8 @@ use crate::error::DatasetError;
 use client::{CONCURRENCY, Settings};
 use limited::Limited;
 
-/// A client of the place's bucket, with place and credentials from the environment. Asks nothing of the server.
+/// Returns a client of the bucket, with location and credentials from the environment, without
+/// sending a request.
 ///
 /// # Errors
 /// [`DatasetError::StoreSettings`] names a missing or unusable variable.
@@ -35,7 +36,7 @@ pub(super) fn connect(place: &Place) -> Result<Arc<dyn ObjectStore>, DatasetErro
     })
 }
 
-/// A store over a network, as everybody here uses it.
+/// Wraps a network store with the common limits and repetitions.
 fn shared(store: impl ObjectStore) -> Arc<dyn ObjectStore> {
     let store = LimitStore::new(store, CONCURRENCY);
     match limited::limits() {
@@ -45,7 +46,7 @@ fn shared(store: impl ObjectStore) -> Arc<dyn ObjectStore> {
 }
 
 impl Service {
-    /// How the variables that tell of it begin.
+    /// Returns the prefix of its environment variables.
     pub(super) fn variables(self) -> &'static str {
         match self {
             Self::S3 => "AWS_",
@@ -56,7 +57,7 @@ impl Service {
 }
 
 impl Place {
-    /// What its variables do not say, or say wrongly.
+    /// Returns an error for missing or wrong variables.
     pub(super) fn settings_error(&self, what: impl Into<String>) -> DatasetError {
         DatasetError::StoreSettings {
             url: format!("{}://{}", self.service.scheme(), self.bucket),

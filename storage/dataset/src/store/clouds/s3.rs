@@ -1,4 +1,5 @@
-//! S3 and servers that speak it: `s3://bucket/prefix`, with place and credentials from the usual `AWS_…` variables.
+//! S3 and compatible servers: `s3://bucket/prefix`, with location and credentials from the usual
+//! `AWS_…` variables.
 
 use object_store::ClientConfigKey;
 use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, Checksum, S3ConditionalPut};
@@ -7,7 +8,7 @@ use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, ret
 use super::place::Place;
 use crate::error::DatasetError;
 
-/// A client of the bucket. Asks nothing of the server.
+/// Returns a client of the bucket, without sending a request.
 ///
 /// # Errors
 /// [`DatasetError::StoreSettings`] names the variable; values are not repeated.
@@ -18,10 +19,10 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, Da
     let mut builder = AmazonS3Builder::new()
         .with_config(client(ClientConfigKey::Timeout), TIMEOUT)
         .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT)
-        // The server refuses what arrives otherwise than it was sent.
+        // With a checksum, the server refuses content corrupted in transit.
         .with_checksum_algorithm(Checksum::SHA256);
     for (name, value) in settings.iter() {
-        // Variables that it does not know are other programs'.
+        // Unknown variables belong to other programs.
         if let Ok(key) = name.to_ascii_lowercase().parse() {
             builder = builder.with_config(key, value);
         }
@@ -29,7 +30,7 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, Da
     builder
         .with_bucket_name(&place.bucket)
         .with_conditional_put(S3ConditionalPut::ETagMatch)
-        // Objects are deleted one by one, and not every server knows the request for many.
+        // Objects are deleted one by one, because not every server supports bulk deletion.
         .with_disable_bulk_delete(true)
         .with_retry(retries())
         .build()
@@ -41,7 +42,7 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, Da
         })
 }
 
-/// What would otherwise fail late and with words that name no variable.
+/// Checks for errors that would otherwise occur late, with messages that name no variable.
 fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
     let wrong = |what: &str| Err(place.settings_error(what));
     let endpoint = settings.first(&["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"]);
@@ -68,7 +69,8 @@ fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
         || settings.has("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI")
         || settings.has("AWS_CONTAINER_CREDENTIALS_FULL_URI")
         || settings.has("AWS_METADATA_ENDPOINT");
-    // Amazon's own machines have roles that no variable tells of; they are asked when a request is made.
+    // Amazon's own machines may have roles without any variable; their credentials are requested on
+    // first use.
     if role || endpoint.is_none() {
         return Ok(());
     }
@@ -161,7 +163,8 @@ mod tests {
         );
     }
 
-    /// A server of a few lines that drops the first of three requests, refuses the second and carries out the third.
+    /// Starts a minimal server that drops the first of three requests, refuses the second and
+    /// executes the third.
     fn stumbling() -> (String, Arc<Mutex<Vec<String>>>) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let url = format!("http://{}", listener.local_addr().unwrap());
