@@ -1,6 +1,7 @@
-//! Recipes: beside the scenes of a data set stands how they are made, so that `dataset repair` can make one again. A
-//! recipe is the stage of the job, without its place and its number of scenes; the key that it is stored under follows
-//! from what it says (where scenes are files, from all of the job's files, while it names its own scene's alone).
+//! Recipes: a data set stores how its scenes are made, so that `dataset repair` can make one again.
+//! A recipe is the stage of the job, without its location and its number of scenes. Its key is
+//! derived from the recipe's content. If scenes are files, the recipe contains only its own scene's
+//! file, but the key covers all files of the job.
 
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
@@ -11,7 +12,7 @@ use serde_json::json;
 
 use super::{Control, Task, TaskError, output::Stores};
 
-/// The data set that the recipe lies in.
+/// Name that stands for the data set that contains the recipe.
 const HERE: &str = "here";
 
 /// Stores the recipe of a rendering.
@@ -36,7 +37,8 @@ pub(super) fn note(
     stores.note_recipe(dataset, &task.stage.to_string(), own, &content, control)
 }
 
-/// Stores the recipe of a reprocessing. A source in the same store is named without it, so that both can move together.
+/// Stores the recipe of a reprocessing. A source in the same store is named without the store, so
+/// that both can move together.
 pub(super) fn note_reprocess(
     stores: &Stores,
     dataset: &Dataset,
@@ -66,7 +68,7 @@ fn here(profile: &str) -> OutputSettings {
     }
 }
 
-/// The task that a recipe describes, in the data set `dataset` of `store`, and its key.
+/// Returns the task that a recipe describes, in the data set `dataset` of `store`, and its key.
 pub(super) fn read(
     recipe: &Recipe,
     store: &str,
