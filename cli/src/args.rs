@@ -1,4 +1,4 @@
-//! The command line: one definition feeds the parser, the help, and the completions.
+//! The command line. A single definition drives the parser, the help and the completions.
 
 mod data;
 mod guard;

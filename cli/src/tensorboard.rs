@@ -1,10 +1,11 @@
-//! TensorBoard's event files: a run's scalars, and what its HPARAMS tab shows of a sweep.
+//! TensorBoard's event files: a run's scalars, and a sweep's data for the HPARAMS tab.
 //!
-//! A file is TFRecords (length, content, and a masked CRC-32C of each) of `Event` messages. Crates that write it are not
-//! kept (`tensorboard-rs`: 2022, without hyperparameters), and the messages that it takes are few ([`message`]).
+//! A file consists of TFRecords (length, content, and a masked CRC-32C of each) of `Event`
+//! messages. The crates that write this format are unmaintained (`tensorboard-rs`: 2022, without
+//! hyperparameters), and only few messages are needed ([`message`]).
 //!
-//! Records bear no date, so neither does what is written from them: an event's time is its epoch, in seconds. The same
-//! records give the same files.
+//! Records have no date, so the event files have none either: an event's time is its epoch, in
+//! seconds. The same records give the same files.
 
 mod message;
 
@@ -20,10 +21,10 @@ use serde_json::Value;
 
 use crate::error::{Result, io};
 
-/// Name of each event file; TensorBoard wants `tfevents` in it.
+/// Name of each event file. TensorBoard requires `tfevents` in the name.
 const FILE: &str = "events.out.tfevents.0.picofarm";
 
-/// A run: what is in one folder.
+/// A run: the contents of one folder.
 #[derive(Default)]
 pub struct Run {
     events: Vec<Event>,
@@ -39,15 +40,15 @@ pub enum Ended {
 /// A parameter of a sweep.
 pub struct Parameter {
     pub name: String,
-    /// An interval of numbers, where it is one.
+    /// The interval of a numeric parameter.
     pub interval: Option<[f64; 2]>,
-    /// The values of a list, where it is one.
+    /// The values of a list parameter.
     pub listed: Vec<Value>,
 }
 
 impl Run {
-    /// Adds the numbers of a history's line: its `step` is the step, and all others are scalars by their names; those in a
-    /// table of it are called `table/name`.
+    /// Adds the numbers of a line of the history. Its `step` is the step, and all others are
+    /// scalars by their names; those in a table are called `table/name`.
     pub fn line(&mut self, line: &Value) {
         let step = line["step"].as_i64().unwrap_or(0);
         let mut values = Vec::new();
@@ -85,7 +86,8 @@ impl Run {
         self.add(0, vec![end]);
     }
 
-    /// Adds what a sweep is about, for the HPARAMS tab: its parameters and the scalar that is less for a better trial.
+    /// Adds the description of a sweep for the HPARAMS tab: its parameters, and the scalar that
+    /// better trials minimise.
     pub fn experiment(&mut self, parameters: &[Parameter], metric: (&str, &str)) {
         let experiment = Experiment {
             hparam_infos: parameters.iter().map(info).collect(),
@@ -102,10 +104,10 @@ impl Run {
         self.add(0, vec![value]);
     }
 
-    /// Writes the event file into a folder, which is made where it is missing.
+    /// Writes the event file into a folder, creating it if missing.
     ///
     /// # Errors
-    /// The folder or the file cannot be written.
+    /// Fails if the folder or the file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
         fs::create_dir_all(folder).map_err(|e| io(folder.display(), &e))?;
         let file = folder.join(FILE);
@@ -133,7 +135,7 @@ impl Run {
     }
 }
 
-/// Numbers of a JSON document, by their paths.
+/// Collects the numbers of a JSON document, by their paths.
 fn scalars(into: &mut Vec<SummaryValue>, path: &str, value: &Value) {
     match value {
         Value::Object(table) => {
@@ -180,7 +182,7 @@ fn info(parameter: &Parameter) -> HParamInfo {
     }
 }
 
-/// A value as the tab shows it.
+/// Converts a value to the form that the tab displays.
 fn plain(value: &Value) -> Anything {
     let kind = match value {
         Value::Bool(truth) => Kind::Bool(*truth),
@@ -193,7 +195,7 @@ fn plain(value: &Value) -> Anything {
     Anything { kind: Some(kind) }
 }
 
-/// A record: length, its checksum, content, its checksum.
+/// Writes a record: length, its checksum, content, its checksum.
 fn record(into: &mut Vec<u8>, content: &[u8]) {
     let length = (content.len() as u64).to_le_bytes();
     into.extend(length);
@@ -202,14 +204,15 @@ fn record(into: &mut Vec<u8>, content: &[u8]) {
     into.extend(masked(content).to_le_bytes());
 }
 
-/// TFRecord's checksum: CRC-32C, turned and moved, so that a checksum of checksums is not a constant.
+/// Returns TFRecord's checksum: a CRC-32C, rotated and offset so that a checksum of checksums is
+/// not a constant.
 fn masked(bytes: &[u8]) -> u32 {
     crc32c::crc32c(bytes)
         .rotate_right(15)
         .wrapping_add(0xa282_ead8)
 }
 
-/// What the HPARAMS tab reads: metadata, and beside it a tensor of nothing, which it wants.
+/// Returns the metadata for the HPARAMS tab, with the empty tensor that it requires.
 fn hparams(tag: &str, what: What) -> SummaryValue {
     let content = HParams { what: Some(what) }.encode_to_vec();
     let nothing = Tensor {
@@ -236,7 +239,7 @@ mod tests {
 
     use super::*;
 
-    /// What a file holds, read back: each checksum is checked.
+    /// Reads the contents of a file back and checks each checksum.
     fn read(mut bytes: &[u8]) -> Vec<Event> {
         let mut events = Vec::new();
         while !bytes.is_empty() {

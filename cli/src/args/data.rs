@@ -1,5 +1,5 @@
-//! The arguments of commands that make data of data: `scene sense`, `dataset reprocess`, `dataset split`,
-//! `dataset export`, `dataset import`.
+//! Arguments of commands that derive data from other data: `scene sense`, `dataset reprocess`,
+//! `dataset split`, `dataset export`, `dataset import`.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,5 @@
-//! The arguments of commands that keep data sets whole: `dataset verify`, `repair`, `gc`, `snapshot` and `show`.
+//! Arguments of commands that check and repair data sets: `dataset verify`, `repair`, `gc`,
+//! `snapshot` and `show`.
 
 use std::{path::PathBuf, time::Duration};
 

@@ -1,4 +1,5 @@
-//! Numbers on the command line: what each may be. Those that jobs have too are as there.
+//! Value parsers for numbers with a valid range. Numbers that also appear in jobs have the same
+//! range as there.
 
 use std::{fmt::Display, ops::RangeInclusive, str::FromStr};
 

@@ -1,4 +1,4 @@
-//! The arguments of commands that render: `scene render`, `scene plan`, `bench render`.
+//! Arguments of commands that render: `scene render`, `scene plan`, `bench render`.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,5 @@
-//! Errors about a command line repeat what was given. Of a URL they do not repeat what may be a secret.
+//! Removes possible secrets in URLs from error messages about the command line, which repeat its
+//! arguments.
 
 use clap::error::{ContextKind, ContextValue};
 

@@ -1,4 +1,4 @@
-//! `picofarm model export --format tensorboard`: what a model's epochs found.
+//! `picofarm model export --format tensorboard`: exports the metrics of a model's epochs.
 
 use std::path::Path;
 
@@ -13,10 +13,11 @@ use crate::{
     tensorboard::Run,
 };
 
-/// The object of a model that holds its epochs.
+/// Name of the object with a model's epochs.
 const HISTORY: &str = "history.jsonl";
 
-/// Writes what the model's epochs found as a run of TensorBoard's, into a folder of its name.
+/// Writes the metrics of the model's epochs as a TensorBoard run, into a folder named after the
+/// model.
 pub async fn run(store: &str, name: &str, out: &Path, output: Output) -> Result<()> {
     let models = open(store)?;
     let manifest = models.manifest(name).await.map_err(failed)?;

@@ -1,4 +1,4 @@
-//! `picofarm sweep export`: trials for other people's tools, as CSV or as TensorBoard's event files.
+//! `picofarm sweep export`: exports trials as CSV or as TensorBoard event files.
 
 use std::{fs, path::Path};
 
@@ -14,7 +14,7 @@ use crate::{
     tensorboard::{Ended, Parameter, Run},
 };
 
-/// Writes a row for each trial or, with `curves`, for each epoch of each.
+/// Writes a row for each trial, or with `curves` for each epoch of each trial.
 pub fn as_csv(records: &Records, out: &Path, curves: bool, output: Output) -> Result<()> {
     let sweep = &records.sweep()?;
     let rows = match curves {
@@ -30,7 +30,7 @@ pub fn as_csv(records: &Records, out: &Path, curves: bool, output: Output) -> Re
     Ok(())
 }
 
-/// Writes a folder for each trial that has ended, and beside them what the HPARAMS tab needs.
+/// Writes a folder for each trial that has ended, and the data for the HPARAMS tab.
 pub fn as_tensorboard(records: &Records, out: &Path, output: Output) -> Result<()> {
     let mut all = Run::default();
     let space = records.space()?;
@@ -76,7 +76,7 @@ fn parameter((name, domain): (String, Domain)) -> Parameter {
     }
 }
 
-/// A row for each trial.
+/// Returns a row for each trial.
 fn trials(sweep: &Sweep) -> Vec<Vec<String>> {
     let parameters = sweep.parameters();
     let mut header = ["trial", "model", "end", "epochs", &sweep.error]
@@ -105,7 +105,8 @@ fn trials(sweep: &Sweep) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// A row for each line of the history of each trial that ended: its epochs, and validations within them.
+/// Returns a row for each line in the history of each trial that has ended: its epochs, and
+/// validations within them.
 fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
     let header = [
         "trial",
@@ -131,12 +132,12 @@ fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
     rows
 }
 
-/// A number with all its digits; empty where there is none.
+/// Formats a number with all its digits; empty if there is none.
 fn number(value: Option<f64>) -> String {
     value.map_or_else(String::new, |value| value.to_string())
 }
 
-/// A line of CSV (RFC 4180).
+/// Formats a line of CSV (RFC 4180).
 fn csv(row: &[String]) -> String {
     let cell = |text: &String| match text.contains([',', '"', '\n', '\r']) {
         true => format!("\"{}\"", text.replace('"', "\"\"")),

@@ -1,4 +1,4 @@
-//! `picofarm sweep importance`: how much each parameter mattered.
+//! `picofarm sweep importance`: shows the importance of each parameter.
 
 use std::fmt::Write;
 
@@ -11,10 +11,10 @@ use crate::{
     output::{Output, table},
 };
 
-/// Prints how much each parameter mattered.
+/// Prints the importance of each parameter.
 ///
 /// # Errors
-/// Fewer trials have ended than it takes.
+/// Fails if too few trials have ended.
 pub fn run(records: &Records, output: Output) -> Result<()> {
     let Some(found) = importance(&records.space()?, &records.tried()) else {
         let what = format!(
@@ -39,7 +39,7 @@ pub fn run(records: &Records, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// What shares and chances mean, and what they are worth.
+/// Explains shares and chances, and how reliable they are.
 pub fn note(found: &Importance) -> String {
     let mut note = format!(
         "share: how differently the {} best of {} trials are spread over the parameter (PED-ANOVA); chance: how often a \
@@ -56,7 +56,7 @@ pub fn note(found: &Importance) -> String {
     note
 }
 
-/// The same for a page; nothing where too few trials have ended.
+/// Returns the same for a page; nothing if too few trials have ended.
 pub fn weights(records: &Records) -> Result<(Vec<Weight>, String)> {
     let Some(found) = importance(&records.space()?, &records.tried()) else {
         return Ok((Vec::new(), String::new()));

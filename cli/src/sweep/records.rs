@@ -1,4 +1,4 @@
-//! What the trials of a sweep have recorded, and the same for tables, pages and searches.
+//! The records of a sweep's trials, and their conversion for tables, pages and searches.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,20 +18,20 @@ use crate::{
     model::open,
 };
 
-/// What the trials of a sweep have recorded.
+/// The records of a sweep's trials.
 pub struct Records {
     pub name: String,
     pub id: String,
-    /// Of those that have ended, in order.
+    /// Trials that have ended, in order.
     pub ended: Vec<TrialRecord>,
-    /// How good those were that came to any rung, in order.
+    /// Losses of the trials at each rung, in order.
     pub rungs: Vec<Rung>,
 }
 
-/// The records of the sweep that is meant.
+/// Reads the records of the selected sweep.
 ///
 /// # Errors
-/// There is none, or several are called so.
+/// Fails if there is none, or if several match.
 pub async fn read(which: &WhichSweep) -> Result<Records> {
     let models = open(&which.store)?;
     let mut ids = ids(&models, &which.name, &which.id).await?;
@@ -46,13 +46,13 @@ pub async fn read(which: &WhichSweep) -> Result<Records> {
     }
 }
 
-/// The sweeps of a name whose ids begin so.
+/// Returns the ids that begin with `begin`, of the sweeps called `name`.
 pub async fn ids(models: &Models, name: &str, begin: &str) -> Result<Vec<String>> {
     let ids: BTreeSet<String> = models.sweeps(name).await.map_err(failed)?;
     Ok(ids.into_iter().filter(|id| id.starts_with(begin)).collect())
 }
 
-/// A sweep of which nothing is there.
+/// Returns the error for a sweep without records.
 pub fn nothing(name: &str) -> CliError {
     let what = format!("no trial of a sweep called {name:?} has reported anything yet");
     CliError::input(what).hint(
@@ -61,7 +61,7 @@ pub fn nothing(name: &str) -> CliError {
 }
 
 impl Records {
-    /// All of a sweep.
+    /// Reads all records of a sweep.
     pub async fn of(models: &Models, name: &str, id: String) -> Result<Self> {
         let (ended, rungs) = models.trials(name, &id).await.map_err(failed)?;
         Ok(Self {
@@ -72,19 +72,19 @@ impl Records {
         })
     }
 
-    /// What is less for a better trial.
+    /// Returns the name of the error that better trials minimise.
     pub fn error(&self) -> &'static str {
         let kind = self.ended.first().map(|trial| &*trial.kind);
         kind.map_or("validation loss", error_name)
     }
 
-    /// For tables and pages.
+    /// Returns the trials for tables and pages.
     ///
     /// # Errors
-    /// A line of a history that cannot be read.
+    /// Fails if a line of a history cannot be read.
     pub fn sweep(&self) -> Result<Sweep> {
         let mut all: BTreeMap<u64, Row> = BTreeMap::new();
-        // Rungs come in order: the last that a trial has reached counts.
+        // Rungs are in order, so the last one that a trial has reached counts.
         for rung in &self.rungs {
             all.insert(rung.index, open_trial(&self.name, rung));
         }
@@ -99,7 +99,7 @@ impl Records {
         })
     }
 
-    /// For searches: those that have ended.
+    /// Returns the trials that have ended, for searches.
     pub fn tried(&self) -> Vec<Tried> {
         let tried = |trial: &TrialRecord| Tried {
             values: trial.values.clone(),
@@ -108,10 +108,11 @@ impl Records {
         self.ended.iter().map(tried).collect()
     }
 
-    /// The values that parameters may have: as the job file says, or where it lists values alone, those that were tried.
+    /// Returns the values that parameters may have: the job file's domains, or the tried values if
+    /// the file only lists values.
     ///
     /// # Errors
-    /// A record that holds no such thing.
+    /// Fails if a record has no such values.
     pub fn space(&self) -> Result<Space> {
         let Some(first) = self.ended.first() else {
             return Ok(Space::new());
@@ -138,7 +139,8 @@ impl Records {
             .collect()
     }
 
-    /// A parameter's values that were tried: numbers as an interval, anything else as a list.
+    /// Returns the tried values of a parameter as a domain: numbers as an interval, anything else
+    /// as a list.
     fn tried_of(&self, name: &str) -> Domain {
         let values: Vec<&Value> = self
             .ended
@@ -150,7 +152,7 @@ impl Records {
             let low = numbers.iter().copied().fold(f64::INFINITY, f64::min);
             let high = numbers.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             if low < high {
-                // Over more than a decade, magnitudes count.
+                // An interval of more than a decade is logarithmic.
                 return Domain::Within(match low > 0.0 && high > 10.0 * low {
                     true => Interval::Log([low, high]),
                     false => Interval::Range([low, high]),
@@ -167,7 +169,7 @@ impl Records {
     }
 }
 
-/// How a trial ended, for searches.
+/// Returns how a trial ended, for searches.
 pub fn outcome(trial: &TrialRecord) -> Outcome {
     match (&trial.end, trial.loss) {
         (TrialEnd::Finished, Some(loss)) if loss.is_finite() => Outcome::Finished(loss),
@@ -226,12 +228,12 @@ fn shown(value: &Value) -> Shown {
     }
 }
 
-/// A loss for people.
+/// Formats a loss.
 pub fn loss(loss: Option<f64>) -> String {
     loss.map_or_else(|| "-".into(), |loss| format!("{loss:.4}"))
 }
 
-/// Values for people, by name.
+/// Formats values by name.
 pub fn listed<'a>(values: impl Iterator<Item = (&'a String, String)>) -> String {
     let values: Vec<String> = values
         .map(|(name, value)| format!("{name} = {value}"))
@@ -239,7 +241,7 @@ pub fn listed<'a>(values: impl Iterator<Item = (&'a String, String)>) -> String 
     values.join(", ")
 }
 
-/// A value as text: without quotes.
+/// Formats a value as text without quotes.
 pub fn text(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
@@ -253,7 +255,7 @@ pub mod tests {
 
     use super::*;
 
-    /// A trial of one parameter, of a sweep called `m`.
+    /// Creates a trial with one parameter, of a sweep called `m`.
     pub fn record(index: u64, lr: f64, end: TrialEnd, losses: &[f64]) -> TrialRecord {
         let line = |(i, mae): (usize, &f64)| json!({"epoch": i + 1, "step": i + 1, "loss": mae, "learning_rate": lr, "validation": {"mae_m": mae, "rmse_m": mae}});
         TrialRecord {

@@ -1,7 +1,8 @@
-//! The messages of event files that are written here, with the numbers of tensorboard's `event.proto`, `summary.proto`,
-//! `tensor.proto`, and of its hparams plugin's `plugin_data.proto` and `api.proto`.
+//! The messages of event files that are written here, with the field numbers of tensorboard's
+//! `event.proto`, `summary.proto`, `tensor.proto`, and of its hparams plugin's `plugin_data.proto`
+//! and `api.proto`.
 
-// prost's derives write code whose fields explain themselves by the files above.
+// prost's derives generate undocumented code; the files above document the fields.
 #![allow(missing_docs)]
 
 use std::collections::BTreeMap;
