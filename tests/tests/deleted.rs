@@ -1,4 +1,4 @@
-//! Data that were deleted are not taken for done: the same job file makes them again, to the same bytes.
+//! Deleted data do not count as done: the same job file makes them again, with the same bytes.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -20,7 +20,7 @@ fn reasons(plan: &Value) -> String {
     plan["stages"][0]["reasons"].to_string()
 }
 
-/// The keys of objects that are not the same in both.
+/// Returns the keys of objects that differ between both.
 fn differing<'a>(a: &'a BTreeMap<String, String>, b: &'a BTreeMap<String, String>) -> Vec<&'a str> {
     let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
     let differ = keys.into_iter().filter(|key| a.get(*key) != b.get(*key));
@@ -67,7 +67,7 @@ fn a_deleted_store_and_a_deleted_scene_are_made_again_by_the_same_job_file() {
     worker.kill();
 }
 
-/// Takes a lease of a farm and reports a result that it has made up; returns the coordinator's answer.
+/// Takes a lease of a farm and reports a made-up result. Returns the coordinator's answer.
 async fn lie(url: &str, renderer: &str) -> wire::Acknowledge {
     let hello = wire::Hello {
         worker_id: uuid::Uuid::new_v4().to_string(),

@@ -1,6 +1,6 @@
-//! A sweep over real workers: trials that fall behind leave them to others, one worker is killed, the best model gets its
-//! name, and more trials later are further ones: drawn, or chosen by what was found. TensorBoard shows what came out, where
-//! `PICOFARM_PYTHON` names a Python that has it.
+//! A sweep over real workers: trials that fall behind free their workers, one worker is killed, the
+//! best model is promoted, and later extensions add trials, random or based on the results.
+//! TensorBoard displays the results if `PICOFARM_PYTHON` names a Python that has it.
 
 use std::{ffi::OsStr, fs, path::Path, thread::sleep, time::Duration};
 
@@ -59,7 +59,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     let id = answer["job"].as_str().unwrap().to_owned();
     let _one = farm.worker("one");
     let other = farm.worker("other");
-    // Into a training of the other.
+    // Kills the worker while the other trial is training.
     let begun = std::time::Instant::now();
     while !other.stderr().contains("stage=\"tof.") && farm.status(&id)["state"] == "active" {
         sleep(Duration::from_millis(20));
@@ -117,7 +117,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     ]);
     assert!(fs::read_to_string(&page).unwrap().contains(model));
 
-    // More trials are further ones: those that have ended stay as they are.
+    // When trials are added, those that have ended do not change.
     let hashes = || {
         let mut hashes = store::hashes(&farm.store().join("models"));
         hashes.retain(|key, _| key.contains("/trials/") && !key.ends_with("trials/6.json"));
@@ -126,7 +126,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     let before = hashes();
     let file = write(&farm, 7, "better");
     let plan = farm.json(&["job", "plan", &file]);
-    // 12 rooms, the split and six trials are there.
+    // 12 rooms, the split and six trials exist.
     assert_eq!(
         (&plan["reuse"], &plan["run"]),
         (&19.into(), &3.into()),
@@ -141,7 +141,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     assert_eq!(sweep["trials"].as_array().unwrap().len(), 7);
 }
 
-/// A sweep of one stage that is extended, and one of values chosen by hand.
+/// A job with a sweep of one stage for extension, and a sweep of values chosen by hand.
 fn learning(store: &Path) -> String {
     format!(
         r#"# What follows keeps its comments.
@@ -221,7 +221,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     farm.json(&extend);
     assert_eq!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
     farm.json(&extend);
-    // Another proposal never replaces a file: somebody may have changed it by hand.
+    // Another proposal never replaces a file, because a user may have edited it.
     let other = [&extend[..], &["--sampler", "random"]].concat();
     farm.run(&other)
         .fails(3, &["again.toml", "is there", "--out"]);
@@ -247,7 +247,8 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     ])
     .fails(3, &["another folder"]);
 
-    // Those that ended are reused: 8 rooms, the split, ten and two trials, and what was chosen by hand.
+    // Finished tasks are reused: 8 rooms, the split, ten and two trials, and the values chosen by
+    // hand.
     let hashes = || {
         let mut hashes = store::hashes(&place.join("models"));
         hashes.retain(|key, _| key.contains("/trials/"));
@@ -261,7 +262,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
         (&22.into(), &5.into()),
         "{plan}"
     );
-    // Submits that file, and then one of a trial more.
+    // Submits that file, and then one with another trial.
     let run = [
         "sweep", "run", &next, "--trials", "1", "--rounds", "1", "--stage", "tof",
     ];
@@ -289,7 +290,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     for name in ["depth", "depth-13", "depth-14"] {
         farm.json(&["model", "show", store, name]);
     }
-    // Given again, it finds everything done.
+    // Run again, it finds everything done.
     assert_eq!(farm.json(&run)["rounds"], rounds["rounds"]);
 
     let importance = farm.json(&["sweep", "importance", store, "depth"]);
@@ -345,7 +346,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     shown_by_tensorboard(&farm, &python, &runs, trials);
 }
 
-/// What TensorBoard shows of the runs is what the trials found.
+/// Checks that TensorBoard displays the recorded results of the trials.
 fn shown_by_tensorboard(farm: &Farm, python: &OsStr, runs: &str, trials: &[Value]) {
     let script = Path::new(&picofarm_tests::package()).join("interop/read_tensorboard.py");
     let script = script.display().to_string();
