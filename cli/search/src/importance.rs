@@ -1,14 +1,17 @@
-//! How much each parameter matters, by PED-ANOVA (Watanabe, Bansal and Hutter, IJCAI 2023, as in Optuna's
-//! `PedAnovaImportanceEvaluator`): how differently a parameter's values are spread among the best trials and among all.
+//! Importance of parameters, by PED-ANOVA (Watanabe, Bansal and Hutter, IJCAI 2023, as in Optuna's
+//! `PedAnovaImportanceEvaluator`). It compares the distribution of a parameter's values among the
+//! best trials with that among all trials.
 //!
-//! A parameter's measure is the Pearson divergence of the two densities, ∫ p_all (p_top/p_all − 1)²; shares are measures over
-//! their sum. Since the best are compared with all trials and not with the space, trials need not be drawn evenly: those
-//! that an estimator proposed do, too. Only the order of trials counts, so those that stopped on their way take part
-//! (see [`crate::Outcome`]).
+//! The importance of a parameter is the Pearson divergence of the two densities, ∫ p_all
+//! (p_top/p_all − 1)². A share is the importance divided by the sum over all parameters. Because
+//! the best trials are compared with all trials and not with the space, trials need not be drawn
+//! uniformly: trials proposed by an estimator work too. Only the order of trials matters, so trials
+//! that stopped early take part (see [`crate::Outcome`]).
 //!
-//! Something always comes out, of few trials mostly chance. So each share has a probability beside it: how often a parameter
-//! without any effect would get as great a measure, by exchanging which trials are the best (a permutation test, Fisher
-//! 1935). A share says something only where that is small.
+//! The method always gives a result; with few trials it is mostly chance. Each share therefore has
+//! a probability: how often a parameter without any effect would reach the same importance when the
+//! best trials are exchanged at random (a permutation test, Fisher 1935). A share is meaningful
+//! only if this probability is small.
 
 use picofarm_proto::model::{Domain, Interval};
 use serde::Serialize;
@@ -19,42 +22,47 @@ use crate::{
     ranked,
 };
 
-/// Trials that must have ended; with fewer, the best cannot be distinguished from the rest.
+/// Minimum number of trials that must have ended. With fewer, the best cannot be distinguished from
+/// the rest.
 pub const LEAST: usize = 10;
-/// With fewer trials than this, shares say little. Of 10 trials drawn at random of a function of three parameters that weigh
-/// 1, 0.1 and 0, the first came first in 73 % of 100 repetitions, of 20 in 89 %, of 40 in 90 %, of 80 in all; its chance
-/// was 5 % or less in 47, 69, 93 and 100 % (`tests/importance.rs`).
+/// With fewer trials than this, shares are unreliable.
+///
+/// Measured with random trials of a function of three parameters with weights 1, 0.1 and 0. The
+/// first parameter ranked first in 73 % of 100 repetitions with 10 trials, 89 % with 20, 90 % with
+/// 40 and 100 % with 80. Its chance was 5 % or less in 47, 69, 93 and 100 %
+/// (`tests/importance.rs`).
 pub const FEW: usize = 40;
-/// The best are at least so many (Optuna's advice).
+/// Minimum number of best trials (Optuna's advice).
 const TOP: usize = 5;
-/// Into how many steps an interval is divided.
+/// Number of steps that an interval is divided into.
 const STEPS: usize = 50;
 /// Exchanges of the permutation test.
 const EXCHANGES: u64 = 199;
 
-/// How much parameters matter.
+/// Importance of parameters.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Importance {
-    /// Trials that have ended.
+    /// Number of trials that have ended.
     pub trials: usize,
-    /// How many of them are the best.
+    /// Number of trials that count as the best.
     pub top: usize,
-    /// By parameter, the greatest share first.
+    /// The parameters, in descending order of their share.
     pub parameters: Vec<Share>,
 }
 
-/// How much a parameter matters.
+/// Importance of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Share {
-    /// Its name.
+    /// Name of the parameter.
     pub parameter: String,
-    /// Of all parameters' measures; they add up to 1.
+    /// Share in the importance of all parameters. The shares add up to 1.
     pub share: f64,
-    /// How often a parameter without effect would come as far, 1/200 at least.
+    /// How often a parameter without effect would reach this importance, at least 1/200.
     pub chance: f64,
 }
 
-/// How much each parameter of a space mattered; `None` where fewer than [`LEAST`] trials have ended.
+/// Returns the importance of each parameter of a space; `None` if fewer than [`LEAST`] trials have
+/// ended.
 pub fn importance(space: &Space, tried: &[Tried]) -> Option<Importance> {
     let ended = ranked(tried);
     if ended.len() < LEAST {
@@ -72,7 +80,7 @@ pub fn importance(space: &Space, tried: &[Tried]) -> Option<Importance> {
             let found = measure(&places[..top]);
             let as_great = (0..EXCHANGES).filter(|round| {
                 let best = exchanged(&places, top, name, *round);
-                // Sums differ in their last bits.
+                // With a tolerance, because sums differ in their last bits.
                 measure(&best) >= found * (1.0 - 1e-9)
             });
             Share {
@@ -97,7 +105,7 @@ pub fn importance(space: &Space, tried: &[Tried]) -> Option<Importance> {
     })
 }
 
-/// Into how many steps a domain is divided.
+/// Returns the number of steps that a domain is divided into.
 fn steps(domain: &Domain) -> usize {
     match domain {
         Domain::OneOf(list) => list.len(),
@@ -108,7 +116,7 @@ fn steps(domain: &Domain) -> usize {
     }
 }
 
-/// In which of them a value lies.
+/// Returns the step that contains a value.
 fn step(domain: &Domain, value: Option<&serde_json::Value>) -> Option<usize> {
     Some(match Place::of(domain, value?)? {
         Place::Number(number) => number,
@@ -116,7 +124,7 @@ fn step(domain: &Domain, value: Option<&serde_json::Value>) -> Option<usize> {
     })
 }
 
-/// Who the best would be if the parameter had no effect: so many of all, drawn without putting back.
+/// Draws `top` trials without replacement, as the best trials of a parameter without effect.
 fn exchanged(places: &[Option<usize>], top: usize, name: &str, round: u64) -> Vec<Option<usize>> {
     let mut places = places.to_vec();
     for i in 0..top.min(places.len()) {
@@ -128,10 +136,10 @@ fn exchanged(places: &[Option<usize>], top: usize, name: &str, round: u64) -> Ve
     places
 }
 
-/// How values are spread over steps.
+/// Distribution of values over steps.
 struct Spread {
     counts: Vec<f64>,
-    /// Whether steps are in an order.
+    /// Whether the steps are ordered.
     ordered: bool,
 }
 
@@ -147,12 +155,13 @@ impl Spread {
         }
     }
 
-    /// The share of each step: kernels at values, and one over all steps that weighs as much as a value.
+    /// Returns the density of each step: a mixture of kernels at the values and one kernel over all
+    /// steps with the weight of one value.
     fn density(&self) -> Vec<f64> {
         let n: f64 = self.counts.iter().sum();
         let steps = self.counts.len() as f64;
         if !self.ordered {
-            // As the estimator's kernels: the prior is divided among all of them.
+            // Like the estimator's kernels: the prior is divided among all of them.
             let least = 1.0 / (n + 1.0);
             let kernel = |hit: f64| (least + hit) / (1.0 + least * steps);
             let density = |count: &f64| {
@@ -171,8 +180,9 @@ impl Spread {
         density
     }
 
-    /// Width of a kernel in steps, by Scott's rule as Optuna has it here: 1.059 min(IQR/1.34, σ) n^(−1/5), and so much at
-    /// least that 90 % of a kernel stay in its step.
+    /// Returns the width of a kernel in steps, by Scott's rule as in Optuna's evaluator: 1.059
+    /// min(IQR/1.34, σ) n^(−1/5). The minimum is the width at which 90 % of a kernel stay in its
+    /// step.
     fn width(&self, n: f64) -> f64 {
         let weighted = |of: &dyn Fn(f64) -> f64| -> f64 {
             let each = self.counts.iter().enumerate();
@@ -194,7 +204,7 @@ impl Spread {
     }
 }
 
-/// The share of a normal distribution of such a width, in steps, that lies below −n, −n + ½, …, n.
+/// Returns the cumulative normal distribution of this width, in steps, at −n, −n + ½, …, n.
 fn edges(width: f64, n: usize) -> Vec<f64> {
     let edges = 0..=4 * n;
     edges
@@ -202,7 +212,8 @@ fn edges(width: f64, n: usize) -> Vec<f64> {
         .collect()
 }
 
-/// Adds a kernel that is cut off at the ends, whose middle lies so many half steps from that of the first step.
+/// Adds a kernel truncated at both ends. Its centre is `half_steps` half steps from the centre of
+/// the first step.
 fn spread(density: &mut [f64], edges: &[f64], half_steps: usize, weight: f64) {
     let n = density.len();
     let edge = |i: usize| edges[2 * n + 2 * i - 1 - half_steps];
@@ -212,7 +223,7 @@ fn spread(density: &mut [f64], edges: &[f64], half_steps: usize, weight: f64) {
     }
 }
 
-/// Pearson's divergence of two densities over steps.
+/// Returns Pearson's divergence of two densities over steps.
 fn divergence(top: &[f64], all: &[f64]) -> f64 {
     let each = top.iter().zip(all).map(|(top, all)| {
         let (top, all) = (top + 1e-12, all + 1e-12);

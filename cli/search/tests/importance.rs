@@ -1,4 +1,4 @@
-//! Importance of parameters of functions where it is known.
+//! Importance of parameters for functions with known importances.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ fn space() -> Space {
     serde_json::from_value(space).unwrap()
 }
 
-/// 1 of x, 0.1 of y, nothing of z.
+/// Weights 1 for x, 0.1 for y and 0 for z.
 fn weighs(values: &BTreeMap<String, serde_json::Value>) -> f64 {
     let of = |name: &str| values[name].as_f64().unwrap();
     let y = (of("y").log10() + 3.0) / 3.0;
@@ -55,7 +55,8 @@ fn what_weighs_more_has_the_greater_share_and_what_weighs_nothing_is_chance() {
 
 #[test]
 fn shares_are_those_of_optuna() {
-    // PedAnovaImportanceEvaluator of Optuna 5.0.0 on the same trials (tests/peers/search_optuna.py).
+    // PedAnovaImportanceEvaluator of Optuna 5.0.0 on the same trials
+    // (tests/peers/search_optuna.py).
     for (trials, seed, shares) in [
         (300, 1, [0.8623, 0.1337, 0.0040]),
         (300, 2, [0.9211, 0.0747, 0.0042]),
@@ -83,7 +84,7 @@ fn a_list_that_decides_all_has_the_greatest_share() {
     let tried: Vec<Tried> = values
         .into_iter()
         .map(|values| Tried {
-            // Of the third kind, by the last digits of x, which say nothing of its size.
+            // For the third kind, the last digits of x, which are independent of its size.
             outcome: match values["kind"] == json!("c") {
                 true => Outcome::Finished((values["x"].as_f64().unwrap() * 1000.0).fract()),
                 false => Outcome::Stopped {
@@ -102,7 +103,8 @@ fn a_list_that_decides_all_has_the_greatest_share() {
 #[test]
 fn too_few_trials_have_no_importance_and_how_few_mislead_is_known() {
     assert!(importance(&space(), &tried(LEAST as u64 - 1, 1)).is_none());
-    // How often the parameter that weighs most comes first, and how often the one that weighs nothing looks as if it did.
+    // Returns the percentage of runs that rank x first, and of those that wrongly find z
+    // significant.
     let rates = |trials: u64| {
         let found: Vec<Importance> = (0..100)
             .map(|seed| importance(&space(), &tried(trials, seed)).unwrap())
@@ -120,7 +122,7 @@ fn too_few_trials_have_no_importance_and_how_few_mislead_is_known() {
     };
     for trials in [10, 20, FEW as u64, 80] {
         let (first, wrong) = rates(trials);
-        // The test's promise, with the spread of 100 repetitions.
+        // The test's nominal rate, with the spread of 100 repetitions.
         assert!(wrong <= 12, "{trials}: {wrong}");
         if trials >= FEW as u64 {
             assert!(first >= 85, "{trials}: {first}");

@@ -1,4 +1,4 @@
-//! zarrs' codec chains over plain bytes, and the cutting of an image into chunks.
+//! zarrs' codec chains over plain bytes, and the division of an image into chunks.
 
 use std::{borrow::Cow, num::NonZeroU64};
 
@@ -15,7 +15,7 @@ pub struct Chain {
     size: usize,
 }
 
-/// zstd or lz4 in blosc, behind a filter.
+/// Returns the codecs for zstd or lz4 in blosc, behind a filter.
 pub fn blosc(cname: &str, level: u32, shuffle: &str, size: usize, blocksize: usize) -> Value {
     json!([
         {"name": "bytes", "configuration": {"endian": "little"}},
@@ -26,7 +26,7 @@ pub fn blosc(cname: &str, level: u32, shuffle: &str, size: usize, blocksize: usi
     ])
 }
 
-/// zstd alone.
+/// Returns the codecs for zstd alone.
 pub fn zstd(level: i32) -> Value {
     json!([
         {"name": "bytes", "configuration": {"endian": "little"}},
@@ -36,10 +36,10 @@ pub fn zstd(level: i32) -> Value {
 }
 
 impl Chain {
-    /// `size` bytes a value.
+    /// Creates a chain for values of `size` bytes.
     ///
     /// # Panics
-    /// Codecs that this program lacks.
+    /// If this program lacks one of the codecs.
     pub fn new(codecs: &Value, size: usize) -> Self {
         let metadata: Vec<zarrs::metadata::v3::MetadataV3> =
             serde_json::from_value(codecs.clone()).expect("well-formed codecs");
@@ -69,7 +69,7 @@ impl Chain {
         coded.map(Cow::into_owned).map_err(broken)
     }
 
-    /// `values` = how many there are.
+    /// Decodes a chunk. `values` = number of values.
     pub fn decode(&self, bytes: &[u8], values: usize) -> Result<Vec<u8>> {
         let (kind, fill) = self.kind();
         let shape = self.shape(values)?;
@@ -81,23 +81,23 @@ impl Chain {
     }
 }
 
-/// A codec that failed.
+/// Returns the error of a codec that failed.
 pub fn broken(what: impl std::fmt::Display) -> CliError {
     CliError::new(Code::Failed, format!("a codec broke: {what}"))
 }
 
-/// An image of histograms cut into chunks. Chunks at the edges are smaller.
+/// An image of histograms divided into chunks. Chunks at the edges are smaller.
 #[derive(Debug, Clone, Copy)]
 pub struct Cut {
     /// Rows, columns, bins.
     pub image: [usize; 3],
     pub chunk: [usize; 3],
-    /// Values lie bin by bin within a chunk.
+    /// Whether values are stored bin by bin within a chunk.
     pub bins_first: bool,
 }
 
 impl Cut {
-    /// Corner and size of each chunk.
+    /// Returns corner and size of each chunk.
     pub fn chunks(self) -> impl Iterator<Item = ([usize; 3], [usize; 3])> {
         let starts = move |axis: usize| (0..self.image[axis]).step_by(self.chunk[axis]);
         let size = move |at: [usize; 3]| {
@@ -108,7 +108,7 @@ impl Cut {
             .map(move |at| (at, size(at)))
     }
 
-    /// Calls with the place of each histogram's part in the image, and in the chunk.
+    /// Calls `call` with the position of each histogram's part in the image, and in the chunk.
     fn each(self, (at, size): ([usize; 3], [usize; 3]), mut call: impl FnMut(usize, usize)) {
         for r in 0..size[0] {
             for c in 0..size[1] {

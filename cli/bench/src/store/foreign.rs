@@ -1,4 +1,4 @@
-//! Formats of others: floats and halves behind general compressors, pcodec, OpenEXR, HDF5.
+//! Foreign formats: floats and halves behind general-purpose compressors, pcodec, OpenEXR, HDF5.
 
 use std::io::Cursor;
 
@@ -15,7 +15,7 @@ use super::{
 };
 use picofarm_cli::error::Result;
 
-/// A way of storing floats or halves.
+/// A format for floats or halves.
 #[derive(Debug, Clone, Copy)]
 pub enum Foreign {
     Zstd32(i32),
@@ -23,14 +23,14 @@ pub enum Foreign {
     Blosc32,
     Blosc16,
     Pco32,
-    /// As `dataset export --format sb3d` writes it.
+    /// As written by `dataset export --format sb3d`.
     ExrHalf,
     /// Shuffle and deflate of this level, in chunks of the same shape.
     Hdf5(u32),
 }
 
 const CHUNK: usize = 32;
-/// Halves end at 65,504; the brightest value becomes at most this.
+/// Upper limit of the scaled brightest value, because halves end at 65,504.
 const BRIGHTEST: f32 = 32_768.0;
 
 impl Foreign {
@@ -165,13 +165,13 @@ fn halves(sample: &Sample) -> Vec<f16> {
     sample.h.iter().map(|h| f16::from_f32(h * factor)).collect()
 }
 
-/// The power of two that brings the brightest value to at most [`BRIGHTEST`].
+/// Returns the power of two that brings the brightest value to at most [`BRIGHTEST`].
 fn factor(h: &[f32]) -> f32 {
     let brightest = h.iter().fold(f32::MIN_POSITIVE, |m, h| m.max(*h));
     2f32.powi((BRIGHTEST / brightest).log2().floor() as i32)
 }
 
-/// One channel of halves, a line a pixel.
+/// Encodes one channel of halves, one line per pixel.
 fn exr(sample: &Sample) -> Result<Vec<u8>> {
     let mut channels = SmallVec::new();
     channels.push(AnyChannel::new("Y", FlatSamples::F16(halves(sample))));

@@ -1,26 +1,28 @@
-//! Ways of storing a histogram image: the profiles, candidates that were tried for them, and other people's formats.
+//! Methods of storing a histogram image: the profiles, candidates that were tried for them, and
+//! foreign formats.
 
 use picofarm_dataset::{CodedImage, DatasetSpec, Profile, TransientCodec};
 
 use super::{foreign::Foreign, sample::Sample, variant::Variant};
 use picofarm_cli::error::{CliError, Result};
 
-/// A way, and what it is shown as.
+/// A method and its displayed name.
 pub struct Method {
     pub name: String,
     pub kind: Kind,
     way: Way,
 }
 
-/// What a way is to a data set.
+/// Category of a method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Kind {
     /// A profile of data sets.
     Profile,
-    /// Tried for the default profile, with its Δ; opens in zarr-python and tensorstore.
+    /// Tried for the default profile, with its Δ; readable by zarr-python and tensorstore.
     Candidate,
-    /// The same, but what is read are no values: a plain reader needs more than a formula, or does not open it at all.
+    /// Like `Candidate`, but a plain reader needs more than a formula to obtain values, or cannot
+    /// open it at all.
     Unreadable,
     /// Another format.
     Other,
@@ -32,14 +34,14 @@ enum Way {
     Foreign(Foreign),
 }
 
-/// An image as a way stores it.
+/// An image encoded by a method.
 pub enum Coded {
     Profile(CodedImage),
-    /// Chunk by chunk, and what does not fit a code: (flat index, value).
+    /// Encoded chunks, and the values outside the code's range: (flat index, value).
     Chunks(Vec<Vec<u8>>, Vec<(u64, f32)>),
 }
 
-/// An entry of an overflow list: index and value.
+/// Size of an entry of an overflow list, in bytes: index and value.
 const ENTRY: usize = 12;
 
 impl Coded {
@@ -67,7 +69,7 @@ impl Method {
         }
     }
 
-    /// Into `target`, which has the image's size.
+    /// Decodes into `target`, which has the image's size.
     pub fn decode(&self, coded: &Coded, sample: &Sample, target: &mut [f32]) -> Result<()> {
         match (&self.way, coded) {
             (Way::Profile(codec), Coded::Profile(image)) => {
@@ -88,7 +90,8 @@ impl Method {
     }
 }
 
-/// All ways, for images like those of `spec`; `only` keeps those whose names contain one of the texts.
+/// Returns all methods for images like those of `spec`. `only` selects the methods with names that
+/// contain one of the texts.
 pub fn all(spec: &DatasetSpec, only: &[String]) -> Result<Vec<Method>> {
     let mut methods = Vec::new();
     for name in Profile::NAMES.into_iter().filter(|n| *n != "counts-u16") {

@@ -1,5 +1,5 @@
-//! `picofarm bench store`: what each way of storing histograms costs and loses, on scenes of this renderer, and how
-//! fast they are read again.
+//! `picofarm bench store`: size, error and reading speed of each method of storing histograms, on
+//! rendered scenes.
 
 mod chain;
 mod counting;
@@ -30,14 +30,14 @@ use method::{Kind, Method};
 use reading::Reading;
 use sample::{Loss, Sample};
 
-/// Scenes of the whole data set.
+/// Number of scenes of the whole data set.
 const SCENES: f64 = 97_432.0;
-/// Values of one of its scenes.
+/// Number of values of one of its scenes.
 const VALUES: f64 = 256.0 * 256.0 * 637.0;
-/// Times that each scene is coded and decoded; the fastest counts.
+/// Number of times that each scene is encoded and decoded; the fastest counts.
 const REPEATS: usize = 2;
 
-/// What was found.
+/// Results of the benchmark.
 #[derive(Debug, Serialize)]
 struct Report {
     machine: Machine,
@@ -50,7 +50,7 @@ struct Report {
 struct Machine {
     processor: String,
     cores: usize,
-    /// Whether this program is optimised; times of others mean nothing.
+    /// Whether this program is built with optimisation; otherwise times are meaningless.
     optimised: bool,
 }
 
@@ -59,32 +59,32 @@ struct Scene {
     scene: u64,
     size: [usize; 3],
     photons_per_unit: f32,
-    /// Shares of bins without light, and with less than a photon.
+    /// Fractions of bins without light, and with less than a photon.
     dark: f64,
     below_one_photon: f64,
-    /// Bins of a pixel in which two-bounce light is looked for.
+    /// Mean number of bins of a pixel in which two-bounce light is expected.
     arrivals: f64,
 }
 
-/// One way, over all scenes.
+/// One method, over all scenes.
 #[derive(Debug, Serialize)]
 struct Row {
     name: String,
     kind: Kind,
-    /// Megabytes a scene of 256×256×637, in proportion.
+    /// Size of a scene of 256×256×637 in megabytes, scaled proportionally.
     mb_a_scene: f64,
-    /// Terabytes of 97,432 of them.
+    /// Size of 97,432 such scenes in terabytes.
     tb: f64,
-    /// The largest error, and root mean squares over all scenes.
+    /// The maximum error, and root mean squares over all scenes.
     loss: Loss,
     encode_mb_per_cpu_s: f64,
     decode_mb_per_cpu_s: f64,
 }
 
-/// Runs the whole bench.
+/// Runs the whole benchmark.
 ///
 /// # Errors
-/// Scenes that cannot be had, a codec that fails, or an interruption.
+/// Fails if scenes cannot be obtained, a codec fails, or on an interruption.
 pub async fn run(
     args: BenchStore,
     settings: &Settings,
@@ -140,7 +140,7 @@ fn rows(
     output: Output,
     stop: &CancellationToken,
 ) -> Result<Vec<Row>> {
-    // One thread, in whose time everything is.
+    // One thread, so that its CPU time covers all work.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let pool =
         pool.map_err(|e| CliError::new(Code::Resource, format!("cannot start a thread: {e}")))?;
@@ -169,9 +169,9 @@ struct Measured {
     decoded: Vec<f32>,
 }
 
-/// Codes and decodes one scene on this thread.
+/// Encodes and decodes one scene on this thread.
 fn measure(method: &Method, sample: &Sample) -> Result<Measured> {
-    // Its pages are touched before the clock runs.
+    // Touches its pages before the measurement.
     let mut decoded = vec![f32::NAN; sample.h.len()];
     let (mut bytes, mut encode_s, mut decode_s) = (0, f64::INFINITY, f64::INFINITY);
     for _ in 0..REPEATS {

@@ -1,4 +1,4 @@
-//! The picture of size against error.
+//! Plots size against error.
 
 use std::path::Path;
 
@@ -13,10 +13,10 @@ const TOP: usize = 64;
 const BELOW: usize = 72;
 const LEGEND: usize = 370;
 const ROW: usize = 16;
-/// Where ways without any error are drawn.
+/// Position of methods without any error on the logarithmic axis.
 const EXACT: f64 = 1e-3;
 const TARGET: [u8; 3] = [170, 170, 170];
-/// The default's promise: terabytes and rms σ.
+/// The default profile's goal: terabytes and rms σ.
 const PROMISE: (f64, f64) = (2.0, 0.06);
 
 fn colour(kind: Kind) -> [u8; 3] {
@@ -28,15 +28,15 @@ fn colour(kind: Kind) -> [u8; 3] {
     }
 }
 
-/// rms σ as drawn.
+/// Returns rms σ as drawn.
 fn shown(row: &Row) -> f64 {
     row.loss.rms_sigma.max(EXACT)
 }
 
-/// Draws a numbered mark a way: profiles are discs, the rest squares.
+/// Draws a numbered mark per method: discs for profiles, squares for the rest.
 ///
 /// # Errors
-/// The file cannot be written.
+/// Fails if the file cannot be written.
 pub fn draw(report: &Report, path: &Path) -> Result<()> {
     let rows = &report.rows;
     let xs = rows.iter().map(|r| r.tb).chain([PROMISE.0]);
@@ -56,7 +56,7 @@ pub fn draw(report: &Report, path: &Path) -> Result<()> {
     axes.line(corner, (corner.0, bottom), 4, TARGET);
     axes.line((left, corner.1), corner, 4, TARGET);
     let x = axes.left + axes.width + 16;
-    // Profiles last: on top.
+    // Profiles last, so that they are on top.
     let mut order: Vec<usize> = (0..rows.len()).collect();
     order.sort_by_key(|k| rows[*k].kind == Kind::Profile);
     let marks: Vec<(f64, f64)> = rows.iter().map(|row| axes.at(row.tb, shown(row))).collect();
@@ -67,7 +67,7 @@ pub fn draw(report: &Report, path: &Path) -> Result<()> {
             colour(rows[*k].kind),
         );
     }
-    // Where many meet, the first one's number stands for them: the legend has all figures.
+    // If many marks overlap, only the first one's number is drawn. The legend has all figures.
     let mut numbered: Vec<(f64, f64)> = Vec::new();
     for k in order.into_iter().rev() {
         let (px, py) = marks[k];

@@ -1,4 +1,5 @@
-//! Candidates for the default profile: quantisation, order of values, prediction, filters and levels in any combination.
+//! Candidates for the default profile: quantisation, order of values, prediction, filters and
+//! levels in any combination.
 
 use serde_json::Value;
 
@@ -12,7 +13,8 @@ use picofarm_cli::error::Result;
 #[derive(Debug, Clone)]
 pub struct Variant {
     delta: f32,
-    /// c in N = x² + 2cx, x = qΔ/2: 0 is the plain square root, ½ makes steps below one photon as large as above.
+    /// c in N = x² + 2cx, x = qΔ/2: 0 is the plain square root, ½ makes steps below one photon as
+    /// large as above.
     offset: f32,
     /// Rows, columns, bins (0 = all).
     chunk: [usize; 3],
@@ -21,15 +23,15 @@ pub struct Variant {
     pack: Pack,
 }
 
-/// Chunks, and what is too bright for a code: (flat index, value).
+/// Encoded chunks, and the values too bright for a code: (flat index, value).
 type Chunks = (Vec<Vec<u8>>, Vec<(u64, f32)>);
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Predict {
     No,
-    /// From the bin before.
+    /// From the previous bin.
     Time,
-    /// From the column before, within a chunk.
+    /// From the previous column, within a chunk.
     Column,
 }
 
@@ -42,7 +44,8 @@ enum Pack {
 const DELTA: f32 = 0.2;
 
 impl Variant {
-    /// What was tried, by name. The first one is what data sets of format 1 have, with the same Δ as the rest.
+    /// Returns the tried variants by name. The first one is the profile of data sets of format 1,
+    /// with the same Δ as the rest.
     pub fn all() -> Vec<(&'static str, Self)> {
         let zstd =
             |level, shuffle, blocksize| Pack::Zarr(blosc("zstd", level, shuffle, 2, blocksize));
@@ -208,7 +211,7 @@ impl Variant {
         ]
     }
 
-    /// Whether zarr-python and tensorstore both give codes of single bins.
+    /// Returns whether zarr-python and tensorstore both return the codes of individual bins.
     pub fn opens_plainly(&self) -> bool {
         self.predict == Predict::No && matches!(self.pack, Pack::Zarr(_))
     }
@@ -275,7 +278,7 @@ impl Variant {
         }
     }
 
-    /// How far apart a value and its neighbour are, and whether a value has one.
+    /// Returns the distance between a value and its neighbour, and whether a value has one.
     fn neighbour(
         &self,
         [_, columns, bins]: [usize; 3],
@@ -303,7 +306,8 @@ impl Variant {
         (step, has)
     }
 
-    /// Values to differences from their predictions, small ones of either sign to small numbers.
+    /// Replaces values by differences from their predictions, mapped so that small differences of
+    /// either sign become small numbers.
     fn difference(&self, chunk: &mut [u16], size: [usize; 3]) {
         if self.predict == Predict::No {
             return;
