@@ -275,7 +275,7 @@ pub enum CapturesArg {
 }
 
 impl ImportArgs {
-    /// As the importer takes them.
+    /// Converts the arguments to the importer's options.
     pub fn options(&self) -> ImportOptions {
         ImportOptions {
             gate_start_m: self.gate_start_m,

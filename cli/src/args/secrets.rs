@@ -3,7 +3,7 @@
 
 use clap::error::{ContextKind, ContextValue};
 
-/// The error with the user part and the query of every URL in it left out.
+/// Removes the user part and the query of every URL in an error.
 pub(super) fn hidden(mut error: clap::Error) -> clap::Error {
     let context: Vec<(ContextKind, ContextValue)> = error
         .context()
@@ -22,7 +22,7 @@ pub(super) fn hidden(mut error: clap::Error) -> clap::Error {
     error
 }
 
-/// A text without what stands before the `@` and after the `?` of a URL.
+/// Removes the parts of a URL before the `@` and after the `?`.
 pub fn without_secrets(text: &str) -> String {
     let Some((scheme, rest)) = text.split_once("://") else {
         return text.to_owned();
