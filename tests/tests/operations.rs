@@ -153,7 +153,7 @@ fn a_second_signal_ends_a_worker_at_once() {
     farm.submit(&job);
     let mut worker = farm.worker("stubborn");
     worker.until_says("task starts");
-    // The coordinator does not take the lease back, so the worker waits.
+    // The frozen coordinator cannot take the lease back, so the worker waits.
     farm.coordinator().signal(Signal::Stop);
     worker.signal(Signal::Terminate);
     worker.until_says("stopping");

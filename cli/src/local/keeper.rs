@@ -127,7 +127,7 @@ impl Shared {
             .map_err(failed)?;
         let mut stdin = child.stdin.take().expect("asked for above");
         let text = serde_json::to_string(order).expect("an order is plain data");
-        // The exit status of a process that ends at once tells what was wrong.
+        // A process that ends at once reports the reason at its end.
         if let Err(e) = writeln!(stdin, "{text}").and_then(|()| stdin.flush()) {
             info!(worker = order.name, error = %e, "the worker's process did not read its order");
         }

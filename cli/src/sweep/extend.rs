@@ -316,8 +316,7 @@ fn beside(file: &Path, trials: u64, total: u64) -> PathBuf {
     file.with_file_name(format!("{stem}-{total}.toml"))
 }
 
-/// Returns the path of a copy, which must be in the job file's folder because the file's locations
-/// are relative to it.
+/// Checks that a copy is in the job file's folder, because the file's locations are relative to it.
 fn same_folder(file: &Path, out: &Path) -> Result<PathBuf> {
     let folder = |path: &Path| {
         let parent = path.parent().filter(|p| !p.as_os_str().is_empty());

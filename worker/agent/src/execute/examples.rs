@@ -22,8 +22,8 @@ use super::{Control, TaskError, output::Stores, reprocess::quantity};
 #[cfg(test)]
 mod folded;
 
-/// Fraction of a task's spare memory that caches scenes, as a divisor. Training and validation
-/// scenes each have one such cache.
+/// A cache of scenes may use 1/`KEPT_SHARE` of a task's spare memory. Training and validation
+/// scenes have one cache each.
 const KEPT_SHARE: u64 = 6;
 
 /// Maximum number of histogram buffers that are kept for reuse.

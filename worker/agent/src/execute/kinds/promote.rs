@@ -113,7 +113,7 @@ fn loss(manifest: &ModelManifest) -> Result<f64, TaskError> {
     })
 }
 
-/// Returns the trial that trained the chosen model, if any.
+/// Returns the record of the trial that trained a model, if any.
 fn trial_of(
     stores: &Stores,
     models: &picofarm_dataset::Models,

@@ -108,7 +108,7 @@ pub(in crate::execute) fn make(
     make_by(dataset, with, spec, index, key, render)
 }
 
-/// Like `make`, but with the given settings.
+/// Makes scene `index`, renders it with `render`, and encodes it for the data set.
 fn make_by(
     dataset: &Dataset,
     with: With<'_>,

@@ -13,7 +13,7 @@ const TRAINED: f32 = 0.99;
 /// Maximum number of log lines about epochs, because a task's log allowance is not much larger.
 const LINES: u32 = 80;
 
-/// Fraction of a task's spare memory for scenes prepared ahead of the network, as a divisor.
+/// Scenes prepared ahead of the network may use 1/`AHEAD_SHARE` of a task's spare memory.
 const AHEAD_SHARE: u64 = 8;
 
 /// Returns how scenes are prepared: with as many threads as the task has, in a share of the memory

@@ -30,7 +30,7 @@ impl<'a> Board<'a> {
         }
     }
 
-    /// Returns this process's rank among the processes of the training.
+    /// Returns this process as a member of the training.
     pub(super) fn members(
         &'a self,
         peers: &str,

@@ -16,8 +16,8 @@ use picofarm_proto::model::{
 use super::{known::Known, of_model};
 use crate::execute::{Control, TaskError};
 
-/// Returns the plan of a network for scenes of a data set. `spots` contribute to the histogram.
-/// `greatest` returns the largest bin, for the logarithm.
+/// Returns the plan of a network for scenes of a data set. `spots` is the number of spots that
+/// contribute to the histogram. `greatest` is the largest bin, for the logarithm.
 ///
 /// # Errors
 /// [`TaskError::User`] naming the setting that does not fit the data set.
