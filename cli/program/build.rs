@@ -1,13 +1,13 @@
-//! Names the features and the commit that `picofarm --version` prints.
+//! Passes the features and the commit for `picofarm --version` to the compiler.
 
 use std::{path::Path, process::Command};
 
-/// Features that a user may miss, in the order of `Cargo.toml`.
+/// Features listed by `picofarm --version`, in the order of `Cargo.toml`.
 const FEATURES: [&str; 8] = [
     "clouds", "formats", "postgres", "networks", "cuda", "wgpu", "traces", "bench",
 ];
 
-/// Returns what git prints, or `None` outside a checkout or without git.
+/// Returns the output of git, or `None` outside a checkout or without git.
 fn git(args: &[&str]) -> Option<String> {
     let output = Command::new("git").args(args).output().ok()?;
     let text = String::from_utf8(output.stdout).ok()?;

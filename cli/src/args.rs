@@ -1,4 +1,4 @@
-//! The command line: one definition feeds the parser, the help, and the completions.
+//! The command line. A single definition drives the parser, the help and the completions.
 
 mod data;
 mod demultiplex;
@@ -44,7 +44,8 @@ pub struct Cli {
     pub command: Command,
 }
 
-/// The command line. `-1` is a value wherever one is expected, and refused as that, rather than an unknown option.
+/// Returns the command line's definition. `-1` is parsed as a value if a value is expected, so that
+/// it is rejected as a value and not as an unknown option.
 pub fn command() -> clap::Command {
     fn numbers(command: clap::Command) -> clap::Command {
         command
@@ -57,10 +58,10 @@ pub fn command() -> clap::Command {
     numbers(Cli::command())
 }
 
-/// Reads a command line.
+/// Parses a command line.
 ///
 /// # Errors
-/// What is wrong with it, without the secrets that URLs in it may hold.
+/// Returns clap's error, without possible secrets in URLs.
 pub fn parse(
     words: impl IntoIterator<Item = OsString>,
     version: &'static str,
@@ -117,7 +118,8 @@ pub struct Global {
 }
 
 impl Command {
-    /// Where its traces go, and what it is in them; nowhere for whatever runs no part of a farm.
+    /// Returns the trace collector's URL and the command's service name; `None` for commands that
+    /// run no part of a farm.
     pub fn traces(&self) -> Option<(&str, &'static str)> {
         let (traces, service) = match self {
             Self::Demo(demo) => (&demo.traces, "picofarm"),
@@ -306,12 +308,12 @@ pub struct Traces {
 }
 
 impl Traces {
-    /// Where they go, if anywhere.
+    /// Returns the collector's URL, if any.
     fn given(&self) -> Option<&str> {
         self.otlp.as_deref().filter(|url| !url.trim().is_empty())
     }
 
-    /// The same, to keep.
+    /// Returns the collector's URL as an owned string.
     pub fn url(&self) -> Option<String> {
         self.given().map(str::to_owned)
     }

@@ -1,4 +1,4 @@
-//! `picofarm assets …`, and which furniture a job uses.
+//! `picofarm assets …`, and the choice of furniture for a job.
 
 use std::path::Path;
 
@@ -12,10 +12,10 @@ use crate::{
     settings::Settings,
 };
 
-/// The fingerprint of the library that `name` stands for.
+/// Returns the fingerprint of the library called `name`.
 ///
 /// # Errors
-/// It is not installed, or no library is called so.
+/// Fails if the library is not installed, or if there is no library of this name.
 pub fn resolve(name: &str, dir: &Path) -> Result<String> {
     Ok(AssetLibrary::named(name, &[dir.to_owned()])?
         .fingerprint()

@@ -1,4 +1,4 @@
-//! `picofarm audit`: who did what.
+//! `picofarm audit`: shows the audit log.
 
 use picofarm_proto::{model::AuditEntry, show};
 
@@ -11,13 +11,13 @@ use crate::{
     settings::Settings,
 };
 
-/// Lines asked for at a time.
+/// Number of lines per request.
 const PAGE: u32 = 1_000;
 
-/// Shows the last lines of the audit log, the oldest of them first.
+/// Shows the last lines of the audit log, oldest first.
 ///
 /// # Errors
-/// The coordinator cannot be reached or refuses; `--job` is no id.
+/// Fails if the coordinator cannot be reached or refuses, or if `--job` is not an id.
 pub async fn run(args: &Audit, settings: &Settings, output: Output) -> Result<()> {
     let job = match &args.job {
         None => None,

@@ -1,27 +1,27 @@
-//! `--strategy` and `--strategies`: the renderer's ways of finding light, chosen by hand.
+//! `--strategy` and `--strategies`: manual choice of the renderer's sampling strategies.
 
 use picofarm_settings::{Choice, Strategy};
 
 use crate::error::{CliError, Result};
 
-/// One choice: the name as in [`Strategy`], and what is chosen.
+/// One choice: a field of [`Strategy`] by name, and its value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Chosen {
     name: String,
     choice: Choice,
 }
 
-/// A way to render that a benchmark compares with others.
+/// A set of strategies for comparison in a benchmark.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Variant {
     pub name: String,
     pub strategy: Strategy,
 }
 
-/// Reads `path-reuse=1` or `mirror-images=off`.
+/// Parses `path-reuse=1` or `mirror-images=off`.
 ///
 /// # Errors
-/// A message that lists the names there are.
+/// Returns a message that lists the valid names.
 pub fn parse(text: &str) -> Result<Chosen, String> {
     let Some((name, value)) = text.split_once('=') else {
         let all = Strategy::NAMES.join(", ");
@@ -43,10 +43,10 @@ pub fn parse(text: &str) -> Result<Chosen, String> {
     Ok(Chosen { name, choice })
 }
 
-/// All choices together.
+/// Combines several choices.
 ///
 /// # Errors
-/// One is made twice.
+/// Fails if a strategy is chosen twice.
 pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
     let mut all = Strategy::default();
     for (i, c) in chosen.iter().enumerate() {
@@ -60,14 +60,15 @@ pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
     Ok(all)
 }
 
-/// What one word of `--strategies` stands for.
+/// The variants of one word of `--strategies`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ways(Vec<Variant>);
 
-/// Reads `default`, `each` (each way of finding light left out in turn), `path-reuse=1` or `path-reuse=1+mirror-images=off`.
+/// Parses `default`, `each` (each strategy turned off in turn), `path-reuse=1` or
+/// `path-reuse=1+mirror-images=off`.
 ///
 /// # Errors
-/// Those of [`parse`], or a choice made twice.
+/// Returns the errors of [`parse`], or an error if a strategy is chosen twice.
 pub fn ways(text: &str) -> Result<Ways, String> {
     let default = Variant {
         name: "picofarm".into(),
@@ -83,7 +84,7 @@ pub fn ways(text: &str) -> Result<Ways, String> {
     match text {
         "default" => Ok(Ways(vec![default])),
         "each" => {
-            // What is no switch is a size, and 1 makes nothing of it.
+            // A strategy without a switch is a size, and size 1 turns it off.
             let without = |name: &str| {
                 let name = name.replace('_', "-");
                 of(&format!("{name}=off")).or_else(|_| of(&format!("{name}=1")))
@@ -98,7 +99,7 @@ pub fn ways(text: &str) -> Result<Ways, String> {
     }
 }
 
-/// All ways to compare, each once, in order.
+/// Returns all variants to compare, in order and without duplicates.
 pub fn variants(ways: &[Ways]) -> Vec<Variant> {
     let mut all: Vec<Variant> = vec![];
     for way in ways.iter().flat_map(|w| &w.0) {

@@ -1,4 +1,5 @@
-//! The coordinator as the commands see it: model types in, model types out, errors with a hint.
+//! The commands' client for a coordinator: converts between model types and the wire, and adds
+//! hints to errors.
 
 use std::time::Duration;
 
@@ -22,22 +23,22 @@ use tonic::{
 
 use crate::error::{CliError, Code, Result};
 
-/// How long a coordinator may take to complete a connection, and to give its first answer if there
-/// is another to ask.
+/// Timeout of a connection attempt, and of the coordinator's first answer if there is another
+/// coordinator to try.
 const CONNECT: Duration = Duration::from_secs(5);
-/// How long the last coordinator of a list may take for its first answer.
+/// Timeout of the first answer of the last coordinator in a list.
 const LAST: Duration = Duration::from_secs(15);
-/// How long a call may take that reads or steers.
+/// Timeout of calls that read or control.
 const ANSWER: Duration = Duration::from_secs(60);
-/// How long planning or submitting may take: a large job is compared with what its stores have.
-/// Meanwhile pings tell whether the coordinator lives.
+/// Timeout of planning and submitting, because a large job is compared with the contents of its
+/// stores. Meanwhile, pings show whether the coordinator is alive.
 const SUBMIT: Duration = Duration::from_secs(15 * 60);
-/// How often a connection is pinged, and how long the answer may take.
+/// Interval between pings on a connection, and timeout of their answer.
 const PING: Duration = Duration::from_secs(10);
 
 type Jobs = JobsClient<InterceptedService<Channel, Bearer>>;
 
-/// Calls a method of the coordinator within a time.
+/// Calls a method of the coordinator with a timeout.
 macro_rules! call {
     ($client:ident, $within:expr, $method:ident, $request:expr) => {{
         let request = $request;
@@ -54,13 +55,13 @@ macro_rules! call {
 #[derive(Clone)]
 pub struct Client {
     jobs: Jobs,
-    /// The coordinator in use, and all there are.
+    /// URL of the coordinator in use, and URLs of all coordinators.
     url: String,
     urls: String,
     access: Access,
 }
 
-/// What a submission answered.
+/// Answer to a submission.
 pub struct Submitted {
     pub job: JobId,
     pub existed: bool,
@@ -76,7 +77,7 @@ fn refused(status: &Status) -> CliError {
         | Grpc::Unimplemented
         | Grpc::Unauthenticated
         | Grpc::PermissionDenied => Code::Coordinator,
-        // A stream that breaks off has other codes, but a cause: no connection any more.
+        // A broken stream has another code, but its cause is a lost connection.
         _ if lost_connection(status) => Code::Coordinator,
         _ => Code::Failed,
     };
@@ -104,7 +105,7 @@ fn required<T>(value: Option<T>, field: &'static str) -> Result<T> {
 }
 
 impl Client {
-    /// Connects to the first coordinator that answers, of a list of URLs with commas between them.
+    /// Connects to the first coordinator that answers. `urls` is a comma-separated list.
     pub async fn connect(urls: &str, access: &Access) -> Result<Self> {
         let all: Vec<_> = urls.split(',').map(str::trim).collect();
         let (client, url) = first_that_answers(&all, access).await?;
@@ -121,9 +122,9 @@ impl Client {
         Self::connect(&self.urls, &self.access).await
     }
 
-    /// The answer to a call within a time. If a coordinator is silent and there are others, the
-    /// first of them that answers is asked and used from then on: every call has the same effect
-    /// once and twice.
+    /// Returns the answer to a call within a time. If the coordinator is silent and there are
+    /// others, the first of them that answers is used from then on. This is safe because every call
+    /// is idempotent.
     async fn ask<T, F>(&mut self, within: Duration, call: impl Fn(Jobs) -> F) -> Result<T>
     where
         F: Future<Output = std::result::Result<Response<T>, Status>>,
@@ -159,7 +160,7 @@ impl Client {
         &self.url
     }
 
-    /// (version, protocol, workers connected).
+    /// Returns the server's version, protocol and number of connected workers.
     pub async fn server(&mut self) -> Result<(String, u32, u32)> {
         let info = call!(self, ANSWER, get_server_info, wire::GetServerInfoRequest {});
         Ok((info.version, info.protocol, info.workers))
@@ -193,7 +194,7 @@ impl Client {
         })
     }
 
-    /// A page of the list of jobs, and where the next begins.
+    /// Returns a page of the list of jobs, and the start of the next page.
     pub async fn list(&mut self, ask: &Listing<'_>) -> Result<(Vec<JobSummary>, Option<String>)> {
         let request = wire::ListJobsRequest {
             page_size: ask.limit,
@@ -219,7 +220,7 @@ impl Client {
         required(reply.job, "job")?.try_into().map_err(unreadable)
     }
 
-    /// Finds the one job whose id begins with `text`.
+    /// Finds the only job with an id that begins with `text`.
     pub async fn find(&mut self, text: &str) -> Result<JobId> {
         if let Ok(id) = text.parse() {
             return Ok(id);
@@ -277,7 +278,7 @@ impl Client {
         Ok(call!(self, ANSWER, retry_job, request).retried)
     }
 
-    /// Holds a job, or lets it go on.
+    /// Pauses or resumes a job.
     pub async fn pause(&mut self, job: JobId, paused: bool) -> Result<JobStatus> {
         let job_id = job.to_string();
         let status = match paused {
@@ -293,7 +294,7 @@ impl Client {
         required(status, "job")?.try_into().map_err(unreadable)
     }
 
-    /// Tells workers of this name or id to end; how many there are.
+    /// Drains the workers of this name or id, and returns their number.
     pub async fn drain(&mut self, worker: &str) -> Result<u32> {
         let request = wire::DrainWorkerRequest {
             worker: worker.to_owned(),
@@ -301,7 +302,7 @@ impl Client {
         Ok(call!(self, ANSWER, drain_worker, request).workers)
     }
 
-    /// A job's events after a sequence number, at most a thousand.
+    /// Returns a job's events after a sequence number, at most a thousand.
     pub async fn events(
         &mut self,
         job: JobId,
@@ -320,7 +321,7 @@ impl Client {
         Ok(self.history(page).await?.0)
     }
 
-    /// A page of the history, and whether its job had ended before it was read.
+    /// Returns a page of the history, and whether its job had ended before the page was read.
     pub async fn history(&mut self, page: Page) -> Result<(Vec<Event>, bool)> {
         let request = wire::ListEventsRequest {
             job_id: page.job.map(|job| job.to_string()).unwrap_or_default(),
@@ -337,7 +338,7 @@ impl Client {
         Ok((events, reply.ended))
     }
 
-    /// Why a job, or a task of it, is as it is.
+    /// Explains the state of a job or of one of its tasks.
     pub async fn explain(
         &mut self,
         job: JobId,
@@ -361,7 +362,8 @@ impl Client {
         })
     }
 
-    /// A page of the audit log, newest first: lines with smaller sequence numbers than `before`.
+    /// Returns a page of the audit log, newest first: lines with smaller sequence numbers than
+    /// `before`.
     pub async fn audit(
         &mut self,
         before: Option<u64>,
@@ -380,7 +382,7 @@ impl Client {
         entries.collect::<Result<_, _>>().map_err(unreadable)
     }
 
-    /// The workers connected to the coordinator that answers.
+    /// Returns the workers connected to the coordinator that answers.
     pub async fn workers(&mut self) -> Result<Workers> {
         let reply = call!(self, ANSWER, list_workers, wire::ListWorkersRequest {});
         Ok(Workers {
@@ -392,25 +394,25 @@ impl Client {
     }
 }
 
-/// Which jobs of the list.
+/// Selects jobs of the list.
 #[derive(Default)]
 pub struct Listing<'a> {
-    /// At most so many; 0 = as many as the coordinator gives.
+    /// Maximum number of jobs; 0 = the coordinator's limit.
     pub limit: u32,
-    /// Where to begin, as an earlier page said.
+    /// Start of the page, as returned with the previous page.
     pub page: Option<&'a str>,
-    /// Only those that stand so.
+    /// Only jobs in this state.
     pub state: Option<JobState>,
-    /// Only this user's.
+    /// Only jobs of this user.
     pub user: Option<&'a str>,
-    /// Only those of this name, or whose id begins so.
+    /// Only jobs with this name, or with an id that begins with it.
     pub find: Option<&'a str>,
 }
 
-/// Which part of the history.
+/// Selects a part of the history.
 #[derive(Debug, Clone, Copy)]
 pub struct Page {
-    /// `None` = of all jobs.
+    /// The job; `None` = all jobs.
     pub job: Option<JobId>,
     /// Position of the stage in the job.
     pub stage: Option<u32>,
@@ -418,13 +420,13 @@ pub struct Page {
     /// Only events after this sequence number.
     pub after: u64,
     pub limit: u32,
-    /// The last `limit` rather than the first.
+    /// Selects the last `limit` events instead of the first.
     pub newest: bool,
-    /// What tasks logged, too.
+    /// Includes the logs of tasks.
     pub logs: bool,
 }
 
-/// Answer to the question why.
+/// An explanation of a job's state.
 #[derive(Debug, Serialize)]
 pub struct Explained {
     pub job: JobStatus,
@@ -432,25 +434,25 @@ pub struct Explained {
     pub task: Option<TaskExplanation>,
 }
 
-/// Who works for a coordinator.
+/// The workers of a coordinator.
 #[derive(Debug, Serialize)]
 pub struct Workers {
-    /// Names the process that answered.
+    /// Name of the process that answered.
     pub coordinator: String,
     pub workers: Vec<ConnectedWorker>,
-    /// Workers connected to other coordinators of the same catalog.
+    /// Number of workers connected to other coordinators of the same catalog.
     pub elsewhere: u32,
-    /// Coordinators of the catalog.
+    /// Number of coordinators of the catalog.
     pub coordinators: u32,
 }
 
-/// Why a coordinator gave no answer that can be used.
+/// The reason why a coordinator gave no usable answer.
 enum NoAnswer {
-    /// It refused: another one would do the same.
+    /// It refused; another coordinator would do the same.
     Refused(CliError),
-    /// It, or the connection to it, reported that it cannot answer; another one may.
+    /// It, or the connection to it, reported that it cannot answer; another coordinator may.
     Unavailable(CliError),
-    /// It was silent or away; another one may answer.
+    /// It was silent or unreachable; another coordinator may answer.
     Silent(CliError),
 }
 
@@ -459,10 +461,10 @@ impl NoAnswer {
         Self::Silent(CliError::new(Code::Coordinator, did).hint(hint))
     }
 
-    /// What a silent coordinator did.
+    /// Returns the error of a silent coordinator.
     ///
     /// # Errors
-    /// It refused.
+    /// Fails with the refusal if the coordinator refused.
     fn silence(self) -> Result<CliError> {
         match self {
             Self::Refused(error) => Err(error),
@@ -471,7 +473,7 @@ impl NoAnswer {
     }
 }
 
-/// The answer, within a time.
+/// Returns the answer within a time.
 async fn answer<T>(
     within: Duration,
     call: impl Future<Output = std::result::Result<Response<T>, Status>>,
@@ -489,7 +491,7 @@ async fn answer<T>(
     }
 }
 
-/// "URL (what it did)" of each.
+/// Formats each coordinator as "URL (error)".
 fn list(silent: &[(&str, CliError)]) -> String {
     let each = silent
         .iter()
@@ -497,7 +499,7 @@ fn list(silent: &[(&str, CliError)]) -> String {
     each.collect::<Vec<_>>().join(", ")
 }
 
-/// The error of a command that no coordinator answers.
+/// Returns the error for the case that no coordinator answers.
 fn none_answers(silent: &[(&str, CliError)]) -> CliError {
     let error = CliError::new(
         Code::Coordinator,
@@ -509,14 +511,15 @@ fn none_answers(silent: &[(&str, CliError)]) -> CliError {
     }
 }
 
-/// The first of these coordinators that answers.
+/// Connects to the first of these coordinators that answers.
 ///
 /// # Errors
-/// One cannot be asked with these settings; or none answers: what each of them did.
+/// Fails if the settings are unusable for one of them, or if none answers. The error describes each
+/// coordinator.
 async fn first_that_answers<'a>(urls: &[&'a str], access: &Access) -> Result<(Jobs, &'a str)> {
     let (mut silent, mut wrong) = (Vec::new(), None);
     for (i, url) in urls.iter().enumerate() {
-        // The last one is waited for longer: there is no other to ask.
+        // The last coordinator has a longer timeout, because there is no other to try.
         let within = match i + 1 == urls.len() {
             true => LAST,
             false => CONNECT,
@@ -525,7 +528,7 @@ async fn first_that_answers<'a>(urls: &[&'a str], access: &Access) -> Result<(Jo
             Ok(jobs) => return Ok((jobs, *url)),
             Err(no) => match no.silence() {
                 Ok(error) => silent.push((*url, error)),
-                // A wrong setting for one coordinator does not stop another from answering.
+                // A wrong setting for one coordinator does not prevent another from answering.
                 Err(error) => {
                     wrong.get_or_insert(error);
                 }
@@ -546,7 +549,7 @@ async fn first_that_answers<'a>(urls: &[&'a str], access: &Access) -> Result<(Jo
     Err(CliError { message, ..wrong })
 }
 
-/// Connects to one coordinator and waits for its first answer, each within a time.
+/// Connects to one coordinator and waits for its first answer, each with a timeout.
 async fn connect_to(url: &str, access: &Access, within: Duration) -> Result<Jobs, NoAnswer> {
     let target = access
         .target(url)
@@ -559,8 +562,8 @@ async fn connect_to(url: &str, access: &Access, within: Duration) -> Result<Jobs
     };
     let mut jobs = JobsClient::with_interceptor(channel, target.bearer.clone())
         .max_decoding_message_size(64 << 20);
-    // A client certificate is refused only after the handshake, and plain HTTP by a TLS port only
-    // when it is spoken: the first call tells.
+    // A client certificate is refused only after the handshake, and a TLS port refuses plain HTTP
+    // only on the first request. The first call reveals both.
     let first = jobs.get_server_info(wire::GetServerInfoRequest {});
     match tokio::time::timeout(within, first).await {
         Ok(Err(status)) if lost_connection(&status) => Err(no_connection(&target, &status).await),
@@ -569,7 +572,7 @@ async fn connect_to(url: &str, access: &Access, within: Duration) -> Result<Jobs
     }
 }
 
-/// With pings, so that a connection to a coordinator that is frozen or gone ends.
+/// Enables pings, so that a connection to a frozen or vanished coordinator ends.
 fn lively(endpoint: Endpoint) -> Endpoint {
     endpoint
         .tcp_nodelay(true)
@@ -589,7 +592,7 @@ fn mute(did: &str, within: Duration) -> NoAnswer {
     down(format!("{did} within {} s", within.as_secs()))
 }
 
-/// Why there is no connection.
+/// Returns the reason why there is no connection.
 async fn no_connection(
     target: &Target,
     error: &(dyn std::error::Error + Send + Sync + 'static),
@@ -601,21 +604,21 @@ async fn no_connection(
     }
 }
 
-/// What a coordinator says about a proof.
+/// A coordinator's answer about a proof.
 pub enum Standing {
-    /// It lets callers with this proof in, for this reason.
+    /// It accepts callers with this proof, for this reason.
     Accepted(String),
-    /// It does not.
+    /// It refuses callers with this proof.
     Refused(String),
     /// It cannot be asked.
     Unknown(String),
 }
 
-/// Asks the coordinator at `url` whether a proof is accepted: `proof` is the SHA-256 of a token, or
-/// the name in a client certificate, with the scheme before it.
+/// Asks the coordinator at `url` whether a proof is accepted. `proof` is the SHA-256 of a token, or
+/// the name in a client certificate, with the scheme as prefix.
 pub async fn standing(url: &str, access: &Access, proof: &str) -> Standing {
     let words = |no: NoAnswer| no.silence().unwrap_or_else(|refused| refused).message;
-    // The question is not the caller's: its own token stays here.
+    // The request is not about the caller, so the caller's own token is not sent.
     let asker = Access {
         token: None,
         ..access.clone()
@@ -656,7 +659,7 @@ pub async fn standing(url: &str, access: &Access, proof: &str) -> Standing {
 pub struct Watch(tonic::Streaming<wire::WatchJobResponse>);
 
 impl Watch {
-    /// The next status; `None` when the job has ended.
+    /// Returns the next status; `None` when the job has ended.
     pub async fn next(&mut self) -> Result<Option<JobStatus>> {
         match self.0.message().await {
             Ok(None) => Ok(None),

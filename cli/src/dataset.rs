@@ -1,4 +1,4 @@
-//! `picofarm dataset …`: what a data set holds, whether it is whole, and what it looks like.
+//! `picofarm dataset …`: shows, checks and converts data sets.
 
 pub mod export;
 pub mod gc;
@@ -119,7 +119,7 @@ fn describe(place: &str, info: &Summary) -> String {
     ) + &further(info)
 }
 
-/// What only some data sets have.
+/// Describes the properties that only some data sets have.
 fn further(info: &Summary) -> String {
     let mut text = String::new();
     let sizes = info.spec.subsets.sizes();
@@ -145,7 +145,7 @@ fn further(info: &Summary) -> String {
     text
 }
 
-/// The store and the folder in it of a data set's place.
+/// Splits a data set's location into the store and the folder in it.
 fn store_and_folder(place: &str) -> Result<(String, String)> {
     let trimmed = place.trim_end_matches('/');
     let parts = match trimmed.rsplit_once('/') {
@@ -164,7 +164,7 @@ fn store_and_folder(place: &str) -> Result<(String, String)> {
     }
 }
 
-/// What the failure of a task means for a command that runs it here.
+/// Converts the failure of a task into the error of a command that runs it on this machine.
 pub fn task_failed(error: TaskError) -> CliError {
     let (code, hint) = match &error {
         TaskError::User(_) | TaskError::Damaged(_) => (Code::Input, None),
@@ -214,7 +214,7 @@ pub fn failed(error: DatasetError) -> CliError {
     failed
 }
 
-/// Where the pictures are.
+/// Locations of the pictures.
 pub struct Drawn {
     pub sheet: PathBuf,
     pub flight: PathBuf,
@@ -223,10 +223,10 @@ pub struct Drawn {
 /// File name of a contact sheet.
 pub const SHEET: &str = "contact-sheet.png";
 
-/// Draws the contact sheet of `scenes` and the first one's light in flight into `dir`.
+/// Draws the contact sheet of `scenes` and the first scene's light in flight into `dir`.
 ///
 /// # Errors
-/// No scenes, an unreadable scene, or a folder that cannot be written.
+/// Fails if there are no scenes, a scene cannot be read, or the folder cannot be written.
 pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
     let Some(&first) = scenes.first() else {
         return Err(CliError::input(format!(

@@ -66,7 +66,7 @@ fn place(task: &RenderTask) -> String {
     format!("{}/{}", task.output.store, task.output.dataset)
 }
 
-/// What is to be done, once places and versions are pinned.
+/// The requested work, with locations and versions pinned.
 struct Asked<'a> {
     reconstruct: bool,
     dir: &'a Path,
@@ -85,7 +85,7 @@ impl Asked<'_> {
     }
 }
 
-/// Whether the data set holds scenes of other settings.
+/// Returns whether the data set already belongs to other settings.
 async fn taken(task: &RenderTask) -> Result<bool> {
     let place = place(task);
     if !Path::new(&place).join("zarr.json").exists() {
@@ -93,7 +93,7 @@ async fn taken(task: &RenderTask) -> Result<bool> {
     }
     let key = task.stage_key().to_string();
     let dataset = dataset::open(&place).await?;
-    // Each worker writes down how it makes scenes before it makes one.
+    // Each worker stores its recipe before it makes a scene.
     let recipes = dataset.recipe_keys().await.map_err(dataset::failed)?;
     Ok(recipes.iter().any(|recipe| *recipe != key))
 }
@@ -136,10 +136,10 @@ async fn submit(
     Ok((task, own, submitted))
 }
 
-/// Renders, verifies and shows a data set, and rooms in 3D where they are asked for.
+/// Renders, verifies and shows a data set, and reconstructs its rooms if requested.
 ///
 /// # Errors
-/// Bad arguments, a folder that holds another demo, an interruption, or a failure on the way.
+/// Fails on invalid arguments, a folder with another demo, an interruption, or any failed step.
 pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()> {
     let dir = std::path::absolute(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
     let task = jobfile::resolve_render(task(&args), &dir, &settings.assets)?;
@@ -176,7 +176,7 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
         args.traces.url(),
     )
     .await?;
-    // This process's own coordinator asks nobody who they are.
+    // This process's own coordinator requires no authentication.
     let mut client = Client::connect(&farm.url, &Access::default()).await?;
     let rendered = tokio::select! {
         status = render(&mut client, task, &asked, output) => Some(status),
@@ -194,7 +194,7 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
     tell(&args, &dir, &place, job, &status, output).await
 }
 
-/// Renders: where to, under which job, and how that ended.
+/// Renders the rooms. Returns the location, the job and its final status.
 async fn render(
     client: &mut Client,
     task: RenderTask,
@@ -289,7 +289,7 @@ async fn tell(
     Ok(())
 }
 
-/// The names of graphics processors, which workers open.
+/// Returns the names of the GPUs, which workers open.
 fn gpu_names(gpus: &Gpus) -> Result<Vec<String>> {
     #[cfg(feature = "networks")]
     let names = picofarm_model::device::names(gpus)
@@ -305,7 +305,7 @@ fn gpu_names(gpus: &Gpus) -> Result<Vec<String>> {
 /// Runs a coordinator and workers until a signal.
 ///
 /// # Errors
-/// A taken address or catalog, or a worker that ends.
+/// Fails if the address or catalog is in use, or if a worker ends.
 pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
     let guarded = Guarded::of(&args.guard);
     roles::refuse_unguarded(args.listen, &args.guard, true)?;

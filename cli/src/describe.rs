@@ -1,4 +1,4 @@
-//! Jobs, plans and events in words.
+//! Formats jobs, plans and events as text.
 
 use std::collections::BTreeSet;
 
@@ -116,7 +116,7 @@ fn cost(stages: &[StagePlan], indent: &str) -> String {
     text
 }
 
-/// Why tasks of stages of one matrix, or of one stage, run or do not.
+/// Explains why the tasks of a stage, or of the stages of a matrix, run or do not.
 fn reasons(stages: &[StagePlan], indent: &str) -> String {
     const SHOWN: usize = 2;
     let mut seen = BTreeSet::new();
@@ -149,7 +149,7 @@ pub fn state(status: &JobStatus) -> String {
     }
 }
 
-/// A line about results that the coordinator has not found in their store.
+/// Returns a line about results that the coordinator has not found in their store.
 pub fn unverified(s: &JobStatus) -> String {
     match s.unverified {
         0 => String::new(),
@@ -202,7 +202,7 @@ pub fn describe(s: &JobStatus) -> String {
     text + &places(&s.spec)
 }
 
-/// Where the results of a job are.
+/// Returns the locations of a job's results.
 fn places(spec: &JobSpec) -> String {
     const SHOWN: usize = 4;
     let mut text = String::new();
@@ -232,7 +232,8 @@ fn places(spec: &JobSpec) -> String {
     text
 }
 
-/// The tasks of a job by what becomes of them. A lease may hold many tasks, of which its worker runs one.
+/// Counts the tasks of a job by state. A lease can contain many tasks, but its worker runs one at a
+/// time.
 pub fn counts(s: &JobStatus) -> String {
     let t = &s.tasks;
     let running = s.running.len() as u64;
@@ -269,7 +270,7 @@ fn describe_stages(s: &JobStatus) -> String {
     table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
 }
 
-/// The stages that one needs, those of a matrix together.
+/// Returns the stages that a stage needs, grouped by matrix.
 fn needs(needs: &[String]) -> String {
     let groups = needs.chunk_by(|a, b| same_matrix(a, b));
     groups.map(together).collect::<Vec<_>>().join(", ")
@@ -301,11 +302,11 @@ pub fn describe_event(e: &Event) -> String {
         clock(e.at_ms),
         e.message
     );
-    // Names and messages are others': an event is one line, whatever they hold.
+    // Names and messages come from others, so an event is escaped to a single line.
     show::line(text.trim_end()).into_owned() + "\n"
 }
 
-/// Unix milliseconds as UTC, e.g. `2026-11-21T10:15:30Z`.
+/// Formats Unix milliseconds as UTC, e.g. `2026-11-21T10:15:30Z`.
 pub fn clock(ms: i64) -> String {
     let (days, second) = (ms.div_euclid(86_400_000), ms.rem_euclid(86_400_000) / 1000);
     // Civil date from days since 1970-01-01 (Hinnant's algorithm).

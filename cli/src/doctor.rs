@@ -1,4 +1,4 @@
-//! `picofarm doctor`: is this machine fit to render and store?
+//! `picofarm doctor`: checks whether this machine can render and store.
 
 use picofarm_dataset::{PROBE_WITHIN, Writable, check_writable};
 use serde::Serialize;
@@ -17,7 +17,7 @@ use crate::{
 #[serde(rename_all = "snake_case")]
 enum Verdict {
     Ok,
-    /// Works without it.
+    /// Picofarm works without it.
     Note,
     Bad,
 }
@@ -70,7 +70,7 @@ fn processor() -> Check {
     }
 }
 
-/// What tasks may take, and who says so.
+/// Reports the memory that tasks may use, and the source of this limit.
 fn memory() -> Check {
     let found = picofarm_agent::Memory::here();
     Check {
@@ -100,7 +100,7 @@ fn vector_kernel() -> &'static str {
     "portable ray kernel (same results, slower)"
 }
 
-/// Those that networks may be computed on; each is opened and tried.
+/// Reports the GPUs for networks. Each is opened and tested.
 #[cfg(feature = "networks")]
 fn gpus() -> Check {
     use picofarm_model::device;
@@ -146,7 +146,7 @@ fn gpus() -> Check {
     }
 }
 
-/// A store must give exactly one winner when several writers create the same object.
+/// Checks a store: exactly one writer must win when several create the same object.
 async fn store(place: &str) -> Check {
     let (verdict, detail) = match check_writable(place, PROBE_WITHIN).await {
         Ok(Writable::There) => (
@@ -169,12 +169,12 @@ async fn store(place: &str) -> Check {
     }
 }
 
-/// Free space of a disk below which results do not fit for long, bytes.
+/// Free disk space below which results will soon not fit, in bytes.
 const LITTLE: u64 = 10 << 30;
-/// Free space below which nothing sensible fits.
+/// Free disk space below which almost nothing fits, in bytes.
 const NONE: u64 = 256 << 20;
 
-/// Space where results and temporary files go.
+/// Reports the free space for results and temporary files.
 fn disk(place: &str) -> Check {
     let ground = picofarm_dataset::local_ground(place).ok().flatten();
     let places = ground.into_iter().chain([std::env::temp_dir()]);

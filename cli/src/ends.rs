@@ -1,27 +1,27 @@
-//! When a worker must end: by its own option, or with the Slurm job that it runs in.
+//! End time of a worker: from its own option, or from the Slurm job in which it runs.
 
 use std::time::{Duration, SystemTime};
 
 use crate::error::{CliError, Result};
 
-/// The end of the Slurm job, Unix seconds, as Slurm gives it.
+/// Environment variable with the end of the Slurm job, in Unix seconds.
 const SLURM: &str = "SLURM_JOB_END_TIME";
-/// So long before the end of the Slurm job a worker stops, as `--signal=B:TERM@60` would have it.
+/// Time before the end of the Slurm job at which a worker stops, as with `--signal=B:TERM@60`.
 const BEFORE: Duration = Duration::from_secs(60);
 
 /// A time, or a duration from the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EndAt {
-    /// At this time.
+    /// Ends at this time.
     Time(SystemTime),
-    /// After so long.
+    /// Ends after this duration.
     After(Duration),
 }
 
-/// Reads `--end-at`.
+/// Parses `--end-at`.
 ///
 /// # Errors
-/// It is neither a time nor a duration.
+/// Fails if the text is neither a time nor a duration.
 pub fn parse(text: &str) -> std::result::Result<EndAt, String> {
     if let Ok(time) = humantime::parse_rfc3339(text) {
         return Ok(EndAt::Time(time));
@@ -33,10 +33,10 @@ pub fn parse(text: &str) -> std::result::Result<EndAt, String> {
         })
 }
 
-/// When the worker must end: as it was told, or a minute before its Slurm job.
+/// Returns when the worker must end: as given, or a minute before its Slurm job ends.
 ///
 /// # Errors
-/// The time has passed, or Slurm's is none.
+/// Fails if the time has passed, or if Slurm's end time is not a number.
 pub fn ends_at(given: Option<EndAt>, now: SystemTime) -> Result<Option<SystemTime>> {
     if given.is_some() {
         return own(given, now);
@@ -72,7 +72,7 @@ fn slurms(text: Option<&str>, now: SystemTime) -> Result<Option<SystemTime>> {
         ))
     })?;
     let end = SystemTime::UNIX_EPOCH.checked_add(Duration::from_secs(seconds));
-    // One in the past was prolonged since: its new end is not known here.
+    // A Slurm job with an end in the past was extended; its new end is unknown here.
     let end = end.filter(|at| *at > now);
     if end.is_none() {
         tracing::warn!(

@@ -1,4 +1,4 @@
-//! How a command fails: a message, a hint that can be typed, and a documented exit code.
+//! Errors of commands: a message, a hint with a command to type, and a documented exit code.
 
 use std::fmt;
 
@@ -19,13 +19,13 @@ pub enum Code {
     Interrupted = 130,
 }
 
-/// Why a command failed.
+/// The reason why a command failed.
 #[derive(Debug)]
 pub struct CliError {
     pub code: Code,
     pub message: String,
     pub hint: Option<String>,
-    /// Asking again would not help: whoever was asked does not let this caller in.
+    /// Whether the caller was denied access, so that a retry would not help.
     pub denied: bool,
     /// The field of a job at which the coordinator refuses it.
     pub field: Option<String>,
@@ -53,7 +53,7 @@ impl CliError {
         self
     }
 
-    /// Prints to stderr and gives the exit code.
+    /// Prints the error to stderr and returns the exit code.
     pub fn report(&self, json: bool) -> u8 {
         if json {
             let error = serde_json::json!({"error": {
@@ -69,7 +69,7 @@ impl CliError {
     }
 }
 
-/// What this program was built without, and how to have it.
+/// Returns the error for a feature missing from this build, with the option that adds it.
 pub fn not_built(feature: &str, what: &str) -> CliError {
     CliError::new(
         Code::Resource,
@@ -80,8 +80,8 @@ pub fn not_built(feature: &str, what: &str) -> CliError {
     ))
 }
 
-/// A text behind its mark; further lines are indented. A message may quote what others wrote, and no line of that shall
-/// look like one of ours.
+/// Puts a mark before a text and indents its further lines. A message may quote text from others,
+/// and no line of it may look like one of picofarm's own.
 fn marked(mark: &str, text: &str) -> String {
     let indent = format!("\n{:1$}", "", mark.len());
     format!(
@@ -90,7 +90,7 @@ fn marked(mark: &str, text: &str) -> String {
     )
 }
 
-/// An I/O failure on a path the user knows.
+/// An I/O failure on a path known to the user.
 pub fn io(what: impl fmt::Display, error: &std::io::Error) -> CliError {
     use std::io::ErrorKind as K;
     let failed = CliError::new(Code::Resource, format!("{what}: {error}"));

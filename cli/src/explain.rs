@@ -11,7 +11,7 @@ use crate::{
     settings::Settings,
 };
 
-/// Why a job is as it is, for people.
+/// Formats the explanation of a job's state as text.
 pub fn describe(explained: &Explained) -> String {
     let status = &explained.job;
     let mut text = format!(
@@ -71,7 +71,7 @@ pub fn describe(explained: &Explained) -> String {
 /// `picofarm workers`.
 ///
 /// # Errors
-/// The coordinator cannot be reached, or refuses.
+/// Fails if the coordinator cannot be reached, or refuses.
 pub async fn workers(
     what: Option<args::Workers>,
     settings: &Settings,

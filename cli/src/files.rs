@@ -1,5 +1,5 @@
-//! Files that a person names: regular files only, of at most a size. A pipe, a device or a folder
-//! is refused by its name rather than waited for or read for ever.
+//! Reads files named by the user: only regular files up to a maximum size. A pipe, a device or a
+//! folder is rejected by name, because reading it could block or never end.
 
 use std::path::Path;
 
@@ -7,18 +7,19 @@ use picofarm_files::{FileError, Opener};
 
 use crate::error::{CliError, Result, io};
 
-/// Largest file of settings, bytes.
+/// Maximum size of a settings file, in bytes.
 pub const SETTINGS: u64 = 1 << 20;
-/// Largest job file or list of names, bytes: as large as a message to the coordinator may be.
+/// Maximum size of a job file or a list of names, in bytes. Equals the maximum size of a message to
+/// the coordinator.
 pub const LISTS: u64 = 64 << 20;
-/// Largest file of weights, bytes.
+/// Maximum size of a file of weights, in bytes.
 #[cfg(feature = "networks")]
 pub const WEIGHTS: u64 = 64 << 30;
 
 /// Reads a file of at most `most` bytes.
 ///
 /// # Errors
-/// The file cannot be read, is not a regular file, or is larger.
+/// Fails if the file cannot be read, is not a regular file, or is larger.
 pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
     Opener::anywhere().read(path, most).map_err(|e| match e {
         FileError::Io { source, .. } => match source.kind() {
@@ -34,7 +35,7 @@ pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
 /// Reads a text file of at most `most` bytes.
 ///
 /// # Errors
-/// As [`read`]; the file is not UTF-8.
+/// Fails like [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> Result<String> {
     String::from_utf8(read(path, most)?).map_err(|_| {
         CliError::input(format!(

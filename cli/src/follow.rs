@@ -1,4 +1,4 @@
-//! Following a job until it ends: through losses of the connection, and to the verdict.
+//! Follows a job until it ends, across losses of the connection, and shows its verdicts.
 
 use std::time::{Duration, Instant};
 
@@ -14,14 +14,14 @@ use crate::{
     pace::Pace,
 };
 
-/// How long a coordinator may stay away before whoever follows a job gives up.
+/// Time for which a coordinator may be unreachable before following ends.
 const AWAY: Duration = Duration::from_secs(60);
-/// The first wait before it is asked again; the next are twice as long each.
+/// Wait before the first attempt to reconnect. Each further wait is twice as long.
 const FIRST: Duration = Duration::from_millis(250);
-/// The longest.
+/// Maximum wait between attempts.
 const LONGEST: Duration = Duration::from_secs(5);
 
-/// How to show it.
+/// What to show while following.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Show {
     /// Progress and failures.
@@ -30,20 +30,20 @@ pub enum Show {
     Nothing,
 }
 
-/// What is kept from one connection to the next.
+/// State that outlives a connection.
 struct Watching {
     output: Output,
     show: Show,
     meter: Meter,
     pace: Pace,
-    /// The last event that was shown.
+    /// Sequence number of the last shown event.
     seen: u64,
 }
 
-/// Follows `job` until it ends, through losses of the connection.
+/// Follows `job` until it ends, across losses of the connection.
 ///
 /// # Errors
-/// The coordinator refuses, or stays away for a minute (exit code 4).
+/// Fails if the coordinator refuses, or is unreachable for a minute (exit code 4).
 pub async fn follow(
     client: &mut Client,
     job: JobId,
@@ -87,7 +87,7 @@ pub async fn follow(
 /// Waits until a coordinator answers again.
 ///
 /// # Errors
-/// It refuses, or stays away.
+/// Fails if it refuses, or remains unreachable.
 async fn back(client: &Client, job: JobId) -> Result<Client> {
     let since = Instant::now();
     let mut wait = FIRST;
@@ -134,7 +134,7 @@ async fn stream(
     Ok(None)
 }
 
-/// Prints failures that happened since the last look.
+/// Prints failures since the last call.
 async fn failures(client: &mut Client, job: JobId, watching: &mut Watching) -> Result<()> {
     for event in client.events(job, watching.seen, None).await? {
         watching.seen = event.sequence;
@@ -160,7 +160,7 @@ async fn failures(client: &mut Client, job: JobId, watching: &mut Watching) -> R
     Ok(())
 }
 
-/// The exit of a command that followed a job.
+/// Returns the result of a command that followed a job.
 ///
 /// # Errors
 /// Exit code 5 unless every task is done.

@@ -4,7 +4,7 @@ use picofarm_transient::sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100};
 
 use crate::error::{CliError, Result};
 
-/// A subset by its usual name.
+/// A subset with a standard name.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Group {
     Four,
@@ -12,28 +12,29 @@ pub enum Group {
     PerSpot,
 }
 
-/// A subset by its beams.
+/// A subset given by its beams.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Named {
     name: String,
     beams: Vec<u32>,
 }
 
-/// An array to write: `[row][column][bin]` of some beams, or `[spot][row][column][bin]` of each alone.
+/// An array to write: `[row][column][bin]` of some beams together, or `[spot][row][column][bin]` of
+/// separate beams.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wanted {
     /// Name of the array.
     pub array: String,
-    /// The renderer's groups that it takes.
+    /// The renderer's groups that it contains.
     pub groups: Vec<Vec<u32>>,
-    /// It has a spot axis.
+    /// Whether it has a spot axis.
     pub per_spot: bool,
 }
 
-/// Reads `4`, `25` or `per-spot`.
+/// Parses `4`, `25` or `per-spot`.
 ///
 /// # Errors
-/// It is none of them.
+/// Fails for any other text.
 pub fn parse(text: &str) -> Result<Group, String> {
     match text {
         "4" => Ok(Group::Four),
@@ -43,10 +44,10 @@ pub fn parse(text: &str) -> Result<Group, String> {
     }
 }
 
-/// Reads `left=0,5,7`.
+/// Parses `left=0,5,7`.
 ///
 /// # Errors
-/// What is missing or no number.
+/// Returns a message about the missing or invalid part.
 pub fn parse_named(text: &str) -> Result<Named, String> {
     let (name, list) = text
         .split_once('=')
@@ -68,10 +69,10 @@ pub fn parse_named(text: &str) -> Result<Named, String> {
     })
 }
 
-/// The arrays to write for a scene whose laser has `beams` beams.
+/// Returns the arrays to write for a scene with a laser of `beams` beams.
 ///
 /// # Errors
-/// A subset that this laser does not have, or two arrays of one name.
+/// Fails if the laser does not have a subset, or if two arrays have the same name.
 pub fn wanted(groups: &[Group], named: &[Named], beams: usize) -> Result<Vec<Wanted>> {
     let mut all: Vec<Wanted> = vec![];
     let mut add = |wanted: Wanted| {
@@ -112,7 +113,7 @@ pub fn wanted(groups: &[Group], named: &[Named], beams: usize) -> Result<Vec<Wan
     Ok(all)
 }
 
-/// A subset of the 10×10 grid.
+/// Returns a subset of the 10×10 grid.
 fn of_grid(name: &str, spots: &[usize], beams: usize) -> Result<Wanted> {
     if beams != 100 {
         return Err(CliError::input(format!(

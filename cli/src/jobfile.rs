@@ -1,5 +1,5 @@
-//! Job files: reading, and resolving what a submission must pin (furniture,
-//! scene files' content, renderer version, absolute store).
+//! Reads job files and resolves the inputs that a submission must pin: furniture, hashes of scene
+//! files, renderer version, absolute store.
 
 use std::path::Path;
 
@@ -14,7 +14,8 @@ use crate::{
     files,
 };
 
-/// Reads a job file and pins everything a submission needs but the number of scenes of data sets that exist.
+/// Reads a job file and pins everything that a submission needs, except the number of scenes of
+/// existing data sets.
 #[cfg(test)]
 fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
     checked(read_uncounted(path, None, asset_dir)?, path)
@@ -33,7 +34,7 @@ fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<
         CliError::input(format!("{}: {what}", path.display()))
             .hint("`picofarm job init` writes a job file with every field explained")
     };
-    // Read as it stands where it may be, because then errors name the line.
+    // Parsed from the text if possible, because errors then name the line.
     let table: toml::Table = toml::from_str(&text).map_err(|e| failed(&e))?;
     let spec: JobSpec = if scale.is_some() || table.contains_key("scale") {
         let value = serde_json::to_value(&table).map_err(|e| failed(&e))?;
@@ -52,11 +53,13 @@ fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<
     })
 }
 
-/// Reads a job file and pins everything a submission needs. The number of scenes of data sets that exist, where the file
-/// does not say it, is asked of their stores. Of a file that has several sizes, `scale` is meant.
+/// Reads a job file and pins everything that a submission needs. If the file omits the number of
+/// scenes of an existing data set, it is read from the store. `scale` selects one of the file's
+/// sizes.
 ///
 /// # Errors
-/// Input errors that name the file, the field and what was expected; a data set that cannot be opened.
+/// Input errors that name the file, the field and the expected value. Also fails if a data set
+/// cannot be opened.
 pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
     let mut spec = read_uncounted(path, scale, asset_dir)?;
     for stage in &mut spec.stages {
@@ -79,10 +82,11 @@ pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) ->
     checked(spec, path)
 }
 
-/// Pins furniture, file contents, versions and absolute places.
+/// Pins furniture, file contents, versions and absolute locations.
 ///
 /// # Errors
-/// A field out of its limits, a store that cannot be one, a missing file, or furniture that is not installed.
+/// Fails if a field is out of range, a store location is invalid, a file is missing, or furniture
+/// is not installed.
 fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> {
     let several = spec.stages.len() > 1;
     for stage in &mut spec.stages {
@@ -94,12 +98,12 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
             false => e,
         })?;
     }
-    // What reads an import knows its number of scenes only now.
+    // Stages that read an import learn its number of scenes only now.
     spec.resolve()?;
     Ok(spec)
 }
 
-/// The same for the tasks of one stage.
+/// Like `resolve`, for the tasks of one stage.
 ///
 /// # Errors
 /// As [`read_counted`].
@@ -111,7 +115,7 @@ pub fn resolve_task(task: &mut TaskSpec, base: &Path, asset_dir: &Path) -> Resul
     Ok(picofarm_agent::resolve(task, &here)?)
 }
 
-/// The same for one rendering.
+/// Like `resolve_task`, for one rendering.
 ///
 /// # Errors
 /// As [`read_counted`].
@@ -171,13 +175,14 @@ mod tests {
             let text = std::fs::read_to_string(&path).unwrap();
             let midi = text.contains("[scale.midi]").then_some("midi");
             for scale in ["mini", "paper"].into_iter().chain(midi) {
-                // Rooms of furniture need its assets; their kind is all that differs.
+                // Furnished rooms need assets. The test uses primitive rooms; nothing else changes.
                 let dir = tempfile::tempdir().unwrap();
                 let path = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
                 let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
                 let spec = checked(spec, &path).unwrap();
                 let kinds: Vec<&str> = spec.stages.iter().map(|s| s.task.kind()).collect();
-                // The errors of a reconstruction lie beside it; `dataset info` has their means.
+                // The errors of a reconstruction are stored with it, and `dataset info` shows their
+                // means.
                 if !kinds.contains(&"reconstruct") {
                     assert!(kinds.contains(&"evaluate"), "{path:?}");
                     assert_eq!(kinds.last(), Some(&"report"), "{path:?}");
@@ -195,7 +200,7 @@ mod tests {
         let mut networks = 0;
         for file in std::fs::read_dir(&folder).unwrap() {
             let path = file.unwrap().path();
-            // An example of a sweep, not one of the paper's.
+            // This example is a sweep of its own, not an experiment of the paper.
             if path.ends_with("sweep.toml") {
                 continue;
             }
@@ -349,7 +354,7 @@ mod tests {
 
         use super::*;
 
-        /// How many cases; `PICOFARM_FUZZ=n` runs n times as many.
+        /// Number of cases; `PICOFARM_FUZZ=n` runs n times as many.
         fn cases() -> u32 {
             let times = std::env::var("PICOFARM_FUZZ").map_or(1, |n| n.parse().expect("a number"));
             300 * times
@@ -366,7 +371,7 @@ mod tests {
             ]
         }
 
-        /// A value where a field's was, or text where any was.
+        /// Replaces a field's value, or any piece of text.
         fn spoilt() -> impl Strategy<Value = String> {
             let value = prop_oneof![
                 Just("-1".to_owned()),

@@ -242,7 +242,7 @@ fn init(file: Option<&Path>, kind: Option<JobKind>, output: Output) -> Result<()
     Ok(())
 }
 
-/// A name beside `file` that is free: `job-2.toml` for `job.toml`.
+/// Returns an unused file name next to `file`: `job-2.toml` for `job.toml`.
 fn other(file: &Path) -> PathBuf {
     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
     let end = file
@@ -254,7 +254,8 @@ fn other(file: &Path) -> PathBuf {
         .expect("numbers do not end")
 }
 
-/// Marks what `--force` and `--from-stage` ask for. The job is one of its own: the same without would be there already.
+/// Marks the stages selected by `--force` and `--from-stage`. The marks make the job distinct from
+/// the same job without them, which would already exist.
 fn force_stages(spec: &mut JobSpec, all: bool, from: Option<&str>) -> Result<()> {
     let mut forced: Vec<String> = Vec::new();
     if let Some(from) = from
@@ -279,7 +280,7 @@ fn force_stages(spec: &mut JobSpec, all: bool, from: Option<&str>) -> Result<()>
     Ok(())
 }
 
-/// The position of a stage that is given by name or position.
+/// Returns the position of a stage given by name or position.
 async fn position(client: &mut Client, job: JobId, stage: Option<&str>) -> Result<Option<u32>> {
     let Some(stage) = stage else {
         return Ok(None);
@@ -297,9 +298,10 @@ async fn position(client: &mut Client, job: JobId, stage: Option<&str>) -> Resul
     Ok(u32::try_from(at).ok())
 }
 
-/// The last events, in order.
+/// Returns the last events, in order.
 async fn history(client: &mut Client, page: Page) -> Result<Vec<Event>> {
-    // A page of the coordinator's may be shorter than what is asked for: going forward, the last ones are kept.
+    // The coordinator may return a shorter page than requested. This reads forward and retains the
+    // last events.
     let (mut events, mut after) = (Vec::new(), 0);
     let last = page.limit as usize;
     loop {

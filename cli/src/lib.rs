@@ -1,8 +1,8 @@
-//! The commands of the `picofarm` program: every role of the farm, and what people ask of it. The program itself
-//! (`cli/program`) chooses what it is built with; benches (`cli/bench`) are a crate above this one, so that a farm's program
-//! does not carry what only comparisons need.
+//! The commands of the `picofarm` program: every role of the farm, and the users' commands. The
+//! program itself (`cli/program`) selects the features. Benches (`cli/bench`) are a crate above
+//! this one, so that the program of a farm does not contain code that only comparisons need.
 //!
-//! Only these two use this library, so what it shows them is not documented item by item.
+//! Only these two crates use this library, so its public items are not all documented.
 #![allow(missing_docs)]
 
 pub mod args;
@@ -68,16 +68,17 @@ use crate::{
     traces::Traces,
 };
 
-/// What runs `picofarm bench …`, where the program has it.
+/// Runs `picofarm bench …`, if the program has it.
 pub type Bench = for<'a> fn(
     args::Bench,
     &'a settings::Settings,
     Output,
 ) -> Pin<Box<dyn Future<Output = Result<()>> + Send + 'a>>;
 
-/// Runs the whole program, from its command line to its exit code. `version` is the text of `--version`.
+/// Runs the whole program, from its command line to its exit code. `version` is the text of
+/// `--version`.
 pub fn run_program(version: &'static str, bench: Option<Bench>) -> ExitCode {
-    // One provider of cryptography for everything in this program that speaks TLS.
+    // A single cryptography provider for all TLS code of this program.
     rustls::crypto::ring::default_provider()
         .install_default()
         .expect("nothing has chosen one before main");
@@ -92,7 +93,7 @@ pub fn run_program(version: &'static str, bench: Option<Bench>) -> ExitCode {
     }
 }
 
-/// Prints help, the version, or what is wrong with the arguments.
+/// Prints help, the version, or an error about the arguments.
 fn usage(asked: &clap::Error) -> ExitCode {
     let printed = asked.print().and_then(|()| std::io::stdout().flush());
     match printed {
@@ -132,7 +133,7 @@ fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
     ended
 }
 
-/// A worker's process of `up` or `demo`: its parent has resolved the settings.
+/// Runs a worker process of `up` or `demo`. Its parent has resolved the settings.
 fn local_worker() -> Result<()> {
     let order = local::received()?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -236,9 +237,10 @@ fn show_settings(resolved: &Resolved, output: Output) {
     output.result(&document, || table(&rows));
 }
 
-/// Log lines go to stderr, those of tasks also to their coordinator, and spans to a collector, if one is named.
+/// Sends log lines to stderr, those of tasks also to their coordinator, and spans to a trace
+/// collector, if configured.
 fn log(filter: &str, traces: Option<&Traces>) -> Result<logging::Flush> {
-    // A driver that has nothing to list is no error.
+    // A driver without devices is not an error.
     let filter = match filter.contains("wgpu") {
         true => filter.to_owned(),
         false => format!("{filter},wgpu_hal=off"),
@@ -249,7 +251,7 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<logging::Flush> {
     })?;
     let started = logging::LogLines::start(std::io::stderr());
     let (lines, last_lines) = started.map_err(|e| error::io("cannot start a thread", &e))?;
-    // Without colours: what is written is escaped as a whole, since lines may quote what others wrote.
+    // Without colours, because the output is escaped as a whole: lines may quote text from others.
     let stderr = tracing_subscriber::fmt::layer()
         .with_writer(move || output::Escaped(lines.clone()))
         .with_ansi(false)

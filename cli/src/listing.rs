@@ -1,4 +1,4 @@
-//! `picofarm job list`: a page of the jobs there are.
+//! `picofarm job list`: shows a page of the jobs.
 
 use picofarm_proto::{
     model::{JobState, JobSummary},
@@ -24,7 +24,7 @@ impl From<ListedState> for JobState {
     }
 }
 
-/// Shows the jobs that `ask` asks for, and how to see more of them.
+/// Shows the jobs selected by `ask`, and how to see more of them.
 pub async fn run(client: &mut Client, ask: &Listing<'_>, output: Output) -> Result<()> {
     let (jobs, next) = client.list(ask).await?;
     output.result(&json!({"jobs": jobs, "next_page": next}), || {

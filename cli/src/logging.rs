@@ -1,8 +1,8 @@
 //! Log lines on stderr, written by a thread of their own.
 //!
-//! Whoever reads stderr may stop reading: a pipe that is full would hold up every thread that logs.
-//! So lines wait in a queue with a bound. A line that finds no room is dropped and counted, and the
-//! next line that does says how many were dropped.
+//! The reader of stderr may stop reading, and a full pipe would block every thread that logs. Lines
+//! therefore wait in a bounded queue. A line that does not fit is dropped and counted, and the next
+//! line that fits is preceded by the number of dropped lines.
 
 use std::{
     collections::VecDeque,
@@ -11,16 +11,16 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Bytes that may wait.
+/// Maximum size of the queue, in bytes.
 const ROOM: usize = 4 << 20;
-/// How long the last lines may take when the program ends.
+/// Time limit for writing the last lines when the program ends.
 const LAST_LINES: Duration = Duration::from_secs(1);
 
-/// Takes log lines, one a call, and never blocks.
+/// Accepts log lines, one per call, and never blocks.
 #[derive(Clone)]
 pub struct LogLines(Arc<Shared>);
 
-/// Writes what waits when it is dropped, unless nobody reads.
+/// On drop, writes the queued lines, unless nobody reads them.
 pub struct Flush(LogLines);
 
 #[derive(Default)]
@@ -32,9 +32,9 @@ struct Shared {
 #[derive(Default)]
 struct Queue {
     lines: VecDeque<Vec<u8>>,
-    /// Of the lines, and of those that are being written.
+    /// Size of the queued lines and of those being written, in bytes.
     bytes: usize,
-    /// Lines that found no room since the last that did.
+    /// Number of lines dropped since the last line that fitted.
     dropped: u64,
     writing: bool,
 }
@@ -45,7 +45,7 @@ impl Queue {
         self.lines.push_back(line);
     }
 
-    /// Takes a line, or counts it.
+    /// Queues a line, or counts it as dropped.
     fn offer(&mut self, line: &[u8]) {
         if self.bytes + line.len() > ROOM {
             self.dropped += 1;
@@ -86,7 +86,7 @@ impl Shared {
             }
             queue.writing = true;
             drop(queue);
-            // A stderr that is closed or full takes no line that would say so.
+            // If stderr is closed or full, there is no place to report it.
             let _ = to.write_all(&lines).and_then(|()| to.flush());
             queue = self.lock();
             queue.writing = false;
@@ -97,10 +97,10 @@ impl Shared {
 }
 
 impl LogLines {
-    /// Lines for `to`, which a new thread writes.
+    /// Starts a thread that writes log lines to `to`.
     ///
     /// # Errors
-    /// The system gives no thread.
+    /// Fails if the system cannot start a thread.
     pub fn start(to: impl Write + Send + 'static) -> io::Result<(Self, Flush)> {
         let lines = Self(Arc::default());
         let shared = Arc::clone(&lines.0);
@@ -145,7 +145,7 @@ mod tests {
 
     use super::*;
 
-    /// Takes a piece for each `()` that it is sent.
+    /// Writer that accepts one piece for each `()` that it receives.
     struct Slow(mpsc::Receiver<()>, mpsc::Sender<Vec<u8>>);
 
     impl Write for Slow {

@@ -1,4 +1,4 @@
-//! `picofarm model …`: the models that a store keeps.
+//! `picofarm model …`: the models of a store.
 
 mod care;
 #[cfg(feature = "networks")]
@@ -26,7 +26,7 @@ use crate::{
     output::{Output, bytes, table},
 };
 
-/// The object of a model that holds its weights.
+/// Name of the object with a model's weights.
 pub(crate) const WEIGHTS: &str = "weights.safetensors";
 
 pub async fn run(command: Command, output: Output) -> Result<()> {
@@ -87,7 +87,7 @@ async fn list(store: &str, output: Output) -> Result<()> {
     for name in models.names().await.map_err(failed)? {
         let manifest = models.look(&name).await.map_err(failed)?;
         let checkpoints = models.checkpoints(&name).await.map_err(failed)?;
-        // A folder may hold evaluations, notes or a killed training's objects alone.
+        // A folder may contain only evaluations, notes, or objects of a killed training.
         if manifest.is_some() || !checkpoints.is_empty() {
             let verdict = match &manifest {
                 Some(manifest) => Some(verdict(&models, manifest).await?),
@@ -143,7 +143,7 @@ async fn list(store: &str, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// What a model is worth beside trivial answers, by its evaluation on the most scenes.
+/// Compares a model with the trivial baselines, by its evaluation on the most scenes.
 async fn verdict(models: &Models, manifest: &ModelManifest) -> Result<Verdict> {
     let mut evaluations = models.evaluations(&manifest.name).await.map_err(failed)?;
     let sha256 = manifest.sha256();
@@ -157,7 +157,7 @@ async fn verdict(models: &Models, manifest: &ModelManifest) -> Result<Verdict> {
     })
 }
 
-/// A store without models: where they were looked for.
+/// Returns the error for a store without models, with the searched location.
 pub(super) fn nothing(store: &str) -> CliError {
     let local = !store.contains("://");
     let whole = match local {
@@ -272,7 +272,7 @@ async fn export(store: &str, name: &str, out: &Path, output: Output) -> Result<(
     };
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty());
     let folder = folder.unwrap_or(Path::new("."));
-    // Whole or not at all, and never over another file.
+    // The file is written completely or not at all, and never replaces another file.
     let mut file = tempfile::NamedTempFile::new_in(folder).map_err(failed)?;
     file.write_all(&weights).map_err(failed)?;
     file.as_file().sync_all().map_err(failed)?;
@@ -285,13 +285,13 @@ async fn export(store: &str, name: &str, out: &Path, output: Output) -> Result<(
     Ok(())
 }
 
-/// Most steps that any training under the name has saved.
+/// Returns the largest number of steps that any training under the name has saved.
 fn furthest(checkpoints: &[Checkpoint]) -> Option<u64> {
     let finished = checkpoints.iter().filter(|c| c.finished);
     finished.map(|c| c.step).max()
 }
 
-/// The numbers of a model's figures, in a line.
+/// Formats a model's numeric figures in one line.
 fn figures(metrics: &Value) -> String {
     let mut text = Vec::new();
     for (name, value) in metrics.as_object().into_iter().flatten() {

@@ -1,4 +1,5 @@
-//! What a command prints: text for people or JSON for programs, and progress on a terminal or as lines.
+//! Output of commands: text for people or JSON for programs, and progress as a bar on a terminal or
+//! as lines.
 
 use std::{
     io::{ErrorKind, IsTerminal, Write},
@@ -13,23 +14,23 @@ use serde::Serialize;
 
 use crate::error::{CliError, Result, io};
 
-/// Why the first write to stdout that failed did.
+/// The error of the first failed write to stdout.
 static UNPRINTED: OnceLock<std::io::Error> = OnceLock::new();
 
-/// Writes to stdout. A failure is the command's, which ends with [`printed`].
+/// Writes to stdout. The command reports a failure at its end, by calling [`printed`].
 pub fn print(bytes: &[u8]) {
     let mut stdout = std::io::stdout().lock();
     if let Err(error) = stdout.write_all(bytes).and_then(|()| stdout.flush()) {
-        // Only the first is told, and it is likely the cause of the others.
+        // Only the first error is reported, because it is probably the cause of the others.
         let _ = UNPRINTED.set(error);
     }
 }
 
-/// Whether everything that was printed has reached stdout.
+/// Checks that all output has reached stdout.
 ///
 /// # Errors
-/// Something has not, e.g. because the disk is full. A closed pipe (`| head`) is not an error worth
-/// a message.
+/// Fails if some output was lost, e.g. because the disk is full. A closed pipe (`| head`) is not
+/// reported.
 pub fn printed() -> Result<()> {
     match UNPRINTED.get() {
         Some(error) if error.kind() != ErrorKind::BrokenPipe => Err(unprinted(error)),
@@ -44,20 +45,21 @@ fn unprinted(error: &std::io::Error) -> CliError {
     }
 }
 
-/// Writes a line to stderr. There is nobody to tell if that fails, and the work goes on.
+/// Writes a line to stderr. A failure is ignored, because it cannot be reported and the work
+/// continues.
 pub fn tell(line: impl std::fmt::Display) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// Where results go.
+/// Destination and format of results.
 #[derive(Clone, Copy)]
 pub struct Output {
     pub json: bool,
 }
 
 impl Output {
-    /// Prints a result: `text` for people, or the value as JSON. Neither reaches a terminal with control characters; text
-    /// from elsewhere goes through [`show::line`] before it becomes part of a line.
+    /// Prints a result: `text` for people, or the value as JSON. Control characters are escaped in
+    /// both. Text from others must pass through [`show::line`] before it becomes part of a line.
     pub fn result(&self, value: &impl Serialize, text: impl FnOnce() -> String) {
         let shown = if self.json {
             let document = serde_json::to_string(value).expect("results are plain data");
@@ -68,7 +70,8 @@ impl Output {
         print(format!("{}\n", shown.trim_end()).as_bytes());
     }
 
-    /// A warning on stderr, which begins with "warning: "; an object {"warning": …} with --json.
+    /// Prints a warning on stderr: a line that begins with "warning: ", or an object {"warning": …}
+    /// with --json.
     pub fn warn(&self, text: impl AsRef<str>) {
         let text = text.as_ref();
         if self.json {
@@ -80,7 +83,7 @@ impl Output {
         }
     }
 
-    /// A remark for people on stderr; silent with --json.
+    /// Prints a remark on stderr; does nothing with --json.
     pub fn say(&self, text: impl AsRef<str>) {
         if !self.json {
             tell(show::lines(text.as_ref()));
@@ -88,7 +91,7 @@ impl Output {
     }
 }
 
-/// A writer of log lines, one a call, that lets no control character through.
+/// A writer of log lines, one per call, that escapes control characters.
 pub struct Escaped<W>(pub W);
 
 impl<W: Write> Write for Escaped<W> {
@@ -108,16 +111,17 @@ impl<W: Write> Write for Escaped<W> {
     }
 }
 
-/// Progress of one thing: a bar on a terminal, a line now and then elsewhere.
+/// Progress of one operation: a bar on a terminal, a line at intervals elsewhere.
 pub struct Meter {
     bar: Option<ProgressBar>,
     quiet: bool,
     last: Option<(Instant, String)>,
-    /// Columns of the terminal that the bar is fitted to.
+    /// Number of terminal columns that the bar is fitted to.
     columns: u16,
 }
 
-/// How a bar and its message look on a terminal of so many columns. The message is cut to what is left.
+/// Returns the layout of bar and message for a terminal with `columns` columns. The message is cut
+/// to the remaining width.
 fn template(columns: u16) -> &'static str {
     match columns {
         0..60 => "{percent:>3} % {wide_msg}",
@@ -145,8 +149,8 @@ impl Meter {
         meter
     }
 
-    /// Fits the bar to the terminal, which may have been made narrower since. A line that is wider than the terminal would
-    /// be wrapped, and each redraw would leave a piece of it behind.
+    /// Fits the bar to the current width of the terminal. A line wider than the terminal would
+    /// wrap, and each redraw would leave a piece of it behind.
     fn fit(&mut self) {
         let Some(bar) = &self.bar else { return };
         let (_, columns) = Term::stderr().size();
@@ -196,7 +200,7 @@ impl Meter {
     }
 }
 
-/// Plain text columns, aligned; the first row is the header. A cell is one line, whatever is in it.
+/// Formats aligned text columns; the first row is the header. Each cell is escaped to one line.
 pub fn table(rows: &[Vec<String>]) -> String {
     let cells = |row: &Vec<String>| {
         row.iter()
@@ -225,7 +229,7 @@ pub fn table(rows: &[Vec<String>]) -> String {
         .collect()
 }
 
-/// "1.5 s", "2 min 05 s", "3 h 10 min", "42 days", "more than 1,000 years".
+/// Formats a duration: "1.5 s", "2 min 05 s", "3 h 10 min", "42 days", "more than 1,000 years".
 pub fn duration(seconds: f64) -> String {
     const DAY: u64 = 86_400;
     const THOUSAND_YEARS: u64 = 365_250 * DAY;
@@ -250,7 +254,7 @@ pub fn program() -> String {
     }
 }
 
-/// "512 B", "20.1 MB", "1.9 TB" (powers of ten).
+/// Formats a size with powers of ten: "512 B", "20.1 MB", "1.9 TB".
 pub fn bytes(n: u64) -> String {
     let mut value = n as f64;
     for unit in ["B", "kB", "MB", "GB"] {
@@ -291,7 +295,7 @@ mod tests {
             });
             assert!(bar < 60 || columns > bar + 20, "{columns}: {template}");
             assert!(bar + 20 <= columns.max(20), "{columns}: {template}");
-            // Without it, a message would be wrapped.
+            // Without it, a message would wrap.
             assert!(template.ends_with("{wide_msg}"));
             ProgressStyle::with_template(template).unwrap();
         }

@@ -1,6 +1,6 @@
-//! How far a job is, in a line: which stage runs, its tasks, and how long the rest of that stage will take. Stages take
-//! times of their own (a training an hour, a thousand small scenes a minute), so nothing is said of a stage that has not
-//! begun.
+//! Describes the progress of a job in one line: the current stage, its tasks, and its remaining
+//! time. Stages differ greatly in speed (an hour per training, a thousand small scenes a minute),
+//! so there is no forecast for a stage that has not begun.
 
 use std::{collections::HashMap, time::Instant};
 
@@ -8,18 +8,19 @@ use picofarm_proto::model::{JobState, JobStatus, StageState, StageStatus};
 
 use crate::output::duration;
 
-/// Seconds for which a stage is watched before its end is forecast.
+/// Time for which a stage is observed before its end is forecast, in seconds.
 const WATCHED_S: f64 = 2.0;
 
-/// The pace of stages since we began to watch.
+/// The pace of stages since the start of observation.
 #[derive(Default)]
 pub struct Pace {
-    /// When a stage was first seen, and what of it was done then, in tasks.
+    /// For each stage: when it was first seen, and the number of tasks done then.
     began: HashMap<usize, (Instant, f64)>,
 }
 
 impl Pace {
-    /// The share of the job that is done, in [0, 1] (each stage counts the same), and a line about it.
+    /// Returns the finished fraction of the job in [0, 1], where each stage counts equally, and a
+    /// line about it.
     pub fn describe(&mut self, s: &JobStatus, now: Instant) -> (f64, String) {
         let several = s.stages.len() > 1;
         let done: Vec<f64> = (0..s.stages.len()).map(|at| done(s, at)).collect();
@@ -27,14 +28,14 @@ impl Pace {
         let shares: f64 = shares.map(|(stage, done)| done / total(stage)).sum();
         let mut fraction = shares / s.stages.len().max(1) as f64;
         if s.state == JobState::Active {
-            // Whole only when it has ended.
+            // The fraction is 1 only when the job has ended.
             fraction = fraction.min(0.999);
         }
         let mut text = Vec::new();
         let left = |at: &usize| total(&s.stages[*at]) - done[*at];
         let open = (0..s.stages.len()).filter(|at| s.stages[*at].state == StageState::Open);
         let open: Vec<usize> = open.collect();
-        // A stage with a task in hand comes before one that waits for a worker.
+        // A stage with a running task precedes one that waits for a worker.
         let runs = |at: &usize| s.running.iter().any(|r| r.stage as usize == *at);
         let now_at = open
             .iter()
@@ -72,7 +73,7 @@ impl Pace {
         if let [only] = &s.running[..]
             && !only.text.is_empty()
         {
-            // What a task says belongs to its own stage.
+            // A task's message belongs to its own stage.
             let other = s.stages.get(only.stage as usize);
             let other = other.filter(|_| now_at != Some(only.stage as usize));
             text.push(match other {
@@ -83,7 +84,7 @@ impl Pace {
         (fraction, text.join(", "))
     }
 
-    /// Seconds that the rest of a stage takes at its pace, where that is known.
+    /// Returns the remaining seconds of a stage at its pace, if known.
     fn left(&mut self, at: usize, s: &JobStatus, done: f64, now: Instant) -> Option<f64> {
         let (since, first) = *self.began.entry(at).or_insert((now, done));
         let elapsed = now.duration_since(since).as_secs_f64();
@@ -93,7 +94,7 @@ impl Pace {
     }
 }
 
-/// Tasks of a stage that are over, with the shares of those that run.
+/// Returns the number of finished tasks of a stage, plus the fractions of running ones.
 fn done(s: &JobStatus, at: usize) -> f64 {
     let of = s.running.iter().filter(|r| r.stage as usize == at);
     let running: f64 = of.map(|r| f64::from(r.fraction)).sum();
@@ -226,7 +227,7 @@ mod tests {
             text,
             "0/1 tasks, about 3 min 00 s left, 1 worker, epoch 2 of 10"
         );
-        // It stands: no forecast is made of nothing.
+        // The stage makes no progress, so there is no forecast.
         let mut still = Pace::default();
         still.describe(&at(0.25), start);
         let (_, text) = still.describe(&at(0.25), start + Duration::from_secs(60));

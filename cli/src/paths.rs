@@ -1,14 +1,15 @@
-//! Paths and places as people type them: `..` and `.` mean what they mean in a shell. (Jobs on the wire must name places
-//! without them: there they would mean another folder to each machine.)
+//! Paths and locations typed by users: `..` and `.` are resolved as in a shell. (Jobs on the wire
+//! must not contain them, because each machine would resolve them to another folder.)
 
 use std::path::Path;
 
 use picofarm_agent::absolute;
 
-/// Reads the folder or URL of a store, a data set or what lies in one. What climbs is resolved; the rest stays as typed.
+/// Parses the folder or URL of a store, of a data set or of something in one. Resolves `..`; the
+/// rest stays as typed.
 ///
 /// # Errors
-/// A message that says why it can be none.
+/// Returns a message about why the text is not a location.
 pub fn place(text: &str) -> Result<String, String> {
     picofarm_dataset::check_location(text).map_err(|e| e.to_string())?;
     let mut parts = text.trim_end_matches('/').split('/');

@@ -1,4 +1,4 @@
-//! Pictures and pages as files.
+//! Writes pictures and pages to files.
 
 use picofarm_figures::Canvas;
 
@@ -12,23 +12,23 @@ fn cannot_write(path: &std::path::Path, error: impl std::fmt::Display) -> CliErr
     .hint("check the folder and the free space, then run the same command again")
 }
 
-/// Writes a picture as PNG, whole or not at all.
+/// Writes a picture as PNG, completely or not at all.
 ///
 /// # Errors
-/// The file cannot be written.
+/// Fails if the file cannot be written.
 pub fn save(canvas: &Canvas, path: &std::path::Path) -> Result<()> {
     write_atomically(path, &canvas.png())
 }
 
-/// Writes a file whole or not at all.
+/// Writes a file completely or not at all.
 pub(crate) fn write_atomically(path: &std::path::Path, bytes: &[u8]) -> Result<()> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    // Another process may write the same file now.
+    // Another process may write the same file at the same time.
     let partial = path.with_file_name(format!(".{name}.{}.partial", uuid::Uuid::new_v4()));
     std::fs::write(&partial, bytes)
         .and_then(|()| std::fs::rename(&partial, path))
         .map_err(|e| {
-            // The partial file is ours; nothing is lost if it cannot be removed.
+            // The partial file belongs to this process; failing to remove it loses nothing.
             let _ = std::fs::remove_file(&partial);
             cannot_write(path, e)
         })

@@ -1,5 +1,6 @@
-//! Asks the stores of a job before it is sent: whether they can be written to, their identities, and which results they
-//! have already. Only workers need to reach them, so the answers are remarks.
+//! Checks the stores of a job before submission: whether they are writable, their identities, and
+//! which results they already have. Only workers need access to the stores, so failures are only
+//! remarks.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -13,10 +14,11 @@ use picofarm_proto::{
 
 use crate::output::Output;
 
-/// Longest that a store is waited for.
+/// Timeout of a check.
 const WITHIN: Duration = Duration::from_secs(8);
 
-/// Says of each store that the job writes to and that cannot be written to from here, why not.
+/// Warns about each output store of the job that cannot be written from this machine, with the
+/// reason.
 pub async fn warn_of_stores(spec: &JobSpec, output: Output) {
     let results = spec.stages.iter().map(|stage| stage.task.results());
     let stores: BTreeSet<String> = results.map(|results| results.store.to_owned()).collect();
@@ -32,16 +34,17 @@ pub async fn warn_of_stores(spec: &JobSpec, output: Output) {
     }
 }
 
-/// Whether stores without an identity are given one.
+/// Whether stores without an identity receive one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Identity {
-    /// Those that the job writes to are: it is submitted.
+    /// Create one in the job's output stores, because the job is submitted.
     Create,
-    /// None is: the job is only planned.
+    /// Create none, because the job is only planned.
     Read,
 }
 
-/// Records the identities of the stores that this machine reaches in the job, so that its workers use no others.
+/// Records the identities of the stores that this machine reaches in the job, so that its workers
+/// use no others.
 pub async fn identify(spec: &mut JobSpec, identity: Identity, output: Output) {
     let written = spec.stages.iter().map(|stage| stage.task.results().store);
     let written: BTreeSet<String> = written
@@ -87,7 +90,7 @@ async fn identity_of(place: &str, create: bool) -> Result<Option<String>, String
     found.await.map_err(|e| e.to_string())
 }
 
-/// Manifests of a data set that are read to see whether they are of these settings.
+/// Number of manifests of a data set that are read to check its settings.
 const LOOKED_AT: usize = 8;
 
 /// Counts in a plan the scenes that lie in their store although the coordinator knows nothing of them: workers take over those
@@ -98,7 +101,7 @@ pub async fn there(spec: &JobSpec, plan: &mut JobPlan) -> Vec<String> {
         .filter(|(stage, planned)| planned.run > 0 && !stage.force)
         .map(async |(stage, planned)| {
             let found = tokio::time::timeout(WITHIN, scenes_of(stage, planned.total)).await;
-            // A store that cannot be read from here is a worker's to read.
+            // A store that cannot be read from this machine may be readable by workers.
             let (place, [there, looked, equal]) = found.ok()?.ok()??;
             if there <= planned.reuse || equal == 0 {
                 return None;
@@ -130,8 +133,8 @@ pub async fn there(spec: &JobSpec, plan: &mut JobPlan) -> Vec<String> {
     found.into_iter().flatten().collect()
 }
 
-/// Where a stage's scenes are, how many are there, how many were looked at, and how many of those are of its settings; `None`
-/// for stages whose results are no scenes.
+/// Returns the location of a stage's scenes, and three counts: existing scenes, examined scenes,
+/// and examined scenes with the stage's settings. `None` if the stage's results are not scenes.
 async fn scenes_of(
     stage: &StageSpec,
     total: u64,

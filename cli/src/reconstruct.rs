@@ -1,4 +1,4 @@
-//! `picofarm reconstruct`: one scene file in 3D, without a farm.
+//! `picofarm reconstruct`: reconstructs one scene file without a farm.
 
 mod mlp;
 mod orbit;
@@ -43,12 +43,12 @@ use crate::{
     roles, signals,
 };
 
-/// Pixels a side of a novel view.
+/// Width and height of a novel view, in pixels.
 const VIEW_SIDE: u32 = 128;
-/// Novel views on the circle, before those are left out that stand in something.
+/// Number of novel views on the circle, before those inside an object are removed.
 const AROUND: usize = 24;
 
-/// What was made, and how long each part took.
+/// The result, and the time of each part.
 struct Made {
     reconstructed: Reconstructed,
     mesh: Surface,
@@ -62,7 +62,7 @@ struct Made {
 /// `reconstruct`.
 ///
 /// # Errors
-/// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
+/// Fails on an unusable scene or argument, too little memory, a folder in use, or an interruption.
 pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     mlp::check(&args)?;
     check_networks(&args)?;
@@ -111,7 +111,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// Refuses a grid that does not fit into memory, before anything is rendered for it.
+/// Rejects a grid that does not fit into memory, before anything is rendered for it.
 fn check_memory(args: &Reconstruct, scene: &Scene, nodes: u32) -> Result<()> {
     let i = &scene.camera.intrinsics;
     let shape = Shape {
@@ -155,7 +155,7 @@ fn make(
     let settings = Settings {
         nodes,
         planes: !args.no_planes && args.field == FieldArg::Grid,
-        // Networks take the grid's box and evidence; they learn from shadows themselves.
+        // Networks use the grid's box and evidence, but learn from shadows themselves.
         shadows: match args.field {
             FieldArg::Grid => Settings::default().shadows,
             FieldArg::Mlp => Shadows::Carve,
@@ -213,7 +213,7 @@ fn make(
     })
 }
 
-/// The grid.
+/// Fits the grid.
 fn fit(measured: Measured, settings: Settings, watch: &Watch) -> Result<Reconstructed> {
     let mut reconstruction = Reconstruction::begin(measured, settings, watch).map_err(refused)?;
     match reconstruction.run(watch).map_err(refused)? {
@@ -222,7 +222,7 @@ fn fit(measured: Measured, settings: Settings, watch: &Watch) -> Result<Reconstr
     }
 }
 
-/// Times and masks, and what is to be said of predictions.
+/// Returns times and masks, and the quality of predictions, if used.
 fn measure(
     args: &Reconstruct,
     scene: &Scene,
@@ -256,7 +256,7 @@ fn measure(
     Ok((measured, None))
 }
 
-/// The detector of captures: photon noise and ambient light, an ideal pulse.
+/// Returns the detector for captures: photon noise and ambient light, with an ideal pulse.
 fn sensor(args: &Reconstruct) -> Option<Sensor> {
     args.detector.photons.map(|photons| Sensor {
         pulse: Pulse::None {},
@@ -267,14 +267,14 @@ fn sensor(args: &Reconstruct) -> Option<Sensor> {
     })
 }
 
-/// Refuses a render that does not fit into memory.
+/// Rejects a render that does not fit into memory.
 fn fits_memory(settings: &CaptureSettings, scene: &Scene, threads: usize) -> Result<()> {
     let size = picofarm_agent::scene_size(scene);
     picofarm_agent::check_memory(&settings.render_settings(), size, threads)
         .map_err(|e| CliError::new(Code::Resource, e))
 }
 
-/// Refuses options of predictions where times come from elsewhere.
+/// Rejects options for predictions if times have another source.
 fn check_networks(args: &Reconstruct) -> Result<()> {
     let given = &args.networks;
     if args.spots_from != SpotsFrom::Captures && args.detector.photons.is_some() {
@@ -311,7 +311,8 @@ fn refused(e: ReconstructError) -> CliError {
     }
 }
 
-/// What metrics.json holds: the same bytes for the same scene and arguments, so no times.
+/// Returns the contents of metrics.json. They contain no run times, so that the same scene and
+/// arguments give the same bytes.
 fn metrics(
     args: &Reconstruct,
     scene: &Scene,

@@ -1,4 +1,5 @@
-//! `picofarm scene render` and `picofarm scene plan`: one scene file on this machine, without a farm.
+//! `picofarm scene render` and `picofarm scene plan`: one scene file on this machine, without a
+//! farm.
 
 use std::{
     path::Path,
@@ -34,7 +35,7 @@ use crate::{
     roles, signals,
 };
 
-/// Shows progress; a cancelled token stops the render.
+/// Shows progress. A cancelled token stops the render.
 struct Watcher {
     done: AtomicU32,
     meter: Mutex<Meter>,
@@ -53,10 +54,10 @@ impl Progress for Watcher {
     }
 }
 
-/// Samples of a render that time alone bounds: more than any takes.
+/// Maximum samples of a render that only time limits: more than any render reaches.
 const MOST_SAMPLES: u32 = 1 << 20;
 
-/// A scene and how it is rendered.
+/// A scene and its render settings.
 struct Order {
     scene: Scene,
     settings: Settings,
@@ -86,7 +87,7 @@ impl Order {
                 .map_err(|(at, what)| CliError::input(format!("--wavelengths-nm{at}: {what}")))?,
             ..RenderSettings::default()
         };
-        // As in a job: one place knows the ranges.
+        // Checked as in a job, so that the ranges are defined in one place.
         asked.check().map_err(|e| {
             let option = e.field.trim_start_matches("render.");
             let option = option.replace(['_', '.'], "-");
@@ -133,12 +134,12 @@ impl Order {
         picofarm_agent::scene_size(&self.scene)
     }
 
-    /// Bytes that the render takes at most.
+    /// Returns the maximum memory of the render, in bytes.
     fn memory(&self) -> u64 {
         picofarm_agent::render_bytes(&self.settings, self.size(), self.threads)
     }
 
-    /// Whether that is here.
+    /// Checks that this memory is available.
     fn fits(&self) -> Result<(), String> {
         picofarm_agent::check_memory(&self.settings, self.size(), self.threads)
     }
@@ -147,12 +148,12 @@ impl Order {
 /// `scene render`.
 ///
 /// # Errors
-/// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
+/// Fails on an unusable scene or argument, too little memory, a folder in use, or an interruption.
 pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     free_folder(&args.out)?;
     let mut order = Order::new(&args.render, args.split)?;
     if args.seconds.is_some() && args.render.error.is_none() && args.render.samples.is_none() {
-        // Time alone bounds it.
+        // Only time limits the render.
         order.settings.budget = Budget::Samples(MOST_SAMPLES);
     }
     order.fits().map_err(|e| CliError::new(Code::Resource, e))?;
@@ -187,7 +188,7 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     let seconds = start.elapsed().as_secs_f64();
     let beside = beside(&mut rendered, &order);
     if args.seconds.is_some() {
-        // What was done, so that it can be done again.
+        // Records the samples actually used, so that the render can be repeated.
         order.settings.budget = Budget::Samples(rendered.error.samples);
     }
     write(&args.out, &order, &rendered, &beside)?;
@@ -217,7 +218,7 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
 /// `scene plan`.
 ///
 /// # Errors
-/// A scene or arguments that cannot be used.
+/// Fails on an unusable scene or argument.
 pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
     let order = Order::new(&args.render, false)?;
     let memory = order.memory();
@@ -288,10 +289,10 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// Passes that classes of paths are judged by.
+/// Number of passes for estimating the variance of path classes.
 const PASSES: u32 = 64;
 
-/// Which paths carry the variance, as a table.
+/// Formats the variance by path class as a table.
 fn carried(asked: bool, classes: &[ClassVariance]) -> String {
     if !asked {
         return String::new();
@@ -312,7 +313,7 @@ fn carried(asked: bool, classes: &[ClassVariance]) -> String {
     text
 }
 
-/// The plan of a render that the size alone decides: it does not fit, so nothing is measured for it.
+/// Prints the plan of a render that does not fit into memory. Nothing is measured for it.
 fn too_large(order: &Order, memory: u64, what: &str, output: Output) -> Result<()> {
     let ((width, height), _) = order.size();
     output.result(
@@ -326,7 +327,7 @@ fn too_large(order: &Order, memory: u64, what: &str, output: Output) -> Result<(
     Ok(())
 }
 
-/// The renderer's decisions, one a line.
+/// Formats the renderer's decisions, one per line.
 fn decided(plan: &picofarm_transient::Plan) -> String {
     let strategies = plan.strategies.iter().map(|line| format!("  {line}\n"));
     let approximations = plan.approximations.iter();
@@ -335,8 +336,7 @@ fn decided(plan: &picofarm_transient::Plan) -> String {
         .collect()
 }
 
-/// What is wrong with scene or gate, one a line.
-/// Returns a line for each thing that was changed or left out while the scene was read.
+/// Returns a line for each change or omission made while the scene was read.
 fn noted(scene: &Scene) -> String {
     let notes = scene.provenance.notes.iter();
     let read = notes.filter_map(|(key, note)| Some((key.strip_prefix("import.")?, note)));
@@ -349,10 +349,10 @@ fn warned(warnings: &[String]) -> String {
     lines.collect()
 }
 
-/// Refuses early what the writer would refuse after the render.
+/// Rejects early a folder that the writer would reject after the render.
 ///
 /// # Errors
-/// The folder is not empty, or cannot be looked into.
+/// Fails if the folder is not empty, or cannot be read.
 pub fn free_folder(out: &Path) -> Result<()> {
     let taken = match std::fs::read_dir(out) {
         Ok(mut entries) => entries.next().is_some(),
@@ -368,7 +368,7 @@ pub fn free_folder(out: &Path) -> Result<()> {
     Ok(())
 }
 
-/// A histogram beside the main one.
+/// A histogram in addition to the main one.
 struct Beside {
     array: String,
     per_spot: bool,

@@ -25,25 +25,25 @@ use crate::{
     stored::StoreReader,
 };
 
-/// Cores that this process may use.
+/// Returns the number of cores that this process may use.
 pub fn cores() -> usize {
     picofarm_agent::cores()
 }
 
-/// Whom a coordinator lets in, and how much they may ask of it.
+/// Access rules and limits of a coordinator.
 #[derive(Default)]
 pub struct Guarded {
     access: Access,
     quotas: Quotas,
     connections: Connections,
-    /// Of the process, MiB.
+    /// Memory limit of the process, in MiB.
     memory_mib: Option<u64>,
-    /// How long the audit log is kept.
+    /// Number of days for which the audit log is retained.
     audit_days: Option<u32>,
 }
 
 impl Guarded {
-    /// As the options say.
+    /// Creates the rules from the options.
     pub fn of(args: &args::Guard) -> Self {
         let pair = args.tls_cert.clone().zip(args.tls_key.clone());
         Self {
@@ -72,17 +72,17 @@ impl Guarded {
         }
     }
 
-    /// Whether whoever reaches the address may come in, over plain HTTP.
+    /// Returns whether anyone who reaches the address has access, over plain HTTP.
     pub fn is_open(&self) -> bool {
         self.access.tls.is_none() && !self.access.authenticates()
     }
 }
 
-/// On loopback, only `up` (and `demo`) do without tokens or client certificates; beyond it, all need them and TLS;
-/// unless asked for with --allow-insecure.
+/// Rejects an unprotected address. On loopback, only `up` and `demo` need no tokens or client
+/// certificates. Any other address needs them and TLS. `--allow-insecure` overrides both.
 ///
 /// # Errors
-/// The options leave open what they must not.
+/// Fails if the options leave the address unprotected.
 pub fn refuse_unguarded(listen: SocketAddr, args: &args::Guard, up: bool) -> Result<()> {
     if args.allow_insecure {
         return Ok(());
@@ -117,7 +117,7 @@ pub fn refuse_unguarded(listen: SocketAddr, args: &args::Guard, up: bool) -> Res
     Ok(())
 }
 
-/// What a worker's end means for the exit code.
+/// Converts a worker's end into an exit code.
 pub fn agent_error(error: &AgentError) -> CliError {
     let code = match error {
         AgentError::Refused { .. } => Code::Coordinator,
@@ -127,7 +127,7 @@ pub fn agent_error(error: &AgentError) -> CliError {
     let ended = CliError::new(code, error);
     match error {
         AgentError::Refused { .. } => {
-            // Others are about tokens and certificates, and say themselves what to do.
+            // Other messages concern tokens and certificates, and include their own remedy.
             let text = error.to_string();
             if ["version", "protocol"]
                 .iter()
@@ -142,11 +142,11 @@ pub fn agent_error(error: &AgentError) -> CliError {
     }
 }
 
-/// The most memory that a coordinator takes where nobody says how much it may.
+/// Maximum memory of a coordinator if no limit is known.
 const COORDINATOR_MIB: u64 = 4096;
 
-/// The memory of a coordinator's process: as asked, or the limit that it runs under. More than that limit is no help: the
-/// system would end the process.
+/// Returns the memory bound of a coordinator's process: the requested amount or the default, but at
+/// most the system's limit, because the system would kill a process that exceeds it.
 fn memory(asked_mib: Option<u64>) -> MemoryBounds {
     let here = Memory::here().map_or(u64::MAX, |memory| memory.bytes);
     let most = asked_mib.unwrap_or(COORDINATOR_MIB) << 20;
@@ -163,10 +163,12 @@ pub struct Coordinator {
 }
 
 impl Coordinator {
-    /// Starts one on `catalog`, creating it if there is none. A worker reports every sixth of a lease.
+    /// Starts a coordinator on `catalog`, creating the catalog if needed. A worker sends a
+    /// heartbeat every sixth of a lease.
     ///
     /// # Errors
-    /// The catalog is in use, unreadable or of a newer version, or the address is taken.
+    /// Fails if the catalog is in use, unreadable or of a newer version, or if the address is in
+    /// use.
     pub async fn start(
         catalog: CatalogPlace,
         listen: SocketAddr,
@@ -202,7 +204,8 @@ impl Coordinator {
         })
     }
 
-    /// Where clients on this machine reach it. Certificates are for names, so with TLS this is localhost.
+    /// Returns the URL for clients on this machine. With TLS this is localhost, because
+    /// certificates are for names.
     pub fn url(&self) -> String {
         let address = self.running.address;
         match self.secure {
@@ -211,15 +214,15 @@ impl Coordinator {
         }
     }
 
-    /// Where its health and metrics are served.
+    /// Returns the URL of its health and metrics.
     pub fn http(&self) -> Option<String> {
         self.running.http.map(|address| format!("http://{address}"))
     }
 
-    /// Stops it and waits until the catalog is closed.
+    /// Stops the coordinator and waits until the catalog is closed.
     ///
     /// # Errors
-    /// What had ended it before.
+    /// Fails if an error had already ended the coordinator.
     pub async fn stop(self) -> Result<()> {
         self.stop.cancel();
         self.running.wait().await.map_err(|e| coordinator_error(&e))
@@ -277,7 +280,7 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
 /// `picofarm worker`.
 ///
 /// # Errors
-/// A setting out of range, or a coordinator that refuses this worker.
+/// Fails if a setting is out of range, or the coordinator refuses this worker.
 pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> Result<()> {
     if let Some(gib) = args.memory_gib.filter(|gib| !(0.001..=1e6).contains(gib)) {
         return Err(CliError::input(format!(

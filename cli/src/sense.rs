@@ -1,4 +1,4 @@
-//! `picofarm scene sense`: a rendered scene as a sensor sees it.
+//! `picofarm scene sense`: passes a rendered scene through a sensor.
 
 pub mod options;
 
@@ -63,7 +63,7 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
             args.render.display()
         )));
     }
-    // Only a scale by peak looks at the two-bounce part.
+    // Only a scale by peak depends on the two-bounce part.
     let by_peak = !matches!(sensor.scale, Scale::Fixed { .. });
     let two = if by_peak && group.has("two") {
         Some(read(&group, "two", args)?.1)
@@ -159,7 +159,7 @@ fn gate(group: &RenderGroup, path: &Path) -> Result<Gate> {
     Ok(gate)
 }
 
-/// What a reader needs to make sense of the counts, and to make them again.
+/// Returns the attributes that are needed to interpret the counts, and to reproduce them.
 fn attributes(
     group: &RenderGroup,
     gate: Gate,
@@ -209,7 +209,7 @@ fn attributes(
     all
 }
 
-/// Writes the one array in the narrowest type; gives its name, type and sum.
+/// Writes the array in the narrowest type. Returns its name, type and sum.
 fn write(
     out: &Path,
     shape: &[u64],

@@ -1,4 +1,4 @@
-//! Settings: flags > environment (`PICOFARM_…`) > file > defaults, and where each came from.
+//! Settings: flags > environment (`PICOFARM_…`) > file > defaults, and the source of each.
 
 use std::path::{Path, PathBuf};
 
@@ -18,10 +18,10 @@ use crate::{
     files,
 };
 
-/// What a settings file is called.
+/// Name of the settings file among the sources of settings.
 const TOML: &str = "TOML file";
 
-/// What is in force.
+/// The effective settings.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
@@ -33,26 +33,27 @@ pub struct Settings {
     pub log: String,
     /// Certificate authority of the coordinator (PEM).
     pub ca: Option<PathBuf>,
-    /// Own certificate (PEM).
+    /// Client certificate (PEM).
     pub cert: Option<PathBuf>,
-    /// Its private key (PEM).
+    /// Private key of the client certificate (PEM).
     pub key: Option<PathBuf>,
-    /// File that holds the token.
+    /// File with the token.
     pub token_file: Option<PathBuf>,
-    /// What this process may send to object stores, megabytes a second.
+    /// Maximum upload rate of this process to object stores, in megabytes per second.
     pub store_upload_mb_s: Option<f64>,
-    /// What it may fetch from them, megabytes a second.
+    /// Maximum download rate of this process from object stores, in megabytes per second.
     pub store_download_mb_s: Option<f64>,
 }
 
-/// The variable that holds the token itself. No setting and no argument: those are shown and kept.
+/// Environment variable with the token itself. The token is neither a setting nor an argument,
+/// because those are displayed and recorded.
 const TOKEN: &str = "PICOFARM_TOKEN";
 
 impl Settings {
-    /// What to show to a coordinator, and whom to trust.
+    /// Returns the credentials for a coordinator, and the trusted certificates.
     ///
     /// # Errors
-    /// The token file cannot be used.
+    /// Fails if the token file cannot be used.
     pub fn access(&self) -> Result<Access> {
         let token = match std::env::var(TOKEN) {
             Ok(token) if !token.trim().is_empty() => Some(Secret::new(token.trim())),
@@ -69,10 +70,10 @@ impl Settings {
         })
     }
 
-    /// What this process may send to object stores and fetch from them.
+    /// Returns the limits of this process's transfers to and from object stores.
     ///
     /// # Errors
-    /// A rate that is no positive number.
+    /// Fails if a rate is not a positive number.
     pub fn bandwidth(&self) -> Result<Bandwidth> {
         let rate = |name: &str, mb_s: Option<f64>| match mb_s {
             Some(mb_s) if !(mb_s.is_finite() && mb_s > 0.0) => Err(CliError::input(format!(
@@ -116,7 +117,7 @@ impl Default for Settings {
 pub struct Resolved {
     pub settings: Settings,
     pub sources: Vec<(&'static str, String)>,
-    /// Whether the environment holds a token.
+    /// Whether the environment has a token.
     pub token: bool,
 }
 
@@ -135,7 +136,7 @@ const FIELDS: [&str; 9] = [
 /// Resolves the settings.
 ///
 /// # Errors
-/// A named settings file that is missing, or a field that is unknown or of the wrong type.
+/// Fails if a named settings file is missing, or if a field is unknown or of the wrong type.
 pub fn resolve(global: &Global) -> Result<Resolved> {
     let file = match &global.config {
         Some(path) if !path.is_file() => {

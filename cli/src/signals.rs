@@ -1,7 +1,7 @@
-//! SIGINT, SIGTERM and SIGHUP: the first asks for an orderly end, the second ends the process at
-//! once. A SIGTERM right after another is the same one: schedulers send it to the process and to
-//! its group. A SIGHUP never ends the process at once: it comes from a terminal that closes, which
-//! may send it several times.
+//! SIGINT, SIGTERM and SIGHUP: the first signal asks for an orderly end, the second ends the
+//! process at once. A SIGTERM shortly after another counts as the same, because schedulers send it
+//! to the process and to its group. A SIGHUP never ends the process at once, because a closing
+//! terminal may send it several times.
 
 use std::time::{Duration, Instant};
 
@@ -13,13 +13,13 @@ use crate::{
     output::tell,
 };
 
-/// SIGTERMs within this time are one.
+/// Time within which several SIGTERMs count as one.
 const ONE: Duration = Duration::from_secs(2);
 
-/// A token that the first signal cancels.
+/// Returns a token that the first signal cancels.
 ///
 /// # Errors
-/// The system refuses a signal handler.
+/// Fails if the system refuses a signal handler.
 pub fn stop_on_signal() -> Result<CancellationToken> {
     let refused =
         |e: std::io::Error| CliError::new(Code::Failed, format!("cannot listen for signals: {e}"));
@@ -56,7 +56,7 @@ pub struct Hangups(Option<Signal>);
 /// Listens for SIGHUP.
 ///
 /// # Errors
-/// The system refuses a signal handler.
+/// Fails if the system refuses a signal handler.
 pub fn hangups() -> std::io::Result<Hangups> {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     match ignores_hangup(&status) {
@@ -66,7 +66,7 @@ pub fn hangups() -> std::io::Result<Hangups> {
 }
 
 impl Hangups {
-    /// Waits for the next one.
+    /// Waits for the next SIGHUP.
     pub async fn next(&mut self) {
         match &mut self.0 {
             Some(signal) => {
@@ -77,14 +77,14 @@ impl Hangups {
     }
 }
 
-/// Whether a process ignores SIGHUP, the first signal of the mask in `/proc/self/status`.
+/// Returns whether a process ignores SIGHUP, the first signal of the mask in `/proc/self/status`.
 fn ignores_hangup(status: &str) -> bool {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
         .is_some_and(|mask| mask & 1 == 1)
 }
 
-/// The exit of a command that a signal ended.
+/// Returns the error of a command that a signal ended.
 pub fn interrupted(hint: &str) -> CliError {
     CliError::new(Code::Interrupted, "interrupted").hint(hint)
 }

@@ -1,8 +1,9 @@
-//! Looks into stores for a coordinator: whether they hold what workers have reported.
+//! Checks for a coordinator whether stores contain the results that workers have reported.
 //!
-//! By default it looks into folders of the coordinator's machine only. A submitter names a store's place, and must not make
-//! the coordinator send requests to any host, so object stores are looked into only if the operator names them. In a folder
-//! only the names that results have are opened, and only their hash is compared, so that nobody learns what a file contains.
+//! By default, only folders of the coordinator's machine are checked. A submitter chooses a store's
+//! location and must not make the coordinator send requests to arbitrary hosts, so object stores
+//! are checked only if the operator names them. In a folder, only files with the names of results
+//! are opened and only their hash is compared, so that nobody learns the contents of a file.
 
 use std::{
     collections::HashMap,
@@ -26,39 +27,41 @@ use uuid::Uuid;
 
 use crate::error::{CliError, Code, Result};
 
-/// Stores kept open.
+/// Number of stores that remain open.
 const STORES: usize = 64;
-/// Threads that a store on a disk that hangs can hold. Nothing else uses them.
+/// Number of threads that stores on a hanging disk can block. Nothing else uses these threads.
 const THREADS: usize = 64;
-/// In an object store, the objects of one scene in so many are looked up; in a folder, those of all.
+/// In an object store, the objects of one scene in this many are looked up; in a folder, those of
+/// all.
 const ONE_IN: u64 = 8;
 
-/// What reads stores, on a runtime of its own.
+/// Reads stores, on a runtime of its own.
 pub struct StoreReader {
     allowed: Allowed,
     opened: Mutex<HashMap<String, Place>>,
-    /// Taken when dropped.
+    /// `None` only while being dropped.
     runtime: Option<Runtime>,
 }
 
-/// Which stores are looked into.
+/// Stores that may be read.
 #[derive(Debug)]
 enum Allowed {
     /// Folders of this machine.
     Folders,
-    /// What lies below these prefixes.
+    /// Stores below these prefixes.
     Below(StorePrefixes),
-    /// Any.
+    /// Any store.
     Any,
 }
 
 type Place = (Arc<dyn ObjectStore>, Path);
 
 impl StoreReader {
-    /// What `--check-stores` asks for: folders of this machine by default, nothing for `none`, or stores below prefixes.
+    /// Creates the reader for `--check-stores`: folders of this machine by default, no reader for
+    /// `none`, or stores below prefixes.
     ///
     /// # Errors
-    /// A prefix that cannot be used; no threads.
+    /// Fails if a prefix is invalid, or no threads can be started.
     pub fn asked_for(texts: &[String]) -> Result<Option<Self>> {
         match texts {
             [] => Self::new(Allowed::Folders).map(Some),
@@ -70,17 +73,18 @@ impl StoreReader {
     /// Reads stores below these prefixes.
     ///
     /// # Errors
-    /// A prefix that is none; no threads.
+    /// Fails if a prefix is invalid, or no threads can be started.
     pub fn below(prefixes: &[String]) -> Result<Self> {
         let allowed = StorePrefixes::new(prefixes)
             .map_err(|e| CliError::input(format!("--check-stores: {e}")))?;
         Self::new(Allowed::Below(allowed))
     }
 
-    /// Reads any store: for a process that runs the tasks as well, and so reads and writes whatever store they name.
+    /// Reads any store, for a process that also runs the tasks, and therefore accesses whatever
+    /// store they name.
     ///
     /// # Errors
-    /// No threads.
+    /// Fails if no threads can be started.
     pub fn anywhere() -> Result<Self> {
         Self::new(Allowed::Any)
     }
@@ -130,7 +134,7 @@ impl StoreReader {
     }
 }
 
-/// The folder of this machine that a location names.
+/// Returns the folder of this machine that a location names.
 fn folder(location: &str) -> Option<PathBuf> {
     let place = picofarm_proto::model::Place {
         field: "store",
@@ -141,24 +145,25 @@ fn folder(location: &str) -> Option<PathBuf> {
     path.starts_with('/').then(|| path.into())
 }
 
-/// The tasks of a question, each with the SHA-256 that was reported.
+/// The tasks of a question, each with the reported SHA-256.
 type Results = Vec<(u64, [u8; 32])>;
 
-/// What a store is asked, as its data set or model knows it.
+/// A question to a store, in terms of its data sets or models.
 #[derive(Clone)]
 enum Question {
     Scenes(String, Results),
     Parts(String, Vec<PartName>),
     Gltf(Results),
     Model(String, Results),
-    /// Sweep, its id, and the trial.
+    /// Sweep, its id, the trial, and the results.
     Trial(String, String, u64, Results),
     Report(String, Results),
     Split(String, String, Results),
 }
 
 impl Question {
-    /// The question about results of a stage, and the store that is asked; or why there is none.
+    /// Returns the question about results of a stage and the store to ask, or the reason why there
+    /// is none.
     fn of(
         stage: &StageSpec,
         results: &[(u64, [u8; 32])],
@@ -204,7 +209,7 @@ impl Question {
         Ok((place.store.to_owned(), question))
     }
 
-    /// Asks; `thorough` says of which scenes the objects are looked up, too.
+    /// Asks the store. `thorough` selects the scenes for which the objects are looked up too.
     async fn ask(
         self,
         holdings: &Holdings,
@@ -252,7 +257,7 @@ impl Stored for StoreReader {
             let (location, question) = Question::of(stage, results)?;
             let (store, prefix) = self.open(&location)?;
             let folder = folder(&location);
-            // An operator who names a store knows that it is the workers'.
+            // If an operator names a store, it is known to be the workers' store.
             let may_be_absent = matches!(self.allowed, Allowed::Folders);
             let count = results.len();
             let identity = stage.stores.get(location.trim_end_matches('/'));
@@ -271,7 +276,7 @@ impl Stored for StoreReader {
                     };
                     return Ok::<Vec<Found>, DatasetError>(vec![found; count]);
                 }
-                // Where this machine has not mounted it, everything would seem to be gone.
+                // If this machine has not mounted the store, all results would seem lost.
                 if let Some(identity) = identity {
                     check_identity(&*store, &prefix, identity).await?;
                 }
@@ -280,8 +285,8 @@ impl Stored for StoreReader {
                 if let (Some(folder), Question::Scenes(dataset, _)) = (&folder, &question)
                     && held.contains(&Held::Gone)
                 {
-                    // A network's file system remembers for a while that a file was missing. Opening its folder makes it
-                    // ask the server again; whether it can be opened does not matter.
+                    // A network file system caches for a while that a file was missing. Opening its
+                    // folder makes it ask the server again, whether or not that succeeds.
                     let _ = tokio::fs::read_dir(folder.join(dataset).join("manifests")).await;
                     held = question.ask(&holdings, thorough).await?;
                 }
@@ -293,7 +298,7 @@ impl Stored for StoreReader {
                 Ok(found.collect())
             };
             let runtime = self.runtime.as_ref().expect("there until it is dropped");
-            // It ends with whoever waits for it.
+            // Aborts when the caller stops waiting.
             let running = AbortOnDropHandle::new(runtime.spawn(asked));
             match running.await {
                 Ok(Ok(found)) => Ok(found),
@@ -315,7 +320,7 @@ impl fmt::Debug for StoreReader {
 impl Drop for StoreReader {
     fn drop(&mut self) {
         if let Some(runtime) = self.runtime.take() {
-            // A thread that a hanging disk holds is not waited for.
+            // Does not wait for threads that a hanging disk blocks.
             runtime.shutdown_background();
         }
     }

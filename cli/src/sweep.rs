@@ -1,4 +1,4 @@
-//! `picofarm sweep …`: what trials have recorded, and which to add.
+//! `picofarm sweep …`: shows the records of trials, and adds trials.
 
 mod compare;
 mod export;

@@ -1,8 +1,8 @@
-//! The history as it grows: `job logs --follow` and `events`.
+//! Follows the history as it grows: `job logs --follow` and `events`.
 //!
-//! Sequence numbers are drawn when an event is written and seen when its transaction ends, so those of two coordinators
-//! may come to light in another order. So what was seen in the last moments is read again each time, and what is known of
-//! it left out.
+//! Sequence numbers are assigned when an event is written, but an event becomes visible when its
+//! transaction ends. Events of two coordinators can therefore appear in another order. So the
+//! events of the last moments are read again each time, and those already seen are skipped.
 
 use std::{
     collections::BTreeMap,
@@ -20,26 +20,26 @@ use crate::{
     signals,
 };
 
-/// How often the coordinator is asked.
+/// Interval between requests to the coordinator.
 const PAUSE: Duration = Duration::from_millis(500);
-/// How long a transaction may take from drawing a number to its end.
+/// Maximum time of a transaction from assigning a number to its end.
 const OVERLAP: Duration = Duration::from_secs(2);
-/// Events in one answer; the coordinator gives no more.
+/// Maximum number of events in an answer, limited by the coordinator.
 const PAGE: u32 = 10_000;
-/// How long a coordinator may stay away.
+/// Time for which a coordinator may be unreachable.
 const AWAY: Duration = Duration::from_secs(60);
 
-/// What was seen lately.
+/// The recently seen events.
 #[derive(Default)]
 struct Window {
     /// All events up to this one have been seen, long enough ago that none is missing.
     after: u64,
-    /// Later ones, and when each was first seen.
+    /// Later events, and when each was first seen.
     seen: BTreeMap<u64, Instant>,
 }
 
 impl Window {
-    /// Those of a page that are new.
+    /// Returns the new events of a page.
     fn take(&mut self, mut page: Vec<Event>, now: Instant) -> Vec<Event> {
         page.retain(|event| {
             let new = event.sequence > self.after && !self.seen.contains_key(&event.sequence);
@@ -51,7 +51,7 @@ impl Window {
         page
     }
 
-    /// Forgets what need not be read again.
+    /// Forgets events that need not be read again.
     fn advance(&mut self, now: Instant) {
         while let Some(first) = self.seen.first_entry()
             && now.duration_since(*first.get()) > OVERLAP
@@ -65,7 +65,8 @@ impl Window {
 /// `picofarm events`.
 ///
 /// # Errors
-/// The coordinator cannot be reached, refuses, or stays away; Ctrl-C ends it with exit code 130.
+/// Fails if the coordinator cannot be reached, refuses, or becomes unreachable; Ctrl-C ends it with
+/// exit code 130.
 pub async fn events(
     follow_on: bool,
     last: u32,
@@ -93,7 +94,7 @@ pub async fn events(
 
 fn newest(page: Page) -> Page {
     Page {
-        // 0 would be the coordinator's own limit.
+        // 0 would select the coordinator's own limit.
         limit: page.limit.clamp(1, PAGE),
         ..page
     }
@@ -106,10 +107,12 @@ fn line(event: &Event, job: Option<JobId>) -> String {
     }
 }
 
-/// Shows the last events and then each new one, until the job ends; of all jobs, for ever.
+/// Shows the last events and then each new one, until the job ends. Without a job, it never ends by
+/// itself.
 ///
 /// # Errors
-/// The coordinator refuses, or stays away for a minute; Ctrl-C ends it with exit code 130.
+/// Fails if the coordinator refuses, or is unreachable for a minute; Ctrl-C ends it with exit code
+/// 130.
 pub async fn follow(mut client: Client, page: Page, output: Output) -> Result<()> {
     let job = page.job;
     let shown = async {
@@ -147,7 +150,7 @@ pub async fn follow(mut client: Client, page: Page, output: Output) -> Result<()
     }
 }
 
-/// Shows what is new; whether the job has ended and all of it was shown.
+/// Shows new events. Returns whether the job has ended and all its events were shown.
 async fn news(client: &mut Client, of: Page, window: &mut Window, output: Output) -> Result<bool> {
     let mut after = window.after;
     loop {
@@ -168,7 +171,7 @@ async fn news(client: &mut Client, of: Page, window: &mut Window, output: Output
     }
 }
 
-/// One event a line.
+/// Shows one event per line.
 fn show(events: Vec<Event>, job: Option<JobId>, output: Output) {
     for event in events {
         output.result(&event, || line(&event, job));

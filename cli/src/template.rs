@@ -1,8 +1,8 @@
-//! Commented job files to start from, one for each kind of job.
+//! Commented job files as a starting point, one for each kind of job.
 
 use crate::args::JobKind;
 
-/// A job file to start from.
+/// Returns a job file as a starting point.
 pub fn template(kind: JobKind) -> String {
     let scenes = match kind {
         JobKind::Graph => return graph(),
@@ -82,7 +82,7 @@ pub fn template(kind: JobKind) -> String {
     )
 }
 
-/// A job of several stages.
+/// Returns a job of several stages.
 fn graph() -> String {
     "# A picofarm job of several stages. `picofarm job plan FILE` says what it would run.\n\
      name = \"noisy rooms\"\n\
@@ -113,7 +113,7 @@ fn graph() -> String {
         .to_owned()
 }
 
-/// A job that makes its data and trains on them: minutes on a laptop.
+/// Returns a job that makes its data and trains on them: minutes on a laptop.
 fn training() -> String {
     "# A picofarm job that renders small rooms and trains networks on them: an hour on two cores, without a GPU. The same file\n\
      # with furnished rooms, resolution = 256, [scenes] count = 97432 and the defaults of `net` and `optimise` is the paper's.\n\

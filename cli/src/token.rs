@@ -1,4 +1,4 @@
-//! `picofarm token`: who may use a coordinator.
+//! `picofarm token`: manages access to a coordinator.
 
 use std::{
     path::Path,
@@ -20,16 +20,16 @@ use crate::{
     settings::Resolved,
 };
 
-/// How long a coordinator may take to read the token file again. It looks every second.
+/// Maximum time until a coordinator has read the token file again. It checks the file every second.
 const NOTICED: Duration = Duration::from_secs(10);
-/// Between two questions.
+/// Interval between requests.
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Runs one of the commands.
 ///
 /// # Errors
-/// The token file cannot be used, a name is taken, there is no such name, or a coordinator still
-/// accepts a revoked token.
+/// Fails if the token file cannot be used, a name is taken, there is no such name, or a coordinator
+/// still accepts a revoked token.
 pub async fn run(command: Token, resolved: &Resolved, output: Output) -> Result<()> {
     match command {
         Token::Create {
@@ -75,7 +75,7 @@ fn create(
         || token.expose().to_owned(),
     );
     if let Err(unprinted) = printed() {
-        // Nobody has seen the token, and nobody ever will.
+        // The token was never printed and cannot be recovered.
         Tokens::edit(path, |tokens| Ok(tokens.revoke(name))).map_err(unusable)?;
         return Err(unprinted.hint(format!(
             "{name} was not added; free some space and try again"
@@ -181,7 +181,7 @@ async fn revoke(name: &str, path: &Path, resolved: &Resolved, output: Output) ->
     )))
 }
 
-/// The coordinators that somebody has named; the default URL is only a guess.
+/// Returns the coordinators that the user has configured; the default URL is only a guess.
 fn configured(resolved: &Resolved) -> Vec<&str> {
     let named = resolved
         .sources
@@ -198,7 +198,8 @@ fn configured(resolved: &Resolved) -> Vec<&str> {
     }
 }
 
-/// What a question about this caller shows: not its proof, which is kept nowhere.
+/// Returns the proof for a question about a caller: the SHA-256 of its token or the name in its
+/// certificate. The token itself is not stored.
 fn proof(entry: &Entry) -> String {
     match (&entry.sha256, &entry.certificate) {
         (_, Some(name)) => format!("{BY_CERTIFICATE} {name}"),
@@ -206,7 +207,7 @@ fn proof(entry: &Entry) -> String {
     }
 }
 
-/// Asks until the coordinator refuses the proof, or has had time to notice.
+/// Repeats the request until the coordinator refuses the proof, or has had time to notice.
 async fn refused_soon(url: &str, access: &Access, proof: &str) -> Standing {
     let since = Instant::now();
     loop {

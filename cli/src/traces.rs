@@ -1,5 +1,6 @@
-//! Traces for an OpenTelemetry collector (`--otlp`). Besides the URL, what OpenTelemetry's own variables say is heeded:
-//! OTEL_EXPORTER_OTLP_HEADERS, OTEL_SERVICE_NAME, OTEL_RESOURCE_ATTRIBUTES, OTEL_TRACES_SAMPLER(_ARG), OTEL_BSP_….
+//! Traces for an OpenTelemetry collector (`--otlp`). In addition to the URL, these OpenTelemetry
+//! variables are respected: OTEL_EXPORTER_OTLP_HEADERS, OTEL_SERVICE_NAME,
+//! OTEL_RESOURCE_ATTRIBUTES, OTEL_TRACES_SAMPLER(_ARG), OTEL_BSP_….
 
 use std::time::Duration;
 
@@ -19,18 +20,18 @@ use tracing_subscriber::{
 
 use crate::error::{CliError, Result};
 
-/// How long the last spans may take to be sent at the end.
+/// Timeout for sending the last spans at the end.
 const GOODBYE: Duration = Duration::from_secs(3);
 
-/// Spans on their way to a collector.
+/// Exports spans to a collector.
 pub struct Traces(SdkTracerProvider);
 
 impl Traces {
-    /// Begins to send to `url`, as `service` unless OTEL_SERVICE_NAME says otherwise. Must be called within the runtime;
-    /// whether a collector answers is not asked.
+    /// Starts exporting to `url`, as `service` unless OTEL_SERVICE_NAME overrides it. Must be
+    /// called within the runtime. Does not check whether a collector answers.
     ///
     /// # Errors
-    /// The URL or the share of traces to take cannot be used.
+    /// Fails if the URL or the sampling ratio cannot be used.
     pub fn start(url: &str, service: &'static str) -> Result<Self> {
         let mut exporter = SpanExporter::builder()
             .with_tonic()
@@ -50,7 +51,7 @@ impl Traces {
         let mut provider = SdkTracerProvider::builder()
             .with_batch_exporter(exporter)
             .with_resource(resource.build());
-        // A sampler that is named is the library's affair; without one, the share alone will do.
+        // A named sampler is handled by the library. Otherwise only the ratio matters.
         if std::env::var_os("OTEL_TRACES_SAMPLER").is_none() {
             let share = Sampler::TraceIdRatioBased(share()?);
             provider = provider.with_sampler(Sampler::ParentBased(Box::new(share)));
@@ -58,7 +59,7 @@ impl Traces {
         Ok(Self(provider.build()))
     }
 
-    /// The layer that makes traces of spans, of those alone that are meant for it.
+    /// Returns the layer that exports spans with the target for traces.
     pub fn layer<S>(&self) -> impl Layer<S> + use<S>
     where
         S: tracing::Subscriber + for<'a> LookupSpan<'a>,
@@ -68,7 +69,7 @@ impl Traces {
             .with_filter(Targets::new().with_target(TARGET, LevelFilter::DEBUG))
     }
 
-    /// Sends what waits still.
+    /// Sends the remaining spans.
     pub fn end(self) {
         if let Err(error) = self.0.shutdown_with_timeout(GOODBYE) {
             tracing::warn!(%error, "the last traces may be lost");
@@ -76,7 +77,7 @@ impl Traces {
     }
 }
 
-/// The share of traces to take.
+/// Returns the sampling ratio.
 fn share() -> Result<f64> {
     const VARIABLE: &str = "OTEL_TRACES_SAMPLER_ARG";
     match std::env::var(VARIABLE) {

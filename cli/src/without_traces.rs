@@ -1,4 +1,4 @@
-//! A program that was built without traces.
+//! Substitute for traces in a build without them.
 
 use std::convert::Infallible;
 
@@ -6,12 +6,14 @@ use tracing_subscriber::layer::Identity;
 
 use crate::error::{Result, not_built};
 
-/// There are none.
+/// Uninhabited, because there are no traces.
 pub struct Traces(Infallible);
 
 impl Traces {
+    /// Returns an error that names the build option for traces.
+    ///
     /// # Errors
-    /// Always: it says how to build a program with traces.
+    /// Always fails.
     pub fn start(_url: &str, _service: &'static str) -> Result<Self> {
         Err(not_built("traces", "traces (--otlp)"))
     }

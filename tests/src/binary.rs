@@ -1,10 +1,12 @@
-//! Where the `picofarm` program under test is.
+//! Locates the `picofarm` program under test.
 //!
-//! Cargo tells only the tests of its own package where a binary is (`CARGO_BIN_EXE_…`), and builds it only for them.
-//! So it is asked for it: `cargo build --bin picofarm`, once a test process. That costs a third of a second when
-//! nothing changed, can never test a stale program, and is safe in parallel, because Cargo locks its target folder.
-//! Three arguments keep it from compiling the dependencies a second time with other features: `--workspace` and
-//! `--features picofarm/full,picofarm/wgpu`, as the tests are run with, and `--test`, which makes Cargo count the features of development dependencies too.
+//! Cargo tells only the tests of its own package where a binary is (`CARGO_BIN_EXE_…`), and builds
+//! it only for them. This module therefore runs `cargo build --bin picofarm` once per test process.
+//! That takes a third of a second if nothing changed, never tests a stale program, and is safe in
+//! parallel, because Cargo locks its target folder. Three arguments prevent Cargo from compiling
+//! the dependencies a second time with other features: `--workspace` and
+//! `--features picofarm/full,picofarm/wgpu`, with which the tests are run, and `--test`, which
+//! makes Cargo include the features of development dependencies.
 
 use std::{
     env,
@@ -15,11 +17,11 @@ use std::{
 
 use serde_json::Value;
 
-/// The program under test: `PICOFARM_TEST_BINARY` where set (an installed one, say), else built from this workspace
-/// with the profile and into the target folder of the running test.
+/// Returns the program under test: `PICOFARM_TEST_BINARY` if set (for example an installed one),
+/// otherwise one built from this workspace with the profile and target folder of the running test.
 ///
 /// # Panics
-/// When it cannot be built.
+/// If the program cannot be built.
 pub fn picofarm() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
     BINARY.get_or_init(|| match env::var_os("PICOFARM_TEST_BINARY") {
@@ -45,8 +47,9 @@ fn build() -> PathBuf {
         ),
     };
     let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    // What the test runner says of this package. Build scripts that look at it (ring's) would run again, and all that depends
-    // on them, and once more at the next build without it.
+    // Removes the variables that the test runner sets for this package. Otherwise, build scripts
+    // that read them (ring's) would run again, here and in the next ordinary build, and everything
+    // that depends on them would be rebuilt.
     for (name, _) in env::vars_os() {
         let of_package = [
             "CARGO_PKG_",

@@ -1,4 +1,4 @@
-//! Commands as a person types them, and what they answer.
+//! Runs commands as users type them, and returns their output.
 
 use std::{
     ffi::OsStr,
@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use crate::{binary, process::Process};
 
-/// Runs `picofarm` in a folder, untouched by the settings of whoever runs the tests.
+/// Runs `picofarm` in a folder, isolated from the tester's own settings.
 #[derive(Clone)]
 pub struct Cli {
     dir: PathBuf,
@@ -18,7 +18,7 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// Commands run in `dir`, which is their home too.
+    /// Runs commands in `dir`, which is also their home folder.
     pub fn new(dir: &Path) -> Self {
         Self {
             dir: dir.to_owned(),
@@ -26,18 +26,18 @@ impl Cli {
         }
     }
 
-    /// With an environment variable.
+    /// Adds an environment variable.
     pub fn with(mut self, name: &str, value: &str) -> Self {
         self.variables.push((name.to_owned(), value.to_owned()));
         self
     }
 
-    /// The command, to be started by the caller.
+    /// Returns the command for the caller to start.
     pub fn command(&self, args: &[&str]) -> Command {
         self.other(binary::picofarm().as_ref(), args)
     }
 
-    /// Another program in the same folder, with the same variables.
+    /// Returns another program's command in the same folder, with the same variables.
     pub fn other(&self, program: &OsStr, args: &[&str]) -> Command {
         let mut command = Command::new(program);
         for (name, _) in std::env::vars_os() {
@@ -57,7 +57,7 @@ impl Cli {
         command
     }
 
-    /// Starts it and lets it run.
+    /// Starts the command.
     pub fn start(&self, name: &str, args: &[&str]) -> Process {
         Process::start(name, self.command(args), &self.dir)
     }
@@ -69,14 +69,14 @@ impl Cli {
         ended
     }
 
-    /// Runs it to its end.
+    /// Runs the command to its end.
     pub fn run(&self, args: &[&str]) -> Ended {
         let mut ended = self.start("command", args).end();
         ended.what = format!("picofarm {}", args.join(" "));
         ended
     }
 
-    /// Runs it to its successful end with `--json`: the document it prints.
+    /// Runs the command with `--json` to its successful end, and returns the printed document.
     pub fn json(&self, args: &[&str]) -> Value {
         self.run(&[args, &["--json"]].concat()).ok().json()
     }
@@ -85,7 +85,7 @@ impl Cli {
 /// How a process ended.
 #[derive(Debug, Clone)]
 pub struct Ended {
-    /// What ran.
+    /// Name of the process.
     pub what: String,
     /// Exit code; `None` if a signal ended it.
     pub code: Option<i32>,
@@ -96,18 +96,18 @@ pub struct Ended {
 }
 
 impl Ended {
-    /// Itself, if the exit code is 0.
+    /// Checks that the exit code is 0.
     ///
     /// # Panics
-    /// Otherwise.
+    /// If the exit code differs.
     pub fn ok(self) -> Self {
         self.code(0)
     }
 
-    /// Itself, if the exit code is `code`.
+    /// Checks that the exit code is `code`.
     ///
     /// # Panics
-    /// Otherwise.
+    /// If the exit code differs.
     pub fn code(self, code: i32) -> Self {
         assert_eq!(
             self.code,
@@ -120,10 +120,10 @@ impl Ended {
         self
     }
 
-    /// Checks that it failed with `code` and that stderr says each of `parts`.
+    /// Checks that the command failed with `code` and that stderr contains each of `parts`.
     ///
     /// # Panics
-    /// Otherwise.
+    /// If it did not.
     pub fn fails(self, code: i32, parts: &[&str]) -> Self {
         let ended = self.code(code);
         for part in parts {
@@ -137,20 +137,20 @@ impl Ended {
         ended
     }
 
-    /// The JSON document on stdout (the last, where there are several lines).
+    /// Returns the JSON document on stdout (on the last line, if there are several).
     ///
     /// # Panics
-    /// When there is none.
+    /// If there is none.
     pub fn json(&self) -> Value {
         let line = self.stdout.lines().last().unwrap_or_default();
         serde_json::from_str(line)
             .unwrap_or_else(|e| panic!("{}: {e} in {:?}", self.what, self.stdout))
     }
 
-    /// The error that `--json` prints on stderr.
+    /// Returns the error that `--json` prints on stderr.
     ///
     /// # Panics
-    /// When there is none.
+    /// If there is none.
     pub fn error(&self) -> Value {
         self.stderr
             .lines()

@@ -1,5 +1,6 @@
-//! A stand-in for Google's and Azure's object stores on a loopback port: puts (also create-only), gets of objects and of
-//! ranges, deletes, and lists in pages, as far as data sets need them. It checks no signature, only who asks.
+//! A stand-in for Google's and Azure's object stores on a loopback port. It supports the requests
+//! that data sets need: puts (also create-only), gets of objects and ranges, deletes, and paged
+//! lists. It checks the caller's name but no signature.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -9,13 +10,14 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-/// By bucket and key, as in `/bucket/key`.
+/// Objects by bucket and key, as in `/bucket/key`.
 type Objects = Arc<Mutex<BTreeMap<String, Vec<u8>>>>;
 
-/// Most objects and folders in one answer to a list; the services' own is 1,000 or 5,000.
+/// Maximum number of objects and folders in an answer to a list. The real services return 1,000 or
+/// 5,000.
 const PAGE: usize = 100;
 
-/// A running stand-in; it ends with the test's process.
+/// A running stand-in. It ends with the test's process.
 pub struct Cloud {
     address: String,
     objects: Objects,
@@ -29,10 +31,11 @@ struct Request {
 }
 
 impl Cloud {
-    /// Starts one that lets those in whose `Authorization` begins with one of these.
+    /// Starts a stand-in that accepts requests with an `Authorization` header that begins with one
+    /// of these.
     ///
     /// # Panics
-    /// When loopback has no free port.
+    /// If loopback has no free port.
     pub fn start(known: &'static [&'static str]) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback has free ports");
         let address = listener.local_addr().expect("it is bound").to_string();
@@ -42,7 +45,7 @@ impl Cloud {
             for stream in listener.incoming().flatten() {
                 let objects = shared.clone();
                 std::thread::spawn(move || {
-                    // A client that goes away ends its connection.
+                    // A client that disconnects ends its connection.
                     let _ = serve(stream, &objects, known);
                 });
             }
@@ -50,15 +53,15 @@ impl Cloud {
         Self { address, objects }
     }
 
-    /// Its URL.
+    /// Returns its URL.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
     }
 
-    /// Objects that it holds.
+    /// Returns the number of its objects.
     ///
     /// # Panics
-    /// When a connection's thread did.
+    /// If the thread of a connection panicked.
     pub fn count(&self) -> usize {
         self.objects.lock().expect("no thread panics").len()
     }
@@ -111,7 +114,7 @@ impl Request {
         }))
     }
 
-    /// Status, further headers and body.
+    /// Returns status, additional headers and body.
     fn answer(&self, objects: &Objects, known: &[&str]) -> (u16, String, Vec<u8>) {
         let header = |name: &str| self.headers.get(name).map(String::as_str);
         let error = |status, code: &str| {
@@ -127,7 +130,7 @@ impl Request {
         let mut objects = objects.lock().expect("no thread panics");
         match &*self.method {
             "POST" if query.contains("comp=batch") => {
-                // Azure's: deletes in a multipart body, answered in one.
+                // Azure batches deletes in a multipart body, with a single answer.
                 let text = String::from_utf8_lossy(&self.body);
                 let mut answer = String::new();
                 for (i, line) in text
@@ -182,7 +185,7 @@ impl Request {
     }
 }
 
-/// The bytes that `bytes=a-b`, `bytes=a-` or `bytes=-n` means; `None` where there are none.
+/// Returns the bytes selected by `bytes=a-b`, `bytes=a-` or `bytes=-n`; `None` if there are none.
 fn part(range: &str, length: usize) -> Option<std::ops::Range<usize>> {
     let (from, to) = range.strip_prefix("bytes=")?.split_once('-')?;
     let (start, end) = match (from.parse::<usize>(), to.parse::<usize>()) {
@@ -194,12 +197,12 @@ fn part(range: &str, length: usize) -> Option<std::ops::Range<usize>> {
     (start < end).then_some(start..end)
 }
 
-/// What a list asks for.
+/// Parameters of a list request.
 struct List {
     prefix: String,
-    /// Keys are cut at the first slash after the prefix.
+    /// Whether keys are cut at the first slash after the prefix.
     folders: bool,
-    /// The last that the page before this one had.
+    /// The last key of the previous page.
     after: String,
 }
 
@@ -282,7 +285,7 @@ fn escaped(text: &str) -> String {
         .replace('>', "&gt;")
 }
 
-/// A URL's text: `%20` stands for a space.
+/// Decodes the text of a URL: `%20` becomes a space.
 fn decoded(text: &str) -> String {
     let mut bytes = Vec::with_capacity(text.len());
     let mut rest = text.as_bytes();

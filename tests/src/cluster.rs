@@ -1,5 +1,5 @@
-//! A farm as it runs in earnest: several coordinators on one Postgres (or one on SQLite), workers that reach them through
-//! proxies, and any of them may fail at any time.
+//! A farm as in production: several coordinators on one Postgres (or one on SQLite), and workers
+//! that reach them through proxies. Any of them may fail at any time.
 
 use std::net::SocketAddr;
 
@@ -14,11 +14,11 @@ use crate::{
 pub struct Coordinator {
     process: Option<Process>,
     address: SocketAddr,
-    /// Before it; outlives its process.
+    /// The proxy in front of it, which outlives its process.
     pub proxy: Proxy,
 }
 
-/// Coordinators, their database and what reaches them.
+/// Coordinators, their database and their proxies.
 pub struct Cluster {
     /// The coordinators.
     pub coordinators: Vec<Coordinator>,
@@ -29,7 +29,7 @@ pub struct Cluster {
     pub scratch: Scratch,
 }
 
-/// What the coordinators keep their catalog in.
+/// The database of the coordinators' catalog.
 enum Database {
     Postgres(Postgres),
     /// A SQLite file in the cluster's folder, for one coordinator.
@@ -37,17 +37,18 @@ enum Database {
 }
 
 impl Cluster {
-    /// One coordinator on SQLite.
+    /// Starts one coordinator on SQLite.
     pub fn on_sqlite(name: &str, lease_s: f64) -> Self {
         Self::with_database(Database::Sqlite, name, 1, lease_s, |cli| cli)
     }
 
-    /// Coordinators with leases of `lease_s` seconds; `None`, having said so, where there is no Postgres.
+    /// Starts coordinators with leases of `lease_s` seconds. Prints a message and returns `None` if
+    /// there is no Postgres.
     pub fn start(name: &str, coordinators: usize, lease_s: f64) -> Option<Self> {
         Self::reaching(name, coordinators, lease_s, |cli| cli)
     }
 
-    /// The same, whose processes and commands come with further settings.
+    /// Like `start`, with additional settings for its processes and commands.
     pub fn reaching(
         name: &str,
         coordinators: usize,
@@ -90,7 +91,7 @@ impl Cluster {
         cluster
     }
 
-    /// Ends the database without a word to anyone and starts it again. SQLite ends with its coordinator.
+    /// Kills the database and starts it again. SQLite ends with its coordinator.
     pub fn crash_database(&mut self) {
         match &mut self.database {
             Database::Postgres(postgres) => postgres.crash(),
@@ -123,10 +124,10 @@ impl Cluster {
         (process, address)
     }
 
-    /// A coordinator's process.
+    /// Returns a coordinator's process.
     ///
     /// # Panics
-    /// When it was killed.
+    /// If it was killed.
     pub fn coordinator(&mut self, i: usize) -> &mut Process {
         self.coordinators[i].process.as_mut().expect("it runs")
     }
@@ -134,31 +135,31 @@ impl Cluster {
     /// Ends a coordinator as `kill -9` does.
     ///
     /// # Panics
-    /// When it does not run.
+    /// If it does not run.
     pub fn kill_coordinator(&mut self, i: usize) {
         self.coordinators[i].process.take().expect("it runs").kill();
     }
 
-    /// Starts a killed coordinator where it was.
+    /// Starts a killed coordinator again at its address.
     pub fn start_coordinator(&mut self, i: usize) {
         let listen = self.coordinators[i].address.to_string();
         let (process, _) = self.launch(&listen);
         self.coordinators[i].process = Some(process);
     }
 
-    /// The coordinators, as a worker's list that begins with the `first`.
+    /// Returns the URLs of the coordinators as a worker's list, starting with `first`.
     pub fn urls(&self, first: usize) -> String {
         let n = self.coordinators.len();
         let url = |i: usize| self.coordinators[(first + i) % n].proxy.url();
         (0..n).map(url).collect::<Vec<_>>().join(",")
     }
 
-    /// Starts a worker with one thread that goes to the `first` coordinator before the others.
+    /// Starts a worker with one thread that prefers the coordinator `first`.
     pub fn worker(&self, name: &str, first: usize) -> Process {
         self.worker_with(name, first, &[])
     }
 
-    /// The same with further options.
+    /// Like `worker`, with additional options.
     pub fn worker_with(&self, name: &str, first: usize, options: &[&str]) -> Process {
         let args = ["worker", "--log", "info", "--name", name, "--threads", "1"];
         let urls = self.urls(first);
@@ -168,7 +169,7 @@ impl Cluster {
         )
     }
 
-    /// Commands that go to whichever coordinator answers, past the proxies.
+    /// Returns commands that use any coordinator that answers, without the proxies.
     pub fn cli(&self) -> Cli {
         let urls: Vec<_> = self
             .coordinators
@@ -180,7 +181,7 @@ impl Cluster {
             .with("PICOFARM_COORDINATOR", &urls.join(","))
     }
 
-    /// The JSON answer of a command, asked again while no coordinator can answer.
+    /// Returns the JSON answer of a command. Retries while no coordinator can answer.
     pub fn json(&self, args: &[&str]) -> Value {
         until(&format!("an answer to {args:?}"), || {
             let ended = self.cli().run(&[args, &["--json"]].concat());
@@ -192,10 +193,10 @@ impl Cluster {
         })
     }
 
-    /// Submits a job: its id.
+    /// Submits a job and returns its id.
     ///
     /// # Panics
-    /// When it is refused.
+    /// If it is refused.
     pub fn submit(&self, job: &Job) -> String {
         let file = self.scratch.join(&format!("{}.toml", job.name));
         job.write(&file);
@@ -206,15 +207,15 @@ impl Cluster {
             .to_owned()
     }
 
-    /// `job status`.
+    /// Returns the output of `job status`.
     pub fn status(&self, job: &str) -> Value {
         self.json(&["job", "status", job])
     }
 
-    /// Waits until the job ends: its last status.
+    /// Waits until the job ends, and returns its last status.
     ///
     /// # Panics
-    /// When it does not end.
+    /// If it does not end.
     pub fn until_ended(&self, job: &str) -> Value {
         until(&format!("the end of job {job}"), || {
             let status = self.status(job);
@@ -222,10 +223,10 @@ impl Cluster {
         })
     }
 
-    /// The whole history.
+    /// Returns the whole history.
     ///
     /// # Panics
-    /// When it is no list.
+    /// If it is not a list.
     pub fn events(&self, job: &str) -> Vec<Value> {
         let answer = self.json(&["job", "logs", job, "--last", "1000000"]);
         answer.as_array().expect("a history is a list").clone()

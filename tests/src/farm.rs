@@ -1,4 +1,4 @@
-//! A farm of real processes: one coordinator, any number of workers, and what people would ask them.
+//! A farm of real processes: one coordinator, any number of workers, and the commands of users.
 
 use std::path::PathBuf;
 
@@ -17,7 +17,7 @@ use crate::{
 
 /// A folder with a catalog and a store, and the coordinator on them.
 pub struct Farm {
-    // Processes end before the folder goes.
+    // Processes end before the folder is deleted.
     coordinator: Option<Process>,
     url: Option<String>,
     lease_s: f64,
@@ -28,17 +28,17 @@ pub struct Farm {
 }
 
 impl Farm {
-    /// A farm with a running coordinator whose leases live so long that none expires in a test.
+    /// Starts a farm with long leases, so that none expires in a test.
     pub fn start(name: &str) -> Self {
         Self::with_lease(name, 300.0)
     }
 
-    /// A farm with a running coordinator whose leases live for `lease_s` seconds.
+    /// Starts a farm with leases of `lease_s` seconds.
     pub fn with_lease(name: &str, lease_s: f64) -> Self {
         Self::on(Scratch::new(name), "catalog.sqlite", lease_s)
     }
 
-    /// The same in a folder that is there already, with the catalog at this place in it.
+    /// Starts a farm in an existing folder, with the catalog at this path in it.
     pub fn on(scratch: Scratch, catalog: &str, lease_s: f64) -> Self {
         let mut farm = Self {
             coordinator: None,
@@ -52,7 +52,7 @@ impl Farm {
         farm
     }
 
-    /// The same farm, whose workers and commands reach an S3 server.
+    /// Makes the farm's workers and commands use an S3 server.
     pub fn reaching(self, server: &Server) -> Self {
         Self {
             cli: server.with(self.cli),
@@ -60,18 +60,18 @@ impl Farm {
         }
     }
 
-    /// Starts the coordinator: the first time on a free port, then on the same one.
+    /// Starts the coordinator: the first time on a free port, later on the same one.
     ///
     /// # Panics
-    /// When it does not come up.
+    /// If it does not start.
     pub fn start_coordinator(&mut self) {
         self.start_coordinator_with(&[]);
     }
 
-    /// The same with more arguments.
+    /// Like `start_coordinator`, with more arguments.
     ///
     /// # Panics
-    /// When it does not come up.
+    /// If it does not start.
     pub fn start_coordinator_with(&mut self, more: &[&str]) {
         let listen = match &self.url {
             Some(url) => url.trim_start_matches("http://").to_owned(),
@@ -101,10 +101,10 @@ impl Farm {
         self.coordinator = Some(process);
     }
 
-    /// The coordinator's process.
+    /// Returns the coordinator's process.
     ///
     /// # Panics
-    /// When it was taken.
+    /// If it was taken.
     pub fn coordinator(&mut self) -> &mut Process {
         self.coordinator.as_mut().expect("a coordinator runs")
     }
@@ -112,12 +112,12 @@ impl Farm {
     /// Ends the coordinator as `kill -9` does.
     ///
     /// # Panics
-    /// When there is none, or it had ended by itself.
+    /// If there is none, or it had ended by itself.
     pub fn kill_coordinator(&mut self) {
         self.coordinator.take().expect("a coordinator runs").kill();
     }
 
-    /// Its URL.
+    /// Returns the coordinator's URL.
     ///
     /// # Panics
     /// Before its first start.
@@ -132,15 +132,15 @@ impl Farm {
             .start(name, &[&args[..], &["--coordinator", self.url()]].concat())
     }
 
-    /// Commands that know the coordinator.
+    /// Returns commands that use the coordinator.
     pub fn cli(&self) -> Cli {
         self.cli.clone().with("PICOFARM_COORDINATOR", self.url())
     }
 
-    /// How often the logs of all processes of this farm say `words`.
+    /// Counts the occurrences of `words` in the logs of all processes of this farm.
     ///
     /// # Panics
-    /// When a log cannot be read.
+    /// If a log cannot be read.
     pub fn logged(&self, words: &str) -> u64 {
         let entries = std::fs::read_dir(self.scratch.path()).expect("the test's folder is there");
         let count = |path: PathBuf| {
@@ -159,20 +159,20 @@ impl Farm {
         self.cli().run(args)
     }
 
-    /// The JSON answer of a command that succeeds.
+    /// Returns the JSON answer of a successful command.
     pub fn json(&self, args: &[&str]) -> Value {
         self.cli().json(args)
     }
 
-    /// The folder for results.
+    /// Returns the folder for results.
     pub fn store(&self) -> PathBuf {
         self.scratch.join("store")
     }
 
-    /// Submits a job: its id.
+    /// Submits a job and returns its id.
     ///
     /// # Panics
-    /// When it is refused.
+    /// If it is refused.
     pub fn submit(&self, job: &Job) -> String {
         let file = self.scratch.join(&format!("{}.toml", job.name));
         job.write(&file);
@@ -183,42 +183,42 @@ impl Farm {
             .to_owned()
     }
 
-    /// `job status`.
+    /// Returns the output of `job status`.
     pub fn status(&self, job: &str) -> Value {
         self.json(&["job", "status", job])
     }
 
-    /// Number of tasks in a state (`done`, `dead`, `pending`, …).
+    /// Returns the number of tasks in a state (`done`, `dead`, `pending`, …).
     ///
     /// # Panics
-    /// When the status does not tell.
+    /// If the status lacks this number.
     pub fn count(&self, job: &str, state: &str) -> u64 {
         self.status(job)["tasks"][state]
             .as_u64()
             .expect("a status counts tasks")
     }
 
-    /// The whole history.
+    /// Returns the whole history.
     ///
     /// # Panics
-    /// When it is no list.
+    /// If it is not a list.
     pub fn events(&self, job: &str) -> Vec<Value> {
         let answer = self.json(&["job", "logs", job, "--last", "1000000"]);
         answer.as_array().expect("a history is a list").clone()
     }
 
-    /// The events of a kind.
+    /// Returns the events of a kind.
     pub fn events_of(&self, job: &str, kind: &str) -> Vec<Value> {
         let mut events = self.events(job);
         events.retain(|e| e["kind"] == kind);
         events
     }
 
-    /// Waits until one of `workers` is in the middle of a scene; `false` if the job ended first. Workers tell it six
-    /// times in the life of a lease, so this is for farms with short leases.
+    /// Waits until one of `workers` is in the middle of a scene. Returns `false` if the job ended
+    /// first. Workers report progress six times per lease, so this is for farms with short leases.
     ///
     /// # Panics
-    /// When neither happens.
+    /// If neither happens.
     pub fn until_busy(&self, job: &str, workers: &[&str]) -> bool {
         until(&format!("{workers:?} to be in a scene"), || {
             let status = self.status(job);
@@ -233,10 +233,11 @@ impl Farm {
         })
     }
 
-    /// Waits until the job ends: its last status. A long job may take long, as long as it gets on.
+    /// Waits until the job ends, and returns its last status. A long job may take long, as long as
+    /// it makes progress.
     ///
     /// # Panics
-    /// When it does not end.
+    /// If it does not end.
     pub fn until_ended(&self, job: &str) -> Value {
         let mut before = Value::Null;
         loop {
@@ -252,10 +253,10 @@ impl Farm {
         }
     }
 
-    /// The JSON answer of a command, asked again while the coordinator cannot answer.
+    /// Returns the JSON answer of a command. Retries while the coordinator cannot answer.
     ///
     /// # Panics
-    /// When it fails for another reason, or for long.
+    /// If it fails for another reason, or for long.
     pub fn patiently(&self, args: &[&str]) -> Value {
         until(&format!("an answer to {args:?}"), || {
             let ended = self.run(&[args, &["--json"]].concat());
@@ -267,10 +268,11 @@ impl Farm {
         })
     }
 
-    /// Waits until the job is done, and checks that each scene was committed exactly once and the data set is whole.
+    /// Waits until the job is done, and checks that each scene was committed exactly once and that
+    /// the data set is undamaged.
     ///
     /// # Panics
-    /// When any of it fails.
+    /// If any of this fails.
     pub fn until_done_once(&self, job: &Job, id: &str) {
         let status = self.until_ended(id);
         assert_eq!(status["state"], "done", "{status}");
@@ -287,10 +289,11 @@ impl Farm {
         assert_eq!(report["scenes"], total, "{report}");
     }
 
-    /// Checks in the history that each of `total` scenes was committed exactly once and nothing raised an alarm.
+    /// Checks in the history that each of `total` scenes was committed exactly once and that there
+    /// was no alarm.
     ///
     /// # Panics
-    /// When one was not.
+    /// If a check fails.
     pub fn committed_once(&self, job: &str, total: u64) {
         for task in 0..total {
             let task = task.to_string();
@@ -308,7 +311,7 @@ impl Farm {
     }
 }
 
-/// The objects that an undisturbed run of `job` leaves, from a farm of its own.
+/// Returns the objects of an undisturbed run of `job` on a farm of its own.
 pub fn undisturbed(name: &str, job: &Job) -> std::collections::BTreeMap<String, String> {
     let farm = Farm::start(&format!("{name}-undisturbed"));
     let job = Job {

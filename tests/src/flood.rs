@@ -1,23 +1,24 @@
-//! A caller that sends far more than a coordinator has memory for.
+//! A client that sends far more than a coordinator has memory for.
 
 use std::time::Duration;
 
 use picofarm_proto::wire::{self, jobs_client::JobsClient};
 
-/// Connections of one flood.
+/// Number of connections of a flood.
 const CONNECTIONS: usize = 4;
-/// Requests under way on each.
+/// Number of concurrent requests per connection.
 const REQUESTS: usize = 8;
-/// Size of each request's spec, bytes. Its small values take several times as much memory once they are read.
+/// Size of each request's spec, in bytes. Its small values take several times as much memory after
+/// parsing.
 const BYTES: usize = 8 << 20;
-/// A flood ends after this time, whatever has been answered by then.
+/// Maximum duration of a flood, whatever has been answered by then.
 const ENOUGH: Duration = Duration::from_secs(4);
 
-/// Sends specs of many small values over several connections at once. Whether the coordinator refuses them or closes the connections
-/// is its affair.
+/// Sends specs of many small values over several connections at once. The coordinator may refuse
+/// them or close the connections.
 ///
 /// # Panics
-/// When no runtime can be had.
+/// If no runtime can be created.
 pub fn specs(url: &str) {
     let spec = format!("{{\"name\":[{}0]}}", "0,".repeat(BYTES / 2));
     let runtime = tokio::runtime::Runtime::new().expect("threads can be had");
@@ -33,13 +34,13 @@ pub fn specs(url: &str) {
                 };
                 let mut client = client.clone();
                 under_way.push(tokio::spawn(async move {
-                    // An answer is as good as a refusal.
+                    // An answer and a refusal are equally acceptable.
                     let _ = client.plan_job(request).await;
                 }));
             }
         }
         let all = futures::future::join_all(under_way);
-        // Those that are not answered by then are dropped with the runtime.
+        // Pending requests are dropped with the runtime.
         let _ = tokio::time::timeout(ENOUGH, all).await;
     });
     runtime.shutdown_background();

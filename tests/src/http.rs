@@ -1,4 +1,4 @@
-//! A plain HTTP/1.1 GET, for what the coordinator serves to probes and Prometheus.
+//! A plain HTTP/1.1 GET, for the coordinator's probe and Prometheus endpoints.
 
 use std::{
     io::{Read, Write},
@@ -6,10 +6,10 @@ use std::{
     time::Duration,
 };
 
-/// Status code and body of `url` (`http://ADDRESS/PATH`); `None` where nobody answers.
+/// Returns status code and body of `url` (`http://ADDRESS/PATH`); `None` if nobody answers.
 ///
 /// # Panics
-/// When the answer is no HTTP.
+/// If the answer is not HTTP.
 pub fn get(url: &str) -> Option<(u16, String)> {
     let rest = url.strip_prefix("http://").expect("a plain URL");
     let (address, path) = rest.split_once('/').expect("a URL with a path");
@@ -25,7 +25,7 @@ pub fn get(url: &str) -> Option<(u16, String)> {
     Some((code.parse().expect("a status is a number"), body.to_owned()))
 }
 
-/// The value of a sample on a page of metrics, its labels as they are written there.
+/// Returns the value of a sample on a page of metrics. `name` includes its labels as printed there.
 pub fn sample(page: &str, name: &str) -> Option<f64> {
     let line = page
         .lines()

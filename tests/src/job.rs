@@ -5,20 +5,20 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// A job that renders in seconds; the fields are those of the job file.
+/// A job that renders in seconds. The fields are those of the job file.
 #[derive(Clone)]
 pub struct Job {
     /// Name.
     pub name: String,
-    /// `kind = …` and what goes with it.
+    /// `kind = …` and its parameters.
     pub scenes: String,
-    /// Scenes; not written for `kind = "files"`.
+    /// Number of scenes; not written for `kind = "files"`.
     pub count: Option<u64>,
     /// Seed.
     pub seed: u64,
-    /// Pixels.
+    /// Width and height of the image, in pixels.
     pub resolution: u32,
-    /// Camera paths a pixel: what a scene costs.
+    /// Camera paths per pixel, which determine the time per scene.
     pub samples: u32,
     /// ℓ_min in metres.
     pub gate_start_m: f64,
@@ -26,14 +26,14 @@ pub struct Job {
     pub store: PathBuf,
     /// Data set.
     pub dataset: String,
-    /// Failures until a task is dead.
+    /// Number of failures after which a task is dead.
     pub max_failures: u32,
-    /// Lost workers until a task is dead.
+    /// Number of lost workers after which a task is dead.
     pub max_crashes: u32,
 }
 
 impl Job {
-    /// Primitive rooms of 16×16 pixels × 64 bins, done in a moment each.
+    /// A job of primitive rooms with 16×16 pixels × 64 bins, each rendered in a moment.
     pub fn quick(store: &Path, count: u64) -> Self {
         Self {
             name: "quick".into(),
@@ -50,8 +50,8 @@ impl Job {
         }
     }
 
-    /// The same with so many paths that each scene takes one to two seconds on one thread: long enough to be struck
-    /// in the middle. Lost workers never use up a task.
+    /// A job of slow scenes: each takes one to two seconds on one thread, long enough to be
+    /// interrupted. Lost workers never make a task dead.
     pub fn slow(store: &Path, count: u64) -> Self {
         Self {
             name: "slow".into(),
@@ -61,7 +61,7 @@ impl Job {
         }
     }
 
-    /// Scene files, one task each.
+    /// A job of scene files, one task each.
     pub fn files(store: &Path, files: &[&Path]) -> Self {
         let list: Vec<String> = files
             .iter()
@@ -75,12 +75,12 @@ impl Job {
         }
     }
 
-    /// Where the data set lies.
+    /// Returns the location of the data set.
     pub fn place(&self) -> PathBuf {
         self.store.join(&self.dataset)
     }
 
-    /// The job file's text.
+    /// Returns the job file's text.
     pub fn toml(&self) -> String {
         let mut text = format!(
             "name = {:?}\n\n[scenes]\n{}\nseed = {}\n",
@@ -106,11 +106,11 @@ impl Job {
     /// Writes the job file.
     ///
     /// # Panics
-    /// When it cannot be written.
+    /// If it cannot be written.
     pub fn write(&self, file: &Path) {
         std::fs::write(file, self.toml()).expect("the test's folder is writable");
     }
 }
 
-/// Paths a pixel for one to two seconds a scene.
+/// Paths per pixel for one to two seconds per scene.
 const SLOW: u32 = 768;

@@ -1,8 +1,9 @@
-//! The harness of the end-to-end tests: real `picofarm` processes on loopback ports, started, stopped, frozen and
-//! killed; what they print, and what they leave in a store.
+//! The harness of the end-to-end tests: starts, stops, freezes and kills real `picofarm` processes
+//! on loopback ports, and reads their output and stores.
 //!
-//! Nothing here knows the insides of the program. A test waits for what can be seen from outside (status, events,
-//! files, logs), never for a time. Each test has a folder of its own, which stays when the test fails.
+//! The harness does not use internals of the program. A test waits for externally visible
+//! conditions (status, events, files, logs), never for a fixed time. Each test has a folder of its
+//! own, which is retained if the test fails.
 
 pub mod binary;
 pub mod cli;
@@ -34,11 +35,12 @@ pub use process::{Process, Signal};
 pub use scratch::Scratch;
 pub use slurm::Slurm;
 
-/// The folder of the tests, as cargo says where it runs them. (As it was when they were built, it may be another checkout's: a
-/// target folder may be kept.)
+/// Returns the folder of the tests, from the variable that cargo sets when it runs them. (The
+/// folder known at build time may belong to another checkout, because a target folder may be
+/// reused.)
 ///
 /// # Panics
-/// Where neither cargo nor nextest runs this.
+/// If neither cargo nor nextest runs this.
 pub fn package() -> String {
     std::env::var("CARGO_MANIFEST_DIR").expect("cargo or nextest runs the tests")
 }

@@ -1,4 +1,4 @@
-//! A file system of a given size, to fill up or to make read-only. Needs root.
+//! A file system of a given size, for tests with full or read-only disks. Needs root.
 
 use std::{
     path::{Path, PathBuf},
@@ -7,14 +7,15 @@ use std::{
 
 use crate::wait::until;
 
-/// A tmpfs; unmounted with the value.
+/// A tmpfs, unmounted on drop.
 pub struct Tmpfs(PathBuf);
 
 impl Tmpfs {
-    /// Mounts one of `kib` KiB at the new folder `path`; `None`, saying why, where the system does not let us.
+    /// Mounts a tmpfs of `kib` KiB at the new folder `path`. Prints the reason and returns `None`
+    /// if the system does not allow it.
     ///
     /// # Panics
-    /// When the folder cannot be made.
+    /// If the folder cannot be created.
     pub fn mount(path: &Path, kib: u64) -> Option<Self> {
         std::fs::create_dir(path).expect("the test's folder is writable");
         let size = format!("size={kib}k");
@@ -39,15 +40,16 @@ impl Tmpfs {
     /// Changes its options, e.g. `ro` or `size=1000k`.
     ///
     /// # Panics
-    /// When the system refuses.
+    /// If the system refuses.
     pub fn remount(&self, options: &str) {
         assert!(self.try_remount(options), "remount,{options}");
     }
 
-    /// Changes its options; `false` where the system refuses, as it does `ro` while a file is open for writing.
+    /// Changes its options. Returns `false` if the system refuses, as it does `ro` while a file is
+    /// open for writing.
     ///
     /// # Panics
-    /// When there is no `mount`.
+    /// If there is no `mount`.
     fn try_remount(&self, options: &str) -> bool {
         let output = Command::new("mount")
             .args(["-o", &format!("remount,{options}")])
@@ -56,21 +58,23 @@ impl Tmpfs {
         output.expect("there is `mount`").status.success()
     }
 
-    /// Makes it read-only, in a moment in which nobody writes: in others the system refuses.
+    /// Makes it read-only. Retries until no file is open for writing, because the system refuses
+    /// otherwise.
     ///
     /// # Panics
-    /// When the system refuses for too long.
+    /// If the system refuses for too long.
     pub fn forbid_writes(&self) {
         until("a moment in which nobody writes", || {
             self.try_remount("ro").then_some(())
         });
     }
 
-    /// Leaves at most `kib` KiB free until [`Tmpfs::widen`]. Others may be writing: where more was used than had been
-    /// counted, the system refuses the size, and it is counted again.
+    /// Leaves at most `kib` KiB free until [`Tmpfs::widen`]. Others may be writing at the same
+    /// time. If more is in use than counted, the system refuses the size, and the space is counted
+    /// again.
     ///
     /// # Panics
-    /// When the system refuses for too long.
+    /// If the system refuses for too long.
     pub fn fill(&self, kib: u64) {
         until("a size that the system takes", || {
             self.try_remount(&format!("size={}k", self.used_kib() + kib))
@@ -78,10 +82,10 @@ impl Tmpfs {
         });
     }
 
-    /// Gives it `mib` MiB.
+    /// Sets its size to `mib` MiB.
     ///
     /// # Panics
-    /// When the system refuses.
+    /// If the system refuses.
     pub fn widen(&self, mib: u64) {
         self.remount(&format!("size={mib}m"));
     }
@@ -89,7 +93,7 @@ impl Tmpfs {
     /// Covers it with an empty file system, as if it were not mounted, until the value is dropped.
     ///
     /// # Panics
-    /// When the system refuses.
+    /// If the system refuses.
     pub fn cover(&self) -> Cover {
         let status = Command::new("mount")
             .args(["-t", "tmpfs", "-o", "size=64m", "picofarm-test-cover"])
@@ -99,10 +103,10 @@ impl Tmpfs {
         Cover(self.0.clone())
     }
 
-    /// KiB in use.
+    /// Returns the KiB in use.
     ///
     /// # Panics
-    /// When `df` does not tell.
+    /// If `df` does not report them.
     pub fn used_kib(&self) -> u64 {
         let output = Command::new("df")
             .args(["--output=used", "-k"])
@@ -128,7 +132,8 @@ impl Drop for Cover {
 
 impl Drop for Tmpfs {
     fn drop(&mut self) {
-        // Lazily: a process that still runs in it must not keep the mount alive. Nothing to be done where it fails.
+        // Lazily, because a process that still runs in it must not keep the mount alive. A failure
+        // is ignored.
         let _ = Command::new("umount").arg("-l").arg(&self.0).status();
     }
 }

@@ -1,4 +1,5 @@
-//! Scene files, jobs and messages that hold what a database refuses and a terminal obeys.
+//! Scene files, jobs and messages with content that a database rejects and a terminal would
+//! interpret.
 
 use std::{
     path::{Path, PathBuf},
@@ -13,11 +14,11 @@ use serde_json::Value;
 
 use crate::job::Job;
 
-/// Writes a glTF file that names an extension with a NUL byte, an escape sequence and a line break: no reader knows it,
-/// and honest readers quote it.
+/// Writes a glTF file that names an extension with a NUL byte, an escape sequence and a line break.
+/// No reader knows this extension, and error messages quote it.
 ///
 /// # Panics
-/// When it cannot be written.
+/// If it cannot be written.
 pub fn scene(folder: &Path, number: u64) -> PathBuf {
     let path = folder.join(format!("poison-{number}.gltf"));
     let name = format!("x\\u0000y\\u001b]0;owned\\u0007\\n{number}");
@@ -28,7 +29,7 @@ pub fn scene(folder: &Path, number: u64) -> PathBuf {
     path
 }
 
-/// A job whose scene cannot be read, and whose reason holds a NUL byte.
+/// Returns a job with an unreadable scene. The reason for its failure contains a NUL byte.
 pub fn job(store: &Path, folder: &Path, number: u64) -> Job {
     let scene = scene(folder, number);
     Job {
@@ -39,10 +40,8 @@ pub fn job(store: &Path, folder: &Path, number: u64) -> Job {
     }
 }
 
-/// Checks that the history of such a job says why it failed, in text that a terminal can show.
-///
-/// # Panics
-/// When it does not.
+/// Checks that the history of such a job contains the reason for its failure, with nothing that a
+/// terminal would interpret.
 pub fn assert_told(events: &[Value]) {
     let said = events.iter().any(|e| {
         let message = e["message"].as_str().unwrap_or_default();
@@ -51,10 +50,11 @@ pub fn assert_told(events: &[Value]) {
     assert!(said, "the history says which extension it was: {events:?}");
 }
 
-/// Opens a session whose every text holds what Postgres refuses and a terminal obeys, and whose numbers cannot be.
+/// Opens a session with invalid numbers, and with texts that Postgres rejects and a terminal would
+/// interpret.
 ///
 /// # Panics
-/// When no runtime can be had.
+/// If no runtime can be created.
 pub fn lie(url: &str) {
     let name = "w\0orker\x1b]0;owned\x07\nforged line";
     let hello = wire::Hello {
@@ -88,7 +88,7 @@ pub fn lie(url: &str) {
     let url = url.to_owned();
     let runtime = tokio::runtime::Runtime::new().expect("threads can be had");
     runtime.block_on(async {
-        // Whether it is refused or not heard at all is the coordinator's affair.
+        // The coordinator may refuse it or not answer at all.
         let Ok(mut client) = FarmClient::connect(url).await else {
             return;
         };

@@ -1,11 +1,11 @@
-//! A Postgres server of a test's own, that may be killed.
+//! A Postgres server for a single test, which may be killed.
 
 use std::{
     path::{Path, PathBuf},
     process::Command,
 };
 
-/// A running server; stopped when dropped.
+/// A running server, stopped on drop.
 pub struct Postgres {
     dir: PathBuf,
     /// Its URL.
@@ -21,16 +21,17 @@ fn script(args: &[&str]) -> std::process::Output {
 }
 
 impl Postgres {
-    /// Starts one; `None`, having said so, where tests/run has not seen to it that Postgres is installed.
+    /// Starts a server. Prints a message and returns `None` if tests/run has not set up Postgres.
     ///
     /// # Panics
-    /// When it does not start.
+    /// If it does not start.
     pub fn start(name: &str) -> Option<Self> {
         if std::env::var_os("PICOFARM_TEST_POSTGRES").is_none() {
             eprintln!("SKIPPED: tests/run sets PICOFARM_TEST_POSTGRES where Postgres is installed");
             return None;
         }
-        // Its user must be able to enter the folder, and a socket's path is short.
+        // The user of the server must be able to enter the folder, and the path of a socket must be
+        // short.
         let dir = std::env::temp_dir().join(format!("pf-{name}-{}", std::process::id()));
         let mut server = Self {
             dir,
@@ -43,7 +44,7 @@ impl Postgres {
     /// Starts it again.
     ///
     /// # Panics
-    /// When it does not start.
+    /// If it does not start.
     pub fn up(&mut self) {
         let started = script(&["start", &self.dir.display().to_string()]);
         let error = String::from_utf8_lossy(&started.stderr);
@@ -53,15 +54,15 @@ impl Postgres {
             .clone_into(&mut self.url);
     }
 
-    /// Ends it in order: connections break, what was committed stays.
+    /// Stops it in order: connections break, committed data remain.
     pub fn down(&self) {
         script(&["stop", &self.dir.display().to_string()]);
     }
 
-    /// Ends it without a word to anyone and starts it again: it recovers what was committed.
+    /// Kills it and starts it again. It recovers the committed data.
     ///
     /// # Panics
-    /// When it does not come back.
+    /// If it does not restart.
     pub fn crash(&mut self) {
         script(&["stop", &self.dir.display().to_string(), "immediate"]);
         self.up();
@@ -71,7 +72,7 @@ impl Postgres {
 impl Drop for Postgres {
     fn drop(&mut self) {
         script(&["stop", &self.dir.display().to_string(), "immediate"]);
-        // What is left over is in the system's folder for such things.
+        // Files that remain are in the system's temporary folder.
         let _ = std::fs::remove_dir_all(&self.dir);
     }
 }

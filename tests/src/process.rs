@@ -1,4 +1,4 @@
-//! A running process with its output in files: signals, waiting, and a sure end.
+//! A running process with its output in files: signals, waiting, and a guaranteed end.
 
 use std::{
     fs::File,
@@ -9,7 +9,7 @@ use std::{
 
 use crate::{cli::Ended, wait::until};
 
-/// What can be sent to a process.
+/// Signals for a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Signal {
     /// Ctrl-C.
@@ -24,7 +24,7 @@ pub enum Signal {
     Continue,
 }
 
-/// A process. Ends with the value, by SIGKILL if need be.
+/// A process. It ends on drop, by SIGKILL if necessary.
 pub struct Process {
     child: Child,
     name: String,
@@ -33,10 +33,10 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts `command`; its output goes to `dir/NN-name.stdout` and `.stderr`.
+    /// Starts `command`. Its output goes to `dir/NN-name.stdout` and `.stderr`.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// If it cannot be started.
     pub fn start(name: &str, mut command: Command, dir: &Path) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
@@ -56,30 +56,30 @@ impl Process {
         }
     }
 
-    /// Its process id.
+    /// Returns its process id.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
 
-    /// Its name.
+    /// Returns its name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// What it has printed to stdout so far.
+    /// Returns its stdout so far.
     pub fn stdout(&self) -> String {
         std::fs::read_to_string(&self.stdout).expect("the output was created at the start")
     }
 
-    /// What it has printed to stderr so far.
+    /// Returns its stderr so far.
     pub fn stderr(&self) -> String {
         std::fs::read_to_string(&self.stderr).expect("the output was created at the start")
     }
 
-    /// Whether it still runs.
+    /// Returns whether it still runs.
     ///
     /// # Panics
-    /// When the system does not say.
+    /// If the system does not report it.
     pub fn runs(&mut self) -> bool {
         self.child
             .try_wait()
@@ -87,10 +87,10 @@ impl Process {
             .is_none()
     }
 
-    /// Waits until its stderr says `words`.
+    /// Waits until its stderr contains `words`.
     ///
     /// # Panics
-    /// When it ends without.
+    /// If it ends before.
     pub fn until_says(&mut self, words: &str) {
         until(&format!("{} to say {words:?}", self.name), || {
             let runs = self.runs();
@@ -103,7 +103,7 @@ impl Process {
     /// Sends a signal.
     ///
     /// # Panics
-    /// When the process has ended.
+    /// If the process has ended.
     pub fn signal(&mut self, signal: Signal) {
         assert!(self.runs(), "{} has ended: {}", self.name, self.stderr());
         let name = match signal {
@@ -113,7 +113,8 @@ impl Process {
             Signal::Stop => "STOP",
             Signal::Continue => "CONT",
         };
-        // The shell's builtin: `unsafe` is not worth a signal, and not every system has /bin/kill.
+        // Uses the shell's builtin, because a signal is no reason for `unsafe`, and not every
+        // system has /bin/kill.
         let sent = Command::new("sh")
             .args(["-c", &format!("kill -s {name} {}", self.child.id())])
             .status()
@@ -124,7 +125,7 @@ impl Process {
     /// Ends it at once, as `kill -9` does.
     ///
     /// # Panics
-    /// When it had ended by itself: then the test did not test what it meant to.
+    /// If it had ended by itself, because then the test did not test the intended case.
     pub fn kill(mut self) {
         assert!(
             self.runs(),
@@ -139,7 +140,7 @@ impl Process {
     /// Waits until it ends by itself.
     ///
     /// # Panics
-    /// When it does not.
+    /// If it does not.
     pub fn end(mut self) -> Ended {
         let status = until(&format!("the end of {}", self.name), || {
             self.child.try_wait().expect("a child can be waited for")
@@ -152,10 +153,10 @@ impl Process {
         }
     }
 
-    /// The first line of its stdout, once it is there.
+    /// Waits for the first line of its stdout, and returns it.
     ///
     /// # Panics
-    /// When it ends without one.
+    /// If it ends without one.
     pub fn first_line(&mut self) -> String {
         until(&format!("the first line of {}", self.name), || {
             let runs = self.runs();
@@ -174,7 +175,7 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Both fail only when it has ended already.
+        // Both fail only if it has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -1,4 +1,5 @@
-//! A TCP proxy that fails when asked to: cut its connections, or hold back what passes.
+//! A TCP proxy that simulates network failures: it cuts its connections, or delays or withholds
+//! data.
 
 use std::{
     io::{ErrorKind, Read, Write},
@@ -11,36 +12,36 @@ use std::{
     time::Duration,
 };
 
-/// How it behaves.
+/// Behaviour of the proxy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Mode {
-    /// Everything passes at once.
+    /// Data pass at once.
     Pass = 0,
-    /// Nothing passes, in either direction; connections stay open, as in a partition.
+    /// No data pass in either direction, but connections stay open, as in a network partition.
     Hold = 1,
-    /// Each piece passes a while later.
+    /// Each piece of data passes after a delay.
     Delay = 2,
 }
 
-/// The proxy; it lives until the process ends.
+/// The proxy. It runs until the process ends.
 pub struct Proxy {
-    /// Where it listens.
+    /// Address on which it listens.
     pub address: SocketAddr,
     state: Arc<State>,
 }
 
 struct State {
     mode: AtomicU8,
-    /// Connections of an earlier number are cut.
+    /// Connections with an earlier number are cut.
     generation: AtomicU64,
 }
 
 impl Proxy {
-    /// A proxy before `target`.
+    /// Starts a proxy in front of `target`.
     ///
     /// # Panics
-    /// When no port is free.
+    /// If no port is free.
     pub fn before(target: SocketAddr) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port is free");
         let address = listener.local_addr().expect("it listens");
@@ -51,7 +52,7 @@ impl Proxy {
         let shared = state.clone();
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
-                // Where nobody listens, the client is let go at once.
+                // If nobody listens, the client's connection is closed at once.
                 if let Ok(server) = TcpStream::connect(target) {
                     join(client, server, &shared);
                 }
@@ -60,17 +61,17 @@ impl Proxy {
         Self { address, state }
     }
 
-    /// How it behaves from now on.
+    /// Sets the behaviour from now on.
     pub fn set(&self, mode: Mode) {
         self.state.mode.store(mode as u8, SeqCst);
     }
 
-    /// Cuts all connections; new ones are welcome.
+    /// Cuts all connections, but accepts new ones.
     pub fn cut(&self) {
         self.state.generation.fetch_add(1, SeqCst);
     }
 
-    /// Its URL.
+    /// Returns its URL.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
     }
@@ -85,7 +86,7 @@ fn join(client: TcpStream, server: TcpStream, state: &Arc<State>) {
         let state = state.clone();
         thread::spawn(move || {
             pass(&from, &to, &state, generation);
-            // Both directions end together; they may be over already.
+            // Both directions end together; they may already be closed.
             let _ = from.shutdown(Shutdown::Both);
             let _ = to.shutdown(Shutdown::Both);
         });
@@ -94,7 +95,7 @@ fn join(client: TcpStream, server: TcpStream, state: &Arc<State>) {
 
 fn pass(mut from: &TcpStream, mut to: &TcpStream, state: &State, generation: u64) {
     let cut = || state.generation.load(SeqCst) != generation;
-    // A timeout, so that a cut is noticed on a silent connection.
+    // With a timeout, so that a silent connection notices a cut.
     let _ = from.set_read_timeout(Some(Duration::from_millis(20)));
     let _ = to.set_nodelay(true);
     let mut piece = [0; 16 << 10];

@@ -1,6 +1,7 @@
-//! An S3 server of the tests' own: SeaweedFS on loopback ports in a scratch folder, one a test.
+//! An S3 server for the tests: SeaweedFS on loopback ports in a scratch folder, one per test.
 //!
-//! `tests/run` installs the program and names it in `PICOFARM_WEED`, so that nothing is skipped there.
+//! `tests/run` installs the program and names it in `PICOFARM_WEED`, so that no test is skipped
+//! there.
 
 use std::{
     collections::BTreeMap,
@@ -24,17 +25,17 @@ use sha2::{Digest, Sha256};
 
 use crate::{cli::Cli, ports::lasting, process::Process, scratch::Scratch, wait::until};
 
-/// Who may read and write.
+/// Access key with read and write permission.
 pub const KEY: &str = "farmkey0";
-/// Its secret; appears in no log.
+/// Its secret, which must not appear in any log.
 pub const SECRET: &str = "far+msecret/0123456789";
-/// Who may only read.
+/// Access key and secret with read permission only.
 pub const READER: (&str, &str) = ("readkey0", "readsecret0123456789");
 
-/// Ports of the server's parts, S3's last.
+/// Names of the server's parts that need ports, S3 last.
 const PARTS: [&str; 4] = ["master", "volume", "filer", "s3"];
 
-/// A running server with one bucket of each test's own.
+/// A running server, with a new bucket for each test.
 pub struct Server {
     process: Option<Process>,
     ports: [(u16, u16); 4],
@@ -44,10 +45,10 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts a server; `None`, having said so, where none is installed.
+    /// Starts a server. Prints a message and returns `None` if none is installed.
     ///
     /// # Panics
-    /// When it does not come up.
+    /// If it does not start.
     pub fn start(name: &str) -> Option<Self> {
         let Some(program) = std::env::var_os("PICOFARM_WEED") else {
             eprintln!(
@@ -62,7 +63,7 @@ impl Server {
                 "name": name, "actions": actions, "credentials": [{"accessKey": key, "secretKey": secret}],
             })
         };
-        // Not an administrator, whose puts would create missing buckets.
+        // Not an administrator, because the administrator's puts would create missing buckets.
         let who = serde_json::json!({"identities": [
             identity("farm", (KEY, SECRET), &["Read", "Write", "List"]),
             identity("reader", READER, &["Read", "List"]),
@@ -79,10 +80,11 @@ impl Server {
         Some(server)
     }
 
-    /// Starts it, the first time or again with what it holds, and waits until it answers.
+    /// Starts the server, for the first time or again with its existing objects, and waits until it
+    /// answers.
     ///
     /// # Panics
-    /// When it runs already, or does not come up.
+    /// If it is running already, or does not start.
     pub fn up(&mut self) {
         assert!(self.process.is_none(), "the server runs");
         let mut command = Command::new(&self.program);
@@ -111,7 +113,7 @@ impl Server {
             command.arg(format!("-{part}.port={http}"));
             command.arg(format!("-{part}.port.grpc={grpc}"));
         }
-        // It writes a pid file and takes settings from where it runs.
+        // The server writes a pid file and reads settings in its working folder.
         command.current_dir(self.scratch.path());
         let mut process = Process::start("weed", command, self.scratch.path());
         let bucket = self.store("probe");
@@ -126,20 +128,20 @@ impl Server {
         self.process = Some(process);
     }
 
-    /// Ends it as `kill -9` does; what it holds stays.
+    /// Ends the server as `kill -9` does. Its objects remain.
     ///
     /// # Panics
-    /// When it does not run.
+    /// If it is not running.
     pub fn kill(&mut self) {
         self.process.take().expect("the server runs").kill();
     }
 
-    /// Where it answers.
+    /// Returns its S3 endpoint.
     pub fn endpoint(&self) -> String {
         format!("http://127.0.0.1:{}", self.ports[3].0)
     }
 
-    /// A new bucket's name.
+    /// Creates a bucket and returns its name.
     pub fn bucket(&self) -> String {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!("farm-{}", COUNT.fetch_add(1, Ordering::Relaxed));
@@ -147,12 +149,12 @@ impl Server {
         name
     }
 
-    /// Commands that know the server and its keys.
+    /// Configures commands with the server and its keys.
     pub fn with(&self, cli: Cli) -> Cli {
         self.as_user(cli, (KEY, SECRET))
     }
 
-    /// Commands that know the server and come with these keys.
+    /// Configures commands with the server and these keys.
     pub fn as_user(&self, cli: Cli, (key, secret): (&str, &str)) -> Cli {
         cli.with("AWS_ENDPOINT_URL", &self.endpoint())
             .with("AWS_ALLOW_HTTP", "true")
@@ -161,10 +163,10 @@ impl Server {
             .with("AWS_SECRET_ACCESS_KEY", secret)
     }
 
-    /// SHA-256 of every object below a prefix, by its key there.
+    /// Returns the SHA-256 of every object below a prefix, by its key there.
     ///
     /// # Panics
-    /// When one cannot be read.
+    /// If an object cannot be read.
     pub fn hashes(&self, bucket: &str, prefix: &str) -> BTreeMap<String, String> {
         let store = self.store(bucket);
         let below = Path::from(prefix);
@@ -180,10 +182,10 @@ impl Server {
         runtime().block_on(read).expect("the objects can be read")
     }
 
-    /// The bytes of an object.
+    /// Returns the bytes of an object.
     ///
     /// # Panics
-    /// When there is none.
+    /// If there is none.
     pub fn get(&self, bucket: &str, key: &str) -> Vec<u8> {
         let key = Path::from(key);
         let store = self.store(bucket);
@@ -191,20 +193,20 @@ impl Server {
         bytes.expect("the object is there").to_vec()
     }
 
-    /// Puts an object in any case.
+    /// Puts an object, replacing any existing one.
     ///
     /// # Panics
-    /// When the server refuses.
+    /// If the server refuses.
     pub fn put(&self, bucket: &str, key: &str, bytes: Vec<u8>) {
         let (store, key) = (self.store(bucket), Path::from(key));
         let put = runtime().block_on(async { store.put(&key, bytes.into()).await });
         put.expect("the object can be written");
     }
 
-    /// Deletes an object behind everyone's back.
+    /// Deletes an object without the program's knowledge.
     ///
     /// # Panics
-    /// When it cannot.
+    /// If it cannot be deleted.
     pub fn delete(&self, bucket: &str, key: &str) {
         let (store, key) = (self.store(bucket), Path::from(key));
         runtime()
@@ -213,7 +215,7 @@ impl Server {
     }
 
     fn store(&self, bucket: &str) -> Arc<AmazonS3> {
-        // The client takes the provider of cryptography that the process has chosen; the first call chooses.
+        // The client uses the process's cryptography provider, which the first call installs.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let store = AmazonS3Builder::new()
             .with_endpoint(self.endpoint())
@@ -231,7 +233,7 @@ impl Server {
         Arc::new(store.expect("the settings go together"))
     }
 
-    /// Buckets are folders of the filer, which asks for no keys.
+    /// Buckets are folders of the filer, which requires no keys.
     fn create_bucket(&self, name: &str) -> bool {
         let request = || {
             let mut filer = TcpStream::connect(("127.0.0.1", self.ports[2].0)).ok()?;
@@ -255,7 +257,7 @@ fn runtime() -> tokio::runtime::Runtime {
         .expect("a runtime can be made")
 }
 
-/// Free ports, which the server cannot choose itself.
+/// Returns free ports, because the server cannot choose them itself.
 fn free_ports() -> [(u16, u16); 4] {
     PARTS.map(|_| (lasting(), lasting()))
 }

@@ -1,4 +1,5 @@
-//! A folder of a test's own. It goes when the test passes; when it fails it stays, and its logs are shown.
+//! A folder for a single test. It is deleted if the test passes. If the test fails, the folder is
+//! retained and its logs are shown.
 
 use std::path::{Path, PathBuf};
 
@@ -6,10 +7,10 @@ use std::path::{Path, PathBuf};
 pub struct Scratch(PathBuf);
 
 impl Scratch {
-    /// A new folder for the test `name`.
+    /// Creates a new folder for the test `name`.
     ///
     /// # Panics
-    /// When the system's temporary folder cannot be used.
+    /// If the system's temporary folder cannot be used.
     pub fn new(name: &str) -> Self {
         let dir = tempfile::Builder::new()
             .prefix(&format!("picofarm-{name}-"))
@@ -18,12 +19,12 @@ impl Scratch {
         Self(dir.keep())
     }
 
-    /// Its path.
+    /// Returns its path.
     pub fn path(&self) -> &Path {
         &self.0
     }
 
-    /// A path in it.
+    /// Returns a path in it.
     pub fn join(&self, name: &str) -> PathBuf {
         self.0.join(name)
     }
@@ -32,7 +33,7 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         if !std::thread::panicking() {
-            // A folder that stays behind is no reason to fail a test that passed.
+            // A test that passed must not fail because its folder cannot be deleted.
             let _ = std::fs::remove_dir_all(&self.0);
             return;
         }
@@ -41,7 +42,7 @@ impl Drop for Scratch {
             .into_iter()
             .flatten()
             .filter_map(|entry| Some(entry.ok()?.path()))
-            // Of commands, the failed assertion shows what they said.
+            // The output of commands is omitted, because the failed assertion shows it.
             .filter(|path| {
                 let name = path.file_name().unwrap_or_default().to_string_lossy();
                 name.ends_with(".stderr") && !name.ends_with("-command.stderr")

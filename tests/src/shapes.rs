@@ -1,10 +1,10 @@
-//! Scene files to be spoilt: a generated `.glb` taken apart into `.gltf` and `.bin`.
+//! Scene files for corruption tests: a generated `.glb` split into `.gltf` and `.bin`.
 
 use std::{fs, path::Path};
 
 use serde_json::{Value, json};
 
-/// A `.glb` file's two parts.
+/// The two parts of a `.glb` file.
 pub struct Parts {
     /// The JSON document.
     pub document: Value,
@@ -13,10 +13,10 @@ pub struct Parts {
 }
 
 impl Parts {
-    /// Takes a `.glb` apart.
+    /// Splits a `.glb` file.
     ///
     /// # Panics
-    /// When it is none.
+    /// If it is not a `.glb` file.
     pub fn of(glb: &Path) -> Self {
         let bytes = fs::read(glb).unwrap_or_else(|e| panic!("{}: {e}", glb.display()));
         assert_eq!(&bytes[..4], b"glTF", "{}", glb.display());
@@ -30,10 +30,10 @@ impl Parts {
         }
     }
 
-    /// Makes the first vertex of the first mesh not a number.
+    /// Sets the first vertex of the first mesh to NaN.
     ///
     /// # Panics
-    /// When there is no mesh.
+    /// If there is no mesh.
     pub fn spoil_vertex(&mut self) {
         let index = |v: &Value| v.as_u64().expect("an index") as usize;
         let offset = |v: &Value| v["byteOffset"].as_u64().unwrap_or(0) as usize;
@@ -44,10 +44,10 @@ impl Parts {
         self.buffer[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
     }
 
-    /// Writes `<stem>.gltf`, and `<stem>.bin`, to which it refers, into `folder`.
+    /// Writes `<stem>.gltf` and the `<stem>.bin` to which it refers into `folder`.
     ///
     /// # Panics
-    /// When the folder cannot be written.
+    /// If the folder cannot be written.
     pub fn write(&self, folder: &Path, stem: &str) {
         let mut document = self.document.clone();
         document["buffers"] =

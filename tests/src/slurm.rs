@@ -1,4 +1,5 @@
-//! A Slurm cluster of a test's own on this machine, and workers that come to it by the scripts of `deploy/slurm`.
+//! A Slurm cluster for a single test on this machine, and workers started by the scripts of
+//! `deploy/slurm`.
 
 use std::{
     fmt::Write,
@@ -10,7 +11,7 @@ use std::{
 
 use crate::{binary, farm::Farm, wait::until};
 
-/// A running cluster, with everything that runs on it; ended when dropped.
+/// A running cluster, with everything that runs on it. It ends on drop.
 pub struct Slurm {
     dir: PathBuf,
     home: PathBuf,
@@ -29,11 +30,12 @@ fn said(what: &str, command: &mut Command) -> String {
 }
 
 impl Slurm {
-    /// Starts a cluster of nodes with one core each in the farm's folder; `None`, having said so, where tests/run has
-    /// not seen to it that Slurm is installed. Declare it after the farm, so that it ends first.
+    /// Starts a cluster of nodes with one core each in the farm's folder. Prints a message and
+    /// returns `None` if tests/run has not set up Slurm. Declare it after the farm, so that it ends
+    /// first.
     ///
     /// # Panics
-    /// When it does not start.
+    /// If it does not start.
     pub fn start(farm: &Farm, nodes: usize) -> Option<Self> {
         if std::env::var_os("PICOFARM_TEST_SLURM").is_none() {
             eprintln!(
@@ -58,10 +60,10 @@ impl Slurm {
         )
     }
 
-    /// Runs one of Slurm's commands: what it prints.
+    /// Runs one of Slurm's commands and returns its output.
     ///
     /// # Panics
-    /// When it fails.
+    /// If it fails.
     pub fn run(&self, program: &str, args: &[&str]) -> String {
         let mut command = Command::new(program);
         said(
@@ -70,10 +72,11 @@ impl Slurm {
         )
     }
 
-    /// Submits a job array of workers for the farm as a person would: its id. Their logs lie with those of the farm.
+    /// Submits a job array of workers for the farm as a user would, and returns its id. Their logs
+    /// are stored with those of the farm.
     ///
     /// # Panics
-    /// When it is refused.
+    /// If it is refused.
     pub fn workers(&self, farm: &Farm, array: &str) -> String {
         let env = farm.scratch.join("worker.env");
         let mut text = String::new();
@@ -97,26 +100,26 @@ impl Slurm {
         said("submit.sh", &mut submit)
     }
 
-    /// What the worker of an array element (`12_0`) has logged so far, over all its lives.
+    /// Returns the log so far of the worker of an array element (`12_0`), over all its restarts.
     pub fn log(&self, element: &str) -> String {
-        // It is not there before the element has started.
+        // The file does not exist before the element has started.
         fs::read_to_string(self.home.join(format!("{element}.stderr"))).unwrap_or_default()
     }
 
-    /// Waits until the worker of an array element has said `words` so many times.
+    /// Waits until the log of an array element's worker contains `words` at least `times` times.
     ///
     /// # Panics
-    /// When it does not.
+    /// If it does not.
     pub fn until_said(&self, element: &str, words: &str, times: usize) {
         until(&format!("worker {element} to say {words:?}"), || {
             (self.log(element).matches(words).count() >= times).then_some(())
         });
     }
 
-    /// Waits until an array element is in this state, as squeue names it.
+    /// Waits until an array element is in this state, as named by squeue.
     ///
     /// # Panics
-    /// When it does not come there.
+    /// If it does not reach this state.
     pub fn until_state(&self, element: &str, state: &str) {
         until(&format!("{element} to be {state}"), || {
             let now = self.run("squeue", &["-h", "-t", "all", "-o", "%T", "-j", element]);
@@ -127,27 +130,28 @@ impl Slurm {
     /// Starts a requeued element now; Slurm itself waits for two minutes.
     ///
     /// # Panics
-    /// When it is not there.
+    /// If the element does not exist.
     pub fn start_again(&self, element: &str) {
         self.until_state(element, "PENDING");
-        // Its credential was revoked within this second, and slurmd knows seconds only: one made in the same second is
-        // refused as that of a job "already killed", and Slurm gives the job up.
+        // The element's credential was revoked within this second, and slurmd has a resolution of
+        // one second. A credential made in the same second is refused as that of a job "already
+        // killed", and Slurm abandons the job.
         let start = ["update", &format!("JobId={element}"), "StartTime=now+2"];
         self.run("scontrol", &start);
     }
 
-    /// Cuts a node off: Slurm's processes on it are gone, the worker goes on.
+    /// Disconnects a node: Slurm's processes on it end, but the worker continues.
     ///
     /// # Panics
-    /// When there is no such node.
+    /// If there is no such node.
     pub fn lose_node(&self, node: &str) {
         self.script(&["lose"], &[node]);
     }
 
-    /// Sends a signal (`STOP`) to the worker that runs on a node.
+    /// Sends a signal (`STOP`) to the worker on a node.
     ///
     /// # Panics
-    /// When there is none.
+    /// If there is none.
     pub fn signal(&self, node: &str, signal: &str) {
         self.script(&["signal"], &[node, signal]);
     }

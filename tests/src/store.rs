@@ -1,4 +1,5 @@
-//! What lies in a store: every object's hash and time, and ways to damage one.
+//! Reads the contents of a store: every object's hash and time, the scenes of a data set, and files
+//! left by killed writers.
 
 use std::{
     collections::BTreeMap,
@@ -9,14 +10,14 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
-/// The object in a store's root that has its identity, which no two stores share.
+/// Name of the object in a store's root with its identity, which is unique to the store.
 const IDENTITY: &str = ".picofarm-store.json";
 
-/// Every object under a folder by its path in it, with the SHA-256 of its bytes. Left out are the unfinished files
-/// `name#1` that a killed writer leaves beside the objects, which no reader sees, and the identity of a store.
+/// Returns the SHA-256 of every object under a folder, by its path in it. Omits the identity of a
+/// store, and the unfinished files `name#1` of killed writers, which no reader sees.
 ///
 /// # Panics
-/// When a file cannot be read.
+/// If a file cannot be read.
 pub fn hashes(folder: &Path) -> BTreeMap<String, String> {
     let hash = |path: &Path| hex::encode(Sha256::digest(read(path)));
     files(folder)
@@ -25,10 +26,10 @@ pub fn hashes(folder: &Path) -> BTreeMap<String, String> {
         .collect()
 }
 
-/// When each object under a folder was last written.
+/// Returns the modification time of each object under a folder.
 ///
 /// # Panics
-/// When a file cannot be looked up.
+/// If the metadata of a file cannot be read.
 pub fn times(folder: &Path) -> BTreeMap<String, SystemTime> {
     let time = |path: &Path| {
         let modified = fs::metadata(path).and_then(|m| m.modified());
@@ -40,7 +41,7 @@ pub fn times(folder: &Path) -> BTreeMap<String, SystemTime> {
         .collect()
 }
 
-/// The scenes that are finished, by their manifests in the data set at `place`.
+/// Returns the finished scenes, by their manifests in the data set at `place`.
 pub fn finished(place: &Path) -> Vec<u64> {
     let mut scenes: Vec<u64> = fs::read_dir(place.join("manifests"))
         .into_iter()
@@ -59,19 +60,19 @@ pub fn finished(place: &Path) -> Vec<u64> {
     scenes
 }
 
-/// The manifest of a scene.
+/// Returns the manifest of a scene.
 ///
 /// # Panics
-/// When it is missing or no JSON.
+/// If it is missing or is not JSON.
 pub fn manifest(place: &Path, scene: u64) -> serde_json::Value {
     let path = place.join(format!("manifests/{scene}.json"));
     serde_json::from_slice(&read(&path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The objects of a scene with its manifest, by their keys in the data set.
+/// Returns the objects of a scene, including its manifest, by their keys in the data set.
 ///
 /// # Panics
-/// When the manifest is missing or no manifest.
+/// If the manifest is missing or invalid.
 pub fn objects(place: &Path, scene: u64) -> Vec<String> {
     let manifest = manifest(place, scene);
     let objects = manifest["objects"]
@@ -109,7 +110,7 @@ fn files(folder: &Path) -> BTreeMap<String, PathBuf> {
     found
 }
 
-/// The unfinished files `name#1` of killed writers under a folder.
+/// Returns the unfinished files `name#1` of killed writers under a folder.
 pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut folders = vec![folder.to_owned()];

@@ -1,17 +1,17 @@
-//! Waiting for something that can be seen, with an end.
+//! Waits for a visible condition, with a timeout.
 
 use std::{
     thread::sleep,
     time::{Duration, Instant},
 };
 
-/// No wait of a healthy test comes near this; it keeps a broken one from hanging.
+/// Timeout of every wait. No passing test comes near it; it stops a broken test from hanging.
 pub const PATIENCE: Duration = Duration::from_secs(300);
 
-/// Looks every few milliseconds until there is something.
+/// Polls every few milliseconds until `look` returns a value.
 ///
 /// # Panics
-/// When nothing came in [`PATIENCE`].
+/// If it does not within [`PATIENCE`].
 pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {

@@ -1,5 +1,6 @@
-//! Callers that mean harm: what a coordinator's memory grows to, whatever they send and whatever they leave unread.
-//! `cargo nextest run -p picofarm-tests --test attack --run-ignored all --no-capture` prints the worst resident size by memory.
+//! Malicious clients: limits the coordinator's memory, whatever clients send and whatever they
+//! leave unread. `cargo nextest run -p picofarm-tests --test attack --run-ignored all --no-capture`
+//! prints the maximum resident size by memory limit.
 
 use std::{
     collections::HashMap,
@@ -26,13 +27,13 @@ const WINDOW: u8 = 8;
 const END_STREAM: u8 = 1;
 const END_HEADERS: u8 = 4;
 
-/// A client that keeps to HTTP/2's framing and to nothing else: it takes no answer that it need not take.
+/// A client that follows only HTTP/2's framing and accepts no answer that it need not accept.
 struct Rude {
     stream: TcpStream,
     next: u32,
-    /// What may be sent on the connection.
+    /// Flow-control window of the connection for sending.
     window: i64,
-    /// The same of each open stream.
+    /// Flow-control windows of the open streams for sending.
     streams: HashMap<u32, i64>,
     buffer: Vec<u8>,
     settings: Vec<(u16, u32)>,
@@ -55,7 +56,7 @@ impl Rude {
             settings: Vec::new(),
         };
         rude.stream.write_all(PREFACE).ok()?;
-        // Nothing may be sent to it: SETTINGS_INITIAL_WINDOW_SIZE = 0.
+        // The server may not send anything: SETTINGS_INITIAL_WINDOW_SIZE = 0.
         rude.frame(SETTINGS, 0, 0, &[0, 4, 0, 0, 0, 0])?;
         Some(rude)
     }
@@ -68,7 +69,7 @@ impl Rude {
         self.stream.write_all(&frame).ok()
     }
 
-    /// Takes the frames that are there, for the windows and the settings that they tell.
+    /// Reads the available frames for window updates and settings.
     fn listen(&mut self) -> Option<()> {
         let mut some = [0; 16 << 10];
         match self.stream.read(&mut some) {
@@ -115,7 +116,7 @@ impl Rude {
         Some(())
     }
 
-    /// Opens a request with `extra` bytes of headers that mean nothing.
+    /// Opens a request with `extra` bytes of meaningless headers.
     fn request(&mut self, method: &str, extra: usize, end: bool) -> Option<u32> {
         let path = format!("/picofarm.v1.Jobs/{method}");
         let filler = "x".repeat(extra);
@@ -139,7 +140,8 @@ impl Rude {
         Some(id)
     }
 
-    /// Sends a message on a stream, as far as the windows allow within some seconds and until it is refused.
+    /// Sends a message on a stream until it is refused, as far as the windows allow within some
+    /// seconds.
     fn message(&mut self, stream: u32, message: &[u8]) -> Option<()> {
         let mut data = vec![0];
         data.extend(u32::try_from(message.len()).ok()?.to_be_bytes());
@@ -164,7 +166,7 @@ impl Rude {
     }
 }
 
-/// A header that is not indexed, in plain letters.
+/// Appends a header without indexing or compression.
 fn literal(block: &mut Vec<u8>, name: &str, value: &str) {
     block.push(0);
     for text in [name, value] {
@@ -215,7 +217,7 @@ impl Target {
         }
     }
 
-    /// Resident size in MiB: now, and at most so far.
+    /// Returns the resident size in MiB: current, and maximum so far.
     fn resident(&self) -> (u64, u64) {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id()));
         let status = status.expect("it runs");
@@ -233,7 +235,8 @@ impl Target {
     }
 }
 
-/// A message with a spec of many short strings: each costs ten times its letters once read.
+/// Returns a message with a spec of many short strings. After parsing, each string takes ten times
+/// its length.
 fn dense(bytes: usize) -> Vec<u8> {
     let json = format!("[{}\"a\"]", "\"a\",".repeat(bytes / 4));
     nested(1, &nested(1, json.as_bytes()))
@@ -251,7 +254,7 @@ fn nested(field: u8, content: &[u8]) -> Vec<u8> {
     message
 }
 
-/// Requests with long headers, whose answers nobody takes.
+/// Sends requests with long headers and does not read the answers.
 fn headers(address: &str, connections: usize, requests: usize) {
     std::thread::scope(|scope| {
         for _ in 0..connections {
@@ -266,7 +269,7 @@ fn headers(address: &str, connections: usize, requests: usize) {
     });
 }
 
-/// Large specs, many at a time.
+/// Sends large specs, many at a time.
 fn specs(address: &str, connections: usize, requests: usize, bytes: usize) {
     let message = dense(bytes);
     std::thread::scope(|scope| {
@@ -284,7 +287,7 @@ fn specs(address: &str, connections: usize, requests: usize, bytes: usize) {
     });
 }
 
-/// Lists that nobody takes.
+/// Requests lists and does not read them.
 fn unread(address: &str, connections: usize, requests: usize) {
     std::thread::scope(|scope| {
         for _ in 0..connections {
@@ -301,7 +304,7 @@ fn unread(address: &str, connections: usize, requests: usize) {
     });
 }
 
-/// Connections that stop in the middle of their first request.
+/// Opens connections that stop in the middle of their first request.
 fn halves(address: &str, connections: usize) {
     let mut open = Vec::new();
     for _ in 0..connections {
@@ -310,14 +313,14 @@ fn halves(address: &str, connections: usize) {
         };
         let mut block = Vec::new();
         literal(&mut block, "x-filler", &"x".repeat(14_000));
-        // Without END_HEADERS: more is to come, and does not.
+        // Without END_HEADERS: more should follow, and does not.
         let _ = rude.frame(HEADERS, 0, 1, &block);
         open.push(rude);
     }
     std::thread::sleep(Duration::from_secs(1));
 }
 
-/// Makes a history whose lists are long: a job that is held and goes on again and again.
+/// Creates a long history by pausing and resuming a job again and again.
 fn history(scratch: &Scratch, target: &Target, lines: usize) {
     let url = format!("http://{}", target.address);
     let cli = Cli::new(scratch.path()).with("PICOFARM_COORDINATOR", &url);
@@ -339,7 +342,8 @@ fn history(scratch: &Scratch, target: &Target, lines: usize) {
     });
 }
 
-/// All attacks with so many connections; the resident size in MiB after each, at most.
+/// Runs all attacks with this number of connections. Returns the maximum resident size in MiB after
+/// each.
 fn attack(target: &Target, connections: usize) -> Vec<(&'static str, u64)> {
     let address = &*target.address;
     let mut worst = Vec::new();

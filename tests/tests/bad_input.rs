@@ -1,10 +1,11 @@
-//! Wrong input: the exit code tells the kind, the message names the culprit, and nothing is lost.
+//! Invalid input: the exit code tells the kind of error, the message names the cause, and nothing
+//! is lost.
 
 use std::fs;
 
 use picofarm_tests::{Cli, Farm, Job, Scratch, shapes::Parts, store};
 
-/// A generated scene to be spoilt, `room.glb`.
+/// Generates a scene for corruption, `room.glb`.
 fn room(cli: &Cli) {
     let args = [
         "scene",
@@ -122,7 +123,7 @@ fn a_scene_without_its_mesh_file_dies_alone_and_the_message_names_the_file() {
     farm.run(&["job", "submit", "early.toml"])
         .fails(3, &["scenes.files[0]", "torn.bin"]);
 
-    // There at submission, gone when the worker wants it.
+    // Exists at submission, but is deleted before the worker reads it.
     parts.write(farm.scratch.path(), "torn");
     let id = farm.submit(&job);
     fs::remove_file(&mesh).unwrap();

@@ -1,4 +1,5 @@
-//! `picofarm bench render` prints its tables, one JSON document and a picture. Times are never judged.
+//! `picofarm bench render` prints its tables, one JSON document and a picture. The tests do not
+//! check times.
 
 use picofarm_tests::{Cli, Scratch};
 
@@ -113,7 +114,7 @@ fn a_stored_render_can_be_the_truth() {
     let rung = &scene["variants"][0]["rungs"][0];
     assert!(rung["error"]["median"].as_f64().unwrap() > 0.0, "{found}");
 
-    // Another gate is another measurement.
+    // Results with another gate are not comparable.
     cli.run(&[&bench[..], &truth, &["--resolution", "16"]].concat())
         .fails(3, &["truth.zarr", "gate"]);
     cli.run(&["bench", "render", "no-such-room"])

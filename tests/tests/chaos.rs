@@ -1,9 +1,12 @@
-//! Two coordinators on one Postgres, six workers behind proxies, and a seeded hand that kills, freezes, cuts off and
-//! delays any of them, the database and the store too, fills the store's disk or makes it read-only, submits scenes that
-//! no catalog can speak of, and sends what no worker would. At the end every scene was committed once, the bad jobs have
-//! failed with their reason, and the store holds the objects of an undisturbed run, bit for bit, and no others.
+//! Chaos test with two coordinators on one Postgres and six workers behind proxies. A seeded random
+//! sequence kills, freezes, disconnects and delays any of them, the database and the store. It also
+//! fills the store's disk or makes it read-only, submits scenes with text that the catalog cannot
+//! store, and sends invalid messages. At the end, every scene was committed once, the bad jobs have
+//! failed with their reason, and the store has exactly the objects of an undisturbed run, bit for
+//! bit.
 //!
-//! The short form runs with all tests. The long one: `PICOFARM_CHAOS=300 tests/run -E 'binary(chaos)'` (rounds).
+//! The short form runs with all tests. The long one:
+//! `PICOFARM_CHAOS=300 tests/run -E 'binary(chaos)'` (rounds).
 
 use std::{
     thread::sleep,
@@ -15,13 +18,13 @@ use picofarm_tests::{
     proxy::Mode, rng::Rng, s3, store,
 };
 
-/// Short, so that what is frozen for longer is soon lost.
+/// Short, so that processes frozen for longer soon count as lost.
 const LEASE_S: f64 = 3.0;
 const WORKERS: usize = 6;
 
-/// Rounds of the short form.
+/// Number of rounds of the short form.
 const ROUNDS: u64 = 8;
-/// Size of the store's disk when it is well, MiB.
+/// Normal size of the store's disk, in MiB.
 const DISK_MIB: u64 = 256;
 
 fn rounds() -> u64 {
@@ -34,7 +37,7 @@ fn millis(rng: &mut Rng, most: u64) -> Duration {
     Duration::from_millis(rng.number() % most)
 }
 
-/// The workers of a test, started again when they are killed.
+/// The workers of a test, restarted when they are killed.
 struct Crew {
     workers: Vec<Process>,
     started: usize,
@@ -59,14 +62,15 @@ impl Crew {
     }
 }
 
-/// Where the objects lie.
+/// Location of the objects.
 enum Store {
     Disk(Tmpfs),
     S3(s3::Server),
 }
 
 impl Store {
-    /// The workers see an empty folder in its place, as if it were not mounted. (A service is away.)
+    /// Hides the store: the workers see an empty folder, as if it were not mounted. (A service
+    /// becomes unreachable.)
     fn vanish(&mut self, rng: &mut Rng) {
         match self {
             Self::S3(_) => self.strike(rng),
@@ -78,7 +82,7 @@ impl Store {
         }
     }
 
-    /// One misfortune, and its end.
+    /// Causes one failure and ends it.
     fn strike(&mut self, rng: &mut Rng) {
         match self {
             Self::S3(server) => {
@@ -100,13 +104,13 @@ impl Store {
     }
 }
 
-/// A cluster at work, and what has been done to it.
+/// A working cluster, and the failures so far.
 struct Site {
     crew: Crew,
     /// Jobs that must fail.
     poisoned: Vec<String>,
     store: Store,
-    // A disk is unmounted before its folder goes.
+    // A disk is unmounted before its folder is deleted.
     cluster: Cluster,
 }
 
@@ -120,7 +124,7 @@ impl Site {
         }
     }
 
-    /// One misfortune, and its end.
+    /// Causes one failure and ends it.
     fn strike(&mut self, rng: &mut Rng) {
         let cluster = &mut self.cluster;
         let which = (rng.number() % cluster.coordinators.len() as u64) as usize;
@@ -140,7 +144,7 @@ impl Site {
                 sleep(Duration::from_secs_f64(LEASE_S) + millis(rng, 2_000));
                 self.crew.workers[who].signal(Signal::Continue);
             }
-            // Long enough that the other coordinator takes over what this one had.
+            // Long enough that the other coordinator takes over this one's work.
             3 => {
                 cluster.coordinator(which).signal(Signal::Stop);
                 sleep(Duration::from_secs(4) + millis(rng, 4_000));
@@ -161,7 +165,8 @@ impl Site {
             }
             7 => cluster.crash_database(),
             8 => {
-                // Beside the honest job's data set, so that what is left of it is no object of that.
+                // In a folder other than the normal job's data set, so that leftovers are not
+                // counted as its objects.
                 let place = cluster.scratch.join("elsewhere");
                 let number = self.poisoned.len() as u64;
                 let job = poison::job(&place, cluster.scratch.path(), number);
@@ -175,7 +180,7 @@ impl Site {
                 assert!(cluster.coordinator(which).runs(), "it survives the flood");
             }
             12 => race_tokens(&cluster.scratch, rng),
-            // An allocation with a wall time: the worker ends in order before it is killed.
+            // An allocation with a time limit: the worker ends in order before it is killed.
             13 => {
                 let name = format!("short-{}", self.crew.started);
                 let seconds = 2 + rng.number() % 6;
@@ -188,7 +193,7 @@ impl Site {
         sleep(millis(rng, 800));
     }
 
-    /// The bad jobs have failed, with their reason.
+    /// Checks that the bad jobs have failed, with their reason.
     fn assert_poison_told(&self) {
         for id in &self.poisoned {
             let status = self.cluster.until_ended(id);
@@ -198,7 +203,7 @@ impl Site {
     }
 }
 
-/// Tokens that are made and revoked at the same moment: each call has its effect.
+/// Creates and revokes tokens concurrently. Each call must have its effect.
 fn race_tokens(scratch: &Scratch, rng: &mut Rng) {
     let cli = Cli::new(scratch.path());
     let number = rng.number();
@@ -263,14 +268,16 @@ fn with_one_coordinator_on_sqlite_too() {
     );
 }
 
-/// Strikes a cluster with objects on a disk, and compares the store with that of an undisturbed run.
+/// Runs the failures on a cluster with its objects on a disk, and compares the store with that of
+/// an undisturbed run.
 fn endure(cluster: Cluster, name: &str, seed: u64) {
     let Some(disk) = Tmpfs::mount(&cluster.scratch.join("store"), DISK_MIB << 10) else {
         return;
     };
     let mut rng = Rng::new(seed);
     let mut site = Site::new(cluster, Store::Disk(disk));
-    // The work lasts as long as the misfortunes: a job a few rounds, all into one data set that grows.
+    // The work must last as long as the failures: each job lasts a few rounds, and all write to one
+    // growing data set.
     let jobs = rounds().div_ceil(5);
     let mut job = Job::slow(&site.cluster.scratch.join("store"), 0);
     for n in 1..=jobs {
@@ -315,7 +322,7 @@ fn with_objects_on_s3_too() {
     assert_eq!(there, undisturbed("chaos-s3", &job));
 }
 
-/// How long something took, for people: `--nocapture` shows it. On a busy machine it means little.
+/// Prints how long an operation took, for `--nocapture`. On a busy machine the time means little.
 fn took(what: &str, since: Instant) {
     eprintln!("{what}: {:.2} s", since.elapsed().as_secs_f64());
 }
@@ -364,7 +371,7 @@ fn the_lease_of_a_killed_worker_soon_belongs_to_another_although_it_had_long_to_
     let killed = Instant::now();
     heir.until_says("task starts");
     took("the task of a killed worker at another", killed);
-    // A lease lives for ten minutes here, longer than the patience of any test.
+    // A lease lasts ten minutes here, longer than the timeout of any test.
     done_once(&cluster, &id, 1);
     assert!(heir.stderr().contains("task done"), "{}", heir.stderr());
 }
@@ -377,7 +384,8 @@ fn a_frozen_workers_late_report_is_refused_and_its_objects_are_those_of_the_othe
     let job = Job::slow(&cluster.scratch.join("store"), 1);
     let id = cluster.submit(&job);
     let mut zombie = cluster.worker("zombie", 0);
-    // Once it renders: before, it would look into the store when it wakes, and find what the other has made.
+    // Only after rendering has started: before, it would look into the store when it wakes, and
+    // find the other's result.
     zombie.until_says("scene made");
     zombie.signal(Signal::Stop);
     let _heir = cluster.worker("heir", 1);

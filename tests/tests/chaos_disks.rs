@@ -1,9 +1,12 @@
-//! One coordinator on SQLite and three workers; the catalog and the store lie on small disks of their own. A seeded hand
-//! fills either disk, makes the store read-only, moves the catalog away, submits scenes that no catalog can speak of,
-//! sends what no worker would, and kills and freezes processes. At the end every scene was committed once, the bad jobs
-//! have failed with their reason, and the store holds the objects of an undisturbed run, bit for bit, and no others.
+//! Chaos test with one coordinator on SQLite and three workers. The catalog and the store are on
+//! small disks of their own. A seeded random sequence fills either disk, makes the store read-only,
+//! moves the catalog away, submits scenes with text that the catalog cannot store, sends invalid
+//! messages, and kills and freezes processes. At the end, every scene was committed once, the bad
+//! jobs have failed with their reason, and the store has exactly the objects of an undisturbed run,
+//! bit for bit.
 //!
-//! The short form runs with all tests. The long one: `PICOFARM_CHAOS=100 tests/run -E 'binary(chaos_disks)'` (rounds).
+//! The short form runs with all tests. The long one:
+//! `PICOFARM_CHAOS=100 tests/run -E 'binary(chaos_disks)'` (rounds).
 
 use std::{fs, path::PathBuf, thread::sleep, time::Duration};
 
@@ -12,15 +15,15 @@ use picofarm_tests::{
     wait::until,
 };
 
-/// Short, so that what is frozen for longer is soon lost.
+/// Short, so that processes frozen for longer soon count as lost.
 const LEASE_S: f64 = 3.0;
 const WORKERS: usize = 3;
-/// Rounds of the short form: each kind of strike once.
+/// Number of rounds of the short form: each kind of failure once.
 const ROUNDS: u64 = KINDS;
 const KINDS: u64 = 9;
-/// Rounds while one job lasts.
+/// Number of rounds per job.
 const ROUNDS_A_JOB: u64 = 5;
-/// Size of each disk when it is well, MiB.
+/// Normal size of each disk, in MiB.
 const DISK_MIB: u64 = 64;
 
 fn rounds() -> u64 {
@@ -37,12 +40,12 @@ struct Site {
     poisoned: Vec<String>,
     catalog: Tmpfs,
     store: Tmpfs,
-    // The disks are unmounted before its folder goes.
+    // The disks are unmounted before its folder is deleted.
     farm: Farm,
 }
 
 impl Site {
-    /// `None` where nothing can be mounted.
+    /// Returns `None` if nothing can be mounted.
     fn start() -> Option<Self> {
         let scratch = Scratch::new("chaos-disks");
         let catalog = Tmpfs::mount(&scratch.join("catalog"), DISK_MIB << 10)?;
@@ -86,7 +89,8 @@ impl Site {
         self.poisoned.push(id);
     }
 
-    /// Moves the catalog's file away for a while. A coordinator may end over it, with a reason; then it is started again.
+    /// Moves the catalog's file away for a while. A coordinator may end because of this, with a
+    /// reason, and is then restarted.
     fn without_catalog(&mut self, how_long: Duration) {
         let path = |name: &str| -> PathBuf { self.farm.scratch.join("catalog").join(name) };
         let (here, away) = (path("catalog.sqlite"), path("elsewhere.sqlite"));
@@ -97,7 +101,7 @@ impl Site {
             "a coordinator made a new catalog where its own was"
         );
         fs::rename(&away, &here).expect("the catalog is there");
-        // One that has seen it ends within a moment, if it is to end.
+        // A coordinator that has noticed ends within a moment, if it ends at all.
         sleep(Duration::from_secs(1));
         if !self.farm.coordinator().runs() {
             let says = self.farm.coordinator().stderr();
@@ -109,7 +113,7 @@ impl Site {
         }
     }
 
-    /// One misfortune, and its end.
+    /// Causes one failure and ends it.
     fn strike(&mut self, kind: u64, rng: &mut Rng) {
         let who = (rng.number() % WORKERS as u64) as usize;
         let mut millis = |most: u64| Duration::from_millis(rng.number() % most);
@@ -173,7 +177,7 @@ fn full_disks_a_lost_catalog_and_poison_change_nothing_for_honest_jobs() {
         job.count = Some(6 * n);
         let id = site.submit(&job);
         for round in (n - 1) * ROUNDS_A_JOB..(n * ROUNDS_A_JOB).min(rounds()) {
-            // Each kind in turn, so that the short form knows them all.
+            // Each kind in turn, so that the short form covers them all.
             site.strike(round % KINDS, &mut rng);
         }
         let status = site.ended(&id);

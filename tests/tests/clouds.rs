@@ -1,5 +1,5 @@
-//! Google's and Azure's stores by URL, against a stand-in: the probe of a store, who may use it, and what is said where
-//! something is missing; limits on bandwidth as settings.
+//! Google's and Azure's stores by URL, against a stand-in: the probe of a store, access control,
+//! error messages for missing settings, and bandwidth limits as settings.
 
 use picofarm_tests::{Cli, Scratch, cloud::Cloud};
 

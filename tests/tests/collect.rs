@@ -1,4 +1,5 @@
-//! `dataset collect` on a local store: says first, spares what is young, deletes what belongs to no finished scene.
+//! `dataset collect` on a local store: lists first, retains recent objects, deletes objects that
+//! belong to no finished scene.
 
 use std::fs;
 

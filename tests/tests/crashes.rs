@@ -1,24 +1,26 @@
-//! `kill -9` of anything, at any instant, any number of times: every scene is committed once, and the store holds
-//! the objects of an undisturbed run, bit for bit.
+//! `kill -9` of any process, at any instant, any number of times: every scene is committed once,
+//! and the store has the objects of an undisturbed run, bit for bit.
 
 use std::{thread::sleep, time::Duration};
 
 use picofarm_tests::{Farm, Job, Process, farm::undisturbed, rng::Rng, store};
 
-/// Short enough that a killed worker's scene is soon given to another.
+/// Short enough that a killed worker's scene is soon assigned to another.
 const LEASE_S: f64 = 2.0;
-/// Kills in each test.
+/// Number of kills in each test.
 const ROUNDS: u64 = 4;
 
-/// Waits for an instant to strike: while one of `workers` is in a scene, and then some milliseconds later, so that
-/// kills hit rendering, coding, publishing and the report. `false` if the job has ended, on a very fast machine.
+/// Waits for an instant to kill: while one of `workers` is in a scene, and then some milliseconds
+/// later, so that kills hit rendering, encoding, publishing and the report. Returns `false` if the
+/// job has ended, on a very fast machine.
 fn instant(farm: &Farm, id: &str, workers: &[&str], rng: &mut Rng) -> bool {
     let busy = farm.until_busy(id, workers);
     sleep(Duration::from_millis(rng.number() % 900));
     busy
 }
 
-/// Done, each scene committed once, no scene computed to its end twice, and the objects of an undisturbed run.
+/// Checks that the job is done, each scene was committed once, no scene was fully computed twice,
+/// and the objects are those of an undisturbed run.
 fn as_if_nothing_had_happened(farm: &Farm, job: &Job, id: &str, name: &str) {
     farm.until_done_once(job, id);
     assert_eq!(farm.count(id, "dead"), 0);

@@ -1,4 +1,5 @@
-//! `dataset verify` finds every kind of damage and names the object; repairing costs only the damaged scene.
+//! `dataset verify` finds every kind of damage and names the object. Repair only makes the damaged
+//! scenes again.
 
 use std::{fs, path::Path};
 
@@ -91,11 +92,11 @@ fn any_damage_is_repaired_bit_for_bit_and_nothing_else_is_written() {
         ("truncated", truncate),
         ("deleted", delete),
     ];
-    // A histogram, an image, a small array, and the manifest with all else whole.
+    // A histogram, an image, a small array, and the manifest with everything else intact.
     for key in [&objects[0], &objects[2], &objects[14], &manifest] {
         for (harm, damage) in &harms {
             damage(&place.join(key));
-            // Nothing but the manifest itself says that a scene was finished.
+            // Only the manifest shows that a scene was finished.
             let complete = (*key == manifest && *harm == "deleted").then_some("--complete");
             let args: Vec<&str> = repair.iter().copied().chain(complete).collect();
             let dry = farm.json(&[&args[..], &["--dry-run"]].concat());
@@ -109,7 +110,7 @@ fn any_damage_is_repaired_bit_for_bit_and_nothing_else_is_written() {
             assert_eq!(store::hashes(&place), whole, "{harm} {key}");
         }
     }
-    // Two histograms, two manifests swapped: both scenes are made again.
+    // Two histograms or two manifests swapped: both scenes are made again.
     for key in ["transient/c/N/0/0/0", "manifests/N.json"] {
         let [a, b] = ["0", "2"].map(|n| place.join(key.replace('N', n)));
         let held = place.join("held");
@@ -122,13 +123,13 @@ fn any_damage_is_repaired_bit_for_bit_and_nothing_else_is_written() {
         assert_eq!(done["scenes"].as_array().unwrap().len(), 2, "{done}");
         assert_eq!(store::hashes(&place), whole, "{key}");
     }
-    // Metadata follow from the root's.
+    // Metadata of arrays follow from the root's.
     flip(&place.join("depth/zarr.json"));
     farm.run(&["dataset", "verify", &folder, "--fast"])
         .fails(6, &["depth/zarr.json"]);
     farm.run(&repair).ok();
     assert_eq!(store::hashes(&place), whole);
-    // The root: what it says follows from the recipe and the other metadata.
+    // The contents of the root follow from the recipe and the other metadata.
     for damage in [flip as Harm, delete] {
         damage(&place.join("zarr.json"));
         let said = farm.run(&["dataset", "verify", &folder]);
@@ -159,7 +160,7 @@ fn nothing_is_overwritten_by_what_is_not_proved_to_be_the_same() {
     let whole = store::hashes(&place);
     farm.run(&["dataset", "snapshot", "create", &folder, "v1"])
         .ok();
-    // Histogram and manifest are both broken: nothing says what the scene was, but the snapshot does.
+    // With both histogram and manifest broken, only the snapshot shows what the scene was.
     let keys = ["transient/c/0/0/0/0", "manifests/0.json"].map(|k| place.join(k));
     for key in &keys {
         flip(key);
@@ -174,7 +175,7 @@ fn nothing_is_overwritten_by_what_is_not_proved_to_be_the_same() {
     let mut now = store::hashes(&place);
     now.remove("snapshots/v1.json.gz").expect("it is kept");
     assert_eq!(now, whole);
-    // Another job is not what made it, whatever the person says.
+    // A job that did not make the data set is rejected, even if the user names it.
     let recipes = place.join("recipes");
     let away = farm.store().join("recipes-away");
     fs::rename(&recipes, &away).unwrap();
@@ -218,7 +219,7 @@ fn a_reprocessed_scene_is_measured_again_from_its_source() {
     let done = farm.json(&["dataset", "repair", &to]);
     assert_eq!(done["scenes"][0]["scene"], 1, "{done}");
     assert_eq!(store::hashes(&noisy), whole);
-    // The source moved, and the recipe is lost: the manifest knows the rest.
+    // The source was moved, and the recipe is lost: the manifest has the remaining information.
     let moved = farm.store().join("moved");
     fs::rename(&clean, &moved).unwrap();
     delete(&noisy.join("depth/c/0/0/0"));
@@ -281,7 +282,8 @@ fn a_snapshot_stays_what_it_was_while_the_data_set_grows_and_loses() {
     assert_eq!(listed.as_array().unwrap().len(), 2, "{listed}");
     farm.run(&["dataset", "verify", &folder]).ok();
 
-    // A scene that only v2 has is lost to it, not to v1; and what a snapshot names is not collected.
+    // A scene that only v2 has is lost to v2 but not to v1. Objects named by a snapshot are not
+    // collected.
     delete(&place.join("manifests/2.json"));
     snapshot(&["verify", &folder, "v1"]).ok();
     snapshot(&["verify", &folder, "v2"]).fails(6, &["scene 2", "manifests/2.json: missing"]);
@@ -302,7 +304,7 @@ fn a_snapshot_stays_what_it_was_while_the_data_set_grows_and_loses() {
         .ok();
     snapshot(&["verify", &folder, "v2"]).ok();
 
-    // A snapshot that was changed is not believed.
+    // A modified snapshot is rejected.
     flip(&place.join("snapshots/v2.json.gz"));
     farm.run(&["dataset", "verify", &folder, "--fast"])
         .fails(6, &["snapshots/v2.json.gz"]);

@@ -1,4 +1,5 @@
-//! Data made of data: `dataset reprocess` and `dataset split`, killed, stopped, repeated, and given nonsense.
+//! Data derived from data: `dataset reprocess` and `dataset split`, when killed, stopped, repeated,
+//! and given invalid arguments.
 
 use std::{
     fs,
@@ -8,10 +9,10 @@ use std::{
 use picofarm_tests::{Cli, Farm, Job, Signal, store, wait::until};
 use serde_json::json;
 
-/// Scenes that take long enough together to be struck in the middle.
+/// Number of scenes that take long enough together to be interrupted.
 const COUNT: u64 = 40;
 
-/// A farm whose store holds `count` small finished scenes.
+/// Starts a farm with a store of `count` small finished scenes.
 fn source(name: &str, count: u64) -> (Farm, Job) {
     let farm = Farm::start(name);
     let job = Job::quick(&farm.store(), count);
@@ -74,7 +75,7 @@ fn a_reprocess_killed_again_and_again_gives_what_an_undisturbed_one_gives() {
     assert_eq!(rest["computed"], COUNT as usize - before);
     assert_eq!(rest["bytes"], whole["bytes"]);
     assert!(store::hashes(&stormy) == store::hashes(&reprocess.place("calm")));
-    // Once more: nothing is written.
+    // The second run writes nothing.
     let times = store::times(&stormy);
     assert_eq!(reprocess.cli.json(&args)["adopted"], COUNT);
     assert!(store::times(&stormy) == times);
@@ -228,7 +229,7 @@ fn a_verify_stage_names_the_damaged_scene_and_is_done_when_it_is_repaired() {
     farm.until_ended(id);
     assert_eq!(farm.count(id, "done"), 4);
 
-    // Sizes alone do not show it.
+    // The sizes alone do not reveal the damage.
     fs::write(&broken, &bytes).unwrap();
     let text = fs::read_to_string(&file).unwrap() + "verify = { fast = true }\n";
     fs::write(&file, text).unwrap();

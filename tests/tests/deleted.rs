@@ -1,4 +1,4 @@
-//! Data that were deleted are not taken for done: the same job file makes them again, to the same bytes.
+//! Deleted data do not count as done: the same job file makes them again, with the same bytes.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -20,7 +20,7 @@ fn reasons(plan: &Value) -> String {
     plan["stages"][0]["reasons"].to_string()
 }
 
-/// The keys of objects that are not the same in both.
+/// Returns the keys of objects that differ between both.
 fn differing<'a>(a: &'a BTreeMap<String, String>, b: &'a BTreeMap<String, String>) -> Vec<&'a str> {
     let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
     let differ = keys.into_iter().filter(|key| a.get(*key) != b.get(*key));

@@ -1,4 +1,4 @@
-//! `picofarm demo`: makes what it promises, once; can be interrupted and grown.
+//! `picofarm demo` makes its scenes once, can be interrupted, and can be extended.
 
 use std::{fs, path::Path};
 
@@ -60,7 +60,7 @@ fn the_demo_makes_a_data_set_and_pictures_and_a_second_run_renders_nothing() {
     assert_eq!(second["job"], first["job"]);
     assert_eq!(store::times(&place), times, "nothing is written again");
 
-    // One more scene: the finished ones stay as they are.
+    // With one more scene, the finished ones do not change.
     let grown = demo(&cli, "3", "4").json();
     assert_eq!(
         (&grown["scenes"], &grown["reused"]),
@@ -114,7 +114,7 @@ fn the_demo_goes_on_to_rooms_in_3d_and_a_second_run_makes_nothing_again() {
     let second = cli.run(&again).ok().json();
     assert_eq!(second["reconstructions"]["scenes"], 2, "{second}");
     assert_eq!(store::times(&place), times, "nothing is written again");
-    // The rooms alone are another job, and are there already.
+    // The rooms alone are another job, and already exist.
     let rooms = cli.run(&[&small[..], &["--json"]].concat()).ok().json();
     assert_eq!(rooms["reused"], 2, "{rooms}");
     assert!(rooms["reconstructions"].is_null(), "{rooms}");

@@ -1,4 +1,4 @@
-//! What a new user types, and what goes wrong on an ordinary day.
+//! Commands of a new user, and ordinary mishaps.
 
 use std::{
     fs,
@@ -7,14 +7,14 @@ use std::{
 
 use picofarm_tests::{Cli, Farm, Job, Scratch, Signal, poison, store, wait::until};
 
-/// A small demo.
+/// Runs a small demo.
 fn demo(cli: &Cli, resolution: &str) -> serde_json::Value {
     let args = ["demo", "--scenes", "1", "--samples", "4", "--spots", "4"];
     let more = ["--assets", "parametric", "--workers", "1", "--resolution"];
     cli.json(&[&args[..], &more, &[resolution]].concat())
 }
 
-/// A generated scene, `room.glb`.
+/// Generates a scene, `room.glb`.
 fn room(cli: &Cli) {
     let args = ["scene", "generate", "--kind", "primitive", "--seed", "5"];
     cli.run(
@@ -34,13 +34,13 @@ fn a_demo_of_other_settings_gets_a_data_set_of_its_own_and_paths_may_climb() {
     let first = demo(&cli, "16");
     let place = scratch.join("picofarm-demo/store/rooms");
     let hashes = store::hashes(&place);
-    // Another resolution, as other furniture, is another data set.
+    // Another resolution, like other furniture, gives another data set.
     let second = demo(&cli, "8");
     assert_ne!(first["dataset"], second["dataset"]);
     let other = second["dataset"].as_str().unwrap();
     assert!(other.contains("/store/rooms-"), "{other}");
     assert_eq!(store::hashes(&place), hashes, "the first stays as it is");
-    // Each is found again.
+    // Each data set is found again.
     assert_eq!(demo(&cli, "8")["dataset"], second["dataset"]);
     assert_eq!(demo(&cli, "16")["dataset"], first["dataset"]);
 
@@ -94,7 +94,8 @@ fn a_followed_job_outlives_its_coordinator() {
     let job = Job::quick(&farm.store(), 2);
     let id = farm.submit(&job);
     let watching = farm.cli().start("watch", &["job", "watch", &id]);
-    // It is connected when the history says that it waits; killing the coordinator before that shows nothing.
+    // The watcher is connected when the history shows that it waits. Killing the coordinator
+    // earlier would test nothing.
     until("the watcher's first line", || {
         let log = fs::read_dir(farm.scratch.path()).unwrap();
         log.map(|e| e.unwrap().path())
@@ -128,7 +129,7 @@ fn a_coordinator_that_does_not_answer_is_left_for_the_next() {
     let job = Job::quick(&farm.store(), 2);
     let id = farm.submit(&job);
     job.write(&farm.scratch.join("job.toml"));
-    // Connections are taken by the system, and nobody ever reads from them.
+    // The system accepts connections, but nobody ever reads from them.
     let mute = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let mute = format!("http://{}", mute.local_addr().unwrap());
     let good = farm.url().to_owned();
@@ -190,7 +191,7 @@ fn results_that_do_not_reach_stdout_fail_the_command() {
         assert!(said.contains("standard output"), "{args:?}: {said}");
         assert_eq!(into(args, "/dev/null").status.code(), Some(0), "{args:?}");
     }
-    // A reader that has seen enough.
+    // A reader that closes the pipe early.
     let mut child = cli
         .command(&["config"])
         .stdout(std::process::Stdio::piped())
@@ -200,7 +201,7 @@ fn results_that_do_not_reach_stdout_fail_the_command() {
     drop(child.stdout.take());
     let ended = child.wait_with_output().unwrap();
     assert_eq!((ended.status.code(), &*ended.stderr), (Some(0), &[][..]));
-    // Nor does a full stderr end what is under way.
+    // A full stderr does not end running work either.
     let full = fs::OpenOptions::new()
         .write(true)
         .open("/dev/full")
@@ -267,7 +268,7 @@ fn a_log_that_nobody_reads_stops_nobody() {
         "PICOFARM_COORDINATOR",
         document["coordinator"].as_str().unwrap(),
     );
-    // Some 10 kB of log each; a pipe takes 64.
+    // About 10 kB of log each; the capacity of a pipe is 64 kB.
     for _ in 0..20 {
         cli.run(&["job", "list"]).ok();
     }
@@ -410,7 +411,7 @@ fn scenes_without_light_say_why() {
     );
 }
 
-/// Whether a text moves no cursor, and no line of it pretends to be of this program.
+/// Checks that a text moves no cursor, and that none of its lines imitates this program's messages.
 fn assert_harmless(text: &str) {
     let bad = |c: char| (c.is_control() && c != '\n') || ('\u{202a}'..='\u{202e}').contains(&c);
     assert!(!text.contains(bad), "{text:?}");
@@ -458,7 +459,7 @@ fn names_from_elsewhere_move_no_cursor_and_forge_no_line() {
         ended.error()["message"].as_str().unwrap().contains(evil),
         "JSON says the same"
     );
-    // A file's content is somebody else's too.
+    // The contents of a file also come from others.
     let json = format!(
         "{{\"asset\": {{\"version\": \"2.0\"}}, \"extensionsRequired\": [{}]}}",
         serde_json::to_string(evil).unwrap()

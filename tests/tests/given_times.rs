@@ -1,4 +1,4 @@
-//! Two-bounce times and masks that somebody else measured: imported, and made a room in 3D.
+//! Two-bounce times and masks from foreign measurements: imported and reconstructed.
 
 use std::{fs, path::Path};
 
@@ -9,7 +9,7 @@ use serde_json::json;
 
 const SIDE: usize = 48;
 
-/// A `.npy` file of 32-bit floats.
+/// Returns a `.npy` file of 32-bit floats.
 fn npy(shape: &[usize], values: &[f32]) -> Vec<u8> {
     let shape = shape.iter().map(|n| format!("{n},")).collect::<String>();
     let head = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}");
@@ -28,7 +28,8 @@ fn length(a: [f32; 3]) -> f32 {
     a.iter().map(|x| x * x).sum::<f32>().sqrt()
 }
 
-/// The first scene of `rooms` as files, with two-bounce paths as an instrument would measure them, and without depth.
+/// Writes the first scene of `rooms` as files, with two-bounce paths as an instrument would measure
+/// them, and without depth.
 fn measured(store: &Path, folder: &Path) {
     let (at, prefix) = open_store(store.to_str().unwrap()).unwrap();
     let read = async {
@@ -89,7 +90,7 @@ fn submit(farm: &Farm, stages: &[String]) -> String {
     answer["job"].as_str().unwrap().to_owned()
 }
 
-/// Vertices of a mesh, and the mean of their distances from the camera.
+/// Returns the number of vertices of a mesh, and their mean distance from the camera.
 fn vertices(farm: &Farm, folder: &str, from: [f32; 3]) -> (usize, f32) {
     let ply = fs::read(farm.store().join(folder).join("scenes/0/mesh.ply")).unwrap();
     let end = ply.windows(11).position(|w| w == b"end_header\n").unwrap();
@@ -162,7 +163,7 @@ output = {{ store = {store:?}, dataset = "rooms" }}
         &[reconstruct("given-3d", &by_name("given"), "given")],
     );
     assert_eq!(farm.until_ended(&id)["state"], "done");
-    // The import knows no pose: its mesh is in the camera's axes.
+    // The import has no pose, so its mesh is in the camera's coordinates.
     let (few, near) = vertices(&farm, "given-3d", [0.0; 3]);
     let (many, far) = vertices(&farm, "truth-3d", [0.0; 3]);
     assert!(few.abs_diff(many) * 20 < many, "{few} and {many} vertices");

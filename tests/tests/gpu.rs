@@ -1,11 +1,12 @@
-//! Graphics processors on a farm: who gets stages that ask for one, and what comes of them. On a machine without a card,
-//! Mesa's software device; a program that was built without the feature, or a machine without any device, says so.
+//! GPUs on a farm: the assignment of stages that request one, and their results. On a machine
+//! without a card, the tests use Mesa's software device. A program without the feature, or a
+//! machine without any device, prints a message.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
 use picofarm_tests::{Farm, Process, cli::Cli, scratch::Scratch, store};
 
-/// A device, by name, and whether it is a software device.
+/// Returns the name of a device, and whether it is a software device.
 fn device() -> Option<(String, bool)> {
     let scratch = Scratch::new("gpu-devices");
     let listed = Cli::new(scratch.path()).json(&["model", "devices"]);
@@ -24,7 +25,7 @@ fn device() -> Option<(String, bool)> {
     })
 }
 
-/// Rooms, and a network that learns from them on a graphics processor, is judged and asked there.
+/// Returns a job that renders rooms, and trains, evaluates and runs a network on a GPU.
 fn job(store: &Path, processes: u32) -> String {
     format!(
         r#"
@@ -98,7 +99,7 @@ fn stages_that_ask_for_a_device_wait_for_workers_that_have_one_and_several_train
     let farm = Farm::with_lease("gpu-together", 5.0);
     let id = submit(&farm, 2);
     let _plain = farm.worker("plain");
-    // All that needs no device is done by a worker without one; and then nothing more.
+    // A worker without a device completes all tasks that need none, and then nothing more.
     while farm.count(&id, "done") < 9 {
         sleep(Duration::from_millis(50));
     }

@@ -1,4 +1,5 @@
-//! Jobs of several stages with real processes: killed in the middle, run again, changed, forced, held, drained.
+//! Jobs of several stages with real processes: killed half-way, run again, changed, forced, paused,
+//! drained.
 
 use std::{
     collections::BTreeMap,
@@ -8,7 +9,8 @@ use std::{
 use picofarm_tests::{Cli, Farm, Process, rng::Rng, store, wait::until};
 use serde_json::Value;
 
-/// Renders, measures with two sensors, splits one of them, and exports its training side.
+/// Returns a job that renders, passes the scenes through two sensors, splits one of the results,
+/// and exports its training side.
 fn graph(store: &Path, scenes: u64, dark: &str) -> String {
     let store = store.display();
     format!(
@@ -90,7 +92,7 @@ impl Graph {
         })
     }
 
-    /// Every object but what a worker that is killed while it tries the store out may leave.
+    /// Returns every object, except those that a killed worker may leave while it probes the store.
     fn objects(&self) -> BTreeMap<String, String> {
         let mut all = store::hashes(&self.farm.store());
         all.retain(|name, _| {
@@ -99,7 +101,7 @@ impl Graph {
         all
     }
 
-    /// How often the workers' logs say that a task of a kind was computed.
+    /// Returns the number of computed tasks, according to the workers' logs.
     fn computed(&self) -> u64 {
         self.farm.logged("task done")
     }
@@ -151,7 +153,7 @@ fn another_sensor_over_rendered_scenes_renders_nothing_and_force_proves_the_resu
 
     graph.write(&graph.text(4, "0.0, 0.5, 1.0"));
     let plan = graph.cli.json(&["job", "plan", graph.file()]);
-    // An export leaves nothing that the coordinator could compare: a worker looks at it again.
+    // An export leaves no result that the coordinator could compare, so a worker checks it again.
     assert_eq!((&plan["reuse"], &plan["run"]), (&13.into(), &5.into()));
     let stages = plan["stages"].as_array().expect("a plan has stages");
     let new = stages.iter().find(|s| s["name"] == "noise[1.0]");
@@ -165,7 +167,7 @@ fn another_sensor_over_rendered_scenes_renders_nothing_and_force_proves_the_resu
     assert!((first + 4..=first + 5).contains(&graph.computed()));
     assert_eq!(store::times(&graph.farm.store().join("clean")), before);
 
-    // From a stage on, each task runs again and comes out the same.
+    // From a given stage on, each task runs again with the same result.
     let objects = graph.objects();
     let job = graph.submit(&["--from-stage", "noise[0.5]"]);
     let status = graph.until_ended(&job);

@@ -1,5 +1,5 @@
-//! Data that leave and come back: exported in the paper's layout, imported by command and as a stage of a job, and scenes
-//! written as files for other programs.
+//! Data sets exported in the paper's layout and imported again, by command and as a stage of a job,
+//! and scenes written as files for other programs.
 
 use std::{fs, path::PathBuf};
 
@@ -8,7 +8,7 @@ use serde_json::Value;
 
 const SCENES: u64 = 4;
 
-/// A rendered data set, exported in the paper's layout to the folder that is returned.
+/// Renders a data set and exports it in the paper's layout. Returns the folder.
 fn exported(farm: &Farm, cli: &Cli) -> PathBuf {
     let store = farm.store();
     submit(
@@ -88,7 +88,7 @@ fn what_is_exported_in_the_papers_layout_comes_back_by_command_and_as_a_stage_wi
         (&0.into(), &SCENES.into())
     );
 
-    // As stages: imported, measured, and the scenes themselves written as files.
+    // As stages: imports, passes through a sensor, and writes the scenes themselves as files.
     let (store, folder) = (farm.store(), path(&release).to_owned());
     let store = store.display();
     let job = format!(
@@ -123,7 +123,7 @@ generate = {{ dest = "{store}/mitsuba", format = "mitsuba" }}
         SCENES
     );
 
-    // A broken scene comes back from its files, once it is said where they are.
+    // A broken scene is restored from its files when their location is given.
     let broken = target.join("transient/c/2/0/0/0");
     let bytes = fs::read(&broken).expect("published");
     fs::write(&broken, &bytes[..bytes.len() / 2]).expect("writable");
@@ -147,7 +147,7 @@ generate = {{ dest = "{store}/mitsuba", format = "mitsuba" }}
     );
     assert!(farm.store().join("mitsuba/000000/scene.xml").is_file());
 
-    // Forced, everything comes out the same.
+    // With --force, all results are the same.
     let before = store::hashes(&farm.store());
     let file = farm.scratch.join("job.toml");
     let job = cli.json(&["job", "submit", path(&file), "--force"])["job"].clone();
@@ -185,7 +185,7 @@ fn an_import_that_cannot_go_on_says_why_and_goes_on_when_it_can() {
     let done = cli.json(&import);
     assert_eq!((&done["imported"], &done["found"]), (&2.into(), &2.into()));
 
-    // Another release does not go into the same data set.
+    // Another release is not imported into the same data set.
     fs::remove_dir_all(release.join("000000")).unwrap();
     cli.run(&import).fails(3, &["manifests/0.json", "--list"]);
     cli.run(&["dataset", "import", path(&farm.store()), path(&target)])

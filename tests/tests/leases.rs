@@ -1,11 +1,12 @@
-//! Workers that leave politely, and workers that come back from the dead.
+//! Workers that leave in order, and workers that return after their lease has expired.
 
 use picofarm_tests::{Farm, Job, Signal, store, wait::until};
 use serde_json::Value;
 
 #[test]
 fn a_worker_told_to_end_hands_its_scene_to_another_at_once() {
-    // The lease lives for minutes: only handing it back lets another worker have the scene in this test's time.
+    // The lease lasts minutes, so only handing it back lets another worker have the scene during
+    // this test.
     let farm = Farm::start("handed-back");
     let job = Job::slow(&farm.store(), 1);
     let job = Job {
@@ -60,8 +61,8 @@ fn a_worker_that_wakes_up_after_its_lease_doubles_and_overwrites_nothing() {
     heir.signal(Signal::Terminate);
     heir.end().ok();
     zombie.signal(Signal::Continue);
-    // It works on its old scene to the end, since it cannot know; then it must take new work, which shows that the
-    // old scene is behind it.
+    // It works on its old scene to the end, because it cannot know. Then it must take new work,
+    // which shows that it has finished the old scene.
     let after = Job {
         name: "after".into(),
         dataset: "after".into(),

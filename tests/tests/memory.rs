@@ -1,15 +1,16 @@
-//! Estimates of memory beside the largest memory of real workers: each kind of task runs on a worker of its own.
+//! Compares estimated memory with the maximum memory of real workers. Each kind of task runs on a
+//! worker of its own.
 
 use std::{fs, path::Path};
 
 use picofarm_tests::{Farm, Process, wait::until};
 use serde_json::Value;
 
-/// An estimate may be so many times what is measured, and not less than that part of it.
-/// (The same task's largest memory differs by a third between runs.)
+/// Maximum and minimum ratio of an estimate to the measured memory. (The maximum memory of the same
+/// task differs by a third between runs.)
 const MOST: f64 = 2.5;
 const LEAST: f64 = 0.75;
-/// Those that a plan counts with.
+/// Number of threads that a plan assumes.
 const THREADS: u32 = 8;
 
 fn job(store: &Path, side: u32, samples: u32) -> String {
@@ -80,7 +81,7 @@ fn job(store: &Path, side: u32, samples: u32) -> String {
     .concat()
 }
 
-/// The largest memory that a worker took while it ran the stages of a label to their end.
+/// Returns the maximum memory that a worker used while it ran the stages of a label to their end.
 fn measured(farm: &Farm, job: &str, label: &str) -> f64 {
     let threads = THREADS.to_string();
     let args = [
@@ -128,7 +129,7 @@ fn estimates_are_near_the_largest_memory_of_each_kind_of_task() {
     let shown = farm.json(&["job", "plan", file.to_str().unwrap()]);
     let id = farm.json(&["job", "submit", file.to_str().unwrap()]);
     let id = id["job"].as_str().unwrap();
-    // A stage in parts is two, for one worker.
+    // A stage in parts appears as two stages, which run on one worker.
     let mut estimates: Vec<(String, f64)> = Vec::new();
     for stage in shown["stages"].as_array().unwrap() {
         let label = stage["name"].as_str().unwrap().split('.').next().unwrap();

@@ -1,4 +1,5 @@
-//! What operators ask a running farm: is it well, how much is there to do, why does this not run, who works here.
+//! Operators' questions to a running farm: is it healthy, how much is there to do, why does this
+//! not run, which workers are there.
 
 use picofarm_tests::{
     Cli, Farm, Job, Process, Scratch, Signal,
@@ -8,7 +9,7 @@ use picofarm_tests::{
 };
 use serde_json::Value;
 
-/// A coordinator with an HTTP endpoint, and the addresses of both.
+/// Starts a coordinator with an HTTP endpoint, and returns it with both addresses.
 fn coordinator(cli: &Cli) -> (Process, String, String) {
     let args = ["coordinator", "--allow-insecure", "--json", "--log", "info"];
     let more = [
@@ -66,7 +67,7 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
         .expect("a job has an id")
         .to_owned();
 
-    // Nobody works yet: the metrics ask for workers, and the job says so.
+    // Without a worker, the metrics request workers, and the job reports it.
     let page = until("the tasks to be counted", || {
         let (_, page) = get(&format!("{http}/metrics"))?;
         (sample(&page, "picofarm_tasks_pending") == Some(4.0)).then_some(page)
@@ -94,7 +95,8 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
     let status = cli.json(&["job", "status", &id]);
     assert_eq!(status["tasks"]["done"], 4, "{status}");
 
-    // What a task logged on its worker is with its history; that of the whole job stays short unless asked.
+    // A task's log on its worker appears in the task's history. The history of the whole job omits
+    // it unless requested.
     let lines = |args: &[&str]| -> Vec<String> {
         let events = cli.json(&[&["job", "logs", &id], args].concat());
         let events = events.as_array().expect("a list of events");
@@ -134,7 +136,7 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
     assert_eq!(why["reasons"][0]["code"], "ended", "{why}");
     assert_eq!(why["task"]["output"]["made"]["worker"], "one", "{why}");
 
-    // The other follower goes on until Ctrl-C.
+    // The other follower continues until Ctrl-C.
     assert!(forever.runs());
     until("the end to be shown", || {
         forever.stdout().contains("ended").then_some(())
@@ -151,12 +153,12 @@ fn a_second_signal_ends_a_worker_at_once() {
     farm.submit(&job);
     let mut worker = farm.worker("stubborn");
     worker.until_says("task starts");
-    // Nobody takes its lease back, so it waits.
+    // The frozen coordinator cannot take the lease back, so the worker waits.
     farm.coordinator().signal(Signal::Stop);
     worker.signal(Signal::Terminate);
     worker.until_says("stopping");
     if worker.runs() {
-        // Right after the first it is the same one.
+        // Shortly after the first, it counts as the same signal.
         worker.signal(Signal::Terminate);
         worker.signal(Signal::Interrupt);
         worker.end().code(130);

@@ -1,5 +1,5 @@
-//! Heavy scenes in parts, with real processes: several workers share a scene, are killed again and again, and give what
-//! one worker gives.
+//! Heavy scenes in parts, with real processes: several workers share a scene, are killed again and
+//! again, and produce the same result as one worker.
 
 use std::{collections::BTreeMap, path::Path};
 
@@ -47,7 +47,7 @@ fn until_done(cli: &Cli, job: &str) -> Value {
     status
 }
 
-/// Every object but what a worker that is killed while it tries the store out may leave.
+/// Returns every object, except those that a killed worker may leave while it probes the store.
 fn objects(farm: &Farm) -> BTreeMap<String, String> {
     let mut all = store::hashes(&farm.store());
     all.retain(|name, _| !name.starts_with(".probe-"));
@@ -92,7 +92,7 @@ fn workers_that_share_scenes_and_are_killed_give_the_objects_of_one_that_does_no
     assert!(kills > 0, "it was struck in the middle");
     assert_eq!(objects(&wild), objects(&calm));
 
-    // The whole job finds what the parts made, and forced, both stages make it again.
+    // The whole job finds the parts' result; with force, both stages make it again.
     let plan = wild.scratch.join("heavy.toml");
     std::fs::write(&plan, job(&wild.store(), 1)).expect("the folder is there");
     let plan = cli.json(&["job", "plan", plan.to_str().expect("plain")]);

@@ -1,5 +1,6 @@
-//! The Python example of docs/python: it reads what the program reads, trains, and so do xarray and tensorstore, from a
-//! disk and from S3. Runs where `PICOFARM_PYTHON` names a Python with zarr, xarray, tensorstore, obstore and h5py.
+//! The Python example of docs/python, xarray and tensorstore read the same data as the program,
+//! from disk and from S3, and the example trains. Runs if `PICOFARM_PYTHON` names a Python with
+//! zarr, xarray, tensorstore, obstore and h5py.
 
 use std::{
     ffi::OsString,
@@ -9,7 +10,7 @@ use std::{
 use picofarm_tests::{Cli, Ended, Farm, Job, Scratch, s3::Server, store};
 use serde_json::Value;
 
-/// Scenes.
+/// Number of scenes.
 const COUNT: u64 = 5;
 
 fn python(name: &str) -> Option<OsString> {
@@ -22,16 +23,16 @@ fn python(name: &str) -> Option<OsString> {
     python
 }
 
-/// Runs a script of this repository to its successful end, where the variables of `cli` hold.
+/// Runs a script of this repository to its successful end, with the variables of `cli`.
 fn run(python: &OsString, cli: &Cli, script: &str, args: &[&str]) -> Ended {
     let folder = Path::new(&picofarm_tests::package()).join("..");
     let script = folder.join(script).display().to_string();
-    // `-B`: nothing is left beside the scripts.
+    // `-B`: writes no bytecode next to the scripts.
     cli.run_other(python, &[&["-B", &script], args].concat())
         .ok()
 }
 
-/// A farm with rooms of 32×32 pixels in its store, as rendered.
+/// Starts a farm with rendered rooms of 32×32 pixels in its store.
 fn rooms(name: &str) -> (Farm, PathBuf) {
     let farm = Farm::start(name);
     let job = Job {
@@ -54,7 +55,8 @@ fn rooms(name: &str) -> (Farm, PathBuf) {
     (farm, place)
 }
 
-/// The same scenes in another profile, so bright that some bins saturate; and what the program itself reads of them.
+/// Reprocesses the same scenes into another profile, so bright that some bins saturate. Returns the
+/// location of an HDF5 export, which contains the values that the program itself reads.
 fn reprocess(farm: &Farm, source: &Path, target: &str, profile: &str) -> String {
     let source = source.display().to_string();
     let bright = ["--peak-photons", "100000"];
@@ -78,7 +80,7 @@ fn reprocess(farm: &Farm, source: &Path, target: &str, profile: &str) -> String 
     exported
 }
 
-/// Everything that the example does, at one place.
+/// Runs everything that the example does, at one location.
 fn everything(python: &OsString, farm: &Farm, source: &Path, place: &dyn Fn(&str) -> String) {
     let cli = farm.cli();
     for (profile, saturates) in [
@@ -162,7 +164,8 @@ fn the_example_reads_what_the_program_reads_and_learns_from_s3() {
     everything(&python, &farm, &source, &place);
 }
 
-/// Where `PICOFARM_BLENDER_PYTHON` names a Python with bpy too, which is 374 MB and for one version of Python alone.
+/// Runs if `PICOFARM_BLENDER_PYTHON` names a Python that also has bpy, which takes 374 MB and
+/// supports a single version of Python.
 #[test]
 fn blender_sees_each_pixel_at_the_depth_that_the_renderer_states() {
     let Some(readers) = python("blender") else {

@@ -1,4 +1,4 @@
-//! `picofarm reconstruct`: one scene file in 3D, without a farm.
+//! `picofarm reconstruct`: reconstructs one scene file without a farm.
 
 use std::{path::Path, sync::Arc};
 
@@ -6,7 +6,7 @@ use picofarm_tests::{Cli, Scratch};
 use serde_json::Value;
 use zarrs::{array::Array, filesystem::FilesystemStore};
 
-/// A scratch folder with a small measuring room, `room.glb`.
+/// Creates a scratch folder with a small room, `room.glb`.
 fn room(name: &str, object: &str, spots: &str) -> (Scratch, Cli) {
     let scratch = Scratch::new(name);
     let cli = Cli::new(scratch.path());
@@ -30,7 +30,7 @@ const TRUTH: [&str; 9] = [
     "--out",
 ];
 
-/// Files whose bytes depend on scene and arguments alone.
+/// Files with contents that depend on scene and arguments only.
 const ALWAYS_SAME: [&str; 5] = [
     "mesh.glb",
     "mesh.ply",
@@ -111,7 +111,8 @@ fn a_scene_becomes_a_mesh_a_density_and_its_errors_and_nothing_else() {
     );
     assert_eq!(ply.len() as u64, header as u64 + 12 * vertices + 13 * faces);
 
-    // The importer reads it, and the renderer takes it: it has the camera and the beams of the measurement.
+    // The importer reads it, and the renderer accepts it: it has the camera and the beams of the
+    // measurement.
     let shown = cli.json(&["scene", "show", "made/mesh.glb"]);
     assert_eq!(shown["triangles"], kept["triangles"], "{shown}");
     assert_eq!(shown["beams"], 16, "{shown}");
@@ -188,7 +189,7 @@ fn what_cannot_be_used_is_refused_by_name_and_nothing_is_written() {
             3,
             "--tof belongs to --spots-from predictions",
         ),
-        // All light comes later than this gate.
+        // All light arrives after the end of this gate.
         (
             &[
                 "--resolution",

@@ -1,5 +1,5 @@
-//! Reconstructions as a job: planned, leased, killed and resumed as renders are, from truth, from single-spot captures and from
-//! what networks predict.
+//! Reconstructions as a job: planned, leased, killed and resumed like renders, from ground truth,
+//! from single-spot captures and from predictions of networks.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
@@ -36,7 +36,7 @@ fn submit(farm: &Farm, text: &str) -> String {
     answer["job"].as_str().unwrap().to_owned()
 }
 
-/// The objects that a job leaves that nobody disturbs.
+/// Returns the objects of an undisturbed run of the job.
 fn undisturbed() -> std::collections::BTreeMap<String, String> {
     let farm = Farm::start("rooms-calm");
     let id = submit(&farm, &job(&farm.store(), SCENES));
@@ -79,7 +79,7 @@ fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
-/// What commands say of the folders `truth-3d` and `seen-3d`.
+/// Checks the output of commands about the folders `truth-3d` and `seen-3d`.
 fn looked_at(farm: &Farm) {
     let place = |name: &str| farm.store().join(name).to_str().unwrap().to_owned();
     let (truth, seen) = (place("truth-3d"), place("seen-3d"));
@@ -89,7 +89,7 @@ fn looked_at(farm: &Farm) {
     ]);
     let sheet = fs::read(drawn["contact_sheet"].as_str().unwrap()).unwrap();
     assert!(sheet.starts_with(b"\x89PNG"));
-    // Three rows of pictures of 160 pixels.
+    // Three rows of pictures with 160 pixels.
     let height = u32::from_be_bytes(sheet[20..24].try_into().unwrap());
     assert!((480..600).contains(&height), "{height}");
 
@@ -120,7 +120,7 @@ fn looked_at(farm: &Farm) {
             .unwrap()
             > 0.0
     );
-    // Other rooms, spots and images than the paper's.
+    // The rooms, spots and images differ from the paper's.
     assert_eq!(of_truth["as_published"], false, "{said_of}");
     let ranks: Vec<&str> = of_truth["extremes"]
         .as_array()
@@ -227,7 +227,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
         for folder in ["truth-3d", "seen-3d"] {
             let found = metrics(&farm, folder, scene);
             let l1 = found["novel_views"]["all"]["l1_m"].as_f64().unwrap();
-            // Networks of eight rooms are poor ones: of one room or another they see nothing.
+            // Networks trained on eight rooms are poor: in one room or another they see nothing.
             let most = if folder == "truth-3d" { 0.25 } else { 2.5 };
             assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
             if folder == "seen-3d" {
@@ -248,7 +248,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
         }
     }
     assert!(from_predictions < 1.0, "{from_predictions}");
-    // A damaged result is found, and put back by the same job again.
+    // A damaged result is found, and restored by running the same job again.
     let folder = farm.store().join("truth-3d");
     let verified = farm.json(&["dataset", "verify", folder.to_str().unwrap()]);
     assert_eq!(verified["scenes"], 12, "{verified}");
@@ -274,7 +274,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
     assert_eq!(farm.until_ended(&again)["state"], "done");
     assert_eq!(fs::read(&mesh).unwrap(), whole);
     looked_at(&farm);
-    // No histogram of each spot alone; predictions of other rooms.
+    // A source without separate histograms per spot; predictions of other rooms.
     let before = text
         .split("[[stage]]\nname = \"from-truth\"")
         .next()
@@ -324,7 +324,7 @@ output = {{ store = {store:?}, dataset = "mixed-3d" }}
     one_command_asks_the_same_networks(&farm);
 }
 
-/// `picofarm reconstruct --spots-from predictions` with the farm's models.
+/// Runs `picofarm reconstruct --spots-from predictions` with the farm's models.
 fn one_command_asks_the_same_networks(farm: &Farm) {
     let store = farm.store();
     let store = store.to_str().unwrap();

@@ -1,4 +1,5 @@
-//! Data sets on an S3 server: the bytes of a local store, the same tools, and no loss when the server dies.
+//! Data sets on an S3 server have the same bytes as on a local store, work with the same tools, and
+//! lose nothing if the server dies.
 
 use picofarm_tests::{
     Farm, Job,
@@ -9,7 +10,7 @@ use picofarm_tests::{
 
 const PREFIX: &str = "sets/deep";
 
-/// A farm, a server, and a job into a bucket of its own.
+/// Starts a farm and a server, and returns them with a job that writes to a bucket of its own.
 fn place(
     name: &str,
     lease_s: f64,
@@ -51,7 +52,8 @@ fn a_job_into_s3_leaves_the_objects_of_a_local_one_and_every_tool_reads_them() {
     assert!(!worker.stderr().contains(SECRET));
     worker.kill();
 
-    // Objects of a published scene vanish; a new catalog knows nothing; whole scenes are adopted.
+    // Objects of a published scene vanish; a new catalog has no record of them; intact scenes are
+    // adopted.
     let transient = format!("{below}/transient/c/1/0/0/0");
     let depth = format!("{below}/depth/c/1/0/0");
     for key in [&transient, &depth] {
@@ -67,8 +69,8 @@ fn a_job_into_s3_leaves_the_objects_of_a_local_one_and_every_tool_reads_them() {
     assert_eq!(server.hashes(&bucket, &below), hashes);
     other.kill();
 
-    // What killed workers leave is collected, and nothing else. What a server that stalls wrote after its probe had been
-    // given up is collected first.
+    // Files left by killed workers are collected, and nothing else. An object that a stalled server
+    // wrote after its probe was abandoned is collected first.
     let collect = [
         "dataset",
         "collect",
@@ -78,7 +80,7 @@ fn a_job_into_s3_leaves_the_objects_of_a_local_one_and_every_tool_reads_them() {
         "--nothing-runs",
     ];
     farm.json(&[&collect[..], &["--delete"]].concat());
-    // The store's identity is one more.
+    // The store's identity is an additional object.
     assert_eq!(server.hashes(&bucket, PREFIX).len(), hashes.len() + 1);
     server.delete(&bucket, &format!("{below}/manifests/2.json"));
     server.put(&bucket, &format!("{PREFIX}/.probe-1-race"), b"x".to_vec());

@@ -1,4 +1,4 @@
-//! Single scenes without a farm: generate, show, render, and the arrays that come out.
+//! Single scenes without a farm: generate, show, render, and the resulting arrays.
 
 use std::{path::Path, sync::Arc};
 
@@ -138,7 +138,7 @@ fn the_parts_of_a_split_render_add_up_to_the_whole() {
     }
     assert_eq!(get("depth").0, [16, 16]);
 
-    // What is left is the one-bounce light: never negative, and only where a spot is seen.
+    // The remainder is the one-bounce light: never negative, and present only where a spot is seen.
     let sum = |a: &[f32]| a.iter().map(|&v| f64::from(v)).sum::<f64>();
     assert!(sum(&two) > 0.0 && sum(&multi) > 0.0);
     let mut spots = 0;
@@ -162,7 +162,8 @@ fn the_parts_of_a_split_render_add_up_to_the_whole() {
         "{spots} pixels with one-bounce light from 4 spots"
     );
 
-    // The same seed gives the same bits, also with another number of threads; a taken folder is refused.
+    // The same seed gives the same bits, also with another number of threads. An existing folder is
+    // rejected.
     cli.run(&[&render[..], &["--out", "again.zarr", "--threads", "1"]].concat())
         .ok();
     assert_eq!(

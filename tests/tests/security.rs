@@ -1,4 +1,5 @@
-//! Who gets in: real processes with certificates and tokens, right and wrong ones, and the answer to each.
+//! Access control: real processes with valid and invalid certificates and tokens, and the answer to
+//! each.
 
 use std::{fs, os::unix::fs::PermissionsExt, path::Path};
 
@@ -14,7 +15,7 @@ fn private(path: &Path, text: &str) {
     fs::set_permissions(path, fs::Permissions::from_mode(0o600)).unwrap();
 }
 
-/// A certificate authority; its certificate goes to `NAME.pem`.
+/// Creates a certificate authority. Its certificate is written to `NAME.pem`.
 fn authority(scratch: &Scratch, name: &str) -> Authority {
     let mut params = CertificateParams::new(Vec::new()).unwrap();
     params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -24,7 +25,7 @@ fn authority(scratch: &Scratch, name: &str) -> Authority {
     issuer
 }
 
-/// A certificate for `host` with the common name `name`, in `NAME.pem` and `NAME.key`.
+/// Creates a certificate for `host` with the common name `name`, in `NAME.pem` and `NAME.key`.
 fn certificate(scratch: &Scratch, by: &Authority, name: &str, host: &str, until: i32) {
     let mut params = CertificateParams::new(vec![host.to_owned()]).unwrap();
     params.distinguished_name.push(DnType::CommonName, name);
@@ -144,7 +145,7 @@ fn the_right_certificate_and_token_are_let_in_and_all_others_are_told_why_not() 
         .run(&list)
         .fails(3, &["in the clear"]);
 
-    // A worker without the role, one with it, and what it does.
+    // A worker without the role, one with it, and its work.
     let work = ["worker", "--threads", "1", "--log", "trace", "--name"];
     with(&ada)
         .run(&[&work[..], &["ada"]].concat())
@@ -156,7 +157,7 @@ fn the_right_certificate_and_token_are_let_in_and_all_others_are_told_why_not() 
     with(&ada).run(&[&submit[..], &["--watch"]].concat()).ok();
     assert_eq!(store::finished(&job.place()), [0]);
 
-    // Revoked.
+    // A revoked token.
     cli.run(&["token", "revoke", "--tokens", "tokens.toml", "worker"])
         .ok();
     works.end().fails(4, &["\"worker\" was revoked"]);
@@ -192,7 +193,7 @@ fn a_revocation_is_confirmed_by_the_coordinators_that_are_asked() {
     let names = ["eve", "bob", "ada", "cid"];
     let tokens = names.map(|name| token(&cli, name, "admin"));
     let (_ours, url) = coordinator(&cli, &["--tokens", "tokens.toml"]);
-    // Its file is another one: nobody copies the revocation.
+    // The coordinator has another token file, to which nobody copies the revocation.
     fs::copy(scratch.join("tokens.toml"), scratch.join("copy.toml")).unwrap();
     fs::create_dir(scratch.join("elsewhere")).unwrap();
     let elsewhere = Cli::new(&scratch.join("elsewhere"));
@@ -292,7 +293,7 @@ fn a_token_ends_when_it_expires() {
             .with("PICOFARM_COORDINATOR", &url)
             .with("PICOFARM_TOKEN", token)
     };
-    // A stream that is open ends, too.
+    // An open stream ends too.
     let follows = with(&short).start("events", &["events", "--follow"]);
     until("the end of the token", || {
         (with(&short).run(&["job", "list"]).code == Some(4)).then_some(())
@@ -338,7 +339,7 @@ fn client_certificates_are_judged_by_the_authorities_of_now() {
     until("the end of the closure", || {
         (eve.run(&list).code == Some(0)).then_some(())
     });
-    // A worker's connection from before the change does not outlive its authority.
+    // A worker's connection from before the change does not outlive its certificate authority.
     let mut worker = eve.start("worker", &["worker", "--threads", "1", "--log", "info"]);
     worker.until_says("connected");
     fs::copy(scratch.join("ours.pem"), &clients).unwrap();
@@ -434,7 +435,7 @@ fn a_coordinator_with_unusable_files_says_which() {
     run(&["--tokens", "nowhere.toml"]).fails(3, &["nowhere.toml"]);
     run(&["--tokens", "broken.toml"]).fails(3, &["broken.toml", "name"]);
 
-    // An expired certificate is the clients' to refuse, and a plain port is distinguished from one with TLS.
+    // Clients must reject an expired certificate. A plain port is distinguished from one with TLS.
     let old = [
         "--allow-insecure",
         "--tls-cert",
@@ -476,7 +477,7 @@ fn a_worker_touches_only_its_store_prefixes() {
         message.contains("output.store") && message.contains("--store-prefix"),
         "{message}"
     );
-    // The submission gave the store its identity; the worker wrote nothing.
+    // The submission wrote the store's identity; the worker wrote nothing.
     assert!(picofarm_tests::store::hashes(&farm.store()).is_empty());
 }
 
@@ -503,7 +504,7 @@ fn a_scene_within_the_prefixes_names_no_file_outside_of_them() {
             <shape type="ply"><string name="filename" value="{name}"/></shape></scene>"#
         );
         fs::write(inside.join("scene.xml"), scene).unwrap();
-        // Who submits can leave out every check of this program.
+        // A submitter can bypass every check in this client program.
         let job = format!(
             "name = \"x\"\n[scenes]\nkind = \"files\"\nroot = {root:?}\nfiles = [\"inside/scene.xml\"]\n\
              [render]\nresolution = 16\nsamples = 2\n[output]\nstore = \"inside/store\"\ndataset = \"d\"\n\

@@ -1,9 +1,10 @@
-//! Workers as Slurm job arrays, on a real cluster of this machine: what Slurm does to them costs no scene and no
-//! failure.
+//! Workers as Slurm job arrays, on a real cluster on this machine: Slurm's interventions cost no
+//! scene and cause no failure.
 
 use picofarm_tests::{Farm, Job, Slurm, store, wait::until};
 
-/// Scenes long enough that a worker asked to end is not about to finish one anyway.
+/// Returns a job with scenes that are long enough that a worker asked to end is not about to finish
+/// one anyway.
 fn job(farm: &Farm, count: u64) -> Job {
     let job = Job::slow(&farm.store(), count);
     Job {
@@ -12,7 +13,7 @@ fn job(farm: &Farm, count: u64) -> Job {
     }
 }
 
-/// Scenes were given back by this worker, and nothing was counted against them.
+/// Checks that this worker handed scenes back and that no failure was counted for them.
 fn given_back(farm: &Farm, id: &str, worker: &str) {
     let released = farm.events_of(id, "released");
     assert!(
@@ -82,7 +83,8 @@ fn a_worker_that_outlives_its_lost_node_cannot_spoil_what_the_requeued_one_did()
     let id = farm.submit(&job);
     let element = format!("{}_0", slurm.workers(&farm, "0"));
     slurm.until_said(&element, "task starts", 1);
-    // A switch failed: the node is lost to Slurm and to the coordinator, and nobody ends the worker.
+    // A switch failed: both Slurm and the coordinator have lost the node, and nobody ends the
+    // worker.
     slurm.lose_node("n1");
     slurm.signal("n1", "STOP");
     slurm.start_again(&element);

@@ -1,4 +1,5 @@
-//! A full disk and a read-only store: the job waits, says why, loses nothing, and goes on when there is room.
+//! A full disk and a read-only store: the job waits, reports why, loses nothing, and continues when
+//! there is room.
 
 use std::{path::Path, time::SystemTime};
 
@@ -14,7 +15,7 @@ struct Half {
 }
 
 impl Half {
-    /// `None` where nothing can be mounted.
+    /// Returns `None` if nothing can be mounted.
     fn done(name: &str) -> Option<Self> {
         let farm = Farm::start(name);
         let disk = Tmpfs::mount(&farm.store(), 64 << 10)?;
@@ -32,8 +33,9 @@ impl Half {
         })
     }
 
-    /// Asks for five scenes, waits until the worker says `words`, repairs the disk with `options`, and checks that
-    /// the job completes with the first two scenes untouched and no failure counted.
+    /// Submits a job for five scenes, waits until the worker logs `words`, repairs the disk with
+    /// `options`, and checks that the job completes with the first two scenes untouched and no
+    /// failure counted.
     fn grow_through(mut self, words: &str, options: &str) {
         let (farm, job) = (
             &self.farm,
@@ -86,7 +88,7 @@ fn a_read_only_store_stops_no_process_and_loses_nothing() {
 #[test]
 fn a_job_whose_store_cannot_be_written_leaves_the_only_worker_to_others_and_ends_when_it_can() {
     let farm = Farm::start("store-away");
-    // A file where a folder is expected: not even root writes below it.
+    // A file where a folder is expected: not even root can write below it.
     let blocked = farm.scratch.join("blocked");
     std::fs::write(&blocked, "").unwrap();
     let waiting = Job::quick(&blocked.join("store"), 40);
@@ -111,7 +113,7 @@ fn a_job_whose_store_cannot_be_written_leaves_the_only_worker_to_others_and_ends
     let status = farm.status(&first);
     assert_eq!(status["state"], "active", "{status}");
     assert_eq!(status["tasks"]["dead"], 0, "{status}");
-    // The store is tried by one task now and then, not by each.
+    // One task probes the store at intervals, not every task.
     let tries = farm.events_of(&first, "released").len();
     assert!(tries < 15, "{tries} tries");
 
@@ -120,7 +122,8 @@ fn a_job_whose_store_cannot_be_written_leaves_the_only_worker_to_others_and_ends
     farm.until_done_once(&waiting, &first);
 }
 
-/// Starts a worker that sees another folder in place of the store; `None` where nothing can be mounted.
+/// Starts a worker that sees another folder at the store's path. Returns `None` if nothing can be
+/// mounted.
 fn unmounted(farm: &Farm, instead: &Path) -> Option<Process> {
     let (store, instead) = (farm.store(), instead.display().to_string());
     let script = "mount --bind \"$0\" \"$1\" && shift && exec \"$@\"";
@@ -166,7 +169,7 @@ fn a_worker_whose_store_is_not_mounted_gives_no_scene_and_stops_no_other() {
         without.kill();
     }
 
-    // A folder that vanishes under a job stops its tasks, and they go on when it is back.
+    // If a folder vanishes under a job, its tasks stop, and they continue when it is back.
     let more = Job {
         count: Some(9),
         ..job
@@ -224,7 +227,7 @@ fn a_full_temporary_folder_stops_no_job_and_the_doctor_names_it() {
         return;
     };
     let full = scratch.join("tmp").display().to_string();
-    // As much as there is room for.
+    // Writes as much as there is room for.
     let _ = std::fs::write(scratch.join("tmp/fill"), [0; 1 << 16]);
     let cli = Cli::new(scratch.path());
     let cli = cli.with("TMPDIR", &full).with("SQLITE_TMPDIR", &full);

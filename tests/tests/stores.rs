@@ -1,8 +1,8 @@
-//! One suite for every kind of store: what data sets rest on holds for folders, for S3, for Google's and for Azure's, each
-//! opened by its URL as the program does.
+//! Tests the store operations that data sets depend on, for folders, S3, Google's and Azure's
+//! stores. Each is opened by its URL, as the program does.
 //!
-//! Clients take who and where from the environment, so each store's suite runs in a process of its own: this test binary
-//! again, with one ignored test.
+//! Clients take credentials and endpoints from the environment, so each store's suite runs in a
+//! process of its own: this test binary again, with one ignored test.
 
 use std::{collections::BTreeSet, env, process::Command, sync::Arc, time::Duration};
 
@@ -19,10 +19,10 @@ use picofarm_tests::{Scratch, cloud::Cloud, s3};
 #[allow(dead_code, reason = "the tests of data sets use the rest")]
 mod common;
 
-/// The URL that the suite runs at.
+/// URL at which the suite runs.
 const PLACE: &str = "PICOFARM_TEST_STORE";
 
-/// Runs the suite at `url` in a process that knows these variables.
+/// Runs the suite at `url` in a process with these variables.
 fn holds(url: &str, variables: &[(&str, &str)]) {
     let mut command = Command::new(env::current_exe().expect("this is a program"));
     command
@@ -95,7 +95,7 @@ fn azures_store_keeps_what_data_sets_rest_on() {
     );
 }
 
-/// Where a store is, and the prefix that it is used below.
+/// A store and the prefix used in it.
 #[derive(Clone)]
 struct At {
     store: Arc<dyn ObjectStore>,
@@ -192,7 +192,7 @@ async fn a_put_replaces_and_a_range_is_a_part(at: &At) {
         range: Some(GetRange::Suffix(10)),
         ..GetOptions::default()
     };
-    // Azure has no suffixes, and says so.
+    // Azure does not support suffix ranges and returns an error.
     match at.store.get_opts(&key, last).await {
         Ok(found) => assert_eq!(found.bytes().await.unwrap(), bytes[299_990..]),
         Err(Error::NotSupported { .. }) => {}
@@ -209,7 +209,7 @@ async fn what_is_missing_is_not_found(at: &At) {
         let missing = |e: Error| assert!(matches!(e, Error::NotFound { .. }), "{name}: {e}");
         missing(at.get(name).await.unwrap_err());
         missing(at.store.head(&key).await.unwrap_err());
-        // A second deletion may succeed or say that nothing is there.
+        // A second deletion may succeed or report that there is no object.
         if let Err(e) = at.store.delete(&key).await {
             missing(e);
         }
@@ -269,7 +269,7 @@ async fn a_list_is_whole_and_keeps_to_its_folder(at: &At) {
         .await
         .unwrap();
     assert_eq!(scenes.common_prefixes.len(), 250);
-    // Many at once, as models and checkpoints are removed.
+    // Many at once, as when models and checkpoints are removed.
     let keys = at.list("list").await;
     let keys = futures::stream::iter(keys.into_iter().map(Ok)).boxed();
     let deleted: Vec<Path> = at.store.delete_stream(keys).try_collect().await.unwrap();
@@ -291,7 +291,7 @@ async fn scenes_come_back_and_damage_is_found(at: &At) {
         .await
         .unwrap_err();
     assert!(missing.to_string().contains("no data set"), "{missing}");
-    // Several workers come at once.
+    // Several workers open it at once.
     let opened = join_all((0..4).map(|_| open())).await;
     let dataset = opened.into_iter().map(Result::unwrap).next_back().unwrap();
     let (_, memory) = common::in_memory(&spec).await;
@@ -345,7 +345,7 @@ async fn scenes_come_back_and_damage_is_found(at: &At) {
         .collect();
     assert_eq!(faults.len(), 2, "{faults:?}");
     assert!(faults.contains(&(Some(2), &Fault::Missing)), "{faults:?}");
-    // Publishing again puts back what is missing; nothing else is orphaned.
+    // Publishing again restores missing objects; no other object is orphaned.
     let scene = common::Scene::new(&spec, 2);
     dataset
         .publish(2, &scene.record(), &provenance)

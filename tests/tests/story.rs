@@ -1,11 +1,11 @@
-//! A person's way through the commands: write a job, plan, submit, follow, look, stop, repair.
+//! A user's path through the commands: write a job, plan, submit, follow, inspect, stop, repair.
 
 use std::fs;
 
 use picofarm_tests::{Cli, Farm, Job, Scratch, store};
 use serde_json::json;
 
-/// The template that `job init` writes, made small.
+/// Writes the template of `job init` with small settings.
 fn small_template(farm: &Farm) {
     let cli = farm.cli();
     let file = cli.json(&["job", "init", "mine.toml", "--kind", "primitive"]);
@@ -107,7 +107,7 @@ fn a_job_from_its_first_line_to_its_data_set() {
     );
     assert_eq!(store::times(&place), times);
 
-    // More scenes: only the new ones run.
+    // With more scenes, only the new ones run.
     let path = farm.scratch.join("mine.toml");
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text.replace("count = 2", "count = 3")).unwrap();
@@ -136,7 +136,7 @@ fn a_cancelled_job_stops_keeps_what_it_has_and_can_be_submitted_again() {
     farm.run(&["job", "wait", &id])
         .fails(5, &["was cancelled", "--again"]);
 
-    // The worker is free at once for other work.
+    // The worker is free for other work at once.
     let quick = Job {
         name: "other".into(),
         dataset: "other".into(),

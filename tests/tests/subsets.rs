@@ -1,4 +1,5 @@
-//! Histograms of subsets of the spots from one pass: in single renders and in data sets; and what a render would take.
+//! Histograms of subsets of the spots from one pass, in single renders and in data sets; and the
+//! estimated cost of a render.
 
 use std::{fs, path::Path, sync::Arc};
 
@@ -15,14 +16,14 @@ fn array(group: &Path, name: &str) -> (Vec<u64>, Vec<f32>) {
     (array.shape().to_vec(), data)
 }
 
-/// A room with `spots` spots, `room.glb`.
+/// Generates a room with `spots` spots, `room.glb`.
 fn room(cli: &Cli, spots: &str) {
     let generate = ["scene", "generate", "--kind", "primitive", "--seed", "3"];
     cli.run(&[&generate[..], &["--spots", spots, "--out", "room.glb"]].concat())
         .ok();
 }
 
-/// Σ over some of the planes of `[spot][…]`.
+/// Returns the sum over some of the planes of `[spot][…]`.
 fn sum(planes: &[f32], one: usize, spots: impl Iterator<Item = usize>) -> Vec<f64> {
     let mut all = vec![0.0; one];
     for spot in spots {
@@ -89,7 +90,7 @@ fn groups_of_a_render_add_up_and_are_those_asked_for() {
     let left = array(&group, "transient_left").1;
     same("transient_left", &left, &of(&mut [0, 5, 7].into_iter()));
 
-    // Without groups the whole is the same.
+    // Without groups, the main histogram is the same.
     cli.run(&[&render[..], &GATE, &["--out", "plain.zarr"]].concat())
         .ok();
     let plain = array(&scratch.join("plain.zarr"), "transient").1;
@@ -170,7 +171,7 @@ fn a_plan_says_what_a_render_would_do_and_writes_nothing() {
     }
     assert!(text.contains(strategies[0].as_str().unwrap()), "{text}");
 
-    // A smaller error takes more.
+    // A smaller error takes more samples.
     let goal = |share| {
         let args = [
             "scene",
@@ -194,7 +195,7 @@ fn a_plan_says_what_a_render_would_do_and_writes_nothing() {
     assert_eq!(made, 0, "no folder was made: {files:?}");
 }
 
-/// A job over a 10×10 grid with more lines in `[render]`.
+/// Submits a job over a 10×10 grid with more lines in `[render]`.
 fn submit(farm: &Farm, job: &Job, name: &str, render: &str) -> picofarm_tests::Ended {
     let file = format!("{name}.toml");
     let text = job
@@ -267,7 +268,7 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
     farm.run(&["dataset", "picture", "store/rooms", "--out", "pictures"])
         .ok();
 
-    // The same data set with other settings is refused by name.
+    // The same data set with other settings is rejected by name.
     for (name, render, part) in [
         (
             "fewer",

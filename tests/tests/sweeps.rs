@@ -58,7 +58,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     let id = answer["job"].as_str().unwrap().to_owned();
     let _one = farm.worker("one");
     let other = farm.worker("other");
-    // Into a training of the other.
+    // Kills the worker while the other trial is training.
     let begun = std::time::Instant::now();
     while !other.stderr().contains("stage=\"tof.") && farm.status(&id)["state"] == "active" {
         sleep(Duration::from_millis(20));
@@ -116,7 +116,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     ]);
     assert!(fs::read_to_string(&page).unwrap().contains(model));
 
-    // More trials are further ones: those that have ended stay as they are.
+    // When trials are added, those that have ended do not change.
     let hashes = || {
         let mut hashes = store::hashes(&farm.store().join("models"));
         hashes.retain(|key, _| key.contains("/trials/") && !key.ends_with("trials/6.json"));
@@ -125,7 +125,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     let before = hashes();
     let file = write(&farm, 7, "better");
     let plan = farm.json(&["job", "plan", &file]);
-    // 12 rooms, the split and six trials are there.
+    // 12 rooms, the split and six trials exist.
     assert_eq!(
         (&plan["reuse"], &plan["run"]),
         (&19.into(), &3.into()),
@@ -140,7 +140,7 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     assert_eq!(sweep["trials"].as_array().unwrap().len(), 7);
 }
 
-/// A sweep of one stage that is extended, and one of values chosen by hand.
+/// A job with a sweep of one stage for extension, and a sweep of values chosen by hand.
 fn learning(store: &Path) -> String {
     format!(
         r#"# What follows keeps its comments.
@@ -220,7 +220,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     farm.json(&extend);
     assert_eq!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
     farm.json(&extend);
-    // Another proposal never replaces a file: somebody may have changed it by hand.
+    // Another proposal never replaces a file, because a user may have edited it.
     let other = [&extend[..], &["--sampler", "random"]].concat();
     farm.run(&other)
         .fails(3, &["again.toml", "is there", "--out"]);
@@ -246,7 +246,8 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     ])
     .fails(3, &["another folder"]);
 
-    // Those that ended are reused: 8 rooms, the split, ten and two trials, and what was chosen by hand.
+    // Finished tasks are reused: 8 rooms, the split, ten and two trials, and the values chosen by
+    // hand.
     let hashes = || {
         let mut hashes = store::hashes(&place.join("models"));
         hashes.retain(|key, _| key.contains("/trials/"));
@@ -260,7 +261,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
         (&22.into(), &5.into()),
         "{plan}"
     );
-    // Submits that file, and then one of a trial more.
+    // Submits that file, and then one with another trial.
     let run = [
         "sweep", "run", &next, "--trials", "1", "--rounds", "1", "--stage", "tof",
     ];
@@ -288,7 +289,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     for name in ["depth", "depth-13", "depth-14"] {
         farm.json(&["model", "show", store, name]);
     }
-    // Given again, it finds everything done.
+    // Run again, it finds everything done.
     assert_eq!(farm.json(&run)["rounds"], rounds["rounds"]);
 
     let compared = farm.json(&["sweep", "compare", store, "depth", "by-hand"]);

@@ -1,4 +1,5 @@
-//! A lease begins a trace at the coordinator, which goes on through the worker and comes back with the reports.
+//! A lease begins a trace at the coordinator, which continues in the worker and returns with the
+//! reports.
 
 use std::{
     collections::BTreeMap,
@@ -18,10 +19,10 @@ use tokio::{net::TcpListener, runtime::Runtime};
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, transport::Server};
 
-/// Spans by the service that sent them.
+/// Spans with the name of the service that sent them.
 type Spans = Vec<(String, Span)>;
 
-/// What stands in for an OpenTelemetry collector.
+/// A stand-in for an OpenTelemetry collector.
 #[derive(Clone, Default)]
 struct Collector(Arc<Mutex<Spans>>);
 
@@ -46,7 +47,8 @@ impl TraceService for Collector {
     }
 }
 
-/// What a collector hears of a job of two scenes, when the processes have ended.
+/// Returns the spans that a collector has received of a job of two scenes when the processes have
+/// ended.
 fn heard(name: &str, of_coordinator: &[(&str, &str)]) -> Spans {
     let runtime = Runtime::new().unwrap();
     let collector = Collector::default();
@@ -61,7 +63,7 @@ fn heard(name: &str, of_coordinator: &[(&str, &str)]) -> Spans {
 
     let scratch = Scratch::new(name);
     let cli = Cli::new(scratch.path());
-    // Named by the variable to the one, by the option to the other.
+    // The coordinator's collector is set by the variable, the worker's by the option.
     let mut said = cli.clone().with("OTEL_EXPORTER_OTLP_ENDPOINT", &collects);
     for (name, value) in of_coordinator {
         said = said.with(name, value);

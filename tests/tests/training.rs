@@ -1,20 +1,21 @@
-//! Training as a task: killed at any instant, gone on with by another worker, and the weights are those of a training that
-//! nobody disturbed, bit for bit.
+//! Training as a task: killed at any instant and resumed by another worker, it gives the weights of
+//! an undisturbed training, bit for bit.
 //!
-//! The short form runs with all tests. The long one: `PICOFARM_KILLS=20 tests/run -E 'binary(training)'`.
+//! The short form runs with all tests. The long one:
+//! `PICOFARM_KILLS=20 tests/run -E 'binary(training)'`.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
 use picofarm_tests::{Farm, Signal, rng::Rng, store, wait};
 
-/// Kills of workers while they train.
+/// Number of kills of training workers.
 fn kills_wanted() -> u64 {
     std::env::var("PICOFARM_KILLS").map_or(6, |n| {
         n.parse().expect("PICOFARM_KILLS is a number of kills")
     })
 }
 
-/// A job that renders rooms and splits them; stages that learn from them follow.
+/// Returns a job that renders rooms and splits them, for stages that learn from them.
 fn rooms(name: &str, store: &Path) -> String {
     format!(
         r#"
@@ -108,7 +109,7 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
         if kills == wanted || farm.status(&id)["state"] != "active" {
             break;
         }
-        // Into the training, and then some.
+        // Waits until the training runs, and then for a random time.
         let begun = std::time::Instant::now();
         while worker.runs() && !worker.stderr().contains("task starts") {
             sleep(Duration::from_millis(20));
@@ -127,14 +128,14 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     assert!(resumed > 0, "no training went on from a checkpoint");
     let _last = farm.worker("last");
     assert_eq!(farm.until_ended(&id)["state"], "done");
-    // What was learnt, and what follows from it.
+    // The trained weights and the results computed from them.
     for (folder, part) in [
         ("models", "weights.safetensors"),
         ("seen", "manifests/15.json"),
     ] {
         let made = |farm: &Farm| {
             let mut hashes = store::hashes(&farm.store().join(folder));
-            // How fast a training was is nobody's but its own.
+            // The speed of a training varies between runs.
             hashes.retain(|key, _| !key.contains("checkpoints") && !key.ends_with("speed.json"));
             hashes
         };
@@ -146,7 +147,7 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
             "after {kills} kills, {resumed} resumptions"
         );
     }
-    // Reports show how fast trainings were, too: of all else they tell the same.
+    // Reports also contain training speeds; the rest of their contents is the same.
     let said = |farm: &Farm| {
         let report = fs::read(farm.store().join("reports/all/manifest.json")).unwrap();
         let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
@@ -167,13 +168,13 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     models_can_be_looked_after(&calm);
 }
 
-/// A training that is saved every so many minutes.
+/// Submits a training with this interval between checkpoints.
 fn submit_saved(farm: &Farm, minutes: f64, epochs: u32) -> String {
     let optimise = format!("epochs = {epochs}, batch = 4");
     submit_training(farm, &optimise, (1, minutes))
 }
 
-/// Steps after which a training has a checkpoint in the store.
+/// Returns the steps at which a training has a checkpoint in the store.
 fn saved(farm: &Farm) -> Vec<u64> {
     let folder = farm.store().join("models/tof");
     if !folder.exists() {
@@ -187,7 +188,7 @@ fn saved(farm: &Farm) -> Vec<u64> {
     steps.collect()
 }
 
-/// Steps done, as the task says of itself.
+/// Returns the number of steps done, as reported by the task.
 fn step_of(farm: &Farm, id: &str) -> Option<u64> {
     let status = farm.status(id);
     let text = status.to_string();
@@ -204,7 +205,7 @@ fn a_training_told_to_end_is_saved_where_it_stands_and_another_worker_goes_on_fr
     assert_eq!(calm.until_ended(&id)["state"], "done");
 
     let farm = Farm::with_lease("saved-told", 4.0);
-    // Nothing is saved by the clock in this test's time.
+    // No checkpoint is due within the duration of this test.
     let id = submit_saved(&farm, 60.0, 600);
     let mut leaver = farm.worker("leaver");
     wait::until("the training to be under way", || {
@@ -245,7 +246,7 @@ fn no_more_than_one_step_is_lost_by_a_kill_where_each_step_is_saved() {
     wait::until("some steps", || {
         step_of(&farm, &id).filter(|step| *step > 5)
     });
-    // What it said that it had done, before it was killed.
+    // The last progress that it reported before it was killed.
     let said = step_of(&farm, &id).unwrap();
     killed.kill();
     let steps = saved(&farm);
@@ -257,7 +258,8 @@ fn no_more_than_one_step_is_lost_by_a_kill_where_each_step_is_saved() {
     assert!(heir.stderr().contains(&words), "{}", heir.stderr());
 }
 
-/// Submits a training of one stage, by so many processes, with so many minutes between checkpoints.
+/// Submits a training of one stage with these numbers of processes and of minutes between
+/// checkpoints.
 fn submit_training(farm: &Farm, optimise: &str, (processes, minutes): (u32, f64)) -> String {
     let rooms = rooms("training", &farm.store());
     let job = format!(
@@ -300,7 +302,7 @@ fn processes_of_one_training_that_are_killed_or_frozen_and_come_again_leave_the_
     let mut workers = vec![start(0), start(1), start(2)];
     let (mut kills, mut said) = (0, String::new());
     while kills < wanted {
-        // Into the training, all of them.
+        // Waits until all processes train.
         let begun = std::time::Instant::now();
         while farm.status(&id)["state"] == "active"
             && !workers
@@ -314,7 +316,7 @@ fn processes_of_one_training_that_are_killed_or_frozen_and_come_again_leave_the_
         if farm.status(&id)["state"] != "active" {
             break;
         }
-        // Whoever it is: one that leads, or another.
+        // The victim is chosen at random: the leader or another process.
         let which = (rng.number() % 3) as usize;
         let victim = std::mem::replace(&mut workers[which], start(3 + kills));
         said.push_str(&victim.stderr());
@@ -337,12 +339,12 @@ fn processes_of_one_training_that_are_killed_or_frozen_and_come_again_leave_the_
         there.keys().any(|key| key.contains("weights.safetensors")),
         "{there:?}"
     );
-    // Neither other weights nor calls.
+    // The weights are the same, and no calls are left.
     assert_eq!(there, made(&calm), "after {kills} kills");
     eprintln!("{kills} kills");
 
-    // Frozen for longer than a lease, one after the other, and awake again: the others go on meanwhile, and whoever wakes does
-    // no harm.
+    // Each worker in turn is frozen for longer than a lease and then resumed. The others continue
+    // in the meantime, and a resumed worker does no harm.
     let farm = Farm::with_lease("together-frozen", 2.0);
     let id = submitted(&farm, 3);
     let mut workers: Vec<_> = (0..3).map(|n| farm.worker(&format!("cold-{n}"))).collect();
@@ -382,7 +384,7 @@ fn models_can_be_looked_after(farm: &Farm) {
         let key = whole.keys().find(|key| key.ends_with(part));
         folder.join(key.expect("a model has it"))
     };
-    // Figures stand in the manifest, weights nowhere else.
+    // Figures are also stored in the manifest, but weights are not stored anywhere else.
     let (weights, metrics) = (of("weights.safetensors"), of("metrics.json"));
     let sound = fs::read(&weights).unwrap();
     flip(&weights);
@@ -394,7 +396,7 @@ fn models_can_be_looked_after(farm: &Farm) {
     fs::write(&weights, sound).unwrap();
     farm.run(&["model", "repair", at, "shadow"]).ok();
     assert_eq!(store::hashes(&folder), whole);
-    // What others build on stays.
+    // A model that others build on is not removed.
     farm.run(&["model", "remove", at, "tof"]).fails(
         3,
         &[

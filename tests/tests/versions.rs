@@ -1,4 +1,5 @@
-//! A coordinator serves workers of the previous minor version. Other versions are refused with what to do.
+//! A coordinator serves workers of the previous minor version. Other versions are refused with a
+//! remedy.
 
 use std::time::Duration;
 
@@ -42,7 +43,7 @@ fn hello(version: &str, protocol: u32) -> wire::Hello {
     }
 }
 
-/// Says hello and gives the first answer.
+/// Sends a hello and returns the first answer.
 async fn greet(url: &str, hello: wire::Hello) -> Result<Option<SessionResponse>, Status> {
     let mut client = FarmClient::connect(url.to_owned())
         .await
@@ -181,7 +182,7 @@ async fn a_worker_refused_for_its_version_exits_with_4_and_says_what_to_do() {
     server.abort();
 }
 
-/// Stands between a worker and its coordinator and reports another version of the worker.
+/// Relays between a worker and its coordinator, and reports another version of the worker.
 struct Relay {
     coordinator: String,
     version: String,
@@ -210,14 +211,14 @@ impl FarmService for Relay {
     }
 }
 
-/// This version with another minor number.
+/// Returns this version with another minor number.
 fn with_minor(change: impl Fn(u64) -> u64) -> String {
     let mut numbers = VERSION.split('.').map(|n| n.parse::<u64>().unwrap());
     let (major, minor) = (numbers.next().unwrap(), numbers.next().unwrap());
     format!("{major}.{}.9", change(minor))
 }
 
-/// Serves a relay to `coordinator`; returns its URL.
+/// Serves a relay to `coordinator` and returns its URL.
 async fn relay(coordinator: &str, version: String) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
@@ -233,7 +234,7 @@ async fn relay(coordinator: &str, version: String) -> String {
     url
 }
 
-/// Runs a job on a farm whose worker reports this version; returns the hashes of the objects.
+/// Runs a job on a farm with a worker that reports this version. Returns the hashes of the objects.
 async fn hashes_by(
     name: &'static str,
     version: String,

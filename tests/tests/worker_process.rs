@@ -1,4 +1,5 @@
-//! The workers of `up` are processes of their own: what ends one of them, or what none of them can hold, ends nothing else.
+//! The workers of `up` are processes of their own: the death of one, or a task too large for all of
+//! them, ends nothing else.
 
 use std::fs;
 
@@ -66,7 +67,7 @@ impl Up {
         })
     }
 
-    /// Another job runs to its end.
+    /// Checks that another job runs to its end.
     fn still_works(&mut self, name: &str) {
         let job = self.submit(name, &self.small(name).toml());
         let ended = self.until_ended(&job);
@@ -75,17 +76,17 @@ impl Up {
     }
 }
 
-/// Processes whose parent is `pid`.
+/// Returns the child processes of `pid`.
 fn children(pid: u32) -> Vec<u32> {
     let processes = fs::read_dir("/proc").unwrap().filter_map(Result::ok);
     let ids = processes.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
     ids.filter(|id| parent(*id) == Some(pid)).collect()
 }
 
-/// The parent of a process that is there and has not ended.
+/// Returns the parent of a process that has not ended.
 fn parent(pid: u32) -> Option<u32> {
     let text = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The name in parentheses may hold anything.
+    // The name in parentheses may contain any character.
     let mut rest = text.rsplit_once(')')?.1.split_whitespace();
     let state = rest.next()?;
     (state != "Z").then(|| rest.next()?.parse().ok()).flatten()
@@ -141,7 +142,8 @@ fn a_task_that_gets_no_memory_fails_alone() {
         maximum: None,
     };
     prlimit(Some(pid(worker)), Resource::As, limit).unwrap();
-    // Histograms of 2 GB: more than that, and than the addresses that the allocator has set aside.
+    // Histograms of 2 GB, which exceeds the limit and the addresses that the allocator has
+    // reserved.
     let big = Job {
         name: "big".into(),
         dataset: "big".into(),

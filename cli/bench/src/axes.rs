@@ -1,4 +1,5 @@
-//! Logarithmic axes on a canvas: a frame, ticks, grid lines, lines between points, text of two sizes.
+//! Logarithmic axes on a canvas: a frame, ticks, grid lines, lines between points, text in two
+//! sizes.
 
 use font8x8::UnicodeFonts;
 
@@ -19,7 +20,7 @@ pub struct Span {
 }
 
 impl Span {
-    /// Holds all values, with a little room and at least one and a half decades.
+    /// Returns a span that contains all values, with a margin and at least one and a half decades.
     pub fn around(values: impl Iterator<Item = f64>) -> Self {
         let usable = values.filter(|v| v.is_finite() && *v > 0.0);
         let (low, high) = usable.fold((f64::INFINITY, 0.0f64), |(l, h), v| (l.min(v), h.max(v)));
@@ -36,12 +37,12 @@ impl Span {
         }
     }
 
-    /// Where `v` lies: 0 at the low end, 1 at the high one.
+    /// Returns the relative position of `v`: 0 at the low end, 1 at the high one.
     pub fn share(self, v: f64) -> f64 {
         (v / self.low).ln() / (self.high / self.low).ln()
     }
 
-    /// 1, 2 and 5 times the powers of ten within; the second says whether it gets a label.
+    /// Returns 1, 2 and 5 times the powers of ten in the span, and whether each gets a label.
     fn ticks(self) -> Vec<(f64, bool)> {
         let decades = (self.low.log10().floor() as i32)..=(self.high.log10().ceil() as i32);
         let labelled = |digit: i32| match (self.high / self.low).log10() {
@@ -68,7 +69,7 @@ pub struct Axes {
 }
 
 impl Axes {
-    /// Pixel of a point.
+    /// Returns the pixel of a point.
     pub fn at(&self, x: f64, y: f64) -> (f64, f64) {
         (
             self.left as f64 + self.x.share(x) * self.width as f64,
@@ -76,7 +77,7 @@ impl Axes {
         )
     }
 
-    /// Grid, frame, tick labels and the axes' names.
+    /// Draws grid, frame, tick labels and the axes' names.
     pub fn draw(&mut self, x_name: &str, y_name: &str) {
         let (left, top) = (self.left, self.top);
         let (right, bottom) = (left + self.width, top + self.height);
@@ -113,7 +114,7 @@ impl Axes {
         self.text(8, top.saturating_sub(26), y_name, 2, INK);
     }
 
-    /// Text with letters of `scale` times eight pixels.
+    /// Draws text with letters of `scale` times eight pixels.
     pub fn text(&mut self, x: usize, y: usize, text: &str, scale: usize, colour: [u8; 3]) {
         for (i, letter) in text.chars().enumerate() {
             let glyph = font8x8::BASIC_FONTS.get(letter).unwrap_or_default();
@@ -132,7 +133,8 @@ impl Axes {
         }
     }
 
-    /// A line two pixels wide, cut off at the frame; `dash` = pixels on and off, 0 for a solid line.
+    /// Draws a line two pixels wide, clipped at the frame. `dash` = pixels on and off, 0 for a
+    /// solid line.
     pub fn line(&mut self, from: (f64, f64), to: (f64, f64), dash: usize, colour: [u8; 3]) {
         let steps = (to.0 - from.0)
             .abs()
@@ -151,7 +153,7 @@ impl Axes {
         }
     }
 
-    /// A marker: a filled square (`round` = false) or disc.
+    /// Draws a marker: a filled square (`round` = false) or disc.
     pub fn marker(&mut self, at: (f64, f64), round: bool, colour: [u8; 3]) {
         for dy in -4i32..=4 {
             for dx in -4i32..=4 {
@@ -170,7 +172,7 @@ impl Axes {
     }
 }
 
-/// "0.02", "5", "200".
+/// Formats a tick: "0.02", "5", "200".
 fn tick(v: f64) -> String {
     let decimals = (-v.log10().floor()).max(0.0) as usize;
     format!("{v:.decimals$}")

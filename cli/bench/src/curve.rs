@@ -1,4 +1,4 @@
-//! Curves of time against error: where they meet a given error, and how fast things grow.
+//! Curves of error over time: the time at which they reach a given error, and growth exponents.
 
 use serde::Serialize;
 
@@ -10,11 +10,11 @@ pub struct Crossing {
     pub how: How,
 }
 
-/// Where a crossing comes from.
+/// Method by which a crossing was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum How {
-    /// Between two rungs, straight in the logarithms.
+    /// Between two rungs, linearly in the logarithms.
     Interpolated,
     /// Beyond the last rung, with error ~ time^-1/2.
     Extrapolated,
@@ -33,7 +33,7 @@ impl std::fmt::Display for Crossing {
     }
 }
 
-/// 0.123, 1.23, 12.3, 123, 1234.
+/// Formats three digits: 0.123, 1.23, 12.3, 123, 1234.
 pub fn three_digits(v: f64) -> String {
     let decimals = match v.abs() {
         x if x < 0.9995 => 3,
@@ -44,7 +44,7 @@ pub fn three_digits(v: f64) -> String {
     format!("{v:.decimals$}")
 }
 
-/// CPU seconds to `target` on a curve of (CPU seconds, error). `None` without points.
+/// Returns the CPU seconds to `target` on a curve of (CPU seconds, error). `None` without points.
 pub fn crossing(points: &[(f64, f64)], target: f64) -> Option<Crossing> {
     let mut points = points.to_vec();
     points.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -71,7 +71,8 @@ pub fn crossing(points: &[(f64, f64)], target: f64) -> Option<Crossing> {
     })
 }
 
-/// Exponent k of y ~ x^k by least squares in the logarithms; `None` with fewer than two different x.
+/// Returns the exponent k of y ~ x^k by least squares in the logarithms; `None` with fewer than two
+/// different x.
 pub fn exponent(points: &[(f64, f64)]) -> Option<f64> {
     let n = points.len() as f64;
     let logs: Vec<(f64, f64)> = points.iter().map(|(x, y)| (x.ln(), y.ln())).collect();

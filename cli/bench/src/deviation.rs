@@ -1,19 +1,20 @@
-//! How wrong a render is, beside a converged one whose own noise is known and taken off in quadrature.
+//! Errors of a render against a converged one. The noise of the converged render is known and
+//! subtracted in quadrature.
 
 use serde::Serialize;
 
-/// A converged result to measure against. One-bounce peaks are left out.
+/// A converged reference. One-bounce peaks are left out.
 pub struct Truth {
     pub bins: usize,
     /// `[row][column][bin]`.
     pub value: Vec<f32>,
     /// Its own expected squared error, summed over the bins of each pixel.
     pub noise: Vec<f64>,
-    /// Where it comes from, in words.
+    /// Description of its origin.
     pub source: String,
 }
 
-/// What separates a render from the truth.
+/// Errors of a render against the reference.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Deviation {
     /// Median over pixels of |h - r| / |r|, norms over the bins.
@@ -25,7 +26,7 @@ pub struct Deviation {
 }
 
 impl Truth {
-    /// Median over pixels of its own noise, relative.
+    /// Returns the median over pixels of the reference's own relative noise.
     pub fn median_noise(&self) -> f64 {
         let relative = self
             .value
@@ -35,7 +36,7 @@ impl Truth {
         median(relative.collect())
     }
 
-    /// How far `h` is from it.
+    /// Returns the errors of `h`.
     pub fn deviation(&self, h: &[f32]) -> Deviation {
         let (mut all, mut of) = (0.0, 0.0);
         let mut each = Vec::with_capacity(self.noise.len());
@@ -66,12 +67,12 @@ fn square(values: &[f32]) -> f64 {
     values.iter().map(|&v| f64::from(v).powi(2)).sum()
 }
 
-/// Root of the ratio of two squares; nothing where there is nothing to compare with.
+/// Returns the root of the ratio of two squares; `None` if the denominator is 0.
 fn share(of: f64, whole: f64) -> Option<f64> {
     (whole > 0.0).then(|| (of / whole).sqrt())
 }
 
-/// The middle value; 0 for none.
+/// Returns the median; 0 for no values.
 fn median(mut values: Vec<f64>) -> f64 {
     if values.is_empty() {
         return 0.0;

@@ -1,4 +1,4 @@
-//! One scene: the truth, a ladder of budgets beside it, and whether the stopping rule holds.
+//! Measures one scene: a ladder of budgets against a reference, and a check of the stopping rule.
 
 use picofarm_scene::Scene;
 use picofarm_transient::{Budget, Gate, Settings};
@@ -20,12 +20,13 @@ use super::{
     truth,
 };
 
-/// The truth's noise may be this share of the smallest error measured with it; beyond, a warning.
+/// Maximum noise of the reference, as a fraction of the smallest error measured with it. Above
+/// this, a warning is printed.
 const QUIET: f64 = 0.5;
-/// The stopping rule holds if the true error is at most this much above the target.
+/// The stopping rule passes if the true error is at most this factor times the target.
 const SLACK: f64 = 1.1;
 
-/// What was found for one scene.
+/// Results for one scene.
 #[derive(Debug, Serialize)]
 pub struct Outcome {
     pub scene: String,
@@ -35,9 +36,9 @@ pub struct Outcome {
     pub spots: usize,
     pub triangles: usize,
     pub threads: usize,
-    /// Where the truth comes from.
+    /// Origin of the reference.
     pub truth: String,
-    /// Median over pixels of the truth's own relative noise.
+    /// Median over pixels of the reference's own relative noise.
     pub truth_noise: f64,
     pub variants: Vec<Curve>,
     pub stopping: Stopping,
@@ -45,13 +46,13 @@ pub struct Outcome {
     pub warnings: Vec<String>,
 }
 
-/// Time against error of one way to render.
+/// Error over time for one way to render.
 #[derive(Debug, Serialize)]
 pub struct Curve {
     pub name: String,
     pub rungs: Vec<Rung>,
     pub to: Vec<Target>,
-    /// What the renderer decided to do, in its words.
+    /// The renderer's decisions, in its own words.
     pub plan: Vec<String>,
 }
 
@@ -63,9 +64,9 @@ pub struct Rung {
     pub cpu_s: f64,
     pub wall_s: f64,
     pub rays: u64,
-    /// What it really is.
+    /// The measured error.
     pub error: Deviation,
-    /// What the renderer says that the median is.
+    /// The renderer's own estimate of the median error.
     pub claimed: f64,
 }
 
@@ -76,12 +77,12 @@ pub struct Target {
     pub at: Option<Crossing>,
 }
 
-/// A render with an error asked for, in the way of the first variant.
+/// A render with a target error, with the settings of the first variant.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Stopping {
     pub target: f64,
     pub rung: Rung,
-    /// The true error does not exceed the target by more than a tenth of it.
+    /// Whether the true error exceeds the target by at most a tenth.
     pub holds: bool,
 }
 
@@ -91,12 +92,12 @@ pub struct PeerCurve {
     pub name: String,
     pub rungs: Vec<PeerRung>,
     pub to: Vec<Target>,
-    /// Its time / the first variant's, for each target.
+    /// Ratio of its time to the first variant's, for each target.
     pub ratio: Vec<Option<f64>>,
 }
 
 impl Curve {
-    /// (CPU seconds, error) of its rungs.
+    /// Returns (CPU seconds, error) of its rungs.
     pub fn points(&self) -> Vec<(f64, f64)> {
         self.rungs
             .iter()
@@ -106,7 +107,7 @@ impl Curve {
 }
 
 impl PeerCurve {
-    /// (CPU seconds, error) of its rungs.
+    /// Returns (CPU seconds, error) of its rungs.
     pub fn points(&self) -> Vec<(f64, f64)> {
         self.rungs
             .iter()
@@ -118,7 +119,8 @@ impl PeerCurve {
 /// Measures one scene.
 ///
 /// # Errors
-/// What the renderer refuses, an unfit stored truth, or an interruption.
+/// Fails if the renderer rejects the scene, a stored reference is unsuitable, or on an
+/// interruption.
 pub fn run(
     scene: &Scene,
     args: &BenchRender,
@@ -181,7 +183,8 @@ pub fn run(
     Ok(outcome)
 }
 
-/// Enough that the truth's noise hardly shows in the largest rung and in the render with a stopping rule.
+/// Returns a number of samples for which the reference's noise is negligible in the largest rung
+/// and in the render with a stopping rule.
 fn truth_samples(args: &BenchRender, until: u32) -> u32 {
     let largest = args.ladder.iter().copied().max().unwrap_or(1);
     args.truth_samples
@@ -192,7 +195,7 @@ fn gate(args: &BenchRender) -> Gate {
     settings(args, Budget::Samples(1), 0).gate
 }
 
-/// The ladder of one variant.
+/// Measures the ladder of one variant.
 fn climb(
     variant: &Variant,
     scene: &Scene,
@@ -224,7 +227,7 @@ fn climb(
     })
 }
 
-/// A render beside the truth.
+/// Compares a render with the reference.
 fn compare(measured: &Measured, truth: &Truth) -> Rung {
     let r = &measured.rendered;
     Rung {

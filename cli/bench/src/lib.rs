@@ -1,6 +1,5 @@
-//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what very
-//! many scenes cost; what storing histograms costs; what a
-//! training step takes.
+//! `picofarm bench …`: benchmarks of renders (time and error), of the scheduler, of operations on
+//! very many scenes, of histogram codecs, and of training steps.
 
 mod axes;
 mod curve;
@@ -29,10 +28,11 @@ use picofarm_cli::{
     signals,
 };
 
-/// Runs a bench to its end, or until a signal.
+/// Runs a benchmark to its end, or until a signal.
 ///
 /// # Errors
-/// As the bench: arguments that cannot be used, a machine without the room, a benched part that fails.
+/// Fails on unusable arguments, insufficient space on the machine, or a failure of the measured
+/// code.
 pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
     let stop = signals::stop_on_signal()?;
     let args = match command {

@@ -17,7 +17,7 @@ use picofarm_cli::{
     roles, signals,
 };
 
-/// What one render took.
+/// Time and result of a render.
 pub struct Measured {
     /// CPU seconds of this process, user and system, over all threads.
     pub cpu_s: f64,
@@ -25,7 +25,7 @@ pub struct Measured {
     pub rendered: Rendered,
 }
 
-/// CPU time that this process has used.
+/// Returns the CPU time that this process has used.
 pub(super) fn cpu_time() -> Duration {
     let now = clock_gettime(ClockId::ProcessCPUTime);
     Duration::new(
@@ -34,7 +34,7 @@ pub(super) fn cpu_time() -> Duration {
     )
 }
 
-/// Settings of a benchmark's renders: without one-bounce peaks, which are analytic.
+/// Returns the settings of a benchmark's renders: without one-bounce peaks, which are analytic.
 pub fn settings(args: &BenchRender, budget: Budget, seed: u64) -> Settings {
     Settings {
         gate: args.gate.gate(),
@@ -59,10 +59,10 @@ pub struct Bench<'a> {
 }
 
 impl<'a> Bench<'a> {
-    /// With `threads` threads; `None` = all cores.
+    /// Creates a bench with `threads` threads; `None` = all cores.
     ///
     /// # Errors
-    /// The threads cannot be started.
+    /// Fails if the threads cannot be started.
     pub fn new(
         threads: Option<usize>,
         output: Output,
@@ -79,10 +79,10 @@ impl<'a> Bench<'a> {
         Ok(Self { pool, output, stop })
     }
 
-    /// Renders `scene`; `what` is shown meanwhile.
+    /// Renders `scene`. Displays `what` meanwhile.
     ///
     /// # Errors
-    /// What the renderer refuses, or an interruption.
+    /// Fails if the renderer rejects the scene, or on an interruption.
     pub fn render(&self, scene: &Scene, settings: &Settings, what: &str) -> Result<Measured> {
         let watch = Watch {
             meter: Mutex::new(Meter::new(self.output)),

@@ -1,4 +1,5 @@
-//! `picofarm bench model`: how long a training step takes, beside other forms and other programs in the same run.
+//! `picofarm bench model`: measures the time of a training step, and compares it with other forms
+//! and programs in the same run.
 
 use std::{
     fs,
@@ -26,38 +27,38 @@ use picofarm_cli::{
     output::{Output, bytes, table},
 };
 
-/// Steps of AdamW in a record.
+/// Number of AdamW steps in a record.
 const RECORDED: usize = 20;
 
-/// What was found.
+/// Results of the benchmark.
 #[derive(Serialize)]
 struct Report {
     trial: Trial,
     parameters: usize,
-    /// Multiply-adds of a pass forward, a sample; the one-hot channels counted as if they were dense.
+    /// Multiply-adds of a forward pass per sample, with one-hot channels counted as dense.
     multiply_adds: f64,
     threads: usize,
-    /// On this graphics processor; threads do not count then.
+    /// Name of the GPU, if used; the number of threads is then irrelevant.
     gpu: Option<String>,
     forms: Vec<Form>,
-    /// The largest difference between the outputs of the gather and the dense form.
+    /// Maximum difference between the outputs of the gather and the dense form.
     forms_differ: Option<f64>,
-    /// From the CPU in 32 bits: lengths of differences over lengths.
+    /// Deviation from the CPU in 32 bits: norm of the difference over the norm.
     from_cpu: Option<Apart>,
-    /// Seconds of our first step; on a graphics processor kernels are chosen and compiled in it.
+    /// Seconds of picofarm's first step. On a GPU, kernels are selected and compiled in it.
     first_step_s: f64,
 }
 
-/// One way of taking the step.
+/// One way to compute the step.
 #[derive(Serialize)]
 struct Form {
     name: String,
-    /// Median over rounds, seconds.
+    /// Median over rounds, in seconds.
     step_s: f64,
     samples_per_s: f64,
-    /// Median over rounds of this form's time over ours: above 1, ours is faster.
+    /// Median over rounds of this form's time divided by picofarm's: above 1, picofarm is faster.
     times_ours: f64,
-    /// Memory beyond what was there before, at most; of our own forms.
+    /// Maximum memory beyond that in use before; only for picofarm's own forms.
     peak_bytes: Option<u64>,
 }
 
@@ -128,7 +129,8 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         first.push(begun.elapsed().as_secs_f64());
         peaks.push(before.and_then(|b| Some(peak()?.saturating_sub(b))));
     }
-    // As where a worker trains; only now, so that what earlier steps left does not hide what one takes.
+    // As in a worker's training. Called only here, so that memory retained from earlier steps does
+    // not hide the memory of one step.
     let _kept = Kept::from_now();
     for peer in &mut peers {
         peer.steps(1)?;
@@ -137,7 +139,7 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
     for round in 0..args.rounds {
         output.say(format!("round {} of {}", round + 1, args.rounds));
         for ((_, learner, batch), to) in forms.iter_mut().zip(&mut seconds) {
-            // Where a worker trains, its loader makes them.
+            // In a worker's training, its loader prepares the batches.
             let batches: Vec<Batch> = (0..args.steps).map(|_| batch.clone()).collect();
             let begun = Instant::now();
             learner
@@ -308,7 +310,7 @@ fn text(report: &Report) -> String {
     out
 }
 
-/// Another program that takes steps when asked to.
+/// Another program that performs steps on request.
 struct Peer {
     name: String,
     child: Child,
@@ -359,7 +361,7 @@ impl Peer {
         }
     }
 
-    /// Seconds that it says so many steps took.
+    /// Makes the program run `steps` steps, and returns the seconds that it reports.
     fn steps(&mut self, steps: u64) -> Result<f64> {
         let name = self.name.clone();
         let failed = |what: String| CliError::new(Code::Failed, format!("{name}: {what}"));
@@ -373,13 +375,13 @@ impl Peer {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        // Its input ends with this; what does not end then is ended.
+        // The end of its input should end it; otherwise it is killed.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// Memory now, from which the peak counts from now on; where the system can say.
+/// Resets the peak of memory use, and returns the memory in use now, if the system reports it.
 fn reset_peak() -> Option<u64> {
     fs::write("/proc/self/clear_refs", "5").ok()?;
     status("VmRSS:")

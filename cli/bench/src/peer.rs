@@ -1,4 +1,4 @@
-//! Measurements of other renderers, as tests/peers writes them.
+//! Measurements of other renderers, as written by tests/peers.
 
 use std::path::PathBuf;
 
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use picofarm_cli::error::{CliError, Result, io};
 
-/// One file: what one tool took.
+/// A file with the measurements of one tool.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Peer {
     /// Name and version.
@@ -40,7 +40,7 @@ pub struct PeerRung {
 /// Reads the files.
 ///
 /// # Errors
-/// A file that cannot be read or is something else.
+/// Fails if a file cannot be read or has another format.
 pub fn read(paths: &[PathBuf]) -> Result<Vec<Peer>> {
     let one = |path: &PathBuf| {
         let what = || format!("--peer {}", path.display());

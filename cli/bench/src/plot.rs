@@ -1,4 +1,4 @@
-//! The picture of time against error.
+//! Plots error over time.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use super::{
 const SIZE: (usize, usize) = (1000, 700);
 const MARGIN: (usize, usize) = (64, 64);
 const BELOW: usize = 72;
-/// Wong's colours, which the colour-blind can tell apart.
+/// Wong's colours, which people with colour blindness can distinguish.
 const COLOURS: [[u8; 3]; 7] = [
     [0, 114, 178],
     [213, 94, 0],
@@ -24,7 +24,7 @@ const COLOURS: [[u8; 3]; 7] = [
     [90, 90, 90],
 ];
 const TARGET: [u8; 3] = [170, 170, 170];
-/// Pixels on and off of a peer's line.
+/// Dash length of a peer's line, in pixels.
 const DASH: usize = 7;
 
 struct Line {
@@ -34,11 +34,11 @@ struct Line {
     dash: usize,
 }
 
-/// Draws one line a scene and variant (solid, discs, a colour each) and one a peer (dashed, squares, in the colour of
-/// the scene's first variant).
+/// Draws one line per scene and variant (solid, with discs, in a colour of its own) and one per
+/// peer (dashed, with squares, in the colour of the scene's first variant).
 ///
 /// # Errors
-/// The file cannot be written.
+/// Fails if the file cannot be written.
 pub fn draw(found: &[Outcome], targets: &[f64], path: &Path) -> Result<()> {
     let lines = lines(found);
     let points = || lines.iter().flat_map(|l| &l.points);
@@ -107,7 +107,7 @@ fn lines(found: &[Outcome]) -> Vec<Line> {
     lines
 }
 
-/// In the upper right corner, where curves that fall are not.
+/// Draws the legend in the upper right corner, which falling curves do not cross.
 fn legend(axes: &mut Axes, lines: &[Line]) {
     const ROW: usize = 16;
     let longest = lines.iter().map(|l| l.name.chars().count()).max();

@@ -1,4 +1,4 @@
-//! What a benchmark prints: tables for people, one document for programs.
+//! Output of the render benchmark: tables for people, one document for programs.
 
 use serde_json::{Value, json};
 
@@ -10,7 +10,7 @@ use super::{
     scaling::{Axis, Scaling},
 };
 
-/// The document that `--json` prints.
+/// Returns the document that `--json` prints.
 pub fn document(found: &[Outcome], args: &BenchRender) -> Value {
     json!({
         "renderer": picofarm_transient::RENDERER_VERSION,
@@ -20,7 +20,7 @@ pub fn document(found: &[Outcome], args: &BenchRender) -> Value {
     })
 }
 
-/// Time against error, scene by scene.
+/// Formats error over time, scene by scene.
 pub fn ladders(found: &[Outcome]) -> String {
     let parts: Vec<String> = found.iter().map(ladder).collect();
     parts.join("\n")
@@ -30,7 +30,7 @@ fn percent(share: f64) -> String {
     three_digits(100.0 * share)
 }
 
-/// A share that somebody asked for, as short as it is: "10 %", "2.5 %".
+/// Formats a requested fraction as a percentage with as few digits as possible: "10 %", "2.5 %".
 fn asked(share: f64) -> String {
     format!("{} %", (share * 1e6).round() / 1e4)
 }
@@ -100,7 +100,7 @@ fn row(name: &str, r: &Rung) -> Vec<String> {
     ]
 }
 
-/// CPU seconds to each error, one row a curve.
+/// Returns the CPU seconds to each error, one row per curve.
 fn times(found: &Outcome) -> Vec<Vec<String>> {
     let shown = |at: Option<Crossing>| at.map_or("-".into(), |c| c.to_string());
     let mut header = vec!["CPU s to".to_owned()];
@@ -133,7 +133,7 @@ fn times(found: &Outcome) -> Vec<Vec<String>> {
     rows
 }
 
-/// As [`table`], with every column but the first flush right.
+/// Like [`table`], with every column except the first aligned right.
 fn right_aligned(rows: &[Vec<String>]) -> String {
     let columns = rows.first().map_or(0, Vec::len);
     let width = |c: usize| rows.iter().map(|r| r[c].len()).max().unwrap_or(0);
@@ -157,7 +157,7 @@ fn right_aligned(rows: &[Vec<String>]) -> String {
     table(&padded)
 }
 
-/// How the time grows.
+/// Formats the growth of the time.
 pub fn scaling(found: &Scaling) -> String {
     let b = &found.base;
     let mut text = format!(

@@ -1,5 +1,5 @@
-//! How the time to a given error grows with triangles, spots, bins and pixels. The error is the
-//! renderer's own estimate; the ladders say how good that is.
+//! Measures how the time to a given error grows with triangles, spots, bins and pixels. The error
+//! is the renderer's own estimate; the ladders show how accurate it is.
 
 use picofarm_scene::Scene;
 use picofarm_transient::{Budget, Gate};
@@ -15,7 +15,7 @@ use super::{
     tessellate::quadruple,
 };
 
-/// The sizes that are tried.
+/// The sizes to measure.
 struct Sizes {
     pixels: u32,
     most_triangles: usize,
@@ -40,7 +40,7 @@ const QUICK: Sizes = Sizes {
     resolutions: &[16, 32, 64],
 };
 
-/// What was found.
+/// Results of the measurement.
 #[derive(Debug, Serialize)]
 pub struct Scaling {
     pub scene: String,
@@ -50,7 +50,7 @@ pub struct Scaling {
     pub axes: Vec<Axis>,
 }
 
-/// Growth along one axis; everything else as in the base.
+/// Growth along one axis, with all other sizes as in the base.
 #[derive(Debug, Serialize)]
 pub struct Axis {
     pub name: &'static str,
@@ -82,10 +82,10 @@ pub struct Size {
     pub rays: u64,
 }
 
-/// Measures the growth for the first of the scenes that the arguments name.
+/// Measures the growth for the first scene that the arguments name.
 ///
 /// # Errors
-/// What the renderer refuses, or an interruption.
+/// Fails if the renderer rejects the scene, or on an interruption.
 pub fn run(args: &BenchRender, output: Output, stop: &CancellationToken) -> Result<Scaling> {
     let sizes = if args.quick { &QUICK } else { &FULL };
     let mut scene = load(&args.scenes[0], args)?;
@@ -128,7 +128,7 @@ impl Study<'_> {
         let what = format!("{}: {what}, until {} %", scene.name, target * 100.0);
         let measured = self.bench.render(scene, &settings, &what)?;
         let r = &measured.rendered;
-        // A full study takes long: what is known is shown at once.
+        // A full study takes long, so each result is shown at once.
         let cpu = three_digits(measured.cpu_s);
         self.output.say(format!("{what}: {cpu} CPU s"));
         Ok(Size {
@@ -197,7 +197,7 @@ impl Study<'_> {
     }
 }
 
-/// The same interval in another number of bins.
+/// Returns the same interval with another number of bins.
 fn with_bins(gate: Gate, bins: u32) -> Gate {
     Gate {
         bin_width_m: gate.bin_width_m * f64::from(gate.bins) / f64::from(bins),

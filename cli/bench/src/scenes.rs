@@ -1,4 +1,4 @@
-//! The scenes that a benchmark renders: presets by name, or files.
+//! The scenes of a benchmark: presets by name, or files.
 
 use std::path::Path;
 
@@ -16,13 +16,13 @@ use picofarm_cli::{
 
 use super::tessellate::tessellate;
 
-/// Image width and height where none is given.
+/// Default image width and height.
 const PIXELS: u32 = 32;
 
-/// The scene that `name` stands for, at the size that the arguments ask for.
+/// Returns the scene called `name`, at the size that the arguments request.
 ///
 /// # Errors
-/// Neither a preset nor a readable scene file, or a size out of range.
+/// Fails if the name is neither a preset nor a readable scene file, or if a size is out of range.
 pub fn load(name: &str, args: &BenchRender) -> Result<Scene> {
     let pixels = args.resolution.unwrap_or(PIXELS);
     let mut scene = match preset(name)? {
@@ -38,16 +38,16 @@ pub fn load(name: &str, args: &BenchRender) -> Result<Scene> {
     Ok(scene)
 }
 
-/// Another resolution, the same view.
+/// Sets another resolution with the same view.
 pub fn resize(scene: &mut Scene, pixels: u32) {
     let i = &mut scene.camera.intrinsics;
     *i = i.resized(pixels, pixels);
 }
 
-/// Another grid of spots, the same room.
+/// Sets another grid of spots in the same room.
 ///
 /// # Errors
-/// There is no such grid.
+/// Fails if there is no such grid.
 pub fn with_spots(scene: &mut Scene, spots: u32) -> Result<()> {
     let aim = Aim::grid(spots).ok_or_else(|| {
         CliError::input(format!(
@@ -64,7 +64,7 @@ enum Preset {
     Primitive,
 }
 
-/// `furnished` or `primitive`, with `:SEED` if another than 1 is wanted.
+/// Parses `furnished` or `primitive`, with an optional `:SEED` (default 1).
 fn preset(name: &str) -> Result<Option<(Preset, u64)>> {
     let (kind, seed) = match name.split_once(':') {
         Some((kind, seed)) => (kind, Some(seed)),
@@ -82,7 +82,7 @@ fn preset(name: &str) -> Result<Option<(Preset, u64)>> {
     Ok(Some((kind, seed)))
 }
 
-/// Parametric furniture: the same scene on every machine.
+/// Generates a scene with parametric furniture, which is the same on every machine.
 fn generate(kind: Preset, seed: u64, spots: u32, pixels: u32) -> Result<Scene> {
     let mut scene = match kind {
         Preset::Furnished => {

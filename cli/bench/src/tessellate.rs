@@ -1,4 +1,5 @@
-//! More triangles for the same surface: every triangle is cut into four at the middles of its edges.
+//! Increases the number of triangles of a surface: every triangle is divided into four at the
+//! midpoints of its edges.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -6,13 +7,13 @@ use picofarm_scene::{Mesh, Scene};
 
 use picofarm_cli::error::{CliError, Result};
 
-/// More than this is a mistake.
+/// Maximum number of triangles; a larger number is a mistake.
 const MOST: usize = 1 << 26;
 
-/// Cuts all triangles until the scene has at least `wanted`.
+/// Divides all triangles until the scene has at least `wanted`.
 ///
 /// # Errors
-/// A scene without triangles, or a number out of reach.
+/// Fails if the scene has no triangles, or if the number is too large.
 pub fn tessellate(scene: &mut Scene, wanted: usize) -> Result<()> {
     let found = scene.triangle_count();
     if found == 0 || wanted > MOST {
@@ -26,7 +27,8 @@ pub fn tessellate(scene: &mut Scene, wanted: usize) -> Result<()> {
     Ok(())
 }
 
-/// Four triangles for each. Shared meshes stay shared, and shared edges are cut at one point.
+/// Divides each triangle into four. Shared meshes stay shared, and shared edges are divided at the
+/// same point.
 pub fn quadruple(scene: &mut Scene) {
     let mut done = BTreeMap::<*const Mesh, Arc<Mesh>>::new();
     for object in &mut scene.objects {

@@ -1,4 +1,4 @@
-//! Where the truth comes from: two independent converged renders, or a stored one.
+//! The reference of a benchmark: two independent converged renders, or a stored one.
 
 use std::{path::Path, sync::Arc};
 
@@ -19,7 +19,7 @@ use super::{
 /// Seeds of the two halves, far from those of the rungs.
 const SEEDS: [u64; 2] = [0x7472_7574_6800, 0x7472_7574_6801];
 
-/// Renders two halves of the truth; half their difference is its noise, whatever its nature.
+/// Renders two halves of the reference. Half their difference is its noise, whatever its nature.
 ///
 /// # Errors
 /// As [`Bench::render`].
@@ -51,11 +51,11 @@ pub fn render(scene: &Scene, args: &BenchRender, samples: u32, bench: &Bench<'_>
     })
 }
 
-/// Reads the parts `two` and `multi` and their standard errors from a folder that
-/// `picofarm scene render --split` wrote.
+/// Reads the parts `two` and `multi` and their standard errors from a folder written by
+/// `picofarm scene render --split`.
 ///
 /// # Errors
-/// Not such a folder, or one of another image size or gate.
+/// Fails if the folder has another format, image size or gate.
 pub fn read(dir: &Path, scene: &Scene, gate: Gate) -> Result<Truth> {
     let bad = |what: String| {
         CliError::input(format!("--truth {}: {what}", dir.display())).hint(

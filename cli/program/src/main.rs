@@ -1,13 +1,14 @@
-//! The `picofarm` program. What it is built with are this package's features; all it does is in `picofarm-cli`.
+//! The `picofarm` program. This package's features select its parts; its code is in `picofarm-cli`.
 
 use std::process::ExitCode;
 
-/// The system's allocator gives pages back that the next tensor of that size fetches again: with this one, a small network's
-/// step on the CPU takes 0.81 to 0.98 of the time, and renders as long as before.
+/// The system's allocator returns pages that the next tensor of that size requests again. With
+/// mimalloc, a training step of a small network on the CPU takes 0.81 to 0.98 of the time, and
+/// renders take as long as before.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// What `--version` prints: version, commit, and features.
+/// Text of `--version`: version, commit and features.
 const VERSION: &str = concat!(
     env!("CARGO_PKG_VERSION"),
     " (",

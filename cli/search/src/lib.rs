@@ -1,11 +1,12 @@
 //! Which values a sweep should try next ([`tpe`]).
 //!
-//! Pure functions of what trials have found: the same records give the same answers, on every machine. Randomness is
-//! SHA-256 of a seed and of what is drawn.
+//! All functions are pure functions of the trials' results: the same records give the same answers
+//! on every machine. Random numbers are SHA-256 of a seed and of their purpose.
 //!
-//! Written here rather than taken from crates.io: the crates there (`tpe`, `optimizer`, `hyperopt`, `parzen`) have generators
-//! of random numbers of their own or a study that must hear of each trial as it goes, and use the platform's logarithm.
-//! Here proposals must follow from records in a store alone, in rounds of any number, to the same digits everywhere.
+//! The crates on crates.io (`tpe`, `optimizer`, `hyperopt`, `parzen`) do not fit: they have their
+//! own random number generators or a study object that must observe each trial as it runs, and use
+//! the platform's logarithm. Here, proposals must follow from stored records alone, in rounds of
+//! any size, and be identical to the last digit everywhere.
 
 mod parzen;
 pub mod tpe;
@@ -16,7 +17,7 @@ use picofarm_proto::model::Domain;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-/// The values that each parameter may have, by its name.
+/// The possible values of each parameter, by its name.
 pub type Space = BTreeMap<String, Domain>;
 /// A trial's values, by the parameters' names.
 pub type Values = BTreeMap<String, Value>;
@@ -33,24 +34,25 @@ pub struct Tried {
 /// How a trial ended.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Outcome {
-    /// It came to its end: how bad it is.
+    /// It finished, with this loss.
     Finished(f64),
-    /// It fell behind others.
+    /// It was stopped because it had fallen behind other trials.
     Stopped {
-        /// Epochs done.
+        /// Number of epochs done.
         epochs: u64,
-        /// How bad it was then.
+        /// Loss at that point.
         loss: f64,
     },
-    /// Its numbers broke.
+    /// It failed because its numbers diverged.
     Failed,
     /// It has not ended.
     Open,
 }
 
 impl Outcome {
-    /// From the best to the worst: those that came to their end by their loss, those that stopped by how far they came and
-    /// then by their loss, and those that failed. (So does Optuna's `TPESampler`.) Open ones come last.
+    /// Orders outcomes from best to worst: finished trials by their loss, stopped trials by their
+    /// epochs and then by their loss, and failed trials, as Optuna's `TPESampler` does. Open trials
+    /// come last.
     fn order(&self, other: &Self) -> Ordering {
         let key = |outcome: &Self| match *outcome {
             Self::Finished(loss) => (0, 0, loss),
@@ -67,14 +69,15 @@ impl Outcome {
     }
 }
 
-/// Those that have ended, from the best to the worst; of equals the earlier one first.
+/// Returns the trials that have ended, from best to worst. Of equal trials, the earlier one comes
+/// first.
 fn ranked(tried: &[Tried]) -> Vec<&Tried> {
     let mut ended: Vec<&Tried> = tried.iter().filter(|t| t.outcome.ended()).collect();
     ended.sort_by(|a, b| a.outcome.order(&b.outcome));
     ended
 }
 
-/// Random bits that follow from what they are for.
+/// Returns random bits derived from their purpose.
 fn bits(seed: u64, of: &str, numbers: [u64; 2]) -> u64 {
     let mut hash = Sha256::new();
     hash.update(seed.to_le_bytes());
@@ -85,12 +88,12 @@ fn bits(seed: u64, of: &str, numbers: [u64; 2]) -> u64 {
     u64::from_le_bytes(digest[..8].try_into().expect("a digest has 32 bytes"))
 }
 
-/// A number in [0, 1) of random bits.
+/// Converts random bits to a number in [0, 1).
 fn uniform(bits: u64) -> f64 {
     (bits >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// A whole number below `n` of random bits.
+/// Converts random bits to an integer below `n`.
 fn below(n: usize, bits: u64) -> usize {
     ((u128::from(bits) * n as u128) >> 64) as usize
 }

@@ -1,13 +1,14 @@
-//! Mixtures of kernels over a space, one kernel for each trial and one for what is believed before any.
+//! Mixtures of kernels over a space, with one kernel for each trial and one for the prior.
 //!
-//! Multivariate: a kernel is a product over parameters, so that values which go well together stay together (Falkner et
-//! al., ICML 2018, which Watanabe 2023, arXiv 2304.11127, recommends). Numbers of an interval are mapped to [0, 1], by their
-//! logarithm where the interval is one of magnitudes; their kernel is a normal distribution cut off at the ends. Whole
-//! numbers are steps of it. Of a list, a kernel prefers its trial's value to the others, which are alike.
+//! The mixture is multivariate: a kernel is a product over parameters, so that combinations of good
+//! values are preserved (Falkner et al., ICML 2018; recommended by Watanabe 2023, arXiv
+//! 2304.11127). Numbers of an interval are mapped to [0, 1], by their logarithm if the interval is
+//! logarithmic. Their kernel is a truncated normal distribution, integrated over steps for
+//! integers. In a list, a kernel prefers its trial's value to the others, which have equal weights.
 //!
-//! Widths are those of Optuna's `TPESampler(multivariate=True)`: 0.2 n^(−1/(d+4)) of the interval (Scott's rule), but at
-//! least 1/min(100, n + 2) ("magic clipping"). The prior is a normal distribution as wide as the interval, in its middle,
-//! and weighs as much as a trial.
+//! Widths are those of Optuna's `TPESampler(multivariate=True)`: 0.2 n^(−1/(d+4)) of the interval
+//! (Scott's rule), but at least 1/min(100, n + 2) ("magic clipping"). The prior is a normal
+//! distribution as wide as the interval, centred in it, and has the weight of one trial.
 
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
@@ -16,21 +17,21 @@ use serde_json::Value;
 
 use crate::{Space, Values, below, bits, uniform};
 
-/// A mixture.
+/// A mixture of kernels.
 pub(crate) struct Mixture<'a> {
     space: &'a Space,
-    /// For each kernel, where it lies by parameter; the last is the prior, which lies nowhere.
+    /// Centre of each kernel, by parameter. The last kernel is the prior, which has no centre.
     kernels: Vec<Vec<Option<Place>>>,
     /// Width of the trials' kernels.
     width: f64,
 }
 
-/// Where a value lies in its domain.
+/// Position of a value in its domain.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Place {
     /// A share of an interval, and half of a step's width: 0 where there are no steps.
     At(f64, f64),
-    /// The position in a list.
+    /// Index in a list.
     Number(usize),
 }
 
@@ -51,7 +52,7 @@ impl Place {
 }
 
 impl<'a> Mixture<'a> {
-    /// The mixture of some trials.
+    /// Creates the mixture of some trials.
     pub(crate) fn of<'v>(space: &'a Space, trials: impl Iterator<Item = &'v Values>) -> Self {
         let place = |values: &Values| -> Vec<Option<Place>> {
             let of = |(name, domain): (&String, &Domain)| Place::of(domain, values.get(name)?);
@@ -68,7 +69,7 @@ impl<'a> Mixture<'a> {
         }
     }
 
-    /// The logarithm of the density at some values.
+    /// Returns the logarithm of the density at some values.
     pub(crate) fn log_density(&self, values: &Values) -> f64 {
         let places: Vec<Option<Place>> = self
             .space
@@ -89,12 +90,12 @@ impl<'a> Mixture<'a> {
         most + libm::log(sum / logs.len() as f64)
     }
 
-    /// Values drawn from it: draw number `number` for trial `trial`.
+    /// Draws values from the mixture: draw number `number` for trial `trial`.
     pub(crate) fn draw(&self, seed: u64, trial: u64, number: u64) -> Values {
         let bits = |of: &str| bits(seed, of, [trial, number]);
         let kernel = &self.kernels[below(self.kernels.len(), bits("kernel"))];
         let of = |((name, domain), centre): ((&String, &Domain), &Option<Place>)| {
-            // No parameter has such a name.
+            // No parameter can have this name.
             let share = uniform(bits(&format!("value of {name}")));
             let value = match domain {
                 Domain::OneOf(list) => {
@@ -136,7 +137,7 @@ impl<'a> Mixture<'a> {
         }
     }
 
-    /// Middle and width of a kernel over an interval.
+    /// Returns centre and width of a kernel over an interval.
     fn normal(&self, centre: Option<Place>) -> (f64, f64) {
         match centre {
             Some(Place::At(share, _)) => (share, self.width),
@@ -144,14 +145,16 @@ impl<'a> Mixture<'a> {
         }
     }
 
-    /// The weight that a kernel gives to a value of a list; the prior's weight of 1 is divided among all kernels.
+    /// Returns the weight that a kernel gives to a value of a list. The prior's weight of 1 is
+    /// divided among all kernels.
     fn weight(&self, values: usize, somewhere: bool, hit: bool) -> f64 {
         let least = 1.0 / self.kernels.len() as f64;
         let sum = least * values as f64 + f64::from(u8::from(somewhere));
         (least + f64::from(u8::from(hit))) / sum
     }
 
-    /// The share of an interval below which a kernel has this share of its weight: by bisection, to the last bit that counts.
+    /// Returns the quantile of a kernel at a given share of its weight, as a fraction of the
+    /// interval. Found by bisection to the last significant bit.
     fn quantile(&self, centre: Option<Place>, share: f64) -> f64 {
         let (mean, width) = self.normal(centre);
         let below = |x: f64| normal_below((x - mean) / width);
@@ -168,7 +171,7 @@ impl<'a> Mixture<'a> {
     }
 }
 
-/// The position that lies at a share of the sum of weights, which is 1.
+/// Returns the index at which the cumulative weight reaches a share of the total, which is 1.
 fn at_share(weights: impl Iterator<Item = f64>, mut share: f64) -> usize {
     let passed = |weight: &f64| {
         share -= weight;
@@ -233,7 +236,7 @@ mod tests {
         let trials = vec![values(1e-2, 3, "b", 0.5); 8];
         let mixture = Mixture::of(&space, trials.iter());
         let draws: Vec<Values> = (0..2000).map(|i| mixture.draw(7, 1, i)).collect();
-        // The density of one parameter, whatever the others are.
+        // The density of one parameter, for any values of the others.
         let density = |name: &str, value: Value| {
             let one = Space::from([(name.to_owned(), space[name].clone())]);
             let alone = Mixture {
@@ -253,7 +256,7 @@ mod tests {
         );
         let kind = density("kind", json!("b"));
         assert!((share(&|d| d["kind"] == "b") - kind).abs() < 0.03, "{kind}");
-        // Of x, a tenth of its interval: 0.1 times the mean density there.
+        // A tenth of x's interval: 0.1 times the mean density there.
         let near = (0..100).map(|i| density("x", json!(0.3 + 0.004 * (f64::from(i) + 0.5))));
         let near = near.sum::<f64>() / 100.0 * 0.1;
         let found = share(&|d| (0.3..0.7).contains(&d["x"].as_f64().unwrap()));

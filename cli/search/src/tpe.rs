@@ -1,26 +1,29 @@
-//! Further values by the tree-structured Parzen estimator (Bergstra et al., "Algorithms for Hyper-Parameter Optimization",
-//! NIPS 2011): of candidates drawn near the best trials, the one whose density among the best is greatest beside that among
-//! the others.
+//! Proposes values with the tree-structured Parzen estimator (Bergstra et al., "Algorithms for
+//! Hyper-Parameter Optimization", NIPS 2011). From candidates drawn near the best trials, it
+//! selects the one with the greatest ratio of the density among the best to the density among the
+//! others.
 //!
-//! The best are ⌈0.1 n⌉ of n trials, at most 25, and 24 candidates are drawn (Optuna's defaults; Watanabe, arXiv 2304.11127,
-//! says what each choice does). Before [`STARTUP`] trials have ended, values are drawn at random. Trials that are open
-//! count among the others, and so do those that were proposed just before: a round does not propose one place many times
-//! ("constant liar"). What was tried is not proposed again, because a training with the same values is the same training.
+//! The best are ⌈0.1 n⌉ of n trials, at most 25, and 24 candidates are drawn. These are Optuna's
+//! defaults; Watanabe, arXiv 2304.11127, describes the effect of each choice. Before [`STARTUP`]
+//! trials have ended, values are drawn at random. Open trials and those just proposed count among
+//! the others, so that a round does not propose the same values many times ("constant liar"). Tried
+//! values are not proposed again, because a training with the same values is the same training.
 
 use picofarm_proto::model::domain;
 
 use crate::{Space, Tried, Values, parzen::Mixture, ranked};
 
-/// Trials that must have ended before the estimator proposes anything.
+/// Number of trials that must have ended before the estimator proposes anything.
 pub const STARTUP: usize = 10;
-/// Most of the trials that are the best.
+/// Maximum number of best trials.
 const MOST: usize = 25;
 /// Candidates for each proposal.
 const CANDIDATES: u64 = 24;
-/// Draws at random before it is said that nothing is left.
+/// Number of random draws after which nothing is considered left to try.
 const PATIENCE: u64 = 200;
 
-/// Proposes the values of `count` further trials, numbered from `first`; fewer where nothing is left to try.
+/// Proposes the values of `count` further trials, numbered from `first`. Returns fewer if nothing
+/// is left to try.
 pub fn propose(space: &Space, tried: &[Tried], seed: u64, first: u64, count: u64) -> Vec<Values> {
     let ended = ranked(tried);
     let best = ended.len().div_ceil(10).min(MOST);
@@ -58,8 +61,8 @@ pub fn propose(space: &Space, tried: &[Tried], seed: u64, first: u64, count: u64
     proposed
 }
 
-/// The values of `count` further trials, numbered from `first`, at random: those that the sweep would draw, but for what was
-/// tried already.
+/// Returns random values of `count` further trials, numbered from `first`: those that the sweep
+/// would draw, except values that were already tried.
 pub fn random(space: &Space, tried: &[Tried], seed: u64, first: u64, count: u64) -> Vec<Values> {
     let mut proposed: Vec<Values> = Vec::new();
     for trial in first..first.saturating_add(count) {
@@ -74,7 +77,7 @@ pub fn random(space: &Space, tried: &[Tried], seed: u64, first: u64, count: u64)
     proposed
 }
 
-/// The trial's draw, or of further ones the first that is not known.
+/// Returns the trial's draw, or the first of further draws with values that were not tried.
 fn at_random(
     space: &Space,
     seed: u64,

@@ -1,9 +1,9 @@
-//! Functions whose least value is known, and what a search finds of it.
+//! Searches for the known minimum of test functions.
 
 use picofarm_search::{Outcome, Space, Tried, Values, tpe};
 use serde_json::json;
 
-/// A function over a space; its least value is about 0.
+/// A function over a space, with a minimum of about 0.
 struct Objective {
     name: &'static str,
     space: Space,
@@ -18,7 +18,7 @@ fn text<'a>(values: &'a Values, name: &str) -> &'a str {
     values[name].as_str().unwrap()
 }
 
-/// How many decades two numbers lie apart.
+/// Returns the distance of two numbers in decades.
 fn decades(x: f64, from: f64) -> f64 {
     (x / from).log10()
 }
@@ -82,7 +82,7 @@ fn objectives() -> Vec<Objective> {
 
 type Search = fn(&Space, &[Tried], u64, u64, u64) -> Vec<Values>;
 
-/// The least value that is found with so many trials, in rounds.
+/// Returns the lowest value found with `trials` trials, in rounds.
 fn least(objective: &Objective, search: Search, seed: u64, trials: u64, round: u64) -> f64 {
     let mut tried: Vec<Tried> = Vec::new();
     while (tried.len() as u64) < trials {
@@ -205,7 +205,7 @@ fn trials_that_stopped_early_teach_less_than_those_that_came_further() {
         values: [("x".to_owned(), json!(x))].into(),
         outcome,
     };
-    // Those near 0.9 came far; those near 0.1 look better, but stopped at once.
+    // Trials near 0.9 ran long; those near 0.1 look better, but stopped at once.
     let mut tried = Vec::new();
     for i in 0..15 {
         let x = f64::from(i) * 0.005;

@@ -1,5 +1,5 @@
-//! The arguments of commands that make data of data: `scene sense`, `dataset reprocess`, `dataset split`,
-//! `dataset export`, `dataset import`.
+//! Arguments of commands that derive data from other data: `scene sense`, `dataset reprocess`,
+//! `dataset split`, `dataset export`, `dataset import`.
 
 use std::path::PathBuf;
 
@@ -268,7 +268,7 @@ pub enum CapturesArg {
 }
 
 impl ImportArgs {
-    /// As the importer takes them.
+    /// Converts the arguments to the importer's options.
     pub fn options(&self) -> ImportOptions {
         ImportOptions {
             gate_start_m: self.gate_start_m,

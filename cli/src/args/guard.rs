@@ -1,4 +1,4 @@
-//! Options that say who may use a coordinator, and how much.
+//! Options for access to a coordinator and its limits.
 
 use std::{path::PathBuf, time::SystemTime};
 

@@ -1,4 +1,5 @@
-//! The arguments of commands that keep data sets whole: `dataset verify`, `repair`, `gc`, `snapshot` and `show`.
+//! Arguments of commands that check and repair data sets: `dataset verify`, `repair`, `gc`,
+//! `snapshot` and `show`.
 
 use std::{path::PathBuf, time::Duration};
 
@@ -145,7 +146,7 @@ pub struct BenchDataset {
     pub keep: bool,
 }
 
-/// An age with its unit: `30s`, `90m`, `24h`, `7d`.
+/// Parses an age with its unit: `30s`, `90m`, `24h`, `7d`.
 fn age(text: &str) -> Result<Duration, String> {
     let expected = || format!("expected a number with s, m, h or d, e.g. 24h, found {text:?}");
     let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());

@@ -1,4 +1,5 @@
-//! Numbers on the command line: what each may be. Those that jobs have too are as there.
+//! Value parsers for numbers with a valid range. Numbers that also appear in jobs have the same
+//! range as there.
 
 use std::{fmt::Display, ops::RangeInclusive, str::FromStr};
 
@@ -17,22 +18,23 @@ fn within<T: FromStr + PartialOrd + Display>(
     }
 }
 
-/// Seeds, and numbers that count from 0.
+/// Parses a seed, or a number that counts from 0.
 pub fn whole(text: &str) -> Result<u64, String> {
     within(text, 0..=u64::MAX, "(a whole number)")
 }
 
-/// Scenes of a job.
+/// Parses the number of scenes of a job.
 pub fn scenes(text: &str) -> Result<u64, String> {
     within(text, 1..=100_000_000, "scenes")
 }
 
-/// Threads of a pool. More than a machine has cores is slow, but works; thousands exhaust it.
+/// Parses the number of threads of a pool. More threads than cores are slow but work; thousands
+/// exhaust the machine.
 pub fn threads(text: &str) -> Result<usize, String> {
     within(text, 1..=1024, "threads; leave it out for all cores")
 }
 
-/// Workers of one process.
+/// Parses the number of workers of one process.
 pub fn workers(text: &str) -> Result<usize, String> {
     within(
         text,
@@ -41,62 +43,63 @@ pub fn workers(text: &str) -> Result<usize, String> {
     )
 }
 
-/// Simulated workers.
+/// Parses the number of simulated workers.
 pub fn simulated(text: &str) -> Result<usize, String> {
     within(text, 1..=100_000, "simulated workers")
 }
 
-/// Memory of a worker.
+/// Parses the memory of a worker.
 pub fn gib(text: &str) -> Result<f64, String> {
     within(text, 0.05..=1e6, "GiB (of 1.07 GB)")
 }
 
-/// Photons of a peak.
+/// Parses the photons of a peak.
 pub fn photons(text: &str) -> Result<f64, String> {
     within(text, 1e-3..=1e6, "photons")
 }
 
-/// Ambient photons of a bin.
+/// Parses the ambient photons per bin.
 pub fn ambient(text: &str) -> Result<f64, String> {
     within(text, 0.0..=1e6, "photons a bin")
 }
 
-/// A time that somebody waits.
+/// Parses a waiting time.
 pub fn seconds(text: &str) -> Result<f64, String> {
     within(text, 0.0..=1e9, "seconds")
 }
 
-/// Life of a lease: shorter than a heartbeat's way it would always run out, longer than a day it would never.
+/// Parses the duration of a lease. A lease shorter than a heartbeat's round trip would always
+/// expire; one longer than a day would practically never.
 pub fn lease(text: &str) -> Result<f64, String> {
     within(text, 0.1..=86_400.0, "seconds")
 }
 
-/// Days that jobs are kept.
+/// Parses the days for which jobs are retained.
 pub fn days(text: &str) -> Result<f64, String> {
     within(text, 0.0..=36_500.0, "days")
 }
 
-/// Rows of a picture, of 20 or more pixels each.
+/// Parses the rows of a picture, each at least 20 pixels high.
 pub fn rows(text: &str) -> Result<usize, String> {
     within(text, 1..=1000, "rows")
 }
 
-/// Pictures of a model on a page.
+/// Parses the number of pictures of a model on a page.
 pub fn pictures(text: &str) -> Result<usize, String> {
     within(text, 0..=100, "scenes of each model")
 }
 
-/// A limit that leaves something.
+/// Parses a limit of at least one.
 pub fn at_least_one(text: &str) -> Result<usize, String> {
     within(text, 1..=1_000_000_000, "").map_err(|said| said.trim_end().to_owned())
 }
 
-/// Laser spots: a grid, random ones, or places.
+/// Parses laser spots: a grid, random ones, or positions.
 pub fn spots(text: &str) -> Result<Spots, String> {
     text.parse()
 }
 
-/// Laser spots of a grid.
+/// Parses the number of laser spots of a grid.
 pub fn grid(text: &str) -> Result<u32, String> {
     match text.parse()? {
         Spots::Grid(spots) => Ok(spots),
@@ -108,7 +111,7 @@ pub fn grid(text: &str) -> Result<u32, String> {
 mod tests {
     use clap::error::ErrorKind;
 
-    /// A command line, and what its refusal says.
+    /// A command line, and the expected text of its error.
     const REFUSED: [(&str, &str); 36] = [
         ("up --workers 0", "expected 1 to 1024 workers"),
         ("demo --workers 0", "expected 1 to 1024 workers"),

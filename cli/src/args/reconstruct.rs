@@ -1,4 +1,4 @@
-//! The arguments of `reconstruct`.
+//! Arguments of `reconstruct`.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The arguments of commands that render: `scene render`, `scene plan`, `bench render`.
+//! Arguments of commands that render: `scene render`, `scene plan`, `bench render`.
 
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ pub struct SceneRoot {
 }
 
 impl SceneRoot {
-    /// What the readers take.
+    /// Converts the arguments to the readers' bounds.
     pub fn bounds(&self) -> Bounds {
         Bounds {
             root: self.root.clone(),
@@ -91,7 +91,7 @@ pub struct BeamArgs {
 }
 
 impl BeamArgs {
-    /// The width; `None` where nothing was said.
+    /// Returns the width; `None` if no option sets it.
     pub fn width(&self) -> Option<BeamWidth> {
         let default = BeamWidth::default();
         let said = self.beam_diameter_mm.is_some()
@@ -200,14 +200,14 @@ pub struct GateArgs {
 }
 
 impl GateArgs {
-    /// What is meant where nothing is said.
+    /// The default gate.
     pub const USUAL: Self = Self {
         gate_start_m: 1.0,
         bin_width_m: 0.0384,
         bins: 637,
     };
 
-    /// The gate.
+    /// Returns the gate.
     pub fn gate(&self) -> Gate {
         Gate {
             start_m: self.gate_start_m,
@@ -217,7 +217,7 @@ impl GateArgs {
     }
 }
 
-/// A positive time.
+/// Parses a positive time.
 fn seconds(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(s) if s > 0.0 && f64::is_finite(s) => Ok(s),

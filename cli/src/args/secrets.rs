@@ -1,8 +1,9 @@
-//! Errors about a command line repeat what was given. Of a URL they do not repeat what may be a secret.
+//! Removes possible secrets in URLs from error messages about the command line, which repeat its
+//! arguments.
 
 use clap::error::{ContextKind, ContextValue};
 
-/// The error with the user part and the query of every URL in it left out.
+/// Removes the user part and the query of every URL in an error.
 pub(super) fn hidden(mut error: clap::Error) -> clap::Error {
     let context: Vec<(ContextKind, ContextValue)> = error
         .context()
@@ -21,7 +22,7 @@ pub(super) fn hidden(mut error: clap::Error) -> clap::Error {
     error
 }
 
-/// A text without what stands before the `@` and after the `?` of a URL.
+/// Removes the parts of a URL before the `@` and after the `?`.
 pub fn without_secrets(text: &str) -> String {
     let Some((scheme, rest)) = text.split_once("://") else {
         return text.to_owned();

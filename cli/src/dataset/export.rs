@@ -1,4 +1,5 @@
-//! `picofarm dataset export`: a data set packed for sharing, or in a layout that other tools know.
+//! `picofarm dataset export`: packs a data set for sharing, or converts it to the layout of other
+//! tools.
 
 use std::time::Instant;
 

@@ -1,4 +1,4 @@
-//! `picofarm dataset gc`: what belongs to no finished scene, said or deleted.
+//! `picofarm dataset gc`: lists or deletes objects that belong to no finished scene.
 
 use picofarm_dataset::{Collection, MIN_GRACE};
 use serde_json::{Value, json};

@@ -1,4 +1,4 @@
-//! `picofarm dataset import`: other people's data into a data set of ours.
+//! `picofarm dataset import`: imports foreign data into a data set.
 
 use std::{path::Path, sync::Arc, time::Instant};
 
@@ -96,7 +96,7 @@ struct Done {
     written: u64,
     /// Quantities reported as missing.
     named: Vec<&'static str>,
-    /// By scene, how well its files agree.
+    /// Agreement of each scene's files, by scene.
     verdicts: Vec<(u64, Verdict)>,
 }
 
@@ -108,7 +108,7 @@ struct Work {
 }
 
 impl Work {
-    /// Imports a scene, unless it is there; `false` where a signal came.
+    /// Imports a scene unless it exists. Returns `false` if a signal arrived.
     async fn one(
         &self,
         index: u64,
@@ -181,7 +181,8 @@ fn refused(error: ImportError) -> CliError {
     }
 }
 
-/// Names of scenes, one a line. The paper's list has a header, and names archives.
+/// Reads names of scenes, one per line. The paper's list has a header and contains names of
+/// archives.
 fn names(file: &Path) -> Result<Vec<String>> {
     let text = files::read_text(file, files::LISTS)?;
     let names = text

@@ -1,4 +1,4 @@
-//! Progress of what mostly is over in a moment.
+//! Progress display for operations that usually end within a moment.
 
 use std::{
     sync::Mutex,
@@ -7,7 +7,8 @@ use std::{
 
 use crate::output::{Meter, Output};
 
-/// Progress of what mostly is over in a moment: nothing is shown before it has taken a while.
+/// Progress of an operation that usually ends within a moment: nothing is shown until it has taken
+/// a while.
 pub struct Late {
     since: Instant,
     what: &'static str,

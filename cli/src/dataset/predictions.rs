@@ -1,4 +1,4 @@
-//! `picofarm dataset info|show|verify` of what models predict.
+//! `picofarm dataset info|show|verify` for predictions of models.
 
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_dataset::{
@@ -21,13 +21,13 @@ use crate::{
 /// Requests in flight.
 const CONCURRENCY: usize = 16;
 
-/// The predictions at a place, if it holds some.
+/// Opens the predictions at a location, if there are any.
 pub async fn find(place: &str) -> Result<Option<Predictions>> {
     let (store, prefix) = open_store(place).map_err(failed)?;
     Predictions::find(store, prefix).await.map_err(failed)
 }
 
-/// What there is of them.
+/// Shows an overview of the predictions.
 pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()> {
     let present = there.scenes_present().await.map_err(failed)?;
     let spec = there.spec();
@@ -60,7 +60,7 @@ pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()
     Ok(())
 }
 
-/// The verdicts on several scenes as one; `None` without any.
+/// Combines the verdicts on several scenes; `None` if there are none.
 pub(super) fn summed(verdicts: impl Iterator<Item = (u64, Verdict)>) -> Option<Verdict> {
     let all: Vec<(u64, Verdict)> = verdicts.collect();
     let doubtful = || all.iter().filter(|(_, verdict)| verdict.doubtful);
@@ -99,7 +99,7 @@ fn arrays(spec: &PredictionSpec) -> Vec<String> {
     names
 }
 
-/// Where one scene's come from.
+/// Shows the origin of one scene's predictions.
 pub async fn show(args: &DatasetShow, there: &Predictions, output: Output) -> Result<()> {
     let manifest = there.manifest(args.scene).await.map_err(failed)?;
     let facts = json!({
@@ -157,10 +157,10 @@ fn described(manifest: &PredictionManifest) -> String {
     table(&rows)
 }
 
-/// Whether they are whole.
+/// Checks the predictions for damage.
 ///
 /// # Errors
-/// Exit code 6 naming what is broken.
+/// Exit code 6 naming the broken objects.
 pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -> Result<()> {
     if args.snapshot.is_some() {
         return Err(CliError::input(format!(
@@ -198,7 +198,7 @@ pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -
     Err(broken_by(&args.dataset, &report.problems, hint))
 }
 
-/// How it is repaired.
+/// Returns how to repair a problem.
 fn hint(problem: &Problem) -> &'static str {
     match problem.scene {
         Some(_) => {

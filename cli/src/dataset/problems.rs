@@ -1,4 +1,4 @@
-//! What a check found broken, in words and as JSON.
+//! Formats the problems found by a check as text and as JSON.
 
 use picofarm_dataset::{Problem, VerifyMode};
 use picofarm_proto::show;
@@ -6,10 +6,10 @@ use serde_json::{Value, json};
 
 use crate::error::{CliError, Code};
 
-/// Problems and unfinished scenes that are shown to people.
+/// Maximum number of problems and unfinished scenes shown as text.
 pub const SHOWN: usize = 20;
 
-/// How thoroughly to check.
+/// Returns the thoroughness of the check.
 pub fn mode(fast: bool) -> VerifyMode {
     match fast {
         true => VerifyMode::Fast,
@@ -17,12 +17,12 @@ pub fn mode(fast: bool) -> VerifyMode {
     }
 }
 
-/// What is broken, as an error.
+/// Returns the problems as an error.
 pub fn broken(place: &str, problems: &[Problem]) -> CliError {
     broken_by(place, problems, Problem::hint)
 }
 
-/// The same where it is repaired otherwise.
+/// Like `broken`, with other repair hints.
 pub fn broken_by(
     place: &str,
     problems: &[Problem],
@@ -67,12 +67,12 @@ pub fn broken_by(
     }
 }
 
-/// What is broken, as JSON.
+/// Returns the problems as JSON.
 pub fn problems_json(problems: &[Problem]) -> Vec<Value> {
     problems_json_by(problems, Problem::hint)
 }
 
-/// The same where they are repaired otherwise.
+/// Like `problems_json`, with other repair hints.
 pub fn problems_json_by(problems: &[Problem], hint: fn(&Problem) -> &'static str) -> Vec<Value> {
     problems
         .iter()

@@ -1,5 +1,4 @@
-//! `dataset info` of reconstructions: the means of their errors; whether they are whole; their pictures; and a page
-//! about them.
+//! `dataset info`, `verify`, `picture` and `report` for reconstructions.
 
 mod page;
 mod picture;
@@ -29,7 +28,7 @@ use crate::{
 /// Requests in flight.
 const CONCURRENCY: usize = 16;
 
-/// Figures of `metrics.json` of which means are given: a name, and the way to it.
+/// Figures of `metrics.json` for which means are reported: name and JSON pointer.
 const FIGURES: [(&str, &str); 12] = [
     ("l1_m", "/novel_views/all/l1_m"),
     ("rmse_m", "/novel_views/all/rmse_m"),
@@ -45,21 +44,21 @@ const FIGURES: [(&str, &str); 12] = [
     ("spots", "/spots"),
 ];
 
-/// The reconstructions at a place, if there are any.
+/// Opens the reconstructions at a location, if there are any.
 pub async fn find(place: &str) -> Result<Option<Reconstructions>> {
     let (store, prefix) = open_store(place).map_err(failed)?;
     match Reconstructions::open(store, prefix).await {
         Ok(there) => Ok(Some(there)),
         Err(error @ DatasetError::Store { .. }) => Err(failed(error)),
-        // What else may lie there is not for this to say.
+        // Other contents of the location are not this function's concern.
         Err(_) => Ok(None),
     }
 }
 
-/// The reconstructions at a place, which must have some.
+/// Opens the reconstructions at a location, which must have some.
 ///
 /// # Errors
-/// Something else lies there, or nothing.
+/// Fails if the location is empty or contains something else.
 pub async fn opened(place: &str) -> Result<Reconstructions> {
     match find(place).await? {
         Some(there) => Ok(there),
@@ -110,7 +109,7 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
     Ok(())
 }
 
-/// The metrics of a scene.
+/// Reads the metrics of a scene.
 async fn metrics(place: &str, there: &Reconstructions, scene: u64) -> Result<Value> {
     let bytes = there.read(scene, "metrics.json").await.map_err(failed)?;
     serde_json::from_slice(&bytes).map_err(|e| {
@@ -119,7 +118,8 @@ async fn metrics(place: &str, there: &Reconstructions, scene: u64) -> Result<Val
     })
 }
 
-/// A figure of a scene's metrics by its way; `None` where it was not measured, or the class has no pixels.
+/// Returns a figure of a scene's metrics by its JSON pointer; `None` if it was not measured, or the
+/// class has no pixels.
 fn figure(metrics: &Value, way: &str) -> Option<f64> {
     let class = way.rsplit_once('/').map_or("", |(class, _)| class);
     if metrics.pointer(&format!("{class}/pixels")) == Some(&json!(0)) {
@@ -131,7 +131,7 @@ fn figure(metrics: &Value, way: &str) -> Option<f64> {
 /// `dataset verify`.
 ///
 /// # Errors
-/// Exit code 6 naming what is broken.
+/// Exit code 6 naming the broken objects.
 pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Output) -> Result<()> {
     if args.snapshot.is_some() || args.complete {
         return Err(CliError::input(format!(
@@ -172,7 +172,7 @@ pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Outpu
 /// Verifies reconstructions in full, for other commands.
 ///
 /// # Errors
-/// Exit code 6 naming what is broken.
+/// Exit code 6 naming the broken objects.
 pub async fn check(place: &str, there: &Reconstructions) -> Result<Verification> {
     let report = there.verify(VerifyMode::Full, &|_, _| ()).await;
     let report = report.map_err(failed)?;
@@ -182,7 +182,7 @@ pub async fn check(place: &str, there: &Reconstructions) -> Result<Verification>
     }
 }
 
-/// How it is repaired.
+/// Returns how to repair a problem.
 fn hint(_: &Problem) -> &'static str {
     "submit its job again with `picofarm job submit FILE --from-stage STAGE`, with its reconstruct stage: what is damaged is \
      made again, proved equal, and put back"

@@ -1,4 +1,5 @@
-//! `picofarm dataset repair`: broken scenes made again on this machine, exactly those, and put back.
+//! `picofarm dataset repair`: makes broken scenes again on this machine and restores exactly their
+//! broken objects.
 
 use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
@@ -142,13 +143,13 @@ async fn hints(args: &DatasetRepair, settings: &Settings) -> Result<Hints> {
 struct Done {
     /// Broken metadata.
     metadata: Vec<Problem>,
-    /// Metadata that was written again.
+    /// Metadata that was rewritten.
     written: Vec<String>,
-    /// Not for this command to repair.
+    /// Problems that this command cannot repair.
     left: Vec<Problem>,
-    /// Scene, its problems, and the objects that were written (with --dry-run: how it would be made).
+    /// Scene, its problems, and the rewritten objects (with --dry-run: how it would be made).
     repaired: Vec<(u64, Vec<Problem>, Vec<String>)>,
-    /// Scene, its problems, and why they stay.
+    /// Scene, its problems, and the reason why they remain.
     failed: Vec<(u64, Vec<Problem>, String)>,
 }
 
@@ -192,7 +193,7 @@ impl Work {
         Ok(done)
     }
 
-    /// Mends a scene and checks it once more; given up when a signal comes.
+    /// Repairs a scene and checks it again. Stops when a signal arrives.
     fn one(&self, scene: u64) -> std::result::Result<Vec<String>, TaskError> {
         let control = Arc::new(Control::default());
         if self.stop.is_cancelled() {

@@ -1,4 +1,5 @@
-//! `picofarm dataset reprocess`: every scene of a data set through a sensor, on this machine.
+//! `picofarm dataset reprocess`: passes every scene of a data set through a sensor, on this
+//! machine.
 
 use std::{sync::Arc, time::Instant};
 
@@ -71,7 +72,7 @@ pub async fn run(args: DatasetReprocess, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// What the arguments ask for, with everything that a key depends on filled in.
+/// Returns the task for the arguments, with all inputs of its key filled in.
 fn task(args: &DatasetReprocess) -> Result<ReprocessTask> {
     let (store, dataset) = store_and_folder(&args.source)?;
     let source = SourceSettings { store, dataset };
@@ -94,7 +95,7 @@ fn task(args: &DatasetReprocess) -> Result<ReprocessTask> {
     };
     let task = ReprocessTask {
         source,
-        // As many as there are; not known yet.
+        // Placeholder for the number of scenes, which is unknown here.
         count: 1,
         reprocess: settings,
         output,
@@ -149,7 +150,7 @@ impl Work {
         Ok(done)
     }
 
-    /// One scene, given up when a signal comes.
+    /// Reprocesses one scene. Stops when a signal arrives.
     fn one(&self, scene: u64) -> Result<picofarm_agent::Output, TaskError> {
         let control = Arc::new(Control::default());
         let (stop, stopped) = (self.stop.clone(), control.clone());

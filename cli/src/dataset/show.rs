@@ -1,4 +1,4 @@
-//! `picofarm dataset show`: where a scene came from.
+//! `picofarm dataset show`: shows the origin of a scene.
 
 use picofarm_agent::repair::leads_to;
 use serde_json::{Value, json};
@@ -99,8 +99,8 @@ pub async fn run(args: &DatasetShow, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// The recipe whose key leads to the scene's task: where it lies, and its stage. Of several the data set does not say
-/// which, then it is left out.
+/// Returns the location and the stage of the recipe from which the scene's task key follows.
+/// Returns `None` if several recipes are possible.
 async fn recipe(
     dataset: &picofarm_dataset::Dataset,
     scene: u64,
@@ -132,7 +132,7 @@ fn text(value: &Value) -> String {
     }
 }
 
-/// SHA-256, hexadecimal.
+/// SHA-256, in hexadecimal.
 fn sha256(bytes: &[u8]) -> String {
     picofarm_dataset::sha256_hex(bytes)
 }

@@ -1,4 +1,4 @@
-//! `picofarm dataset snapshot …`: what a data set was at a time, for good.
+//! `picofarm dataset snapshot …`: permanent records of a data set's contents.
 
 use std::time::SystemTime;
 
@@ -17,7 +17,7 @@ use crate::{
     output::{Output, bytes, table},
 };
 
-/// Scenes of a difference that are shown to people.
+/// Maximum number of differing scenes shown as text.
 const SHOWN: usize = 20;
 
 pub async fn run(command: Command, output: Output) -> Result<()> {

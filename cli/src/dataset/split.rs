@@ -1,4 +1,4 @@
-//! `picofarm dataset split`: which scenes are for training, validation and test.
+//! `picofarm dataset split`: divides the scenes into training, validation and test.
 
 use picofarm_agent::{
     Control,

@@ -1,4 +1,4 @@
-//! `picofarm dataset verify`: what is broken, and how it is repaired.
+//! `picofarm dataset verify`: finds broken objects and shows how to repair them.
 
 use picofarm_dataset::{Dataset, Snapshot, Verification, VerifyMode, VerifyOptions};
 use serde_json::json;
@@ -37,14 +37,14 @@ pub async fn run(args: &DatasetVerify, output: Output) -> Result<()> {
     tell(&args.dataset, &how, &report, output)
 }
 
-/// What to look at.
+/// Scope of the verification.
 pub struct How<'a> {
     pub fast: bool,
     pub complete: bool,
     pub snapshot: Option<&'a Snapshot>,
 }
 
-/// Verifies, showing how far it is.
+/// Verifies a data set and shows progress.
 pub async fn look(dataset: &Dataset, how: &How<'_>, output: Output) -> Result<Verification> {
     let late = Late::new("scenes checked", output);
     let watch = |done, of| late.at(done, of);
@@ -59,10 +59,10 @@ pub async fn look(dataset: &Dataset, how: &How<'_>, output: Output) -> Result<Ve
     report
 }
 
-/// Prints what was found.
+/// Prints the result.
 ///
 /// # Errors
-/// Exit code 6 naming what is broken.
+/// Exit code 6 naming the broken objects.
 pub fn tell(place: &str, how: &How<'_>, report: &Verification, output: Output) -> Result<()> {
     let facts = json!({
         "dataset": place, "fast": how.fast, "snapshot": how.snapshot.map(|s| &s.name), "scenes": report.scenes,
@@ -111,7 +111,7 @@ fn unfinished(report: &Verification) -> String {
 /// Verifies a data set in full, for other commands.
 ///
 /// # Errors
-/// Exit code 6 naming what is broken.
+/// Exit code 6 naming the broken objects.
 pub async fn check(place: &str) -> Result<Verification> {
     let report = open(place)
         .await?

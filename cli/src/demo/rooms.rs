@@ -1,4 +1,4 @@
-//! What `demo --reconstruct` does after the rooms are rendered: each of them in 3D.
+//! `demo --reconstruct`: reconstructs each rendered room.
 
 use std::path::{Path, PathBuf};
 
@@ -20,14 +20,14 @@ use crate::{
     settings::Settings,
 };
 
-/// Nodes of the grids: two thirds of the default, in half its time.
+/// Nodes per side of the grids: two thirds of the default, for half its time.
 const NODES: u32 = 128;
-/// Novel views of each room to compare.
+/// Number of novel views of each room to compare.
 const VIEWS: u32 = 24;
-/// Rows of the contact sheet at most.
+/// Maximum number of rows of the contact sheet.
 const ROWS: usize = 16;
 
-/// What is said before it begins.
+/// Returns the announcement for the user.
 pub fn announced() -> String {
     format!(
         "then each room in 3D: a grid of {NODES} nodes, from the depth and shadows of the ground truth. That is quick, and shows \
@@ -35,11 +35,11 @@ pub fn announced() -> String {
     )
 }
 
-/// The stage that reconstructs what `task` renders. It takes the ground truth: a demo has no networks, and renders no
-/// histogram of each spot alone.
+/// Returns the stage that reconstructs the rooms rendered by `task`. It uses the ground truth,
+/// because a demo has no networks and renders no separate histogram of each spot.
 ///
 /// # Errors
-/// Places that cannot be used.
+/// Fails if a location cannot be used.
 pub fn stage(task: &RenderTask, dir: &Path, settings: &Settings) -> Result<StageSpec> {
     let mut spec = TaskSpec::Reconstruct(ReconstructTask {
         source: SourceSettings {
@@ -64,12 +64,12 @@ pub fn stage(task: &RenderTask, dir: &Path, settings: &Settings) -> Result<Stage
     Ok(StageSpec::new(spec))
 }
 
-/// Where the reconstructions of a data set go.
+/// Returns the location of the reconstructions of a data set.
 fn beside(dataset: &str) -> String {
     format!("{dataset}-3d")
 }
 
-/// Reconstructions, verified and drawn.
+/// Verified reconstructions and their picture.
 pub struct Rooms {
     place: String,
     sheet: PathBuf,
@@ -81,7 +81,7 @@ impl Rooms {
     /// Verifies the reconstructions of the data set at `place`, and draws them into `dir`.
     ///
     /// # Errors
-    /// Exit code 6 naming what is broken; a folder that cannot be written.
+    /// Exit code 6 naming the broken objects; fails if the folder cannot be written.
     pub async fn of(place: &str, dir: &Path) -> Result<Self> {
         let place = beside(place);
         let there = opened(&place).await?;
@@ -96,12 +96,12 @@ impl Rooms {
         })
     }
 
-    /// For JSON.
+    /// Returns the facts for JSON.
     pub fn facts(&self) -> Value {
         json!({"folder": self.place, "scenes": self.scenes, "bytes": self.bytes, "contact_sheet": self.sheet})
     }
 
-    /// Where they are.
+    /// Describes where the reconstructions are.
     pub fn told(&self) -> String {
         format!(
             "rooms in 3D      {} ({}, all verified): scenes/<scene>/ with mesh.glb, views.png, metrics.json\n\
@@ -112,7 +112,7 @@ impl Rooms {
         )
     }
 
-    /// What to do next.
+    /// Returns suggestions for next commands.
     pub fn next(&self) -> String {
         let place = show::argument(&self.place);
         let program = program();

@@ -1,4 +1,4 @@
-//! The demo's pictures, drawn again each time a room is finished.
+//! The demo's pictures, redrawn each time a room is finished.
 
 use std::{path::PathBuf, time::Duration};
 
@@ -7,9 +7,9 @@ use tokio_util::sync::CancellationToken;
 
 use crate::dataset;
 
-/// How often the store is asked for finished rooms.
+/// Interval at which the store is searched for finished rooms.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Rooms on a sheet.
+/// Number of rooms on a sheet.
 pub const ROOMS: usize = 16;
 
 /// A contact sheet that grows with the data set.
@@ -26,15 +26,17 @@ impl GrowingSheet {
         Self { stop, task }
     }
 
-    /// Ends it. When this returns, no picture is being written.
+    /// Stops drawing. When this returns, no picture is being written.
     pub async fn stop(self) {
         self.stop.cancel();
-        // A drawing that panicked is reported by the last drawing, which every demo makes.
+        // A panic in a drawing is ignored here, because the final drawing of every demo would
+        // report it.
         self.task.await.ok();
     }
 }
 
-/// The last picture is the caller's, who has verified the rooms. A failure here is met again there.
+/// The caller draws the final picture after it has verified the rooms. A failure here would recur
+/// there.
 async fn grow(place: String, total: u64, dir: PathBuf, stop: CancellationToken) {
     let mut drawn = 0;
     loop {

@@ -1,4 +1,5 @@
-//! Scenes without light: their tasks warn of it in their logs. Where many do, that is said of the whole job.
+//! Warns about scenes without light. Their tasks log such warnings; if many do, one warning covers
+//! the whole job.
 
 use std::collections::BTreeSet;
 
@@ -15,7 +16,7 @@ use crate::client::{Client, Page};
 /// Lines of history that are searched.
 const LINES: u32 = 10_000;
 
-/// What to say of a job whose scenes are without light, as far as its latest history tells.
+/// Returns a warning about a job's scenes without light, according to its latest history.
 pub async fn warning(client: &mut Client, status: &JobStatus) -> Option<String> {
     let renders = |kind: &str| matches!(kind, "render");
     let rendered: u64 = status
@@ -36,7 +37,7 @@ pub async fn warning(client: &mut Client, status: &JobStatus) -> Option<String> 
         newest: true,
         logs: true,
     };
-    // It is a remark: where the history cannot be read, others say so.
+    // The warning is optional. If the history cannot be read, other calls report it.
     let (events, _) = client.history(page).await.ok()?;
     let mut tasks = BTreeSet::new();
     let mut example = None;

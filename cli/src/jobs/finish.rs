@@ -1,14 +1,14 @@
-//! How a job ended that was followed.
+//! The result of a job that was followed.
 
 use picofarm_proto::model::JobStatus;
 
 use super::{dark, verdicts};
 use crate::{client::Client, describe::describe, error::Result, follow::verdict, output::Output};
 
-/// Tells how it ended.
+/// Prints the result.
 ///
 /// # Errors
-/// It did not end well.
+/// Fails if the job did not succeed.
 pub async fn finish(client: &mut Client, status: &JobStatus, output: Output) -> Result<()> {
     output.result(status, || describe(status));
     if let Some(warning) = dark::warning(client, status).await {

@@ -1,4 +1,4 @@
-//! What is said of a submission, and of a job that has the same spec already.
+//! Formats the result of `job submit`, including when an identical job exists.
 
 use picofarm_proto::model::{JobPlan, JobState, JobStatus};
 use serde_json::json;
@@ -12,14 +12,15 @@ use crate::{
     output::Output,
 };
 
-/// What the job with the same spec does, where there is one: a submission answers with it.
+/// Describes the state of an existing job with the same spec, because a submission returns that
+/// job.
 pub async fn twin(client: &mut Client, plan: &JobPlan) -> String {
     let Some(job) = plan.existing_job else {
         return String::new();
     };
     match client.status(job).await {
         Ok(status) => line(&status),
-        // It may be somebody else's, of which only its id is known.
+        // The job may belong to another user, and then only its id is known.
         Err(_) => String::new(),
     }
 }
@@ -49,10 +50,11 @@ fn line(s: &JobStatus) -> String {
     }
 }
 
-/// Says what became of a submission, and follows the job if asked to.
+/// Prints the result of a submission, and follows the job if requested.
 ///
 /// # Errors
-/// A job that was there already and has ended badly: nothing runs, unless it is submitted with --again.
+/// Fails if an identical job exists and has failed: nothing runs unless it is submitted with
+/// --again.
 pub async fn answer(
     client: &mut Client,
     submitted: Submitted,

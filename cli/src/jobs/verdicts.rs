@@ -1,4 +1,4 @@
-//! What results are worth, as tasks tell it in their logs: shown when a job ends that was followed.
+//! Verdicts on results, from the logs of tasks. They are shown when a followed job ends.
 
 use std::collections::BTreeMap;
 
@@ -12,17 +12,18 @@ use picofarm_proto::{
 
 use crate::client::{Client, Page};
 
-/// Lines of history that are searched.
+/// Number of history lines to search.
 const LINES: u32 = 10_000;
-/// Lines of a stage that are shown one by one; of more, they are counted.
+/// Maximum number of lines per stage that are shown individually. More are summarised by their
+/// number.
 const EACH: usize = 4;
-/// Kinds of stages whose tasks tell it.
+/// Kinds of stages with verdicts.
 const KINDS: [&str; 4] = ["evaluate", "import", "infer", "reconstruct"];
 
 /// A line, and whether it is a warning.
 pub type Line = (bool, String);
 
-/// The lines about a job, as far as its latest history tells.
+/// Returns the lines about a job, according to its latest history.
 pub async fn lines(client: &mut Client, status: &JobStatus) -> Vec<Line> {
     if !status.stages.iter().any(|s| KINDS.contains(&&*s.kind)) {
         return Vec::new();
@@ -36,16 +37,17 @@ pub async fn lines(client: &mut Client, status: &JobStatus) -> Vec<Line> {
         newest: true,
         logs: true,
     };
-    // They are remarks: where the history cannot be read, others say so.
+    // The lines are optional. If the history cannot be read, other calls report it.
     let Ok((events, _)) = client.history(page).await else {
         return Vec::new();
     };
     told(status, &events)
 }
 
-/// The lines of a history: each by itself where a stage has few, else how many are doubtful, with an example.
+/// Returns the lines of a history. A stage with few lines has each shown; otherwise the number of
+/// doubtful results is shown, with an example.
 fn told(status: &JobStatus, events: &[Event]) -> Vec<Line> {
-    // By stage, then by task and text: a task that ran twice tells the same twice.
+    // By stage, then by task and text, because a task that ran twice logs the same line twice.
     let mut stages: BTreeMap<u32, BTreeMap<(u64, &str), bool>> = BTreeMap::new();
     for event in events.iter().filter(|e| e.kind == EventKind::Log) {
         let Some((warns, text)) = marked(&event.message, VERDICT) else {

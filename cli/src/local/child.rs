@@ -1,5 +1,6 @@
-//! The process of a worker whose parent is `demo` or `up`. It reads one line that says everything, and then until the line
-//! `stop` (an orderly end) or the end of its input (the parent is gone: it ends at once).
+//! A worker process with `demo` or `up` as its parent. It reads one line with its settings. Then it
+//! reads until the line `stop`, which asks for an orderly end, or until the end of its input: then
+//! the parent has died, and the process ends at once.
 
 use std::io::{BufRead, Write};
 
@@ -22,38 +23,38 @@ use crate::{
 pub(super) const COMMAND: &str = "local-worker";
 /// The line that asks for an orderly end.
 pub(super) const STOP: &str = "stop";
-/// The kernel's score (−1000 to 1000) by which it chooses what to kill when memory runs out: rather a worker than the
-/// coordinator or anything else.
+/// The kernel's OOM score adjustment (−1000 to 1000), so that a worker is killed before the
+/// coordinator or another process when memory runs out.
 const OOM_SCORE: &str = "800";
 
-/// Arguments of a worker's process.
+/// Arguments of a worker process.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Order {
     /// The parent's settings.
     pub settings: Settings,
     /// URL of the coordinator.
     pub coordinator: String,
-    /// The coordinator asks nobody who they are.
+    /// Whether the coordinator requires no authentication.
     pub open: bool,
-    /// Name, for people.
+    /// Name of the worker, for display.
     pub name: String,
-    /// The worker, whichever process it is.
+    /// Id of the worker, the same for all its processes.
     pub worker_id: WorkerId,
-    /// Threads to render with.
+    /// Number of threads for tasks.
     pub threads: usize,
-    /// Memory that tasks may take, MiB.
+    /// Memory that tasks may use, in MiB.
     pub memory_mib: u64,
-    /// Where that number comes from.
+    /// Source of that limit.
     pub memory_from: String,
-    /// Graphics processors, by name.
+    /// GPUs, by name.
     pub gpus: Vec<String>,
-    /// Where traces go.
+    /// URL of the trace collector.
     pub otlp: Option<String>,
-    /// How the process before this one ended; empty for the first.
+    /// How the previous process ended; empty for the first.
     pub ended: String,
 }
 
-/// The last line that a worker's process writes: how it ended.
+/// The last line that a worker process writes: how it ended.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Verdict {
     /// Exit code of an error; 0 = it was asked to end.
@@ -80,7 +81,7 @@ impl From<Verdict> for Result<()> {
 /// Reads the parent's order.
 ///
 /// # Errors
-/// There is none: a person has called this.
+/// Fails if there is none, because a user has called the command.
 pub fn received() -> Result<Order> {
     let mut line = String::new();
     let read = std::io::stdin().lock().read_line(&mut line);
@@ -94,7 +95,7 @@ pub fn received() -> Result<Order> {
 /// Runs the worker until its parent ends it.
 ///
 /// # Errors
-/// None: what goes wrong is written for the parent.
+/// Does not fail: errors are written for the parent.
 pub async fn serve(order: Order) -> Result<()> {
     let verdict = match work(order).await {
         Ok(()) => Verdict {
@@ -109,16 +110,16 @@ pub async fn serve(order: Order) -> Result<()> {
         },
     };
     let text = serde_json::to_string(&verdict).expect("a verdict is plain data");
-    // Without a parent there is nobody to tell.
+    // Without a parent, nobody reads the line.
     let _ = writeln!(std::io::stdout(), "{text}");
     Ok(())
 }
 
 async fn work(order: Order) -> Result<()> {
-    // Beside the end of the input, which a process that is frozen does not notice. Where there is no such thing, that
-    // is all.
+    // In addition to the end of the input, which a frozen process does not notice. On systems
+    // without this signal, the end of the input must suffice.
     let _ = set_parent_process_death_signal(Some(Signal::KILL));
-    // Raising it needs no rights; a system without it has another way to choose.
+    // Raising the score needs no rights. A system without this file chooses in another way.
     let _ = std::fs::write("/proc/self/oom_score_adj", OOM_SCORE);
     let stop = CancellationToken::new();
     listen(stop.clone())?;
@@ -148,7 +149,7 @@ async fn work(order: Order) -> Result<()> {
     summary.map(|_| ()).map_err(|e| roles::agent_error(&e))
 }
 
-/// Listens to the parent, on a thread that nothing else can hold up.
+/// Listens to the parent, on a thread of its own so that nothing delays it.
 fn listen(stop: CancellationToken) -> Result<()> {
     let listener = move || {
         for line in std::io::stdin().lock().lines() {
@@ -158,7 +159,7 @@ fn listen(stop: CancellationToken) -> Result<()> {
                 Err(_) => break,
             }
         }
-        // Nobody is left to give work or to take it.
+        // There is no parent left to assign work or receive results.
         std::process::exit(Code::Failed as i32);
     };
     std::thread::Builder::new()
@@ -168,9 +169,8 @@ fn listen(stop: CancellationToken) -> Result<()> {
     Ok(())
 }
 
-/// Ctrl-C in a terminal, or its closing, reaches the parent, too, which says what is to be done. A
-/// SIGTERM may be meant for this process
-/// alone.
+/// Ignores Ctrl-C in a terminal and the closing of the terminal, because the parent receives them
+/// too and decides. A SIGTERM may be meant for this process alone.
 fn heed_signals(stop: CancellationToken) -> Result<()> {
     let refused =
         |e: std::io::Error| CliError::new(Code::Failed, format!("cannot listen for signals: {e}"));

@@ -1,7 +1,7 @@
-//! The parent of a worker's process: starts it, notices how it ends, and starts the next one.
+//! The parent of a worker process: starts it, notices its end, and starts the next one.
 //!
-//! Each worker has a thread that starts its processes and waits for them. The kernel sends a child its signal at the death
-//! of the thread that started it, and this thread lives as long as the farm does.
+//! Each worker has a thread that starts its processes and waits for them. The kernel signals a
+//! child when the thread that started it dies, so this thread must live as long as the farm.
 
 use std::{
     io::{BufRead, BufReader, Write},
@@ -17,7 +17,8 @@ use tracing::{error, info};
 use super::child::{Order, STOP, Verdict};
 use crate::error::{CliError, Code, Result};
 
-/// A process that lived shorter than this is followed by the next one only after a wait, which doubles each time.
+/// After a process with a shorter life than this, the next one starts only after a wait, which
+/// doubles each time.
 const SHORT_LIFE: Duration = Duration::from_secs(5);
 const FIRST_WAIT: Duration = Duration::from_millis(100);
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
@@ -35,16 +36,17 @@ struct Shared {
 struct State {
     /// No further process is started.
     stopping: bool,
-    /// Of the process that lives.
+    /// Standard input of the running process.
     stdin: Option<ChildStdin>,
 }
 
 impl Keeper {
-    /// Starts a worker's thread and with it the first process. What is sent comes when the worker has ended for good:
-    /// because it was asked to, or with the reason why no further process would do better.
+    /// Starts a worker's thread and its first process. The receiver gets a message when the worker
+    /// has ended for good: because it was asked to, or with the error that would also end any
+    /// further process.
     ///
     /// # Errors
-    /// The system starts no thread.
+    /// Fails if the system cannot start a thread.
     pub fn start(order: Order) -> Result<(Self, oneshot::Receiver<Result<()>>)> {
         let shared = Arc::<Shared>::default();
         let (ended, receiver) = oneshot::channel();
@@ -52,19 +54,19 @@ impl Keeper {
         std::thread::Builder::new()
             .name(order.name.clone())
             .spawn(move || {
-                // Nobody listens when the whole farm ends.
+                // When the whole farm ends, nobody receives the message.
                 let _ = ended.send(theirs.keep(order));
             })
             .map_err(|e| CliError::new(Code::Resource, format!("cannot start a thread: {e}")))?;
         Ok((Self(shared), receiver))
     }
 
-    /// Tells the worker to stop; it hands back or finishes what it has.
+    /// Tells the worker to stop. It hands back or finishes its tasks.
     pub fn stop(&self) {
         let mut state = self.0.lock();
         state.stopping = true;
         if let Some(stdin) = &mut state.stdin {
-            // One that has just ended hears nothing, and needs nothing.
+            // A process that has just ended does not read the line and does not need it.
             let _ = writeln!(stdin, "{STOP}").and_then(|()| stdin.flush());
         }
         self.0.stopped.notify_all();
@@ -106,7 +108,7 @@ impl Shared {
         }
     }
 
-    /// Starts a process; `None` where none is wanted any more.
+    /// Starts a process; `None` if the worker must stop.
     fn begin(&self, order: &Order) -> Result<Option<Child>> {
         let failed = |e: std::io::Error| {
             let what = format!("cannot start a process for the worker {}: {e}", order.name);
@@ -125,7 +127,7 @@ impl Shared {
             .map_err(failed)?;
         let mut stdin = child.stdin.take().expect("asked for above");
         let text = serde_json::to_string(order).expect("an order is plain data");
-        // A process that ends at once says by its end what was wrong.
+        // A process that ends at once reports the reason at its end.
         if let Err(e) = writeln!(stdin, "{text}").and_then(|()| stdin.flush()) {
             info!(worker = order.name, error = %e, "the worker's process did not read its order");
         }
@@ -133,7 +135,7 @@ impl Shared {
         Ok(Some(child))
     }
 
-    /// Waits for its end; what it said at last, where it ended by itself.
+    /// Waits for the end of a process. Returns its status, and its last line if it ended by itself.
     fn end(&self, mut child: Child) -> Result<(ExitStatus, Option<Verdict>)> {
         let failed = |e: std::io::Error| {
             CliError::new(
@@ -155,7 +157,7 @@ impl Shared {
         ))
     }
 
-    /// Waits, or until the worker shall stop.
+    /// Waits for a time, or until the worker must stop.
     fn pause(&self, wait: Duration) {
         let until = Instant::now() + wait;
         let mut state = self.lock();
@@ -170,7 +172,7 @@ impl Shared {
     }
 }
 
-/// How a process ended that did not say so itself, in words for the history of the task that it had in hand.
+/// Describes the end of a process that did not report it, for the history of its current task.
 fn ending(status: ExitStatus) -> String {
     match (status.signal(), status.code()) {
         (Some(9), _) => "killed by signal 9: probably out of memory".into(),

@@ -19,14 +19,14 @@ use crate::{
     stored::StoreReader,
 };
 
-/// Life of a lease: short, since after a `kill -9` of this one process the next run waits for it to end, and no network
-/// can delay a heartbeat.
+/// Duration of a lease. It is short because after a `kill -9` of this process the next run waits
+/// for it to expire, and because no network delays heartbeats.
 const LEASE: Duration = Duration::from_secs(20);
 
 /// A farm on this machine.
 pub struct Local {
     pub url: String,
-    /// Where its health and metrics are served.
+    /// URL of its health and metrics.
     pub http: Option<String>,
     coordinator: roles::Coordinator,
     keepers: Vec<Keeper>,
@@ -34,11 +34,13 @@ pub struct Local {
 }
 
 impl Local {
-    /// Starts a coordinator on `catalog` and `workers` workers that share the cores and graphics processors, each in a process of its own: what
-    /// ends one of them, ends neither the coordinator nor the others.
+    /// Starts a coordinator on `catalog` and `workers` workers that share the cores and GPUs. Each
+    /// worker has a process of its own, so that its death affects neither the coordinator nor the
+    /// other workers.
     ///
     /// # Errors
-    /// The catalog is in use or unreadable, the address is taken, or no process can be started.
+    /// Fails if the catalog is in use or unreadable, the address is in use, or a process cannot be
+    /// started.
     pub async fn start(
         catalog: &Path,
         listen: SocketAddr,
@@ -50,7 +52,7 @@ impl Local {
     ) -> Result<Self> {
         let open = guarded.is_open();
         if !open {
-            // What is wrong with it is said here, and not by each worker.
+            // Errors in the settings are reported here once, and not by each worker.
             settings.access()?;
         }
         let coordinator = roles::Coordinator::start(
@@ -60,7 +62,8 @@ impl Local {
             guarded,
             http,
             None,
-            // Its workers run here, too: as this user, and they read and write whatever stores a job names.
+            // The workers run on this machine as the same user, and access whatever stores a job
+            // names.
             Some(StoreReader::anywhere()?),
         )
         .await?;
@@ -102,11 +105,13 @@ impl Local {
         Ok(local)
     }
 
-    /// Resolves when a worker is refused or cannot be started, which none should be while the farm runs.
+    /// Resolves when a worker is refused or cannot be started, which does not happen in a healthy
+    /// farm.
     pub async fn worker_lost(&mut self) -> CliError {
         loop {
             match self.workers.join_next().await {
-                // It was drained: the others go on, and without any the farm waits for some from elsewhere.
+                // The worker was drained. The others continue, and without any, the farm waits for
+                // workers from elsewhere.
                 Some(Ok(Ok(()))) => tracing::info!("a worker has ended"),
                 Some(Ok(Err(e))) => return e,
                 Some(Err(e)) => {
@@ -117,10 +122,10 @@ impl Local {
         }
     }
 
-    /// Stops the workers, which hand back or finish their work, then the coordinator.
+    /// Stops the workers, which hand back or finish their work, and then the coordinator.
     ///
     /// # Errors
-    /// The coordinator ended with an error.
+    /// Fails if the coordinator ended with an error.
     pub async fn stop(mut self) -> Result<()> {
         for keeper in &self.keepers {
             keeper.stop();

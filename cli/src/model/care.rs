@@ -1,4 +1,4 @@
-//! `picofarm model verify|repair|remove`: whether models are whole, what can be put back of one, and how one goes.
+//! `picofarm model verify|repair|remove`: checks, repairs and removes models.
 
 use bytes::Bytes;
 use picofarm_dataset::{
@@ -13,13 +13,13 @@ use crate::{
     output::{Output, bytes},
 };
 
-/// Lines of problems that are shown to people.
+/// Maximum number of problem lines shown as text.
 const SHOWN: usize = 20;
 
-/// Checks models; all of a store's where none are named.
+/// Checks the named models, or all models of a store if none are named.
 ///
 /// # Errors
-/// Exit code 6 naming what is broken.
+/// Exit code 6 naming the broken objects.
 pub async fn verify(store: &str, names: &[String], output: Output) -> Result<()> {
     let models = open(store)?;
     let names = match names.is_empty() {
@@ -101,7 +101,7 @@ fn line(name: &str, check: &ModelCheck) -> String {
     )
 }
 
-/// What helps against a problem.
+/// Returns the remedy for a problem.
 fn remedy(problem: &Problem) -> &'static str {
     match &problem.fault {
         Fault::Foreign => "move it elsewhere; nothing reads it, nothing here deletes it",
@@ -116,10 +116,10 @@ fn remedy(problem: &Problem) -> &'static str {
     }
 }
 
-/// Puts back what can be of a model.
+/// Restores the objects of a model as far as possible.
 ///
 /// # Errors
-/// Exit code 6 naming what stays broken, and the job that makes it again.
+/// Exit code 6 naming the objects that remain broken, and the job that makes them again.
 pub async fn repair(store: &str, name: &str, dry: bool, output: Output) -> Result<()> {
     let models = open(store)?;
     let check = models.verify(name).await.map_err(failed)?;
@@ -149,7 +149,8 @@ pub async fn repair(store: &str, name: &str, dry: bool, output: Output) -> Resul
     Err(CliError::new(Code::Damaged, what).hint(again(name, check.manifest.as_ref())))
 }
 
-/// What can be computed of a model's objects: its figures from the manifest, weights and history from a checkpoint.
+/// Computes those objects of a model that can be derived again: its figures from the manifest,
+/// weights and history from a checkpoint.
 async fn made_again(models: &Models, manifest: &ModelManifest) -> Result<Vec<Bytes>> {
     let mut made = vec![Bytes::from(pretty(&manifest.metrics))];
     let newest = models.newest_checkpoint(&manifest.name, &manifest.training_key);
@@ -160,7 +161,7 @@ async fn made_again(models: &Models, manifest: &ModelManifest) -> Result<Vec<Byt
     Ok(made)
 }
 
-/// The weights and the history that a checkpoint holds; nothing where it cannot be read.
+/// Returns the weights and the history from a checkpoint; nothing if it cannot be read.
 #[cfg(feature = "networks")]
 fn left_by(checkpoint: &[Bytes]) -> Result<Vec<Bytes>> {
     let Ok((weights, history)) = picofarm_model::train::left_by(checkpoint) else {
@@ -178,7 +179,7 @@ fn left_by(_: &[Bytes]) -> Result<Vec<Bytes>> {
     Err(crate::error::not_built("networks", what))
 }
 
-/// As trainings write `metrics.json`.
+/// Formats JSON as trainings do in `metrics.json`.
 fn pretty(value: &Value) -> Vec<u8> {
     let mut value = value.clone();
     value.sort_all_objects();
@@ -187,7 +188,7 @@ fn pretty(value: &Value) -> Vec<u8> {
     bytes
 }
 
-/// Which job makes a model again.
+/// Describes the job that makes a model again.
 fn again(name: &str, manifest: Option<&ModelManifest>) -> String {
     let Some(manifest) = manifest else {
         return format!(
@@ -224,7 +225,7 @@ fn repaired(name: &str, done: &ModelRepair, dry: bool) -> String {
 /// Removes a model.
 ///
 /// # Errors
-/// Exit code 3 where something builds on it, or it is still trained, and `force` is not given.
+/// Exit code 3 if something builds on it, or it is still being trained, and `force` is not given.
 pub async fn remove(
     store: &str,
     name: &str,

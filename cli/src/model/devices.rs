@@ -1,4 +1,4 @@
-//! `picofarm model devices`: the graphics processors of this machine, each tried.
+//! `picofarm model devices`: lists and tests the GPUs of this machine.
 
 use picofarm_model::device::{self, OpenGpu, RUNTIMES};
 use serde::Serialize;
@@ -10,17 +10,18 @@ use crate::{
 
 #[derive(Serialize)]
 struct Listed {
-    /// As `--gpus` takes it.
+    /// Name for `--gpus`.
     name: String,
     /// A card, or a driver that computes on the CPU.
     kind: &'static str,
-    /// As it calls itself; none where it cannot be opened or computes wrongly.
+    /// Name reported by the device; `None` if it cannot be opened or computes wrongly.
     device: Option<String>,
-    /// How far a product, a convolution and their gradients lie from the CPU's at most, over the greatest value of each.
+    /// Maximum deviation of a product, a convolution and their gradients from the CPU's results,
+    /// relative to the largest value of each.
     apart: Option<f32>,
-    /// Why it cannot be used.
+    /// The reason why it cannot be used.
     fault: Option<String>,
-    /// For people.
+    /// Result of the test as text.
     #[serde(skip)]
     tried: String,
 }

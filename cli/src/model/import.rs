@@ -1,4 +1,4 @@
-//! `picofarm model import`: a network that was trained elsewhere, as a model of a store.
+//! `picofarm model import`: stores a network that was trained elsewhere as a model.
 
 use std::path::Path;
 
@@ -63,7 +63,7 @@ pub(super) async fn run(
     Ok(())
 }
 
-/// How each kind of refusal is mended.
+/// Returns the remedy for a refusal.
 fn hint(refused: &NotImported) -> &'static str {
     match refused {
         NotImported::Settings(_) => {

@@ -1,4 +1,4 @@
-//! `picofarm model report`: a page about trained models.
+//! `picofarm model report`: writes a page about trained models.
 
 use std::{fs, path::Path, time::SystemTime};
 
@@ -50,7 +50,7 @@ pub(super) async fn run(
     Ok(())
 }
 
-/// The finished models that are meant.
+/// Returns the selected finished models.
 async fn chosen(store: &str, models: &Models, names: &[String]) -> Result<Vec<String>> {
     let mut there = Vec::new();
     for name in models.names().await.map_err(failed)? {

@@ -1,4 +1,5 @@
-//! `picofarm reconstruct --field mlp`: PlatoNeRF's networks, sampled on the grid that everything else works on.
+//! `picofarm reconstruct --field mlp`: PlatoNeRF's networks, sampled on the grid that all later
+//! steps use.
 
 use picofarm_reconstruct::{Measured, Reconstructed, Settings};
 use serde_json::Value;
@@ -9,10 +10,10 @@ use crate::{
     error::{CliError, Result},
 };
 
-/// Checks that options and field belong together.
+/// Checks that the options match the field.
 ///
 /// # Errors
-/// An option of the other field, or none for the number of steps.
+/// Fails if an option belongs to the other field, or if the number of steps is missing.
 pub fn check(args: &Reconstruct) -> Result<()> {
     if args.field == FieldArg::Mlp {
         if cfg!(not(feature = "networks")) {
@@ -44,10 +45,10 @@ pub fn check(args: &Reconstruct) -> Result<()> {
     Ok(())
 }
 
-/// Fits the networks: the result on a grid, and the settings for metrics.json.
+/// Fits the networks. Returns the result on a grid, and the settings for metrics.json.
 ///
 /// # Errors
-/// Measurements that cannot be used, a fit that fails, or an interruption.
+/// Fails on unusable measurements, a failed fit, or an interruption.
 #[cfg(feature = "networks")]
 pub fn fit(
     args: &Reconstruct,
@@ -84,10 +85,10 @@ pub fn fit(
     Ok((training.finish(start), json!(settings)))
 }
 
-/// Says that there are no networks.
+/// Returns an error, because this build has no networks.
 ///
 /// # Errors
-/// Always.
+/// Always fails.
 #[cfg(not(feature = "networks"))]
 pub fn fit(_: &Reconstruct, _: Measured, _: Settings, _: &Watch) -> Result<(Reconstructed, Value)> {
     Err(crate::error::not_built("networks", "networks"))

@@ -1,4 +1,4 @@
-//! A walk around a reconstruction as an animation.
+//! An animation that orbits a reconstruction.
 
 use picofarm_agent::reconstruct::{CELL, shaded};
 use picofarm_figures::animation;
@@ -7,10 +7,10 @@ use picofarm_scene::Camera;
 
 /// Frames of the animation.
 const FRAMES: usize = 24;
-/// Hundredths of a second a frame.
+/// Duration of a frame, in hundredths of a second.
 const DELAY: u16 = 12;
 
-/// The surface from views all around, as a GIF.
+/// Renders the surface from views all around, as a GIF.
 pub fn orbit(made: &Reconstructed, cameras: &[Camera]) -> Vec<u8> {
     let palette: Vec<u8> = (0..=255u8).flat_map(|i| [i; 3]).collect();
     let renderer = Renderer::new(&made.field);

@@ -1,5 +1,6 @@
-//! `picofarm reconstruct --spots-from predictions`: times and masks by networks that see one histogram of all spots at once
-//! (Shoot-Bounce-3D, appendices C and E). No truth enters: the networks are given the histogram, and where the spots are.
+//! `picofarm reconstruct --spots-from predictions`: times and masks from networks that see a single
+//! histogram of all spots (Shoot-Bounce-3D, appendices C and E). No ground truth is used: the input
+//! is the histogram and the positions of the spots.
 
 use picofarm_agent::reconstruct::slant;
 use picofarm_model::{Model, ModelError, cpu, input::Target, masks, scene};
@@ -20,7 +21,7 @@ use crate::{
     signals,
 };
 
-/// The networks that are asked.
+/// The networks in use.
 pub struct Networks {
     tof: Member,
     shadow: Member,
@@ -34,10 +35,11 @@ struct Member {
     model: Model,
 }
 
-/// Reads the models, each of which must predict what its option says, of the same histograms, for images and beams as they are.
+/// Reads the models. Each must predict the quantity of its option, take the same histograms, and
+/// fit the images and beams.
 ///
 /// # Errors
-/// A model that is not there, or does not fit; the option is named.
+/// Fails if a model does not exist or does not fit. The error names the option.
 pub async fn read(args: &Reconstruct, beams: usize) -> Result<Networks> {
     let given = &args.networks;
     let needed = |option: &str, value: &Option<String>| {
@@ -126,10 +128,11 @@ pub async fn read(args: &Reconstruct, beams: usize) -> Result<Networks> {
     })
 }
 
-/// Renders the histogram and asks the networks: the measurements, and how good the predictions are for metrics.json.
+/// Renders the histogram and runs the networks. Returns the measurements, and the quality of the
+/// predictions for metrics.json.
 ///
 /// # Errors
-/// A render that fails, models that do not fit, or an interruption.
+/// Fails on a failed render, unsuitable models, or an interruption.
 pub fn measure(
     args: &Reconstruct,
     scene: &Scene,
@@ -202,7 +205,7 @@ pub fn measure(
     Ok((measured, facts))
 }
 
-/// The render's progress.
+/// Forwards the render's progress.
 struct Capture<'a>(&'a Watch);
 
 impl picofarm_transient::Progress for Capture<'_> {
@@ -211,7 +214,7 @@ impl picofarm_transient::Progress for Capture<'_> {
     }
 }
 
-/// The scene as a network sees it: nothing of its truth but the spots.
+/// Returns the scene as a network's input, with no ground truth except the spots.
 fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
     let i = &scene.camera.intrinsics;
     let pixels = (i.width * i.height) as usize;
@@ -242,7 +245,7 @@ fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
     }
 }
 
-/// Mean error of z-depth over the pixels that see something, metres.
+/// Returns the mean error of z-depth over the pixels with a surface, in metres.
 fn depth_error(depth: &[f32], rendered: &Rendered) -> f64 {
     let there = rendered
         .truth
@@ -256,7 +259,8 @@ fn depth_error(depth: &[f32], rendered: &Rendered) -> f64 {
     sum / n.max(1) as f64
 }
 
-/// Intersection over union of what is lit; 1 where nothing is and nothing is said to be.
+/// Returns the intersection over union of the lit pixels; 1 if no pixel is lit and none is
+/// predicted.
 fn iou(said: &[u8], truth: &[u8]) -> f64 {
     let pairs = || said.iter().zip(truth).map(|(a, b)| (*a != 0, *b != 0));
     let both = pairs().filter(|(a, b)| *a && *b).count();

@@ -1,4 +1,4 @@
-//! Progress of a reconstruction: which part, its loss, and how long the rest of the part takes.
+//! Progress of a reconstruction: the current part, its loss, and its remaining time.
 
 use std::{sync::Mutex, time::Instant};
 
@@ -7,10 +7,10 @@ use tokio_util::sync::CancellationToken;
 
 use crate::output::{Meter, Output, duration};
 
-/// Seconds for which a part is watched before its end is forecast.
+/// Time for which a part is observed before its end is forecast, in seconds.
 const WATCHED_S: f64 = 1.0;
 
-/// Shows progress; a cancelled token stops the work.
+/// Shows progress. A cancelled token stops the work.
 pub struct Watch {
     shown: Mutex<Shown>,
     stop: CancellationToken,
@@ -35,7 +35,7 @@ impl Watch {
         }
     }
 
-    /// Shows how far a part is; returns whether to go on.
+    /// Shows the progress of a part. Returns whether to continue.
     pub fn step(&self, part: &str, done: f32) -> bool {
         self.show(part, done, None)
     }
@@ -47,9 +47,9 @@ impl Watch {
     }
 
     fn show(&self, part: &str, done: f32, loss: Option<f64>) -> bool {
-        // Whoever finds it taken has nothing newer to tell.
+        // If another thread has the lock, its progress is at least as new.
         if let Ok(mut shown) = self.shown.try_lock() {
-            // Captures are one part, whatever their number.
+            // All captures count as one part.
             let head = |text: &str| text.split(' ').next().unwrap_or("").to_owned();
             if head(&shown.part) != head(part) {
                 shown.began = Instant::now();

@@ -1,4 +1,4 @@
-//! Says that there are no networks to predict times and masks.
+//! Substitute for predictions of times and masks in a build without networks.
 
 use picofarm_reconstruct::Measured;
 use picofarm_scene::Scene;
@@ -10,13 +10,13 @@ use crate::{
     error::{Result, not_built},
 };
 
-/// There are none.
+/// Uninhabited, because there are no networks.
 pub enum Networks {}
 
-/// Says so.
+/// Returns an error, because this build has no networks.
 ///
 /// # Errors
-/// Always.
+/// Always fails.
 pub async fn read(_: &Reconstruct, _: usize) -> Result<Networks> {
     Err(not_built("networks", "networks"))
 }

@@ -1,4 +1,5 @@
-//! The files of a reconstruction, all or none: they are written beside the folder and renamed into place.
+//! Writes the files of a reconstruction, all or none: first to a temporary folder, which is then
+//! renamed.
 
 use std::{fs, path::Path};
 
@@ -8,7 +9,7 @@ use crate::error::{CliError, Code, Result, io};
 /// Writes mesh, density and metrics to `out`, which does not exist or is empty.
 ///
 /// # Errors
-/// The folder cannot be written.
+/// Fails if the folder cannot be written.
 pub fn write(out: &Path, made: &Made) -> Result<()> {
     let out = std::path::absolute(out).map_err(|e| io(format!("--out {}", out.display()), &e))?;
     let (Some(parent), Some(name)) = (out.parent(), out.file_name()) else {
@@ -25,10 +26,10 @@ pub fn write(out: &Path, made: &Made) -> Result<()> {
         uuid::Uuid::new_v4()
     ));
     let written = into(&partial, made)
-        // Replaces an empty folder; fails on one that was filled meanwhile.
+        // Replaces an empty folder; fails if it has been filled in the meantime.
         .and_then(|()| fs::rename(&partial, &out).map_err(failed));
     if written.is_err() {
-        // The first error is the one to tell; what cannot be removed shows in the folder.
+        // The first error is reported. Files that cannot be removed are visible in the folder.
         let _ = fs::remove_dir_all(&partial);
     }
     written

@@ -1,4 +1,4 @@
-//! A sensor's settings from its file and the options on top of it.
+//! A sensor's settings: its file, overridden by the options.
 
 use picofarm_transient::sensor::{DeadTime, Jitter, Pulse, Scale, Sensor};
 
@@ -8,7 +8,7 @@ use crate::{
     files,
 };
 
-/// The settings file with the options on top.
+/// Reads the settings file and applies the options.
 pub fn settings(args: &SensorArgs) -> Result<Sensor> {
     let mut sensor = match &args.sensor {
         None => Sensor::default(),

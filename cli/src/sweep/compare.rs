@@ -1,4 +1,4 @@
-//! `picofarm sweep compare`: sweeps side by side, at the same number of epochs spent.
+//! `picofarm sweep compare`: compares sweeps at equal numbers of epochs spent.
 
 use picofarm_dataset::{TrialEnd, TrialRecord};
 use serde::Serialize;
@@ -11,30 +11,30 @@ use crate::{
     output::{Output, table},
 };
 
-/// At how many numbers of epochs the table compares.
+/// Number of rows of the table, one per number of epochs.
 const STEPS: u64 = 8;
 
-/// A sweep beside others.
+/// A sweep in a comparison.
 #[derive(Debug, PartialEq, Serialize)]
 struct Compared {
     name: String,
     id: String,
-    /// What is less for a better trial.
+    /// Name of the error that better trials minimise.
     error: &'static str,
     finished: usize,
     stopped: usize,
     diverged: usize,
-    /// That have come to a rung and not to an end.
+    /// Number of trials that have reached a rung but have not ended.
     open: usize,
-    /// Of all trials that have ended.
+    /// Epochs of all trials that have ended.
     epochs: u64,
     best: Option<Best>,
-    /// The least error of the trials that came to their end, after so many epochs in all: trials in the order of their
-    /// numbers, as one worker would have run them.
+    /// The lowest error of the finished trials after a total number of epochs. Trials are taken in
+    /// the order of their numbers, as one worker would have run them.
     course: Vec<(u64, f64)>,
 }
 
-/// The best of the trials that came to their end.
+/// The best of the finished trials.
 #[derive(Debug, PartialEq, Serialize)]
 struct Best {
     model: String,
@@ -42,7 +42,7 @@ struct Best {
     values: Map<String, Value>,
 }
 
-/// Compares the sweeps of these names; `NAME/ID` means one of several.
+/// Compares the sweeps of these names. `NAME/ID` selects one of several.
 pub async fn run(store: &str, names: &[String], output: Output) -> Result<()> {
     let models = open(store)?;
     let mut compared: Vec<Compared> = Vec::new();
@@ -109,7 +109,7 @@ fn of(records: &Records) -> Compared {
     }
 }
 
-/// The least error after so many epochs in all.
+/// Returns the lowest error after a total number of epochs.
 fn after(sweep: &Compared, epochs: u64) -> Option<f64> {
     let there = sweep
         .course
@@ -154,7 +154,7 @@ fn described(sweeps: &[Compared]) -> String {
         let mut row = vec![epochs.to_string()];
         row.extend(sweeps.iter().map(|sweep| match epochs <= sweep.epochs {
             true => loss(after(sweep, epochs)),
-            // It has spent no more than it has.
+            // The sweep has not spent that many epochs.
             false => String::new(),
         }));
         course.push(row);
@@ -197,7 +197,7 @@ mod tests {
         let other = of(&records(vec![record(0, 1e-2, TrialEnd::Finished, &[0.3])]));
         let text = described(&[found, other]);
         assert!(text.contains("m.5") && text.contains("lr = 0.03"), "{text}");
-        // The other has spent one epoch; what it would have found later is not known.
+        // The other sweep has spent one epoch; its later results are unknown.
         assert!(
             text.contains("\n1             -         0.3000\n"),
             "{text}"

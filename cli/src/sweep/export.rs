@@ -54,7 +54,8 @@ fn trials(sweep: &Sweep) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// A row for each line of the history of each trial that ended: its epochs, and validations within them.
+/// Returns a row for each line in the history of each trial that has ended: its epochs, and
+/// validations within them.
 fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
     let header = [
         "trial",
@@ -80,12 +81,12 @@ fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
     rows
 }
 
-/// A number with all its digits; empty where there is none.
+/// Formats a number with all its digits; empty if there is none.
 fn number(value: Option<f64>) -> String {
     value.map_or_else(String::new, |value| value.to_string())
 }
 
-/// A line of CSV (RFC 4180).
+/// Formats a line of CSV (RFC 4180).
 fn csv(row: &[String]) -> String {
     let cell = |text: &String| match text.contains([',', '"', '\n', '\r']) {
         true => format!("\"{}\"", text.replace('"', "\"\"")),

@@ -1,10 +1,13 @@
-//! `picofarm sweep extend` and `sweep run`: further trials, by what those that have ended found.
+//! `picofarm sweep extend` and `sweep run`: proposes further trials, based on the results of
+//! finished ones.
 //!
-//! Trials are stages of a job with settings of their own, and a job does not change once it is submitted: leases, plans, reuse
-//! and keys follow from that. So a search that learns goes in rounds. A round reads what the store holds, proposes values,
-//! and writes them into a job file beside the first one, which lists the values of all trials. Whoever submits it has the
-//! trials that ended reused and only the new ones trained; whoever does not likes a proposal changes it in the file. The
-//! file alone says what is run, as any other, and the same records give the same file.
+//! Trials are stages of a job with settings of their own, and a job does not change after its
+//! submission, because leases, plans, reuse and keys depend on it. An adaptive search therefore
+//! works in rounds. A round reads the records in the store, proposes values, and writes a new job
+//! file with the values of all trials to the folder of the first one. When that file is submitted,
+//! finished trials are reused and only the new ones are trained. Users can edit proposals in the
+//! file. As with any job, the file alone determines what runs, and the same records give the same
+//! file.
 
 use std::{
     io::Write,
@@ -40,18 +43,18 @@ use crate::{
 struct Sweep {
     store: String,
     stage: String,
-    /// Its trials as the file has them, by number.
+    /// Its trials in the file, by number.
     trials: Vec<Trial>,
 }
 
-/// A file that was written.
+/// A written file.
 struct Extended {
     file: PathBuf,
     sweep: String,
     id: String,
-    /// How many trials have ended.
+    /// Number of trials that have ended.
     ended: usize,
-    /// The number of the first new trial.
+    /// Number of the first new trial.
     first: u64,
     proposed: Vec<Values>,
 }
@@ -72,7 +75,7 @@ pub async fn run(args: Extend, settings: &Settings, output: Output) -> Result<()
     Ok(())
 }
 
-/// Submits a job file, waits for its end, extends it, and so on.
+/// Repeatedly submits a job file, waits for its end, and extends it.
 pub async fn rounds(args: SweepRun, settings: &Settings, output: Output) -> Result<()> {
     let SweepRun { mut more, rounds } = args;
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
@@ -97,7 +100,7 @@ pub async fn rounds(args: SweepRun, settings: &Settings, output: Output) -> Resu
     Ok(())
 }
 
-/// The next round's file: the one that an earlier run has written, or a new one.
+/// Returns the next round's file: from an earlier run, or a new one.
 async fn extend_or_find(more: &MoreTrials, settings: &Settings) -> Result<PathBuf> {
     let spec = jobfile::read_counted(&more.file, more.scale.as_deref(), &settings.assets).await?;
     let sweep = find(&spec.stages, more.stage.as_deref())?;
@@ -169,7 +172,7 @@ async fn extend(
     };
     let failed = |e: std::io::Error| io(out.display(), &e);
     let written = NewFile::beside(&out, &after).map_err(failed)?;
-    // What was written must mean the same sweep, with these trials.
+    // Checks that the written file has the same sweep with the new trials.
     let spec = jobfile::read_counted(written.path(), scale.as_deref(), &settings.assets).await?;
     let found = find(&spec.stages, Some(&stage))?;
     let same = found.trials[0].id == first.id && found.trials.iter().map(|t| &t.values).eq(&values);
@@ -191,11 +194,11 @@ async fn extend(
     })
 }
 
-/// A file that is whole before it has its name.
+/// A file with complete content that has not received its name yet.
 struct NewFile(tempfile::NamedTempFile);
 
 impl NewFile {
-    /// With this content, in the folder of `out`.
+    /// Creates a file with this content in the folder of `out`.
     fn beside(out: &Path, content: &str) -> std::io::Result<Self> {
         let folder = out.parent().filter(|p| !p.as_os_str().is_empty());
         let mut file = tempfile::Builder::new()
@@ -212,7 +215,8 @@ impl NewFile {
         self.0.path()
     }
 
-    /// Gives it its name, if that is free or what it names is equal; says whether it was.
+    /// Gives the file its name if the name is unused, or if an existing file is equal. Returns
+    /// whether this succeeded.
     fn keep(self, out: &Path) -> std::io::Result<bool> {
         let ours = std::fs::read(self.path())?;
         match self.0.persist_noclobber(out) {
@@ -225,7 +229,7 @@ impl NewFile {
     }
 }
 
-/// The sweep of a job's stages that is meant.
+/// Returns the selected sweep of a job's stages.
 fn find(stages: &[picofarm_proto::model::StageSpec], stage: Option<&str>) -> Result<Sweep> {
     let mut sweeps: Vec<Sweep> = Vec::new();
     for spec in stages {
@@ -264,10 +268,11 @@ fn find(stages: &[picofarm_proto::model::StageSpec], stage: Option<&str>) -> Res
     }
 }
 
-/// All trials so far: those of the file, and those beyond it that have ended.
+/// Returns all trials so far: those of the file, and further ones that have ended.
 ///
 /// # Errors
-/// The file and the store have other values for one of them, or one between them is not known.
+/// Fails if file and store have different values for a trial, or if a trial between them is
+/// unknown.
 fn all(trials: &[Trial], ended: &[TrialRecord]) -> Result<Vec<Tried>, String> {
     let mut all: Vec<Tried> = trials
         .iter()
@@ -303,14 +308,15 @@ fn all(trials: &[Trial], ended: &[TrialRecord]) -> Result<Vec<Tried>, String> {
     Ok(all)
 }
 
-/// `job-40.toml` beside `job.toml` or `job-32.toml`, for a file of 32 trials that gets 40.
+/// Returns `job-40.toml` in the folder of `job.toml` or `job-32.toml`, for a file of 32 trials
+/// extended to 40.
 fn beside(file: &Path, trials: u64, total: u64) -> PathBuf {
     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
     let stem = stem.strip_suffix(&format!("-{trials}")).unwrap_or(&stem);
     file.with_file_name(format!("{stem}-{total}.toml"))
 }
 
-/// A job file's places are relative to its folder, so a copy belongs there.
+/// Checks that a copy is in the job file's folder, because the file's locations are relative to it.
 fn same_folder(file: &Path, out: &Path) -> Result<PathBuf> {
     let folder = |path: &Path| {
         let parent = path.parent().filter(|p| !p.as_os_str().is_empty());
@@ -416,7 +422,7 @@ mod tests {
         assert!(write("a = 1"), "the same again");
         assert!(!write("a = 2"));
         assert_eq!(std::fs::read_to_string(&out).unwrap(), "a = 1");
-        // Nothing else is left in the folder.
+        // No other file is left in the folder.
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 

@@ -1,13 +1,15 @@
-//! A job file whose sweep lists the values of all its trials: the same file otherwise, comments among it.
+//! Edits a job file so that its sweep lists the values of all its trials. The rest of the file,
+//! including comments, does not change.
 
 use picofarm_search::Values;
 use serde_json::Value;
 use toml_edit::{Array, DocumentMut, InlineTable, Item, TableLike};
 
-/// The text of a job file with these trials in the sweep of a stage, the best of which gets the name `promote`.
+/// Returns the text of a job file with these trials in the sweep of a stage. The best trial
+/// receives the name `promote`.
 ///
 /// # Errors
-/// What is wrong with the file, or which stage is not in it.
+/// Returns a message about an error in the file, or about the missing stage.
 pub fn with_values(
     text: &str,
     stage: &str,
@@ -40,7 +42,7 @@ pub fn with_values(
     Ok(document.to_string())
 }
 
-/// Sets a value, and leaves the comments beside it where they are.
+/// Sets a value without removing the comments next to it.
 fn set(table: &mut dyn TableLike, key: &str, mut value: toml_edit::Value) {
     match table.get_mut(key).and_then(Item::as_value_mut) {
         Some(there) => {
@@ -53,7 +55,7 @@ fn set(table: &mut dyn TableLike, key: &str, mut value: toml_edit::Value) {
     }
 }
 
-/// A line for each trial.
+/// Formats a line for each trial.
 fn list(values: &[Values]) -> Array {
     let mut list = Array::new();
     for trial in values {
@@ -86,7 +88,7 @@ fn toml(value: &Value) -> toml_edit::Value {
             (None, Some(number)) => number.into(),
             (None, None) => number.to_string().into(),
         },
-        // TOML has none, so no job file gave one.
+        // TOML has no null, so no job file contains one.
         Value::Null => "".into(),
     }
 }
@@ -125,7 +127,7 @@ mod tests {
              [stage.sweep.over]\nlr = { log = [1e-4, 1e-1] }  # rates\nwidth = { int = [2, 9] }\n\
              [stage.train]\nmodel = \"m\"\n"
         );
-        // Again, with what was written.
+        // Applied again to its own output.
         let again = with_values(&out, "tof", &[values(0.001, 8)], "m-1").unwrap();
         assert_eq!(
             read(&again)["stage"][1]["sweep"]["values"],

@@ -1,4 +1,4 @@
-//! What the trials of a sweep have recorded, and the same for tables, pages and searches.
+//! The records of a sweep's trials, and their conversion for tables, pages and searches.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,20 +17,20 @@ use crate::{
     model::open,
 };
 
-/// What the trials of a sweep have recorded.
+/// The records of a sweep's trials.
 pub struct Records {
     pub name: String,
     pub id: String,
-    /// Of those that have ended, in order.
+    /// Trials that have ended, in order.
     pub ended: Vec<TrialRecord>,
-    /// How good those were that came to any rung, in order.
+    /// Losses of the trials at each rung, in order.
     pub rungs: Vec<Rung>,
 }
 
-/// The records of the sweep that is meant.
+/// Reads the records of the selected sweep.
 ///
 /// # Errors
-/// There is none, or several are called so.
+/// Fails if there is none, or if several match.
 pub async fn read(which: &WhichSweep) -> Result<Records> {
     let models = open(&which.store)?;
     let mut ids = ids(&models, &which.name, &which.id).await?;
@@ -45,13 +45,13 @@ pub async fn read(which: &WhichSweep) -> Result<Records> {
     }
 }
 
-/// The sweeps of a name whose ids begin so.
+/// Returns the ids that begin with `begin`, of the sweeps called `name`.
 pub async fn ids(models: &Models, name: &str, begin: &str) -> Result<Vec<String>> {
     let ids: BTreeSet<String> = models.sweeps(name).await.map_err(failed)?;
     Ok(ids.into_iter().filter(|id| id.starts_with(begin)).collect())
 }
 
-/// A sweep of which nothing is there.
+/// Returns the error for a sweep without records.
 pub fn nothing(name: &str) -> CliError {
     let what = format!("no trial of a sweep called {name:?} has reported anything yet");
     CliError::input(what).hint(
@@ -60,7 +60,7 @@ pub fn nothing(name: &str) -> CliError {
 }
 
 impl Records {
-    /// All of a sweep.
+    /// Reads all records of a sweep.
     pub async fn of(models: &Models, name: &str, id: String) -> Result<Self> {
         let (ended, rungs) = models.trials(name, &id).await.map_err(failed)?;
         Ok(Self {
@@ -71,19 +71,19 @@ impl Records {
         })
     }
 
-    /// What is less for a better trial.
+    /// Returns the name of the error that better trials minimise.
     pub fn error(&self) -> &'static str {
         let kind = self.ended.first().map(|trial| &*trial.kind);
         kind.map_or("validation loss", error_name)
     }
 
-    /// For tables and pages.
+    /// Returns the trials for tables and pages.
     ///
     /// # Errors
-    /// A line of a history that cannot be read.
+    /// Fails if a line of a history cannot be read.
     pub fn sweep(&self) -> Result<Sweep> {
         let mut all: BTreeMap<u64, Row> = BTreeMap::new();
-        // Rungs come in order: the last that a trial has reached counts.
+        // Rungs are in order, so the last one that a trial has reached counts.
         for rung in &self.rungs {
             all.insert(rung.index, open_trial(&self.name, rung));
         }
@@ -99,7 +99,7 @@ impl Records {
     }
 }
 
-/// How a trial ended, for searches.
+/// Returns how a trial ended, for searches.
 pub fn outcome(trial: &TrialRecord) -> Outcome {
     match (&trial.end, trial.loss) {
         (TrialEnd::Finished, Some(loss)) if loss.is_finite() => Outcome::Finished(loss),
@@ -158,12 +158,12 @@ fn shown(value: &Value) -> Shown {
     }
 }
 
-/// A loss for people.
+/// Formats a loss.
 pub fn loss(loss: Option<f64>) -> String {
     loss.map_or_else(|| "-".into(), |loss| format!("{loss:.4}"))
 }
 
-/// Values for people, by name.
+/// Formats values by name.
 pub fn listed<'a>(values: impl Iterator<Item = (&'a String, String)>) -> String {
     let values: Vec<String> = values
         .map(|(name, value)| format!("{name} = {value}"))
@@ -171,7 +171,7 @@ pub fn listed<'a>(values: impl Iterator<Item = (&'a String, String)>) -> String 
     values.join(", ")
 }
 
-/// A value as text: without quotes.
+/// Formats a value as text without quotes.
 pub fn text(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
@@ -185,7 +185,7 @@ pub mod tests {
 
     use super::*;
 
-    /// A trial of one parameter, of a sweep called `m`.
+    /// Creates a trial with one parameter, of a sweep called `m`.
     pub fn record(index: u64, lr: f64, end: TrialEnd, losses: &[f64]) -> TrialRecord {
         let line = |(i, mae): (usize, &f64)| json!({"epoch": i + 1, "step": i + 1, "loss": mae, "learning_rate": lr, "validation": {"mae_m": mae, "rmse_m": mae}});
         TrialRecord {

@@ -1,9 +1,10 @@
-//! The worker: a session with the coordinator (its own crate, [`picofarm_session`]) and the executors that turn a task
-//! into a published scene. Knows the data set, scenes and the renderer; never the wire or the catalog.
+//! The worker: a session with the coordinator (its own crate, [`picofarm_session`]) and the
+//! executors that turn a task into a published scene. This crate depends on the data set, scenes
+//! and the renderer, but not on the wire protocol or the catalog.
 //!
-//! [`run`] is the whole worker; [`run_with`] takes another [`Executor`], which is how tests look at the
-//! session without rendering. The features `networks` and `clouds` bring the kinds of task that train networks, and stores
-//! over a network.
+//! [`run`] is the complete worker. [`run_with`] takes another [`Executor`], so that tests can
+//! exercise the session without rendering. The feature `networks` adds the task kinds that train
+//! networks, and `clouds` adds stores over a network.
 
 pub mod execute;
 mod run;

@@ -1,4 +1,4 @@
-//! The whole worker.
+//! The complete worker.
 
 use std::sync::Arc;
 
@@ -8,11 +8,11 @@ use tokio_util::sync::CancellationToken;
 
 use crate::TaskExecutor;
 
-/// Runs a worker for every kind of task, until `shutdown` or a refusal.
+/// Runs a worker for every kind of task, until `shutdown` or until the coordinator refuses it.
 ///
 /// # Errors
-/// [`AgentError`]: a setting that cannot be used, or the coordinator refuses this worker. An unreachable
-/// coordinator is no error: the worker tries again for ever.
+/// [`AgentError`] if a setting cannot be used, or the coordinator refuses this worker. An
+/// unreachable coordinator is not an error: the worker retries for ever.
 pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Summary, AgentError> {
     config.check()?;
     let files = opener(&StorePrefixes::new(&config.store_prefixes)?);

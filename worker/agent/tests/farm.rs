@@ -1,4 +1,5 @@
-//! Worker and coordinator together, in one process: real catalog, real scenes, real data set.
+//! Worker and coordinator together in one process, with a real catalog, real scenes and a real data
+//! set.
 
 mod common;
 
@@ -15,7 +16,7 @@ use picofarm_proto::{
 use picofarm_tests::ports::lasting;
 use tokio_util::sync::CancellationToken;
 
-/// A coordinator that keeps its catalog in `dir`.
+/// A coordinator with its catalog in `dir`.
 struct Farm {
     running: Running,
     stop: CancellationToken,
@@ -25,7 +26,7 @@ impl Farm {
     async fn start(dir: &Path, listen: SocketAddr) -> Self {
         let stop = CancellationToken::new();
         let config = CoordinatorConfig {
-            // No lease runs out here, however long a busy disk keeps a transaction.
+            // No lease expires in this test, even if a busy disk delays a transaction.
             lease_ms: 60_000,
             heartbeat_ms: 100,
             ..CoordinatorConfig::new(CatalogPlace::from(dir.join("catalog.sqlite")), listen)
@@ -80,7 +81,7 @@ impl Farm {
         job.unwrap().try_into().unwrap()
     }
 
-    /// The job's status when it has ended.
+    /// Returns the job's status once it has ended.
     async fn ended(&self, id: &str) -> JobStatus {
         soon("the job's end", async {
             loop {

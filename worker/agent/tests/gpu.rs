@@ -1,5 +1,5 @@
-//! Stages that ask for a graphics processor: trained, asked and judged there as on the CPU. Every device that drivers list is
-//! tried, software devices too.
+//! Stages that request a GPU: training, inference and evaluation work there as on the CPU. Tests
+//! every device that the drivers list, including software devices.
 #![cfg(any(feature = "cuda", feature = "wgpu"))]
 
 mod place;
@@ -14,7 +14,7 @@ use serde_json::json;
 
 use place::*;
 
-/// All that drivers list. Says so where there are none.
+/// Returns all GPUs that the drivers list. Prints a message if there are none.
 fn listed() -> Vec<String> {
     let listed: Vec<String> = gpus().iter().map(|gpu| gpu.id().to_owned()).collect();
     if listed.is_empty() {
@@ -50,7 +50,7 @@ async fn what_is_trained_predicted_and_judged_on_a_device_is_what_the_cpu_finds(
             std::fs::read_to_string(path).unwrap()
         };
         assert!(speed(&there).contains(&id) && !speed(&here).contains("gpu"));
-        // Evaluated and predicted there; of the same network here.
+        // Evaluates and predicts with the same network on the GPU (there) and on the CPU (here).
         let twin = Place::new().await;
         copy(
             &there.dir.path().join("models"),

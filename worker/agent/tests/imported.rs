@@ -1,4 +1,4 @@
-//! Networks from elsewhere as models of a store: asked as those that were trained here.
+//! Imported networks as models of a store work like those trained here.
 
 mod place;
 
@@ -34,7 +34,8 @@ impl Rooms {
     }
 }
 
-/// A model's tensors as PyTorch would have saved them: no word of what they are, under a wrapper's names.
+/// Returns a model's tensors as PyTorch would have saved them: without metadata, with the prefix of
+/// a wrapper.
 async fn foreign(place: &Place, model: &str) -> Vec<u8> {
     let models = place.models();
     let manifest = models.manifest(model).await.unwrap();
@@ -67,7 +68,7 @@ async fn an_imported_network_answers_as_the_one_it_was() {
         let models = place.models();
         let published = models.publish(new.clone(), false).await.unwrap();
         let name = published.manifest.name.clone();
-        // Once more is the same model.
+        // Importing it again gives the same model.
         let again = models.publish(new, false).await.unwrap();
         assert_eq!(again.manifest, published.manifest);
         let times = if model == "sh" { "depths" } else { "" };

@@ -1,5 +1,6 @@
-//! What models predict, as tasks: the same that evaluations found, published once, repaired, and what is refused. And reports
-//! about models. The data are made up: nothing is rendered.
+//! Predictions of models as tasks: equal to those of evaluations, published once, repaired, and
+//! refused for unsuitable inputs. Also reports about models. The data are synthetic: nothing is
+//! rendered.
 
 mod place;
 
@@ -38,7 +39,7 @@ impl Place {
     }
 }
 
-/// The inference of models over another data set.
+/// Returns the inference of models over another data set.
 fn of(place: &Place, dataset: &str, models: &[&str]) -> StageSpec {
     let mut stage = place.inference(json!({"models": models}));
     let TaskSpec::Infer(task) = &mut stage.task else {
@@ -92,7 +93,7 @@ async fn what_is_kept_is_what_evaluations_found() {
         errors.sum::<f64>() / pixels as f64,
         figures["m"]["mae_m"].as_f64().unwrap(),
     );
-    // What lies beyond 0 to 4.5 m is kept at its end, and then nearer to the truth.
+    // Depths outside 0 to 4.5 m are clamped to that range, which brings them nearer to the truth.
     assert!(mae > 0.5 * found && mae <= found + 1e-5, "{mae}, {found}");
     let mirrors = rooms.read::<u8>(scene, Quantity::Specular).await.unwrap();
     let light = rooms.read_visibility(scene).await.unwrap();
@@ -101,7 +102,7 @@ async fn what_is_kept_is_what_evaluations_found() {
         assert!((ours - found).abs() < 1e-9, "{name}: {ours}, {found}");
     }
     let manifest = place.manifest(scene).await;
-    // Whether predictions agree is stated with figures, whatever they are worth.
+    // The manifest has agreement figures, whatever the quality of the predictions.
     let agreement = &manifest.agreement;
     assert!(
         agreement["verdict"].is_string() && agreement["reasons"].is_array(),
@@ -135,7 +136,7 @@ async fn a_task_that_is_run_again_adopts_or_completes_what_is_there() {
         (again.adopted, &again.manifest_sha256, again.bytes),
         (true, &first.manifest_sha256, first.bytes)
     );
-    // Killed before the manifest stood, and with an object missing besides.
+    // Simulates a kill before the manifest was written, with an object missing too.
     place.forget("seen/manifests/3.json");
     place.forget("seen/lit/c/3/0/0/0");
     assert!(!place.infer(json!({}), 3).await.unwrap().adopted);
@@ -149,12 +150,12 @@ async fn a_task_that_is_run_again_adopts_or_completes_what_is_there() {
     let forced = run_at(forced, 3, Arc::default()).await.unwrap();
     assert!(!forced.adopted);
     assert_same(&place.files("seen"), &before);
-    // Of the whole farm's other stores nothing differs: same trainings, same predictions.
+    // Another store with the same trainings has the same predictions.
     let other = Place::new().await;
     other.train_all().await;
     other.infer(json!({}), 3).await.unwrap();
     assert_same(&other.files("seen"), &before);
-    // The scene's data change, and with them the key: another one's place is not taken.
+    // The scene's data change, and so does the key. Predictions with another key are not replaced.
     let said = match place.infer(json!({"models": ["m", "s"]}), 3).await {
         Err(TaskError::User(text)) => text,
         other => panic!("{other:?}"),
@@ -315,12 +316,12 @@ async fn a_report_is_made_once_of_models_and_what_is_said_of_them() {
         (again.adopted, &again.manifest_sha256),
         (true, &first.manifest_sha256)
     );
-    // Killed before the manifest stood.
+    // Simulates a kill before the manifest was written.
     place.forget("reports/main/manifest.json");
     place.forget("reports/main/report.json");
     assert!(!run(place.report(all.clone())).await.unwrap().adopted);
     assert_same(&place.files("reports/main"), &files);
-    // More is known by now: the name is that of what was known then.
+    // A new evaluation exists now, but the report's name belongs to the earlier results.
     run(place.evaluation(json!({"models": ["s"]})))
         .await
         .unwrap();

@@ -1,5 +1,5 @@
-//! What every kind of task keeps to, whatever it does. The suite takes the kinds from the executor: one that is not in the
-//! jobs below makes it fail.
+//! Tests that every kind of task must pass. The suite takes the list of kinds from the executor,
+//! and fails if one of them is missing from the jobs below.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -30,7 +30,8 @@ use uuid::Uuid;
 
 const SCENES: u64 = 4;
 
-/// Every kind but imports, whose scenes the last of them writes.
+/// A job with every kind except imports. Its last stage writes the scenes that the import test
+/// reads.
 fn first_job(store: &str) -> Value {
     let scenes = json!({"kind": "primitive", "count": SCENES, "seed": 5, "spots": 4});
     let render = json!({"resolution": 16, "samples": 2});
@@ -58,7 +59,7 @@ fn first_job(store: &str) -> Value {
     ]})
 }
 
-/// PlatoNeRF's networks, small ones, of each room.
+/// A stage that fits small PlatoNeRF networks to each room.
 fn networks(store: &str, steps: u32) -> Value {
     json!({"name": "networks", "kind": "reconstruct", "source": "rooms",
         "reconstruct": {"field": "mlp", "grid": {"nodes": 24}, "mlp": {"steps": steps, "width": 8, "batch": 16}},
@@ -72,7 +73,7 @@ fn import_job(store: &str) -> Value {
     ]})
 }
 
-/// A store, and what runs tasks.
+/// A store and an executor.
 struct Place {
     dir: tempfile::TempDir,
     runtime: Runtime,
@@ -90,7 +91,7 @@ impl Place {
         self.dir.path().display().to_string()
     }
 
-    /// The stages of a job, as they are submitted.
+    /// Returns the stages of a job as submitted.
     fn stages(&self, job: Value) -> Vec<StageSpec> {
         let mut spec: JobSpec = serde_json::from_value(job).unwrap();
         let here = Submission {
@@ -114,7 +115,7 @@ impl Place {
         TaskExecutor::new(&[], runtime, Opener::anywhere())
     }
 
-    /// Runs one task on a worker of so many threads.
+    /// Runs one task on a worker with `threads` threads.
     fn run(
         &self,
         stage: &StageSpec,
@@ -133,7 +134,7 @@ impl Place {
         pool.install(|| self.executor().run(&task, control))
     }
 
-    /// Runs all tasks of a stage: the SHA-256 of each result.
+    /// Runs all tasks of a stage and returns the SHA-256 of each result.
     fn run_all(&self, stage: &StageSpec, threads: usize) -> Vec<String> {
         let ran = (0..stage.tasks()).map(|index| {
             let output = self.run(stage, index, (threads, &Control::default()));
@@ -143,7 +144,7 @@ impl Place {
         ran.collect()
     }
 
-    /// All files of the store, but for how fast trainings were, which is no result.
+    /// Returns all files of the store except the training speeds, which are not results.
     fn files(&self) -> BTreeMap<PathBuf, Vec<u8>> {
         let (mut found, mut folders) = (BTreeMap::new(), vec![self.dir.path().to_owned()]);
         while let Some(folder) = folders.pop() {
@@ -170,7 +171,7 @@ fn assert_same(ours: &BTreeMap<PathBuf, Vec<u8>>, theirs: &BTreeMap<PathBuf, Vec
     }
 }
 
-/// Every stage of both jobs, run in turn; `each` is called before and after.
+/// Runs every stage of both jobs in turn. Calls `each` before and after each stage.
 fn every_kind(
     place: &Place,
     mut before: impl FnMut(&StageSpec),
@@ -227,7 +228,7 @@ fn a_task_that_is_stopped_first_leaves_what_a_calm_one_does() {
             }
         },
         |stage, results| {
-            // A report says how fast its models were trained, which is another figure each time.
+            // A report contains the training speed of its models, which varies.
             let expected = expected.next().unwrap();
             if stage.task.kind() != "report" {
                 assert_eq!(results, expected, "{}", stage.name);
@@ -307,7 +308,7 @@ fn a_job_survives_the_catalog_and_says_its_memory() {
                 source: Some(shape),
                 networks: stage.task.network(&shape).into_iter().collect(),
             };
-            // A report's depends on its models alone.
+            // A report's memory depends only on its models.
             if stage.task.kind() != "report" {
                 let bytes = peak_bytes(&stage.task, &known, 2).unwrap();
                 assert!(
@@ -343,7 +344,7 @@ fn damaged_histograms_are_the_stores_trouble_and_name_the_object() {
     let mut tried = BTreeSet::new();
     for stage in &stages {
         let kind = stage.task.kind();
-        // Those that look at no histogram; a reconstruction from truth is one.
+        // Kinds that read no histogram. A reconstruction from ground truth is one of them.
         if stage.task.reads().is_none() || matches!(kind, "split" | "promote" | "reconstruct") {
             continue;
         }
@@ -355,7 +356,7 @@ fn damaged_histograms_are_the_stores_trouble_and_name_the_object() {
             Err(TaskError::Damaged(text)) => {
                 assert!(text.contains("rooms/transient/c/"), "{kind}: {text}");
             }
-            // To find damage is what it is for.
+            // Verification fails because it has found the damage.
             Err(TaskError::User(text)) if kind == "verify" => {
                 assert!(text.contains("rooms/transient/c/"), "{text}");
             }
@@ -366,7 +367,7 @@ fn damaged_histograms_are_the_stores_trouble_and_name_the_object() {
     assert!(tried.len() >= 5, "{tried:?}");
 }
 
-/// PlatoNeRF's room, some of whose walls are mirrors, with four beams.
+/// PlatoNeRF's room with four beams, and mirrors for some of its walls.
 fn room_of_mirrors() -> Vec<u8> {
     let settings = PlatoSettings {
         object: PlatoObject::Empty,
@@ -435,7 +436,7 @@ fn networks_that_are_stopped_go_on_from_their_checkpoint_to_the_same_bytes() {
     for strike in 0..20u8 {
         let control = Arc::new(Control::default());
         let hand = Arc::clone(&control);
-        // From .49 to .85 the networks learn.
+        // The networks train between progress 0.49 and 0.85.
         let at = 0.5 + 0.3 * f32::from(strike) / 20.0;
         let striker = std::thread::spawn(move || {
             while hand.fraction() < at {
@@ -452,7 +453,7 @@ fn networks_that_are_stopped_go_on_from_their_checkpoint_to_the_same_bytes() {
     steps.dedup();
     assert!(steps.len() > 10, "{steps:?}");
 
-    // One that is damaged costs no more than itself.
+    // A damaged checkpoint costs only itself.
     let newest = struck
         .files()
         .into_keys()
@@ -463,6 +464,6 @@ fn networks_that_are_stopped_go_on_from_their_checkpoint_to_the_same_bytes() {
     bytes[100] ^= 1;
     fs::write(&newest, bytes).unwrap();
     struck.run_all(&of_struck[1], 2);
-    // The same files: no checkpoint is left.
+    // The files are the same: no checkpoint is left.
     assert_same(&struck.files(), &calm.files(), "after 20 strikes");
 }

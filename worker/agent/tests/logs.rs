@@ -1,4 +1,4 @@
-//! What a task logs reaches its coordinator while it runs, and ahead of the report on it.
+//! A task's log reaches its coordinator while the task runs, and before its report.
 
 mod common;
 
@@ -34,7 +34,7 @@ async fn lines_arrive_while_their_task_runs_and_the_last_ones_before_its_report(
         if index == 0 {
             held.pass(control)?;
         }
-        // Whichever thread of the pool says it.
+        // Logs from every thread of the pool count.
         rayon::join(
             || warn!(target: "picofarm_transient", "left"),
             || warn!(target: "picofarm_transient", "left"),
@@ -57,7 +57,7 @@ async fn lines_arrive_while_their_task_runs_and_the_last_ones_before_its_report(
     let done = c.done().await;
     assert_eq!(done.index, 0);
     c.acknowledge(done.lease, 0).await;
-    // Those of short tasks come with their reports.
+    // The logs of short tasks come with their reports.
     for index in [1, 2] {
         let mut said = Vec::new();
         loop {

@@ -1,4 +1,4 @@
-//! Parts of a scene through the executor: whatever becomes of them on their way, the scene is the same.
+//! Parts of a scene through the executor: the scene is the same whatever happens to its parts.
 
 mod common;
 
@@ -48,7 +48,7 @@ async fn run(stage: StageSpec, index: u64) -> Result<Output, TaskError> {
     tokio::task::spawn_blocking(work).await.unwrap()
 }
 
-/// Contents by path.
+/// Returns the contents of all files by path.
 fn objects(at: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut found = vec![];
     let mut folders = vec![at.to_owned()];
@@ -117,7 +117,7 @@ async fn parts_that_are_damaged_missing_or_swapped_are_made_up_for_and_all_are_d
     assert!(!joined.adopted);
     assert_eq!(objects(&store), expected);
 
-    // A part that comes late, or is asked for again, is not rendered: the scene is there.
+    // A part that arrives late or is requested again is not rendered, because the scene exists.
     let late = run(parts_of(whole.clone()), 4 * each + 2).await.unwrap();
     assert!(late.adopted && late.bytes == 0, "{late:?}");
     assert_eq!(objects(&store), expected);

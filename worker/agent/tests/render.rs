@@ -1,4 +1,5 @@
-//! The render executor on tiny scenes: what it publishes, when it adopts, and whom it blames.
+//! The render executor on tiny scenes: what it publishes, when it adopts, and how it classifies
+//! errors.
 
 mod common;
 
@@ -78,7 +79,7 @@ impl Place {
         soon("a tiny render", work).await.unwrap()
     }
 
-    /// The text of a failure that is the job's own.
+    /// Returns the message of a failure caused by the job itself.
     async fn complaint(&self, index: u64) -> String {
         match self.run(index).await {
             Err(TaskError::User(text)) => text,
@@ -91,7 +92,7 @@ fn sha256(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// Every file under `dir`, by relative path.
+/// Returns the contents of every file under `dir`, by relative path.
 fn files(dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let (mut found, mut folders) = (BTreeMap::new(), vec![dir.to_path_buf()]);
     while let Some(folder) = folders.pop() {
@@ -128,7 +129,8 @@ async fn a_published_scene_reads_back_and_the_output_names_its_manifest() {
     let transient = dataset.read_transient(3).await.unwrap();
     assert_eq!(transient.len(), 16 * 16 * 40);
     assert!(transient.iter().any(|h| *h > 0.0));
-    // The spot lies in front of the camera and inside the image: positions are in the camera's frame.
+    // The spot is in front of the camera and inside the image, because positions are in the
+    // camera's frame.
     let spots = dataset.read_spots(3).await.unwrap();
     let [x, y, z] = spots[0].expect("the beam meets a wall").position;
     let i = dataset.read_intrinsics(3).await.unwrap();
@@ -189,7 +191,7 @@ async fn furniture_that_is_not_here_fails_the_task_and_says_how_to_get_it() {
     );
 }
 
-/// A job of one scene file with `content`, written as `name`.
+/// Creates a job of one scene file with `content`, written as `name`.
 fn of_file(name: &str, content: &[u8]) -> Place {
     let mut place = Place::new();
     let path = place.dir.path().join(name);
@@ -312,7 +314,7 @@ async fn a_worker_whose_store_is_not_the_jobs_renders_nothing_and_leaves_nothing
     place.run_with(1, 0, control()).await.unwrap();
     let before = files(&store);
 
-    // One where it is not mounted: the folder is empty, or is not there.
+    // A machine where the store is not mounted: the folder is empty or missing.
     let mounted = place.dir.path().join("elsewhere");
     fs::rename(&store, &mounted).unwrap();
     for there in [true, false] {
@@ -333,7 +335,7 @@ async fn a_worker_whose_store_is_not_the_jobs_renders_nothing_and_leaves_nothing
         }
     }
 
-    // It is mounted again. The identity is no part of what is published.
+    // The store is mounted again. The identity is not part of the published files.
     fs::rename(&mounted, &store).unwrap();
     assert_eq!(files(&store), before);
     place.run_with(1, 1, control()).await.unwrap();
@@ -400,7 +402,7 @@ async fn a_published_scene_that_lost_an_object_is_rendered_again_and_repaired() 
 async fn a_rendered_scene_waits_for_its_store_and_is_published_once_it_can_be() {
     let place = Place::new();
     place.run(0).await.unwrap();
-    // Scene 1's transient cannot be stored while a file stands where its folder belongs.
+    // Scene 1's transient cannot be stored while a file occupies the path of its folder.
     let stone = place.dataset().join("transient/c/1");
     fs::write(&stone, b"").unwrap();
     let control = Arc::new(Control::default());
@@ -413,7 +415,7 @@ async fn a_rendered_scene_waits_for_its_store_and_is_published_once_it_can_be() 
     let (output, ()) = tokio::join!(run, clear);
     assert_eq!(output.unwrap().manifest_sha256, sha256(&place.manifest(1)));
 
-    // A worker that is asked to stop does not wait on.
+    // A worker stops waiting when it is asked to stop.
     fs::write(place.dataset().join("transient/c/2"), b"").unwrap();
     let control = Arc::new(Control::default());
     let stop = async {

@@ -1,5 +1,5 @@
-//! Reprocessing stored scenes: what the sensor does to them in closed form, same bytes on any threads, adoption, and
-//! what is refused. The sources are made up: nothing is rendered.
+//! Reprocessing of stored scenes: the sensor's effects in closed form, equal bytes on any number of
+//! threads, adoption, and refused inputs. The sources are synthetic: nothing is rendered.
 
 use std::{collections::BTreeMap, fs, path::Path, sync::Arc};
 
@@ -21,7 +21,7 @@ const SIDE: u32 = 40;
 const BINS: u32 = 48;
 const PIXELS: usize = (SIDE * SIDE) as usize;
 
-/// A sensor that changes nothing but the unit: a photon for each 1/1000 of h.
+/// A sensor that changes only the unit: one photon per 1/1000 of h.
 fn ideal() -> Sensor {
     Sensor {
         pulse: Pulse::None {},
@@ -67,7 +67,7 @@ impl Place {
         }
     }
 
-    /// Publishes scene `index` of a source with room for four whose h is `h(pixel, bin)`.
+    /// Publishes scene `index` of a source with capacity four and histogram `h(pixel, bin)`.
     async fn publish(&self, index: u64, h: impl Fn(usize, usize) -> f32) {
         self.publish_as(index, spec(9), h).await;
     }
@@ -172,7 +172,7 @@ impl Place {
         .unwrap()
     }
 
-    /// Scene 0 measured: photons, `[pixel][bin]`, and the gate.
+    /// Returns scene 0 after the sensor: photons as `[pixel][bin]`, and the gate.
     async fn photons(&self) -> (Vec<f64>, Gate) {
         self.run(0).await.unwrap();
         let target = self.open("target", None).await;
@@ -226,7 +226,7 @@ fn spec(spots: u32) -> DatasetSpec {
     }
 }
 
-/// Some light everywhere, with a peak that wanders.
+/// A histogram with some light in every bin and a peak that varies by pixel.
 fn lively(pixel: usize, bin: usize) -> f32 {
     let peak = pixel % 40;
     if bin < peak {
@@ -284,7 +284,7 @@ async fn counts_are_whole_and_have_the_mean_and_the_variance_of_poisson() {
     let n = counts.len() as f64;
     let mean = counts.iter().sum::<f64>() / n;
     let variance = counts.iter().map(|c| (c - mean).powi(2)).sum::<f64>() / (n - 1.0);
-    // λ = 7; the variance of the variance of n Poisson numbers is about (2λ² + λ)/n.
+    // λ = 7; the variance of the sample variance of n Poisson numbers is about (2λ² + λ)/n.
     assert!((mean - 7.0).abs() < 5.0 * (7.0 / n).sqrt(), "{mean}");
     assert!(
         (variance - 7.0).abs() < 5.0 * (105.0 / n).sqrt(),
@@ -316,7 +316,8 @@ async fn a_pulse_moves_light_but_makes_and_loses_none() {
             .map(|(h, b)| h * f64::from(b))
             .sum::<f64>()
             / 40.0;
-        // The pulse's own mean: (2·1 + 1·2 + 4·4)/8 of its bins, which are the histogram's within 10⁻⁵.
+        // The mean of the pulse, (2·1 + 1·2 + 4·4)/8 of its bins, which are the histogram's bins
+        // within 10⁻⁵.
         assert!((mean - lit(p) as f64 - 2.5).abs() < 1e-3, "{mean}");
     }
 }
@@ -367,7 +368,7 @@ async fn the_same_bytes_on_any_number_of_threads_and_the_second_time_they_are_ad
         );
     }
     assert!(place.files("seven") == alone);
-    // Another seed is another draw; it does not go into the same place.
+    // Another seed gives another draw, which does not replace the stored one.
     place.settings.seed = 1;
     let text = place.complaint(0).await;
     assert!(

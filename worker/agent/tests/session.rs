@@ -222,7 +222,7 @@ async fn shutdown_takes_the_credit_back_and_hands_back_a_lease_that_was_under_wa
     c.listen_until("credit", |c| c.credit == 1).await;
     c.renew = false;
     worker.shutdown.cancel();
-    // Granted before the coordinator read of the withdrawal.
+    // Granted before the coordinator read the withdrawal.
     c.grant(lease(1, 0, 5)).await;
     let release = c.release().await;
     assert_eq!(release.lease, Some(lease(1, 0, 5).lease.into()));

@@ -1,4 +1,4 @@
-//! Evaluations by shards: whatever becomes of shards on their way, the figures are the same to the bit.
+//! Sharded evaluations: the figures are the same to the bit, whatever happens to the shards.
 
 mod place;
 
@@ -10,7 +10,7 @@ use serde_json::json;
 
 use place::*;
 
-/// The training side has five scenes.
+/// An evaluation of the training side, which has five scenes.
 fn evaluation(place: &Place, shards: u32) -> StageSpec {
     place.evaluation(json!({"models": ["m", "sh", "s"], "side": "train", "shards": shards}))
 }
@@ -22,7 +22,7 @@ fn shards_of(evaluation: &StageSpec) -> StageSpec {
     StageSpec::new(EvaluateShardTask { whole }.into())
 }
 
-/// What the shards of three models are called that lie in the store.
+/// Returns the names of the stored shards of three models.
 fn left(place: &Place) -> Vec<PathBuf> {
     let files = place.files("models").into_keys();
     files
@@ -30,7 +30,7 @@ fn left(place: &Place) -> Vec<PathBuf> {
         .collect()
 }
 
-/// What was found, all bytes.
+/// Returns the bytes of the stored evaluations.
 fn found(place: &Place) -> Files {
     let files = place.files("models").into_iter();
     files
@@ -76,7 +76,7 @@ async fn figures_are_the_same_to_the_bit_over_1_2_and_7_shards_in_any_order() {
         run(stage.clone()).await.unwrap();
         assert_eq!(found(&place), whole, "{shards} shards");
         assert_eq!(left(&place), [] as [PathBuf; 0], "shards are deleted");
-        // What comes late finds the evaluation, and leaves nothing.
+        // A late shard task finds the evaluation and writes nothing.
         assert!(run_one(shards_of(&stage), 1).await.unwrap().adopted);
         assert_eq!(left(&place), [] as [PathBuf; 0]);
     }
@@ -94,7 +94,8 @@ async fn shards_that_are_missing_damaged_or_of_another_scene_are_recomputed() {
     let there = left(&place);
     assert_eq!(there.len(), 9);
     let at = |k: usize| place.dir.path().join("models").join(&there[k]);
-    // Missing; torn; flipped; not packed at all; another shard of as many scenes (5 in 3 shards are 1, 2, 2).
+    // Shards that are missing, truncated, corrupted, not packed at all, or another shard with the
+    // same number of scenes (5 scenes in 3 shards are 1, 2, 2).
     std::fs::remove_file(at(0)).unwrap();
     let bytes = std::fs::read(at(1)).unwrap();
     std::fs::write(at(1), &bytes[..bytes.len() / 2]).unwrap();

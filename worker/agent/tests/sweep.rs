@@ -1,4 +1,5 @@
-//! Sweeps as tasks: trials that fall behind stop, those that diverge say so, and the best gets its name.
+//! Sweeps as tasks: trials that fall behind stop, trials that diverge report it, and the best model
+//! is promoted.
 
 mod place;
 
@@ -9,7 +10,7 @@ use serde_json::{Value, json};
 
 use place::*;
 
-/// The stages of a sweep over the place's data set, as a job file gives them.
+/// Returns the stages of a sweep over the place's data set, as a job file would.
 fn sweep(place: &Place, sweep: &Value, train: &Value) -> Vec<StageSpec> {
     let mut settings = json!({
         "target": "tof", "model": "m", "version": model_version(), "seed": 5, "net": {"width": 2, "levels": 2},
@@ -54,7 +55,8 @@ async fn all_trials(place: &Place) -> Vec<TrialRecord> {
 #[tokio::test(flavor = "multi_thread")]
 async fn trials_that_fall_behind_stop_and_the_best_gets_the_name() {
     let place = Place::new().await;
-    // Far too small a rate learns nothing: whoever comes after the others and is no better stops.
+    // A far too small learning rate learns nothing. A later trial stops if it is no better than the
+    // earlier ones.
     let over = json!({"over": {"lr": [1e-2, 1e-8, 2e-8, 3e-2]}, "stop": {"halving": {"first": 3, "factor": 3}}});
     let stages = sweep(&place, &over, &json!({}));
     let mut outputs = Vec::new();
@@ -81,7 +83,7 @@ async fn trials_that_fall_behind_stop_and_the_best_gets_the_name() {
         assert_eq!(there, trial.end == TrialEnd::Finished);
         assert_eq!(place.models().checkpoints(&trial.model).await.unwrap(), []);
     }
-    // The best is a copy that says of what.
+    // The promoted model is a copy and records its origin.
     let best = place.models().manifest("m").await.unwrap();
     let promoted = best.lineage.promoted.clone().unwrap();
     let source = place.models().manifest(&promoted.model).await.unwrap();
@@ -113,14 +115,14 @@ async fn trials_that_fall_behind_stop_and_the_best_gets_the_name() {
             .await
             .unwrap()
     );
-    // Asked again, nothing is computed and nothing changes.
+    // On a second run, nothing is computed and nothing changes.
     let before = place.files("models");
     for (stage, output) in stages.iter().zip(&outputs) {
         let again = run(stage.clone()).await.unwrap();
         assert_eq!(again.manifest_sha256, output.manifest_sha256);
     }
     assert_same(&place.files("models"), &before);
-    // Run again although they are done, they come to the same ends.
+    // With `force`, finished trials run again and end in the same way.
     for mut stage in stages {
         stage.force = true;
         run(stage).await.unwrap();
@@ -138,10 +140,11 @@ async fn who_is_worse_than_the_median_of_the_others_stops() {
     }
     let trials = all_trials(&place).await;
     let ends: Vec<(&TrialEnd, u64)> = trials.iter().map(|t| (&t.end, t.epochs)).collect();
-    // The second has one other to compare with, which is too few; the third learns nothing and has two.
+    // The second trial has only one other to compare with, which is too few. The third learns
+    // nothing and has two.
     let (finished, pruned) = ((&TrialEnd::Finished, 9), (&TrialEnd::Pruned, 3));
     assert_eq!(ends, [finished, finished, pruned, pruned]);
-    // Where they were asked, and what the sweep's domain was, is on record.
+    // The rungs of the trials and the sweep's domain are stored.
     let id = place.models().sweeps("m").await.unwrap();
     let (_, rungs) = place
         .models()
@@ -168,7 +171,7 @@ async fn who_is_worse_than_the_median_of_the_others_stops() {
 #[tokio::test(flavor = "multi_thread")]
 async fn trials_of_a_bracket_are_compared_with_one_another_alone() {
     let place = Place::new().await;
-    // Of 9 epochs, with the only rung after 3: trials 0, 2 and 4 are asked there, 1 and 3 never.
+    // Of 9 epochs, with the only rung after 3: trials 0, 2 and 4 are judged there, 1 and 3 never.
     let stop = json!({"hyperband": {"first": 3, "factor": 3}});
     let over = json!({"over": {"lr": [1e-2, 1e-8, 2e-8, 3e-8]}, "stop": stop});
     for stage in sweep(&place, &over, &json!({})) {
@@ -192,7 +195,7 @@ async fn a_trial_computes_what_the_training_computes_without_a_sweep() {
     );
     run(plain).await.unwrap();
     assert_same(&place.files("models/m.0"), &calm.files("models/m.0"));
-    // What a plain training has done, a trial takes.
+    // A trial adopts the result of a plain training with the same key.
     let taken = sweep(&calm, &json!({"over": {"lr": [1e-2]}}), &json!({}));
     assert!(run(taken[0].clone()).await.unwrap().adopted);
     assert_eq!(all_trials(&calm).await, all_trials(&place).await);
@@ -209,7 +212,7 @@ async fn trials_that_are_stopped_again_and_again_end_as_those_that_never_were() 
     }
     let mut stops = 0;
     for stage in sweep(&place, &over, &train) {
-        // Share 0.1 is the first rung: some stops fall right on it.
+        // A share of 0.1 is the first rung: some stops happen exactly there.
         for share in [0.05, 0.099, 0.0995, 0.2, 0.5] {
             stops += u32::from(run_until(stage.clone(), share).await);
         }
@@ -223,7 +226,7 @@ async fn trials_that_are_stopped_again_and_again_end_as_those_that_never_were() 
 async fn a_trial_whose_numbers_break_is_a_result_and_not_a_failure() {
     let place = Place::new().await;
     let over = json!({"over": {"lr": [10.0, 1e-2]}});
-    // With such a decay each step makes the weights of the last layer nine times as large.
+    // With this weight decay, each step makes the weights of the last layer nine times as large.
     let optimise = |lr: Value| json!({"epochs": 40, "batch": 2, "learning_rate": lr, "weight_decay": 0.999, "schedule": "constant"});
     for stage in sweep(&place, &over, &json!({"optimise": optimise(json!("{lr}"))})) {
         run(stage).await.unwrap();
@@ -238,7 +241,7 @@ async fn a_trial_whose_numbers_break_is_a_result_and_not_a_failure() {
     );
     let best = place.models().manifest("m").await.unwrap();
     assert_eq!(best.lineage.promoted.unwrap().model, "m.1");
-    // Alone, it is the training's own failure.
+    // Outside a sweep, divergence is the training's own failure.
     let plain = place.training(json!({"model": "x", "optimise": optimise(json!(10.0))}));
     assert!(refused(plain).await.contains("finite"));
 }
@@ -282,7 +285,7 @@ async fn what_cannot_be_compared_is_refused() {
         "{said}"
     );
     assert!(place.models().look("best").await.unwrap().is_none());
-    // Another model under the name stays.
+    // A different model under the name is kept.
     run(promotion(&place, &["a"])).await.unwrap();
     run(place.training(json!({"model": "c", "seed": 9, "optimise": {"epochs": 40, "batch": 2}})))
         .await

@@ -1,5 +1,5 @@
-//! Training and evaluating as tasks: published once, gone on with after a stop or a loss, and what is refused. The data
-//! are made up: nothing is rendered.
+//! Training and evaluation as tasks: published once, resumed after a stop or a loss, and refused
+//! for unsuitable inputs. The data are synthetic: nothing is rendered.
 
 mod place;
 
@@ -67,7 +67,7 @@ async fn a_training_that_is_stopped_again_and_again_ends_as_one_that_never_was()
         stops += 1;
         assert!(!place.models().checkpoints("m").await.unwrap().is_empty());
         if stops % 2 == 0 {
-            // The newest checkpoint is torn: the one before is used.
+            // The newest checkpoint is truncated, so the previous one is used.
             let checkpoints = place.files("models/m/checkpoints");
             let (newest, bytes) = checkpoints.last_key_value().unwrap();
             let path = place.dir.path().join("models/m/checkpoints").join(newest);
@@ -246,7 +246,7 @@ async fn scenes_without_the_truth_that_is_needed_are_refused_by_name() {
             [json!({}), known_times],
         ),
     ] {
-        // Scenes 0, 3 and 6 lack it, whichever side they are on.
+        // Scenes 0, 3 and 6 lack it, on either side of the split.
         let place = Place::lacking(&[missing, "normal"]).await;
         for more in refused_are {
             let said = refused(place.training(more)).await;
@@ -293,7 +293,7 @@ async fn models_are_not_judged_by_truth_that_is_missing() {
         let said = refused(other.evaluation(evaluation)).await;
         assert!(said.contains(&format!(" lack {missing} (scene ")), "{said}");
     }
-    // What is only asked needs no truth, but for what it is given.
+    // Inference needs no ground truth except for its own inputs.
     let other = Place::lacking(&["depth", "visibility", "specular"]).await;
     link(&other);
     run(other.inference(json!({}))).await.unwrap();
@@ -323,7 +323,7 @@ async fn two_bounce_times_follow_from_the_depths_that_an_infer_stage_has_kept() 
     assert_eq!(kept.lineage.models["m"], tof.sha256());
     assert_eq!(kept.lineage.times.as_ref().unwrap().predictions, "depths");
 
-    // The folder's name is no part of what comes out; its bytes are.
+    // The name of the folder does not affect the result; its bytes do.
     place.predict("m", "again").await;
     place
         .predict_with(json!({"model": "other", "seed": 9}), "others")
@@ -348,7 +348,7 @@ async fn two_bounce_times_follow_from_the_depths_that_an_infer_stage_has_kept() 
     assert_ne!(hash(&of("else").await), hash(&kept));
     assert_ne!(hash(&of("true").await), hash(&kept));
 
-    // An evaluation takes the training's times, or those that it is told to take.
+    // An evaluation uses the training's times unless its settings name others.
     for (model, times, found) in [
         ("sh", "", "depths"),
         ("sh", "others", "others"),
@@ -380,12 +380,12 @@ async fn predictions_that_do_not_fit_are_refused_by_name_before_anything_is_lear
             json!({"target": "shadow", "model": "x", "shadow": shadow, "optimise": short}),
         )
     };
-    // Masks alone.
+    // Predictions of masks only.
     place.predict("s", "mirrors").await;
     // A scene is missing.
     place.predict("m", "short").await;
     std::fs::remove_file(place.dir.path().join("short/manifests/4.json")).unwrap();
-    // Depths by two models.
+    // Depths from two models.
     place.predict("m", "mixed").await;
     place
         .predict_with(json!({"model": "other", "seed": 9}), "others")
@@ -410,7 +410,7 @@ async fn predictions_that_do_not_fit_are_refused_by_name_before_anything_is_lear
             "{said}"
         );
     }
-    // The scenes are made anew; what was predicted of them before is not of them.
+    // The scenes are made again, so that earlier predictions belong to other scenes.
     let other = Place::lacking(&["normal"]).await;
     for folder in ["models", "depths"] {
         let (from, to) = (place.dir.path().join(folder), other.dir.path().join(folder));
@@ -445,13 +445,13 @@ async fn processes_train_together_to_the_bits_of_one_and_leave_nothing_behind() 
     let all = (0..3).map(|task| run_at(stage.clone(), task, Arc::default()));
     let found = futures::future::join_all(all).await;
     let outputs: Vec<_> = found.into_iter().map(Result::unwrap).collect();
-    // One of them has kept it, whoever that was.
+    // At least one of the processes has stored the network; any may be the one.
     assert!(outputs.iter().any(|output| !output.adopted), "{outputs:?}");
     for output in &outputs {
         assert_eq!(output.manifest_sha256, outputs[0].manifest_sha256);
     }
     assert_same(&place.files("models"), &alone.files("models"));
-    // Asked again, each finds it.
+    // On a second run, each process finds the stored model.
     for task in 0..3 {
         assert!(
             run_at(stage.clone(), task, Arc::default())
@@ -475,7 +475,7 @@ async fn a_sensor_draws_anew_at_each_visit_and_the_same_on_any_machine() {
     };
     let (place, again, calm) = (Place::new().await, Place::new().await, Place::new().await);
     run(place.training(with(json!({})))).await.unwrap();
-    // Stopped half-way and gone on with elsewhere.
+    // The training is stopped half-way and resumed elsewhere.
     assert!(run_until(again.training(with(json!({}))), 0.4).await);
     run(again.training(with(json!({})))).await.unwrap();
     assert_eq!(place.files("models"), again.files("models"));
@@ -489,7 +489,8 @@ async fn a_sensor_draws_anew_at_each_visit_and_the_same_on_any_machine() {
         calm.files("models").keys().collect::<Vec<_>>(),
         "photons change what is learnt"
     );
-    // A step sees all five scenes; at a rate of almost zero its loss differs by the noise alone.
+    // A step sees all five scenes. With a learning rate of almost zero, its loss varies only with
+    // the noise.
     let still = json!({"model": "still", "optimise": {"epochs": 6, "batch": 5, "learning_rate": 1e-8, "weight_decay": 0.0, "schedule": "constant"}});
     let losses = |place: &Place| {
         let path = place.files("models/still");

@@ -1,4 +1,5 @@
-//! `picofarm bench dataset`: what looking after very many scenes costs: listing, verifying, snapshots, collection.
+//! `picofarm bench dataset`: the cost of operations on very many scenes: listing, verifying,
+//! snapshots, collection.
 
 mod simulate;
 
@@ -28,12 +29,13 @@ struct Row {
     scenes: u64,
     what: &'static str,
     seconds: f64,
-    /// CPU time of this process, the system's on its behalf included: what other programs do meanwhile does not count.
+    /// CPU time of this process, including the system's on its behalf. Other programs do not affect
+    /// it.
     cpu_seconds: f64,
     cpu_us_per_scene: f64,
-    /// Largest resident memory of this process meanwhile; `None` where the system does not tell.
+    /// Maximum resident memory of this process meanwhile; `None` if the system does not report it.
     peak_bytes: Option<u64>,
-    /// What it found, or made.
+    /// Result of the operation.
     result: String,
 }
 
@@ -100,7 +102,7 @@ async fn grow(
     .map_err(|e| CliError::new(Code::Failed, format!("the benchmark broke: {e}")))?
 }
 
-/// Everything that is measured, on the data set as it is now.
+/// Measures all operations on the data set in its current state.
 async fn look(simulated: &Simulated, output: Output) -> Result<Vec<Row>> {
     let scenes = simulated.scenes;
     let mut rows = Vec::new();
@@ -166,7 +168,7 @@ async fn look(simulated: &Simulated, output: Output) -> Result<Vec<Row>> {
         watch,
         format!("{} scenes, whole", report.scenes),
     );
-    // It names the scene that is to be orphaned.
+    // The snapshot names the scene that will be orphaned.
     let place = dataset.snapshot_place(&snapshot.name);
     std::fs::remove_file(&place).map_err(|e| io(&place, &e))?;
 
@@ -218,12 +220,12 @@ fn text(rows: &[Row]) -> String {
     table(&all)
 }
 
-/// Time, CPU time, and the largest resident memory since it was started.
+/// Time, CPU time, and the maximum resident memory since the start.
 struct Watch(Instant, Duration);
 
 impl Watch {
     fn start() -> Self {
-        // Resets the peak that the kernel keeps; where there is no such file, none is reported either.
+        // Resets the kernel's peak. If the file does not exist, no peak is reported either.
         let _ = std::fs::write("/proc/self/clear_refs", "5");
         Self(Instant::now(), cpu_time())
     }

@@ -1,5 +1,6 @@
-//! A data set of very many scenes of a few bytes each: real objects under real keys with true manifests, written past the
-//! store and linked to one another where the file system can, so that it costs folders more than bytes.
+//! A data set of very many scenes of a few bytes each: real objects under real keys with correct
+//! manifests. They are written without the store, and hard-linked if the file system supports it,
+//! so that the data set needs folders rather than bytes.
 
 use std::{
     collections::BTreeMap,
@@ -21,13 +22,13 @@ use picofarm_cli::{
 pub struct Simulated {
     pub folder: PathBuf,
     manifest: Manifest,
-    /// By key without its scene: a file to link to.
+    /// A file to link to, by the key without its scene.
     models: BTreeMap<String, PathBuf>,
     pub scenes: u64,
 }
 
 impl Simulated {
-    /// One scene, truly published, and room for `room`.
+    /// Creates the data set with one properly published scene and capacity `room`.
     pub async fn start(folder: &Path, room: u64) -> Result<Self> {
         let spec = DatasetSpec {
             scenes: room,
@@ -104,7 +105,7 @@ impl Simulated {
                 .or_insert_with_key(|model| self.folder.join(model));
             match fs::hard_link(&*from, &to) {
                 Ok(()) => {}
-                // So many links to a file, or none at all, and not more.
+                // The file system does not support links, or no more links to this file.
                 Err(e)
                     if matches!(
                         e.kind(),
@@ -125,7 +126,7 @@ impl Simulated {
         Ok(())
     }
 
-    /// Takes the manifest of the last scene away, so that there is something to collect.
+    /// Removes the manifest of the last scene, so that there is something to collect.
     pub fn orphan(&self) -> Result<PathBuf> {
         let path = self.folder.join(Manifest::key(self.scenes - 1));
         let away = self.folder.with_extension("orphan");
@@ -133,14 +134,14 @@ impl Simulated {
         Ok(away)
     }
 
-    /// Puts it back.
+    /// Restores the manifest.
     pub fn adopt(&self, away: &Path) -> Result<()> {
         let path = self.folder.join(Manifest::key(self.scenes - 1));
         fs::rename(away, &path).map_err(|e| io_error(path.display(), &e))
     }
 }
 
-/// The key of scene 0's object for another scene.
+/// Converts the key of scene 0's object to another scene.
 fn renamed(key: &str, scene: u64) -> String {
     let mut parts: Vec<&str> = key.split('/').collect();
     let number = scene.to_string();
@@ -150,7 +151,7 @@ fn renamed(key: &str, scene: u64) -> String {
     parts.join("/")
 }
 
-/// The folder, if nothing lies there.
+/// Checks that the folder is empty or does not exist.
 pub fn empty(folder: &Path) -> Result<()> {
     match fs::read_dir(folder) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),

@@ -1,4 +1,5 @@
-//! Heartbeats beside plans of large jobs: nobody's leases may depend on what others submit.
+//! Measures heartbeats while large jobs are planned, because submissions of other users must not
+//! endanger leases.
 
 use std::time::{Duration, Instant};
 
@@ -13,18 +14,18 @@ use picofarm_cli::{
     output::table,
 };
 
-/// Life of a lease, seconds: workers report six times in it.
+/// Duration of a lease, in seconds. Workers send six heartbeats in it.
 const LEASE_S: f64 = 6.0;
-/// How long heartbeats are measured with nothing beside them.
+/// Duration of the measurement of heartbeats without other load.
 const ALONE: Duration = Duration::from_secs(5);
 
-/// What was found.
+/// Results of the measurement.
 #[derive(Debug, Serialize)]
 pub struct Beside {
     workers: usize,
     plans: usize,
     plan_bytes: usize,
-    /// Until the last plan was answered.
+    /// Seconds until the last plan was answered.
     plans_s: f64,
     alone: Latency,
     beside: Latency,
@@ -96,9 +97,9 @@ impl Beside {
     }
 }
 
-/// A job of so many files that its spec has this size.
+/// Returns a job with enough files that its spec has this size.
 fn large(number: usize, megabytes: u64) -> JobSpec {
-    // What one file takes as JSON.
+    // Size of one file as JSON.
     const EACH: u64 = 160;
     let file = |i: u64| {
         serde_json::json!({

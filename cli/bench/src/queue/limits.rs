@@ -1,6 +1,8 @@
-//! What the database does by itself, each transaction durable. For benches. Two limits: a queue with a row a task, where
-//! clients claim batches in one transaction and complete them in another, which is what a scheduler without ranges would be;
-//! and rows of the size of an output, appended by one client as fast as it takes them, which no catalog can pass.
+//! Measures limits of the database itself with durable transactions, for comparison. The first
+//! limit is a queue with a row per task, where clients claim batches in one transaction and
+//! complete them in another, as a scheduler without ranges would. The second is rows of the size of
+//! an output, appended by one client as fast as the database accepts them; no catalog can exceed
+//! this.
 
 use std::{
     path::Path,
@@ -17,12 +19,13 @@ use picofarm_database::CatalogPlace;
 const TABLE: &str = "CREATE TABLE raw_limit (set_key BIGINT NOT NULL, task BIGINT NOT NULL, manifest {bytes} NOT NULL, \
                      bytes BIGINT NOT NULL, seconds DOUBLE PRECISION NOT NULL, PRIMARY KEY (set_key, task))";
 
-/// Tasks a second that clients claim and complete in a table with a row a task, `batch` a transaction: on Postgres eight
-/// clients, with `SKIP LOCKED`; on SQLite the one writer that it allows. Takes about `time`; leaves nothing behind. The
-/// catalog must not be open in SQLite's case.
+/// Returns the tasks per second that clients claim and complete in a table with a row per task,
+/// `batch` per transaction: on Postgres with eight clients and `SKIP LOCKED`; on SQLite with the
+/// only writer that it allows. Takes about `time` and leaves nothing behind. The catalog must not
+/// be open in SQLite's case.
 ///
 /// # Errors
-/// When the database cannot be written.
+/// Fails if the database cannot be written.
 pub async fn queue_limit(
     place: &CatalogPlace,
     batch: usize,
@@ -39,11 +42,11 @@ pub async fn queue_limit(
     }
 }
 
-/// Rows a second that one client writes with `batch` rows a transaction. Takes about `time`; leaves nothing behind.
-/// The catalog must not be open in SQLite's case.
+/// Returns the rows per second that one client writes with `batch` rows per transaction. Takes
+/// about `time` and leaves nothing behind. The catalog must not be open in SQLite's case.
 ///
 /// # Errors
-/// When the database cannot be written.
+/// Fails if the database cannot be written.
 pub async fn raw_limit(
     place: &CatalogPlace,
     batch: usize,
@@ -72,14 +75,14 @@ fn remove_raw(path: &Path) {
     for suffix in ["", "-wal", "-shm"] {
         let mut file = path.to_owned().into_os_string();
         file.push(suffix);
-        // Not all of them are there.
+        // Not all of these files exist.
         let _ = std::fs::remove_file(file);
     }
 }
 
-/// Clients of a Postgres queue.
+/// Number of clients of a Postgres queue.
 const CLIENTS: usize = 8;
-/// Tasks in the queue: more than are done in the time.
+/// Number of tasks in the queue: more than can be done in the time.
 const QUEUED: i64 = 300_000;
 const QUEUE: &str = "CREATE TABLE raw_queue (task BIGINT PRIMARY KEY, state SMALLINT NOT NULL, worker BIGINT NOT NULL, \
                      manifest {bytes})";
@@ -155,7 +158,7 @@ async fn postgres_queue(url: &str, batch: usize, time: Duration) -> Result<f64, 
     Ok(rate)
 }
 
-/// Claims and completes until the time is over; how many.
+/// Claims and completes tasks until the time is over, and returns their number.
 async fn postgres_client(
     url: &str,
     me: i64,

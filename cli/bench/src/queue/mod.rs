@@ -1,5 +1,6 @@
-//! `picofarm bench queue`: the scheduler without the work. Simulated workers speak the real protocol over gRPC with a
-//! coordinator in a process of its own, and every task is committed for good; only rendering is left out.
+//! `picofarm bench queue`: measures the scheduler without the work. Simulated workers use the real
+//! protocol over gRPC with a coordinator in a process of its own, and every task is durably
+//! committed. Only rendering is left out.
 
 mod beside;
 mod limits;
@@ -29,10 +30,11 @@ use picofarm_cli::{
 use server::Server;
 use stats::{Latency, Stats};
 
-/// Rows a transaction for which the raw limit is measured, beside the coordinator's own.
+/// Rows per transaction for which the raw limit is measured, in addition to the coordinator's own
+/// number.
 const RAW: [usize; 3] = [1, 100, 1000];
 
-/// What was found.
+/// Results of the benchmark.
 #[derive(Debug, Serialize)]
 struct Report {
     catalog: String,
@@ -43,7 +45,7 @@ struct Report {
     beside: Option<beside::Beside>,
 }
 
-/// How long it took to submit a job.
+/// Time to submit a job.
 #[derive(Debug, Serialize)]
 struct Submit {
     tasks: u64,
@@ -61,25 +63,27 @@ struct Throughput {
     tasks_per_second: f64,
     coordinator_cpu_s: f64,
     coordinator_peak_bytes: u64,
-    /// Rows a second that one client writes into the same database, by rows a transaction, before and after.
+    /// Rows per second that one client writes into the same database, by rows per transaction,
+    /// before and after.
     raw: Vec<raw::Raw>,
-    /// Tasks in a commit of the coordinator's, on average.
+    /// Mean number of tasks in a commit of the coordinator.
     tasks_per_commit: f64,
-    /// `tasks_per_second` over what a queue with a row a task does with as many tasks a transaction, measured right after.
+    /// Ratio of `tasks_per_second` to the rate of a queue with a row per task and the same number
+    /// of tasks per transaction, measured right after.
     of_queue: Option<f64>,
-    /// The same over rows that are only appended.
+    /// Ratio of `tasks_per_second` to the rate of rows that are only appended.
     of_append: Option<f64>,
 }
 
-/// Workers with tasks of a fixed length.
+/// Workers with tasks of a fixed duration.
 #[derive(Debug, Serialize)]
 struct Fleet {
     workers: usize,
     task_s: f64,
     tasks: u64,
     wall_s: f64,
-    /// Busy time over workers × wall time, from the first lease to the last commit less one task's length (the last
-    /// round ends raggedly).
+    /// Busy time over workers × wall time, from the first lease to the last commit minus the
+    /// duration of one task (the workers finish the last round at different times).
     efficiency: f64,
     lease: Latency,
     heartbeat: Latency,
@@ -87,15 +91,15 @@ struct Fleet {
     refused: u64,
     revoked: u64,
     coordinator_cpu_s: f64,
-    /// CPU seconds of the coordinator for each second of wall time.
+    /// CPU seconds of the coordinator per second of wall time.
     coordinator_load: f64,
     coordinator_peak_bytes: u64,
 }
 
-/// Runs the whole bench.
+/// Runs the whole benchmark.
 ///
 /// # Errors
-/// A coordinator that does not start, or workers that it refuses.
+/// Fails if the coordinator does not start, or if it refuses workers.
 pub async fn run(args: BenchQueue, output: Output, stop: &CancellationToken) -> Result<()> {
     let scratch = tempfile::tempdir()
         .map_err(|e| CliError::new(Code::Resource, format!("a scratch folder: {e}")))?;
@@ -151,7 +155,7 @@ impl Bench<'_> {
         let start = Instant::now();
         let job = client.submit(spec(tasks), false).await?.job;
         let seconds = start.elapsed().as_secs_f64();
-        // It would share the workers of what follows.
+        // Otherwise it would share the workers of the next measurement.
         client.cancel(job).await?;
         let coordinator_peak_bytes = server.usage()?.peak_bytes;
         self.output
@@ -214,7 +218,7 @@ impl Bench<'_> {
         let job = client.submit(spec(tasks), false).await?.job;
         let mut cpu_s = 0.0;
         if self.args.restart {
-            // All lose their coordinator in the middle of a task, and come back at once.
+            // All workers lose their coordinator in the middle of a task, and reconnect at once.
             tokio::time::sleep(task.mul_f64(1.5)).await;
             cpu_s -= before.cpu_s;
             cpu_s += server.kill_and_restart().await?.cpu_s;
@@ -277,7 +281,7 @@ impl Bench<'_> {
     }
 }
 
-/// Simulated workers at work.
+/// Running simulated workers.
 struct Running {
     stats: Arc<Stats>,
     workers: JoinSet<()>,
@@ -331,7 +335,7 @@ impl Running {
     }
 }
 
-/// A job that nobody renders, with a data set of its own.
+/// Returns a job that no real worker renders, with a data set of its own.
 fn spec(tasks: u64) -> JobSpec {
     let dataset = format!("bench-{}", uuid::Uuid::new_v4().simple());
     let spec = serde_json::json!({

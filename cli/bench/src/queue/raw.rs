@@ -1,5 +1,5 @@
-//! What the database itself can do: a queue with a row a task, and rows of the size of an output, in transactions that
-//! are durable.
+//! Measures limits of the database itself: a queue with a row per task, and rows of the size of an
+//! output, in durable transactions.
 
 use std::time::Duration;
 
@@ -15,16 +15,16 @@ use super::limits;
 pub struct Raw {
     /// Rows in a transaction.
     pub batch: usize,
-    /// Claimed and completed, where each task is a row.
+    /// Rate of claimed and completed tasks, with a row per task.
     pub tasks_per_second: f64,
-    /// Only appended.
+    /// Rate of appended rows.
     pub rows_per_second: f64,
 }
 
 /// Measures with these batch sizes, about two seconds each.
 ///
 /// # Errors
-/// A database that cannot be written.
+/// Fails if the database cannot be written.
 pub async fn measure(place: &CatalogPlace, batches: &[usize]) -> Result<Vec<Raw>> {
     let mut found = Vec::new();
     for batch in batches.iter().copied() {

@@ -13,17 +13,17 @@ use picofarm_cli::{
     error::{CliError, Code, Result},
 };
 
-/// A coordinator's process; killed when dropped.
+/// A coordinator's process, killed on drop.
 pub struct Server {
     child: Child,
     url: String,
-    /// Where its metrics are, `host:port`.
+    /// Address of its metrics, `host:port`.
     http: String,
     place: CatalogPlace,
     lease_s: f64,
 }
 
-/// What a process has used.
+/// Resources used by a process.
 #[derive(Debug, Clone, Copy)]
 pub struct Usage {
     pub cpu_s: f64,
@@ -56,7 +56,8 @@ impl Server {
         Client::connect(&self.url, &picofarm_agent::Access::default()).await
     }
 
-    /// Kills the process without a word and starts another in its place; returns what the first had used.
+    /// Kills the process and starts another on the same catalog. Returns the resources used by the
+    /// first.
     pub async fn kill_and_restart(&mut self) -> Result<Usage> {
         let usage = self.usage()?;
         self.end();
@@ -67,7 +68,7 @@ impl Server {
         Ok(usage)
     }
 
-    /// Commits to the catalog so far.
+    /// Returns the number of commits to the catalog so far.
     pub fn commits(&self) -> Result<u64> {
         let failed =
             |e: std::io::Error| CliError::new(Code::Resource, format!("reading metrics: {e}"));
@@ -88,7 +89,7 @@ impl Server {
             .ok_or_else(|| CliError::new(Code::Failed, "the coordinator's metrics lack commits"))
     }
 
-    /// CPU time and peak memory so far.
+    /// Returns CPU time and peak memory so far.
     pub fn usage(&self) -> Result<Usage> {
         let id = self.child.id();
         let read = |file: &str| {
@@ -160,7 +161,7 @@ fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, Str
         .args(["--check-stores", "none"])
         // A lost session counts until it is noticed.
         .args(["--max-sessions", "100000"])
-        // Not an argument: it may hold a password.
+        // Not as an argument, because it may contain a password.
         .env("PICOFARM_CATALOG", url)
         .stdout(Stdio::piped())
         .spawn()

@@ -1,4 +1,4 @@
-//! What simulated workers tell, together.
+//! Combined measurements of simulated workers.
 
 use std::{
     sync::{
@@ -10,7 +10,7 @@ use std::{
 
 use serde::Serialize;
 
-/// Shared by all workers of a fleet.
+/// Measurements shared by all workers of a fleet.
 #[derive(Default)]
 pub struct Stats {
     connected: AtomicU64,
@@ -29,7 +29,7 @@ struct Measured {
     trouble: Option<String>,
 }
 
-/// Milliseconds that something took.
+/// Distribution of a duration, in milliseconds.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Latency {
     pub p50_ms: f64,
@@ -57,7 +57,7 @@ impl Stats {
         self.measured.lock().expect("no panic while locked")
     }
 
-    /// A worker was welcomed, for the first time or again.
+    /// Records that a worker was welcomed. `again`: after a reconnect.
     pub fn welcomed(&self, again: bool) {
         match again {
             true => self.reconnects.fetch_add(1, Relaxed),
@@ -110,7 +110,7 @@ impl Stats {
         self.measured().trouble.clone()
     }
 
-    /// From the first lease to the last acknowledgement.
+    /// Returns the times of the first lease and of the last acknowledgement.
     pub fn span(&self) -> (Instant, Instant) {
         let measured = self.measured();
         let now = Instant::now();
@@ -121,7 +121,7 @@ impl Stats {
         latency(self.measured().lease.clone())
     }
 
-    /// The heartbeats since the last time this was asked.
+    /// Returns the latencies of heartbeats since the last call.
     pub fn heartbeats_since(&self) -> Latency {
         latency(std::mem::take(&mut self.measured().heartbeat))
     }

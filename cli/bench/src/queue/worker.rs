@@ -1,5 +1,5 @@
-//! A worker that works nothing: it takes leases, waits as long as a task lasts, reports, and keeps its leases over
-//! reconnects, as the real one does.
+//! A simulated worker without work. It takes leases, waits for the duration of a task, reports, and
+//! retains its leases over reconnects, as a real worker does.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -24,9 +24,9 @@ use uuid::Uuid;
 
 use super::stats::Stats;
 
-/// The renderer that bench jobs ask for: no real worker takes them.
+/// The renderer version that bench jobs request, so that no real worker takes them.
 pub const RENDERER: &str = "bench";
-/// Leases that a worker of no-op tasks has at a time, so that it never waits for one.
+/// Number of leases that a worker of no-op tasks has at a time, so that it never waits for one.
 const IN_FLIGHT: u32 = 2;
 
 pub struct Simulated {
@@ -37,11 +37,11 @@ pub struct Simulated {
     leases: VecDeque<Held>,
     /// Reported and not acknowledged.
     unacknowledged: BTreeMap<(LeaseRef, u64), Finished>,
-    /// When the task in hand is done.
+    /// When the current task is done.
     done_at: Option<Instant>,
-    /// When a lease was asked for, for each that was not received yet.
+    /// Times of requests for leases that have not been received yet.
     asked: VecDeque<Instant>,
-    /// It has been connected before.
+    /// Whether it has been connected before.
     welcomed: bool,
 }
 
@@ -88,7 +88,7 @@ impl Simulated {
         }
     }
 
-    /// Works until `stop`, connecting again whenever the connection is lost.
+    /// Works until `stop`, and reconnects whenever the connection is lost.
     pub async fn live(mut self, stop: CancellationToken) {
         loop {
             match self.session(&stop).await {
@@ -96,7 +96,7 @@ impl Simulated {
                 End::Refused(why) => return self.stats.fail(why),
                 End::Lost => {}
             }
-            // Jittered, as the real worker's.
+            // Jittered, as in a real worker.
             let wait = Duration::from_millis(100 + u64::from(Uuid::new_v4().as_bytes()[0]));
             tokio::select! {
                 () = tokio::time::sleep(wait) => {}
@@ -134,7 +134,7 @@ impl Simulated {
             })) => w,
             Ok(_) | Err(_) => return End::Lost,
         };
-        // An attempt that was lost before the first welcome is no reconnect.
+        // An attempt that failed before the first welcome is not a reconnect.
         self.stats.welcomed(self.welcomed);
         self.welcomed = true;
         for report in self.unacknowledged.values() {
@@ -222,7 +222,7 @@ impl Simulated {
         Ok(())
     }
 
-    /// The task in hand is done: report it, begin the next, ask for more when there is none.
+    /// Reports the current task as done, starts the next one, and requests leases if there is none.
     fn task_done(&mut self, to: &Outgoing) {
         self.done_at = None;
         if let Some(held) = self.leases.front_mut() {
@@ -266,10 +266,10 @@ impl Simulated {
         self.unacknowledged.insert((lease, index), report);
     }
 
-    /// Asks for as many leases as are missing.
+    /// Requests the missing leases.
     fn ask(&mut self, to: &Outgoing) {
         let wanted = match self.task.is_zero() {
-            // Those of which reports wait for an answer count as work at hand.
+            // Leases with unacknowledged reports count as work in progress.
             true if self.unacknowledged.len() > 1024 => 0,
             true => IN_FLIGHT,
             false => u32::from(self.leases.is_empty()),
@@ -285,7 +285,7 @@ impl Simulated {
 type Outgoing = mpsc::UnboundedSender<wire::SessionRequest>;
 
 fn say(to: &Outgoing, message: Say) {
-    // A connection that is gone shows when it is listened to.
+    // A closed connection is noticed when reading from it.
     let _ = to.send(wire::SessionRequest {
         message: Some(message),
     });

@@ -1,4 +1,4 @@
-//! A store that counts the bytes and requests that are read through it.
+//! A store that counts the bytes and requests of reads.
 
 use std::{
     fmt,
@@ -17,7 +17,7 @@ use object_store::{
     PutMultipartOptions, PutOptions, PutPayload, PutResult, Result, path::Path,
 };
 
-/// See the module.
+/// A counting wrapper of a store.
 #[derive(Debug)]
 pub struct Counting {
     inner: Arc<dyn ObjectStore>,
@@ -34,7 +34,7 @@ impl Counting {
         }
     }
 
-    /// Bytes and requests since the last call.
+    /// Returns bytes and requests since the last call.
     pub fn take(&self) -> (u64, u64) {
         let take = |counter: &AtomicU64| counter.swap(0, Ordering::Relaxed);
         (take(&self.bytes), take(&self.requests))

@@ -12,12 +12,12 @@ fn read(clock: ClockId) -> Duration {
     )
 }
 
-/// Seconds that the calling thread computes during `work`.
+/// Returns the CPU seconds of the calling thread during `work`.
 pub fn of_thread<T>(work: impl FnOnce() -> T) -> (T, f64) {
     measured(ClockId::ThreadCPUTime, work)
 }
 
-/// Seconds that all threads of this process compute during `work`.
+/// Returns the CPU seconds of all threads of this process during `work`.
 pub fn of_process<T>(work: impl FnOnce() -> T) -> (T, f64) {
     measured(ClockId::ProcessCPUTime, work)
 }

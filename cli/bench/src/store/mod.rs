@@ -26,14 +26,14 @@ use picofarm_cli::{
 use reading::Reading;
 use sample::{Loss, Sample};
 
-/// Scenes of the whole data set.
+/// Number of scenes of the whole data set.
 const SCENES: f64 = 97_432.0;
-/// Values of one of its scenes.
+/// Number of values of one of its scenes.
 const VALUES: f64 = 256.0 * 256.0 * 637.0;
-/// Times that each scene is coded and decoded; the fastest counts.
+/// Number of times that each scene is encoded and decoded; the fastest counts.
 const REPEATS: usize = 2;
 
-/// What was found.
+/// Results of the benchmark.
 #[derive(Debug, Serialize)]
 struct Report {
     machine: Machine,
@@ -46,7 +46,7 @@ struct Report {
 struct Machine {
     processor: String,
     cores: usize,
-    /// Whether this program is optimised; times of others mean nothing.
+    /// Whether this program is built with optimisation; otherwise times are meaningless.
     optimised: bool,
 }
 
@@ -55,10 +55,10 @@ struct Scene {
     scene: u64,
     size: [usize; 3],
     photons_per_unit: f32,
-    /// Shares of bins without light, and with less than a photon.
+    /// Fractions of bins without light, and with less than a photon.
     dark: f64,
     below_one_photon: f64,
-    /// Bins of a pixel in which two-bounce light is looked for.
+    /// Mean number of bins of a pixel in which two-bounce light is expected.
     arrivals: f64,
 }
 
@@ -68,18 +68,18 @@ struct Row {
     name: &'static str,
     /// Megabytes a scene of 256×256×637, in proportion.
     mb_a_scene: f64,
-    /// Terabytes of 97,432 of them.
+    /// Size of 97,432 such scenes in terabytes.
     tb: f64,
-    /// The largest error, and root mean squares over all scenes.
+    /// The maximum error, and root mean squares over all scenes.
     loss: Loss,
     encode_mb_per_cpu_s: f64,
     decode_mb_per_cpu_s: f64,
 }
 
-/// Runs the whole bench.
+/// Runs the whole benchmark.
 ///
 /// # Errors
-/// Scenes that cannot be had, a codec that fails, or an interruption.
+/// Fails if scenes cannot be obtained, a codec fails, or on an interruption.
 pub async fn run(
     args: BenchStore,
     settings: &Settings,
@@ -150,7 +150,7 @@ fn rows(
     output: Output,
     stop: &CancellationToken,
 ) -> Result<Vec<Row>> {
-    // One thread, in whose time everything is.
+    // One thread, so that its CPU time covers all work.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let pool =
         pool.map_err(|e| CliError::new(Code::Resource, format!("cannot start a thread: {e}")))?;

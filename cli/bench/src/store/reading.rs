@@ -1,4 +1,5 @@
-//! How fast scenes are read through data sets' own reader, and how much is fetched for a part of one.
+//! Measures how fast scenes are read through the data set's own reader, and how much is fetched for
+//! a part of a scene.
 
 use std::{
     path::Path,
@@ -28,22 +29,23 @@ use picofarm_cli::{
     signals,
 };
 
-/// Scenes a second that eight GPUs take: 200 epochs of 87,688 scenes in two days.
+/// Scenes per second that eight GPUs consume: 200 epochs of 87,688 scenes in two days.
 pub const TRAINING: f64 = 101.0;
-/// Side of a crop.
+/// Width and height of a crop.
 const CROP: u32 = 64;
-/// Reads of one measurement.
+/// Number of reads per measurement.
 const READS: usize = 12;
-/// Reads of a reader before its first one counts: both of its buffers are there then.
+/// Number of reads of a reader before the first measured one, after which both of its buffers
+/// exist.
 const FIRST: usize = 2;
 
-/// What was found.
+/// Results of the measurement.
 #[derive(Debug, Serialize)]
 pub struct Reading {
     pub profile: String,
-    /// 32-bit floats given out for each second of CPU time, in megabytes, whole scenes.
+    /// Decoded 32-bit floats per CPU second, in megabytes, for whole scenes.
     pub whole_mb_per_cpu_s: f64,
-    /// The same into a buffer that is used again.
+    /// The same with a reused buffer.
     pub reused_mb_per_cpu_s: f64,
     pub crop: Crop,
     /// 128 bins of all pixels.
@@ -51,54 +53,55 @@ pub struct Reading {
     pub loaders: Vec<Loader>,
 }
 
-/// Crops at several places.
+/// Crops at several positions.
 #[derive(Debug, Serialize)]
 pub struct Crop {
     pub side: u32,
-    /// Along the inner chunks' edges.
+    /// Aligned with the edges of the inner chunks.
     pub aligned: Fetched,
-    /// Mean over crops at all offsets by multiples of 16 pixels.
+    /// Mean over crops at all offsets that are multiples of 16 pixels.
     pub mean: Fetched,
-    /// The worst of these.
+    /// Maximum over these crops.
     pub worst: Fetched,
 }
 
-/// What a read fetched.
+/// Data fetched by a read.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Fetched {
-    /// Bytes of the transient's object, its index included; the manifest, which every read has, is not.
+    /// Bytes of the transient's object, including its index but not the manifest, which every read
+    /// fetches.
     pub bytes: f64,
-    /// Over the part's share of the object.
+    /// Bytes relative to the part's share of the object.
     pub of_share: f64,
     pub requests: f64,
 }
 
-/// What a loader makes of a scene.
+/// Result of loading a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Into {
     /// Its histogram, in a buffer of the thread.
     Histogram,
-    /// Its share of a network's batch: bins as images, scaled, in fresh memory.
+    /// Its share of a network's batch: scaled images of bins, in newly allocated memory.
     Input,
 }
 
-/// Several readers at once, as in a training's loader: each with a thread of its own.
+/// Several concurrent readers, as in a training's loader, each with a thread of its own.
 #[derive(Debug, Serialize)]
 pub struct Loader {
-    /// What a scene is made into.
+    /// Result of loading each scene.
     pub into: Into,
     pub threads: usize,
     pub scenes_per_s: f64,
     pub cpu_s_a_scene: f64,
-    /// Cores that decode [`TRAINING`] scenes a second, by CPU time.
+    /// Number of cores that decode [`TRAINING`] scenes per second, by CPU time.
     pub cores_for_training: f64,
 }
 
-/// Reads scenes of `spec`'s size, coded with the default profile, in `folder`.
+/// Measures reading of scenes of `spec`'s size, encoded with the default profile, in `folder`.
 ///
 /// # Errors
-/// A folder that cannot be written, or an interruption.
+/// Fails if the folder cannot be written, or on an interruption.
 pub fn measure(
     samples: &[Sample],
     source: &Dataset,
@@ -113,7 +116,7 @@ pub fn measure(
     let single = pool(1)?;
     let scene = |i: usize| (i % samples.len()) as u64;
     let mut buffer = Vec::new();
-    // The first reads bring files into memory.
+    // The first reads bring the files into memory.
     let mut whole = 0.0;
     let mut reused = 0.0;
     for i in 0..samples.len() + READS {
@@ -174,7 +177,7 @@ fn pool(threads: usize) -> Result<rayon::ThreadPool> {
     })
 }
 
-/// A data set of the samples in the default profile.
+/// Writes a data set of the samples in the default profile.
 async fn written(
     samples: &[Sample],
     source: &Dataset,
@@ -265,8 +268,8 @@ async fn fetched(spec: &DatasetSpec, folder: &Path) -> Result<(Crop, Fetched), D
     Ok((crop, of(share)))
 }
 
-/// `threads` readers that take turns at the scenes. The first reads of each are not measured: they fetch memory
-/// that the next ones find there.
+/// Measures `threads` readers that share the scenes in turn. The first reads of each are not
+/// measured, because they allocate memory that later reads reuse.
 fn loader(
     dataset: &Dataset,
     scenes: usize,
@@ -293,7 +296,7 @@ fn loader(
                     let bins = seen.bins;
                     planes_of(&mut seen, bins, Normalise::MinMax, &mut scaled);
                     buffer = seen.histogram;
-                    // It joins its batch.
+                    // Stands for joining the batch.
                     drop(std::hint::black_box(scaled.clone()));
                 }
             }
@@ -319,7 +322,7 @@ fn loader(
         };
         let readers: Vec<_> = pools.iter().map(reader).collect();
         drop(ready);
-        // Nothing is ever sent: this ends once every reader is ready, or has ended.
+        // Nothing is ever sent: the call returns once every reader is ready, or has ended.
         let _ = all_ready.recv();
         drop(held);
         let start = Instant::now();
@@ -344,7 +347,7 @@ fn loader(
     })
 }
 
-/// A scene of which a network sees h, `[bin][row][column]`, and nothing else.
+/// Returns a scene with only the histogram h, `[bin][row][column]`.
 fn seen(spec: &DatasetSpec, h: Vec<f32>) -> Scene {
     Scene {
         height: spec.height as usize,

@@ -1,4 +1,4 @@
-//! The bench's tables.
+//! The tables of the benchmark.
 
 use super::{
     Report, Row,
@@ -61,7 +61,7 @@ fn profiles(rows: &[Row]) -> String {
     table(&cells)
 }
 
-/// Three decimals; in powers of ten where it is large.
+/// Formats an error with three decimals, or in powers of ten if it is large.
 fn error(sigma: f64) -> String {
     match sigma {
         0.0 => "0".into(),

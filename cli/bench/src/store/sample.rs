@@ -1,4 +1,4 @@
-//! A rendered scene that the codecs are tried on, and what they make of it.
+//! A rendered scene for the codecs, and the errors of a codec on it.
 
 use std::ops::Range;
 
@@ -6,7 +6,8 @@ use picofarm_dataset::{Dataset, DatasetError, Gate, Quantity, Spot};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// A histogram image with what is needed to judge a code: photons and where two-bounce light arrives.
+/// A histogram image, with the information for evaluating a code: photons, and where two-bounce
+/// light arrives.
 pub struct Sample {
     pub scene: u64,
     pub height: usize,
@@ -20,23 +21,23 @@ pub struct Sample {
     arrivals: Vec<Vec<u16>>,
 }
 
-/// What a code did to a scene.
+/// Errors of a code on a scene.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Loss {
-    /// Largest error in σ = √max(N, 1) of N photons.
+    /// Maximum error in σ = √max(N, 1) of N photons.
     pub max_sigma: f64,
     pub rms_sigma: f64,
-    /// Share of pixels whose brightest two-bounce bin is another one now.
+    /// Fraction of pixels in which another two-bounce bin is now the brightest.
     pub peak_moved: f64,
     /// Rms error of the brightest two-bounce bin's intensity, in σ.
     pub peak_sigma: f64,
 }
 
 impl Sample {
-    /// A scene of a data set.
+    /// Reads a scene of a data set.
     ///
     /// # Errors
-    /// Those of reading.
+    /// Fails if the scene cannot be read.
     pub async fn read(dataset: &Dataset, scene: u64) -> Result<Self, DatasetError> {
         let spec = *dataset.spec();
         let depth: Vec<f32> = dataset.read(scene, Quantity::Depth).await?;
@@ -70,17 +71,17 @@ impl Sample {
         })
     }
 
-    /// Bytes as 32-bit floats.
+    /// Returns the size as 32-bit floats, in bytes.
     pub fn raw_bytes(&self) -> usize {
         self.h.len() * 4
     }
 
-    /// Mean number of bins of a pixel with two-bounce light.
+    /// Returns the mean number of bins of a pixel with two-bounce light.
     pub fn arrivals(&self) -> f64 {
         self.arrivals.iter().map(Vec::len).sum::<usize>() as f64 / self.arrivals.len() as f64
     }
 
-    /// Error of what a code gives back.
+    /// Returns the error of a code's decoded values.
     pub fn loss(&self, found: &[f32]) -> Loss {
         assert_eq!(
             found.len(),
@@ -146,7 +147,7 @@ impl Sums {
     }
 }
 
-/// τ of two-bounce light, metres: laser to spot to `x` to camera.
+/// Returns τ of two-bounce light in metres: laser to spot to `x` to camera.
 fn path(spot: &Spot, x: [f32; 3]) -> f64 {
     let norm = |v: [f32; 3]| {
         v.map(|c| f64::from(c) * f64::from(c))
@@ -158,7 +159,8 @@ fn path(spot: &Spot, x: [f32; 3]) -> f64 {
     f64::from(spot.path_m) + norm([x[0] - p[0], x[1] - p[1], x[2] - p[2]]) + norm(x)
 }
 
-/// The bins of these paths and their neighbours (a pixel has an extent), ascending.
+/// Returns the bins of these paths and their neighbours (because a pixel has an extent), in
+/// ascending order.
 fn bins(paths: impl Iterator<Item = f64>, gate: &Gate) -> Vec<u16> {
     let last = i64::from(gate.bins) - 1;
     let around = |tau: f64| {
@@ -174,7 +176,7 @@ fn bins(paths: impl Iterator<Item = f64>, gate: &Gate) -> Vec<u16> {
     bins
 }
 
-/// The first of the brightest of some bins.
+/// Returns the first of the brightest of some bins.
 fn brightest(h: &[f32], bins: &[u16]) -> Option<(usize, f32)> {
     let all = bins.iter().map(|b| (usize::from(*b), h[usize::from(*b)]));
     all.reduce(|best, one| if one.1 > best.1 { one } else { best })

@@ -1,4 +1,4 @@
-//! Where the benchmark's scenes come from: rendered now, or a data set that keeps floats as they are.
+//! The benchmark's scenes: rendered now, or from a data set with unmodified floats.
 
 use std::{net::SocketAddr, path::Path};
 
@@ -24,10 +24,11 @@ use picofarm_cli::{
     signals,
 };
 
-/// The data set to measure with: `--from`, or rooms rendered into `dir` by a farm of one worker.
+/// Returns the data set to measure: `--from`, or rooms rendered into `dir` by a farm of one worker.
 ///
 /// # Errors
-/// A data set that lost something already or has no scenes, a failed render, or an interruption.
+/// Fails if the data set has lost precision or has no scenes, if a render fails, or on an
+/// interruption.
 pub async fn source(
     args: &BenchStore,
     dir: &Path,
@@ -98,7 +99,7 @@ async fn render(
         None,
     )
     .await?;
-    // This process's own coordinator asks nobody who they are.
+    // This process's own coordinator requires no authentication.
     let mut client = Client::connect(&farm.url, &Access::default()).await?;
     let job = client.submit(spec, false).await?.job;
     let show = match output.json {
@@ -119,10 +120,10 @@ async fn render(
     }
 }
 
-/// The scenes to measure with.
+/// Reads the scenes to measure.
 ///
 /// # Errors
-/// There are none, or one cannot be read.
+/// Fails if there are none, or one cannot be read.
 pub async fn samples(dataset: &Dataset, most: u64) -> Result<Vec<Sample>> {
     let scenes = dataset.scenes_present().await.map_err(CliError::input)?;
     let mut samples = Vec::new();

@@ -1,4 +1,4 @@
-//! The page about reconstructions: one HTML file that needs nothing beside it.
+//! The page about reconstructions: a self-contained HTML file.
 
 use std::fmt::Write;
 
@@ -12,7 +12,7 @@ use serde_json::Value;
 use super::report::{Group, Report, Spread};
 use crate::output::bytes;
 
-/// Columns of the table: a figure by its name in `dataset info`, heading, unit.
+/// Columns of the table: the figure's name in `dataset info`, heading, unit.
 const COLUMNS: [(&str, &str, &str); 11] = [
     ("l1_m", "L1", "m"),
     ("rmse_m", "RMSE", "m"),
@@ -32,7 +32,7 @@ const CLASSES: &str = "Errors of novel views are of the distance along the ray, 
     Outside: it is outside that view. Within view: visible and occluded together. Specular: the surface is a mirror, wherever it is; \
     its pixels are in no other column, neither in L1, RMSE nor PSNR. A dash: nothing was measured.";
 
-/// The report as a page.
+/// Formats the report as a page.
 pub(super) fn html(report: &Report) -> String {
     let sections = [
         ("Novel views and meshes", table(report)),
@@ -98,13 +98,13 @@ fn table(report: &Report) -> String {
     out
 }
 
-/// The last part of a place: what people know it by.
+/// Returns the last part of the group's location, as a short name.
 fn name(group: &Group) -> &str {
     let place = group.place.trim_end_matches('/');
     place.rsplit('/').next().unwrap_or(place)
 }
 
-/// The settings that tell groups apart, in a line.
+/// Formats the settings that distinguish groups, in one line.
 fn told(group: &Group) -> String {
     let text = |way: &str| match group.settings.pointer(way) {
         Some(Value::String(text)) => text.clone(),

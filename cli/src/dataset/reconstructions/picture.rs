@@ -1,4 +1,4 @@
-//! `dataset picture` of reconstructions: a contact sheet with one novel view a scene.
+//! `dataset picture` of reconstructions: a contact sheet with one novel view per scene.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use crate::{
     picture::save,
 };
 
-/// Room for a scene's number and error.
+/// Width of the column for a scene's number and error, in pixels.
 const SIDE: usize = 72;
 const GAP: usize = 4;
 const HEAD: usize = TEXT + 8;
@@ -23,7 +23,8 @@ const INK: [u8; 3] = [210, 210, 215];
 /// Draws the first `rows` scenes as a PNG.
 ///
 /// # Errors
-/// No scenes, one without novel views, damage, or a file that cannot be written.
+/// Fails if there are no scenes, a scene has no novel views or is damaged, or the file cannot be
+/// written.
 pub async fn draw(place: &str, there: &Reconstructions, rows: usize, path: &Path) -> Result<()> {
     let present = there.scenes_present().await.map_err(failed)?;
     let scenes = &present[..present.len().min(rows.max(1))];
@@ -59,7 +60,7 @@ pub async fn draw(place: &str, there: &Reconstructions, rows: usize, path: &Path
     save(&canvas, path)
 }
 
-/// The picture of a scene's novel views.
+/// Reads the picture of a scene's novel views.
 async fn views(place: &str, there: &Reconstructions, scene: u64) -> Result<Canvas> {
     let bytes = there.read(scene, "views.png").await.map_err(|e| match e {
         DatasetError::NotPublished { .. } => CliError::input(format!(

@@ -1,7 +1,8 @@
-//! `dataset report`: a page about reconstructions, and the same as JSON.
+//! `dataset report`: a page about reconstructions, and its content as JSON.
 //!
-//! It stands with data sets, not with models: reconstructions lie in stores as data sets do, are named by place, and need no
-//! network. What trains and predicts has `model report`.
+//! The command belongs to data sets, not to models, because reconstructions are stored like data
+//! sets, are named by location, and need no network. `model report` is the counterpart for trained
+//! models.
 
 use std::collections::BTreeMap;
 
@@ -19,41 +20,41 @@ use crate::{
     picture::write_atomically,
 };
 
-/// What the page tells, and the JSON beside it.
+/// Contents of the page and of its JSON file.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
     pub title: String,
-    /// The day on which it was made.
+    /// Date of the report.
     pub date: String,
-    /// Groups of reconstructions of equal settings.
+    /// Groups of reconstructions with equal settings.
     pub groups: Vec<Group>,
     pub published: [Published; 4],
     pub differs: &'static str,
 }
 
-/// Reconstructions of a folder that have the same settings.
+/// Reconstructions of a folder with the same settings.
 #[derive(Debug, Serialize)]
 pub(super) struct Group {
     pub place: String,
     pub settings: Value,
-    /// Version of the reconstruction.
+    /// Version of the reconstruction code.
     pub code: String,
     pub scenes: usize,
     pub bytes: u64,
-    /// Fewest and most spots of a scene that took part.
+    /// Minimum and maximum number of spots that a scene used.
     pub spots: Option<[u64; 2]>,
-    /// Width and height of the images that were measured, where all have the same.
+    /// Width and height of the measured images, if all are equal.
     pub image: Option<[u64; 2]>,
-    /// By the names of `dataset info`.
+    /// Figures by their names in `dataset info`.
     pub figures: BTreeMap<&'static str, Spread>,
-    /// 16 spots, 512 x 512 pixels, and PlatoNeRF's room.
+    /// Whether the group has the published setup: 16 spots, 512 x 512 pixels and PlatoNeRF's room.
     pub as_published: bool,
     pub extremes: Vec<Extreme>,
-    /// What they are worth together.
+    /// Combined verdict.
     pub verdict: Option<Verdict>,
 }
 
-/// Mean over scenes, and its standard error where there are two scenes and more.
+/// Mean over scenes, and its standard error if there are at least two scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub(super) struct Spread {
     pub mean: f64,
@@ -61,7 +62,7 @@ pub(super) struct Spread {
     pub scenes: usize,
 }
 
-/// The best, the median or the worst scene by its L1.
+/// The best, the median or the worst scene by L1.
 #[derive(Debug, Serialize)]
 pub(super) struct Extreme {
     pub rank: &'static str,
@@ -118,7 +119,7 @@ struct Scene {
 /// `dataset report`.
 ///
 /// # Errors
-/// A place without reconstructions, damage, or a page that cannot be written.
+/// Fails if a location has no reconstructions or is damaged, or if the page cannot be written.
 pub async fn run(args: &DatasetReport, output: Output) -> Result<()> {
     let mut groups = Vec::new();
     for place in &args.places {
@@ -154,7 +155,7 @@ pub async fn run(args: &DatasetReport, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// The figures of a folder.
+/// Collects the figures of a folder.
 async fn collected(place: &str) -> Result<Vec<Group>> {
     let there = opened(place).await?;
     let present = there.scenes_present().await.map_err(failed)?;
@@ -175,7 +176,7 @@ async fn collected(place: &str) -> Result<Vec<Group>> {
         .buffered(CONCURRENCY)
         .try_collect()
         .await?;
-    // By their text: settings are JSON, which has no order.
+    // Grouped by the text of their settings, because JSON values have no order.
     let mut alike: BTreeMap<(String, String), Vec<Scene>> = BTreeMap::new();
     for scene in scenes {
         let key = (
@@ -239,7 +240,7 @@ async fn group(place: &str, there: &Reconstructions, scenes: &[Scene]) -> Result
     })
 }
 
-/// Mean and standard error; `None` without values.
+/// Returns mean and standard error; `None` without values.
 fn spread(values: &[f64]) -> Option<Spread> {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;
@@ -251,7 +252,7 @@ fn spread(values: &[f64]) -> Option<Spread> {
     })
 }
 
-/// Best, median and worst scene, each once.
+/// Returns the best, median and worst scene, each once.
 async fn extremes(there: &Reconstructions, scenes: &[Scene]) -> Result<Vec<Extreme>> {
     let mut ranked: Vec<(f64, u64)> = scenes
         .iter()
@@ -297,7 +298,7 @@ mod tests {
         assert_eq!(spread(&[]), None);
         let one = spread(&[0.3]).unwrap();
         assert_eq!((one.mean, one.standard_error, one.scenes), (0.3, None, 1));
-        // Deviation 1 of four: its half.
+        // Standard deviation 1, of four values: a standard error of one half.
         let four = spread(&[0.0, 0.0, 1.5, 1.5]).unwrap();
         let error = four.standard_error.unwrap();
         assert!((four.mean - 0.75).abs() < 1e-12 && (error - 0.75f64.sqrt() / 2.0).abs() < 1e-12);

@@ -1,4 +1,4 @@
-//! The scenes of a data set as networks meet them: a histogram, and the truth of the spots that made it.
+//! The scenes of a data set as training examples: a histogram and the ground truth of its spots.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -22,51 +22,53 @@ use super::{Control, TaskError, output::Stores, reprocess::quantity};
 #[cfg(test)]
 mod folded;
 
-/// One part of so many of the memory that is left beside a task holds scenes; training and validation have one each.
+/// A cache of scenes may use 1/`KEPT_SHARE` of a task's spare memory. Training and validation
+/// scenes have one cache each.
 const KEPT_SHARE: u64 = 6;
 
-/// Histograms whose room is kept for others, at most.
+/// Maximum number of histogram buffers that are kept for reuse.
 const SPARE: usize = 4;
 
-/// What draws of sensors are, among all random numbers of a training.
+/// Stream number of the sensor's noise among the random streams of a training.
 const SENSED: u64 = 5;
-/// The draw of scenes that look the same whenever they are met. No training has so many visits.
+/// Draw of scenes that look the same at every visit. No training visits a scene this often.
 const ALWAYS: u64 = u64::MAX;
 
-/// Scenes of a data set, in an order.
+/// Scenes of a data set, in a fixed order.
 pub(super) struct Examples {
     dataset: Dataset,
     runtime: Handle,
     quantity: Quantity,
-    /// The spots whose light the histogram holds; `None` = all.
+    /// The spots that contribute to the histogram; `None` = all.
     spots: Option<Vec<u32>>,
     scenes: Vec<u64>,
-    /// What histograms go through, and the seed of its noise.
+    /// The sensor that histograms pass through, and the seed of its noise.
     sensor: Option<(Sensing, u64)>,
-    /// Depths that two-bounce times follow from; the truth's where there are none.
+    /// Predicted depths that two-bounce times are derived from; `None` = the true depths.
     depths: Option<Predictions>,
     kept: Mutex<Kept>,
-    /// Scenes whose histograms hold light, and nothing but finite numbers.
+    /// Scenes with checked histograms: these contain light and only finite numbers.
     sound: Mutex<HashSet<u64>>,
-    /// Room of histograms that nobody looks at any more: fresh memory for each would cost as much as decoding it.
+    /// Histogram buffers for reuse, because allocating new memory for each would cost as much as
+    /// decoding it.
     spare: Mutex<Vec<Vec<f32>>>,
-    /// What the sensor's scale follows from, by scene: the same at each visit.
+    /// The peak of each scene, from which the sensor's scale follows. It is the same at each visit.
     peaks: Mutex<HashMap<usize, f64>>,
 }
 
-/// Scenes that stay in memory, as many as there is room for. The order in which a training visits them is random, so that
-/// no choice would be better than the first ones.
+/// Cache of scenes, filled until its memory is used up. Scenes are never replaced: a training
+/// visits them in random order, so no other choice would be better than the first ones.
 #[derive(Default)]
 struct Kept {
     scenes: HashMap<usize, Arc<Scene>>,
-    /// Bytes left.
+    /// Remaining memory, in bytes.
     room: usize,
 }
 
 impl Kept {
     fn keep(&mut self, index: usize, scene: &Arc<Scene>) {
         let bytes = scene.bytes();
-        // Spare room has its share.
+        // Reserves memory for the spare buffers too.
         if bytes.saturating_mul(1 + SPARE) <= self.room
             && self.scenes.insert(index, scene.clone()).is_none()
         {
@@ -75,17 +77,19 @@ impl Kept {
     }
 }
 
-/// The sides of a split that were asked for, each in the split's order.
+/// The requested sides of a split, each in the split's order.
 pub(super) struct Sides<const N: usize> {
     pub(super) split: SplitUsed,
     pub(super) scenes: [Vec<u64>; N],
 }
 
 impl Examples {
-    /// The given scenes with one of the data set's histograms, and true two-bounce times.
+    /// Creates examples from the given scenes, with one of the data set's histograms and true
+    /// two-bounce times.
     ///
     /// # Errors
-    /// [`TaskError::User`] naming the field below `of`, where the data set has no such histogram or spot.
+    /// [`TaskError::User`] naming the field below `of` if the data set has no such histogram or
+    /// spot.
     pub(super) fn new(
         stores: &Stores,
         dataset: &Dataset,
@@ -134,8 +138,8 @@ impl Examples {
         })
     }
 
-    /// The same, of which scenes stay in a share of the memory that is left beside their task, MiB; none where that is not
-    /// known.
+    /// Sets the size of the cache to a share of the memory left to the task (`left_mib`, MiB). If
+    /// that memory is unknown, nothing is cached.
     #[must_use]
     pub(super) fn staying(self, left_mib: Option<u64>) -> Self {
         let bytes = (left_mib.unwrap_or(0) << 20) / KEPT_SHARE;
@@ -146,16 +150,16 @@ impl Examples {
         Self { kept, ..self }
     }
 
-    /// The same with two-bounce times that follow from these depths; from the truth's where there are none.
+    /// Derives two-bounce times from these depths, or from the true depths if `None`.
     #[must_use]
     pub(super) fn timed_by(self, depths: Option<Predictions>) -> Self {
         Self { depths, ..self }
     }
 
-    /// The same through a sensor, whose noise has a seed.
+    /// Passes histograms through a sensor with a noise seed.
     ///
     /// # Errors
-    /// [`TaskError::User`] naming the sensor's field that cannot be.
+    /// [`TaskError::User`] naming the sensor's invalid field.
     pub(super) fn through(self, sensor: Option<(Sensor, u64)>) -> Result<Self, TaskError> {
         let gate = &self.dataset.spec().gate;
         let sensing = |(sensor, seed)| {
@@ -169,19 +173,19 @@ impl Examples {
         Ok(Self { sensor, ..self })
     }
 
-    /// Spots whose light the histogram holds.
+    /// Returns the number of spots that contribute to the histogram.
     pub(super) fn spots(&self) -> usize {
         let all = self.dataset.spec().spots as usize;
         self.spots.as_ref().map_or(all, Vec::len)
     }
 
-    /// Which of the data set's they are.
+    /// Returns the indices of these spots in the data set.
     pub(super) fn spot_numbers(&self) -> Vec<u32> {
         let all = || (0..self.dataset.spec().spots).collect();
         self.spots.clone().unwrap_or_else(all)
     }
 
-    /// A scene as it is stored.
+    /// Returns a scene as it is stored.
     fn stored(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
         let kept = || self.kept.lock().expect("no panic while locked");
         if let Some(scene) = kept().scenes.get(&index) {
@@ -192,7 +196,7 @@ impl Examples {
         Ok(scene)
     }
 
-    /// A scene through the sensor, if there is one; `draw` tells one draw of its noise from another.
+    /// Returns a scene through the sensor, if there is one. `draw` selects the draw of its noise.
     fn sensed(&self, index: usize, draw: u64) -> Result<Arc<Scene>, Unreadable> {
         let stored = self.stored(index)?;
         let Some((sensor, seed)) = &self.sensor else {
@@ -216,13 +220,14 @@ impl Examples {
         Ok(Arc::new(stored.showing(seen)))
     }
 
-    /// Room of a histogram that nobody looks at any more, or none.
+    /// Takes a spare histogram buffer, or an empty one if there is none.
     fn room(&self) -> Vec<f32> {
         let mut spare = self.spare.lock().expect("no panic while locked");
         spare.pop().unwrap_or_default()
     }
 
-    /// What is seen of a scene, and in which order: as networks take it where no sensor stands before them.
+    /// Reads a scene's histogram and its element order, in the order that networks expect if there
+    /// is no sensor.
     async fn histogram(&self, scene: u64) -> Result<(Vec<f32>, Order), DatasetError> {
         let Some(spots) = self
             .spots
@@ -269,13 +274,13 @@ impl Examples {
             dataset.read_spots(scene),
             dataset.read_intrinsics(scene),
         )?;
-        // What was sound once is not looked through again at each visit.
+        // A sound histogram is not checked again at each visit.
         let sound = || self.sound.lock().expect("no panic while locked");
         if !sound().contains(&scene) {
             check_light(&dataset.place(), scene, &histogram)?;
             sound().insert(scene);
         }
-        // Nothing is seen there: infinitely far, not at the camera.
+        // Pixels without a depth are set to infinity, because zero would be at the camera.
         let depth_m: Vec<f32> = depth
             .into_iter()
             .map(|z| if z > 0.0 { z } else { f32::INFINITY })
@@ -340,7 +345,8 @@ impl Scenes for Examples {
     }
 }
 
-/// Refuses a histogram that tells nothing, or holds what is no number: a network would take both for what is seen.
+/// Rejects a histogram that has no light or contains numbers that are not finite, because a network
+/// would take both for measurements.
 fn check_light(place: &str, scene: u64, histogram: &[f32]) -> Result<(), DatasetError> {
     let odd = histogram.iter().find(|h| !(h.is_finite() && **h >= 0.0));
     let what = match odd {
@@ -358,11 +364,11 @@ fn check_light(place: &str, scene: u64, histogram: &[f32]) -> Result<(), Dataset
     })
 }
 
-/// The scenes of the given sides of a split's newest version, in the order in which it was cut: the first so many are
-/// always among the first more.
+/// Returns the scenes of the given sides of a split's newest version, in the order of the split. A
+/// smaller limit therefore always selects a prefix of a larger one.
 ///
 /// # Errors
-/// [`TaskError::User`] at `field` where there is no such split.
+/// [`TaskError::User`] at `field` if there is no such split.
 pub(super) fn sides<const N: usize>(
     stores: &Stores,
     dataset: &Dataset,
@@ -396,10 +402,10 @@ pub(super) fn sides<const N: usize>(
     })
 }
 
-/// Keeps the first `limit` scenes; 0 = all.
+/// Truncates `scenes` to the first `limit`; 0 = all.
 ///
 /// # Errors
-/// [`TaskError::User`] at `field` where there are fewer, or none at all.
+/// [`TaskError::User`] at `field` if there are fewer scenes than that, or none at all.
 pub(super) fn first(scenes: &mut Vec<u64>, limit: u64, field: &str) -> Result<(), TaskError> {
     let there = scenes.len() as u64;
     if there == 0 || limit > there {

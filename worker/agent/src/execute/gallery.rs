@@ -1,4 +1,5 @@
-//! Pictures of what trained models say, for people: of scenes that they were evaluated on.
+//! Pictures of the predictions of trained models, for reports. The scenes are those of the models'
+//! evaluations.
 
 use std::sync::Arc;
 
@@ -19,20 +20,20 @@ use super::{
     truth,
 };
 
-/// A model's pictures, and the size of its scenes.
+/// A model's pictures and the size of its images.
 pub(super) struct Shown {
-    /// The model, as it lies in the store.
+    /// The model read from the store.
     pub(super) model: Arc<Model>,
-    /// Rows of its scenes' images.
+    /// Rows of the images.
     pub(super) side: usize,
-    /// What it says.
+    /// Pictures of its predictions.
     pub(super) pictures: Vec<Picture>,
 }
 
-/// What a model, computed on `device`, says of the first `count` scenes that it was evaluated on.
+/// Computes a model's predictions on `device` for the first `count` scenes of its evaluation.
 ///
 /// # Errors
-/// [`TaskError::User`] where the model, its data set or its split is not there any more.
+/// [`TaskError::User`] if the model, its data set or its split no longer exists.
 pub(super) fn show(
     stores: &Stores,
     store: &str,

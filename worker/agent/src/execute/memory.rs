@@ -1,5 +1,5 @@
-//! Whether a task fits into the memory that this worker's tasks may take; [`picofarm_proto::model::memory`] says how much
-//! that is.
+//! Checks that a task fits into the memory available to this worker's tasks.
+//! [`picofarm_proto::model::memory`] defines that limit.
 
 use picofarm_dataset::DatasetSpec;
 use picofarm_proto::{
@@ -15,7 +15,7 @@ use picofarm_transient::Settings;
 use super::TaskError;
 use picofarm_session::Memory;
 
-/// The scenes of a data set, as far as memory depends on them.
+/// Returns the properties of a data set's scenes that determine memory use.
 pub(super) fn shape(spec: &DatasetSpec) -> Shape {
     Shape {
         height: spec.height,
@@ -25,11 +25,11 @@ pub(super) fn shape(spec: &DatasetSpec) -> Shape {
     }
 }
 
-/// Refuses a task that takes more than `limit_mib`; 0 = not known, which refuses nothing. Returns what is left beside the
-/// task, MiB; `None` = not known.
+/// Rejects a task that uses more than `limit_mib`; 0 = unknown, which rejects nothing. Returns the
+/// memory left to the task, in MiB; `None` = unknown.
 ///
 /// # Errors
-/// [`TaskError::User`] with what it takes, what there is, and what to do.
+/// [`TaskError::User`] with the required and available memory, and a remedy.
 pub(super) fn check(
     task: &TaskSpec,
     known: &Known,
@@ -55,10 +55,10 @@ pub(super) fn check(
     )))
 }
 
-/// Width and height of the image, and triangles of a scene.
+/// Width and height of the image, and the number of triangles of a scene.
 pub type SceneSize = ((u32, u32), usize);
 
-/// The size of a scene.
+/// Returns the size of a scene.
 pub fn scene_size(scene: &Scene) -> SceneSize {
     let i = &scene.camera.intrinsics;
     ((i.width, i.height), scene.triangle_count())
@@ -84,10 +84,11 @@ fn rendering(
     }
 }
 
-/// Refuses a render that takes more than `limit_mib`, now that its scene is known; 0 = not known, which refuses nothing.
+/// Rejects a render of a known scene that uses more than `limit_mib`; 0 = unknown, which rejects
+/// nothing.
 ///
 /// # Errors
-/// [`TaskError::User`] with what it takes, what there is, and what to do.
+/// [`TaskError::User`] with the required and available memory, and a remedy.
 pub(super) fn check_render(
     settings: &Settings,
     scene: &Scene,
@@ -108,15 +109,16 @@ pub(super) fn check_render(
     )))
 }
 
-/// Bytes that a render of a scene of such a size takes at most.
+/// Returns the maximum memory of a render of a scene of this size, in bytes.
 pub fn render_bytes(settings: &Settings, size: SceneSize, threads: usize) -> u64 {
     rendering(settings, size, threads).peak_bytes()
 }
 
-/// Checks that a render fits into what tasks may take here, where the system tells how much that is.
+/// Checks that a render fits into the memory available to tasks on this machine, if the system
+/// reports it.
 ///
 /// # Errors
-/// A message with what is needed, what is there, and what to do.
+/// Returns a message with the required and available memory, and a remedy.
 pub fn check_memory(settings: &Settings, size: SceneSize, threads: usize) -> Result<(), String> {
     let needed = render_bytes(settings, size, threads);
     match Memory::here() {
@@ -214,7 +216,7 @@ mod tests {
         assert!(refused.contains("may take 1.0 GiB"), "{refused}");
         let left = of(1 << 20).unwrap().unwrap();
         assert!(left < 1 << 20);
-        // A worker that it takes all of the memory of has none left, and does it.
+        // A task that uses all of a worker's memory is accepted, with none left.
         assert_eq!(of((1 << 20) - left), Ok(Some(0)));
         assert!(of((1 << 20) - left - 1).is_err());
         assert_eq!(of(0), Ok(None), "not known");

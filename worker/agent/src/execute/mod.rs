@@ -1,4 +1,4 @@
-//! What runs tasks: the kinds, and what they share.
+//! Runs tasks: the kinds, and the code that they share.
 
 #[cfg(feature = "networks")]
 mod examples;

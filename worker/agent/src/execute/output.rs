@@ -1,5 +1,5 @@
-//! The data set as the executor sees it: opened for a job, asked for finished scenes, and published to with
-//! patience. Says who is to blame when the store does not play along.
+//! The executor's access to stores: opens data sets, looks up finished scenes, and publishes
+//! results with retries. Classifies store errors by cause.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -29,26 +29,28 @@ use super::{Control, TaskError, memory};
 
 /// A store and the prefix in it.
 type Place = (Arc<dyn ObjectStore>, Path);
-/// A store's place, and the identity that is expected of it.
+/// A store's location and the identity that it must have.
 type StoreName = (String, Option<Uuid>);
 
-/// How long what is finished is held at least for a store that does not take it.
+/// Minimum time for which a result is retried if the store does not accept it.
 const LEAST_PATIENCE: Duration = Duration::from_secs(3);
-/// How often a task that waits for its store is asked whether it shall stop.
+/// Interval at which a task that waits for its store checks whether it must stop.
 const STOP_LOOK: Duration = Duration::from_millis(50);
 
-/// Stores, reached from the executor's own thread.
+/// Stores, accessed from the executor's own thread.
 pub(super) struct Stores {
     runtime: Handle,
-    /// Opened stores that passed the probe, by location: their connections are kept from task to task.
+    /// Opened stores that passed the probe, by location. Their connections are kept from task to
+    /// task.
     probed: Mutex<BTreeMap<StoreName, Place>>,
-    /// Folders that were found to be empty or of the kind that writes there.
+    /// Folders that passed the check of their contents: empty, or only with names of the kind that
+    /// writes there.
     own_folders: Mutex<BTreeSet<String>>,
     /// Opened stores that are only read, by location.
     sources: Mutex<BTreeMap<StoreName, Place>>,
-    /// How long a rendered scene is held at most for a store that does not take it.
+    /// Maximum time for which a rendered scene is retried if the store does not accept it.
     patience: Duration,
-    /// Memory that tasks may take, MiB; 0 = not known.
+    /// Memory that tasks may use, in MiB; 0 = unknown.
     memory_mib: u64,
 }
 
@@ -64,14 +66,15 @@ impl Stores {
         }
     }
 
-    /// The same for tasks that may take so much memory, MiB; 0 = not known.
+    /// Sets the memory that tasks may use, in MiB; 0 = unknown.
     pub(super) fn with_memory(self, memory_mib: u64) -> Self {
         Self { memory_mib, ..self }
     }
 
-    /// Refuses a task that takes more memory than tasks may take here; one of several workers on a machine has its part of
-    /// it. `source` is the data set that it reads, where its size depends on one. Returns what is left beside the task, MiB;
-    /// `None` = not known.
+    /// Rejects a task that uses more memory than tasks may use on this machine. If several workers
+    /// share the machine, each has a share of that memory. `source` is the data set that the task
+    /// reads, if memory use depends on it. Returns the memory left to the task, in MiB; `None` =
+    /// unknown.
     pub(super) fn fits(
         &self,
         task: TaskSpec,
@@ -84,19 +87,20 @@ impl Stores {
         memory::check(&task, &known, self.memory_mib)
     }
 
-    /// Refuses a render that takes more memory than tasks may take here, now that its scene is known: what a task of scene files takes
-    /// is not known before.
+    /// Rejects a render that uses more memory than tasks may use, once its scene is known. The
+    /// memory of a task with scene files is unknown before.
     pub(super) fn check_render(&self, settings: &Settings, scene: &Scene) -> Result<(), TaskError> {
         memory::check_render(settings, scene, self.memory_mib)
     }
 
-    /// What reaches stores, for threads other than the executor's.
+    /// Returns the runtime that serves store requests, for threads other than the executor's.
     #[cfg(feature = "networks")]
     pub(super) fn runtime(&self) -> &Handle {
         &self.runtime
     }
 
-    /// The models of a store, to read and to write. The first use of a location proves that it is safe.
+    /// Opens the models of a store for reading and writing. The first use of a location probes its
+    /// store.
     #[cfg(feature = "networks")]
     pub(super) fn models(
         &self,
@@ -107,14 +111,14 @@ impl Stores {
         Ok(picofarm_dataset::Models::new(store, &prefix))
     }
 
-    /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
+    /// Creates or opens the job's data set. The first use of a location probes its store.
     pub(super) fn open(&self, spec: &RenderTask, control: &Control) -> Result<Dataset, TaskError> {
         let place = &spec.output;
         let described = dataset_spec(spec)?;
         self.create_or_open(&place.store, &place.dataset, &described, control)
     }
 
-    /// Creates or opens a data set to write to. The first use of a location proves that its store is safe.
+    /// Creates or opens a data set for writing. The first use of a location probes its store.
     pub(super) fn create_or_open(
         &self,
         location: &str,
@@ -131,7 +135,7 @@ impl Stores {
         )
     }
 
-    /// Opens a data set to read; creates nothing, and asks of its store nothing but reading.
+    /// Opens a data set for reading. Creates nothing and needs only read access.
     pub(super) fn open_source(
         &self,
         location: &str,
@@ -142,7 +146,7 @@ impl Stores {
         self.wait_for(control, Dataset::open(store, prefix.join(dataset)), of_open)
     }
 
-    /// The models of a store, to read only; asks of it nothing else.
+    /// Opens the models of a store for reading. Needs only read access.
     #[cfg(feature = "networks")]
     pub(super) fn source_models(
         &self,
@@ -153,7 +157,7 @@ impl Stores {
         Ok(picofarm_dataset::Models::new(store, &prefix))
     }
 
-    /// A place to read from.
+    /// Opens a location for reading.
     pub(super) fn source(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
         let name = named(location, control)?;
         let known = || self.sources.lock().expect("no panic while locked");
@@ -165,8 +169,8 @@ impl Stores {
         Ok(place)
     }
 
-    /// Checks the stores of a task that must have an identity: before it works with them, and before what it has done counts.
-    /// A store that is mounted between counts as one that is not.
+    /// Checks the stores of a task that must have an identity, before the task uses them and again
+    /// before its result counts. A store that was mounted in between fails the check.
     pub(super) fn check_identities(&self, control: &Control) -> Result<(), TaskError> {
         for location in control.identified() {
             let (store, prefix) = self.source(location, control)?;
@@ -189,7 +193,7 @@ impl Stores {
         self.wait(control, dataset.create_recipe(key, scene, content))
     }
 
-    /// A place to write to. The first use of a location proves that its store is safe.
+    /// Opens a location for writing. The first use of a location probes its store.
     pub(super) fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
         let name = named(location, control)?;
         let known = || self.probed.lock().expect("no panic while locked");
@@ -202,7 +206,8 @@ impl Stores {
         Ok((store, prefix))
     }
 
-    /// The same for a folder that a field names, and in which every name must satisfy `is_own`. It is looked at once.
+    /// Like `probed`, for a folder that a field names, in which `is_own` must accept every name.
+    /// The folder is checked once.
     pub(super) fn probed_own(
         &self,
         (field, location): (&str, &str),
@@ -218,7 +223,8 @@ impl Stores {
         Ok((store, prefix))
     }
 
-    /// Waits for the store, unless the task shall stop: a server that is away may take minutes to be given up.
+    /// Waits for a store request, unless the task must stop, because a request to an unreachable
+    /// server can take minutes to fail.
     pub(super) fn wait<T>(
         &self,
         control: &Control,
@@ -227,7 +233,7 @@ impl Stores {
         self.wait_for(control, request, of_dataset)
     }
 
-    /// The same for requests that fail with errors of their own.
+    /// Like `wait`, for requests with their own error type.
     pub(super) fn wait_for<T, E>(
         &self,
         control: &Control,
@@ -248,7 +254,7 @@ impl Stores {
         })
     }
 
-    /// The manifest of scene `index` if this very task has published it.
+    /// Returns the manifest of scene `index` if this exact task has published it.
     pub(super) fn finished(
         &self,
         dataset: &Dataset,
@@ -297,7 +303,7 @@ impl Stores {
         self.patiently(control, async || {
             match dataset.publish_encoded(scene.clone()).await {
                 Err(conflict @ DatasetError::Conflict { .. }) => {
-                    // A manifest that somebody made up must not hold the scene for ever.
+                    // A manifest without valid objects must not occupy the scene for ever.
                     let replaced = dataset.replace_unfounded(scene.clone()).await?;
                     replaced.ok_or(conflict)
                 }
@@ -306,9 +312,9 @@ impl Stores {
         })
     }
 
-    /// Asks a store that fails (unreachable, full) again for a while, so that what is rendered is not lost with the
-    /// first hiccup: for as long as the task has taken, since so long it takes to do it again. After that the worker is
-    /// worth more to others.
+    /// Retries a request to a store that fails (unreachable, full), so that a result is not lost
+    /// with the first hiccup. Retries last as long as the task has taken, because repeating it
+    /// would take as long. After that, the worker is more useful for other tasks.
     pub(super) fn patiently<T>(
         &self,
         control: &Control,
@@ -326,7 +332,7 @@ impl Stores {
                 return Err(error);
             }
             if Instant::now() >= until {
-                // The next task looks whether it can store before it computes.
+                // The next task probes the store again before it computes.
                 self.probed.lock().expect("no panic while locked").clear();
                 return Err(error);
             }
@@ -343,7 +349,7 @@ impl Stores {
     }
 }
 
-/// A store's place with the identity that a task expects there.
+/// Returns a store's location with the identity that a task expects there.
 fn named(location: &str, control: &Control) -> Result<StoreName, TaskError> {
     let identity = control.identity(location).map(Uuid::parse_str);
     let identity = identity.transpose().map_err(|e| {
@@ -362,7 +368,7 @@ fn opened((location, identity): &StoreName) -> Result<Place, TaskError> {
     })
 }
 
-/// The data set that a job's settings describe.
+/// Returns the properties of the data set that a job's settings describe.
 pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> {
     let render = &spec.render;
     Ok(DatasetSpec {
@@ -381,12 +387,12 @@ pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
     })
 }
 
-/// SHA-256 of a manifest's bytes as they lie in the store, hexadecimal.
+/// Returns the SHA-256 of a manifest's stored bytes, in hexadecimal.
 pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
     hex::encode(Sha256::digest(manifest.to_bytes()))
 }
 
-/// The same where it is opened: what is there may be no data set of ours at all.
+/// Like `of_dataset`, for errors on opening: the location may have no picofarm data set.
 fn of_open(error: DatasetError) -> TaskError {
     match of_dataset(error) {
         TaskError::Damaged(text) => TaskError::User(text),
@@ -394,7 +400,7 @@ fn of_open(error: DatasetError) -> TaskError {
     }
 }
 
-/// Tells in the task's log what a result is worth; `job watch` shows it when the job ends.
+/// Logs a verdict on a result. `job watch` shows it when the job ends.
 pub(super) fn saying(verdict: &Verdict, of: &str) {
     let text = &verdict.text;
     match verdict.doubtful {
@@ -403,15 +409,17 @@ pub(super) fn saying(verdict: &Verdict, of: &str) {
     }
 }
 
-/// Who is to blame for a data set's error.
+/// Classifies a data set's error by cause.
 pub(super) fn of_dataset(error: DatasetError) -> TaskError {
     let text = error.to_string();
     match error {
-        // Of the settings, the worker's environment is to blame: another one may have them.
+        // Wrong store settings are the fault of this worker's environment; another worker may have
+        // the right ones.
         DatasetError::Store { .. }
         | DatasetError::StoreSettings { .. }
         | DatasetError::Io { .. } => TaskError::Store(text),
-        // Repeated reading has not helped. To run the task elsewhere may, and repairing the store does.
+        // Repeated reading has not helped. Running the task elsewhere may help, and repairing the
+        // store does.
         DatasetError::Damaged { .. } => TaskError::Damaged(text),
         DatasetError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),

@@ -51,7 +51,8 @@ pub(super) fn note(
     }
 }
 
-/// Stores the recipe of a reprocessing. A source in the same store is named without it, so that both can move together.
+/// Stores the recipe of a reprocessing. A source in the same store is named without the store, so
+/// that both can move together.
 pub(super) fn note_reprocess(
     stores: &Stores,
     dataset: &Dataset,

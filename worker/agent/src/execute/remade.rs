@@ -1,17 +1,19 @@
-//! Scenes made again by the recipe beside their data set, to compare with what was found of them.
+//! Makes the scenes of a data set again from its recipes, as the ground truth for results computed
+//! from them.
 
 use picofarm_proto::model::{SourceSettings, TaskSpec};
 use picofarm_scene::Scene;
 
 use super::{Context, Control, TaskError, recipe, reprocess::source_manifest, scenes};
 
-/// Data sets that are reprocessed from one another, at most.
+/// Maximum depth of a chain of reprocessed data sets.
 const DEEPEST: usize = 8;
 
-/// The scene that a data set's scene was rendered of, also by way of the data sets that it was reprocessed from.
+/// Returns the scene that a data set's scene was rendered from. Follows the data sets that it was
+/// reprocessed from.
 ///
 /// # Errors
-/// [`TaskError::User`] where no recipe leads to it; those of making a scene.
+/// [`TaskError::User`] if no recipe leads to the scene; errors of making a scene.
 pub(super) fn scene(
     context: &Context,
     source: &SourceSettings,

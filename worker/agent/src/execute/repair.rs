@@ -1,6 +1,7 @@
-//! Making broken scenes again: from the recipe beside the data set, from a job file, from the data set that it was made
-//! of, or from the files that it was imported from. The task's key says whether that is what made it, and the manifest's
-//! hashes whether the same came out.
+//! Repairs broken scenes by making them again: from the data set's recipe, a job file, the data set
+//! that they were reprocessed from, or the files that they were imported from. The task's key shows
+//! whether the right inputs were used, and the manifest's hashes show whether the result is the
+//! same.
 
 use std::path::PathBuf;
 
@@ -27,14 +28,14 @@ use super::{
     recipe, render, reprocess, scenes,
 };
 
-/// What a person says of how the data set was made, beyond what it says itself.
+/// Information from the user on how the data set was made, in addition to its own recipes.
 #[derive(Debug, Clone, Default)]
 pub struct Hints {
     /// The job that made it.
     pub job: Option<JobSpec>,
-    /// Where the data set is now that it was made of.
+    /// Current location of the data set that it was reprocessed from.
     pub source: Option<SourceSettings>,
-    /// Where the files are now that it was imported from.
+    /// Current location of the files that it was imported from.
     pub files: Option<PathBuf>,
 }
 
@@ -66,8 +67,8 @@ enum Way {
 }
 
 impl Repairer {
-    /// For the data set `dataset` in `store`. Stores are reached through `runtime`, which must not be a thread that calls
-    /// [`Self::run`].
+    /// Creates a repairer for the data set `dataset` in `store`. `runtime` serves store requests
+    /// and must not own the thread that calls [`Self::run`].
     pub fn new(
         asset_dirs: &[PathBuf],
         runtime: Handle,
@@ -84,11 +85,11 @@ impl Repairer {
         }
     }
 
-    /// Makes a scene again and puts back what is broken of it; see [`Dataset::restore`]. Blocks; works on rayon's
-    /// current pool.
+    /// Makes a scene again and restores its broken objects. See [`Dataset::restore`]. Blocks, and
+    /// computes on rayon's current pool.
     ///
     /// # Errors
-    /// [`TaskError::User`] where it is unknown how the scene was made, or where it came out otherwise.
+    /// [`TaskError::User`] if it is unknown how the scene was made, or if the result differs.
     pub fn run(
         &self,
         scene: u64,
@@ -103,10 +104,11 @@ impl Repairer {
         self.stores.wait(control, dataset.restore(encoded, witness))
     }
 
-    /// Writes the root's metadata of a data set that cannot be opened.
+    /// Rewrites the root metadata of a data set that cannot be opened.
     ///
     /// # Errors
-    /// [`TaskError::User`] where neither a recipe nor the job says what its properties were, or its arrays contradict.
+    /// [`TaskError::User`] if neither a recipe nor the job states the data set's properties, or if
+    /// its arrays contradict them.
     pub fn restore_root(&self, control: &Control) -> Result<Dataset, TaskError> {
         let (store, prefix) = open_store(&self.store).map_err(of_dataset)?;
         let prefix = prefix.join(&*self.dataset);
@@ -115,7 +117,7 @@ impl Repairer {
             .wait(control, remains(store.clone(), prefix.clone()))?;
         let stages = self.hints.job.iter().flat_map(|job| &job.stages);
         let mut tasks: Vec<_> = stages.map(|s| (stage_key(s), s.task.clone())).collect();
-        // Unproved by any scene, a person's word is not enough.
+        // Hints from the user are not used unless a scene confirms them.
         if left.scene.is_none() {
             tasks.clear();
         }
@@ -148,7 +150,7 @@ impl Repairer {
         }))
     }
 
-    /// The properties of the data set that a task makes.
+    /// Returns the properties of the data set that a task makes.
     fn described(
         &self,
         task: &TaskSpec,
@@ -168,10 +170,10 @@ impl Repairer {
         }
     }
 
-    /// How the scene would be made, in a line for people; nothing is made.
+    /// Describes in one line how the scene would be made, without making it.
     ///
     /// # Errors
-    /// [`TaskError::User`] where that is unknown.
+    /// [`TaskError::User`] if this is unknown.
     pub fn explain(&self, scene: u64, control: &Control) -> Result<String, TaskError> {
         let dataset = self
             .stores
@@ -188,7 +190,7 @@ impl Repairer {
         })
     }
 
-    /// The scene's manifest, if it is usable.
+    /// Reads the scene's manifest, if it is usable.
     fn manifest(
         &self,
         dataset: &Dataset,
@@ -236,7 +238,8 @@ impl Repairer {
         }
     }
 
-    /// How the scene is made: the way whose key is the manifest's; without a manifest, the only one.
+    /// Returns the way to make the scene: the one with the manifest's key, or without a manifest
+    /// the only candidate.
     fn way(
         &self,
         dataset: &Dataset,
@@ -284,7 +287,7 @@ impl Repairer {
         )))
     }
 
-    /// Everything that may have made the scene.
+    /// Returns all ways in which the scene may have been made.
     fn candidates(
         &self,
         dataset: &Dataset,
@@ -311,7 +314,7 @@ impl Repairer {
         Ok(all)
     }
 
-    /// The reprocessing that a manifest describes.
+    /// Returns the reprocessing that a manifest describes.
     fn reprocessed(
         &self,
         manifest: &Manifest,
@@ -378,7 +381,7 @@ impl Repairer {
     }
 }
 
-/// An imported scene from its files.
+/// Imports a scene from its files.
 fn import(
     dataset: &Dataset,
     scene: u64,

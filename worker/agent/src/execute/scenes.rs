@@ -1,4 +1,5 @@
-//! From a task to its scene: generated from the task's own seed, or read from a file pinned by its hash.
+//! Makes a task's scene: generates it from the task's own seed, or reads it from a file pinned by
+//! its hash.
 
 use std::path::{Path, PathBuf};
 
@@ -17,14 +18,14 @@ use tracing::{info, warn};
 
 use super::TaskError;
 
-/// What scenes are made with: the furniture at hand, and what opens scene files.
+/// Inputs for making scenes: the installed furniture, and the opener of scene files.
 pub(super) type With<'a> = (&'a [AssetLibrary], &'a Opener);
 
-/// Names of the furniture libraries that this program knows.
+/// Names of the supported furniture libraries.
 const LIBRARIES: [&str; 3] = ["parametric", "sweethome3d", "gltf"];
 
-/// Finds the furniture on this machine. A library that is not installed is no error: jobs that need it go
-/// to other workers.
+/// Finds the furniture libraries on this machine. A missing library is not an error, because jobs
+/// that need it run on other workers.
 pub(super) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
     LIBRARIES
         .iter()
@@ -46,7 +47,7 @@ pub(super) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
         .collect()
 }
 
-/// The scene of task `index`, with an image of `side` pixels and the job's spots.
+/// Returns the scene of task `index`, with an image of `side` pixels and the job's spots.
 pub(super) fn scene(
     source: &SceneSource,
     side: u32,
@@ -116,7 +117,7 @@ fn library<'a>(
     })
 }
 
-/// Reads a scene file after checking its hash, and gives it the job's resolution.
+/// Reads a scene file after checking its hash, and sets the job's resolution.
 fn read(
     file: &SceneFile,
     at: &str,
@@ -145,10 +146,10 @@ fn read(
     Ok(scene)
 }
 
-/// Reads a scene with its own laser, or one aimed as the job says where it has none.
+/// Reads a scene with its own laser, or with a laser aimed as the job specifies if it has none.
 fn with_laser(path: &Path, aim: &Aim, bounds: &Bounds) -> Result<Scene, SceneError> {
     match import::read_scene_with(path, &ImportOptions::default(), bounds) {
-        // A file with an unusable laser is not repaired here.
+        // A file with an unusable laser is rejected, not repaired.
         Err(SceneError::NoLaser { .. }) => {
             warn!(path = %path.display(), spots = aim.film().len(), "the file has no laser; the job's spots are used");
             let options = ImportOptions {
@@ -161,7 +162,7 @@ fn with_laser(path: &Path, aim: &Aim, bounds: &Bounds) -> Result<Scene, SceneErr
     }
 }
 
-/// A scene's error with its place in the job.
+/// Adds the scene's field in the job to an error.
 fn named(at: &str, error: SceneError) -> TaskError {
     match of_scene(error) {
         TaskError::User(text) => TaskError::User(format!("{at}: {text}")),
@@ -170,7 +171,7 @@ fn named(at: &str, error: SceneError) -> TaskError {
     }
 }
 
-/// Who is to blame for a scene's error: a disk that fails is nobody's fault, everything else is the job's.
+/// Classifies a scene's error: a failing disk is not the job's fault, everything else is.
 pub(super) fn of_scene(error: SceneError) -> TaskError {
     use std::io::ErrorKind::{
         InvalidInput, IsADirectory, NotADirectory, NotFound, PermissionDenied,

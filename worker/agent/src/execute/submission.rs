@@ -1,4 +1,5 @@
-//! Where a job is submitted: what its tasks must be certain of is filled in there, because only there it is known.
+//! The environment in which a job is submitted. Submission fills in the inputs of its tasks that
+//! are only known there.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -9,22 +10,23 @@ use picofarm_scene::{
     import::{Bounds, fingerprint},
 };
 
-/// Where a job is submitted.
+/// The environment in which a job is submitted.
 #[derive(Debug, Clone, Copy)]
 pub struct Submission<'a> {
-    /// The folder that relative paths start from.
+    /// Base folder of relative paths.
     pub base: &'a Path,
     /// Folders with furniture.
     pub assets: &'a [PathBuf],
 }
 
 impl Submission<'_> {
-    /// A store's place, absolute; empty stays empty.
+    /// Returns a store's absolute location. An empty one stays empty.
     pub(super) fn store(&self, field: &str, text: &str) -> Result<String, SpecError> {
         if text.is_empty() {
             return Ok(String::new());
         }
-        // As it is written: beside the job file, a mistyped URL would look like a folder.
+        // Checks the location as written, because resolved against the job file's folder, a
+        // mistyped URL would look like a folder.
         check_location(text).map_err(|e| SpecError::new(field, e.to_string()))?;
         match text.contains("://") {
             true => Ok(text.to_owned()),
@@ -32,7 +34,7 @@ impl Submission<'_> {
         }
     }
 
-    /// A path, absolute.
+    /// Returns an absolute path.
     pub(super) fn path(&self, field: &str, text: &str) -> Result<PathBuf, SpecError> {
         absolute(self.base, text).map_err(|e| SpecError::new(field, e))
     }
@@ -45,7 +47,7 @@ impl Submission<'_> {
             .map_err(|e| SpecError::new("output.profile", e))
     }
 
-    /// Pins furniture, and the content of files.
+    /// Pins furniture and the content of files.
     pub(super) fn scenes(&self, source: &mut SceneSource) -> Result<(), SpecError> {
         let (files, root) = match &mut source.kind {
             SceneKind::Furnished { assets, .. } => {
@@ -113,10 +115,10 @@ pub fn repin(source: &mut SceneSource) -> Result<Vec<usize>, SpecError> {
 /// places without them: there they would mean another folder to each machine.)
 ///
 /// # Errors
-/// The path is empty, or there is no current folder.
+/// Fails if the path is empty, or there is no current folder.
 pub fn absolute(base: &Path, path: &str) -> Result<PathBuf, String> {
     if path == "~" || path.starts_with("~/") {
-        // A shell expands it; here it would make a folder of this name.
+        // Only a shell expands it; here it would create a folder of this name.
         return Err(format!(
             "{path:?}: `~` is not expanded here; write the whole path (or \"./{path}\" for a folder named ~)"
         ));
@@ -125,7 +127,7 @@ pub fn absolute(base: &Path, path: &str) -> Result<PathBuf, String> {
     let mut plain = PathBuf::new();
     for part in whole.components() {
         if part == Component::ParentDir {
-            // The folder above a link's target is not the one above the link.
+            // The parent folder of a link's target differs from that of the link.
             plain = plain.canonicalize().unwrap_or(plain);
             plain.pop();
         } else {

@@ -1,4 +1,4 @@
-//! From a job's subsets of spots to the renderer's settings, and from the renderer's groups to
+//! Converts a job's subsets of spots into the renderer's settings, and the renderer's groups into
 //! the data set's arrays.
 
 use picofarm_dataset::{DatasetSpec, Quantity, SubsetRecord};
@@ -7,7 +7,7 @@ use picofarm_transient::{
     sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100},
 };
 
-/// The groups of beams of the data set's further transients, one after the other.
+/// Returns the groups of beams of the data set's additional transients, one after the other.
 pub(super) fn groups(spec: &DatasetSpec) -> Vec<Vec<u32>> {
     let indices = |spots: &[usize]| spots.iter().map(|&s| s as u32).collect();
     let mut groups = vec![];
@@ -21,7 +21,7 @@ pub(super) fn groups(spec: &DatasetSpec) -> Vec<Vec<u32>> {
     groups
 }
 
-/// The rendered groups as the data set takes them.
+/// Returns the rendered groups in the form that the data set stores.
 pub(super) fn records<'a>(spec: &DatasetSpec, rendered: &'a Rendered) -> Vec<SubsetRecord<'a>> {
     let mut groups = rendered.groups.iter().map(Vec::as_slice);
     further(spec)

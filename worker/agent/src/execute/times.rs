@@ -1,4 +1,4 @@
-//! What two-bounce times follow from: the truth's depths, or those that an infer stage has kept.
+//! Source of two-bounce times: the true depths, or those predicted by an infer stage.
 
 use picofarm_dataset::{Dataset, DatasetError, DepthsUsed, Pinned, PinnedDepths, Predictions};
 use picofarm_proto::model::train::TRUTH;
@@ -9,7 +9,7 @@ use super::{
     train::at,
 };
 
-/// What two-bounce times follow from.
+/// Source of two-bounce times.
 pub(super) struct Times {
     /// `truth`, or a folder of the store.
     pub(super) name: String,
@@ -18,10 +18,10 @@ pub(super) struct Times {
 }
 
 impl Times {
-    /// Those that `name` stands for, in the store of a data set.
+    /// Opens the source with the given `name` in the store of a data set.
     ///
     /// # Errors
-    /// [`TaskError::User`] at `field` where there are none, or they are of another size.
+    /// [`TaskError::User`] at `field` if there are no such predictions, or they have another size.
     pub(super) fn of(
         stores: &Stores,
         store: &str,
@@ -55,15 +55,17 @@ impl Times {
         })
     }
 
-    /// Whether they follow from the truth.
+    /// Returns whether the times are derived from the true depths.
     pub(super) fn are_true(&self) -> bool {
         self.predictions.is_none()
     }
 
-    /// What pins the depths of scenes; `None` where they are the truth's, which the scenes pin.
+    /// Returns the hashes of the scenes' depths; `None` for the true depths, which the scenes'
+    /// hashes cover.
     ///
     /// # Errors
-    /// [`TaskError::User`] at `field` where depths are missing, are of other scenes or by several models.
+    /// [`TaskError::User`] at `field` if depths are missing, belong to other scenes, or come from
+    /// several models.
     pub(super) fn pin(
         &self,
         stores: &Stores,
@@ -87,7 +89,7 @@ impl Times {
         found.map(Some)
     }
 
-    /// What a model's lineage says of them.
+    /// Returns the entry for a model's lineage.
     pub(super) fn used(&self, pinned: Option<&PinnedDepths>) -> Option<DepthsUsed> {
         pinned.map(|pinned| DepthsUsed {
             predictions: self.name.clone(),

@@ -1,30 +1,31 @@
-//! What a stage needs to be known of scenes. Imports may lack some of the truth; what is stored in its place stands for
-//! nothing, and a network would learn it as if it were true.
+//! Checks that scenes have the ground truth that a stage needs. Imports may lack some of it. The
+//! placeholders stored instead are meaningless, but a network would learn them as if they were
+//! true.
 
 use picofarm_proto::model::{TrainSettings, train::Target};
 
 use super::TaskError;
 
-/// Scenes that an error names.
+/// Maximum number of scenes that an error names.
 const NAMED: usize = 5;
 
-/// A quantity that a stage cannot do without.
+/// A quantity that a stage requires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Need {
-    /// z-depth that a network learns.
+    /// z-depth as a network's target.
     Depth,
-    /// z-depth that two-bounce times follow from.
+    /// z-depth from which two-bounce times are derived.
     DepthOfTimes,
-    /// Which pixels a spot lights.
+    /// The pixels that each spot lights.
     Visibility,
-    /// Which pixels are mirrors.
+    /// The pixels that are mirrors.
     Specular,
-    /// Lengths of the beams, which two-bounce times begin with.
+    /// Lengths of the beams, which are part of two-bounce times.
     Paths,
 }
 
 impl Need {
-    /// Its name in a manifest's list of what is missing.
+    /// Returns its name in a manifest's list of missing quantities.
     fn name(self) -> &'static str {
         match self {
             Self::Depth | Self::DepthOfTimes => "depth",
@@ -34,7 +35,7 @@ impl Need {
         }
     }
 
-    /// What it is needed for, and what can be done where it is missing.
+    /// Returns the purpose of the quantity, and a remedy if it is missing.
     fn said(self) -> (&'static str, &'static str) {
         let own = "import these scenes with it, or keep them in a data set of their own";
         match self {
@@ -53,7 +54,8 @@ impl Need {
     }
 }
 
-/// What two-bounce times need that are given to a shadow network; from the truth's depth or a model's.
+/// Returns the quantities needed for two-bounce times of a shadow network, derived from the true
+/// depth or from a model's.
 pub(super) fn of_times(timed: bool, from_truth: bool) -> Vec<Need> {
     match (timed, from_truth) {
         (false, _) => Vec::new(),
@@ -62,7 +64,8 @@ pub(super) fn of_times(timed: bool, from_truth: bool) -> Vec<Need> {
     }
 }
 
-/// What a network of these settings is trained and judged with; its two-bounce times follow from the truth's depth or not.
+/// Returns the quantities needed to train and evaluate a network with these settings. `from_truth`:
+/// its two-bounce times are derived from the true depth.
 pub(super) fn of_training(settings: &TrainSettings, from_truth: bool) -> Vec<Need> {
     match settings.target {
         Target::Tof => vec![Need::Depth],
@@ -76,10 +79,11 @@ pub(super) fn of_training(settings: &TrainSettings, from_truth: bool) -> Vec<Nee
     }
 }
 
-/// Refuses scenes of which something is not known that is needed; `missing` holds what is not known of which.
+/// Rejects scenes that lack a needed quantity. `missing` lists the missing quantities of each
+/// scene.
 ///
 /// # Errors
-/// [`TaskError::User`] naming data set, quantity, the first scenes, and what can be done.
+/// [`TaskError::User`] naming data set, quantity, the first scenes, and a remedy.
 pub(super) fn check(
     place: &str,
     needs: &[Need],

@@ -1,5 +1,4 @@
-//! A coordinator that says exactly what a test tells it to say, over real gRPC on a loopback port; and an
-//! executor that does what a test tells it to do.
+//! A scripted coordinator, reached over real gRPC on a loopback port, and a scripted executor.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
 use std::{collections::BTreeMap, net::SocketAddr, sync::Arc, time::Duration};
@@ -29,10 +28,10 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming, transport::Server};
 use uuid::Uuid;
 
-/// No wait in these tests comes near this; it only keeps a broken test from hanging.
+/// Timeout of every wait. No passing test comes near it; it only stops a broken test from hanging.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// Waits for `what`, but not for ever.
+/// Waits for `what`, with a timeout.
 pub async fn soon<T>(what: &str, future: impl Future<Output = T>) -> T {
     match tokio::time::timeout(PATIENCE, future).await {
         Ok(value) => value,
@@ -40,7 +39,7 @@ pub async fn soon<T>(what: &str, future: impl Future<Output = T>) -> T {
     }
 }
 
-/// Waits until `holds` is true.
+/// Waits until `holds` returns true.
 pub async fn until(what: &str, holds: impl Fn() -> bool) {
     soon(what, async {
         while !holds() {
@@ -113,7 +112,7 @@ impl FakeFarm {
         self.address
     }
 
-    /// The next session, its hello read and not answered.
+    /// Accepts the next session and reads its hello, without an answer.
     pub async fn meet(&mut self) -> (Conversation, wire::Hello) {
         let mut c = soon("a session", self.sessions.recv()).await.unwrap();
         let hello = match soon("hello", c.from_worker.message()).await {
@@ -125,7 +124,8 @@ impl FakeFarm {
         (c, hello)
     }
 
-    /// The next session, welcomed with heartbeats each 50 ms and leases of `lease_ms`.
+    /// Accepts the next session and welcomes it, with heartbeats every 50 ms and leases of
+    /// `lease_ms`.
     pub async fn welcome(&mut self, lease_ms: u32) -> (Conversation, wire::Hello) {
         let (c, hello) = self.meet().await;
         c.say(Answer::Welcome(wire::Welcome {
@@ -138,21 +138,21 @@ impl FakeFarm {
     }
 }
 
-/// One session as the coordinator sees it.
+/// A session from the coordinator's side.
 pub struct Conversation {
     from_worker: Streaming<SessionRequest>,
     to_worker: mpsc::Sender<Result<SessionResponse, Status>>,
-    /// Leases the worker asked for.
+    /// Number of leases that the worker asked for.
     pub credit: u32,
-    /// Progress reported, in order.
+    /// Reported progress, in order.
     pub fractions: Vec<f32>,
-    /// Leases that heartbeats are answered without.
+    /// Leases that answers to heartbeats omit.
     pub released: Vec<wire::LeaseRef>,
-    /// Leases that the latest heartbeat named.
+    /// Leases in the latest heartbeat.
     pub held: Vec<wire::LeaseRef>,
-    /// Heartbeats heard.
+    /// Number of received heartbeats.
     pub beats: u32,
-    /// Whether heartbeats are answered at all.
+    /// Whether heartbeats are answered.
     pub renew: bool,
 }
 
@@ -170,8 +170,8 @@ impl Conversation {
         let _ = self.to_worker.send(Err(status)).await;
     }
 
-    /// The next message that is neither credit nor heartbeat; heartbeats are answered on the way. `None`
-    /// when the worker has closed the session.
+    /// Returns the next message other than credit and heartbeats, answering heartbeats in the
+    /// meantime. `None` if the worker has closed the session.
     pub async fn next(&mut self) -> Option<Said> {
         soon("a message from the worker", async {
             loop {
@@ -201,7 +201,8 @@ impl Conversation {
         }
     }
 
-    /// Reads on until `enough` holds, answering heartbeats; anything else is an error of the test.
+    /// Reads messages until `enough` returns true, answering heartbeats. Any other message fails
+    /// the test.
     pub async fn listen_until(&mut self, what: &str, enough: impl Fn(&Self) -> bool) {
         soon(what, async {
             while !enough(self) {
@@ -284,7 +285,7 @@ pub fn spec(store: &str) -> RenderTask {
     }
 }
 
-/// A stage of it.
+/// A stage of that job.
 pub fn stage(spec: RenderTask) -> StageSpec {
     StageSpec::new(TaskSpec::Render(spec))
 }
@@ -310,7 +311,7 @@ pub fn lease(epoch: u64, lo: u64, hi: u64) -> Lease {
 
 type Work = dyn Fn(&Task, &Control) -> Result<Output, TaskError> + Send + Sync;
 
-/// Does what a test says and tells which tasks were started.
+/// Executor that does what the test specifies and reports which tasks were started.
 pub struct FakeExecutor {
     work: Box<Work>,
     started: mpsc::UnboundedSender<u64>,
@@ -331,7 +332,7 @@ impl Executor for FakeExecutor {
     }
 }
 
-/// What an honest executor would say.
+/// The output of a correct executor.
 pub fn output(task: &Task) -> Output {
     Output {
         manifest_sha256: task.key().to_string(),
@@ -377,7 +378,7 @@ impl Worker {
         }
     }
 
-    /// Waits for its end.
+    /// Waits until the worker has ended.
     pub async fn end(self) -> Result<Summary, AgentError> {
         soon("the worker's end", self.life).await.unwrap()
     }
@@ -387,7 +388,7 @@ impl Worker {
     }
 }
 
-/// One thread.
+/// Settings of a worker with one thread.
 pub fn config(address: SocketAddr) -> AgentConfig {
     AgentConfig {
         coordinator: format!("http://{address}"),
@@ -417,7 +418,7 @@ impl Gate {
         Self(CancellationToken::new())
     }
 
-    /// `Err` if asked to stop first.
+    /// Waits for the gate. Returns `Err` if the task is asked to stop first.
     pub fn pass(&self, control: &Control) -> Result<(), TaskError> {
         while !self.0.is_cancelled() {
             if control.stopped() {

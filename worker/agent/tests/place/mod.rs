@@ -1,4 +1,4 @@
-//! A store with a small data set to learn from, made up and not rendered; and a worker for one task.
+//! A store with a small synthetic data set for training, and a worker for one task.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
 use std::{collections::BTreeMap, path::PathBuf, sync::Arc, time::Duration};
@@ -28,7 +28,7 @@ pub const SIDE: u32 = 8;
 pub const BINS: u32 = 8;
 pub const SCENES: u64 = 8;
 
-/// Files by their path.
+/// Contents of files by path.
 pub type Files = BTreeMap<PathBuf, Vec<u8>>;
 
 /// A store with a small data set, split.
@@ -48,7 +48,7 @@ impl Place {
         place
     }
 
-    /// The same, where three scenes lack the named quantities.
+    /// Creates a store in which three scenes lack the named quantities.
     pub async fn lacking(missing: &[&str]) -> Self {
         let place = Self {
             dir: tempfile::tempdir().unwrap(),
@@ -66,12 +66,13 @@ impl Place {
         self.dir.path().to_str().unwrap().to_owned()
     }
 
-    /// Publishes a scene of images with so many rows and columns, and histograms with so many bins (8 at least).
+    /// Publishes a scene. `size` = rows and columns of its images, and bins of its histograms (at
+    /// least 8).
     pub async fn publish(&self, dataset: &str, scene: u64, size: [u32; 2]) {
         self.publish_without(dataset, scene, size, &[]).await;
     }
 
-    /// The same, of which the manifest lists something as missing.
+    /// Like `publish`, with a list of missing quantities in the manifest.
     pub async fn publish_without(
         &self,
         dataset: &str,
@@ -99,7 +100,7 @@ impl Place {
         let depth: Vec<f32> = (0..pixels)
             .map(|p| 1.0 + ((p as u64 * 7 + scene * 3) % 5) as f32 * 0.5)
             .collect();
-        // The nearer, the earlier.
+        // Nearer spots are seen earlier.
         let light = |spot: usize| -> Vec<f32> {
             let mut h = vec![0.01; pixels * bins as usize];
             for (p, z) in depth.iter().enumerate() {
@@ -194,7 +195,7 @@ impl Place {
         let mut settings = json!({
             "target": "tof", "model": "m", "version": model_version(), "seed": 5,
             "net": {"width": 2, "levels": 2}, "optimise": {"epochs": 40, "batch": 2},
-            // A checkpoint each 600 ms.
+            // A checkpoint every 600 ms.
             "checkpoint_minutes": 0.01,
         });
         for (name, value) in more.as_object().unwrap() {
@@ -244,7 +245,7 @@ impl Place {
         StageSpec::new(TaskSpec::Report(ReportTask { report }))
     }
 
-    /// Trains a network of each kind: `m`, `sh` on its depths in `depths`, `s` on its features.
+    /// Trains a network of each kind: `m`; `sh` on its depths in `depths`; `s` on its features.
     pub async fn train_all(&self) {
         let short = json!({"epochs": 10, "batch": 2});
         run(self.training(json!({"optimise": short})))
@@ -259,7 +260,7 @@ impl Place {
         }
     }
 
-    /// The same by a model that is trained for it.
+    /// Like `predict`, with a model trained for this purpose.
     pub async fn predict_with(&self, mut settings: serde_json::Value, folder: &str) {
         settings["optimise"] = json!({"epochs": 10, "batch": 2});
         let model = settings["model"].as_str().unwrap().to_owned();
@@ -267,7 +268,7 @@ impl Place {
         self.predict(&model, folder).await;
     }
 
-    /// Puts what a model predicts of every scene into a folder.
+    /// Stores a model's predictions of every scene in a folder.
     pub async fn predict(&self, model: &str, folder: &str) {
         let mut stage = self.inference(json!({"models": [model]}));
         let TaskSpec::Infer(task) = &mut stage.task else {
@@ -279,7 +280,7 @@ impl Place {
         }
     }
 
-    /// What lies in a folder of the store, but for how fast trainings were.
+    /// Returns the contents of a folder of the store, except the training speeds.
     pub fn files(&self, folder: &str) -> Files {
         let root = self.dir.path().join(folder);
         let (mut found, mut folders) = (BTreeMap::new(), vec![root.clone()]);
@@ -302,7 +303,7 @@ impl Place {
     }
 }
 
-/// Fails for files that are not in both, or not equal; it does not print their bytes.
+/// Asserts that both have the same files with equal contents, without printing their bytes.
 pub fn assert_same(ours: &Files, theirs: &Files) {
     let names = |files: &Files| files.keys().cloned().collect::<Vec<_>>();
     assert_eq!(names(ours), names(theirs));
@@ -333,7 +334,7 @@ pub async fn run_at(
     run_on(Gpus::default(), stage, index, control).await
 }
 
-/// The same on a worker with graphics processors.
+/// Like `run_at`, on a worker with GPUs.
 pub async fn run_on(
     gpus: Gpus,
     stage: StageSpec,
@@ -370,7 +371,8 @@ pub async fn refused(stage: StageSpec) -> String {
     }
 }
 
-/// Runs it, and stops it when it has said that it is past `share`; `false` if it was done before that.
+/// Runs the stage's task and stops it once its progress exceeds `share`. Returns `false` if it
+/// finished first.
 pub async fn run_until(stage: StageSpec, share: f32) -> bool {
     let control = Arc::new(Control::default());
     let (watched, stage) = (control.clone(), tokio::spawn(run_with(stage, control)));

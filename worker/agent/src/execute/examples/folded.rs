@@ -1,4 +1,5 @@
-//! A room in which a mirror folds a beam: two-bounce times of its data set are those of the rendered light.
+//! A room in which a mirror folds a beam. The two-bounce times derived from its data set agree with
+//! the rendered light.
 
 use std::sync::Arc;
 
@@ -62,8 +63,8 @@ fn grey() -> Material {
     }
 }
 
-/// Floor, back wall and a mirror on the right; the beam goes to the mirror and from there to the wall. The camera sees a
-/// patch of the floor.
+/// Returns a room with a floor, a back wall and a mirror on the right. The beam goes to the mirror
+/// and from there to the wall. The camera sees a patch of the floor.
 fn room() -> Scene {
     let floor = [v(-2.0, -1.5, 0.0), v(4.0, 0.0, 0.0), v(0.0, 0.0, -4.0)];
     let wall = [v(-2.0, -1.5, -4.0), v(4.0, 0.0, 0.0), v(0.0, 3.0, 0.0)];
@@ -89,7 +90,8 @@ fn room() -> Scene {
     }
 }
 
-/// The rendered room as a stage reads it from a data set, twice, where so much memory is left beside the task, MiB.
+/// Reads the rendered room from a data set twice, as a stage with `left_mib` MiB of spare memory
+/// does.
 fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
     let (folder, runtime) = (tempfile::tempdir().unwrap(), Runtime::new().unwrap());
     let gate = Gate {
@@ -157,7 +159,7 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
 
 #[test]
 fn scenes_stay_in_a_share_of_the_memory_that_is_left_beside_their_task() {
-    // 400 kB, and as much again for each of four spare rooms.
+    // The scene has 400 kB, and each of the four spare buffers as much again.
     for (left_mib, stays) in [
         (None, false),
         (Some(0), false),
@@ -179,7 +181,7 @@ fn two_bounce_times_from_any_depth_begin_with_the_folded_beams_length() {
         "the beam is folded: {} m, straight {straight} m",
         scene.beams_m[0]
     );
-    // A network that is right in every pixel.
+    // A network with the right depth in every pixel.
     let predicted = picofarm_model::scene::Scene {
         seen_depth_m: Some(scene.depth_m.clone()),
         depth_m: vec![f32::NAN; scene.depth_m.len()],
@@ -194,7 +196,7 @@ fn two_bounce_times_from_any_depth_begin_with_the_folded_beams_length() {
         };
         let last = bins - 1 - h.iter().rev().position(|h| *h > 0.0).unwrap();
         let bin = ((f64::from(tof) - scene.first_m) / scene.bin_width_m).floor() as usize;
-        // A pixel sees a patch, and its centre is within.
+        // A pixel sees a patch; the bin of its centre is within that of the patch.
         assert!(
             (onset..=last).contains(&bin) && last - onset <= 4,
             "pixel {p}: computed bin {bin}, rendered {onset} to {last}"

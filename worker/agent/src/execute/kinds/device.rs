@@ -1,4 +1,5 @@
-//! Where a task's networks are computed: on the CPU, or on the worker's graphics processor where the stage asks for one.
+//! Chooses the device for a task's networks: the CPU, or the worker's GPU if the stage requests
+//! one.
 
 use picofarm_model::{
     Device, ModelError, cpu,
@@ -9,18 +10,18 @@ use super::Context;
 use crate::execute::{Output, Task, TaskError};
 
 impl Context {
-    /// The graphics processor of a task that asks for one.
+    /// Returns the GPU for a task that requests one.
     pub(in crate::execute) fn gpu(&self, task: &Task) -> Option<&OpenGpu> {
         let asked = task.spec.resources.gpus as usize;
         self.gpus.get(asked.checked_sub(1)?)
     }
 
-    /// Where a task's networks are computed.
+    /// Returns the device on which a task's networks are computed.
     pub(in crate::execute) fn device(&self, task: &Task) -> Result<Device, TaskError> {
         match (task.spec.resources.gpus, self.gpu(task)) {
             (0, _) => Ok(cpu()),
             (_, Some(gpu)) => Ok(gpu.device.clone()),
-            // It is placed on workers that have one.
+            // The coordinator assigns such tasks only to workers with a GPU.
             (_, None) => Err(TaskError::Interrupted(
                 "this worker has no graphics processor (--gpus)".into(),
             )),
@@ -28,7 +29,7 @@ impl Context {
     }
 }
 
-/// Runs a task that computes on a graphics processor, if it does; what its driver panics with is the task's error.
+/// Runs a task, on a GPU if it uses one. A panic of the GPU's driver becomes the task's error.
 pub(in crate::execute) fn on_gpu(
     gpu: Option<&OpenGpu>,
     run: impl FnOnce() -> Result<Output, TaskError>,
@@ -39,7 +40,7 @@ pub(in crate::execute) fn on_gpu(
     guarded(&gpu.to_string(), run).unwrap_or_else(|error| Err(TaskError::Crash(plain(error))))
 }
 
-/// Without the field, which the caller names.
+/// Returns the error's message without its field, which the caller adds.
 pub(super) fn plain(error: ModelError) -> String {
     match error {
         ModelError::Invalid { what, .. } => what,

@@ -1,7 +1,9 @@
-//! Evaluation: one task in which trained models meet scenes that they have not seen, or one for each shard of the scenes and
-//! one that joins their sums, in the scenes' order: the same figures to the bit. What it finds lies beside each model; a model
-//! that was evaluated on these scenes before is not asked again. Nothing depends on shards: who joins them asks of those that
-//! are missing or damaged.
+//! Evaluation: computes the errors of trained models on scenes that they were not trained on.
+//!
+//! An evaluation is a single task, or one task for each shard of the scenes and one that joins the
+//! shards in the scenes' order; both give the same figures to the bit. The result is stored next to
+//! each model. A model that was evaluated on these scenes before is skipped. Shards are only a
+//! cache: the joining task recomputes those that are missing or damaged.
 
 use std::ops::Range;
 
@@ -28,7 +30,7 @@ use crate::execute::{
     truth,
 };
 
-/// Training scenes that answers without a network are fitted to, at most.
+/// Maximum number of training scenes that the trivial baselines are fitted to.
 const BASELINE: usize = 64;
 
 impl RunTask for EvaluateTask {
@@ -36,7 +38,7 @@ impl RunTask for EvaluateTask {
         model_version()
     }
 
-    /// Evaluates the models that `task` names; joins their shards where they have some.
+    /// Evaluates the models that `task` names, and joins their shards if there are any.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let _kept = Kept::from_now();
         let evaluation = EvaluationRun::new((context, context.device(task)?), self, control)?;
@@ -60,7 +62,8 @@ impl RunTask for EvaluateShardTask {
         model_version()
     }
 
-    /// Asks the models of the scenes of shard `task.index`, but those whose evaluation or shard is there.
+    /// Evaluates the models on the scenes of shard `task.index`. Skips models with a finished
+    /// evaluation or shard.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let _kept = Kept::from_now();
         let evaluation =
@@ -90,7 +93,7 @@ impl RunTask for EvaluateShardTask {
         }
         control.at(1.0);
         Ok(Output {
-            // Shards go when their evaluations are there: their names are all that stays the same.
+            // Shards are deleted after their evaluation is stored, so only their names are stable.
             manifest_sha256: hex::encode(names.finalize()),
             bytes,
             adopted: !computed,
@@ -98,49 +101,49 @@ impl RunTask for EvaluateShardTask {
     }
 }
 
-/// One evaluation: the scenes, and the models that it asks.
+/// An evaluation: its scenes and its models.
 struct EvaluationRun<'a> {
     stores: &'a Stores,
     task: &'a EvaluateTask,
-    /// Where models are asked.
+    /// Device on which the models run.
     device: Device,
     dataset: Dataset,
     models: Models,
     split: SplitUsed,
     scenes: Vec<u64>,
-    /// What pins their bytes.
+    /// Hashes of the scenes.
     data: Pinned,
-    /// Training scenes that the answers which need no model are fitted to, and what pins their bytes.
+    /// Training scenes that the trivial baselines are fitted to, and their hashes.
     known: Vec<u64>,
     known_data: Pinned,
-    /// Memory that is left beside it, MiB; `None` = not known.
+    /// Memory left to the task, in MiB; `None` = unknown.
     left_mib: Option<u64>,
 }
 
-/// A shard as it lies in the store.
+/// A shard as it is stored.
 #[derive(Serialize, Deserialize)]
 struct ShardRecord {
     /// Key of the evaluation.
     evaluation: String,
-    /// Which shard, and of how many.
+    /// Index of the shard and number of shards.
     shard: (u32, u32),
-    /// Of each scene, in order.
+    /// One entry for each scene, in order.
     answered: Vec<Answered>,
 }
 
-/// A model as it is asked.
+/// A model under evaluation.
 struct Asked {
-    /// Which of the evaluation's.
+    /// Index of the model in the evaluation.
     which: usize,
     model: Known,
-    /// For a shadow network that is given two-bounce times.
+    /// Two-bounce times for a shadow network that takes them.
     times: Option<Times>,
     histogram: Histogram,
     spots: Vec<u32>,
-    /// What the histograms go through, and the seed of its noise.
+    /// The sensor that histograms pass through, and the seed of its noise.
     sensor: Option<(Sensor, u64)>,
     sha256: String,
-    /// Key of what is found.
+    /// Key of the evaluation of this model.
     key: String,
 }
 
@@ -179,7 +182,7 @@ impl<'a> EvaluationRun<'a> {
         })
     }
 
-    /// One of the models, and what it is asked of.
+    /// Prepares one of the models and its input.
     fn asked(&self, which: usize, control: &Control) -> Result<Asked, TaskError> {
         let (stores, models, settings) = (self.stores, &self.models, &self.task.evaluate);
         let name = &settings.models[which];
@@ -219,7 +222,7 @@ impl<'a> EvaluationRun<'a> {
             &truth::of_training(&trained, from_truth),
             &self.data.missing,
         )?;
-        // Trivial answers are fitted to the training scenes, and need no times.
+        // Trivial baselines are fitted to the training scenes and need no times.
         truth::check(
             &place,
             &truth::of_training(&trained, false),
@@ -255,14 +258,14 @@ impl<'a> EvaluationRun<'a> {
         })
     }
 
-    /// What was found of it before.
+    /// Returns the stored evaluation of a model, if there is one.
     fn found(&self, asked: &Asked, control: &Control) -> Result<Option<Evaluation>, TaskError> {
         let name = &self.task.evaluate.models[asked.which];
         let found = self.models.evaluation(name, &asked.key);
         self.stores.wait(control, found)
     }
 
-    /// What one of the models has found or finds now; and whether it is new.
+    /// Returns the evaluation of one of the models, and whether it was computed by this task.
     fn of(&self, which: usize, control: &Control) -> Result<(Evaluation, bool), TaskError> {
         let (stores, models, settings) = (self.stores, &self.models, &self.task.evaluate);
         let name = &settings.models[which];
@@ -308,7 +311,7 @@ impl<'a> EvaluationRun<'a> {
             metrics,
         };
         let new = stores.patiently(control, async || models.put_evaluation(&made).await)?;
-        // What cannot be deleted now is left: nobody reads it.
+        // A shard that cannot be deleted now is left, because nothing reads it.
         for shard in 0..settings.shards {
             let name = self.shard(&asked, shard);
             if settings.shards > 1
@@ -317,7 +320,7 @@ impl<'a> EvaluationRun<'a> {
                 warn!(%error, "a shard that was joined is left behind");
             }
         }
-        // Where somebody else was faster, what stands is what counts.
+        // If another task stored its evaluation first, that one counts.
         let found = match new {
             true => made,
             false => self.found(&asked, control)?.unwrap_or(made),
@@ -326,12 +329,12 @@ impl<'a> EvaluationRun<'a> {
         Ok((found, true))
     }
 
-    /// Tells what the model is worth beside trivial answers.
+    /// Logs how the model compares with the trivial baselines.
     fn tell(&self, asked: &Asked, found: &Evaluation) -> Result<(), TaskError> {
         let target = asked.model.model.question().target;
         let verdict = Verdict::of_evaluation(target.name(), &found.metrics);
         let name = &found.model;
-        // An older version kept figures of answers that are no numbers.
+        // An older version stored evaluations of predictions that are not numbers.
         if found.metrics["mae_m"].is_null() && found.metrics["iou"].is_null() {
             return Err(TaskError::User(format!(
                 "model {name:?}: its evaluation {} has no figures; an older version kept it of answers that are no numbers: \
@@ -356,7 +359,7 @@ impl<'a> EvaluationRun<'a> {
         }
     }
 
-    /// The scenes of a shard, as indices into those of the evaluation.
+    /// Returns the scenes of a shard, as indices into those of the evaluation.
     fn range(&self, shard: u32) -> Range<usize> {
         let (scenes, of) = (
             self.scenes.len() as u64,
@@ -366,7 +369,7 @@ impl<'a> EvaluationRun<'a> {
         begin(u64::from(shard))..begin(u64::from(shard) + 1)
     }
 
-    /// What was answered of a shard; `None` where that is not there, or not whole.
+    /// Reads a shard; `None` if it is missing or incomplete.
     fn read(
         &self,
         name: &ShardName,
@@ -393,7 +396,7 @@ impl<'a> EvaluationRun<'a> {
         }
     }
 
-    /// Shows the scenes of a shard to a model.
+    /// Runs a model on the scenes of a shard.
     fn ask(
         &self,
         asked: &Asked,
@@ -442,7 +445,7 @@ impl<'a> EvaluationRun<'a> {
     }
 }
 
-/// The figures as they lie in the store.
+/// Returns the figures in the form in which they are stored.
 fn metrics(found: &Evaluated, scenes: &[u64]) -> serde_json::Value {
     let baselines = found
         .baselines
@@ -457,7 +460,7 @@ fn metrics(found: &Evaluated, scenes: &[u64]) -> serde_json::Value {
     metrics
 }
 
-/// The figures of all scenes together, for people.
+/// Formats the mean figures of all scenes for the log.
 fn summary(metrics: &serde_json::Value) -> String {
     let all = metrics.as_object().into_iter().flatten();
     let numbers = all.filter(|(name, _)| *name != "examples");
@@ -465,10 +468,10 @@ fn summary(metrics: &serde_json::Value) -> String {
     numbers.collect::<Vec<_>>().join(", ")
 }
 
-/// The settings that a model was trained with.
+/// Returns the settings that a model was trained with.
 pub(in crate::execute) fn trained(settings: &serde_json::Value) -> Result<TrainSettings, String> {
     let mut settings = settings.clone();
-    // The manifest tells the name apart from them.
+    // The manifest stores the model's name separately.
     if let Some(table) = settings.as_object_mut() {
         table.insert("model".into(), "model".into());
     }

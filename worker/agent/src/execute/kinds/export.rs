@@ -1,4 +1,4 @@
-//! Packing a data set for sharing, or a part of it.
+//! Packs a data set, or part of it, for sharing.
 
 use std::ops::Range;
 
@@ -13,27 +13,27 @@ use crate::execute::{
     Context, Control, Output, RunTask, Submission, Task, TaskError, output::of_dataset,
 };
 
-/// Which scenes of a data set.
+/// Selects scenes of a data set.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Scenes {
-    /// All that are published.
+    /// All published scenes.
     All,
-    /// Those of them in an interval.
+    /// The published scenes in an interval.
     Range(Range<u64>),
-    /// Those of them on a side of a split.
+    /// The published scenes on a side of a split.
     Split {
-        /// The split.
+        /// Name of the split.
         name: String,
-        /// The side.
+        /// Name of the side.
         side: String,
     },
 }
 
 impl Scenes {
-    /// Reads nothing, `a..b`, `split:SIDE` or `split:NAME:SIDE`.
+    /// Parses an empty string, `a..b`, `split:SIDE` or `split:NAME:SIDE`.
     ///
     /// # Errors
-    /// It is none of them.
+    /// Fails if the text has none of these forms.
     pub fn parse(text: &str) -> Result<Self, String> {
         let expected =
             || "expected A..B, split:train, split:validation, split:test or split:NAME:SIDE";
@@ -62,10 +62,11 @@ impl Scenes {
         }
     }
 
-    /// The published scenes among them, ascending.
+    /// Returns the selected published scenes, in ascending order.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where there is no such split; others where the store cannot be read.
+    /// [`DatasetError::Invalid`] if there is no such split; other errors if the store cannot be
+    /// read.
     pub async fn of(&self, dataset: &Dataset) -> Result<Vec<u64>, DatasetError> {
         let mut scenes = dataset.scenes_present().await?;
         match self {
@@ -80,7 +81,7 @@ impl Scenes {
     }
 }
 
-/// The scenes of a side of the newest version of a split, ascending.
+/// Returns the scenes on a side of the newest version of a split, in ascending order.
 async fn of_split(dataset: &Dataset, name: &str, side: &str) -> Result<Vec<u64>, DatasetError> {
     let versions = dataset.split_versions(name).await?;
     let Some(version) = versions.last() else {
@@ -105,7 +106,7 @@ impl RunTask for ExportTask {
         Self::VERSION.to_owned()
     }
 
-    /// Packs what the job names. Files that are there already are kept.
+    /// Packs the scenes that the job names. Existing files are kept.
     fn run(&self, context: &Context, _task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, spec) = (&context.stores, self);
         let field = |e: TaskError, field: &str| match e {

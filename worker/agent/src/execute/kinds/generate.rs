@@ -1,5 +1,5 @@
-//! Generating: a scene as a file for other programs. Made anew each time and compared with what is there: that takes less
-//! than to trust it.
+//! Generate: writes a scene as a file for other programs. The scene is always regenerated and
+//! compared with the existing file, because generating takes less time than verifying its origin.
 
 use bytes::Bytes;
 use picofarm_dataset::publish_files;
@@ -11,10 +11,10 @@ use tracing::info;
 
 use crate::execute::{Context, Control, Output, RunTask, Submission, Task, TaskError, scenes};
 
-/// Version of the files that are written of a scene.
+/// Version of the format of the written files.
 const FILES_VERSION: &str = "scene-files-2";
 
-/// Everything of this program that decides a scene file's bytes.
+/// Returns the version of all code of this program that determines a scene file's bytes.
 pub fn generator_version() -> String {
     format!(
         "{}/{}/{FILES_VERSION}",
@@ -37,7 +37,7 @@ impl RunTask for GenerateTask {
             source,
             settings.resolution,
             task.index,
-            // Generated scenes name no files.
+            // Generated scenes refer to no files.
             (libraries, &Opener::anywhere()),
         )?;
         if !control.at(0.5) {
@@ -75,13 +75,14 @@ impl RunTask for GenerateTask {
     }
 }
 
-/// Whether generated scenes have such a name: `000007.glb`, or the folder `000007`.
+/// Returns whether a name is that of a generated scene: `000007.glb`, or the folder `000007`.
 fn is_scene_file(name: &str) -> bool {
     let number = name.strip_suffix(".glb").unwrap_or(name);
     number.len() >= 6 && number.bytes().all(|b| b.is_ascii_digit())
 }
 
-/// The files of a scene for Mitsuba, below `name`; the one that names the others comes last.
+/// Returns the files of a scene for Mitsuba, below `name`. The file that refers to the others comes
+/// last.
 fn mitsuba(scene: &Scene, name: &str) -> Result<Vec<(String, Bytes)>, TaskError> {
     let failed = |e: std::io::Error| {
         TaskError::Interrupted(format!(

@@ -1,4 +1,5 @@
-//! Importing: a scene of other people's data into a data set. See [`picofarm_dataset::import`] for what is checked.
+//! Import: copies a scene of a foreign data set into a data set. See [`picofarm_dataset::import`]
+//! for the checks.
 
 use std::{
     path::Path,
@@ -18,15 +19,15 @@ use crate::execute::{
     output::{manifest_sha256, of_dataset, saying},
 };
 
-/// Everything of this program that decides an imported scene's bytes.
+/// Returns the version of all code of this program that determines an imported scene's bytes.
 pub fn import_version() -> String {
     format!("{IMPORT_VERSION}/{}", picofarm_dataset::ENCODER_VERSION)
 }
 
-/// The format of import settings, if they name one, and their options.
+/// Returns the format that import settings name, if any, and their options.
 ///
 /// # Errors
-/// An unknown name or a value that cannot be, by field.
+/// Returns an error naming the field if a name is unknown or a value is invalid.
 fn import_options(settings: &ImportSettings) -> Result<(Option<Format>, ImportOptions), SpecError> {
     let parsed = |name| Format::parse(name).map_err(|e| SpecError::new("import.format", e));
     let format = match settings.format.is_empty() {
@@ -39,12 +40,12 @@ fn import_options(settings: &ImportSettings) -> Result<(Option<Format>, ImportOp
     Ok((format, options))
 }
 
-/// The source read last: a folder of many scenes is looked through once.
+/// Cache of the latest source, so that a folder with many scenes is listed only once.
 #[derive(Default)]
 pub(in crate::execute) struct Sources(Mutex<Option<(ImportSettings, Arc<Source>)>>);
 
 impl Sources {
-    /// The source that holds scene `name`, and the scene's index in it.
+    /// Opens the source of scene `name`, and returns it with the scene's index in it.
     fn open(
         &self,
         settings: &ImportSettings,
@@ -134,7 +135,7 @@ impl RunTask for ImportTask {
         })
     }
 
-    /// Which scenes there are is asked of the folder.
+    /// The names of the scenes are read from the folder.
     fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
         here.profile(&self.output.profile)?;
         let import = &mut self.import;
@@ -153,7 +154,7 @@ impl RunTask for ImportTask {
     }
 }
 
-/// Who is to blame: a disk that fails is nobody's fault, everything else is the job's.
+/// Classifies an import error: a failing disk is not the job's fault, everything else is.
 fn of_import(error: ImportError) -> TaskError {
     use std::io::ErrorKind::{
         InvalidInput, IsADirectory, NotADirectory, NotFound, PermissionDenied,

@@ -1,7 +1,9 @@
-//! Inference: what trained models see in a scene, kept beside the data set. Adopt, or ask each model and publish.
+//! Inference: stores the predictions of trained models for a scene, next to the data set. The task
+//! adopts predictions that exist, or runs each model and publishes the result.
 //!
-//! A shadow network that is given two-bounce times is given those that follow from the depths of the stage's own ToF model;
-//! where the stage has none, those that it was trained with: from predictions of the data set, or the truth's.
+//! A shadow network that takes two-bounce times receives those derived from the depths of the
+//! stage's own ToF model. If the stage has no such model, it receives the kind of times that it was
+//! trained with: derived from stored predictions, or from the true depths.
 
 use std::{
     collections::BTreeMap,
@@ -32,23 +34,23 @@ use crate::execute::{
 };
 use panel::{Member, Panel, Shown, Times};
 
-/// Progress once everything is asked.
+/// Progress of the task when all models have run.
 const ASKED: f32 = 0.95;
 
-/// Version of what a manifest states of how predictions agree.
+/// Version of the agreement figures in a manifest.
 const AGREEMENT: &str = "agreement-1";
 
-/// Everything of this program that decides the bytes of predictions and their manifests: networks, encoder, and what is
-/// compared. Part of every key.
+/// Returns the version of all code of this program that determines the bytes of predictions and
+/// their manifests: networks, encoder and agreement figures. Part of every key.
 pub fn infer_version() -> String {
     format!("{}/{ENCODER_VERSION}/{AGREEMENT}", model_version())
 }
 
-/// Models that are kept from task to task: those of the latest one.
+/// Cache of models between tasks. It has the models of the latest task.
 #[derive(Default)]
 pub(in crate::execute) struct ModelCache(Mutex<Kept>);
 
-/// Models by the SHA-256 of their manifests, and whether they are on a graphics processor.
+/// Models by the SHA-256 of their manifest and by whether they are on a GPU.
 type Kept = BTreeMap<(String, bool), Arc<Model>>;
 
 impl RunTask for InferTask {
@@ -56,7 +58,7 @@ impl RunTask for InferTask {
         infer_version()
     }
 
-    /// Lets models see scene `index`; with `force` although what they see is there.
+    /// Runs the models on scene `index`; with `force`, even if its predictions exist.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, cache) = (&context.stores, &context.models);
         let (device, on_gpu) = (context.device(task)?, context.gpu(task).is_some());
@@ -115,7 +117,7 @@ impl RunTask for InferTask {
     }
 }
 
-/// Tells whether the predictions of a scene agree.
+/// Logs whether the predictions of a scene agree.
 fn tell(manifest: &PredictionManifest) {
     if let Some(verdict) = Verdict::of_agreement(&manifest.agreement) {
         saying(
@@ -133,7 +135,7 @@ fn output(manifest: &PredictionManifest, adopted: bool) -> Output {
     }
 }
 
-/// What is there if this very task has published it.
+/// Returns the predictions if this exact task has published them.
 fn finished(
     stores: &Stores,
     predictions: &Predictions,
@@ -153,7 +155,7 @@ fn finished(
 }
 
 impl Panel {
-    /// Asks all models of a scene.
+    /// Runs all models on a scene.
     fn ask(
         &self,
         stores: &Stores,
@@ -195,7 +197,7 @@ impl Panel {
     }
 }
 
-/// Models being asked of a scene.
+/// Models in use for one scene.
 struct Asked<'a> {
     stores: &'a Stores,
     models: &'a Models,
@@ -204,10 +206,10 @@ struct Asked<'a> {
     dataset: &'a Dataset,
     index: u64,
     control: &'a Control,
-    /// Models at hand, and those that were asked.
+    /// Cached models, and the models that this task has used.
     cache: Kept,
     used: Kept,
-    /// The scene with each histogram that was read.
+    /// The scene with each histogram that has been read.
     seen: Vec<(Shown, Arc<Scene>)>,
 }
 
@@ -257,7 +259,7 @@ impl Asked<'_> {
         model.depth_m(&scene).map_err(fault)
     }
 
-    /// Two-bounce times follow from `depth_m`, where there is some.
+    /// Predicts masks. Two-bounce times are derived from `depth_m`, if given.
     fn masks(
         &mut self,
         member: &Member,
@@ -266,7 +268,7 @@ impl Asked<'_> {
     ) -> Result<Vec<u8>, TaskError> {
         let (model, mut scene) = (self.model(member)?, self.scene(member)?);
         if depth_m.is_some() {
-            // The scene is not copied: nothing else has it in hand.
+            // The scene is not copied, because nothing else refers to it.
             self.seen.retain(|(_, other)| !Arc::ptr_eq(other, &scene));
             Arc::make_mut(&mut scene).seen_depth_m = depth_m;
             let shown = (member.histogram, member.spots.clone());

@@ -1,5 +1,5 @@
-//! The worker's executor: the table of all kinds of task, each of which runs in a file of its own here. What a kind is says
-//! [`picofarm_proto::model::kinds`].
+//! The worker's executor: the table of all task kinds. Each kind runs in a file of its own in this
+//! folder. [`picofarm_proto::model::kinds`] documents the kinds.
 
 #[cfg(feature = "networks")]
 pub(in crate::execute) mod device;
@@ -44,28 +44,30 @@ use tokio::runtime::Handle;
 
 use super::{Control, Executor, Output, Submission, Task, TaskError, output::Stores, scenes};
 
-/// How long a finished scene waits at most for a store that is full or away before its task is handed back.
+/// Maximum time for which a finished scene waits for a full or unreachable store before its task is
+/// handed back.
 pub(in crate::execute) const STORE_PATIENCE: Duration = Duration::from_secs(120);
 
-/// Where workers of this machine alone reach one another.
+/// Address of workers that only workers of the same machine can reach.
 #[cfg(feature = "networks")]
 const LOOPBACK: &str = "127.0.0.1";
 
-/// How tasks of a kind run.
+/// Runs the tasks of a kind.
 pub(in crate::execute) trait RunTask {
-    /// Version of the code that decides the bytes of its results; empty where this program was built without it.
+    /// Returns the version of the code that determines the bytes of its results. Empty if this
+    /// program was built without the kind.
     fn code_version() -> String
     where
         Self: Sized;
 
-    /// Runs a task of it to its end. The version is this program's.
+    /// Runs a task of this kind to its end. The task's version equals this program's.
     ///
     /// # Errors
-    /// [`TaskError`], by who is to blame.
+    /// [`TaskError`], classified by cause.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError>;
 
-    /// Fills in, where a job is submitted, what its tasks must be certain of beside the version and absolute places; checks
-    /// what only the code that runs it knows.
+    /// Completes the spec when a job is submitted: fills in the inputs of its tasks other than the
+    /// version and absolute paths, and makes the checks that only this code can make.
     ///
     /// # Errors
     /// [`SpecError`] naming the field.
@@ -74,29 +76,29 @@ pub(in crate::execute) trait RunTask {
     }
 }
 
-/// What tasks of every kind run with.
+/// State shared by tasks of every kind.
 pub(in crate::execute) struct Context {
     /// Furniture.
     pub libraries: Vec<AssetLibrary>,
-    /// Stores that have been opened.
+    /// Opened stores.
     pub stores: Stores,
-    /// The import that was read last.
+    /// The latest import source.
     pub sources: import::Sources,
-    /// What opens scene files and imports.
+    /// Opens scene files and imports.
     pub files: Opener,
-    /// Where other workers reach this one.
+    /// Address at which other workers reach this one.
     #[cfg(feature = "networks")]
     pub peers: String,
-    /// Graphics processors that tasks may use.
+    /// GPUs that tasks may use.
     #[cfg(feature = "networks")]
     pub gpus: Vec<OpenGpu>,
-    /// The networks that were asked last.
+    /// The models that the latest inference used.
     #[cfg(feature = "networks")]
     pub models: infer::ModelCache,
 }
 
 impl Context {
-    /// What scenes are made of.
+    /// Returns the inputs for making scenes.
     pub fn scenes(&self) -> scenes::With<'_> {
         (&self.libraries, &self.files)
     }
@@ -104,7 +106,7 @@ impl Context {
 
 macro_rules! kinds {
     ($($kind:ident($task:ident),)*) => {
-        /// The version of this program's code for each kind.
+        /// Returns the version of this program's code for each kind.
         fn versions() -> [(&'static str, String); [$(stringify!($kind)),*].len()] {
             [$(($task::NAME, $task::code_version())),*]
         }
@@ -141,30 +143,32 @@ kinds! {
     EvaluateShard(EvaluateShardTask),
 }
 
-/// Parts of kinds that not every program has, and whether this one does: see [`TaskSpec::ability`].
+/// Optional parts of kinds, and whether this program was built with them. See
+/// [`TaskSpec::ability`].
 const PARTS: [(&str, &str, bool); 2] = [
     (ExportTask::NAME, FORMATS, cfg!(feature = "formats")),
     (ReconstructTask::NAME, MLP, cfg!(feature = "networks")),
 ];
 
-/// The version of this program's code for a kind.
+/// Returns the version of this program's code for a kind.
 fn version(kind: &str) -> String {
     let found = versions().into_iter().find(|(name, _)| *name == kind);
     found.map_or_else(String::new, |(_, version)| version)
 }
 
-/// Says how to have a kind that this program was built without.
+/// Returns a message on how to build picofarm with a missing kind.
 fn not_built(kind: &str) -> String {
     format!(
         "this picofarm was built without networks, which stages of kind {kind:?} need; build it with `--features networks`"
     )
 }
 
-/// Fills in, where a job is submitted, what its tasks must be certain of: absolute places, this program's version,
-/// furniture, the content of files; and checks what only the code that runs them knows.
+/// Completes a task's spec when its job is submitted: fills in absolute paths, this program's
+/// version, furniture and the hashes of files, and makes the checks that only the kind's code can
+/// make.
 ///
 /// # Errors
-/// [`SpecError`] naming the first field that cannot be used.
+/// [`SpecError`] naming the first unusable field.
 pub fn resolve(task: &mut TaskSpec, here: &Submission<'_>) -> Result<(), SpecError> {
     if let Some((source, _)) = task.reads_mut() {
         source.store = here.store("source.store", &source.store)?;
@@ -193,8 +197,9 @@ pub fn resolve(task: &mut TaskSpec, here: &Submission<'_>) -> Result<(), SpecErr
 pub struct TaskExecutor(Context);
 
 impl TaskExecutor {
-    /// An executor with the furniture found in `asset_dirs` and the usual places. Stores are reached through
-    /// `runtime`, which must not be a thread of the executor's own. Scene files and imports are opened by `files`.
+    /// Creates an executor with the furniture found in `asset_dirs` and the usual folders.
+    /// `runtime` serves store requests and must not own the executor's thread. `files` opens scene
+    /// files and imports.
     pub fn new(asset_dirs: &[PathBuf], runtime: Handle, files: Opener) -> Self {
         Self(Context {
             files,
@@ -210,8 +215,8 @@ impl TaskExecutor {
         })
     }
 
-    /// The same where other workers reach it at an address of this machine: host, or host and port. Without networks nobody
-    /// wants to.
+    /// Sets the address at which other workers reach this one: a host, or a host and port. Only
+    /// builds with networks use it.
     #[must_use]
     #[cfg_attr(not(feature = "networks"), expect(unused_mut, unused_variables))]
     pub fn reached_at(mut self, peers: &str) -> Self {
@@ -222,10 +227,11 @@ impl TaskExecutor {
         self
     }
 
-    /// The same with graphics processors, which are opened and tried.
+    /// Opens and tests GPUs for tasks.
     ///
     /// # Errors
-    /// [`AgentError::Config`] where there are none such, or one computes wrongly; in a program without networks, for any.
+    /// [`AgentError::Config`] if a GPU does not exist or computes wrong results, or if this program
+    /// was built without networks and any GPU is requested.
     #[cfg_attr(not(feature = "networks"), expect(unused_mut))]
     pub fn with_gpus(mut self, gpus: &Gpus) -> Result<Self, AgentError> {
         let refused = |what: String| AgentError::Config {
@@ -248,7 +254,7 @@ impl TaskExecutor {
         Ok(self)
     }
 
-    /// The same for tasks that may take so much memory, MiB; 0 = not known.
+    /// Sets the memory that tasks may use, in MiB; 0 = unknown.
     #[must_use]
     pub fn with_memory(self, memory_mib: u64) -> Self {
         Self(Context {
@@ -295,18 +301,18 @@ impl Executor for TaskExecutor {
                  run workers of the other one"
             )));
         }
-        // A lease brings only its part of lists.
+        // A lease brings only its own part of lists.
         if spec.only(0, 0).is_none() {
             spec.check().map_err(|e| TaskError::User(e.to_string()))?;
         }
         if spec.reads().is_none() {
-            // Others say it when they have seen what they read.
+            // Other kinds make this check after they have read their inputs.
             self.0.stores.fits(spec.clone(), None)?;
         }
         let run = || {
             self.0.stores.check_identities(control)?;
             let output = runner(spec).run(&self.0, task, control)?;
-            // What was written while the store was not mounted is not there.
+            // Output written while the store was not mounted is lost.
             self.0.stores.check_identities(control)?;
             Ok(output)
         };

@@ -1,5 +1,6 @@
-//! Parts of heavy scenes: rendered as tasks of their own, and joined by the scene's render task. Nothing depends on them:
-//! who joins renders what is missing or damaged, and the scene is the same to the bit.
+//! Parts of heavy scenes: rendered as tasks of their own, and joined by the scene's render task.
+//! Parts are only a cache: the joining task renders those that are missing or damaged, and the
+//! scene is the same to the bit.
 
 use picofarm_dataset::{Dataset, PartName};
 use picofarm_proto::{
@@ -23,7 +24,7 @@ impl RunTask for PartTask {
         renderer_version()
     }
 
-    /// Renders the part that task `task.index` is, unless it or its whole scene is there.
+    /// Renders the part with index `task.index`, unless it or its whole scene exists.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, with, spec) = (&context.stores, context.scenes(), self);
         let (scene, index) = spec.division().split(task.index);
@@ -31,7 +32,7 @@ impl RunTask for PartTask {
         let dataset = stores.open(&spec.whole, control)?;
         let done = |bytes, adopted| {
             Ok(Output {
-                // A part goes when its scene is there: its name is all that stays the same.
+                // A part is deleted after its scene is published, so only its name is stable.
                 manifest_sha256: hex::encode(Sha256::digest(task.key().0)),
                 bytes,
                 adopted,
@@ -65,7 +66,7 @@ impl RunTask for PartTask {
     }
 }
 
-/// The parts of a scene in the store.
+/// The stored parts of a scene.
 pub(in crate::execute) struct Parts<'a> {
     stores: &'a Stores,
     dataset: &'a Dataset,
@@ -75,7 +76,7 @@ pub(in crate::execute) struct Parts<'a> {
 }
 
 impl<'a> Parts<'a> {
-    /// The parts that the render task `task_key` joins.
+    /// Creates the parts that the render task `task_key` joins.
     pub(in crate::execute) fn new(
         stores: &'a Stores,
         dataset: &'a Dataset,
@@ -100,7 +101,7 @@ impl<'a> Parts<'a> {
         }
     }
 
-    /// A part and its size; `None` if it is not there, or not whole.
+    /// Reads a part and its size in bytes; `None` if it is missing or incomplete.
     fn read(&self, index: u32, control: &Control) -> Result<Option<(Part, u64)>, TaskError> {
         let name = self.name(index);
         let Some(bytes) = self.stores.wait(control, self.dataset.part(&name))? else {
@@ -119,7 +120,7 @@ impl<'a> Parts<'a> {
         Ok(None)
     }
 
-    /// Puts a part; its size.
+    /// Stores a part and returns its size in bytes.
     fn write(&self, part: &Part, control: &Control) -> Result<u64, TaskError> {
         let bytes = postcard::to_allocvec(part)
             .map_err(|e| TaskError::Crash(format!("a part of scene {}: {e}", self.scene)))?;
@@ -129,7 +130,7 @@ impl<'a> Parts<'a> {
         Ok(bytes.len() as u64)
     }
 
-    /// Joins all parts; those that are missing are rendered here.
+    /// Joins all parts. Renders those that are missing.
     pub(in crate::execute) fn join(
         &self,
         scene: &Scene,
@@ -156,7 +157,8 @@ impl<'a> Parts<'a> {
         join_parts(scene, settings, parts, &Watched(control)).map_err(of_render)
     }
 
-    /// Deletes the parts of a scene that is published. What cannot be deleted now, collection finds.
+    /// Deletes the parts of a published scene. Parts that cannot be deleted now are removed by
+    /// garbage collection.
     pub(in crate::execute) fn delete(&self, control: &Control) {
         for which in PartOf::all(self.of) {
             let name = self.name(which.index);
@@ -167,7 +169,7 @@ impl<'a> Parts<'a> {
     }
 }
 
-/// Carries a part's progress to the task that renders all of them.
+/// Maps a part's progress into that of the task that renders all parts.
 struct Share<'a>(&'a Control, f32, f32);
 
 impl Progress for Share<'_> {

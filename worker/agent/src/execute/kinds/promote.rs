@@ -1,5 +1,5 @@
-//! Promotion: the best of several models gets a name of its own. It is the same training's result, byte for byte, and its
-//! manifest says among which it was chosen.
+//! Promotion: gives the best of several models a name of its own. The promoted model is a
+//! byte-for-byte copy of the training's result, and its manifest lists the candidates.
 
 use picofarm_dataset::{ModelManifest, NewModel, Promoted, TrialRecord};
 use picofarm_model::metric::Metrics;
@@ -35,7 +35,7 @@ impl RunTask for PromoteTask {
                         info!("{name} is not there: passed over");
                         continue;
                     }
-                    // Says which there are.
+                    // The error lists the existing models.
                     let missing = stores.wait(control, models.manifest(name));
                     missing.map_err(|e| at(&field, e))?;
                     continue;
@@ -100,7 +100,8 @@ impl RunTask for PromoteTask {
     }
 }
 
-/// What is less for the better model: MAE in metres, or one less IoU, of the validation scenes at its end.
+/// Returns the loss of a model on the validation scenes at the end of its training: MAE in metres,
+/// or 1 − IoU.
 fn loss(manifest: &ModelManifest) -> Result<f64, TaskError> {
     let found = manifest.metrics.get("validation").cloned();
     let found: Option<Metrics> = found.and_then(|m| serde_json::from_value(m).ok());
@@ -112,7 +113,7 @@ fn loss(manifest: &ModelManifest) -> Result<f64, TaskError> {
     })
 }
 
-/// How a trial ended whose model would have this name.
+/// Returns the record of the trial that trained a model, if any.
 fn trial_of(
     stores: &Stores,
     models: &picofarm_dataset::Models,

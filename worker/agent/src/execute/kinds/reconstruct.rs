@@ -1,7 +1,8 @@
-//! Reconstruction: a scene of a data set as a density field, a mesh and their errors. Adopt, or measure, fit and publish.
+//! Reconstruction: computes a density field, a mesh and their errors from a scene of a data set.
+//! The task adopts a reconstruction that exists, or measures, fits and publishes.
 //!
-//! A grid takes seconds, so it keeps no checkpoint: a task that is stopped begins again, and comes to the same bytes. Networks
-//! take minutes to days: they go on from their newest checkpoint.
+//! A grid takes seconds and has no checkpoints: an interrupted task starts again and produces the
+//! same bytes. Networks take minutes to days and resume from their newest checkpoint.
 
 mod captured;
 mod measured;
@@ -45,11 +46,11 @@ pub use captured::slant;
 pub use pictures::{CELL, STEP, columns, first_row, shaded, views};
 pub use written::{density, errors, facts};
 
-/// Pixels a side of a novel view.
+/// Width and height of a novel view, in pixels.
 const VIEW_SIDE: u32 = 128;
-/// The figures of a reconstruction.
+/// Name of the object with the figures of a reconstruction.
 const METRICS: &str = "metrics.json";
-/// Progress once everything is measured, and once the field is fitted.
+/// Progress of the task after measuring and after fitting the field.
 const MEASURED: f32 = 0.2;
 const FITTED: f32 = 0.85;
 
@@ -100,7 +101,7 @@ impl RunTask for ReconstructTask {
     }
 }
 
-/// Tells what a reconstruction is worth, by its metrics.
+/// Logs the quality of a reconstruction, given its metrics.
 fn tell(scene: u64, metrics: &[u8]) -> Result<(), TaskError> {
     let metrics = serde_json::from_slice(metrics)
         .map_err(|e| TaskError::Crash(format!("{METRICS} of scene {scene} is not JSON: {e}")))?;
@@ -119,7 +120,7 @@ fn output(manifest: &ReconstructionManifest, adopted: bool) -> Output {
     }
 }
 
-/// What is there if this very task has published it.
+/// Returns the reconstruction if this exact task has published it.
 fn finished(
     stores: &Stores,
     folder: &Reconstructions,
@@ -138,7 +139,7 @@ fn finished(
     stores.wait(control, looked)
 }
 
-/// A task, and what belongs to it.
+/// A task with the steps that it consists of.
 struct Work<'a>(&'a ReconstructTask);
 
 impl Work<'_> {
@@ -202,7 +203,7 @@ impl Work<'_> {
         Ok(made)
     }
 
-    /// The scene's files by their names.
+    /// Returns the scene's files by name.
     fn files(
         &self,
         context: &Context,
@@ -249,12 +250,12 @@ impl Work<'_> {
     }
 }
 
-/// Between a task's control and a reconstruction.
+/// Forwards progress and stop requests between a task's control and a reconstruction.
 struct Watch<'a>(&'a Control);
 
 impl Progress for Watch<'_> {
     fn at(&self, phase: Phase, done: f32, loss: Option<f64>) -> bool {
-        // How long each takes of the whole, roughly.
+        // Rough share of each phase in the total time.
         let (start, share) = match phase {
             Phase::Depth => (0.0, 0.1),
             Phase::Planes => (0.1, 0.05),

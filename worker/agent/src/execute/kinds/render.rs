@@ -1,4 +1,4 @@
-//! Rendering: adopt, or make the scene, render it, code it and publish it.
+//! Rendering: adopts a scene that exists, or makes, renders, encodes and publishes it.
 
 use std::time::Instant;
 
@@ -25,12 +25,14 @@ use crate::execute::{
     subsets,
 };
 
-/// Photons in the median pixel's brightest bin: the measurement's convention for the stored scale.
+/// Photons in the brightest bin of the median pixel. Defines the stored scale, following the
+/// convention of the measurement.
 const PEAK_PHOTONS: f32 = 400.0;
-/// Share of a task's progress that is rendering; the rest is coding and storing.
+/// Share of rendering in a task's progress. Encoding and storing make up the rest.
 const RENDER_SHARE: f32 = 0.95;
-/// Everything of this program that decides a task's bytes: renderer, generators and encoder. Part of every task
-/// key, so that a change of any of them renames the results.
+/// Returns the version of all code of this program that determines a task's bytes: renderer,
+/// generators and encoder. It is part of every task key, so that a change to any of them renames
+/// the results.
 pub fn renderer_version() -> String {
     format!(
         "{RENDERER_VERSION}/{}/{}/{}",
@@ -112,7 +114,7 @@ pub(in crate::execute) fn make(
     make_by(dataset, with, spec, index, key, render)
 }
 
-/// The same, with these settings.
+/// Makes scene `index`, renders it with `render`, and encodes it for the data set.
 fn make_by(
     dataset: &Dataset,
     with: With<'_>,
@@ -158,7 +160,7 @@ fn make_by(
         .map_err(of_dataset)
 }
 
-/// The job must ask for this renderer.
+/// Checks that the job asks for this version of the renderer.
 pub(in crate::execute) fn check_version(spec: &RenderTask) -> Result<(), TaskError> {
     let ours = renderer_version();
     if spec.render.renderer == ours {
@@ -171,7 +173,7 @@ pub(in crate::execute) fn check_version(spec: &RenderTask) -> Result<(), TaskErr
     )))
 }
 
-/// Makes scene `index`, with the settings to render it by `key`.
+/// Makes scene `index` and returns it with its render settings, which depend on `key`.
 pub(in crate::execute) fn prepare(
     with: With<'_>,
     spec: &RenderTask,
@@ -192,7 +194,7 @@ pub(in crate::execute) fn prepare(
     Ok((scene, settings))
 }
 
-/// Carries the renderer's progress to the task's control.
+/// Forwards the renderer's progress to the task's control.
 pub(in crate::execute) struct Watched<'a>(pub &'a Control);
 
 impl Progress for Watched<'_> {
@@ -201,8 +203,8 @@ impl Progress for Watched<'_> {
     }
 }
 
-/// The renderer's settings for a task. The seed is the head of the task's key, so that nothing but the task
-/// decides the numbers.
+/// Returns the renderer's settings for a task. The seed is the first bytes of the task's key, so
+/// that only the task determines the result.
 fn settings(
     spec: &RenderTask,
     dataset: &DatasetSpec,
@@ -225,7 +227,7 @@ fn settings(
     })
 }
 
-/// The render as the data set takes it.
+/// Returns the render in the form that the data set stores.
 pub(in crate::execute) fn record<'a>(
     scene: &Scene,
     rendered: &'a Rendered,
@@ -277,8 +279,9 @@ pub(in crate::execute) fn in_camera(spot: &picofarm_scene::Spot, camera: &Camera
     }
 }
 
-/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine, and
-/// not the scene's name, which may be that of a file, while the task's key holds only the file's content.
+/// Describes the scene and its render for the manifest. The description depends on the task only.
+/// It contains no time and no machine. It also omits the scene's name: this can be a file name, but
+/// the task's key covers only the file's content.
 fn account(scene: &Scene, rendered: &Rendered, max_bounces: Option<u32>) -> serde_json::Value {
     let mut plan = json!({
         "scene": scene.provenance,

@@ -1,7 +1,8 @@
-//! Reports: what a store holds of models, collected for a page; and the task that keeps such a page in the store.
+//! Reports: collects the stored results of models for a page, and implements the task that stores
+//! such a page.
 //!
-//! The page of a task is a pure function of what the store holds: models, evaluations, and how fast trainings were. It bears no
-//! date.
+//! The page of a task is a pure function of the store's contents: models, evaluations and training
+//! speeds. It has no date.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -29,23 +30,24 @@ use crate::execute::{
     train::{WEIGHTS, at, model_version, of_model},
 };
 
-/// Collects what a store holds of models.
+/// Collects the stored results of models.
 pub struct Collector {
     stores: Stores,
 }
 
 impl Collector {
-    /// Stores are reached through `runtime`, which must not be a thread that calls this.
+    /// Creates a collector. `runtime` serves store requests and must not own the calling thread.
     pub fn new(runtime: Handle) -> Self {
         Self {
             stores: Stores::new(runtime, Duration::ZERO),
         }
     }
 
-    /// What a report tells of a model; it shows what the model says of `pictures` scenes, where it was evaluated.
+    /// Returns a report's entry for a model, with pictures of its predictions for `pictures` scenes
+    /// if it was evaluated.
     ///
     /// # Errors
-    /// [`TaskError::User`] where there is no such model, or its data set or split is not there any more.
+    /// [`TaskError::User`] if there is no such model, or its data set or split no longer exists.
     pub fn entry(
         &self,
         store: &str,
@@ -64,7 +66,7 @@ impl RunTask for ReportTask {
         model_version()
     }
 
-    /// Makes the report that `task` names and keeps it; with `force` although it is there.
+    /// Makes and stores the report that `task` names; with `force`, even if it exists.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let stores = &context.stores;
         let (force, device) = (task.spec.force, context.device(task)?);
@@ -142,7 +144,7 @@ fn output(manifest: &ReportManifest, adopted: bool) -> Output {
     }
 }
 
-/// The report if this very task has published it.
+/// Returns the report if this exact task has published it.
 fn finished(
     stores: &Stores,
     reports: &Reports,
@@ -162,10 +164,10 @@ fn finished(
     stores.wait(control, looked)
 }
 
-/// A model that a report tells of.
+/// A model in a report.
 struct Subject {
     manifest: ModelManifest,
-    /// That of its evaluations with the most scenes.
+    /// The evaluation with the most scenes.
     evaluation: Option<Evaluation>,
     speed: Option<TrainingSpeed>,
 }
@@ -206,7 +208,7 @@ impl Subject {
         control: &Control,
     ) -> Result<Entry, TaskError> {
         let (manifest, name) = (&self.manifest, &*self.manifest.name);
-        // What is in the store has its checksum: this program made it, and does not know it again.
+        // Stored objects have checksums, so this program wrote a value that it cannot read.
         let broken = |what: String| TaskError::Crash(format!("model {name:?}: {what}"));
         let mut entry = match &self.evaluation {
             Some(evaluation) => {
@@ -243,8 +245,8 @@ impl Subject {
     }
 }
 
-/// An evaluation's figures as they lie in the store: those of all scenes, beside them those of trivial answers, by name, and
-/// of each scene.
+/// Parses the stored figures of an evaluation: those of all scenes, those of the trivial baselines
+/// by name, and those of each scene.
 fn evaluated(found: &Value) -> serde_json::Result<Evaluated> {
     let part = |name: &str| found.get(name).cloned().unwrap_or_default();
     let baselines: BTreeMap<String, Metrics> = serde_json::from_value(part("baselines"))?;
@@ -261,12 +263,12 @@ fn known(n: u32) -> Option<u32> {
     (n > 0).then_some(n)
 }
 
-/// Where it comes from.
+/// Fills in the model's origin.
 fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Evaluation>) {
     let from = &manifest.lineage;
     entry.data = Data {
         name: from.dataset.clone(),
-        // Nothing is known of how an imported model was trained.
+        // The training of an imported model is unknown.
         scenes: (from.training_scenes > 0).then_some(from.training_scenes),
         max_bounces: from.measurement.max_bounces,
         images: known(from.measurement.rows)

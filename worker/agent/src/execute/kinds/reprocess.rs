@@ -1,8 +1,10 @@
-//! Reprocessing: a scene of a finished data set through a sensor into another data set. Adopt, or read the histogram,
-//! measure it, and publish it with the source's ground truth. Nothing is rendered.
+//! Reprocessing: passes a scene of a finished data set through a sensor into another data set. The
+//! task adopts a scene that exists, or reads the histogram, simulates the sensor, and publishes the
+//! result with the source's ground truth. Nothing is rendered.
 //!
-//! A scene that the source does not have is the task's own failure: where another stage makes the source, this one waits
-//! for it, so the scene was given up; where nothing makes it, waiting would have no end.
+//! A scene that the source lacks is the task's own failure. If another stage makes the source, this
+//! stage waits for it, so the missing scene was abandoned. If nothing makes the source, waiting
+//! would never end.
 
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile,
@@ -28,11 +30,12 @@ use crate::execute::{
     recipe,
 };
 
-/// Progress once the histogram is read, and once it is measured.
+/// Progress of the task after reading the histogram and after simulating the sensor.
 const READ: f32 = 0.3;
 const MEASURED: f32 = 0.8;
 
-/// Everything of this program that decides a reprocessed scene's bytes: sensor model and encoder. Part of every key.
+/// Returns the version of all code of this program that determines a reprocessed scene's bytes:
+/// sensor model and encoder. Part of every key.
 pub fn sensor_version() -> String {
     format!("{SENSOR_VERSION}/{ENCODER_VERSION}")
 }
@@ -43,17 +46,19 @@ pub struct Reprocessor {
 }
 
 impl Reprocessor {
-    /// Stores are reached through `runtime`, which must not be a thread that calls [`Self::run`].
+    /// Creates a reprocessor. `runtime` serves store requests and must not own the thread that
+    /// calls [`Self::run`].
     pub fn new(runtime: Handle) -> Self {
         Self {
             stores: Stores::new(runtime, STORE_PATIENCE),
         }
     }
 
-    /// The scenes that the source has published, ascending, and how many it has room for: the number of tasks.
+    /// Returns the scenes that the source has published, in ascending order, and its capacity,
+    /// which is the number of tasks.
     ///
     /// # Errors
-    /// [`TaskError::User`] where there is no such data set.
+    /// [`TaskError::User`] if there is no such data set.
     pub fn source(
         &self,
         source: &SourceSettings,
@@ -64,10 +69,10 @@ impl Reprocessor {
         Ok((present, source.spec().scenes))
     }
 
-    /// Reprocesses scene `index`. Blocks; works on rayon's current pool.
+    /// Reprocesses scene `index`. Blocks, and computes on rayon's current pool.
     ///
     /// # Errors
-    /// [`TaskError`], by who is to blame.
+    /// [`TaskError`], classified by cause.
     pub fn run(
         &self,
         task: &ReprocessTask,
@@ -93,7 +98,7 @@ impl RunTask for ReprocessTask {
     }
 }
 
-/// Reprocesses scene `index`; with `force` although it is there.
+/// Reprocesses scene `index`; with `force`, even if it exists.
 fn run(
     stores: &Stores,
     task: &ReprocessTask,
@@ -123,20 +128,20 @@ fn run(
     })
 }
 
-/// What a scene is made of.
+/// Inputs for making a scene.
 pub(in crate::execute) struct Made {
     source: Dataset,
     /// The source's manifest of the scene.
     found: Manifest,
     sensor: Sensor,
-    /// The data set that it belongs to.
+    /// The data set that receives the scene.
     spec: DatasetSpec,
-    /// The task that makes it.
+    /// Key of the task that makes the scene.
     pub(in crate::execute) key: TaskKey,
 }
 
 impl Made {
-    /// Looks at the source's scene `index`; nothing of the target is touched.
+    /// Checks the source's scene `index` without accessing the target.
     pub(in crate::execute) fn of(
         stores: &Stores,
         task: &ReprocessTask,
@@ -172,7 +177,7 @@ impl Made {
         })
     }
 
-    /// Reads, measures and codes the scene for `dataset`.
+    /// Reads the scene, simulates the sensor, and encodes the result for `dataset`.
     pub(in crate::execute) fn encode(
         &self,
         stores: &Stores,
@@ -191,7 +196,7 @@ impl Made {
             bins: source.spec().gate.bins as usize,
             bin_width_ps: source.spec().gate.bin_width_m * PS_PER_M,
         };
-        // The key is the seed of everything; the scene's number adds nothing to it.
+        // The key determines every random number. It already covers the scene's number.
         let seed = u64::from_le_bytes(self.key.0[..8].try_into().expect("a key has 32 bytes"));
         let sensed = debug_span!(target: trace::TARGET, "measure")
             .in_scope(|| sense(&self.sensor, &input, seed, 0))
@@ -236,7 +241,8 @@ fn open_source(
     })
 }
 
-/// The source's manifest of a scene; see the head of this file for what it means where there is none.
+/// Returns the source's manifest of a scene. The module documentation explains why a missing
+/// manifest is an error.
 pub(in crate::execute) fn source_manifest(
     stores: &Stores,
     source: &Dataset,
@@ -262,7 +268,7 @@ pub(in crate::execute) fn source_manifest(
         .map_err(|error| TaskError::User(format!("source: scene {index} is not there ({error})")))
 }
 
-/// The data set that a source becomes.
+/// Returns the properties of the data set that a source is reprocessed into.
 ///
 /// # Errors
 /// [`TaskError::User`] naming the setting that does not fit the source.
@@ -333,7 +339,7 @@ pub(in crate::execute) fn quantity(histogram: Histogram) -> Quantity {
     }
 }
 
-/// The source's spots that light the target; `None` = all.
+/// Returns the source's spots that light the target; `None` = all.
 fn chosen(settings: &ReprocessSettings) -> Option<Vec<u32>> {
     match settings.histogram {
         Histogram::Transient => None,
@@ -342,7 +348,7 @@ fn chosen(settings: &ReprocessSettings) -> Option<Vec<u32>> {
     }
 }
 
-/// h as chosen, `[row][column][bin]`.
+/// Reads the selected histogram h as `[row][column][bin]`.
 fn read(
     stores: &Stores,
     source: &Dataset,
@@ -363,7 +369,8 @@ fn read(
     Ok(sum.finish())
 }
 
-/// What was measured in units of h (dark counts included), and the scale that makes photons of it.
+/// Returns the sensor's output in units of h, including dark counts, and the scale that converts it
+/// to photons.
 fn as_radiance(sensed: &Sensed) -> (Vec<f32>, f32) {
     use rayon::prelude::*;
     let scale = sensed.scale as f32;
@@ -374,7 +381,8 @@ fn as_radiance(sensed: &Sensed) -> (Vec<f32>, f32) {
     (h, scale)
 }
 
-/// What the manifest tells: the source and what was done to it. Only what the task decides; no place, no time.
+/// Describes the source and its processing for the manifest. The description depends on the task
+/// only, with no location or time.
 fn account(settings: &ReprocessSettings, source: &Manifest, sensed: &Sensed) -> serde_json::Value {
     let mut plan = json!({
         "kind": "reprocess",
@@ -400,7 +408,7 @@ fn account(settings: &ReprocessSettings, source: &Manifest, sensed: &Sensed) -> 
         "labels": source.provenance.plan["labels"],
         "scene": source.provenance.plan["scene"],
     });
-    // The truth is copied, and so is what is not known of it.
+    // The ground truth is copied, so the list of its missing quantities is too.
     let missing = source.missing();
     if !missing.is_empty() {
         plan["missing"] = json!(missing);

@@ -1,4 +1,4 @@
-//! Saves what long tasks have reached.
+//! Saves checkpoints of long tasks.
 
 use std::time::{Duration, Instant};
 
@@ -8,14 +8,15 @@ use tracing::{debug, warn};
 
 use crate::execute::output::Stores;
 
-/// How long a task that shall stop may take to save what it has reached.
+/// Maximum time that a stopping task may take for its last checkpoint.
 const LAST_SAVE: Duration = Duration::from_secs(240);
 
-/// Bytes of a piece of a checkpoint: a few are written and read at once, and one is a request.
+/// Size of a piece of a checkpoint, in bytes. Each piece is one request, and a few are written or
+/// read at once.
 #[cfg(feature = "networks")]
 pub(super) const PIECE: usize = 64 << 20;
 
-/// Saves checkpoints while the task goes on, one at a time.
+/// Saves checkpoints in the background, one at a time.
 pub(super) struct Saver<'a> {
     stores: &'a Stores,
     checkpoints: Checkpoints,
@@ -31,14 +32,14 @@ impl<'a> Saver<'a> {
         }
     }
 
-    /// Whether the checkpoint before is still on its way.
+    /// Returns whether the previous checkpoint is still being written.
     pub(super) fn is_busy(&self) -> bool {
         self.under_way
             .as_ref()
             .is_some_and(|task| !task.is_finished())
     }
 
-    /// Begins to save, after the checkpoint before.
+    /// Starts to save a checkpoint, after waiting for the previous one.
     pub(super) fn save(&mut self, step: u64, content: Pieces) {
         self.last();
         let checkpoints = self.checkpoints.clone();
@@ -54,7 +55,8 @@ impl<'a> Saver<'a> {
         self.under_way = Some(self.stores.runtime().spawn(put));
     }
 
-    /// Waits for the checkpoint that is under way. Without it, the task goes on from the one before.
+    /// Waits for the checkpoint in progress. If saving it fails, the task resumes from the previous
+    /// one.
     pub(super) fn last(&mut self) {
         let Some(under_way) = self.under_way.take() else {
             return;

@@ -1,7 +1,8 @@
-//! Splitting: one task that records which scenes of a data set are for training, validation and test.
+//! Splitting: a single task that records which scenes of a data set are for training, validation
+//! and test.
 //!
-//! Versions are create-only. Whoever runs the task again finds the newest version and keeps it, or extends it where
-//! scenes were added since.
+//! Versions are create-only. If the task runs again, it keeps the newest version, or extends it if
+//! scenes have been added since.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -15,7 +16,7 @@ use tokio::runtime::Handle;
 
 use crate::execute::{Context, Control, Output, RunTask, Task, TaskError, output::Stores};
 
-/// Attempts to be the one who writes the next version.
+/// Maximum number of attempts to write the next version when other writers compete.
 const ATTEMPTS: usize = 16;
 
 /// A split of a data set.
@@ -23,15 +24,15 @@ const ATTEMPTS: usize = 16;
 pub struct Split {
     /// The newest version.
     pub record: SplitRecord,
-    /// Where it lies.
+    /// Location of the version.
     pub place: String,
-    /// SHA-256 of its bytes, hexadecimal.
+    /// SHA-256 of its bytes, in hexadecimal.
     pub sha256: String,
-    /// Its bytes.
+    /// Size of the version in bytes.
     pub bytes: u64,
-    /// It was there already and nothing was written.
+    /// Whether the version already existed, so that nothing was written.
     pub adopted: bool,
-    /// Scenes of it that are not published (any more).
+    /// Number of its scenes that are not published, or no longer.
     pub missing: u64,
 }
 
@@ -41,17 +42,18 @@ pub struct Splitter {
 }
 
 impl Splitter {
-    /// Stores are reached through `runtime`, which must not be a thread that calls this.
+    /// Creates a splitter. `runtime` serves store requests and must not own the calling thread.
     pub fn new(runtime: Handle) -> Self {
         Self {
             stores: Stores::new(runtime, Duration::ZERO),
         }
     }
 
-    /// Makes the split, extends it, or finds it as it is.
+    /// Makes the split, extends it, or returns it unchanged.
     ///
     /// # Errors
-    /// [`TaskError::User`] for unusable settings, and for a split of this name with other settings.
+    /// [`TaskError::User`] for unusable settings, and for an existing split of this name with other
+    /// settings.
     pub fn run(
         &self,
         settings: &SplitSettings,
@@ -62,10 +64,10 @@ impl Splitter {
         run(&self.stores, settings, store, dataset, control)
     }
 
-    /// The newest version of a split.
+    /// Returns the newest version of a split.
     ///
     /// # Errors
-    /// [`TaskError::User`] where there is none.
+    /// [`TaskError::User`] if there is none.
     pub fn show(
         &self,
         name: &str,
@@ -109,7 +111,7 @@ impl RunTask for SplitTask {
     }
 }
 
-/// Makes the split, extends it, or finds it as it is.
+/// Makes the split, extends it, or returns it unchanged.
 fn run(
     stores: &Stores,
     settings: &SplitSettings,

@@ -1,7 +1,9 @@
-//! Training: adopt, or go on from the newest checkpoint, or begin; save what is reached now and then; publish.
+//! Training: adopts a model that exists, or resumes from the newest checkpoint, or starts; saves
+//! checkpoints; publishes the model.
 //!
-//! A training may run for days and on many workers, one after the other. So it is saved every few minutes, when it is asked
-//! to stop, and never waits for the store while it computes; a store that is away costs checkpoints, not the training.
+//! A training can run for days, on several workers in turn. It is therefore saved every few minutes
+//! and when it is asked to stop. It never waits for the store while it computes: an unreachable
+//! store costs checkpoints, not the training.
 
 use std::{
     collections::BTreeMap,
@@ -58,7 +60,7 @@ use crate::execute::{
     truth,
 };
 
-/// Version of networks, training and metrics, and of the sensor that may stand before them.
+/// Returns the version of networks, training, metrics and the sensor model.
 pub fn model_version() -> String {
     format!("{}/{SENSOR_VERSION}", picofarm_model::VERSION)
 }
@@ -68,7 +70,8 @@ impl RunTask for TrainTask {
         model_version()
     }
 
-    /// Trains what `task` names; with `force` although it is there, and on a graphics processor where the job asks for `gpus`.
+    /// Trains the model that `task` names; with `force`, even if it exists. Uses a GPU if the job
+    /// asks for `gpus`.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let _kept = Kept::from_now();
         let stores = &context.stores;
@@ -97,24 +100,24 @@ impl RunTask for TrainTask {
     }
 }
 
-/// Everything that a training is made of.
+/// Inputs and state of a training.
 struct TrainingRun<'a> {
     task: &'a TrainTask,
     spec: DatasetSpec,
     models: Models,
     training: Arc<Examples>,
     validation: Arc<Examples>,
-    /// The models that it builds on, by field.
+    /// The models that the training builds on, by field.
     built: BTreeMap<&'static str, Known>,
     lineage: Lineage,
     key: String,
-    /// Memory that is left beside it, MiB; `None` = not known.
+    /// Memory left to the task, in MiB; `None` = unknown.
     left_mib: Option<u64>,
-    /// Where it is computed.
+    /// Device on which the training runs.
     device: Device,
-    /// The graphics processor that this is, as it calls itself.
+    /// Name of the GPU, as reported by its driver.
     gpu: Option<String>,
-    /// Where other workers reach this one.
+    /// Address at which other workers reach this one.
     peers: &'a str,
 }
 
@@ -210,7 +213,7 @@ impl<'a> TrainingRun<'a> {
         })
     }
 
-    /// What the model runtime is asked.
+    /// Returns the plan for the model runtime.
     fn plan(&self, control: &Control) -> Result<Plan, TaskError> {
         let settings = &self.task.train;
         let greatest = match (settings.input.normalise, settings.input.max) {
@@ -236,7 +239,7 @@ impl<'a> TrainingRun<'a> {
         self.validation.is_empty()
     }
 
-    /// Adopts the model that this very training has published before, or trains and publishes.
+    /// Adopts the model if this exact training has published it; otherwise trains and publishes.
     fn learn(
         &self,
         stores: &Stores,
@@ -246,7 +249,7 @@ impl<'a> TrainingRun<'a> {
     ) -> Result<Result<Published, Left>, TaskError> {
         let (models, name, key) = (&self.models, &self.task.train.model, &self.key);
         if !force && let Some(manifest) = finished(stores, models, name, key, control)? {
-            // Whoever published it may have died before this.
+            // The worker that published it may have died before it deleted the checkpoints.
             stores.wait(control, models.delete_checkpoints(name, key))?;
             return Ok(Ok(Published {
                 manifest,
@@ -304,7 +307,7 @@ impl<'a> TrainingRun<'a> {
         Ok(Ok(published))
     }
 
-    /// Tells how fast it was. Nobody misses it where the store does not take it.
+    /// Stores the speed of the training. Failures are ignored, because nothing depends on it.
     fn tell_speed(
         &self,
         stores: &Stores,
@@ -324,7 +327,7 @@ impl<'a> TrainingRun<'a> {
         }
     }
 
-    /// Trains; a trial may be left before its end.
+    /// Runs the training. A trial may be pruned before its end.
     fn train(
         &self,
         plan: Plan,
@@ -356,14 +359,14 @@ impl<'a> TrainingRun<'a> {
         let mut saved = Instant::now();
         let epochs = self.task.train.optimise.epochs;
         let mut teller = Reporter::new(control, epochs);
-        // The answer to the trial at its latest rung.
+        // Decision on the trial at its latest rung.
         let mut answer = Ok(true);
         let mut ask = |line: &Line, best: Option<f64>| {
             let goes_on = |course: &Course<'_>| course.goes_on(line, best, epochs, control);
             answer = course.map_or(Ok(true), goes_on);
             matches!(answer, Ok(true))
         };
-        // It may have been stopped right at a rung.
+        // The training may have been stopped exactly at a rung.
         let position = training.position();
         let best = position.best;
         let at_rung = position.history.last().filter(|_| position.batches == 0);
@@ -384,7 +387,8 @@ impl<'a> TrainingRun<'a> {
                         saved = Instant::now();
                         save(&mut saver, training);
                         if every.is_zero() {
-                            // Not a step more than this one may be lost.
+                            // Finishes the save in progress, so that at most the steps since this
+                            // checkpoint can be lost.
                             saver.last();
                         }
                         debug!("a checkpoint held the training for {:?}", saved.elapsed());
@@ -430,30 +434,30 @@ impl<'a> TrainingRun<'a> {
                     save(&mut saver, &training);
                 }
                 saver.last();
-                // Where the store was away at a rung, the trial goes on from there.
+                // If the store was unreachable at a rung, the trial resumes from there.
                 answer.and(Err(TaskError::Stopped))
             }
         }
     }
 }
 
-/// Saves what a training is now, while it goes on.
+/// Saves the current state of a training in the background.
 fn save(saver: &mut Saver<'_>, training: &Training) {
     let pieces = training.snapshot().pieces(PIECE).map(Bytes::from);
     saver.save(training.learner().steps(), Box::new(pieces));
 }
 
-/// How a training came to its end here.
+/// Outcome of a training on this process.
 enum Came {
-    /// With a network.
+    /// The training finished with a network.
     Out(Trained),
-    /// A trial was left before its end.
+    /// A trial was pruned before its end.
     Left(Left),
-    /// Another process has kept the network.
+    /// Another process has stored the network.
     OutElsewhere,
 }
 
-/// The model if this very training has published it.
+/// Returns the model if this exact training has published it.
 fn finished(
     stores: &Stores,
     models: &Models,
@@ -473,7 +477,7 @@ fn finished(
     stores.wait(control, looked).map_err(|e| at("train", e))
 }
 
-/// The models that a training builds on, by field.
+/// Reads the models that a training builds on, by field.
 fn read_models(
     stores: &Stores,
     models: &Models,
@@ -499,7 +503,7 @@ fn read_models(
     Ok(built)
 }
 
-/// What pins the bytes of scenes, in this order, and what is not known of them.
+/// Returns the hash of the given scenes, in this order, and the quantities that each lacks.
 pub(in crate::execute) fn pin(
     stores: &Stores,
     dataset: &Dataset,
@@ -510,14 +514,14 @@ pub(in crate::execute) fn pin(
     pinned.map_err(|e| at("source", e))
 }
 
-/// Who is to blame for a training's error.
+/// Classifies a training's error by cause.
 pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
     match error {
         ModelError::Scene { scene, source } => match source.downcast::<DatasetError>() {
             Ok(error) => of_dataset(*error),
             Err(error) => TaskError::Crash(format!("scene {scene}: {error}")),
         },
-        // What is in the store has its checksum: this program made it, and does not know it again.
+        // Stored objects have checksums, so this program wrote a value that it cannot read.
         ModelError::Weights { what } | ModelError::File { what } => TaskError::Crash(what),
         ModelError::Group(what) => TaskError::Interrupted(what),
         error @ ModelError::Gpu { .. } => TaskError::Crash(error.to_string()),
@@ -525,7 +529,8 @@ pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
     }
 }
 
-/// The same of a model's answers, with the names of model and scene: `scenes` are those that it was asked of.
+/// Classifies an error of a model's predictions, and adds the names of model and scene. `scenes`
+/// are those that the model ran on.
 pub(in crate::execute) fn of_answers<'a>(
     model: &'a str,
     dataset: &'a str,

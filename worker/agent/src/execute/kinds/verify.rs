@@ -1,4 +1,4 @@
-//! Verifying: a scene's objects are read and compared with its manifest.
+//! Verification: reads a scene's objects and compares them with its manifest.
 
 use picofarm_dataset::VerifyMode;
 use picofarm_proto::model::{SourceSettings, TaskSpec, kinds::VerifyTask};
@@ -8,7 +8,7 @@ use crate::execute::{
     reprocess::source_manifest,
 };
 
-/// Problems that a message names.
+/// Maximum number of problems in a message.
 const NAMED: usize = 3;
 
 impl RunTask for VerifyTask {

@@ -1,5 +1,5 @@
-//! The kinds that need networks, in a program that was built without them: such a worker does not offer them, and such a
-//! program cannot submit them.
+//! Substitutes for the task kinds that need networks, in a build without them. Such a worker does
+//! not offer these kinds, and such a program cannot submit them.
 
 use picofarm_proto::model::{
     EvaluateShardTask, EvaluateTask, InferTask, PromoteTask, ReportTask, TrainTask,

@@ -1,5 +1,5 @@
-//! What every source of scenes keeps to. The match in [`named_in_the_suite`] makes a new one fail to compile until it has a
-//! line here.
+//! Tests that every scene source must pass. The match in [`named_in_the_suite`] fails to compile
+//! for a new source until it has a line here.
 
 use std::fs;
 
@@ -54,7 +54,8 @@ impl Place {
         glb_bytes(&scene.unwrap_or_else(|e| panic!("{source:?} {index}: {e}"))).unwrap()
     }
 
-    /// Every source, resolved as a submission does; the files are what the primitive source makes.
+    /// Returns every source, resolved as on submission. The scene files are written by the
+    /// primitive source.
     fn sources(&self) -> Vec<SceneSource> {
         let made = |kind: &str, more: Value| {
             let mut text = json!({"kind": kind, "count": COUNT, "seed": 5, "spots": SPOTS});
@@ -92,7 +93,7 @@ fn a_scene_depends_on_its_source_and_index_alone() {
         let forwards: Vec<_> = (0..COUNT).map(|i| place.glb(&source, SIDE, i)).collect();
         let other = Place::new();
         for i in (0..COUNT).rev() {
-            // Another worker, another order, and a lease that brings this scene alone.
+            // Another worker makes the scenes in another order, from leases of one scene each.
             let leased = only(&source, i);
             let again = glb_bytes(&other.scene(&leased, SIDE, i).unwrap()).unwrap();
             assert!(again == forwards[i as usize], "{source:?} {i}");
@@ -106,7 +107,7 @@ fn a_scene_depends_on_its_source_and_index_alone() {
     }
 }
 
-/// The source as a lease of one task brings it.
+/// Returns the source as a lease of one task has it.
 fn only(source: &SceneSource, index: u64) -> SceneSource {
     let mut leased = source.clone();
     if let SceneKind::Files { files, first, .. } = &mut leased.kind {
@@ -127,7 +128,7 @@ fn a_scene_is_valid_and_as_large_and_lit_as_the_job_says() {
             assert_eq!((camera.width, camera.height), (SIDE, SIDE));
             assert_eq!(scene.laser.beams.len(), SPOTS as usize);
             assert!(!scene.objects.is_empty());
-            // More pixels are the same room, seen by the same camera.
+            // A higher resolution shows the same room, seen by the same camera.
             let mut finer = place.scene(&source, 2 * SIDE, i).unwrap();
             assert_eq!(finer.camera.intrinsics.width, 2 * SIDE);
             finer.camera.intrinsics = finer.camera.intrinsics.resized(SIDE, SIDE);
@@ -138,7 +139,7 @@ fn a_scene_is_valid_and_as_large_and_lit_as_the_job_says() {
                     "{source:?} {i}"
                 );
             }
-            // A file's beams are cast through its own pixels, and rounded.
+            // The beams of a file are cast through its own pixels and rounded.
             finer.laser = scene.laser.clone();
             assert!(
                 glb_bytes(&finer).unwrap() == glb_bytes(&scene).unwrap(),

@@ -1,4 +1,5 @@
-//! Whether predictions of a scene agree with themselves and with its spots. No truth is asked.
+//! Measures whether the predictions of a scene agree with each other and with its spots, without
+//! ground truth.
 
 use picofarm_dataset::{Dataset, Predicted, Quantity};
 use picofarm_reconstruct::{
@@ -14,7 +15,8 @@ use crate::execute::{
     output::Stores,
 };
 
-/// Compares depths with spots, and masks with both; null where no depth is predicted. `lit_by` are the spots of the masks.
+/// Compares depths with spots, and masks with both. Returns null if no depth is predicted. `lit_by`
+/// are the spots of the masks.
 pub(super) fn of(
     stores: &Stores,
     (dataset, scene): (&Dataset, u64),
@@ -34,7 +36,7 @@ pub(super) fn of(
         )
     };
     let (spots, i, laser) = stores.wait(control, read)?;
-    // Everything is in the camera's frame.
+    // All positions are in the camera's frame.
     let camera = Camera {
         intrinsics: Intrinsics {
             fx: i.fx,
@@ -60,7 +62,7 @@ pub(super) fn of(
         true => lit_by.to_vec(),
         false => (0..spec.spots).collect(),
     };
-    // At least one half.
+    // A probability of at least one half.
     let half = |p: &u8| u8::from(*p >= 128);
     let lit = match masks {
         true => predicted.lit.iter().map(half).collect(),

@@ -1,4 +1,5 @@
-//! The models of an inference: looked at before anything is read or made, and what names their answers.
+//! The models of an infer stage. They are checked before anything is read or computed, and their
+//! manifests name the predictions.
 
 use std::collections::BTreeMap;
 
@@ -24,17 +25,17 @@ use crate::execute::{
     truth::{self, Need},
 };
 
-/// A histogram, and the spots that are summed of `transient_spots`.
+/// A histogram, and the spots that are summed if it is `transient_spots`.
 pub(super) type Shown = (Histogram, Vec<u32>);
 
-/// A model, and what it is shown.
+/// A model and its input.
 pub(super) struct Member {
     /// The field of the job that names it.
     pub(super) field: String,
     pub(super) checked: CheckedModel,
     pub(super) histogram: Histogram,
     pub(super) spots: Vec<u32>,
-    /// What the histogram is the light of, of the source's spots.
+    /// The source's spots that contribute to the histogram.
     lit_by: Vec<u32>,
 }
 
@@ -43,16 +44,16 @@ pub(super) struct Panel {
     pub(super) tof: Option<Member>,
     pub(super) shadow: Option<Member>,
     pub(super) specular: Option<Member>,
-    /// What two-bounce times follow from, where the shadow network is given some.
+    /// Source of the two-bounce times, if the shadow network takes them.
     pub(super) times: Option<Times>,
 }
 
-/// What two-bounce times follow from.
+/// Source of two-bounce times.
 pub(super) enum Times {
     Truth,
-    /// The stage's own ToF model.
+    /// Depths of the stage's own ToF model.
     Own,
-    /// Predictions of the scene that are kept, as the shadow network was trained with.
+    /// Depths of stored predictions, with which the shadow network was trained.
     Kept(Box<(Predictions, PinnedDepths)>),
 }
 
@@ -137,13 +138,13 @@ impl Panel {
         .filter_map(|(kind, member)| Some((kind, member.as_ref()?)))
     }
 
-    /// What must be known of a scene.
+    /// Returns the quantities that the scenes must have.
     pub(super) fn needs(&self) -> Vec<Need> {
         let from_truth = matches!(self.times, Some(Times::Truth));
         truth::of_times(self.times.is_some(), from_truth)
     }
 
-    /// What the group of predictions holds.
+    /// Returns the layout of the group of predictions.
     pub(super) fn spec(&self, dataset: &Dataset) -> PredictionSpec {
         let source = dataset.spec();
         PredictionSpec {
@@ -159,7 +160,7 @@ impl Panel {
         }
     }
 
-    /// The manifest of what is predicted of a scene, but for its objects.
+    /// Returns the manifest of a scene's predictions, without the list of its objects.
     pub(super) fn manifest(
         &self,
         task: &InferTask,

@@ -1,4 +1,5 @@
-//! Measurements from a histogram of each spot alone, and the frames in which a data set keeps places.
+//! Measurements from a separate histogram of each spot, and conversion between the frames of a data
+//! set.
 
 use picofarm_dataset::Dataset;
 use picofarm_proto::model::kinds::reconstruct::ReconstructSettings;
@@ -11,10 +12,12 @@ use picofarm_scene::{Beam, Camera, Intrinsics, Laser, Vec3};
 use super::{MEASURED, of_reconstruction, proceed};
 use crate::execute::{Control, TaskError, output::Stores};
 
-/// A beam is straight if its path is as long as the way to its spot, but for this, metres.
+/// Maximum difference between the path length of a straight beam and the distance to its spot, in
+/// metres. A greater difference means that a mirror folds the beam.
 const FOLDED_M: f32 = 0.01;
 
-/// Place of each spot, and its path from the laser; `None` where a beam meets nothing.
+/// Position of each spot and the length of its path from the laser; `None` if the beam hits
+/// nothing.
 pub(super) type Spots = [Option<(Vec3, f32)>];
 
 pub(super) fn captures(
@@ -31,7 +34,7 @@ pub(super) fn captures(
             dataset.place()
         )));
     }
-    // The directions of beams are not stored: they point at their spots, but for those that a mirror folds.
+    // Directions of beams are not stored. A beam points at its spot unless a mirror folds it.
     let towards = |spot: &Option<(Vec3, f32)>| {
         let away = spot.map_or(camera.forward, |(point, _)| point - origin);
         Beam {
@@ -65,7 +68,7 @@ pub(super) fn captures(
     Ok(all.finish())
 }
 
-/// A camera-to-world matrix, row by row.
+/// A row-major camera-to-world matrix.
 pub(super) struct Frame<'a>(pub &'a [f32]);
 
 impl Frame<'_> {
@@ -88,7 +91,7 @@ impl Frame<'_> {
     }
 }
 
-/// Distance along a pixel's ray for each metre of z-depth.
+/// Returns the distance along a pixel's ray per metre of z-depth.
 pub fn slant(camera: &Camera, pixel: usize) -> f32 {
     let i = &camera.intrinsics;
     let (u, v) = (

@@ -1,4 +1,4 @@
-//! Two-bounce times and masks of a scene, by where they come from.
+//! Two-bounce times and masks of a scene, from ground truth or from predictions.
 
 use picofarm_dataset::{Dataset, DatasetError, Manifest, Predictions, Quantity, SceneUsed};
 use picofarm_proto::model::kinds::reconstruct::{Measurements, Mirrors};
@@ -20,7 +20,7 @@ use crate::execute::{
 };
 
 impl Work<'_> {
-    /// The predictions that are read, and which they are.
+    /// Opens the predictions of the job, and returns them with the hash of their manifest.
     pub(super) fn predictions(
         &self,
         stores: &Stores,
@@ -72,7 +72,7 @@ impl Work<'_> {
         Ok(Some((predictions, used)))
     }
 
-    /// Times and masks of the scene, in the axes of the scene.
+    /// Returns times and masks of the scene, in the scene's coordinates.
     pub(super) fn measured(
         &self,
         stores: &Stores,
@@ -173,7 +173,7 @@ impl Work<'_> {
         .map_err(of_reconstruction)
     }
 
-    /// The beams that are used.
+    /// Returns the beams to use.
     fn beams(&self, spots: u32, predictions: Option<&Predictions>) -> Result<Vec<u32>, TaskError> {
         let there: Vec<u32> = match predictions {
             Some(predictions) => predictions.spec().spots.clone(),
@@ -197,7 +197,7 @@ impl Work<'_> {
     }
 }
 
-/// What tells of each pixel.
+/// Per-pixel images of a scene.
 struct Images {
     depth_m: Vec<f32>,
     /// `[spot][row][column]` of every spot.
@@ -205,7 +205,7 @@ struct Images {
     mirror: Vec<u8>,
 }
 
-/// Those of a data set. What an import lacks is zero there.
+/// Reads the images of a data set. Quantities that an import lacks are zero.
 async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, DatasetError> {
     let (depth_m, lit, mirror) = futures::try_join!(
         dataset.read::<f32>(scene, Quantity::Depth),
@@ -219,7 +219,8 @@ async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, DatasetError
     })
 }
 
-/// What networks predict. Where none looks for mirrors, the truth is not asked instead.
+/// Returns the images that networks predict. If no network predicts mirrors, there are none: the
+/// true mirror mask is not used as a substitute.
 fn predicted(
     stores: &Stores,
     dataset: &Dataset,
@@ -236,7 +237,7 @@ fn predicted(
             dataset.place()
         )));
     }
-    // At least one half.
+    // A probability of at least one half.
     let likely = |p: &u8| u8::from(*p >= 128);
     let mirror = match found.specular.is_empty() {
         true => vec![0; pixels],
@@ -257,7 +258,7 @@ fn predicted(
     })
 }
 
-/// The images of these beams.
+/// Selects the images of the given beams.
 fn of_beams<T: Copy>(all: &[T], beams: &[u32], pixels: usize) -> Vec<T> {
     let of = beams.iter().map(|b| &all[*b as usize * pixels..][..pixels]);
     of.collect::<Vec<_>>().concat()

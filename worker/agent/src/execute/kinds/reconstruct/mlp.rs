@@ -11,10 +11,10 @@ use tracing::{info, warn};
 use super::of_reconstruction;
 use crate::execute::{Control, TaskError, kinds::saver::Saver, output::Stores};
 
-/// Nothing is missing.
+/// This build can fit the networks.
 pub const NOT_BUILT: Option<&str> = None;
 
-/// How often what is reached is saved: at most 24 MB.
+/// Interval between checkpoints of at most 24 MB.
 const EVERY: Duration = Duration::from_secs(120);
 
 /// Fits the networks, from the newest checkpoint if there is one.
@@ -61,7 +61,7 @@ pub fn fit(
     Ok(training.finish(start))
 }
 
-/// A checkpoint, which is small, in one piece.
+/// Returns a checkpoint in one piece, because it is small.
 fn whole(training: &Training) -> Pieces {
     Box::new(std::iter::once(training.checkpoint().into()))
 }

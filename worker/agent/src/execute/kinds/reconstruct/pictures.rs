@@ -1,25 +1,25 @@
-//! What a reconstruction looks like from elsewhere, beside the truth.
+//! Pictures of a reconstruction from novel views, next to the ground truth.
 
 use picofarm_figures::{Canvas, TEXT, inferno, viridis};
 use picofarm_reconstruct::{Reconstructed, World, render::Renderer};
 use picofarm_scene::{Camera, Vec3};
 use rayon::prelude::*;
 
-/// Side of a picture in pixels.
+/// Width and height of a picture, in pixels.
 pub const CELL: usize = 160;
-/// Room between pictures.
+/// Gap between pictures, in pixels.
 const GAP: usize = 8;
-/// Where the first row of pictures begins.
+/// Top edge of the first row of pictures.
 const TOP: usize = GAP + TEXT + GAP;
-/// Novel views that are shown.
+/// Number of novel views in the picture.
 const SHOWN: usize = 3;
-/// The error at which its colour map ends, metres.
+/// Upper end of the colour map for errors, in metres.
 const WORST_M: f32 = 0.3;
 const BACKGROUND: [u8; 3] = [18, 18, 22];
-/// Pixels of which nothing is known.
+/// Colour of pixels without a value.
 const NOTHING: [u8; 3] = [40, 40, 46];
 
-/// What the columns of [`views`] show.
+/// Returns the headings of the columns of [`views`].
 pub fn columns() -> [String; 4] {
     [
         "true distance".to_owned(),
@@ -29,12 +29,13 @@ pub fn columns() -> [String; 4] {
     ]
 }
 
-/// Width of the columns in a picture, with the room to the next one.
+/// Distance between the left edges of two columns, in pixels.
 pub const STEP: usize = CELL + GAP;
 
-/// True distance, reconstructed distance, their difference, and the shaded surface, in rows of novel views: that which looks
-/// most as the measuring camera does comes first. The difference is that of the metrics: where the reconstruction has no
-/// surface, its distance is that to the grid's end.
+/// Draws true distance, reconstructed distance, their difference and the shaded surface, one novel
+/// view per row. The first row shows the view most similar to that of the measuring camera. The
+/// difference is that of the metrics: pixels without a reconstructed surface have the distance to
+/// the end of the grid.
 pub fn views(made: &Reconstructed, world: &World, cameras: &[Camera]) -> Canvas {
     let mut shown: Vec<&Camera> = (0..SHOWN.min(cameras.len()))
         .map(|k| &cameras[(2 * k + 1) * cameras.len() / (2 * SHOWN)])
@@ -73,12 +74,12 @@ pub fn views(made: &Reconstructed, world: &World, cameras: &[Camera]) -> Canvas 
     canvas
 }
 
-/// The first view's row of a picture that [`views`] has drawn; `None` where it shows no view.
+/// Returns the first row of a picture drawn by [`views`]; `None` if it shows no view.
 pub fn first_row(drawn: &Canvas) -> Option<Canvas> {
     drawn.part((GAP, TOP), (columns().len() * STEP, CELL))
 }
 
-/// The surface from a view, [`CELL`] pixels a side, as grey values.
+/// Renders the surface from a view as grey values, [`CELL`] pixels on each side.
 pub fn shaded(renderer: &Renderer<'_>, camera: &Camera) -> Vec<u8> {
     let camera = resized(camera);
     shading(&renderer.view(&camera), &camera)
@@ -91,7 +92,7 @@ fn resized(camera: &Camera) -> Camera {
     }
 }
 
-/// True distance along each pixel's ray.
+/// Returns the true distance along each pixel's ray.
 fn distances(world: &World, camera: &Camera) -> Vec<Option<f32>> {
     let width = camera.intrinsics.width as usize;
     let pixels = width * camera.intrinsics.height as usize;
@@ -113,7 +114,8 @@ fn ray(camera: &Camera, x: usize, y: usize) -> Vec3 {
     camera.ray(x as f32 + 0.5, y as f32 + 0.5).normalized()
 }
 
-/// Lambertian shading by a lamp at the camera; normals from neighbouring distances.
+/// Returns Lambertian shading by a lamp at the camera. Normals are estimated from neighbouring
+/// distances.
 fn shading(distance: &[Option<f32>], camera: &Camera) -> Vec<u8> {
     let (w, h) = (
         camera.intrinsics.width as usize,

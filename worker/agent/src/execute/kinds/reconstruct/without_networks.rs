@@ -1,4 +1,5 @@
-//! PlatoNeRF's networks, in a program that was built without them: such a worker does not offer them.
+//! Substitute for PlatoNeRF's networks in a build without networks. Such a worker does not offer
+//! them.
 
 use picofarm_dataset::{Checkpoints, ReconstructionManifest, Reconstructions};
 use picofarm_proto::model::kinds::ReconstructTask;
@@ -7,12 +8,12 @@ use picofarm_settings::MlpSettings;
 
 use crate::execute::{Control, TaskError, output::Stores};
 
-/// How to have them.
+/// Error message with the build option that adds them.
 pub const NOT_BUILT: Option<&str> = Some(
     "is \"mlp\", but this picofarm was built without networks; build it with `--features networks`",
 );
 
-/// Says that there are none.
+/// Returns an error, because this build has no networks.
 pub fn fit(
     _: Measured,
     _: (&Settings, &MlpSettings),
@@ -23,7 +24,7 @@ pub fn fit(
     Err(TaskError::User(format!("reconstruct.field {what}")))
 }
 
-/// Nothing was kept.
+/// Does nothing, because this build writes no checkpoints.
 pub fn forget(
     _: &ReconstructTask,
     _: &Reconstructions,

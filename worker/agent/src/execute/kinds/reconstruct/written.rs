@@ -1,4 +1,5 @@
-//! What is written of a reconstruction: facts, errors against the true scene, and the density field.
+//! Contents of a reconstruction's files: facts, errors against the true scene, and the density
+//! field.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +14,8 @@ use picofarm_reconstruct::{
 use picofarm_scene::Camera;
 use serde_json::{Value, json};
 
-/// What is known of a reconstruction without its true scene: the same bytes for the same measurements, so no times.
+/// Returns the facts about a reconstruction that do not depend on its true scene. They contain no
+/// run times, so that equal measurements give equal bytes.
 pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Value> {
     let left_out = made.measured.left_out.iter();
     let left_out: Vec<Value> = left_out
@@ -49,10 +51,11 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
     }
 }
 
-/// How far a reconstruction is from its true scene: novel views, mesh, floating matter.
+/// Returns the errors of a reconstruction against its true scene: novel views, mesh, floating
+/// matter.
 ///
 /// # Errors
-/// [`ReconstructError::Invalid`] where the scene has no surface in the grid.
+/// [`ReconstructError::Invalid`] if the scene has no surface in the grid.
 pub fn errors(
     made: &Reconstructed,
     mesh: &Surface,
@@ -79,10 +82,10 @@ pub fn errors(
     }
 }
 
-/// The density field as the objects of a Zarr group.
+/// Encodes the density field as the objects of a Zarr group.
 ///
 /// # Errors
-/// None that a field can give rise to.
+/// Does not fail for a field produced by a reconstruction.
 pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, DatasetError> {
     let field = &made.field;
     let [nx, ny, nz] = field.nodes.map(|n| n as u64);

@@ -1,4 +1,4 @@
-//! What happens along a training: it tells how far it is.
+//! Reports the progress of a training while it runs.
 
 use picofarm_model::{
     metric::Metrics,
@@ -8,16 +8,16 @@ use tracing::info;
 
 use crate::execute::Control;
 
-/// Share of a task's progress that is training.
+/// Share of training in a task's progress.
 const TRAINED: f32 = 0.99;
-/// Lines of an epoch that a task logs at most: its allowance holds few more.
+/// Maximum number of log lines about epochs, because a task's log allowance is not much larger.
 const LINES: u32 = 80;
 
-/// One part of so many of the memory that is left beside the task holds scenes that are made ready for the network.
+/// Scenes prepared ahead of the network may use 1/`AHEAD_SHARE` of a task's spare memory.
 const AHEAD_SHARE: u64 = 8;
 
-/// How scenes are made ready: by as many threads as the task has, in a part of the memory that is left beside it, MiB; `None`
-/// = not known.
+/// Returns how scenes are prepared: with as many threads as the task has, in a share of the memory
+/// left to the task (`left_mib`, MiB; `None` = unknown).
 pub(super) fn loading(left_mib: Option<u64>) -> Loading {
     let standard = Loading::default();
     match left_mib {
@@ -29,14 +29,14 @@ pub(super) fn loading(left_mib: Option<u64>) -> Loading {
     }
 }
 
-/// Tells the task's control and its log how far the training is.
+/// Reports the training's progress to the task's control and log.
 pub(super) struct Reporter<'a> {
     control: &'a Control,
     epochs: u32,
     reported: u64,
-    /// The latest figure of the validation scenes: MAE in metres, or one less IoU.
+    /// The latest metric of the validation scenes, by name: MAE in metres, or 1 − IoU.
     validation: Option<(&'static str, f64)>,
-    /// Training examples a second, and share of the time in which the network waited for data.
+    /// Training examples per second, and the share of time in which the network waited for data.
     pace: Option<(f64, f64)>,
 }
 
@@ -51,7 +51,7 @@ impl<'a> Reporter<'a> {
         }
     }
 
-    /// Training examples a second, and the share of waiting for data, as last heard.
+    /// Returns the latest training examples per second and share of time spent waiting for data.
     pub(super) fn pace(&self) -> Option<(f64, f64)> {
         self.pace
     }
@@ -94,7 +94,8 @@ impl<'a> Reporter<'a> {
             Event::Validated(line) => self.validated(line),
             Event::Epoch(line) => {
                 self.validated(line);
-                // All of few epochs, every so many of many, and the last.
+                // Logs every epoch of a short training; of a long one, epochs at regular intervals
+                // and the last.
                 let between = u64::from(self.epochs.div_ceil(LINES));
                 if line.epoch >= self.reported + between || line.epoch == u64::from(self.epochs) {
                     self.reported = line.epoch;
@@ -105,7 +106,7 @@ impl<'a> Reporter<'a> {
     }
 }
 
-/// An epoch for people.
+/// Formats an epoch for the log.
 fn summary(line: &Line) -> String {
     let loss = format!("loss {:.4}", line.loss);
     match line.validation {

@@ -1,4 +1,4 @@
-//! Where the processes of a training find one another: in the store, below the model.
+//! Rendezvous of the processes of a distributed training: objects in the store, below the model.
 
 use picofarm_dataset::Models;
 use picofarm_members::{Call, Members, Rendezvous};
@@ -30,7 +30,7 @@ impl<'a> Board<'a> {
         }
     }
 
-    /// This process among those of the training.
+    /// Returns this process as a member of the training.
     pub(super) fn members(
         &'a self,
         peers: &str,
@@ -49,7 +49,7 @@ impl Rendezvous for Board<'_> {
             .patiently(self.control, newest)
             .map_err(|e| e.to_string())?;
         Ok(found.map(|(number, content)| {
-            // One that cannot be read is nobody's, and followed by another.
+            // An unreadable call counts as abandoned and is followed by another.
             let nobody = Call {
                 address: String::new(),
                 secret: String::new(),

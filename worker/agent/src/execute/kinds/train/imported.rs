@@ -1,4 +1,4 @@
-//! Networks that were trained elsewhere, as models of a store: released checkpoints, and one's own.
+//! Import of networks that were trained elsewhere: released checkpoints, and one's own.
 
 use std::fmt;
 
@@ -17,27 +17,27 @@ use super::{
 };
 use crate::execute::{TaskError, reprocess::quantity};
 
-/// The data set whose histograms an imported network knows.
+/// The data set with the kind of histograms that an imported network takes.
 #[derive(Debug, Clone, Copy)]
 pub struct ImportFor<'a> {
     /// Folder of the data set.
     pub dataset: &'a str,
-    /// What it is of.
+    /// Properties of the data set.
     pub spec: &'a DatasetSpec,
     /// One of its scenes.
     pub scene: &'a Manifest,
 }
 
-/// Why a network is not imported.
+/// The reason why a network is not imported.
 #[derive(Debug)]
 pub enum NotImported {
     /// The settings cannot be used.
     Settings(String),
-    /// The file is no safetensors, or stores numbers in a form that is not known.
+    /// The file is not in safetensors format, or stores numbers in an unsupported format.
     File(String),
-    /// A tensor is missing, too many, or has another shape than the settings say.
+    /// A tensor is missing, superfluous, or has another shape than the settings require.
     Tensors(String),
-    /// A tensor holds what no network can compute with.
+    /// A tensor contains values that no network can compute with.
     Values(String),
 }
 
@@ -49,12 +49,15 @@ impl fmt::Display for NotImported {
     }
 }
 
-/// A network that was trained elsewhere as a model of a store: `weights` are safetensors by PyTorch's names, alone, of a
-/// wrapped or of a combined network; `settings` say what it is, as `train` in a job file does; `from` is what the file is
-/// called. Trained settings that shape no answer (rates, epochs) may be left out.
+/// Converts a network that was trained elsewhere into a model.
+///
+/// `weights` is a safetensors file with PyTorch's tensor names, of a plain, wrapped or combined
+/// network. `settings` describe the network, as `train` in a job file does. `from` is the name of
+/// the file. Training settings that do not affect predictions (rates, epochs) may be omitted.
 ///
 /// # Errors
-/// [`NotImported`] naming the setting, or the tensor that is missing, has another shape or impossible values.
+/// [`NotImported`] naming the setting or the tensor. The tensor is missing, or has another shape or
+/// invalid values.
 pub fn imported(
     weights: &[u8],
     settings: Value,

@@ -1,4 +1,4 @@
-//! Trained models, read from a store and made ready.
+//! Trained models, read from a store and prepared for predictions.
 
 use std::sync::Arc;
 
@@ -17,16 +17,16 @@ pub(in crate::execute) struct Known {
     pub(super) weights: Bytes,
 }
 
-/// What a manifest holds of a model for those who want to know before they read its weights.
+/// The part of a model's manifest that describes its input, for checks before its weights are read.
 #[derive(Serialize, Deserialize)]
 struct Asked {
-    /// The plan, which the weights hold too.
+    /// The plan, which is also stored with the weights.
     plan: Plan,
-    /// The bins of the histograms that it knows.
+    /// The bins of the model's histograms.
     gate: Gate,
 }
 
-/// What a manifest holds of a model.
+/// Returns the description of a model's input for its manifest.
 pub(super) fn asked(plan: &Plan, spec: &DatasetSpec) -> serde_json::Value {
     let asked = Asked {
         plan: plan.clone(),
@@ -35,10 +35,11 @@ pub(super) fn asked(plan: &Plan, spec: &DatasetSpec) -> serde_json::Value {
     serde_json::to_value(asked).expect("plain data")
 }
 
-/// What histograms a model knows, and of what multiples of pixels images must be.
+/// Returns the histogram bins that a model expects, and the divisor of the image's width and
+/// height, in pixels.
 ///
 /// # Errors
-/// A sentence where another version of networks made the model.
+/// Returns a message if another version of the networks made the model.
 pub fn takes(manifest: &ModelManifest) -> Result<(Gate, u32), String> {
     let asked = serde_json::from_value(manifest.plan.clone());
     let Asked { plan, gate } = asked.map_err(|e| {
@@ -50,17 +51,18 @@ pub fn takes(manifest: &ModelManifest) -> Result<(Gate, u32), String> {
     Ok((gate, plan.net.multiple() as u32))
 }
 
-/// A model of a store that fits a data set; its weights are not read yet.
+/// A stored model that fits a data set. Its weights are not read yet.
 pub(in crate::execute) struct CheckedModel {
     pub(in crate::execute) manifest: ModelManifest,
     pub(in crate::execute) plan: Plan,
 }
 
 impl CheckedModel {
-    /// Looks at a model, which must have been trained on histograms like those of `spec` and take images of that size.
+    /// Checks a model: it must have been trained on histograms like those of `spec`, and accept
+    /// images of that size.
     ///
     /// # Errors
-    /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
+    /// [`TaskError::User`] at `field` if there is no model of this name, or it does not fit.
     pub(in crate::execute) fn look(
         stores: &Stores,
         models: &Models,
@@ -100,7 +102,7 @@ impl CheckedModel {
         Ok(Self { manifest, plan })
     }
 
-    /// Its weights.
+    /// Reads the model's weights.
     fn weights(
         &self,
         stores: &Stores,
@@ -112,7 +114,7 @@ impl CheckedModel {
         weights.map_err(|e| at(field, e))
     }
 
-    /// The model, ready to be asked on a device.
+    /// Loads the model on a device.
     pub(in crate::execute) fn model(
         &self,
         stores: &Stores,
@@ -126,10 +128,10 @@ impl CheckedModel {
 }
 
 impl Known {
-    /// Reads a model that is asked on a device; see [`CheckedModel::look`].
+    /// Reads a model and loads it on a device. See [`CheckedModel::look`].
     ///
     /// # Errors
-    /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
+    /// [`TaskError::User`] at `field` if there is no model of this name, or it does not fit.
     pub(in crate::execute) fn read(
         stores: &Stores,
         models: &Models,

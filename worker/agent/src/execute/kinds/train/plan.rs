@@ -1,4 +1,4 @@
-//! From a job's settings and a data set to what the model runtime is asked.
+//! Converts a job's settings and a data set into the model runtime's plan.
 
 use picofarm_dataset::DatasetSpec;
 use picofarm_model::{
@@ -16,8 +16,8 @@ use picofarm_proto::model::{
 use super::{known::Known, of_model};
 use crate::execute::{Control, TaskError};
 
-/// What is asked of a network over scenes of a data set, `spots` of which made the histogram. `greatest` is the largest
-/// bin, for the logarithm.
+/// Returns the plan of a network for scenes of a data set. `spots` is the number of spots that
+/// contribute to the histogram. `greatest` is the largest bin, for the logarithm.
 ///
 /// # Errors
 /// [`TaskError::User`] naming the setting that does not fit the data set.
@@ -99,7 +99,8 @@ pub(super) fn plan(
     })
 }
 
-/// Refuses a network on the features of another that sees something else, or has another shape.
+/// Rejects a network that builds on the features of another network with a different input or
+/// shape.
 pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
     let (ours, theirs) = (&plan.question, on.model.question());
     let (net, under) = (&plan.net, &on.model.plan().net);
@@ -147,7 +148,7 @@ pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
     Ok(())
 }
 
-/// The largest bin of all scenes.
+/// Returns the largest bin of all scenes.
 pub(super) fn largest_bin(scenes: &dyn Scenes, control: &Control) -> Result<f32, TaskError> {
     let mut max = 0.0f32;
     for index in 0..scenes.len() {

@@ -1,4 +1,4 @@
-//! What a training leaves: a model's objects and figures.
+//! Results of a training: a model's objects and figures.
 
 use picofarm_dataset::{DatasetSpec, Manifest, Measurement, ModelManifest, Profile};
 use picofarm_model::train::{Line, Trained};
@@ -6,9 +6,10 @@ use serde_json::{Value, json};
 
 use crate::execute::Output;
 
-/// Name of the object that holds a model's weights.
+/// Name of the object with a model's weights.
 pub(in crate::execute) const WEIGHTS: &str = "weights.safetensors";
-/// How good a trained network is, and how it came to that: figures of when its weights were kept.
+/// Returns the metrics of a trained network, measured when its weights were stored, and figures of
+/// its training.
 pub(super) fn metrics(trained: &Trained) -> Value {
     let (last, kept) = (trained.history.last(), trained.kept());
     let mut metrics = json!({
@@ -23,7 +24,8 @@ pub(super) fn metrics(trained: &Trained) -> Value {
     metrics
 }
 
-/// What was measured in the scenes of a data set, by the manifest of one of them.
+/// Describes the measurement that the scenes of a data set simulate, given the manifest of one of
+/// them.
 pub(super) fn measurement(spec: &DatasetSpec, spots: u32, scene: &Manifest) -> Measurement {
     let plan = &scene.provenance.plan;
     let sensed = plan["kind"] == "reprocess" && plan["sensor"]["poisson"] == true;
@@ -36,13 +38,13 @@ pub(super) fn measurement(spec: &DatasetSpec, spots: u32, scene: &Manifest) -> M
     }
 }
 
-/// A line of JSON for each epoch, and for each validation within one.
+/// Returns a line of JSON for each epoch, and for each validation within one.
 pub(super) fn lines(history: &[Line]) -> Vec<u8> {
     let line = |line: &Line| serde_json::to_string(line).expect("figures are plain data") + "\n";
     history.iter().map(line).collect::<String>().into_bytes()
 }
 
-/// The lines of `history.jsonl`.
+/// Parses the lines of `history.jsonl`.
 pub(super) fn lines_of(history: &[u8]) -> Result<Vec<Line>, String> {
     let text = String::from_utf8_lossy(history);
     let lines = text.lines().map(serde_json::from_str);

@@ -1,5 +1,6 @@
-//! A training that is one of a sweep's trials: after some epochs it compares itself with those that have come as far, and
-//! stops if it has fallen behind; however it ends, it tells so under the sweep's name, and that is the task's result.
+//! A sweep's trial. At certain epochs (rungs), the training compares itself with the trials that
+//! have also reached them, and stops if it has fallen behind. Its outcome is recorded under the
+//! sweep's name and is the task's result.
 
 use picofarm_dataset::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
 use picofarm_model::{metric::Metrics, train::Line};
@@ -14,26 +15,26 @@ use super::{
 };
 use crate::execute::{Control, Output, TaskError, output::Stores};
 
-/// Name of the object that holds a model's epochs.
+/// Name of the object with a model's epochs.
 pub(super) const HISTORY: &str = "history.jsonl";
 
-/// A trial under way.
+/// A running trial.
 pub(super) struct Course<'a> {
     stores: &'a Stores,
     training: &'a TrainingRun<'a>,
     trial: &'a Trial,
-    /// How it ended before, where it shall end so again.
+    /// Earlier outcome of the trial, if it must end in the same way again.
     again: Option<TrialRecord>,
 }
 
-/// A training that was left before its end.
+/// A training that was pruned before its end.
 pub(super) struct Left {
     pub(super) end: TrialEnd,
     pub(super) history: Vec<Line>,
 }
 
 impl<'a> Course<'a> {
-    /// The trial that the training is, if it is one.
+    /// Returns the trial of a training.
     pub(super) fn of(
         stores: &'a Stores,
         training: &'a TrainingRun<'a>,
@@ -54,7 +55,8 @@ impl<'a> Course<'a> {
         })
     }
 
-    /// How it ended, if it has; with `force` it shall come to the same end again.
+    /// Returns the trial's recorded outcome. With `force`, returns `None` and makes the trial end
+    /// in the same way again.
     pub(super) fn ended(
         &mut self,
         force: bool,
@@ -78,13 +80,14 @@ impl<'a> Course<'a> {
             return Ok(None);
         }
         if let Some(ended) = &found {
-            // The worker that reported it may have died right after.
+            // The worker that recorded the outcome may have died before it deleted the checkpoints.
             self.forget(ended, control)?;
         }
         Ok(found)
     }
 
-    /// Whether it goes on after an epoch of `of`; `best` is the least loss that it has had so far.
+    /// Returns whether the trial continues after an epoch of `of`. `best` is its lowest loss so
+    /// far.
     pub(super) fn goes_on(
         &self,
         line: &Line,
@@ -125,7 +128,7 @@ impl<'a> Course<'a> {
         Ok(goes_on)
     }
 
-    /// Tells that it came to its end, with the model that stands.
+    /// Records that the trial finished with the stored model.
     pub(super) fn finished(
         &self,
         manifest: &ModelManifest,
@@ -136,14 +139,14 @@ impl<'a> Course<'a> {
         let history = self.stores.wait(control, history)?;
         let history = lines_of(&history).map_err(TaskError::Crash)?;
         let mut record = self.record(TrialEnd::Finished, history);
-        // Of the epoch whose weights are kept.
+        // Loss of the epoch from which the weights are.
         let kept = manifest.metrics.get("validation").cloned();
         let kept = kept.and_then(|found| serde_json::from_value::<Metrics>(found).ok());
         record.loss = kept.map(|found| found.loss());
         self.tell(&record, manifest.total_bytes(), adopted, control)
     }
 
-    /// Tells that it was left before its end, and deletes what it would have gone on from.
+    /// Records that the trial was pruned, and deletes its checkpoints.
     pub(super) fn left(&self, left: Left, control: &Control) -> Result<Output, TaskError> {
         let Left { end, history } = left;
         let record = self.record(end, history);
@@ -152,7 +155,7 @@ impl<'a> Course<'a> {
         Ok(output)
     }
 
-    /// Deletes what a trial that has ended would have gone on from.
+    /// Deletes the checkpoints of a trial that has ended.
     fn forget(&self, record: &TrialRecord, control: &Control) -> Result<(), TaskError> {
         let (name, key) = (&record.model, &record.training_key);
         let deleted = self.models().delete_checkpoints(name, key);
@@ -207,7 +210,7 @@ impl<'a> Course<'a> {
     }
 }
 
-/// The output of a trial that has ended before.
+/// Returns the output of a trial that has ended before.
 pub(super) fn adopted(record: &TrialRecord) -> Output {
     Output {
         manifest_sha256: record.sha256(),

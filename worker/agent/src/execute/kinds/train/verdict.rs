@@ -1,19 +1,20 @@
-//! Whether a trial goes on, by what others had found when they had come as far. Pure; the rules are
-//! [`picofarm_proto::model::Stop`]'s.
+//! Decides whether a trial continues, by the losses of other trials at the same rung. Pure;
+//! [`picofarm_proto::model::Stop`] documents the rules.
 
 use std::cmp::Ordering;
 
 use picofarm_dataset::Rung;
 use picofarm_proto::model::Stop;
 
-/// Whether a trial goes on.
+/// The decision on a trial.
 pub(super) struct Verdict {
     pub(super) goes_on: bool,
-    /// How it stands, as the middle of a sentence about it.
+    /// The reason, as the middle of a sentence about the trial.
     pub(super) why: String,
 }
 
-/// Judges a trial by those that have been `there`, itself among them. `best` is the least loss that it has had so far.
+/// Judges a trial by the trials `there` at the same rung, which include itself. `best` is its
+/// lowest loss so far.
 pub(super) fn verdict(stop: &Stop, ours: &Rung, best: f64, there: &[Rung]) -> Verdict {
     match stop {
         Stop::Halving(halving) | Stop::Hyperband(halving) => {
@@ -41,8 +42,8 @@ pub(super) fn verdict(stop: &Stop, ours: &Rung, best: f64, there: &[Rung]) -> Ve
     }
 }
 
-/// The place of a trial among those that have reached a rung, from 1, and whether it goes on: the best 1/factor of them do,
-/// and at least one.
+/// Returns the rank of a trial, from 1, among those that have reached a rung, and whether it
+/// continues. The best 1/factor of them do, and at least one.
 fn among_the_best(ours: &Rung, there: &[Rung], factor: u32) -> (usize, bool) {
     let better = |other: &&Rung| {
         other.index != ours.index
@@ -53,7 +54,8 @@ fn among_the_best(ours: &Rung, there: &[Rung], factor: u32) -> (usize, bool) {
     (place, place <= (there.len() / factor as usize).max(1))
 }
 
-/// Of some numbers, the middle one; of an even number of them, the mean of the two in the middle.
+/// Returns the median of some numbers. For an even count, this is the mean of the two middle
+/// values.
 fn median(numbers: &mut [f64]) -> f64 {
     numbers.sort_by(f64::total_cmp);
     let middle = numbers.len() / 2;
@@ -99,7 +101,7 @@ mod tests {
             .map(|i| halving(&there[i], &there[..=i], 3))
             .collect();
         assert_eq!(on, [true, true, false, true, false, true, true]);
-        // Of seven, the two best.
+        // The two best of seven.
         let late: Vec<bool> = there.iter().map(|r| halving(r, &there, 3)).collect();
         assert_eq!(late, [false, false, false, false, false, true, true]);
         assert_eq!(among_the_best(&there[0], &there, 3).0, 5);
@@ -118,11 +120,11 @@ mod tests {
         let on = |i: usize, best: f64, least: u32| {
             verdict(&median_of(least), &there[i], best, &there).goes_on
         };
-        // The others of trial 4 have a median of 0.3.
+        // The median of the trials other than 4 is 0.3.
         assert!(on(4, 0.3, 4));
         assert!(!on(4, 0.3001, 4));
         assert!(on(4, 0.3001, 5), "four others are too few");
-        // The best so far counts, not the latest.
+        // The best loss so far counts, not the latest.
         assert!(on(3, 0.25, 4) && !on(3, 0.5, 4));
         let alone = &there[..1];
         assert!(verdict(&median_of(1), &alone[0], 9.0, alone).goes_on);
