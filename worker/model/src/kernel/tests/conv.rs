@@ -1,4 +1,4 @@
-//! Convolutions against the definition.
+//! Convolutions compared with the definition.
 
 use proptest::prelude::*;
 
@@ -67,7 +67,7 @@ fn check(s: ConvShape, k: usize, seed: u64) {
         dx[b] += f64::from(w[a]) * f64::from(dy[c]);
         dw[a] += f64::from(x[b]) * f64::from(dy[c]);
     });
-    // Relative to the sums' magnitudes, which are those of random walks.
+    // Tolerances are relative to the sums' magnitudes, which are those of random walks.
     let walks = [
         s.inputs * k * k,
         s.outputs * k * k,
@@ -167,7 +167,7 @@ fn one_hot_convolution_equals_the_dense_one() {
         };
         let d = s.dense();
         let pixels = height * width;
-        // Some pixels have no bin, said in both ways.
+        // Some pixels have no bin, encoded in both ways.
         let hot: Vec<u16> = noise(images * pixels, 5)
             .iter()
             .map(|x| match ((x + 1.0) * 0.5 * (bins + 2) as f32) as usize {
