@@ -244,7 +244,7 @@ fn figures(runs: impl Iterator<Item = Vec<(&'static str, f64)>>) -> Figures {
     spreads.collect()
 }
 
-/// Returns the common first words of names, without a trailing word that introduces a number.
+/// Returns the common first words of names, without a trailing "seed".
 fn common(names: &[&str]) -> String {
     let Some((first, others)) = names.split_first() else {
         return String::new();
