@@ -21,7 +21,7 @@ pub struct Shape {
 }
 
 impl Shape {
-    /// Returns the layer with an output that is joined by the encoded position: 4 of 0..8.
+    /// Returns the layer after which the encoded position is joined: 4 of 0..8.
     fn joined(self) -> usize {
         self.layers / 2
     }

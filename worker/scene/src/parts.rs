@@ -1,34 +1,34 @@
-//! Materials of several parts side by side.
+//! Materials that consist of several parts.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Bsdf, Distribution, Material};
 
-/// Most parts of a material.
+/// The greatest number of parts of a material.
 pub const MAX_PARTS: usize = 8;
 
-/// How a part scatters; see [`Bsdf`].
+/// The scattering of a part; see [`Bsdf`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Lobe {
     /// Lambertian.
     Diffuse {
-        /// Albedo at the laser's wavelength, in [0, 1].
+        /// The albedo at the laser's wavelength, in [0, 1].
         reflectance: f32,
     },
     /// Rough conductor.
     RoughConductor {
-        /// Roughness α of the microfacet distribution.
+        /// The roughness α of the microfacet distribution.
         alpha: f32,
         /// The microfacet distribution.
         distribution: Distribution,
-        /// Scale in [0, 1].
+        /// The scale of the reflection, in [0, 1].
         reflectance: f32,
     },
 }
 
 impl Lobe {
-    /// A material of this part alone.
+    /// Returns the BSDF of this part alone.
     pub fn bsdf(self) -> Bsdf {
         match self {
             Lobe::Diffuse { reflectance } => Bsdf::Diffuse { reflectance },
@@ -44,14 +44,14 @@ impl Lobe {
         }
     }
 
-    /// Its reflectance at the laser's wavelength.
+    /// Returns the reflectance at the laser's wavelength.
     pub fn reflectance(self) -> f32 {
         match self {
             Lobe::Diffuse { reflectance } | Lobe::RoughConductor { reflectance, .. } => reflectance,
         }
     }
 
-    /// The same with its reflectance multiplied by `factor`.
+    /// Returns the part with its reflectance multiplied by `factor`.
     fn scaled(mut self, factor: f32) -> Self {
         match &mut self {
             Lobe::Diffuse { reflectance } | Lobe::RoughConductor { reflectance, .. } => {
@@ -65,9 +65,9 @@ impl Lobe {
 /// A part and its share of the surface.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Part {
-    /// Share in [0, 1]; those of all parts sum to 1 at most, and what is missing is black.
+    /// The share in [0, 1]. The sum of all parts' shares is at most 1; the missing share is black.
     pub weight: f32,
-    /// How it scatters.
+    /// The scattering of the part.
     pub lobe: Lobe,
 }
 
@@ -80,10 +80,10 @@ pub struct Parts {
 }
 
 impl Parts {
-    /// These.
+    /// Creates the parts of a material.
     ///
     /// # Errors
-    /// A message that says how many there may be.
+    /// A message with the allowed number of parts.
     pub fn of(parts: &[Part]) -> Result<Self, String> {
         if !(1..=MAX_PARTS).contains(&parts.len()) {
             return Err(format!(
@@ -103,12 +103,12 @@ impl Parts {
         })
     }
 
-    /// All of them.
+    /// Returns all parts.
     pub fn list(&self) -> &[Part] {
         &self.all[..self.count]
     }
 
-    /// The same with every reflectance multiplied by `factor`.
+    /// Returns the parts with every reflectance multiplied by `factor`.
     pub(crate) fn scaled(mut self, factor: f32) -> Self {
         for part in &mut self.all {
             part.lobe = part.lobe.scaled(factor);
@@ -116,13 +116,13 @@ impl Parts {
         self
     }
 
-    /// Share of the surface that is a near-mirror.
+    /// Returns the share of the surface that near-mirrors take.
     pub(crate) fn mirror(&self) -> f32 {
         let near = |p: &&Part| matches!(p.lobe, Lobe::RoughConductor { alpha, .. } if alpha <= Material::SPECULAR_ALPHA);
         self.list().iter().filter(near).map(|p| p.weight).sum()
     }
 
-    /// Share of its conductors, and their mean roughness by share; both at most 1.
+    /// Returns the share of conductors, and their mean roughness weighted by share; both at most 1.
     pub(crate) fn conductors(&self) -> (f32, f32) {
         let of = |p: &Part| match p.lobe {
             Lobe::RoughConductor { alpha, .. } => (p.weight, p.weight * alpha),
@@ -135,7 +135,7 @@ impl Parts {
         (share.min(1.0), alpha.min(1.0))
     }
 
-    /// Physical limits; the message says what was expected.
+    /// Checks physical limits; the message names the allowed values.
     pub(crate) fn check(&self) -> Result<(), String> {
         let unit = |k: usize, name: &str, v: f32| match (0.0..=1.0).contains(&v) {
             true => Ok(()),
@@ -159,7 +159,7 @@ impl Parts {
                 }
             }
         }
-        // Rounding of weights that sum to 1.
+        // The tolerance allows for rounding of weights that sum to 1.
         match sum <= 1.0 + 1e-5 {
             true => Ok(()),
             false => Err(format!(

@@ -1,21 +1,21 @@
-//! What surfaces reflect by wavelength: as a material states it, or else as its colour stands for it.
+//! Reflectance by wavelength, from a material's spectrum or else from its colour.
 
 use picofarm_settings::WAVELENGTHS_NM;
 use serde::{Deserialize, Serialize};
 
 use crate::{Bsdf, Lobe, Material, Part};
 
-/// What a material reflects at one wavelength; between two of them reflectances are interpolated linearly, beyond the last
-/// ones they stay.
+/// The reflectance at one wavelength. Between two points, reflectances are interpolated linearly;
+/// beyond the last points, they are constant.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpectrumPoint {
-    /// Wavelength, nanometres.
+    /// The wavelength, nanometres.
     pub nm: f32,
-    /// Reflectance of the Lambertian part, or of a conductor alone, in [0, 1].
+    /// The reflectance of the Lambertian part, or of a conductor alone, in [0, 1].
     pub reflectance: f32,
-    /// Reflectance of the conductors of a mix or of several parts, in [0, 1]; without it that of the material's [`Bsdf`]. Other
-    /// materials have none.
+    /// The reflectance of the conductors of a mix or of several parts, in [0, 1]; if `None`, that
+    /// of the material's [`Bsdf`]. Other materials have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub specular_reflectance: Option<f32>,
 }
@@ -23,22 +23,23 @@ pub struct SpectrumPoint {
 /// A material at a wavelength.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtWavelength {
-    /// Reflectance of the Lambertian part.
+    /// The reflectance of the Lambertian part.
     pub lambertian: f32,
-    /// Reflectance of the conductor.
+    /// The reflectance of the conductor.
     pub conductor: f32,
-    /// With a texture: what both are multiplied by is this times the texel's linear RGB, summed over the channels, and no
-    /// more than makes the larger of them 1.
+    /// For a texture: both reflectances are multiplied by this times the texel's linear RGB, summed
+    /// over the channels. The factor is limited so that the larger reflectance is at most 1.
     pub texel: [f32; 3],
 }
 
-/// Wavelengths between which a colour stands for reflectances, nanometres.
+/// The wavelengths between which a colour determines reflectances, nanometres.
 const VISIBLE_NM: (f32, f32) = (400.0, 700.0);
-/// Dominant wavelengths of the primaries of linear RGB (ITU-R BT.709), nanometres: blue, green, red.
+/// The dominant wavelengths of the primaries of linear RGB (ITU-R BT.709), nanometres: blue, green,
+/// red.
 pub(crate) const PRIMARIES_NM: [f32; 3] = [464.3, 549.1, 611.4];
 
-/// The share of red, green and blue in what a colour reflects at a wavelength: that of the primary there, between two primaries both,
-/// linearly. `None` where colours say nothing.
+/// Returns the weights of red, green and blue in a colour's reflectance at a wavelength: 1 at a
+/// primary, and linear between two primaries. Returns `None` outside the range of colours.
 fn of_colour(nm: f32) -> Option<[f32; 3]> {
     if !(VISIBLE_NM.0..=VISIBLE_NM.1).contains(&nm) {
         return None;
@@ -50,8 +51,10 @@ fn of_colour(nm: f32) -> Option<[f32; 3]> {
 }
 
 impl Material {
-    /// What it reflects at a wavelength; of several parts see [`Material::part`]. Where it states no [`Material::spectrum`], its colour stands for it from 400 to 700 nm: reflectances
-    /// are those of its BSDF times the colour there over the mean of the colour's three channels. Outside they are those of its BSDF.
+    /// Returns the reflectances at a wavelength; for several parts see [`Material::part`]. Without
+    /// a [`Material::spectrum`], the colour is used from 400 to 700 nm: reflectances are those of
+    /// the BSDF times the colour at the wavelength over the mean of the colour's three channels.
+    /// Outside that range, they are those of the BSDF.
     pub fn at(&self, nm: f32) -> AtWavelength {
         let plain = match self.bsdf {
             Bsdf::Diffuse { reflectance } => [reflectance, 0.0],
@@ -93,7 +96,8 @@ impl Material {
         }
     }
 
-    /// One of its several parts as a material of its own. What its spectrum says of conductors holds for each of them.
+    /// Returns one of several parts as a material of its own. The spectrum's values for conductors
+    /// apply to each of them.
     pub fn part(&self, part: &Part) -> Self {
         let mut spectrum = self.spectrum.clone();
         for row in &mut spectrum {
@@ -109,7 +113,7 @@ impl Material {
         }
     }
 
-    /// Both reflectances of its spectrum at a wavelength, if it has one.
+    /// Returns both reflectances of the spectrum at a wavelength, if there is one.
     fn stated(&self, nm: f32) -> Option<[f32; 2]> {
         let mix = match self.bsdf {
             Bsdf::Mixed {
@@ -123,7 +127,7 @@ impl Material {
         })
     }
 
-    /// Physical limits of its spectrum; the message says what was expected.
+    /// Checks the physical limits of the spectrum; the message names the allowed values.
     pub(crate) fn check_spectrum(&self) -> Result<(), String> {
         match self.spectrum.is_empty() || !self.transmits() {
             true => check_points(&self.spectrum, Some(self.bsdf)),
@@ -132,7 +136,8 @@ impl Material {
     }
 }
 
-/// What rows hold at a wavelength: in between linearly, beyond the ends as at them. `None` without rows.
+/// Interpolates rows at a wavelength: linearly between rows, constant beyond the ends. Returns
+/// `None` without rows.
 pub(crate) fn interpolated<const N: usize>(
     rows: &[SpectrumPoint],
     nm: f32,
@@ -151,7 +156,8 @@ pub(crate) fn interpolated<const N: usize>(
     }
 }
 
-/// Physical limits of rows, of a material or of a part alone; the message says what was expected.
+/// Checks the physical limits of rows, of a material or of a part alone; the message names the
+/// allowed values.
 pub(crate) fn check_points(rows: &[SpectrumPoint], bsdf: Option<Bsdf>) -> Result<(), String> {
     let unit = 0.0..=1.0;
     let (least, most) = WAVELENGTHS_NM;

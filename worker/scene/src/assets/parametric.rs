@@ -1,7 +1,7 @@
-//! Our own furniture: which builders there are.
+//! The list of builders of our own furniture.
 //!
-//! Every builder draws its dimensions from a variant's own random stream, so variant k of a category is
-//! the same piece for ever. Front is +z, units are metres, y is up.
+//! Every builder draws its dimensions from a variant's own random stream, so variant k of a
+//! category never changes. The front is +z, units are metres, and y is up.
 
 use crate::{Mesh, rng::Rng};
 
