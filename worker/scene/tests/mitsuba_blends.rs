@@ -9,7 +9,8 @@ use picofarm_scene::{
 };
 use proptest::prelude::*;
 
-/// A wall of a BSDF with the id `m`; the image `a.png` lies beside it, and `b.png` of other texels.
+/// Reads a wall with a BSDF with the id `m`. The images `a.png` and `b.png`, with other texels, are
+/// in the same folder.
 fn read(bsdf: &str) -> Result<Scene, SceneError> {
     let text = format!(
         r#"<scene version="3.0.0">
@@ -44,7 +45,7 @@ fn blend(weight: f32, a: &str, b: &str) -> String {
     format!(r#"<bsdf type="blendbsdf"><float name="weight" value="{weight}"/>{a}{b}</bsdf>"#)
 }
 
-/// The outermost element with the id that the wall refers to.
+/// Returns the outermost element with the id that the wall refers to.
 fn named(bsdf: &str) -> String {
     bsdf.replacen("<bsdf ", "<bsdf id=\"m\" ", 1)
 }
@@ -140,7 +141,7 @@ fn what_is_one_part_or_one_of_each_stays_what_it_was() {
         weight: 0.3,
     };
     assert_eq!(plain.bsdf, expected);
-    // Alike parts are one, and parts without a share are none.
+    // Equal parts are merged, and parts without a share are dropped.
     for tree in [
         blend(0.5, &pair, &pair),
         blend(0.0, &pair, &diffuse("0.9")),
@@ -156,7 +157,7 @@ fn what_is_one_part_or_one_of_each_stays_what_it_was() {
         let (found, alone) = (material(&named(&tree)), material(&named(bsdf)));
         assert_eq!((found.bsdf, found.rgb), (alone.bsdf, alone.rgb), "{tree}");
     }
-    // A mix without a share of one part is a mix still.
+    // A mix in which one part has no share remains a mix.
     let m = material(&named(&blend(0.0, &d, &c)));
     assert!(matches!(m.bsdf, Bsdf::Mixed { weight: 0.0, .. }));
     let m = material(&named(&blend(0.3, &c, &d)));
@@ -190,7 +191,7 @@ fn one_bitmap_scales_all_parts() {
         conductor(0.25, 0.4, 1.0),
     ];
     alike(&parts(&material(&named(&tree))), &expected);
-    // What is black has no texture to scale.
+    // A black part has no texture to scale.
     let dark = blend(0.5, &tree, &diffuse("0"));
     let halved = expected.map(|p| Part {
         weight: p.weight / 2.0,
@@ -258,7 +259,7 @@ fn several_parts_have_one_spectrum_of_lambertians_and_one_of_conductors() {
             .iter()
             .all(|p| m.part(p).at(550.0).conductor == 0.5)
     );
-    // Conductors without spectra keep what they reflect.
+    // Conductors without spectra retain their reflectance.
     let m = material(&named(&blend(
         0.5,
         &d,
@@ -343,7 +344,7 @@ fn blends_that_cannot_be_are_refused_by_element() {
     }
 }
 
-/// A tree of blends over leaves that are told apart by their number.
+/// A tree of blends over leaves with distinct numbers.
 #[derive(Debug, Clone)]
 enum Tree {
     Leaf(bool),
@@ -359,7 +360,7 @@ fn tree() -> impl Strategy<Value = Tree> {
 }
 
 impl Tree {
-    /// Its text; its leaves with their shares are added to `leaves`.
+    /// Returns the tree's text; its leaves with their shares are added to `leaves`.
     fn text(&self, share: f64, leaves: &mut Vec<Part>) -> String {
         match self {
             Tree::Leaf(is_metal) => {

@@ -1,4 +1,5 @@
-//! Materials of several parts come back from Mitsuba scenes of ours, with our comment exactly and without it in their shares.
+//! Materials of several parts are restored from our Mitsuba scenes, exactly with our comment, and
+//! in their shares without it.
 
 #[allow(dead_code)]
 mod common;
@@ -28,7 +29,7 @@ fn several_parts_of_an_exported_scene_come_back_exactly() {
     assert_eq!(back.provenance, scene.provenance);
 }
 
-/// The scene as others read it: without our comment.
+/// Returns the scene without our comment, as other programs read it.
 fn without_comment(scene: &Scene) -> Result<Scene, SceneError> {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("scene.xml");
@@ -42,7 +43,7 @@ fn without_comment(scene: &Scene) -> Result<Scene, SceneError> {
 #[test]
 fn without_our_comment_several_parts_have_the_same_shares() {
     let mut scene = common::parted_room();
-    // Its parts reflect differently: they have images of their own.
+    // Its parts have different reflectances and therefore separate images.
     let error = without_comment(&scene)
         .expect_err("two textures")
         .to_string();
@@ -51,7 +52,7 @@ fn without_our_comment_several_parts_have_the_same_shares() {
     let back = without_comment(&scene).expect("reads");
     for (k, (a, b)) in back.objects.iter().zip(&scene.objects).take(4).enumerate() {
         let (a, b) = (&a.mesh.materials[0], &b.mesh.materials[0]);
-        // What a texture is scaled by lies in its image.
+        // The scale of a texture is contained in its image.
         let scaled = |part: Part| match b.texture {
             Some(_) => common::with_reflectance(part, 1.0),
             None => part,

@@ -1,4 +1,4 @@
-//! Canonical `.glb` files come back exactly, and appear whole or not at all.
+//! Canonical `.glb` files are restored exactly, and appear completely or not at all.
 
 use picofarm_scene::{
     Bsdf, Material, Scene, export,
@@ -112,7 +112,7 @@ fn normals_are_of_unit_length_and_do_not_change_what_is_read() {
     }
 }
 
-/// The scene as a file in which another program gave the mirror a roughness of 0.5.
+/// Returns the scene as a file in which another program changed the mirror's roughness to 0.5.
 fn edited(scene: &Scene) -> Vec<u8> {
     let mut bytes = export::glb_bytes(scene).expect("valid");
     let factor = b"\"roughnessFactor\":0.1}";
@@ -204,7 +204,7 @@ fn shares_whose_rounded_sum_exceeds_1_are_metal_and_no_more() {
     comes_back(scene);
 }
 
-/// The scene as a file in which another program set a factor of one mesh's first material.
+/// Returns the scene as a file in which another program set a factor of one mesh's first material.
 fn with_factor(scene: &Scene, mesh: usize, factor: &str, value: f32) -> Vec<u8> {
     let bytes = export::glb_bytes(scene).expect("valid");
     let length = u32::from_le_bytes([bytes[12], bytes[13], bytes[14], bytes[15]]) as usize;

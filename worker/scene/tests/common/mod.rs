@@ -1,4 +1,4 @@
-//! What several tests of files need.
+//! Helpers for several tests of files.
 
 use picofarm_scene::{
     Bsdf, Distribution, Lobe, Material, Part, Parts, Scene, SpectrumPoint, Texture, Wrap,
@@ -6,7 +6,7 @@ use picofarm_scene::{
 };
 use std::sync::Arc;
 
-/// A base64 data URI.
+/// Returns a base64 data URI.
 pub fn data_uri(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::from("data:application/octet-stream;base64,");
@@ -22,7 +22,7 @@ pub fn data_uri(bytes: &[u8]) -> String {
     out
 }
 
-/// A small room in which the first three objects got a texture, a mix and both.
+/// Returns a small room in which the first three objects have a texture, a mix and both.
 pub fn textured_room() -> Scene {
     let settings = PrimitiveSettings {
         width: 96,
@@ -60,7 +60,7 @@ pub fn textured_room() -> Scene {
     scene
 }
 
-/// [`textured_room`] in which every material has a spectrum, mixes of both parts.
+/// Returns [`textured_room`] with a spectrum for every material; those of mixes are of both parts.
 pub fn spectral_room() -> Scene {
     let mut scene = textured_room();
     for (k, object) in scene.objects.iter_mut().enumerate() {
@@ -78,7 +78,7 @@ pub fn spectral_room() -> Scene {
     scene
 }
 
-/// A Lambertian with its share.
+/// Returns a Lambertian with its share.
 pub fn lambertian(weight: f32, reflectance: f32) -> Part {
     Part {
         weight,
@@ -86,7 +86,7 @@ pub fn lambertian(weight: f32, reflectance: f32) -> Part {
     }
 }
 
-/// A conductor with its share.
+/// Returns a conductor with its share.
 pub fn conductor(weight: f32, alpha: f32, reflectance: f32) -> Part {
     Part {
         weight,
@@ -98,7 +98,8 @@ pub fn conductor(weight: f32, alpha: f32, reflectance: f32) -> Part {
     }
 }
 
-/// [`textured_room`] in which the first five objects are of several parts, the second with a spectrum.
+/// Returns [`textured_room`] with several parts in the first five objects; the second has a
+/// spectrum.
 pub fn parted_room() -> Scene {
     let mut scene = textured_room();
     let eight = (0..8).map(|k| match k % 2 {
@@ -137,7 +138,7 @@ pub fn parted_room() -> Scene {
     scene
 }
 
-/// The parts of a material of several.
+/// Returns the parts of a material of several parts.
 pub fn parts(material: &Material) -> Vec<Part> {
     match material.bsdf {
         Bsdf::Several { parts } => parts.list().to_vec(),
@@ -145,7 +146,7 @@ pub fn parts(material: &Material) -> Vec<Part> {
     }
 }
 
-/// Fails unless parts are the same but for rounding.
+/// Fails unless parts are the same up to rounding.
 pub fn alike(found: &[Part], expected: &[Part]) {
     let close = |a: f32, b: f32| (a - b).abs() < 1e-6;
     let same = |a: &Part, b: &Part| {
@@ -164,7 +165,7 @@ pub fn alike(found: &[Part], expected: &[Part]) {
     );
 }
 
-/// The same with another reflectance.
+/// Returns the part with another reflectance.
 pub fn with_reflectance(part: Part, reflectance: f32) -> Part {
     match part.lobe {
         Lobe::Diffuse { .. } => lambertian(part.weight, reflectance),

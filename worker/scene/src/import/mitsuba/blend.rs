@@ -1,17 +1,22 @@
-//! Mitsuba's blends as materials of parts side by side.
+//! Converts Mitsuba's blends to materials of several parts.
 //!
-//! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a blend again. What is read are the
-//! leaves, Lambertians and conductors, in the file's order. The share of a leaf is the product of the weights on the way to it.
-//! Leaves that scatter alike and have one colour are one. One Lambertian and one conductor are [`Bsdf::Mixed`]. One leaf alone
-//! is what it is. All others are [`Bsdf::Several`], without the leaves that have no share and without black Lambertians.
+//! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a
+//! blend again. The importer reads the leaves, Lambertians and conductors, in the file's order. The
+//! share of a leaf is the product of the weights on the path to it. Leaves with the same scattering
+//! and colour are merged. One Lambertian and one conductor become [`Bsdf::Mixed`]. A single leaf
+//! becomes a plain material. All others become [`Bsdf::Several`], without leaves that have no share
+//! and without black Lambertians.
 //!
-//! - **Colour**: a material's `rgb` is the mean of its leaves' colours by their shares, so that the mean of its three channels
-//!   is the sum of shares times reflectances. At a stated wavelength every part has the hue of this `rgb`: together the parts
-//!   reflect what they should, unless one of them would reflect more than it gets. A note says so where hues differ.
-//! - **Texture**: it scales all parts. So all leaves with a share have the same bitmap, or none has one. Black Lambertians need none.
-//! - **Spectra**: Lambertians side by side are one Lambertian of their mean. They are read as one where any leaf of a blend has a
-//!   spectrum. What a material's spectrum says of conductors holds for all of them: they have the same spectrum, or none has one.
-//! - **Sides**: a blend is two-sided where both its BSDFs are.
+//! - **Colour**: a material's `rgb` is the mean of its leaves' colours weighted by their shares, so
+//!   that the mean of its three channels is the sum of shares times reflectances. At a given
+//!   wavelength every part has the hue of this `rgb`: the sum of the parts' reflectances is
+//!   correct, unless one part would reflect more than it receives. If hues differ, a note says so.
+//! - **Texture**: it scales all parts. Therefore all leaves with a share must have the same bitmap,
+//!   or none. Black Lambertians need none.
+//! - **Spectra**: a blend of Lambertians is equivalent to one Lambertian of their mean. They are
+//!   merged if any leaf of a blend has a spectrum. A material's spectrum for conductors applies to
+//!   all of them: they must have the same spectrum, or none.
+//! - **Sides**: a blend is two-sided if both its BSDFs are.
 
 use std::{rc::Rc, sync::Arc};
 
@@ -26,19 +31,20 @@ use super::{
     transform::Matrix,
 };
 
-/// Hues closer than this are the same.
+/// Hues with a smaller difference are the same.
 const SAME_HUE: f32 = 1e-3;
 
-/// What blends are made of.
+/// A leaf of a blend.
 #[derive(Debug, PartialEq)]
 pub(super) struct Leaf {
     pub(super) colour: Colour,
-    /// α and distribution of a conductor; a Lambertian has none.
+    /// α and distribution of a conductor; `None` for a Lambertian.
     pub(super) metal: Option<(f32, Distribution)>,
 }
 
 impl Leaf {
-    /// A Lambertian that reflects nothing, as the missing share of a material does.
+    /// Returns whether the leaf is a Lambertian that reflects nothing, like the missing share of a
+    /// material.
     fn is_black(&self) -> bool {
         let Colour {
             rgb,
@@ -70,14 +76,14 @@ type Share = (f64, Rc<Leaf>);
 /// Leaves with their shares.
 type Leaves = Vec<Share>;
 
-/// A BSDF as leaves side by side, no two alike; their shares sum to 1.
+/// A BSDF as a set of leaves without duplicates; their shares sum to 1.
 pub(super) struct Mix {
     leaves: Leaves,
     pub(super) two_sided: bool,
 }
 
 impl Mix {
-    /// One leaf, one-sided.
+    /// Returns a one-sided mix of one leaf.
     pub(super) fn of(leaf: Rc<Leaf>) -> Self {
         Self {
             leaves: vec![(1.0, leaf)],
@@ -85,7 +91,7 @@ impl Mix {
         }
     }
 
-    /// This and another side by side, which has the share `weight`.
+    /// Returns a mix of `self` and `other`, which has the share `weight`.
     fn beside(self, other: Self, weight: f64) -> Self {
         let two_sided = self.two_sided && other.two_sided;
         let first = self.leaves.into_iter().map(|l| (l.0 * (1.0 - weight), l.1));
@@ -133,7 +139,7 @@ impl Reader<'_> {
         }
     }
 
-    /// The material that a mix is.
+    /// Returns the material of a mix.
     pub(super) fn assemble(&mut self, node: &Node, mix: Mix) -> Result<Look, String> {
         let mut leaves = mix.leaves;
         if !is_simple(&leaves) {
@@ -181,12 +187,12 @@ impl Reader<'_> {
 
 type Assembled = (Bsdf, [f32; 3], Vec<SpectrumPoint>);
 
-/// False for what vanishes in a material's numbers.
+/// Returns whether a share is above zero in single precision.
 fn has_share((share, _): &Share) -> bool {
     *share as f32 > 0.0
 }
 
-/// One Lambertian and one conductor, in this order.
+/// Returns one Lambertian and one conductor, in this order.
 fn pair(leaves: &[Share]) -> Option<(&Share, &Share)> {
     match leaves {
         [a, b] if a.1.metal.is_none() && b.1.metal.is_some() => Some((a, b)),
@@ -195,12 +201,12 @@ fn pair(leaves: &[Share]) -> Option<(&Share, &Share)> {
     }
 }
 
-/// True for one leaf, and for one Lambertian and one conductor.
+/// Returns whether there is one leaf, or one Lambertian and one conductor.
 fn is_simple(leaves: &[Share]) -> bool {
     leaves.len() == 1 || pair(leaves).is_some()
 }
 
-/// The texture that scales all leaves.
+/// Returns the texture that scales all leaves.
 fn texture_of(leaves: &[Share]) -> Result<Option<(Arc<Texture>, Matrix)>, &'static str> {
     let mut all = leaves.iter().filter(|l| !l.1.is_black());
     let Some((_, first)) = all.next() else {
@@ -213,7 +219,7 @@ fn texture_of(leaves: &[Share]) -> Result<Option<(Arc<Texture>, Matrix)>, &'stat
     }
 }
 
-/// The same with all Lambertians but black ones as one, in the place of the first.
+/// Merges all Lambertians except black ones into one, at the position of the first.
 fn with_one_lambertian(leaves: Leaves) -> Leaves {
     let united = |l: &Share| l.1.metal.is_none() && !l.1.is_black();
     let (some, mut rest): (Leaves, Leaves) = leaves.iter().cloned().partition(united);
@@ -231,7 +237,7 @@ fn with_one_lambertian(leaves: Leaves) -> Leaves {
     rest
 }
 
-/// A Lambertian and a conductor with its share.
+/// Returns a mix of a Lambertian and a conductor with its share.
 fn mixed(d: &Colour, (share, metal): &Share) -> Assembled {
     let (s, w) = (&metal.colour, *share as f32);
     let (alpha, distribution) = metal.metal.unwrap_or((1.0, Distribution::Beckmann));
@@ -246,7 +252,7 @@ fn mixed(d: &Colour, (share, metal): &Share) -> Assembled {
     (bsdf, rgb, spectrum_of(Some(d), Some(s)))
 }
 
-/// Leaves that are no simpler material; of those with spectra, one Lambertian at most.
+/// Returns a material of several leaves. Of leaves with spectra, at most one is a Lambertian.
 fn several(leaves: &[Share]) -> Result<Assembled, String> {
     let part = |(share, leaf): &Share| Part {
         weight: *share as f32,
@@ -286,7 +292,7 @@ fn spectrum_of_several(leaves: &[Share]) -> Result<Vec<SpectrumPoint>, &'static 
     Ok(rows)
 }
 
-/// True where colours differ by more than their brightness.
+/// Returns whether colours differ in more than their brightness.
 fn have_several_hues(leaves: &[Share]) -> bool {
     let colours = leaves.iter().map(|l| &l.1.colour);
     let mut hues = colours
