@@ -93,7 +93,7 @@ impl Gpu {
     }
 }
 
-/// A graphics processor whose results agree with the CPU's.
+/// An opened graphics processor. Its results agree with the CPU's.
 #[derive(Debug, Clone)]
 pub struct OpenGpu {
     /// The device's name, as in [`Gpu::id`].

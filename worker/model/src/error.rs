@@ -24,7 +24,7 @@ pub enum ModelError {
         /// The tensor, its invalid value, and the accepted values.
         what: String,
     },
-    /// A network whose answer contains a non-finite number.
+    /// A network that answered with a non-finite number.
     #[error("{what}")]
     Answer {
         /// The scene's index among the scenes given, if there are several.

@@ -76,7 +76,7 @@ pub enum Released {
 }
 
 impl Metrics {
-    /// Returns a loss, of which less is better: MAE, or 1 − IoU.
+    /// Returns a loss: MAE, or 1 − IoU. A smaller loss is better.
     pub fn loss(&self) -> f64 {
         match self {
             Self::Depth { mae_m, .. } => *mae_m,
@@ -150,7 +150,7 @@ impl Tally {
         }
     }
 
-    /// Adds another tally, whose images follow these.
+    /// Adds the tally of the images that follow these.
     pub fn join(&mut self, other: &Self) {
         self.pixels += other.pixels;
         self.absolute += other.absolute;

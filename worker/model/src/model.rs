@@ -58,8 +58,8 @@ impl Model {
     ///
     /// # Errors
     /// [`ModelError::File`] if the bytes are damaged, [`ModelError::Weights`] if a tensor is
-    /// missing or has another shape, [`ModelError::Values`] if one contains a number that is not
-    /// finite or a negative variance.
+    /// missing or has another shape, [`ModelError::Values`] if one contains a non-finite
+    /// number or a negative variance.
     pub fn import(bytes: &[u8], plan: &Plan, device: &Device) -> Result<Vec<u8>, ModelError> {
         let net = Net::new(plan.net.clone())?;
         let declared = net.declared();
@@ -130,8 +130,8 @@ impl Model {
     }
 }
 
-/// Returns the error for an output with non-finite numbers. It tells whether the input or the weights
-/// are the likely cause.
+/// Returns the error for an output with non-finite numbers. The error names the input or the
+/// weights as the likely cause.
 pub(crate) fn not_finite(
     said: &[f32],
     at: usize,

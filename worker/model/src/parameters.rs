@@ -84,7 +84,7 @@ impl Declarations {
     }
 }
 
-/// The values of tensors by name, on the host: the form that is stored and exchanged.
+/// The values of tensors by name, on the host: the form for storage and exchange.
 pub type Named = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 /// The values of a network's parameters on a device, without gradients.

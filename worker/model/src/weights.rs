@@ -1,4 +1,5 @@
-//! Weights as safetensors, by PyTorch's names and in its shapes: `torch.load_state_dict(safetensors.torch.load_file(…))`.
+//! Weights as safetensors, by PyTorch's names and in its shapes:
+//! `torch.load_state_dict(safetensors.torch.load_file(…))`.
 
 use std::collections::{BTreeMap, HashMap};
 

@@ -248,7 +248,8 @@ fn multiply_adds_are_those_counted_by_hand() {
     // Width 6, 2 groups of 2 blocks, windows of 16 tokens.
     let block = 6 * 18 + 6 * 6 + 2 * 6 * 12 + 2 * 16 * 6;
     let swinir = 9 * bins * 6 + 2 * (2 * block + 9 * 36) + 9 * 36 + 9 * 6;
-    // Two filters, one convolution and four others of 6 channels over 6 moments; 16 channels, and 32.
+    // Two filters, one convolution and four others of 6 channels over 6 moments; 16 channels, and
+    // 32.
     let volume = 27 * (2 + 2 * 6 + 4 * 36) * 6 * pixels / 4;
     let images = 9 * 5 * 16 * 16 * pixels / 4;
     let fine = (9 * (17 * 32 + 4 * 32 * 32 + 32) + 2) * pixels;
@@ -279,7 +280,8 @@ fn multiply_adds_are_those_counted_by_hand() {
         let found = small(architecture, 12).multiply_adds(side);
         assert_eq!(found, expected as f64, "{architecture:?}");
     }
-    // Two levels of 2 and 4 channels; time 4, then 2. Projection, encoders, time to one moment, decoder, last layer.
+    // Two levels of 2 and 4 channels; time 4, then 2. Projection, encoders, time to one moment,
+    // decoder, last layer.
     let unet25d = NetSpec {
         width: 2,
         levels: 2,

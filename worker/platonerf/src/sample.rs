@@ -95,8 +95,8 @@ impl Places {
     }
 }
 
-/// Returns positions distributed by the weights: the inverse of a distribution with even density between
-/// the middles of neighbouring positions. The first and the last weight are not used.
+/// Returns positions distributed by the weights: the inverse of a distribution with even density
+/// between the middles of neighbouring positions. The first and the last weight are not used.
 fn by_importance(z: &[f32], weights: &[f32], share: &[f32]) -> Vec<f32> {
     let middles: Vec<f32> = z.windows(2).map(|w| 0.5 * (w[0] + w[1])).collect();
     let inner = &weights[1..weights.len() - 1];

@@ -24,7 +24,7 @@ pub struct MeasuredSpot {
     pub folded: bool,
 }
 
-/// A spot that is not used.
+/// An excluded spot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LeftOut {
     /// The index of its beam in the scene.

@@ -12,7 +12,8 @@ use crate::{
 
 /// The greatest number of light paths that are examined; if there are more, every n-th is.
 const MOST: usize = 2_200_000;
-/// The greatest number of held-out rays of a class. At most one ray in `HELD_OUT_EVERY` is held out.
+/// The greatest number of held-out rays of a class. At most one ray in `HELD_OUT_EVERY` is held
+/// out.
 const HELD_OUT: usize = 4096;
 const HELD_OUT_EVERY: usize = 20;
 /// The step of the examination, voxels.

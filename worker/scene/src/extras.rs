@@ -17,8 +17,8 @@
 //! remain those of the standard parameters: only renders with a wavelength use a spectrum.
 //!
 //! Our own material extras are used as long as metalness and roughness are unchanged. If they were
-//! edited, the BSDF and spectrum in our extras are ignored, and a note says so. A `spectrum`
-//! outside `picofarm` is always used, in our own files too.
+//! edited, the BSDF and spectrum in our extras are ignored, and the importer adds a note. A
+//! `spectrum` outside `picofarm` is always used, in our own files too.
 
 use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};

@@ -1,4 +1,4 @@
-//! PlatoNeRF's measuring room with our own furniture: one object in a box that is open behind, the
+//! PlatoNeRF's measuring room with our own furniture: one object in a box without a rear wall, the
 //! published laser targets, and the published novel views.
 //!
 //! Room, targets and views are those of PlatoNeRF's scripts (facebookresearch/PlatoNeRF,

@@ -1,4 +1,5 @@
-//! Damaged and hostile files of every format: no panic, no scene that fails validation, bounded memory.
+//! Damaged and hostile files of every format: no panic, no scene that fails validation, bounded
+//! memory.
 
 #[allow(dead_code)]
 mod common;

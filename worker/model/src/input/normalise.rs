@@ -6,7 +6,7 @@ use crate::scene::{Order, Scene};
 /// The number of pixels that are transposed together from pixel order to bin order: they fill a
 /// cache line of each bin's plane.
 const BLOCK: usize = 16;
-/// The number of pixels whose planes are scaled together: 0.7 MB for 637 bins.
+/// The number of pixels that are scaled together: 0.7 MB for 637 bins.
 const STRIP: usize = 256;
 
 /// Returns the number of adjacent bins of `stored` that are summed into one of `bins`. The bins

@@ -20,7 +20,7 @@ use super::{
     simd::{Kernels, LANES, Lanes, Op, Positions, outer},
 };
 
-/// The number of windows whose bias gradients are summed together. It is fixed, so the number of
+/// The number of windows in a group for the sum of bias gradients. It is fixed, so the number of
 /// threads does not affect the bits.
 const TOGETHER: usize = 16;
 

@@ -51,7 +51,7 @@ impl BorderShape {
         self.channels * (self.height + 2) * (self.width + 2)
     }
 
-    /// Returns the image that is part `part` of another.
+    /// Returns the index of the image used as part `part` of another.
     fn seen(&self, image: usize, part: usize) -> usize {
         if !self.volume {
             return image;

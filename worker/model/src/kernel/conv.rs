@@ -1,9 +1,9 @@
 //! Convolution and its input gradient: a shifted matrix product over padded bands, without im2col.
 //!
-//! A task is a band of rows and a group of output channels. It packs a chunk of input channels into padded
-//! planes that stay in the second-level cache and adds the chunk to its outputs, tile by tile: eight output
-//! channels by three units of sixteen pixels. Each output is one chain of fused multiply-adds over input
-//! channels, then taps, whatever the tile, chunk or task.
+//! A task is a band of rows and a group of output channels. It packs a chunk of input channels into
+//! padded planes that stay in the second-level cache and adds the chunk to its outputs, tile by
+//! tile: eight output channels by three units of sixteen pixels. Each output is one chain of fused
+//! multiply-adds over input channels, then taps, whatever the tile, chunk or task.
 
 use rayon::prelude::*;
 

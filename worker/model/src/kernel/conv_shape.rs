@@ -5,8 +5,8 @@ use super::plane::Grid;
 /// The number of output channels of a block of packed weights.
 pub(super) const BLOCK: usize = 8;
 
-/// A convolution of stride 1: input (images, inputs, height, width), output (images, outputs, height,
-/// width), weights (outputs, inputs, k, k), all contiguous in this order.
+/// A convolution of stride 1: input (images, inputs, height, width), output (images, outputs,
+/// height, width), weights (outputs, inputs, k, k), all contiguous in this order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConvShape {
     /// The number of images in the batch.

@@ -1,9 +1,10 @@
 //! Weight and bias gradients of the convolutions.
 //!
-//! The output gradient is transposed once to `[block of channels][pixel][32]`, so that the gradient of one
-//! weight row is a chain of outer products: scalars of the packed input times vectors over output channels,
-//! without a reduction across lanes. The chain runs over a block of [`BLOCK_PIXELS`] pixels of one image; the
-//! blocks' sums are added in order. Tasks share out channels, never pixels.
+//! The output gradient is transposed once to `[block of channels][pixel][32]`, so that the gradient
+//! of one weight row is a chain of outer products: scalars of the packed input times vectors over
+//! output channels, without a reduction across lanes. The chain runs over a block of
+//! [`BLOCK_PIXELS`] pixels of one image; the blocks' sums are added in order. Tasks share out
+//! channels, never pixels.
 
 use rayon::prelude::*;
 

@@ -1,8 +1,9 @@
 //! Batch norm fused with ReLU: training, its gradient, and evaluation.
 //!
-//! Each channel is one task: mean, then centred variance, then one pass that normalises and clips. Sums run
-//! over four times sixteen lanes in one plane and in `f64` over the planes. The gradient recomputes the
-//! clipped value with the forward pass's own operations, so that both see the same pixels as clipped.
+//! Each channel is one task: mean, then centred variance, then one pass that normalises and clips.
+//! Sums run over four times sixteen lanes in one plane and in `f64` over the planes. The gradient
+//! recomputes the clipped value with the forward pass's own operations, so that both see the same
+//! pixels as clipped.
 
 use rayon::prelude::*;
 

@@ -14,8 +14,8 @@ use super::simd::{Kernels, LANES, Lanes, Op};
 /// The number of pixels of a band.
 const BAND: usize = 2048;
 
-/// A 3×3 convolution of stride 1 and padding 1 over one-hot bins: input one bin a pixel (images, height,
-/// width), weights (outputs, bins, 3, 3), output (images, outputs, height, width).
+/// A 3×3 convolution of stride 1 and padding 1 over one-hot bins: input one bin a pixel (images,
+/// height, width), weights (outputs, bins, 3, 3), output (images, outputs, height, width).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OneHotShape {
     /// The number of images in the batch.
@@ -64,8 +64,8 @@ impl OneHotShape {
 }
 
 impl Kernels {
-    /// Adds the convolution over one-hot bins to `out`. A bin of [`OneHotShape::bins`] or more (such as
-    /// `u16::MAX`) means that all channels are zero at that pixel.
+    /// Adds the convolution over one-hot bins to `out`. A bin of [`OneHotShape::bins`] or more
+    /// (such as `u16::MAX`) means that all channels are zero at that pixel.
     pub fn onehot_conv3x3(self, s: &OneHotShape, bins: &[u16], w: &[f32], out: &mut [f32]) {
         let d = s.dense();
         assert_eq!(bins.len(), s.images * s.height * s.width, "one bin a pixel");

@@ -32,7 +32,7 @@ pub(super) struct Swinir {
     window: usize,
 }
 
-/// Blocks and a convolution, whose result is added to the input.
+/// Blocks and a convolution. Their result is added to the input.
 #[derive(Debug, Clone)]
 struct Group {
     blocks: Vec<Block>,

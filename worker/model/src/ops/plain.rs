@@ -10,7 +10,7 @@ use burn::tensor::{
 use super::{EPSILON, Normalised, attend, from_windows, shifted, shifted_back, windows};
 use crate::kernel::AdamW;
 
-/// The number of channels that matrix units process at once. If a layer has a number that is not a
+/// The number of channels that matrix units process at once. If a layer has another number than a
 /// multiple (e.g. 637 bins), kernels of graphics processors read its values one by one.
 const ALIGNED: usize = 16;
 

@@ -30,7 +30,7 @@ pub struct Spread {
 pub struct Group {
     /// The common part of its models' names.
     pub label: String,
-    /// The quantity that is learned.
+    /// The learned quantity.
     pub target: Target,
     /// The indices of its models in the report.
     pub models: Vec<usize>,
@@ -69,8 +69,8 @@ pub struct Order {
     /// The pairs in the opposite order: the better experiment here, then the worse. Pairs with
     /// equal metrics are not counted in either order.
     pub turned: Vec<[String; 2]>,
-    /// The number of pairs whose metrics are closer together than the spread of their seeds (√(s₁²
-    /// + s₂²)).
+    /// The number of pairs with a difference of metrics below the spread of their seeds, √(s₁² +
+    /// s₂²).
     pub close: usize,
 }
 
@@ -79,7 +79,7 @@ pub struct Order {
 pub struct Scaling {
     /// The common part of their names.
     pub label: String,
-    /// The quantity that is learned.
+    /// The learned quantity.
     pub target: Target,
     /// The number of scenes and the error, ascending.
     pub points: Vec<(u64, Spread)>,

@@ -23,7 +23,7 @@ impl Scale {
             true => (libm::log10(low), libm::log10(high)),
             false => (low, high),
         };
-        // A range that is empty, or within rounding errors, is widened to a readable one.
+        // An empty range, or one within rounding errors, is widened to a readable one.
         let least = if log {
             0.3
         } else {

@@ -45,7 +45,7 @@ pub struct Average {
     pub(super) values: Parameters,
 }
 
-/// The number of values whose squares are summed at a time.
+/// The number of values in a partial sum of squares.
 const SQUARED: usize = 1 << 16;
 
 /// The results of a batch: gradients, loss, and the running statistics after it.

@@ -19,7 +19,7 @@ pub struct Position {
     pub best: Option<f64>,
     /// The number of validations since the best one.
     pub since_best: u64,
-    /// The step whose weights are the training's result; 0 = the last one.
+    /// The step with the weights that the training returns; 0 = the last one.
     pub kept_step: u64,
     /// A line for each finished epoch, and for each validation within an epoch.
     pub history: Vec<Line>,

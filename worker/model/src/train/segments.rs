@@ -16,7 +16,7 @@ use crate::{
     parameters::{Declared, Id, download, upload},
 };
 
-/// The backward pass over a graph that is cut between segments, from the last segment to the first.
+/// The backward pass over a graph with cuts between segments, from the last segment to the first.
 struct Backward {
     leaves: Vec<Tensor<1>>,
     losses: Loss,

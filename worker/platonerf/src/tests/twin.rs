@@ -1,7 +1,8 @@
-//! Agreement with PyTorch: the same weights, rays and random draws through `tests/twin/twin.py`, with
-//! stored results in the same folder.
+//! Agreement with PyTorch: the same weights, rays and random draws through `tests/twin/twin.py`,
+//! with stored results in the same folder.
 //!
-//! To compute the results again (in the crate's folder; requires Python with torch and safetensors):
+//! To compute the results again (in the crate's folder; requires Python with torch and
+//! safetensors):
 //!
 //! ```sh
 //! PICOFARM_TWIN=input.safetensors cargo test --release -p picofarm-platonerf writes_what_the_twin_reads -- --ignored
@@ -9,8 +10,8 @@
 //! ```
 //!
 //! The twin computes in 64 bits and prints the deviation of the same program in 32 bits. The
-//! tolerances below are a few times that deviation: with frequencies of 512/m, rounding of positions
-//! gives errors of 1e-4 in angles.
+//! tolerances below are a few times that deviation: with frequencies of 512/m, rounding of
+//! positions gives errors of 1e-4 in angles.
 
 use std::collections::HashMap;
 

@@ -10,7 +10,8 @@ use super::{devices, small, storage, upholstery};
 /// A builder of one variant.
 pub(super) type Build = fn(&mut Rng) -> Mesh;
 
-/// (category, number of variants, builder), in the order that fixes the variants' seeds: append only.
+/// (category, number of variants, builder), in the order that fixes the variants' seeds: append
+/// only.
 pub(super) fn catalogue() -> Vec<(&'static str, u64, Build)> {
     vec![
         ("sofa", 8, upholstery::sofa),

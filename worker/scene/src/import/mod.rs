@@ -197,7 +197,7 @@ const MAX_MESSAGE: usize = 1000;
 /// The number of letters of a file's own text that a message quotes.
 const MAX_QUOTE: usize = 80;
 
-/// Truncates a message that is too long to read.
+/// Truncates a message of more than [`MAX_MESSAGE`] letters.
 fn shortened(mut message: String) -> String {
     if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE) {
         message.truncate(end);

@@ -35,8 +35,8 @@ pub(in super::super) fn shifted<L: Lanes, const M: usize, const V: usize, const 
     for c in 0..channels {
         for ky in 0..K {
             for kx in 0..K {
-                // SAFETY: the largest offsets are those asserted above; pointers advance only while channels
-                // remain.
+                // SAFETY: the largest offsets are those asserted above; pointers advance only while
+                // channels remain.
                 unsafe {
                     let mut xs = [L::splat(0.0); V];
                     for v in 0..V {

@@ -116,7 +116,8 @@ fn odd_and_exact_sizes_agree() {
         shape(1, 2, 3, 70, 33),
         shape(2, 1, 40, 33, 48),
         shape(5, 70, 40, 2, 2),
-        // Winograd's form: odd planes, planes of several images, bands of one image, groups of channels.
+        // Winograd's form: odd planes, planes of several images, bands of one image, groups of
+        // channels.
         shape(3, 17, 19, 5, 7),
         shape(5, 33, 40, 4, 4),
         shape(1, 40, 16, 33, 64),

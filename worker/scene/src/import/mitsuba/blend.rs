@@ -10,7 +10,8 @@
 //! - **Colour**: a material's `rgb` is the mean of its leaves' colours weighted by their shares, so
 //!   that the mean of its three channels is the sum of shares times reflectances. At a given
 //!   wavelength every part has the hue of this `rgb`: the sum of the parts' reflectances is
-//!   correct, unless one part would reflect more than it receives. If hues differ, a note says so.
+//!   correct, unless one part would reflect more than it receives. If hues differ, the importer
+//!   adds a note.
 //! - **Texture**: it scales all parts. Therefore all leaves with a share must have the same bitmap,
 //!   or none. Black Lambertians need none.
 //! - **Spectra**: a blend of Lambertians is equivalent to one Lambertian of their mean. They are
