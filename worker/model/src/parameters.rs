@@ -158,8 +158,7 @@ impl Parameters {
         }
     }
 
-    /// Replaces the parameters that are not learned, running statistics included, by another
-    /// network's values.
+    /// Replaces the encoder's parameters, running statistics included, by another network's values.
     ///
     /// # Errors
     /// [`ModelError::Weights`] if one is missing or has another shape.

@@ -26,7 +26,7 @@ fn begun(plan: &Plan) -> Training {
     Training::start(plan.clone(), None, sources(), &Device::flex()).unwrap()
 }
 
-/// Returns a training that is stopped after the given number of steps.
+/// Returns a training, stopped after the given number of steps.
 fn stopped_after(plan: &Plan, steps: u64) -> Training {
     let mut training = begun(plan);
     let ended = training.run(&mut |_, event| match event {

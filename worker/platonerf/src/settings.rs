@@ -75,8 +75,8 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Returns the settings from those of a job or command, for the box of [`grid`], which no
-    /// visible surface exceeds.
+    /// Returns the settings from those of a job or command. Camera rays end at the diagonal of the
+    /// box of [`grid`], because no visible surface is farther away.
     pub fn of(asked: &MlpSettings, start: &Reconstructed, seed: u64) -> Self {
         let paper = Self {
             width: asked.width as usize,

@@ -446,7 +446,7 @@ fn paths(measured: &Measured, depth: &Depth) -> Vec<Count> {
                 let smooth = far[p] - near[p] < SMOOTH * near[p];
                 behind = smooth && away > far[p] + CLEAR_M && away < far[p] + 4.0 * CLEAR_M;
             }
-            // Next to the surfaces at its ends, a path is close to them.
+            // Next to the surfaces at its ends, a path cannot be clear of them.
             let low = |normal: Vec3, foot: Vec3| normal.dot(place - foot) < CLEAR_M;
             let ends = low(here, path.origin) || (there != Vec3::ZERO && low(there, end));
             free &= front || ends;

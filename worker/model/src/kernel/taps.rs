@@ -28,7 +28,8 @@ impl TapShape {
         [self.moments.div_ceil(2), self.height / 2, self.width / 2]
     }
 
-    /// Returns 2·`at` + `by` − 1, if it is within 0..`len` or can be moved there by repetition.
+    /// Returns position 2·`at` + `by` − 1. A position outside 0..`len` is clamped if ends are
+    /// repeated, and `None` otherwise.
     fn place(&self, at: usize, by: usize, len: usize) -> Option<usize> {
         let place = 2 * at + by;
         match self.repeated {

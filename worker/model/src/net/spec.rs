@@ -76,7 +76,7 @@ impl NetSpec {
         (0..self.levels).map(|k| self.width << k).collect()
     }
 
-    /// Returns the number of which width and height must be multiples.
+    /// Returns the required divisor of width and height.
     pub fn multiple(&self) -> usize {
         match self.architecture {
             Architecture::Unet2d | Architecture::Unet25d => 1 << (self.levels - 1),

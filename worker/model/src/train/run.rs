@@ -477,8 +477,8 @@ impl Training {
         })
     }
 
-    /// Returns the metrics on the unmodified validation scenes. Each scene uses a different spot,
-    /// which is always the same.
+    /// Returns the metrics on the unmodified validation scenes. The spot of a scene depends only on
+    /// the scene's index.
     fn validate(&self) -> Result<Metrics, ModelError> {
         let scenes = &*self.sources.validation;
         let mut tally = Tally::default();

@@ -196,8 +196,8 @@ fn in_view(camera: &Camera, x: Vec3) -> bool {
 
 /// Returns up to `count` views on a circle around the middle of the visible points, at the camera's
 /// height and looking at that middle. The circle's radius is half the distance of the camera from
-/// the middle. Views are omitted if they are within 0.25 m of a surface, or if they look at the
-/// outside of the scene.
+/// the middle. Views are omitted if they are within 0.25 m of a surface, inside a solid, or behind
+/// a wall.
 pub fn around(
     measured: &Measured,
     range: &[f32],

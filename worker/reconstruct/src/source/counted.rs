@@ -56,9 +56,8 @@ impl Detector {
     }
 }
 
-/// Returns the mean of the bins up to the median. For counts of ambient light alone the median is a
-/// whole number, but the mean is not. The bins within twice the spread of the median are therefore
-/// averaged.
+/// Returns the level of ambient light: the mean of the bins up to two spreads above the median. The
+/// median itself is too coarse, because it is a whole number for counts of ambient light alone.
 fn lower_mean(h: &[f32]) -> f32 {
     let mut sorted = h.to_vec();
     let middle = (sorted.len() - 1) / 2;

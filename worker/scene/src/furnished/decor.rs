@@ -88,9 +88,9 @@ pub(super) fn openings(rng: &mut Rng, plan: &mut Plan<'_>) {
     }
 }
 
-/// Hangs two to six flat objects on the walls. Mirrors are near-mirrors, and so is every other
-/// picture (glossy glass). With `specular_at_least`, there are always more near-mirrors than the
-/// camera must see.
+/// Hangs two to six flat objects on the walls. Mirrors are near-mirrors, and so are half of the
+/// pictures on average (glossy glass). With `specular_at_least`, more near-mirrors are hung than
+/// the camera must see, as far as there is space.
 pub(super) fn pictures_and_mirrors(rng: &mut Rng, plan: &mut Plan<'_>, specular_at_least: u32) {
     let wanted = if specular_at_least == 0 {
         0
