@@ -2,11 +2,11 @@
 //! novel views against CPU-seconds.
 //!
 //! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each
-//! stage at full size, and at smaller ones. `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS
-//! SHADOW_STEPS squares|cross_entropy` fits PlatoNeRF's room with a chair, from times and shadows
-//! of its truth at 512 pixels in bins of 128 ps, and prints the errors at each quarter of the work.
-//! `-- grid` prints those of the grid in the same views. `-- memory WIDTH` prints the memory of a
-//! step of stage 2.
+//! stage at full size, and at smaller ones.
+//! `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy` fits
+//! PlatoNeRF's room with a chair, from times and shadows of its truth at 512 pixels in bins of 128
+//! ps, and prints the errors at each quarter of the work. `-- grid` prints those of the grid in the
+//! same views. `-- memory WIDTH` prints the memory of a step of stage 2.
 
 use std::error::Error;
 

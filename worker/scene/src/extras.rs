@@ -11,10 +11,11 @@
 //! `"laser_directions": [[x, y, z], …]` in that node's frame.
 //!
 //! They may also define a material's reflectance by wavelength, in that material's extras (custom
-//! properties in Blender): `"spectrum": [{"nm": 532, "reflectance": 0.3}, {"nm": 905,
-//! "reflectance": 0.7}]`, by ascending wavelength in nanometres. Partly metallic materials may have
-//! a `specular_reflectance` in addition to each reflectance, for their conductor. Colour and BSDF
-//! remain those of the standard parameters: only renders with a wavelength use a spectrum.
+//! properties in Blender):
+//! `"spectrum": [{"nm": 532, "reflectance": 0.3}, {"nm": 905, "reflectance": 0.7}]`, by ascending
+//! wavelength in nanometres. Partly metallic materials may have a `specular_reflectance` in
+//! addition to each reflectance, for their conductor. Colour and BSDF remain those of the standard
+//! parameters: only renders with a wavelength use a spectrum.
 //!
 //! Our own material extras are used as long as metalness and roughness are unchanged. If they were
 //! edited, the BSDF and spectrum in our extras are ignored, and the importer adds a note. A

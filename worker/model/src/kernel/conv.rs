@@ -339,8 +339,8 @@ fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Scratch {
     packed
 }
 
-/// Packs the weights of the input gradient, transposed and with the taps reversed: `[inputs /
-/// 8][outputs][taps][8]`.
+/// Packs the weights of the input gradient, transposed and with the taps reversed:
+/// `[inputs / 8][outputs][taps][8]`.
 fn pack_transposed<const K: usize>(s: &ConvShape, w: &[f32]) -> Scratch {
     let taps = K * K;
     let depth = s.outputs * taps;

@@ -25,8 +25,8 @@ pub(super) fn pays(s: &ConvShape) -> bool {
 }
 
 impl Kernels {
-    /// Computes the convolution with weights packed for the direct form, `[outputs /
-    /// 8][inputs][9][8]`.
+    /// Computes the convolution with weights packed for the direct form,
+    /// `[outputs / 8][inputs][9][8]`.
     pub(super) fn winograd(self, s: &ConvShape, x: &[f32], packed: &[f32], out: &mut [f32]) {
         let tiles = Grid {
             images: s.images,
