@@ -1,5 +1,5 @@
-//! What networks have to beat: the best constant, the peak of each pixel's histogram, masks of one value, and images that
-//! are the same for all scenes.
+//! Baselines that networks have to beat: the best constant, the peak of each pixel's histogram,
+//! masks of one value, and images that are the same for all scenes.
 
 use std::sync::Arc;
 
@@ -14,17 +14,17 @@ use crate::{
 /// Answers without a network, fitted to training scenes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Baseline {
-    /// Of depths.
+    /// Answers for depths.
     Depth(DepthBaseline),
-    /// Of masks.
+    /// Answers for masks.
     Mask(MaskBaseline),
 }
 
 impl Baseline {
-    /// Fitted to at most `most` scenes, the first ones.
+    /// Fits a baseline to the first `most` scenes.
     ///
     /// # Errors
-    /// [`ModelError::Scene`]; [`ModelError::Invalid`] where there is none or where they are of several sizes.
+    /// [`ModelError::Scene`]; [`ModelError::Invalid`] if there are no scenes or their sizes differ.
     pub fn fit(question: &Question, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
         let target = question.target;
         Ok(match target {
@@ -35,7 +35,7 @@ impl Baseline {
         })
     }
 
-    /// What they are called, in the order of [`Baseline::answers`].
+    /// Returns the names of the baselines, in the order of [`Baseline::answers`].
     pub fn names(&self) -> &'static [&'static str] {
         match self {
             Self::Depth(_) => &["constant", "peak", "median image"],
@@ -43,7 +43,8 @@ impl Baseline {
         }
     }
 
-    /// What they say of a scene in the place of a network: depth over its scale, or logits of the masks from `plane` on.
+    /// Returns the baselines' answers for a scene, in the form of a network's output: depth over
+    /// its scale, or logits of the masks from `plane` on.
     pub(crate) fn answers(
         &self,
         question: &Question,
@@ -68,11 +69,12 @@ impl Baseline {
     }
 }
 
-/// Masks without a network: each pixel of each spot's mask is what it mostly was.
+/// Masks without a network: each pixel of each spot's mask has its usual value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MaskBaseline {
-    /// `[spot][row][column]`, or `[row][column]` of mirrors: pixels that are set in a large enough share of the training
-    /// scenes; the share is the one with the greatest IoU on these scenes.
+    /// The mask: `[spot][row][column]`, or `[row][column]` for mirrors. A pixel is set if it is set
+    /// in a large enough share of the training scenes; the share is the one with the greatest IoU
+    /// on these scenes.
     pub mask: Vec<bool>,
 }
 
@@ -94,7 +96,7 @@ impl MaskBaseline {
                 *sum += usize::from(*m > 0);
             }
         }
-        // Pixels by the number of scenes in which they are set.
+        // The number of pixels by the number of scenes in which they are set.
         let mut by_count = vec![0usize; count + 1];
         for &n in &set {
             by_count[n] += 1;
@@ -119,23 +121,25 @@ impl MaskBaseline {
 /// Depths without a network, fitted to training scenes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DepthBaseline {
-    /// The median depth, metres: no constant has a smaller mean absolute error.
+    /// The median depth, metres. No other constant has a smaller mean absolute error.
     pub constant_m: f64,
-    /// z of a pixel = `slope` · ℓ · cos θ + `offset_m`, with ℓ the path length of its histogram's greatest bin and θ the
-    /// angle to the optical axis; by least squares.
+    /// The slope of a least-squares fit: z of a pixel = `slope` · ℓ · cos θ + `offset_m`, with ℓ
+    /// the path length of the greatest bin of the pixel's histogram and θ the angle to the optical
+    /// axis.
     pub slope: f64,
-    /// See `slope`, metres.
+    /// The offset of the fit, metres; see `slope`.
     pub offset_m: f64,
-    /// Each pixel's median depth, metres, `[row][column]`: no image that is the same for all scenes has a smaller mean
-    /// absolute error.
+    /// Each pixel's median depth, metres, `[row][column]`. No other image that is the same for all
+    /// scenes has a smaller mean absolute error.
     pub median_m: Vec<f32>,
 }
 
 impl DepthBaseline {
-    /// Fitted to at most `most` scenes, the first ones; depths end at `scale_m`, as those that networks learn.
+    /// Fits the baselines to the first `most` scenes. Depths are limited to `scale_m`, as for
+    /// networks.
     ///
     /// # Errors
-    /// [`ModelError::Scene`]; [`ModelError::Invalid`] where they are of several sizes.
+    /// [`ModelError::Scene`]; [`ModelError::Invalid`] if the scenes' sizes differ.
     pub fn fit(scale_m: f32, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
         let mut depths = Vec::new();
         // Σ1, Σx, Σx², Σz, Σxz
@@ -180,7 +184,7 @@ impl DepthBaseline {
         })
     }
 
-    /// Depths from peaks, metres: `[row][column]`.
+    /// Returns the depths from peaks, metres: `[row][column]`.
     pub fn of_peaks(&self, scene: &Scene) -> Vec<f32> {
         let depth = peaks(scene)
             .into_iter()
@@ -208,13 +212,13 @@ fn same_size(first: usize, other: usize, index: usize) -> Result<(), ModelError>
     }
 }
 
-/// The middle one, the upper of two; 0 of none.
+/// Returns the median, the upper one of an even number of values; 0 if there are none.
 fn median(values: &mut [f32]) -> f32 {
     values.sort_unstable_by(f32::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
-/// Depth as networks learn it: within what they can say.
+/// Limits a depth to the range that networks can predict.
 fn known(z: f32, scale_m: f32) -> f32 {
     if z.is_finite() {
         z.clamp(0.0, scale_m)
@@ -223,7 +227,8 @@ fn known(z: f32, scale_m: f32) -> f32 {
     }
 }
 
-/// Path length of each pixel's greatest bin times the cosine of its angle to the optical axis, metres.
+/// Returns the path length of each pixel's greatest bin times the cosine of its angle to the
+/// optical axis, metres.
 fn peaks(scene: &Scene) -> Vec<f64> {
     let [fx, fy, cx, cy] = scene.intrinsics;
     brightest(scene)
@@ -238,7 +243,7 @@ fn peaks(scene: &Scene) -> Vec<f64> {
         .collect()
 }
 
-/// Each pixel's greatest bin, the first of several.
+/// Returns each pixel's greatest bin, the first of several.
 fn brightest(scene: &Scene) -> Vec<usize> {
     match scene.order {
         Order::Pixels => {

@@ -1,11 +1,14 @@
-//! Where networks are computed: the CPU, or a graphics processor.
+//! The devices that compute networks: the CPU and graphics processors.
 //!
-//! A graphics processor has a name: its runtime and its number there, e.g. `cuda:0` or `wgpu:1`. Those that drivers compute on
-//! the CPU (Mesa's lavapipe) are *software devices*; they serve tests, and nobody gets one without naming it. Before one is
-//! used it computes a small convolution, its gradients and a product: one that is wrong is refused by name. Drivers that
-//! multiply wrongly without a word have been seen; they are wrong by as much as the result. NVIDIA's cards are not: burn has their
-//! tensor cores multiply, which round what they multiply to 11 significant bits (TF32), and results to
-//! some 3·10⁻⁴ of the greatest. How far a device is off is said wherever it is listed.
+//! The name of a graphics processor consists of its runtime and its number within that runtime,
+//! e.g. `cuda:0` or `wgpu:1`. Graphics processors that a driver emulates on the CPU (Mesa's
+//! lavapipe) are *software devices*. They serve tests and are used only if named explicitly. Before
+//! a device is used, it computes a small convolution, its gradients and a matrix product. If the
+//! result is wrong, the device is refused with an error that names it. Some drivers have been
+//! observed to multiply wrongly without reporting an error; their error is as large as the result.
+//! NVIDIA cards deviate far less: burn uses their tensor cores, which round the factors of a
+//! product to 11 significant bits (TF32), so results deviate by about 3·10⁻⁴ of the greatest value.
+//! Every list of devices shows the deviation of each.
 
 use std::fmt;
 
@@ -19,12 +22,12 @@ use crate::{
     ops::{has_kernels, plain},
 };
 
-/// The CPU.
+/// Returns the CPU.
 pub fn cpu() -> Device {
     Device::flex()
 }
 
-/// Runtimes of graphics processors that this program was built with, best first.
+/// The GPU runtimes that this program was built with, best first.
 pub const RUNTIMES: &[&str] = &[
     #[cfg(feature = "cuda")]
     "cuda",
@@ -32,17 +35,18 @@ pub const RUNTIMES: &[&str] = &[
     "wgpu",
 ];
 
-/// How far a probe may lie from the CPU's, over its greatest value: a few times what TF32 makes of it.
+/// The greatest accepted deviation of a probe from the CPU's, relative to its greatest value: a few
+/// times the error of TF32.
 const ROUNDED: f32 = 2e-3;
 
-/// Below it, a device multiplies in 32 bits.
+/// A device with a smaller deviation multiplies in 32 bits.
 const FINE: f32 = 1e-5;
 
-/// What to build a program with that has some.
+/// The hint for programs that were built without a GPU runtime.
 const BUILD: &str =
     "build picofarm with --features wgpu (any vendor's) or --features cuda (NVIDIA's)";
 
-/// A graphics processor that drivers list. It is not opened yet.
+/// A graphics processor that a driver lists. It has not been opened yet.
 #[derive(Debug, Clone)]
 pub struct Gpu {
     id: String,
@@ -51,20 +55,20 @@ pub struct Gpu {
 }
 
 impl Gpu {
-    /// Its runtime and its number there: `cuda:0`, `wgpu:1`.
+    /// Returns the name: the runtime and the number within it, e.g. `cuda:0` or `wgpu:1`.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Whether a driver computes on the CPU in its name.
+    /// Returns whether a driver emulates this device on the CPU.
     pub fn is_software(&self) -> bool {
         self.software
     }
 
-    /// Opens it and compares what it computes with the CPU.
+    /// Opens the device and compares its results with the CPU's.
     ///
     /// # Errors
-    /// [`ModelError::Gpu`] where it cannot be opened, or computes wrongly.
+    /// [`ModelError::Gpu`] if the device cannot be opened or computes wrongly.
     pub fn open(&self) -> Result<OpenGpu, ModelError> {
         let opened = guarded(&self.id, || {
             #[cfg(any(feature = "cuda", feature = "wgpu"))]
@@ -89,21 +93,23 @@ impl Gpu {
     }
 }
 
-/// A graphics processor that computes as the CPU does.
+/// An opened graphics processor. Its results agree with the CPU's.
 #[derive(Debug, Clone)]
 pub struct OpenGpu {
-    /// As [`Gpu::id`].
+    /// The device's name, as in [`Gpu::id`].
     pub id: String,
-    /// As it calls itself.
+    /// The name that the device reports.
     pub name: String,
-    /// How far a product, a convolution and their gradients lay from the CPU's at most, over the greatest value of each.
+    /// The greatest deviation of a product, a convolution and their gradients from the CPU's
+    /// results, relative to the greatest value of each.
     pub apart: f32,
-    /// What tensors are made on.
+    /// The device on which tensors are created.
     pub device: Device,
 }
 
 impl OpenGpu {
-    /// How it computes, for people: to how much of the greatest value, where that is more than rounding in 32 bits gives.
+    /// Describes the device's accuracy for people. Gives the relative deviation if it exceeds the
+    /// rounding error of 32 bits.
     pub fn accuracy(&self) -> String {
         match self.apart > FINE {
             true => format!(
@@ -121,9 +127,10 @@ impl fmt::Display for OpenGpu {
     }
 }
 
-/// Has CubeCL keep what it finds out about a card: which kernels are fastest, and compiled ones. Both take minutes for a network that a
-/// card has not met yet. They are kept in the user's cache folder, unless a `cubecl.toml` says elsewhere; what such a file or
-/// CubeCL's environment variables say counts.
+/// Makes CubeCL store the fastest kernels it found for a card, and its compiled kernels. Finding
+/// and compiling them takes minutes the first time a network runs on a card. They are stored in the
+/// user's cache folder, unless a `cubecl.toml` or CubeCL's environment variables choose another
+/// place.
 #[cfg(feature = "cuda")]
 fn keep_kernels() {
     use burn::cubecl::config::{CubeClRuntimeConfig, RuntimeConfig, cache::CacheConfig};
@@ -132,11 +139,11 @@ fn keep_kernels() {
     if matches!(config.environment.path, CacheConfig::Target) {
         config.environment.path = CacheConfig::Global;
     }
-    // Refused where it has been asked for already: then it is as it was said before.
+    // If a configuration is already in use, this call fails and the earlier one stays in force.
     CubeClRuntimeConfig::try_set(config);
 }
 
-/// Every graphics processor that drivers list, those of the best runtime first.
+/// Returns every graphics processor that a driver lists, those of the best runtime first.
 pub fn gpus() -> Vec<Gpu> {
     #[cfg(feature = "cuda")]
     keep_kernels();
@@ -158,7 +165,7 @@ fn list(to: &mut Vec<Gpu>, runtime: &str, kind: burn::tensor::DeviceType) {
     let software = |device: &Device| *device == Device::wgpu(burn::tensor::DeviceKind::Cpu);
     #[cfg(not(feature = "wgpu"))]
     let software = |_: &Device| false;
-    // Drivers that fail while they are listed have nothing to offer.
+    // A driver that fails while listing its devices offers none.
     let listed = guarded(runtime, || Device::enumerate(kind).into_vec());
     let listed = listed.unwrap_or_default().into_iter().enumerate();
     to.extend(listed.map(|(number, device)| Gpu {
@@ -168,19 +175,19 @@ fn list(to: &mut Vec<Gpu>, runtime: &str, kind: burn::tensor::DeviceType) {
     }));
 }
 
-/// Opens the graphics processors that are wanted, in order.
+/// Opens the requested graphics processors, in order.
 ///
 /// # Errors
-/// [`ModelError::Invalid`] where there are fewer, or none of that name, or the program was built without any runtime;
-/// [`ModelError::Gpu`] as [`Gpu::open`].
+/// [`ModelError::Invalid`] if there are too few, if none has the requested name, or if the program
+/// was built without a runtime; [`ModelError::Gpu`] as for [`Gpu::open`].
 pub fn open(wanted: &Gpus) -> Result<Vec<OpenGpu>, ModelError> {
     chosen(wanted)?.iter().map(Gpu::open).collect()
 }
 
-/// The names of those that are wanted, in order; none is opened.
+/// Returns the names of the requested graphics processors, in order, without opening them.
 ///
 /// # Errors
-/// [`ModelError::Invalid`] as [`open`].
+/// [`ModelError::Invalid`] as for [`open`].
 pub fn names(wanted: &Gpus) -> Result<Vec<String>, ModelError> {
     Ok(chosen(wanted)?.into_iter().map(|gpu| gpu.id).collect())
 }
@@ -198,7 +205,7 @@ fn chosen(wanted: &Gpus) -> Result<Vec<Gpu>, ModelError> {
     Ok(chosen.into_iter().cloned().collect())
 }
 
-/// Those that are wanted.
+/// Selects the requested graphics processors from those listed.
 fn choose<'a>(wanted: &Gpus, listed: &'a [Gpu]) -> Result<Vec<&'a Gpu>, String> {
     let there = || match listed.is_empty() {
         true => "none is there (is its driver installed, and may this process use it?)".to_owned(),
@@ -217,7 +224,7 @@ fn choose<'a>(wanted: &Gpus, listed: &'a [Gpu]) -> Result<Vec<&'a Gpu>, String> 
         Gpus::Count(count) => {
             let runtime = |gpu: &Gpu| gpu.id.split(':').next().map(str::to_owned);
             let mut cards = listed.iter().filter(|gpu| !gpu.software).peekable();
-            // A card is listed by each runtime that reaches it.
+            // Each runtime that reaches a card lists it, so only cards of one runtime are counted.
             let first = cards.peek().and_then(|gpu| runtime(gpu));
             let cards = cards.filter(|gpu| runtime(gpu) == first);
             let chosen: Vec<&Gpu> = cards.take(*count as usize).collect();
@@ -240,12 +247,12 @@ fn choose<'a>(wanted: &Gpus, listed: &'a [Gpu]) -> Result<Vec<&'a Gpu>, String> 
     }
 }
 
-/// Runs what a driver may end by a panic, and says in its error what the panic said.
+/// Runs work in which a driver may panic, and turns a panic's message into an error.
 ///
 /// # Errors
-/// [`ModelError::Gpu`].
+/// [`ModelError::Gpu`] if the work panics.
 pub fn guarded<T>(id: &str, work: impl FnOnce() -> T) -> Result<T, ModelError> {
-    // What is half made is not looked at again.
+    // The values that a panic leaves half finished are not used again.
     std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).map_err(|panic| {
         let said = panic
             .downcast_ref::<String>()
@@ -260,10 +267,10 @@ pub fn guarded<T>(id: &str, work: impl FnOnce() -> T) -> Result<T, ModelError> {
     })
 }
 
-/// Whether a device has the numbers in which a network is computed.
+/// Checks that a device supports the number format in which a network computes.
 ///
 /// # Errors
-/// [`ModelError::Invalid`] where it has not.
+/// [`ModelError::Invalid`] if the device does not support it.
 pub(crate) fn computes(net: &NetSpec, device: &Device) -> Result<(), ModelError> {
     let there = match net.precision {
         Precision::F32 => true,
@@ -279,7 +286,8 @@ pub(crate) fn computes(net: &NetSpec, device: &Device) -> Result<(), ModelError>
     }
 }
 
-/// A step small enough to take a moment on anything: a product and a convolution, each with the gradients of its inputs.
+/// Computes a step small enough to take a moment on any device: a product and a convolution, each
+/// with the gradients of its inputs.
 fn probe(device: &Device) -> Vec<(&'static str, Vec<f32>)> {
     let device = device.clone().autodiff();
     let mut state = 1_u32;
@@ -314,8 +322,8 @@ fn probe(device: &Device) -> Vec<(&'static str, Vec<f32>)> {
     .into()
 }
 
-/// How far a probe lies from another at most, over the greatest value of each part; what is wrong with it where that is more
-/// than [`ROUNDED`].
+/// Returns the greatest deviation of a probe from another, relative to the greatest value of each
+/// part. If it exceeds [`ROUNDED`], returns a description of the deviation instead.
 fn apart(
     found: &[(&'static str, Vec<f32>)],
     expected: &[(&'static str, Vec<f32>)],
@@ -411,7 +419,7 @@ mod tests {
         }
     }
 
-    /// Cards that round what they multiply to TF32 must not be refused.
+    /// Cards that round factors to TF32 must be accepted.
     #[test]
     fn a_probe_whose_factors_were_rounded_is_none_that_is_wrong() {
         let tf32 = |x: f32| f32::from_bits((x.to_bits() + 0x1000) & !0x1fff);

@@ -1,41 +1,41 @@
-//! What can go wrong here.
+//! The errors of the model runtime.
 
 /// An error of the model runtime.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// A setting that cannot be used; says what was expected.
+    /// A setting that cannot be used.
     #[error("{field}: {what}")]
     Invalid {
-        /// The setting.
+        /// The setting's name.
         field: String,
-        /// What is wrong, what was expected, how to correct it.
+        /// The fault, the accepted values, and how to correct the setting.
         what: String,
     },
-    /// Bytes that are no file of weights.
+    /// Bytes that are not a valid weights file.
     #[error("{what}")]
     File {
-        /// What is wrong with them.
+        /// The fault.
         what: String,
     },
-    /// Weights that no network can compute with.
+    /// Weights with which no network can compute.
     #[error("{what}")]
     Values {
-        /// Which tensor, what it holds, and what was expected.
+        /// The tensor, its invalid value, and the accepted values.
         what: String,
     },
-    /// A network that answers with what is no finite number.
+    /// A network that answered with a non-finite number.
     #[error("{what}")]
     Answer {
-        /// The scene, by its index among the scenes given, where there are several.
+        /// The scene's index among the scenes given, if there are several.
         scene: Option<usize>,
-        /// Where, and what is likely at fault.
+        /// The position of the number, and the likely cause.
         what: String,
     },
     /// Weights or a checkpoint that do not belong to this network, or are damaged.
     #[error("{what}")]
     Weights {
-        /// What is wrong, and with which tensor.
+        /// The fault, and the tensor that has it.
         what: String,
     },
     /// A scene that could not be read.
@@ -43,34 +43,34 @@ pub enum ModelError {
     Scene {
         /// Its index among the scenes given.
         scene: usize,
-        /// Why.
+        /// The cause.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// Training produced a number that is none.
+    /// A quantity of training that became NaN or infinite.
     #[error(
         "step {step}: {what}; the last whole checkpoint is kept. Lower optimise.learning_rate, or use precision = \"f32\""
     )]
     NotFinite {
-        /// Optimiser step, from 0.
+        /// The optimiser step, from 0.
         step: u64,
-        /// Which quantity, and where it was first seen.
+        /// The quantity, and the place where it was first seen.
         what: String,
     },
     /// A graphics processor that failed.
     #[error("graphics processor {id}: {what}")]
     Gpu {
-        /// Which, e.g. `cuda:0`.
+        /// The device's name, e.g. `cuda:0`.
         id: String,
-        /// What it did, in its driver's words where it has some.
+        /// The failure, in the driver's words if it gave any.
         what: String,
     },
-    /// What keeps a process from training together with others.
+    /// The reason why a process cannot train together with others.
     #[error("{0}")]
     Group(String),
 }
 
 impl ModelError {
-    /// An unusable setting.
+    /// Returns the error for a setting that cannot be used.
     pub fn invalid(field: impl Into<String>, what: impl Into<String>) -> Self {
         Self::Invalid {
             field: field.into(),
@@ -78,12 +78,12 @@ impl ModelError {
         }
     }
 
-    /// Bytes that are no file of weights.
+    /// Returns the error for bytes that are not a valid weights file.
     pub(crate) fn file(what: impl Into<String>) -> Self {
         Self::File { what: what.into() }
     }
 
-    /// The same, with the scene of an answer where that is not known yet.
+    /// Adds the scene's index to an [`Self::Answer`] that has none yet.
     pub(crate) fn in_scene(self, index: usize) -> Self {
         match self {
             Self::Answer { scene: None, what } => Self::Answer {
@@ -94,7 +94,7 @@ impl ModelError {
         }
     }
 
-    /// Unusable weights.
+    /// Returns the error for weights that cannot be used.
     pub fn weights(what: impl Into<String>) -> Self {
         Self::Weights { what: what.into() }
     }

@@ -1,4 +1,4 @@
-//! Models before scenes that they have not seen: figures, beside those of trivial answers.
+//! The evaluation of models on unseen scenes, compared with trivial answers.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,32 +11,35 @@ use crate::{
     scene::{Scene, Scenes},
 };
 
-/// What an evaluation found.
+/// The result of an evaluation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Evaluated {
-    /// Of all scenes together.
+    /// The metrics over all scenes.
     pub metrics: Metrics,
-    /// The same by the released code's formulas.
+    /// The metrics by the released code's formulas.
     pub released: Released,
-    /// Of trivial answers, by name: see [`Baseline::names`].
+    /// The metrics of trivial answers, by name: see [`Baseline::names`].
     pub baselines: Vec<(String, Metrics)>,
-    /// Of each scene, in order.
+    /// The metrics of each scene, in order.
     pub scenes: Vec<Metrics>,
-    /// Examples: scenes, times spots where a network is asked spot by spot.
+    /// The number of examples: scenes, multiplied by the spots if a network is queried spot by
+    /// spot.
     pub examples: u64,
 }
 
-/// What a model and the trivial answers said of one scene: what figures follow from.
+/// The answers of a model and of the trivial answers for one scene, as the sums from which metrics
+/// are computed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Answered {
     examples: u64,
     model: Tally,
-    /// Those of trivial answers, by name.
+    /// The sums of the trivial answers, by name.
     trivial: Vec<(String, Tally)>,
 }
 
 impl Evaluated {
-    /// Of scenes in order: the same to the bit in however many parts they were asked.
+    /// Computes the metrics of scenes in order. The result is identical to the bit however the
+    /// scenes were divided among evaluations.
     pub fn of(target: Target, scenes: &[Answered]) -> Self {
         let mut whole = Tally::default();
         let mut trivial: Vec<(String, Tally)> = Vec::new();
@@ -62,12 +65,13 @@ impl Evaluated {
     }
 }
 
-/// Asks a model of every scene, spot by spot where it is a shadow network. `baseline` is what it is compared with. `tell` hears
-/// how many scenes are done of how many and says whether to go on; where it does not, there is no answer.
+/// Evaluates a model on every scene, spot by spot if it is a shadow network, and compares it with
+/// `baseline`. `tell` receives the number of finished scenes and their total and returns whether to
+/// continue. If it returns `false`, there is no result.
 ///
 /// # Errors
-/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or the baseline,
-/// [`ModelError::Answer`] for the first answer that is no finite number.
+/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or the
+/// baseline, [`ModelError::Answer`] for the first answer with a non-finite number.
 pub fn evaluate(
     model: &Model,
     baseline: &Baseline,
@@ -79,11 +83,11 @@ pub fn evaluate(
     Ok(answered.map(|scenes| Evaluated::of(target, &scenes)))
 }
 
-/// What is answered of every scene, in order, from which [`Evaluated::of`] makes figures; arguments and errors as
-/// [`evaluate`].
+/// Returns the answers for every scene, in order; [`Evaluated::of`] computes the metrics from them.
+/// The arguments are those of [`evaluate`].
 ///
 /// # Errors
-/// As [`evaluate`].
+/// As for [`evaluate`].
 pub fn answered(
     model: &Model,
     baseline: &Baseline,
@@ -136,7 +140,8 @@ fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answere
     }
 }
 
-/// What a model says of a scene: once, or for each spot. Hears outputs (outputs, H, W) and what was asked.
+/// Computes a model's outputs for a scene: once, or for each spot. `hear` receives the outputs
+/// (outputs, H, W) and the input batch.
 ///
 /// # Errors
 /// [`ModelError::Invalid`] for a scene that does not fit the model.
@@ -152,7 +157,8 @@ pub fn answers(
     .map(drop)
 }
 
-/// The same where `hear` says whether to go on; `false` where it did not.
+/// Like [`answers`], but `hear` returns whether to continue. Returns `false` if it stopped the
+/// computation.
 fn answers_while(
     model: &Model,
     scene: &Scene,
@@ -179,9 +185,10 @@ fn answers_while(
     Ok(true)
 }
 
-/// The masks that a model says of a scene: probabilities times 255, rounded, `[row][column]` of mirrors,
-/// `[spot][row][column]` of light. `tell` hears how many visits are done of how many and says whether to go on; where it does
-/// not, there is no answer.
+/// Returns the masks that a model predicts for a scene: probabilities times 255, rounded, as
+/// `[row][column]` for mirrors and `[spot][row][column]` for light. `tell` receives the number of
+/// finished visits and their total and returns whether to continue. If it returns `false`, there is
+/// no result.
 ///
 /// # Errors
 /// [`ModelError::Invalid`] for a depth network, and for a scene that does not fit the model.
@@ -210,7 +217,7 @@ pub fn masks(
     Ok(whole.then_some(masks))
 }
 
-/// 1/(1 + e^−x) times 255, rounded; x is a finite number.
+/// Returns 1/(1 + e^−x) times 255, rounded; x must be finite.
 fn probability(logit: f32) -> u8 {
     (255.0 / (1.0 + libm::exp(-f64::from(logit)))).round() as u8
 }

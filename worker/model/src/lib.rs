@@ -1,6 +1,7 @@
-//! Networks that take transients apart: what they see, what they are made of, training, metrics.
+//! Networks that decompose transients: their inputs, layers, training and metrics.
 //!
-//! Knows nothing of jobs, stores or leases: scenes come through [`scene::Scenes`], weights and checkpoints go as bytes.
+//! The crate is independent of jobs, stores and leases: scenes are read through [`scene::Scenes`],
+//! and weights and checkpoints are bytes.
 
 pub mod baseline;
 pub mod device;
@@ -21,7 +22,7 @@ pub mod train;
 pub mod trial;
 pub mod weights;
 
-/// Where networks are computed.
+/// The device that computes networks.
 pub use burn::tensor::Device;
 pub use device::cpu;
 pub use error::ModelError;
@@ -30,5 +31,6 @@ pub use kernel::AdamW;
 pub use model::Model;
 pub use random::Random;
 
-/// Version of everything that decides the bytes of trained weights and the figures of evaluations.
+/// The version of all code that determines the bytes of trained weights and the figures of
+/// evaluations.
 pub const VERSION: &str = "model-6";

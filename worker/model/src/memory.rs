@@ -1,9 +1,11 @@
-//! Memory between the tensors of a step and those of the next.
+//! Reuses memory between the tensors of consecutive steps.
 //!
-//! A step frees some hundred megabytes and asks for as many in the next. The allocator gives free memory back to the system after a
-//! second, page by page as it finds it, and the next tensor has each page cleared again: a quarter of the time of a SwinIR's step
-//! (measured). While a network is trained or asked, it keeps free memory for ten seconds. Not always: other tasks, which
-//! free what they do not need again, would hold a third more than they say.
+//! A step frees some hundred megabytes and the next step allocates as many. By default, the
+//! allocator returns free memory to the system after one second, page by page, and the system
+//! clears each page again for the next tensor. This takes a quarter of the time of a SwinIR's step
+//! (measured). While a network is trained or evaluated, the allocator therefore retains free memory
+//! for ten seconds. This does not apply to other tasks: they do not reuse the memory they free, and
+//! would take a third more memory than they reserve.
 
 #![expect(
     unsafe_code,
@@ -20,14 +22,15 @@ use libmimalloc_sys::{mi_option_get, mi_option_set, mi_option_t};
 /// mimalloc's `mi_option_purge_delay`, which its Rust crate does not name.
 const PURGE_DELAY: mi_option_t = 15;
 
-/// How long free memory is kept, milliseconds.
+/// The time for which free memory is held, milliseconds.
 const KEPT_MS: c_long = 10_000;
 
-/// How many ask for it, and what the option was before the first.
+/// The number of live [`Kept`] guards, and the option's value before the first.
 static ASKED: Mutex<(usize, c_long)> = Mutex::new((0, 0));
 
-// SAFETY of the two calls below: both read or write one number in a table, for any option below the table's length (47 in mimalloc
-// 3), at any time and from any thread; mimalloc reads it anew whenever it frees.
+// SAFETY of the two calls below: both read or write one number in a table and are valid for any
+// option below the table's length (47 in mimalloc 3), at any time and from any thread. mimalloc
+// reads the option each time it frees memory.
 
 fn delay() -> c_long {
     unsafe { mi_option_get(PURGE_DELAY) }
@@ -37,17 +40,18 @@ fn set_delay(ms: c_long) {
     unsafe { mi_option_set(PURGE_DELAY, ms) };
 }
 
-/// While one lives, free memory is kept for longer. Where the program has another allocator, nothing changes.
+/// A guard: while one exists, free memory is held for longer. If the program uses another
+/// allocator, the guard has no effect.
 #[derive(Debug)]
 pub struct Kept(());
 
 impl Kept {
-    /// From now on.
+    /// Creates a guard that takes effect immediately.
     pub fn from_now() -> Self {
         let mut asked = ASKED.lock().unwrap_or_else(PoisonError::into_inner);
         if asked.0 == 0 {
             asked.1 = delay();
-            // Who has set it for longer, or switched it off (-1), is left alone.
+            // A longer time, or a disabled option (-1), set by the user is not changed.
             if (0..KEPT_MS).contains(&asked.1) {
                 set_delay(KEPT_MS);
             }
@@ -71,7 +75,7 @@ impl Drop for Kept {
 mod tests {
     use super::{KEPT_MS, Kept, delay};
 
-    /// Also that the number is still that option's: its default is a second.
+    /// Also checks that the number still belongs to that option: its default is one second.
     #[test]
     fn free_memory_is_kept_for_longer_while_anybody_asks() {
         assert_eq!(delay(), 1000, "unset MIMALLOC_PURGE_DELAY");

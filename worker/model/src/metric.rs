@@ -1,4 +1,4 @@
-//! How good answers are: of depths in metres, of masks as overlap.
+//! The metrics of answers: errors of depths in metres, and overlap of masks.
 
 mod boundary;
 
@@ -6,22 +6,23 @@ use serde::{Deserialize, Serialize};
 
 use crate::input::{Question, Target};
 
-/// Masks that the released code scores together.
+/// The number of masks that the released code scores together.
 const BATCH: usize = 32;
 
-/// Sums over pixels, from which figures follow; those of scenes are joined in the scenes' order.
+/// Sums over pixels, from which metrics are computed. The sums of several scenes are joined in the
+/// scenes' order.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Tally {
     pixels: u64,
     absolute: f64,
     squared: f64,
-    /// Sum of the images' boundary F1, and their number.
+    /// The sum of the images' boundary F1, and the number of images.
     boundary: f64,
     images: u64,
     masks: Vec<Overlap>,
 }
 
-/// Pixels of a mask as it is said and as it is.
+/// The pixel counts of a predicted mask and of the true mask.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Overlap {
     both: u64,
@@ -30,41 +31,42 @@ struct Overlap {
     of: u64,
 }
 
-/// Figures of a network on a set of scenes.
+/// The metrics of a network on a set of scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Metrics {
-    /// Of z-depth.
+    /// Metrics of z-depth.
     Depth {
-        /// Mean absolute error, metres.
+        /// The mean absolute error, metres.
         mae_m: f64,
-        /// Root mean square error, metres.
+        /// The root mean square error, metres.
         rmse_m: f64,
     },
-    /// Of a mask at a threshold of one half.
+    /// Metrics of a mask at a threshold of one half.
     Mask {
-        /// Share of pixels that are wrong.
+        /// The share of wrong pixels.
         mae: f64,
-        /// Intersection over union; 1 where neither has any pixel.
+        /// Intersection over union; 1 if neither mask has a pixel.
         iou: f64,
-        /// 2·both over the sum of both masks; 1 where neither has any pixel.
+        /// 2·both over the sum of both masks; 1 if neither mask has a pixel.
         f1: f64,
     },
 }
 
-/// The same by the formulas of the code released with Shoot-Bounce-3D, where they are others.
+/// Metrics by the formulas of the code released with Shoot-Bounce-3D, if they differ from
+/// [`Metrics`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Released {
-    /// Of z-depth.
+    /// Metrics of z-depth.
     Depth {
-        /// Scale-invariant boundary F1 (Depth Pro, section 3.3), the mean over images.
+        /// The scale-invariant boundary F1 (Depth Pro, section 3.3), averaged over images.
         boundary_f1: f64,
     },
-    /// Of masks: figures of 32 masks together, in the scenes' order and then the spots', averaged over these batches. Two
-    /// masks without any pixel have no overlap: 0.
+    /// Metrics of masks. They are computed for 32 masks together, in the order of scenes and then
+    /// of spots, and averaged over these batches. Two masks without any pixel have an overlap of 0.
     Mask {
-        /// Share of pixels that are wrong.
+        /// The share of wrong pixels.
         mae_32: f64,
         /// Intersection over union.
         iou_32: f64,
@@ -74,7 +76,7 @@ pub enum Released {
 }
 
 impl Metrics {
-    /// Less is better: MAE, or one less IoU.
+    /// Returns a loss: MAE, or 1 − IoU. A smaller loss is better.
     pub fn loss(&self) -> f64 {
         match self {
             Self::Depth { mae_m, .. } => *mae_m,
@@ -82,7 +84,7 @@ impl Metrics {
         }
     }
 
-    /// Each figure with its name.
+    /// Returns each metric with its name.
     pub fn figures(&self) -> Vec<(&'static str, f64)> {
         match *self {
             Self::Depth { mae_m, rmse_m } => vec![("mae_m", mae_m), ("rmse_m", rmse_m)],
@@ -92,7 +94,7 @@ impl Metrics {
 }
 
 impl Released {
-    /// Each figure with its name.
+    /// Returns each metric with its name.
     pub fn figures(&self) -> Vec<(&'static str, f64)> {
         match *self {
             Self::Depth { boundary_f1 } => vec![("boundary_f1", boundary_f1)],
@@ -106,8 +108,8 @@ impl Released {
 }
 
 impl Tally {
-    /// Adds images: what a network said (depth over the question's scale, or logits) and what is true, `[image][row][column]`, of
-    /// `height` rows and `width` columns.
+    /// Adds images of `height` rows and `width` columns, `[image][row][column]`: a network's
+    /// outputs (depth over the question's scale, or logits) and the truth.
     pub fn add(
         &mut self,
         question: &Question,
@@ -148,7 +150,7 @@ impl Tally {
         }
     }
 
-    /// Adds another's, whose images come after these.
+    /// Adds the tally of the images that follow these.
     pub fn join(&mut self, other: &Self) {
         self.pixels += other.pixels;
         self.absolute += other.absolute;
@@ -158,7 +160,7 @@ impl Tally {
         self.masks.extend_from_slice(&other.masks);
     }
 
-    /// The figures.
+    /// Computes the metrics.
     pub fn metrics(&self, target: Target) -> Metrics {
         let n = self.pixels.max(1) as f64;
         match target {
@@ -173,7 +175,7 @@ impl Tally {
         }
     }
 
-    /// The figures as the released code has them.
+    /// Computes the metrics by the released code's formulas.
     pub fn released(&self, target: Target) -> Released {
         match target {
             Target::Tof => Released::Depth {
@@ -199,7 +201,7 @@ impl Tally {
 }
 
 impl Overlap {
-    /// Of masks together.
+    /// Returns the sum of several masks' counts.
     fn of(masks: &[Self]) -> Self {
         masks.iter().fold(Self::default(), |a, b| Self {
             both: a.both + b.both,
@@ -209,7 +211,8 @@ impl Overlap {
         })
     }
 
-    /// Share of wrong pixels, intersection over union and F1; the latter two are `empty` where there is no pixel.
+    /// Returns the share of wrong pixels, the intersection over union and F1. The latter two are
+    /// `empty` if there is no pixel.
     fn figures(&self, empty: f64) -> [f64; 3] {
         let share = |part: u64, of: u64| match of {
             0 => empty,
@@ -281,7 +284,8 @@ mod tests {
 
     #[test]
     fn the_released_code_scores_masks_by_32_and_none_where_both_are_empty() {
-        // 32 masks of two pixels, both right; then 16 that are empty in both; and joined in two parts.
+        // 32 masks of two pixels, both right; then 16 that are empty in both; the two tallies are
+        // joined.
         let mut tally = Tally::default();
         tally.add(&asked(Target::Shadow), &[1.0; 40], &[1.0; 40], [1, 2]);
         let mut rest = Tally::default();

@@ -1,4 +1,5 @@
-//! A trained network that can be asked: weights that say themselves what they are.
+//! A trained network that answers queries. Its weights file contains the description of the
+//! network.
 
 use burn::tensor::Device;
 
@@ -21,15 +22,15 @@ pub struct Model {
     parameters: Parameters,
 }
 
-/// Name of the entry in the weights' metadata that says what they are: the [`Plan`] as JSON.
+/// The metadata entry of a weights file that contains the [`Plan`] as JSON.
 pub const PLAN: &str = "plan";
 
 impl Model {
-    /// From what [`crate::train::Training::finish`] gave.
+    /// Reads the bytes that [`crate::train::Training::finish`] returned.
     ///
     /// # Errors
-    /// [`ModelError::File`] where the bytes are damaged, [`ModelError::Weights`] where they do not say what they are,
-    /// [`ModelError::Values`] where no network can compute with them.
+    /// [`ModelError::File`] if the bytes are damaged, [`ModelError::Weights`] if they contain no
+    /// plan, [`ModelError::Values`] if no network can compute with them.
     pub fn read(bytes: &[u8], device: &Device) -> Result<Self, ModelError> {
         let (named, metadata) = weights::read(bytes)?;
         let plan = metadata.get(PLAN).ok_or_else(|| {
@@ -51,12 +52,14 @@ impl Model {
         })
     }
 
-    /// Weights that were trained elsewhere, by PyTorch's names, as those of a network of `plan`: bytes for [`Model::read`].
-    /// Of a file that holds a depth and a shadow network together, the one that the plan asks for.
+    /// Converts weights that were trained elsewhere, with PyTorch's names, to bytes for
+    /// [`Model::read`]. They must be the weights of a network of `plan`. If a file contains a depth
+    /// and a shadow network, the plan decides which one is read.
     ///
     /// # Errors
-    /// [`ModelError::File`] where the bytes are damaged, [`ModelError::Weights`] where a tensor is missing or has another
-    /// shape, [`ModelError::Values`] where one holds what is no finite number or a negative variance.
+    /// [`ModelError::File`] if the bytes are damaged, [`ModelError::Weights`] if a tensor is
+    /// missing or has another shape, [`ModelError::Values`] if one contains a non-finite
+    /// number or a negative variance.
     pub fn import(bytes: &[u8], plan: &Plan, device: &Device) -> Result<Vec<u8>, ModelError> {
         let net = Net::new(plan.net.clone())?;
         let declared = net.declared();
@@ -71,30 +74,31 @@ impl Model {
         ))
     }
 
-    /// How it was trained, and what it is asked.
+    /// Returns the plan by which the network was trained.
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
 
-    /// What it is asked.
+    /// Returns the question that the network answers.
     pub fn question(&self) -> &Question {
         &self.plan.question
     }
 
-    /// Number of learned values.
+    /// Returns the number of learned values.
     pub fn learned(&self) -> usize {
         self.parameters.learned()
     }
 
-    /// What it says of a batch: (N, outputs, H, W), row by row.
+    /// Returns the network's output for a batch: (N, outputs, H, W), row by row.
     pub fn answer(&self, batch: &Batch) -> Vec<f32> {
         predict(&self.net, &self.parameters, batch)
     }
 
-    /// The same, which must be finite numbers; `spot` is the one that the network is asked of.
+    /// Like [`Self::answer`], but checks that all numbers are finite. `spot` is the spot that the
+    /// batch asks about.
     ///
     /// # Errors
-    /// [`ModelError::Answer`] naming the first that is not.
+    /// [`ModelError::Answer`] naming the first non-finite number.
     pub(crate) fn finite_answer(
         &self,
         batch: &Batch,
@@ -107,11 +111,11 @@ impl Model {
         }
     }
 
-    /// Depths of a scene, metres: `[row][column]`.
+    /// Returns the depths of a scene in metres: `[row][column]`.
     ///
     /// # Errors
-    /// [`ModelError::Invalid`] where it is no depth network, or the scene does not fit it; [`ModelError::Answer`] where it
-    /// answers with what is no finite number.
+    /// [`ModelError::Invalid`] if the model is not a depth network or the scene does not fit it;
+    /// [`ModelError::Answer`] if the output contains a non-finite number.
     pub fn depth_m(&self, scene: &Scene) -> Result<Vec<f32>, ModelError> {
         if self.question().target != Target::Tof {
             let what = "two-bounce times follow from depths; this model predicts none";
@@ -126,7 +130,8 @@ impl Model {
     }
 }
 
-/// That a network answers with what is no finite number, and whether its input or its weights are at fault.
+/// Returns the error for an output with non-finite numbers. The error names the input or the
+/// weights as the likely cause.
 pub(crate) fn not_finite(
     said: &[f32],
     at: usize,

@@ -1,7 +1,9 @@
-//! The numbers of a network: by PyTorch's names, in the order of declaration, one flat tensor each.
+//! The parameters of a network, by PyTorch's names and in the order of declaration. Each is a flat
+//! tensor.
 //!
-//! Names and shapes are those of the released PyTorch code (a U-Net after wolny/pytorch-3dunet), so that weights go in and
-//! out without a map. What is not learned (running statistics) lies beside what is.
+//! Names and shapes are those of the released PyTorch code (a U-Net after wolny/pytorch-3dunet), so
+//! weights are imported and exported without a name map. Values that are not learned (running
+//! statistics) are stored with those that are.
 
 use std::collections::BTreeMap;
 
@@ -9,67 +11,68 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::{ModelError, Random};
 
-/// Which parameter of a network.
+/// The index of a parameter in its network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Id(pub(crate) usize);
 
-/// How a parameter begins.
+/// The initial values of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Begin {
     /// Uniform in ±1/√fan-in: PyTorch's default for convolutions, linear layers and their biases.
     FanIn(usize),
-    /// All the same.
+    /// The same value everywhere.
     Constant(f32),
-    /// Normal around 0 with this deviation: what transformers begin with. Their code cuts it off at ±2, a hundred deviations of
-    /// 0.02 away, where no value ever lies.
+    /// Normal around 0 with this deviation: the initialisation of transformers. Their code
+    /// truncates the distribution at ±2, which is a hundred times the usual deviation of 0.02, so
+    /// no value is ever truncated.
     Normal(f32),
-    /// These times that, again and again.
+    /// The first factor's values times the second, repeated to the parameter's length.
     Repeated(&'static [f32], f32),
 }
 
 /// A parameter as a network declares it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Declared {
-    /// PyTorch's name of it.
+    /// The name that PyTorch gives the parameter.
     pub name: String,
-    /// Its shape.
+    /// The shape.
     pub shape: Vec<usize>,
-    /// How it begins.
+    /// The initial values.
     pub begin: Begin,
-    /// Learned by the optimiser, or a statistic that training moves.
+    /// Whether the optimiser learns the parameter. If not, it is a statistic that training updates.
     pub learned: bool,
 }
 
 impl Declared {
-    /// Number of values.
+    /// Returns the number of values.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// The list of a network's parameters, in the making.
+/// The list of a network's parameters while they are being declared.
 #[derive(Debug, Default)]
 pub struct Declarations {
     pub(crate) list: Vec<Declared>,
-    /// What is declared now is not learned.
+    /// Whether parameters declared from now on are excluded from learning.
     pub(crate) frozen: bool,
-    /// Where the second and further segments begin.
+    /// The index of the first parameter of each segment after the first.
     pub(crate) cuts: Vec<usize>,
 }
 
 impl Declarations {
-    /// What is declared from now on is of the next segment of a network: gradients of a segment come before those of the segments
-    /// before it.
+    /// Starts the next segment of a network. The gradients of a segment are computed before those
+    /// of the segments in front of it.
     pub(crate) fn cut(&mut self) {
         self.cuts.push(self.list.len());
     }
 
-    /// Declares one.
+    /// Declares a parameter.
     pub fn add(&mut self, name: String, shape: &[usize], begin: Begin, learned: bool) -> Id {
         self.list.push(Declared {
             name,
@@ -81,7 +84,7 @@ impl Declarations {
     }
 }
 
-/// Values of a tensor by name, on the host: what is stored and exchanged.
+/// The values of tensors by name, on the host: the form for storage and exchange.
 pub type Named = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 /// The values of a network's parameters on a device, without gradients.
@@ -92,7 +95,8 @@ pub struct Parameters {
 }
 
 impl Parameters {
-    /// Values as training from scratch begins: a function of the seed and the declarations alone.
+    /// Returns the values with which training from scratch begins. They depend on the seed and the
+    /// declarations only.
     pub fn begin(declared: Vec<Declared>, seed: u64, device: &Device) -> Self {
         let values = declared.iter().enumerate().map(|(i, d)| {
             let mut random = Random::new(seed, &[1, i as u64]);
@@ -118,10 +122,11 @@ impl Parameters {
         Self { declared, values }
     }
 
-    /// Values from elsewhere.
+    /// Creates parameters from given values.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] naming the first tensor that is missing, too many, or has another shape.
+    /// [`ModelError::Weights`] naming the first tensor that is missing, superfluous, or of another
+    /// shape.
     pub fn from_named(
         declared: Vec<Declared>,
         mut named: Named,
@@ -153,10 +158,10 @@ impl Parameters {
         }
     }
 
-    /// The same with the parts that are not learned taken from another network's values; its running statistics too.
+    /// Replaces the encoder's parameters, running statistics included, by another network's values.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] where one is missing or has another shape.
+    /// [`ModelError::Weights`] if one is missing or has another shape.
     pub fn with_encoder_of(
         mut self,
         mut named: Named,
@@ -180,30 +185,30 @@ impl Parameters {
         Ok(self)
     }
 
-    /// All values on the host.
+    /// Copies all values to the host.
     pub fn to_named(&self) -> Named {
         let each = self.declared.iter().zip(&self.values);
         each.map(|(d, value)| (d.name.clone(), (d.shape.clone(), download(value))))
             .collect()
     }
 
-    /// Each value beside its declaration.
+    /// Returns each declaration with its value.
     pub(crate) fn named_values(&self) -> impl Iterator<Item = (&Declared, &Tensor<1>)> {
         self.declared.iter().zip(&self.values)
     }
 
-    /// The declarations, in order.
+    /// Returns the declarations, in order.
     pub fn declared(&self) -> &[Declared] {
         &self.declared
     }
 
-    /// Number of learned values.
+    /// Returns the number of learned values.
     pub fn learned(&self) -> usize {
         let learned = self.declared.iter().filter(|d| d.learned);
         learned.map(Declared::len).sum()
     }
 
-    /// The value of one, in its shape.
+    /// Returns a parameter's value in its declared shape.
     pub fn get<const D: usize>(&self, id: Id) -> Tensor<D> {
         shaped(&self.declared[id.0], self.values[id.0].clone())
     }
@@ -216,14 +221,14 @@ impl Parameters {
         self.values[id.0] = value;
     }
 
-    /// Takes a value out, so that nobody else holds it while it is changed in place.
+    /// Takes a value out, so that no other reference exists while it is changed in place.
     pub(crate) fn take(&mut self, id: Id) -> Tensor<1> {
         let device = self.values[id.0].device();
         std::mem::replace(&mut self.values[id.0], Tensor::empty([0], &device))
     }
 }
 
-/// A flat value in its declared shape.
+/// Returns a flat value in its declared shape.
 pub(crate) fn shaped<const D: usize>(declared: &Declared, value: Tensor<1>) -> Tensor<D> {
     let shape: [usize; D] = declared
         .shape

@@ -1,11 +1,12 @@
-//! Random numbers that are a function of their names: the same on every machine, in every order, for any number of threads.
+//! Random numbers that depend only on a seed and a stream. They are the same on every machine, in
+//! every order and for any number of threads.
 
 /// SplitMix64 over a seed and a stream (Steele, Lea, Flood 2014): one sequence for each pair.
 #[derive(Debug, Clone)]
 pub struct Random(u64);
 
 impl Random {
-    /// The sequence of a stream of a seed.
+    /// Returns the sequence of a stream of a seed.
     pub fn new(seed: u64, stream: &[u64]) -> Self {
         let mut state = mix(seed ^ 0x9E37_79B9_7F4A_7C15);
         for part in stream {
@@ -14,24 +15,25 @@ impl Random {
         Self(state)
     }
 
-    /// 64 random bits.
+    /// Returns 64 random bits.
     pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         mix(self.0)
     }
 
-    /// Uniform in 0..n; n > 0.
+    /// Returns a uniform integer in 0..n; n must be positive.
     pub fn below(&mut self, n: u64) -> u64 {
         // Multiply-shift; the bias is below n / 2^64.
         ((u128::from(self.bits()) * u128::from(n)) >> 64) as u64
     }
 
-    /// Uniform in [0, 1) with 24 bits.
+    /// Returns a uniform number in [0, 1) with 24 bits.
     pub fn unit(&mut self) -> f32 {
         (self.bits() >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    /// Normal with mean 0 and variance 1 (Box and Muller 1958), the same bits on every machine.
+    /// Returns a normal number with mean 0 and variance 1 (Box and Muller 1958). It has the same
+    /// bits on every machine.
     pub fn normal(&mut self) -> f32 {
         // In (0, 1], so that its logarithm is finite.
         let open = 1.0 - f64::from(self.unit());
@@ -39,7 +41,7 @@ impl Random {
         (libm::sqrt(-2.0 * libm::log(open)) * libm::cos(angle)) as f32
     }
 
-    /// A permutation of 0..n (Fisher and Yates).
+    /// Returns a permutation of 0..n (Fisher and Yates).
     pub fn permutation(&mut self, n: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..n).collect();
         for i in (1..n).rev() {

@@ -1,53 +1,55 @@
-//! What training reads: a scene's histogram and what is known about it.
+//! The input of training: a scene's histogram and its ground truth.
 
 use std::{error::Error, sync::Arc};
 
-/// How a histogram's values follow each other.
+/// The order of a histogram's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Order {
-    /// `[row][column][bin]`: histogram by histogram.
+    /// `[row][column][bin]`: one pixel's histogram after another.
     #[default]
     Pixels,
-    /// `[bin][row][column]`: an image for each bin, as networks take them.
+    /// `[bin][row][column]`: one image for each bin, the order that networks take.
     Bins,
 }
 
-/// A scene. Images are row by row, from the top left.
+/// A scene. Images are stored row by row, from the top left.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Scene {
-    /// Rows.
+    /// The number of rows.
     pub height: usize,
-    /// Columns.
+    /// The number of columns.
     pub width: usize,
-    /// Bins of the histogram.
+    /// The number of bins of the histogram.
     pub bins: usize,
-    /// Path length at the beginning of the first bin, metres.
+    /// The path length at the start of the first bin, metres.
     pub first_m: f64,
-    /// Width of a bin, metres of path.
+    /// The width of a bin, metres of path.
     pub bin_width_m: f64,
-    /// h, in [`Self::order`].
+    /// The histogram h, in [`Self::order`].
     pub histogram: Vec<f32>,
-    /// How its values follow each other.
+    /// The order of the histogram's values.
     pub order: Order,
-    /// z-depth, metres: `[row][column]`.
+    /// The true z-depth, metres: `[row][column]`.
     pub depth_m: Vec<f32>,
-    /// z-depth that two-bounce times follow from where that is not the truth but a network's, metres: `[row][column]`.
+    /// The z-depth from which two-bounce times are computed, if it is a network's prediction and
+    /// not the true depth, metres: `[row][column]`.
     pub seen_depth_m: Option<Vec<f32>>,
-    /// 1 where the first surface is a mirror: `[row][column]`.
+    /// 1 if the first surface is a mirror: `[row][column]`.
     pub specular: Vec<u8>,
-    /// Illumination spots L_i in camera coordinates, metres.
+    /// The illumination spots L_i in camera coordinates, metres.
     pub spots: Vec<[f32; 3]>,
-    /// 1 where a spot lights the point that is seen: `[spot][row][column]`.
+    /// 1 if a spot lights the visible point: `[spot][row][column]`.
     pub lit: Vec<u8>,
-    /// Length of each spot's beam from the laser, metres: longer than the straight line where mirrors fold it. NaN where it
-    /// meets nothing.
+    /// The length of each spot's beam from the laser, metres. Mirrors fold the beam and make it
+    /// longer than the straight line. NaN if the beam hits nothing.
     pub beams_m: Vec<f32>,
-    /// fx, fy, cx, cy in pixels.
+    /// The intrinsics fx, fy, cx, cy in pixels.
     pub intrinsics: [f64; 4],
 }
 
 impl Scene {
-    /// The same with another histogram of as many bins, in [`Order::Pixels`].
+    /// Returns the scene with another histogram, which has as many bins and is in
+    /// [`Order::Pixels`].
     #[must_use]
     pub fn showing(&self, histogram: Vec<f32>) -> Self {
         Self {
@@ -64,36 +66,37 @@ impl Scene {
     }
 }
 
-/// Scenes that are read one by one, in any order, from several threads.
+/// A set of scenes that are read one by one, in any order, from several threads.
 pub trait Scenes: Send + Sync {
-    /// How many.
+    /// Returns the number of scenes.
     fn len(&self) -> usize;
 
-    /// Whether there are none.
+    /// Returns whether there are no scenes.
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// One of them.
+    /// Reads a scene.
     ///
     /// # Errors
-    /// Whatever keeps it from being read.
+    /// Any reason why the scene cannot be read.
     fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable>;
 
-    /// Takes back what nobody needs any more: the room of its histogram may serve for the next.
+    /// Takes back a scene after its last use, so that its histogram's memory can be reused
+    /// for the next.
     fn take_back(&self, _scene: Arc<Scene>) {}
 
-    /// One of them as the `visit`th visit of a training sees it, counted over all epochs: what is drawn at random is drawn anew
-    /// at each. Always the same where nothing is.
+    /// Reads a scene as the `visit`th visit of a training run sees it, counted over all epochs.
+    /// Random parts are drawn again at each visit. A scene without random parts is always the same.
     ///
     /// # Errors
-    /// As [`Self::load`].
+    /// As for [`Self::load`].
     fn visited(&self, index: usize, _visit: u64) -> Result<Arc<Scene>, Unreadable> {
         self.load(index)
     }
 }
 
-/// Why a scene could not be read.
+/// The reason why a scene could not be read.
 pub type Unreadable = Box<dyn Error + Send + Sync>;
 
 impl Scenes for Vec<Arc<Scene>> {
@@ -107,20 +110,21 @@ impl Scenes for Vec<Arc<Scene>> {
 }
 
 impl Scene {
-    /// About how much memory it takes.
+    /// Returns the approximate memory that the scene takes, bytes.
     pub fn bytes(&self) -> usize {
         let seen = self.seen_depth_m.as_ref().map_or(0, Vec::len);
         let floats = self.histogram.len() + self.depth_m.len() + seen;
         4 * floats + self.specular.len() + self.lit.len()
     }
 
-    /// Pixels.
+    /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.height * self.width
     }
 
-    /// Two-bounce path lengths of a spot, metres, from [`Self::seen_depth_m`], else from the true depth: `[row][column]`. The
-    /// beam's length + |x_p − L| + |x_p|, with the camera at the origin; NaN for a beam that meets nothing.
+    /// Returns the two-bounce path lengths of a spot in metres, from [`Self::seen_depth_m`] or else
+    /// the true depth: `[row][column]`. A path length is the beam's length + |x_p − L| + |x_p|,
+    /// with the camera at the origin. It is NaN if the beam hits nothing.
     pub fn tof(&self, spot: usize) -> Vec<f32> {
         let depth_m = self.seen_depth_m.as_ref().unwrap_or(&self.depth_m);
         let [fx, fy, cx, cy] = self.intrinsics;

@@ -1,5 +1,5 @@
-//! A network with random weights and data: to be measured, and compared with the same network in PyTorch
-//! (`tests/peers/model_torch.py`).
+//! A network with random weights and data, for measurements and for comparison with the same
+//! network in PyTorch (`tests/peers/model_torch.py`).
 
 use std::collections::BTreeMap;
 
@@ -15,27 +15,27 @@ use crate::{
     weights,
 };
 
-/// What is tried.
+/// The network, data and optimiser settings of a trial.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
-    /// What the network learns: decides the loss.
+    /// The quantity that the network learns. It determines the loss.
     pub target: Target,
     /// The network.
     pub net: NetSpec,
-    /// Examples a batch.
+    /// The number of examples in a batch.
     pub batch: usize,
-    /// Rows and columns.
+    /// The number of rows and of columns.
     pub side: usize,
-    /// Learning rate.
+    /// The learning rate.
     pub learning_rate: f64,
-    /// Weight decay.
+    /// The weight decay.
     pub decay: f64,
-    /// Of weights and data.
+    /// The seed of weights and data.
     pub seed: u64,
 }
 
 impl Trial {
-    /// The learner at its beginning, and the batch that it sees again and again.
+    /// Returns the learner in its initial state, and the batch that every step uses.
     ///
     /// # Errors
     /// [`ModelError::Invalid`] naming the field that cannot be used.
@@ -51,7 +51,8 @@ impl Trial {
         Ok((learner, self.data()))
     }
 
-    /// The same with the one-hot channels as dense ones, and the same numbers: what the gather is compared with.
+    /// Like [`Self::begin`], but with the one-hot channels as dense ones of the same values. The
+    /// gather is compared with this form.
     ///
     /// # Errors
     /// Those of [`Self::begin`].
@@ -86,7 +87,7 @@ impl Trial {
     fn data(&self) -> Batch {
         let pixels = self.batch * self.side * self.side;
         let mut random = Random::new(self.seed, &[4]);
-        // Like histograms: mostly small, with peaks.
+        // The values resemble histograms: mostly small, with peaks.
         let dense = (0..pixels * self.net.dense).map(|_| random.unit().powi(8));
         let dense = dense.collect();
         let one_hot = match self.net.one_hot {
@@ -109,7 +110,7 @@ impl Trial {
         }
     }
 
-    /// The pace of its steps.
+    /// Returns the optimiser settings of the steps.
     pub fn pace(&self) -> Pace {
         Pace {
             learning_rate: self.learning_rate,
@@ -117,9 +118,10 @@ impl Trial {
         }
     }
 
-    /// Everything that another implementation must reproduce, as safetensors by PyTorch's names: `weights/`, the batch
-    /// (`input/`, `target`), `output` of a training pass, its `gradient/` and running statistics
-    /// (`after/`), `evaluated` of an evaluation pass, and the `losses` of `steps` steps of AdamW.
+    /// Records everything that another implementation must reproduce, as safetensors by PyTorch's
+    /// names: `weights/`, the batch (`input/`, `target`), `output` of a training pass, its
+    /// `gradient/` and running statistics (`after/`), `evaluated` of an evaluation pass, and the
+    /// `losses` of `steps` steps of AdamW.
     ///
     /// # Errors
     /// Those of [`Self::begin`]; [`ModelError::NotFinite`].
@@ -164,7 +166,7 @@ impl Trial {
                 .filter(|(name, _)| name.contains("running_"))
                 .collect(),
         );
-        // From the beginning again: the pass has moved the statistics.
+        // Starts from the initial state again because the pass has updated the statistics.
         let (mut learner, _) = self.begin(device)?;
         let mut losses = Vec::with_capacity(steps);
         for _ in 0..steps {
@@ -178,7 +180,8 @@ impl Trial {
         ))
     }
 
-    /// How far a device is from the CPU in 32 bits, at the beginning: in what the network says in training, and in the gradient.
+    /// Returns the initial deviation of a device from the CPU in 32 bits: of the network's output
+    /// in training, and of the gradient.
     ///
     /// # Errors
     /// Those of [`Self::begin`].
@@ -205,8 +208,9 @@ impl Trial {
         })
     }
 
-    /// The slope of the loss along its own gradient g at the beginning: measured over ±`reach` · g/|g|, and expected: |g|.
-    /// In training the loss is that of a batch, so statistics follow the parameters.
+    /// Returns the initial slope of the loss along its own gradient g: the value measured over
+    /// ±`reach` · g/|g|, and the expected value |g|. In training, the loss is that of a batch, so
+    /// the statistics depend on the parameters.
     ///
     /// # Errors
     /// Those of [`Self::begin`].
@@ -244,20 +248,21 @@ impl Trial {
     }
 }
 
-/// See [`Trial::from_cpu`]: length of the difference over the length, all numbers as one vector.
+/// The result of [`Trial::from_cpu`]: the length of the difference over the length of the
+/// reference, all numbers taken as one vector.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Apart {
-    /// Of what the network says.
+    /// The deviation of the network's output.
     pub output: f64,
-    /// Of the gradient.
+    /// The deviation of the gradient.
     pub gradient: f64,
 }
 
-/// See [`Trial::slope`].
+/// The result of [`Trial::slope`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Slope {
-    /// By finite differences.
+    /// The slope by finite differences.
     pub measured: f64,
-    /// Length of the gradient.
+    /// The length of the gradient.
     pub expected: f64,
 }

@@ -1,4 +1,5 @@
-//! Weights as safetensors, by PyTorch's names and in its shapes: `torch.load_state_dict(safetensors.torch.load_file(…))`.
+//! Weights as safetensors, by PyTorch's names and in its shapes:
+//! `torch.load_state_dict(safetensors.torch.load_file(…))`.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -8,7 +9,7 @@ use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 pub use crate::parameters::Named;
 use crate::{ModelError, net::ONE_HOT, parameters::Declared};
 
-/// Tensors as safetensors, in the order of their names, with metadata.
+/// Encodes tensors as safetensors, in the order of their names, with metadata.
 pub fn write(named: &Named, metadata: &BTreeMap<String, String>) -> Vec<u8> {
     let views = named.iter().map(|(name, (shape, values))| {
         let bytes = bytemuck::cast_slice(values);
@@ -20,10 +21,11 @@ pub fn write(named: &Named, metadata: &BTreeMap<String, String>) -> Vec<u8> {
     safetensors::serialize(views, metadata).expect("the names differ and the shapes fit")
 }
 
-/// Tensors and metadata of safetensors; f32, or f16, bf16, f64 and integers converted.
+/// Decodes the tensors and metadata of safetensors. Values in f16, bf16, f64 and integers are
+/// converted to f32.
 ///
 /// # Errors
-/// [`ModelError::File`].
+/// [`ModelError::File`] if the bytes are not valid.
 pub fn read(bytes: &[u8]) -> Result<(Named, BTreeMap<String, String>), ModelError> {
     let broken = |e: safetensors::SafeTensorError| {
         ModelError::file(format!("these are no whole safetensors: {e}"))
@@ -45,7 +47,7 @@ pub fn read(bytes: &[u8]) -> Result<(Named, BTreeMap<String, String>), ModelErro
                 return Err(ModelError::file(what));
             }
         };
-        // PyTorch counts batches in a scalar.
+        // PyTorch stores a count of batches as a scalar.
         let shape = match view.shape() {
             [] => vec![1],
             shape => shape.to_vec(),
@@ -59,7 +61,8 @@ pub fn read(bytes: &[u8]) -> Result<(Named, BTreeMap<String, String>), ModelErro
 /// Checks that a network can compute with these values.
 ///
 /// # Errors
-/// [`ModelError::Values`] naming the first tensor that holds what is no finite number, or a variance below zero.
+/// [`ModelError::Values`] naming the first tensor that contains a non-finite number or a
+/// variance below zero.
 pub fn check(named: &Named) -> Result<(), ModelError> {
     for (name, (_, values)) in named {
         let odd = |refused: &dyn Fn(f32) -> bool| {
@@ -87,7 +90,7 @@ fn each<const N: usize>(bytes: &[u8], to: impl Fn([u8; N]) -> f32) -> Vec<f32> {
     whole.iter().map(|b| to(*b)).collect()
 }
 
-/// From our parameters to PyTorch's: one-hot channels join the dense ones before them.
+/// Converts our parameters to PyTorch's: one-hot channels join the dense channels in front of them.
 pub fn to_torch(mut named: Named) -> Named {
     let apart: Vec<String> = named
         .keys()
@@ -105,10 +108,10 @@ pub fn to_torch(mut named: Named) -> Named {
     named
 }
 
-/// From PyTorch's parameters (a state dict, also one of a wrapped or a combined model) to ours.
+/// Converts PyTorch's parameters (a state dict, also one of a wrapped or combined model) to ours.
 ///
 /// # Errors
-/// [`ModelError::Weights`] where a joined weight has too few channels.
+/// [`ModelError::Weights`] if a joined weight has too few channels.
 pub fn from_torch(named: Named, declared: &[Declared], part: &str) -> Result<Named, ModelError> {
     let mut out = Named::new();
     for (name, value) in named {

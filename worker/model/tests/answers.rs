@@ -1,4 +1,4 @@
-//! Trained networks before other scenes: they beat trivial answers, and say what they are.
+//! Trained networks on other scenes: they beat trivial answers, and their weights describe them.
 
 mod common;
 
@@ -238,7 +238,7 @@ fn the_released_network_has_the_published_number_of_parameters() {
     }
 }
 
-/// 375 bins to 160 moments: one layer for both streams in the released code, 60,160 values.
+/// 375 bins to 160 moments: in the released code one layer for both streams, 60,160 values.
 #[test]
 fn the_streams_of_a_25d_network_share_their_projection_of_time_unless_each_has_its_own() {
     let values = |one_hot, time_projection| -> usize {
@@ -266,7 +266,7 @@ fn the_streams_of_a_25d_network_share_their_projection_of_time_unless_each_has_i
     }
 }
 
-/// 637 bins to 128 channels: a 1×1 convolution with a bias has 81,664 values, and neither norm nor ReLU.
+/// 637 bins to 128 channels: a 1×1 convolution with a bias has 81,664 values, without norm or ReLU.
 #[test]
 fn a_linear_stem_is_a_1x1_convolution_with_a_bias_over_bins_and_one_hot_bins() {
     for (one_hot, values) in [(0, 637 * 128 + 128), (637, 2 * 637 * 128 + 128)] {
@@ -353,7 +353,7 @@ fn random_numbers_are_uniform_and_permutations_whole() {
     assert_eq!(order, (0..1_000).collect::<Vec<_>>());
 }
 
-/// Weights of a network whose every weight of this name is `value`.
+/// Returns weights in which every weight with this name ending is `value`.
 fn with(weights_of: &[u8], ends: &str, value: f32) -> Vec<u8> {
     let (mut named, metadata) = weights::read(weights_of).unwrap();
     let matching = named.iter_mut().filter(|(name, _)| name.ends_with(ends));

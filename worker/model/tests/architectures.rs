@@ -1,4 +1,5 @@
-//! The networks that are no U-Nets: their parts beside naive loops, their sizes as counted by hand, and that they learn.
+//! Networks other than U-Nets: their parts are compared with naive loops, their sizes with counts
+//! by hand, and they learn.
 
 mod common;
 
@@ -17,11 +18,11 @@ use picofarm_model::{
     weights,
 };
 
-/// Those of a small network of an architecture, over 12 bins.
+/// Returns the spec of a small network of an architecture, over 12 bins.
 fn small(architecture: Architecture, one_hot: usize) -> NetSpec {
     NetSpec {
         architecture,
-        // Heads of NLOST share its channels.
+        // The heads of NLOST share its channels.
         width: match architecture {
             Architecture::Nlost => 8,
             _ => 6,
@@ -42,7 +43,7 @@ const OTHERS: [Architecture; 3] = [
     Architecture::Nlost,
 ];
 
-/// Rows and columns of small images.
+/// Returns the number of rows and columns of small images.
 fn side(architecture: Architecture) -> usize {
     match architecture {
         Architecture::Nlost => 32,
@@ -76,16 +77,16 @@ fn parameters(spec: NetSpec) -> usize {
     net.declared().iter().map(Declared::len).sum()
 }
 
-/// Windows of two images.
+/// The number of windows of two images.
 const W: usize = 4;
-/// Tokens of a window.
+/// The number of tokens of a window.
 const T: usize = 4;
-/// Heads.
+/// The number of heads.
 const H: usize = 2;
-/// Features of a head.
+/// The number of features of a head.
 const S: usize = 3;
 
-/// Attention as a loop over pairs of tokens, with 64 bits.
+/// Computes attention as a loop over pairs of tokens, with 64 bits.
 fn attention(qkv: &[f64], bias: &[f64], mask: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; W * T * H * S];
     for (window, head, a) in (0..W * H * T).map(|i| (i / T / H, i / T % H, i % T)) {
@@ -168,7 +169,7 @@ fn windows_hold_the_pixels_of_their_place_and_go_back_to_it() {
     let y = ops::windows(x.clone(), window);
     assert_eq!(y.dims(), [n * 6, 4, c]);
     let all = values(y.clone());
-    // The fourth window of the second image begins in row 2; its third token lies in the next one.
+    // The fourth window of the second image begins in row 2; its third token is in the next row.
     let (row, column) = (2 + 1, 0);
     let pixel = ((h + row) * w + column) * c;
     assert_eq!(all[((6 + 3) * 4 + 2) * c..][..c], image[pixel..][..c]);
@@ -183,7 +184,8 @@ fn windows_hold_the_pixels_of_their_place_and_go_back_to_it() {
     assert_eq!(values(ops::shifted_back(moved, 1)), image);
 }
 
-/// Tokens that a shift brought together are as far apart as before it: their scores are masked where that is a window or more.
+/// Tokens that a shift brought together are as far apart as before it. Their scores are masked if
+/// that distance is a window or more.
 #[test]
 fn a_mask_parts_what_was_no_neighbour_before_the_shift() {
     for (h, w, window, shift) in [(8, 16, 4, 2), (16, 16, 8, 4), (6, 4, 2, 1)] {
@@ -217,8 +219,8 @@ fn relative_positions_are_differences_of_rows_and_columns() {
     assert_eq!(all, (0..225).collect::<Vec<_>>());
 }
 
-/// Counted by hand: the lightweight SwinIR (width 60, 4 groups) in front of pixel shuffles of 2, 3 and 4, and the one for colour
-/// denoising (width 180, 6 groups).
+/// The counts are by hand: the lightweight SwinIR (width 60, 4 groups) in front of pixel shuffles
+/// of 2, 3 and 4, and the one for colour denoising (width 180, 6 groups).
 #[test]
 fn a_swinir_has_as_many_parameters_as_counted_by_hand() {
     let count = |width, groups, outputs| {
@@ -246,7 +248,8 @@ fn multiply_adds_are_those_counted_by_hand() {
     // Width 6, 2 groups of 2 blocks, windows of 16 tokens.
     let block = 6 * 18 + 6 * 6 + 2 * 6 * 12 + 2 * 16 * 6;
     let swinir = 9 * bins * 6 + 2 * (2 * block + 9 * 36) + 9 * 36 + 9 * 6;
-    // Two filters, one convolution and four others of 6 channels over 6 moments; 16 channels, and 32.
+    // Two filters, one convolution and four others of 6 channels over 6 moments; 16 channels, and
+    // 32.
     let volume = 27 * (2 + 2 * 6 + 4 * 36) * 6 * pixels / 4;
     let images = 9 * 5 * 16 * 16 * pixels / 4;
     let fine = (9 * (17 * 32 + 4 * 32 * 32 + 32) + 2) * pixels;
@@ -264,7 +267,7 @@ fn multiply_adds_are_those_counted_by_hand() {
     let joined = 27 * (24 * 8 + 8 * 5) * 3;
     let volume = first + scales + halved + embedded + near + upwards;
     let volume = (volume + 2 * decoder + 2 * over_time + joined) * pixels / 4;
-    // 16 pixels, each of which looks at all of them.
+    // 16 pixels, each of which attends to all of them.
     let far = (125 * 64 + 27 * 64 + layers + 2 * (16 + 1) * 8) * pixels / 16;
     let images = 9 * 5 * 10 * 10 * pixels / 4;
     let fine = (9 * (11 * 20 + 4 * 20 * 20 + 20) + 2) * pixels;
@@ -277,7 +280,8 @@ fn multiply_adds_are_those_counted_by_hand() {
         let found = small(architecture, 12).multiply_adds(side);
         assert_eq!(found, expected as f64, "{architecture:?}");
     }
-    // Two levels of 2 and 4 channels; time 4, then 2. Projection, encoders, time to one moment, decoder, last layer.
+    // Two levels of 2 and 4 channels; time 4, then 2. Projection, encoders, time to one moment,
+    // decoder, last layer.
     let unet25d = NetSpec {
         width: 2,
         levels: 2,
@@ -291,7 +295,8 @@ fn multiply_adds_are_those_counted_by_hand() {
     assert_eq!(unet25d.multiply_adds(side), expected as f64);
 }
 
-/// The lightweight SwinIR for twice the size, at 1280×720: 244 G is the figure that is usually quoted (not looked up here), with norms.
+/// The lightweight SwinIR for twice the size, at 1280×720: 244 G, including norms, is the figure
+/// that is usually quoted (not looked up here).
 #[test]
 fn a_swinir_takes_about_as_many_multiply_adds_as_is_quoted() {
     let light = NetSpec {
@@ -303,8 +308,9 @@ fn a_swinir_takes_about_as_many_multiply_adds_as_is_quoted() {
     assert!((0.97..1.03).contains(&found), "{found}");
 }
 
-/// The loss along the gradient: (L(p + εg) − L(p − εg)) / 2ε = |g|². Where one-hot bins are filtered the greatest values are many and
-/// equal, so that the loss of networks of volumes has no slope there; PyTorch's gradient is what theirs is compared with.
+/// The loss along the gradient: (L(p + εg) − L(p − εg)) / 2ε = |g|². If one-hot bins are filtered,
+/// many of the greatest values are equal, so the loss of networks of volumes has no slope there;
+/// their gradient is compared with PyTorch's instead.
 #[test]
 fn gradients_of_other_networks_are_the_slopes_of_the_loss() {
     for architecture in OTHERS {
@@ -318,7 +324,7 @@ fn gradients_of_other_networks_are_the_slopes_of_the_loss() {
                 continue;
             }
             let trial = trial(target, small(architecture, one_hot));
-            // NLOST's moments of greatest values jump, more seldom in a shorter step.
+            // The positions of NLOST's greatest values jump, but less often in a shorter step.
             let step = match architecture {
                 Architecture::Nlost => 1e-5,
                 _ => 1e-3,
@@ -335,7 +341,8 @@ fn other_networks_learn_a_batch_by_heart() {
     for architecture in OTHERS {
         let trial = trial(Target::Specular, small(architecture, 0));
         let (mut learner, mut batch) = trial.begin(&Device::flex()).unwrap();
-        // The mirrors of the left half in 2×2 pixels each: networks of volumes see half of the pixels.
+        // The mirrors of the left half are in blocks of 2×2 pixels, because networks of volumes see
+        // half of the pixels.
         let (fine, side) = (batch.target.clone(), side(architecture));
         for (at, mirror) in batch.target.iter_mut().enumerate() {
             *mirror = fine[at / (2 * side) * 2 * side + at % side / 2];
@@ -354,7 +361,7 @@ fn other_networks_learn_a_batch_by_heart() {
 #[test]
 fn other_networks_come_to_the_same_bits_with_any_number_of_threads() {
     for architecture in OTHERS {
-        // Large enough that burn's own operations are split among threads.
+        // The network is large enough that burn's own operations use several threads.
         let net = NetSpec {
             width: 24,
             ..small(architecture, 12)
@@ -377,7 +384,7 @@ fn other_networks_come_to_the_same_bits_with_any_number_of_threads() {
     }
 }
 
-/// The gather of a one-hot input's weights beside the dense form, by PyTorch's names.
+/// Compares the gather of a one-hot input's weights with the dense form, by PyTorch's names.
 #[test]
 fn a_one_hot_input_is_a_dense_one() {
     let trial = trial(Target::Shadow, small(Architecture::Swinir, 12));
@@ -431,7 +438,7 @@ fn what_cannot_be_built_is_refused_by_name() {
     assert!(text.contains("multiple of 8"), "{text}");
 }
 
-/// Scenes that a network of an architecture can see.
+/// Returns scenes of a size that a network of an architecture accepts.
 fn sources(architecture: Architecture) -> Sources {
     let side = side(architecture);
     if side == 8 {
@@ -446,7 +453,8 @@ fn sources(architecture: Architecture) -> Sources {
     }
 }
 
-/// Trained, once stopped after `stop` steps and gone on from the checkpoint.
+/// Returns the result of a training that is stopped once after `stop` steps and resumed from the
+/// checkpoint.
 fn trained(plan: &Plan, stop: Option<u64>) -> Trained {
     let sources = || sources(plan.net.architecture);
     let device = Device::flex();

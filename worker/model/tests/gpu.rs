@@ -1,5 +1,6 @@
-//! Networks on graphics processors beside the kernels of the CPU. Every device that drivers list is tried, software devices
-//! too: Debian's mesa-vulkan-drivers have one, so that this runs on machines without a card.
+//! Networks on graphics processors compared with the kernels of the CPU. Every device that drivers
+//! list is tested, software devices included: Debian's mesa-vulkan-drivers provide one, so the
+//! tests run on machines without a card.
 #![cfg(any(feature = "cuda", feature = "wgpu"))]
 
 mod common;
@@ -17,10 +18,10 @@ use picofarm_model::{
     weights,
 };
 
-/// Steps of AdamW that are compared.
+/// The number of AdamW steps that are compared.
 const STEPS: usize = 20;
 
-/// All that can be opened. Says so where there are none.
+/// Returns all devices that can be opened. Prints a note if there are none.
 fn opened() -> Vec<OpenGpu> {
     let listed = gpus();
     if listed.is_empty() {
@@ -29,7 +30,7 @@ fn opened() -> Vec<OpenGpu> {
     listed.iter().map(|gpu| gpu.open().unwrap()).collect()
 }
 
-/// What each network learns, in each architecture.
+/// Returns a trial for each target and architecture.
 fn networks() -> impl Iterator<Item = Trial> {
     let targets = [Target::Tof, Target::Shadow, Target::Specular];
     targets.into_iter().flat_map(|target| {
@@ -63,7 +64,7 @@ fn networks() -> impl Iterator<Item = Trial> {
                 precision: Precision::F32,
             },
             batch: 3,
-            // Windows of 16² in an image of half the size.
+            // Windows of 16² in a volume of half the image's size.
             side: if architecture == Architecture::Nlost {
                 32
             } else {
@@ -78,7 +79,8 @@ fn networks() -> impl Iterator<Item = Trial> {
 
 type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
-/// The greatest difference of tensors whose names begin with `part`, over the greatest value of each.
+/// Returns the greatest difference of tensors with names that begin with `part`, relative to the
+/// greatest value of each.
 fn apart(a: &Tensors, b: &Tensors, part: &str) -> f64 {
     let named = a.iter().filter(|(name, _)| name.starts_with(part));
     let mut worst = 0.0;
@@ -98,7 +100,7 @@ fn apart(a: &Tensors, b: &Tensors, part: &str) -> f64 {
 fn networks_answer_and_learn_as_on_the_cpu() {
     for gpu in opened() {
         for trial in networks() {
-            // A step of NLOST takes a software device seconds.
+            // A software device takes seconds for a step of NLOST.
             let steps = match trial.net.architecture {
                 Architecture::Nlost => 3,
                 _ => STEPS,
@@ -117,19 +119,19 @@ fn networks_answer_and_learn_as_on_the_cpu() {
                 );
                 worst
             };
-            // Cards that round what they multiply (TF32) are off by so much more.
+            // Cards that round factors (TF32) deviate correspondingly more.
             let coarse = f64::from(gpu.apart / 1e-6).max(1.0);
             assert_eq!(part("weights"), 0.0);
             assert!(part("evaluated") < 1e-4 * coarse);
             assert!(part("output") < 1e-4 * coarse);
-            // The scales of NLOST's group norms have gradients that are sums of what cancels.
+            // The gradients of the scales of NLOST's group norms are sums of cancelling terms.
             let least = match trial.net.architecture {
                 Architecture::Nlost => 1e-2,
                 _ => 2e-3,
             };
             assert!(part("gradient") < least * coarse);
             assert!(part("after") < 1e-4 * coarse);
-            // A weight whose gradient is almost zero goes either way at once.
+            // A weight with an almost zero gradient may move in either direction.
             assert!(part("losses") < 1e-2 * coarse.min(10.0));
             let losses = &theirs["losses"].1;
             assert!(
@@ -190,7 +192,7 @@ fn a_network_says_on_any_device_what_it_says_on_the_cpu() {
     }
 }
 
-/// The next batch comes to the device while it computes, and losses are asked for late.
+/// The next batch is transferred to the device while it computes, and losses are read late.
 #[test]
 fn batches_that_are_brought_ahead_give_the_bits_of_one_after_another() {
     for gpu in opened() {
@@ -220,7 +222,7 @@ fn batches_that_are_brought_ahead_give_the_bits_of_one_after_another() {
     }
 }
 
-/// Of a batch that another process had, too: its numbers come as a part.
+/// Also covers a batch of another process, which arrives as a part.
 #[test]
 fn a_loss_that_is_no_number_moves_nothing_wherever_the_batch_was() {
     let devices = opened().into_iter().map(|gpu| gpu.device);

@@ -1,4 +1,4 @@
-//! Our kernels, as operations with gradients, against burn's operations composed.
+//! Our kernels, as operations with gradients, compared with compositions of burn's operations.
 
 use burn::tensor::{Device, Distribution, Int, Tensor, TensorData};
 use picofarm_model::{AdamW, Random, ops, ops::plain};
@@ -19,7 +19,8 @@ fn close<const D: usize>(a: Tensor<D>, b: Tensor<D>, what: &str) {
     }
 }
 
-/// The same scalar of both forms' outputs, so that their gradients can be compared.
+/// Returns the same scalar function of both forms' outputs, so that their gradients can be
+/// compared.
 fn summed<const D: usize>(y: &Tensor<D>) -> Tensor<1> {
     let weight = random(y.dims(), 99).detach();
     (y.clone() * weight).sum()
@@ -163,7 +164,7 @@ fn taps_with_stride_two_equal_burns() {
 #[test]
 fn a_projection_of_bins_equals_that_of_their_one_hot_tensor() {
     let (n, h, w, channels, outputs) = (2, 3, 5, 7, 4);
-    // -1 and what lies beyond the channels are pixels of zeros.
+    // -1 and bins beyond the channels give pixels of zeros.
     let bins: Vec<i64> = (0..n * h * w).map(|i| i as i64 * 5 % 10 - 1).collect();
     let bins = TensorData::new(bins, [n, h, w]);
     let bins = Tensor::<3, Int>::from_data(bins, &Device::flex().autodiff());

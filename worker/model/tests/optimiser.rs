@@ -1,4 +1,4 @@
-//! What a step of the optimiser may have beside AdamW: gradients that are shortened, an average of the weights, cycles.
+//! Optional parts of an optimiser step: limited gradients, an average of the weights, cycles.
 
 mod common;
 
@@ -26,7 +26,7 @@ fn begun(plan: &Plan) -> Training {
     Training::start(plan.clone(), None, sources(), &Device::flex()).unwrap()
 }
 
-/// After so many steps.
+/// Returns a training, stopped after the given number of steps.
 fn stopped_after(plan: &Plan, steps: u64) -> Training {
     let mut training = begun(plan);
     let ended = training.run(&mut |_, event| match event {
@@ -43,7 +43,8 @@ fn whole(plan: &Plan) -> Trained {
     training.finish()
 }
 
-/// The norm of the first step's gradient, of all parameters together: AdamW's first moment has a tenth of it.
+/// Returns the norm of the first step's gradient over all parameters, computed from AdamW's first
+/// moment, which is a tenth of it.
 fn norm_of_first_step(plan: &Plan) -> f64 {
     let checkpoint = stopped_after(plan, 1).checkpoint();
     let (tensors, _) = weights::read(&checkpoint).unwrap();
@@ -123,7 +124,7 @@ fn an_average_follows_the_weights_is_judged_and_kept_and_goes_on_to_the_same_bit
     }
     assert!(apart > 1e-4, "the average is the last weights");
     let trained = training.finish();
-    // What the last epoch validated is what the weights that are kept say.
+    // The last epoch's validation metrics are those of the stored weights.
     let scenes = scenes(100, 3);
     let model = Model::read(&trained.weights, &Device::flex()).unwrap();
     let baseline =
@@ -132,7 +133,7 @@ fn an_average_follows_the_weights_is_judged_and_kept_and_goes_on_to_the_same_bit
     let found = found.unwrap().unwrap().metrics.loss();
     let said = trained.history[3].validation.unwrap().loss();
     assert!((found - said).abs() < 1e-6, "{found} {said}");
-    // Stopped in the middle.
+    // The training is stopped in the middle.
     let checkpoint = stopped_after(&averaged, 3).checkpoint();
     let mut again = Training::resume(
         averaged,
@@ -157,7 +158,8 @@ fn rates_begin_again_after_each_cycle() {
         restarts: Some((1, 2)),
         ..steady()
     };
-    // Two steps an epoch: cycles of 2, 4 and 8 steps. A line has the rate of its epoch's last step.
+    // With two steps an epoch, the cycles have 2, 4 and 8 steps. A line contains the rate of its
+    // epoch's last step.
     let rates: Vec<f64> = whole(&cycles)
         .history
         .iter()

@@ -1,4 +1,5 @@
-//! Networks in bfloat16: what is rounded, that it is what a device computes that has such numbers, and that networks learn.
+//! Networks in bfloat16: the rounded values, their agreement with a device that supports the
+//! format, and learning.
 
 mod common;
 
@@ -36,7 +37,7 @@ fn numbers_and_their_gradients_are_rounded_to_the_nearest_and_ties_to_even() {
     for (rounded, given) in rounded.iter().zip(given) {
         assert_eq!(rounded.to_bits() & 0xffff, 0, "{given} became {rounded}");
     }
-    // Gradients: those of a sum weighted by numbers that bfloat16 does not have.
+    // Gradients of a sum weighted by numbers that bfloat16 cannot represent.
     let weights = Tensor::<1>::from_data(TensorData::from([1.001f32; 6]), &device);
     let mut gradients = (y * weights).sum().backward();
     let gradient = values(x.grad_remove(&mut gradients).unwrap());
@@ -59,7 +60,7 @@ fn convolutions_are_those_of_a_device_that_has_such_numbers() {
     let theirs = plain::conv3x3(there(x), there(w)) + plain::one_hot_conv3x3(bins, there(one_hot));
     let theirs = values(theirs.cast(FloatDType::F32));
     let size = theirs.iter().fold(0f32, |a, b| a.max(b.abs()));
-    // Half a unit of the last place each, at two places.
+    // The tolerance is half a unit of the last place at each of two places.
     for (a, b) in ours.iter().zip(&theirs) {
         assert!((a - b).abs() <= size / 128.0, "{a} and {b}");
     }

@@ -1,4 +1,4 @@
-//! A report of networks that were really trained.
+//! A report on trained networks.
 
 mod common;
 

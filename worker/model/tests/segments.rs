@@ -1,4 +1,4 @@
-//! Gradients that come one segment of a network after the other are those that come at once, to the bit.
+//! Gradients computed segment by segment are the same, to the bit, as those computed at once.
 
 use burn::tensor::Device;
 use picofarm_model::{
@@ -68,7 +68,7 @@ fn trial(net: NetSpec, seed: u64) -> Trial {
     }
 }
 
-/// What `processes` have of a step of four batches, added up as a group does.
+/// Returns the parts that `processes` compute of a step of four batches, added up as a group does.
 fn together(net: &NetSpec, processes: usize, device: &Device) -> Vec<Part> {
     let count = Net::new(net.clone()).unwrap().segments().len();
     let mut sums: Vec<(usize, Blocks<Vec<f32>>)> = vec![(0, Blocks::default()); count];
@@ -150,7 +150,8 @@ fn unets_have_three_segments_that_hold_every_parameter_once() {
         let expected = if unet && !spec.frozen { 3 } else { 1 };
         assert_eq!(net.segments().len(), expected, "{spec:?}");
     }
-    // The released network: what is left for the end, when nothing hides it, is an eighth.
+    // In the released network, an eighth of the gradients remains for the end, when no computation
+    // hides their transfer.
     let released = Net::new(NetSpec::released(637, 0, 1)).unwrap();
     let values = |which: usize| -> usize {
         let of = released.declared()[released.segments()[which].clone()].iter();

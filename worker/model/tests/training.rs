@@ -1,4 +1,4 @@
-//! Trainings: they learn, they go on from anywhere to the same bits, and they say what is wrong.
+//! Trainings: they learn, resume anywhere with the same bits, and report errors.
 
 mod common;
 
@@ -31,7 +31,8 @@ fn whole(plan: &Plan, sources: Sources) -> Trained {
     training.finish()
 }
 
-/// Stopped after each of `stops` steps, and gone on from a checkpoint in a new training.
+/// Returns the result of a training that is stopped after each of `stops` steps and resumed from a
+/// checkpoint.
 fn stopped(plan: &Plan, stops: &[u64]) -> Trained {
     let device = Device::flex();
     let mut training = Training::start(plan.clone(), None, sources(), &device).unwrap();
@@ -56,7 +57,7 @@ fn stopped(plan: &Plan, stops: &[u64]) -> Trained {
     training.finish()
 }
 
-/// Weights without the plan that stands beside them.
+/// Returns weights without the plan in their metadata.
 fn plain(weights: &[u8]) -> Vec<(String, Vec<u8>)> {
     let tensors = safetensors::SafeTensors::deserialize(weights).unwrap();
     let named = tensors
@@ -113,7 +114,7 @@ fn every_task_is_learned_on_scenes_that_are_easy() {
     }
 }
 
-/// A training that is stopped after so many epochs, and what it then says of the validation scenes.
+/// Stops a training after the given number of epochs. Returns its weights and history.
 fn after(plan: &Plan, epochs: u64) -> (Vec<u8>, Vec<picofarm_model::train::Line>) {
     let mut training = Training::start(plan.clone(), None, sources(), &Device::flex()).unwrap();
     let mut history = Vec::new();
@@ -147,7 +148,7 @@ fn it_ends_early_where_validation_no_longer_improves() {
 
 #[test]
 fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
-    // Steps this large go past the best soon.
+    // With such large steps, training soon passes its best point.
     let plan = Plan {
         epochs: 60,
         early_stop: 4,
@@ -166,14 +167,14 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     assert_eq!(loss(kept), best);
     assert!(trained.stopped_early, "{:?}", trained.history.len());
     assert_eq!(kept.epoch + 4, trained.history.len() as u64);
-    // They say of the validation scenes what that epoch's did.
+    // Their metrics on the validation scenes are those of that epoch.
     let model = picofarm_model::Model::read(&trained.weights, &Device::flex()).unwrap();
     let scenes = scenes(100, 3);
     let baseline = Baseline::fit(&plan.question, &scenes, 3).unwrap();
     let found = picofarm_model::evaluate(&model, &baseline, &scenes, &mut |_, _| true);
     let found = found.unwrap().unwrap().metrics.loss();
     assert!((found - best).abs() < 1e-6, "{found} {best}");
-    // And going on from a checkpoint after the best keeps them too.
+    // A training resumed from a checkpoint after the best one retains them too.
     let device = Device::flex();
     let mut training = Training::start(plan.clone(), None, sources(), &device).unwrap();
     let past = kept.epoch + 2;
@@ -191,7 +192,7 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     let again = training.finish();
     assert!(left == again.weights && history == again.history);
     assert!(again.weights == trained.weights && again.kept_step == trained.kept_step);
-    // Without early_stop, the last ones count.
+    // Without early_stop, the result is the last weights.
     let (last, history) = after(
         &Plan {
             early_stop: 0,
@@ -216,7 +217,7 @@ fn a_validation_within_an_epoch_is_a_line_and_moves_no_bit() {
     assert!(plain(&often.weights) == plain(&seldom.weights));
     let per_epoch = seldom.history[0].step;
     assert!(!per_epoch.is_multiple_of(3), "{per_epoch}");
-    // Each third step, and the end of each epoch.
+    // Every third step, and the end of each epoch.
     let due = |step: &u64| step.is_multiple_of(3) || step.is_multiple_of(per_epoch);
     let due: Vec<u64> = (1..=4 * per_epoch).filter(due).collect();
     let steps: Vec<u64> = often.history.iter().map(|line| line.step).collect();
@@ -229,14 +230,14 @@ fn a_validation_within_an_epoch_is_a_line_and_moves_no_bit() {
         sums += line.loss * (line.step - last) as f64;
         last = line.step;
         if !line.within {
-            // A whole epoch's loss is the mean over its parts, and its validation the same.
+            // A whole epoch's loss is the mean over its parts, and its validation is unchanged.
             let whole = &seldom.history[line.epoch as usize - 1];
             assert!((sums / per_epoch as f64 - whole.loss).abs() < 1e-9);
             assert_eq!(line.validation, whole.validation);
             sums = 0.0;
         }
     }
-    // Cut off anywhere, before and after a line, it comes to the same.
+    // A training interrupted anywhere, before and after a line, gives the same result.
     let cut = stopped(&every(3), &(1..4 * per_epoch).collect::<Vec<_>>());
     assert!(cut.history == often.history && cut.weights == often.weights);
     let at: Vec<f64> = epochs_at(&often.history).map(|(at, _)| at).collect();
@@ -300,7 +301,7 @@ fn trial(seed: u64) -> picofarm_model::trial::Trial {
     }
 }
 
-/// Counts how many scenes are being loaded or waited for, and how many at a time.
+/// Counts the scenes that are loaded or waiting, and the greatest number at a time.
 struct Watched {
     scenes: Vec<Arc<Scene>>,
     loading: std::sync::atomic::AtomicUsize,
@@ -317,7 +318,7 @@ impl picofarm_model::scene::Scenes for Watched {
         use std::sync::atomic::Ordering::SeqCst;
         let now = self.loading.fetch_add(1, SeqCst) + 1;
         self.most.fetch_max(now, SeqCst);
-        // Others get their turn, and finish in another order.
+        // Other threads get a turn, and finish in another order.
         std::thread::sleep(std::time::Duration::from_millis((index as u64 * 7) % 5));
         self.loading.fetch_sub(1, SeqCst);
         self.loaded.fetch_add(1, SeqCst);
@@ -361,7 +362,7 @@ fn scenes_are_loaded_by_several_threads_within_the_room_and_come_in_order() {
     let (four, most, ahead) = with(Loading { threads: 4, room });
     assert!((2..=4).contains(&most), "{most} at a time");
     assert!(ahead <= 2 * 2 + 4, "{ahead} ahead");
-    // One scene is always in hand, however little room there is.
+    // One scene is always in preparation, however little memory is allowed.
     let (little, most, ahead) = with(Loading {
         threads: 4,
         room: 1,
@@ -503,7 +504,8 @@ fn pieces_of_a_checkpoint_are_as_small_as_asked_and_give_the_bits_of_the_whole()
     stop_at(&mut training, 2).unwrap();
     let whole = training.checkpoint();
     let snapshot = training.snapshot();
-    // The training goes on before the snapshot is written: in place, where nothing shares its numbers.
+    // The training continues before the snapshot is written, in place for tensors that are not
+    // shared.
     stop_at(&mut training, 3).unwrap();
     assert!(training.checkpoint() != whole);
     let pieces: Vec<Vec<u8>> = snapshot.pieces(4_000).collect();

@@ -1,9 +1,12 @@
-//! The figures of docs/benchmarks.md on the networks: CPU-seconds of a step, and L1 of novel views against CPU-seconds.
+//! Measures the figures of docs/benchmarks.md on the networks: CPU-seconds of a step, and L1 of
+//! novel views against CPU-seconds.
 //!
-//! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each stage at full size, and at
-//! smaller ones. `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy` fits PlatoNeRF's room
-//! with a chair, from times and shadows of its truth at 512 pixels in bins of 128 ps, and says the errors at each quarter of
-//! the work. `-- grid` says those of the grid in the same views. `-- memory WIDTH` says what a step of stage 2 takes of memory.
+//! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each
+//! stage at full size, and at smaller ones.
+//! `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy` fits
+//! PlatoNeRF's room with a chair, from times and shadows of its truth at 512 pixels in bins of 128
+//! ps, and prints the errors at each quarter of the work. `-- grid` prints those of the grid in the
+//! same views. `-- memory WIDTH` prints the memory of a step of stage 2.
 
 use std::error::Error;
 
@@ -21,11 +24,12 @@ use picofarm_scene::{
 };
 use rustix::time::{ClockId, clock_gettime};
 
-/// Width of a bin of 128 ps, metres.
+/// The width of a bin of 128 ps, metres.
 const BIN_M: f32 = 0.0384;
-/// Nodes of the grid that the densities are sampled at.
+/// The number of nodes of the grid on which densities are sampled.
 const NODES: u32 = 128;
-/// Pixels a side of a novel view through the network, and every how many-th view is taken.
+/// The number of pixels along a side of a novel view through the network, and the distance between
+/// the views that are used.
 const SIDE: u32 = 48;
 const EVERY: usize = 14;
 
@@ -86,7 +90,7 @@ fn cpu_seconds() -> f64 {
     t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
 }
 
-/// Memory at most that one step of stage 2 takes beside the measurements, MiB.
+/// Prints the peak memory of one step of stage 2 in addition to the measurements, MiB.
 fn memory(measured: &Measured, width: usize) -> Result<(), Box<dyn Error>> {
     let peak = || -> Result<f64, Box<dyn Error>> {
         let status = std::fs::read_to_string("/proc/self/status")?;
@@ -100,7 +104,7 @@ fn memory(measured: &Measured, width: usize) -> Result<(), Box<dyn Error>> {
         shadow_steps: 1,
         ..Settings::default()
     };
-    // Forgets the peak of what was before.
+    // Resets the peak of earlier memory use.
     std::fs::write("/proc/self/clear_refs", "5")?;
     let mut training = Training::begin(measured.clone(), settings)?;
     let before = peak()?;
@@ -109,7 +113,7 @@ fn memory(measured: &Measured, width: usize) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// CPU-seconds and seconds of a step of each stage.
+/// Prints CPU-seconds and seconds of a step of each stage.
 fn steps(measured: &Measured) -> Result<(), Box<dyn Error>> {
     println!("width | rays | samples | stage | CPU s a step | s a step");
     let full = Settings::default();
@@ -149,7 +153,7 @@ fn steps(measured: &Measured) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Errors at quarters of a fit.
+/// Prints the errors at quarters of a fit.
 fn curve(scene: &Scene, measured: Measured, settings: Settings) -> Result<(), Box<dyn Error>> {
     let grid = picofarm_reconstruct::Settings {
         nodes: NODES,
@@ -188,7 +192,7 @@ fn curve(scene: &Scene, measured: Measured, settings: Settings) -> Result<(), Bo
     Ok(())
 }
 
-/// What a field is compared in.
+/// The reference for comparing fields.
 struct Views<'a> {
     scene: &'a Scene,
     world: World,
@@ -226,7 +230,7 @@ impl<'a> Views<'a> {
     }
 }
 
-/// Errors of the grid, with and without planes of the room.
+/// Prints the errors of the grid, with and without planes of the room.
 fn grid(scene: &Scene, measured: &Measured) -> Result<(), Box<dyn Error>> {
     let views = Views::new(scene);
     for planes in [true, false] {

@@ -1,21 +1,21 @@
-//! Adam (Kingma and Ba 2015) with PyTorch's order of operations, over flat weights on the host: they are few beside the
-//! points that they are used at.
+//! Adam (Kingma and Ba 2015) with PyTorch's order of operations. The flat weights are on the host,
+//! because they are few compared with the points at which they are used.
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPSILON: f32 = 1e-8;
 
-/// Moments of the gradients of one network.
+/// The moments of the gradients of one network.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Moments {
-    /// Of the gradient.
+    /// The moment of the gradient.
     pub first: Vec<f32>,
-    /// Of its square.
+    /// The moment of its square.
     pub second: Vec<f32>,
 }
 
 impl Moments {
-    /// Before the first step.
+    /// Returns the moments before the first step.
     pub fn new(weights: usize) -> Self {
         Self {
             first: vec![0.0; weights],
@@ -23,7 +23,7 @@ impl Moments {
         }
     }
 
-    /// One step of the weights; `step` counts from 1.
+    /// Takes one step of the weights; `step` counts from 1.
     pub fn step(&mut self, weights: &mut [f32], gradient: &[f32], rate: f64, step: u32) {
         let power = |base: f64| 1.0 - libm::pow(base, f64::from(step));
         let rate = (rate / power(BETA1)) as f32;

@@ -1,4 +1,5 @@
-//! A fit's state as bytes, for going on later: weights, Adam's moments, the step, and what they belong to.
+//! A fit's state as bytes, for resuming later: weights, Adam's moments, the step, and a fingerprint
+//! of the input.
 
 use picofarm_reconstruct::{Measured, ReconstructError};
 
@@ -8,11 +9,12 @@ use crate::{
     training::{State, Training, shape},
 };
 
-/// First bytes of a checkpoint: its form and version.
+/// The first bytes of a checkpoint: its format and version.
 const MAGIC: &[u8; 8] = b"pfplato1";
 
 impl Training {
-    /// The state as bytes: little-endian, 24 bytes a weight of one network (12 MB at full size).
+    /// Returns the state as bytes: little-endian, 24 bytes a weight of one network (12 MB at full
+    /// size).
     pub fn checkpoint(&self) -> Vec<u8> {
         let state = &self.state;
         let mut out = MAGIC.to_vec();
@@ -28,10 +30,11 @@ impl Training {
         out
     }
 
-    /// Goes on from a checkpoint of the same measurements and settings.
+    /// Resumes from a checkpoint of the same measurements and settings.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] for bytes that are no checkpoint of these; otherwise as [`Training::begin`].
+    /// [`ReconstructError::Invalid`] for bytes that are not a checkpoint of these; otherwise as for
+    /// [`Training::begin`].
     pub fn resume(
         measured: Measured,
         settings: Settings,
@@ -74,7 +77,7 @@ impl Training {
         Ok(begun)
     }
 
-    /// FNV-1a over settings and measurements.
+    /// Returns the FNV-1a hash of settings and measurements.
     fn fingerprint(&self) -> u64 {
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         let mut take = |bytes: &[u8]| {

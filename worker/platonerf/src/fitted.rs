@@ -1,4 +1,5 @@
-//! A fitted scene: densities at places, distances along rays, and the whole as a field on a grid.
+//! A fitted scene: densities at positions, distances along rays, and the whole as a field on a
+//! grid.
 
 use burn::tensor::Device;
 use picofarm_reconstruct::{
@@ -16,19 +17,19 @@ use crate::{
     training::{Training, shape},
 };
 
-/// Places that are computed at once.
+/// The number of positions that are computed at once.
 const PLACES: usize = 1 << 14;
 
-/// What a camera ray gives.
+/// The result of a camera ray.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ray {
-    /// Mean distance Σ w z, metres: the paper's depth.
+    /// The mean distance Σ w z, metres: the paper's depth.
     pub depth_m: f32,
-    /// Share of the light that was stopped, without the last sample, which is endless.
+    /// The share of the stopped light, without the last sample, which is endless.
     pub opacity: f32,
 }
 
-/// Both networks, fixed.
+/// Both networks, with fixed weights.
 #[derive(Debug, Clone)]
 pub struct Fitted {
     networks: [Network; 2],
@@ -36,7 +37,7 @@ pub struct Fitted {
 }
 
 impl Training {
-    /// The networks as they are now.
+    /// Returns the networks with their current weights.
     pub fn fitted(&self) -> Fitted {
         let device = Device::flex();
         let of = |k: usize| Network::new(shape(&self.settings), &self.state.weights[k], &device);
@@ -46,8 +47,8 @@ impl Training {
         }
     }
 
-    /// The result so far on the grid of `start`: its box, evidence, depth and measurements, with the densities of the fine
-    /// network.
+    /// Returns the current result on the grid of `start`: its box, evidence, depth and
+    /// measurements, with the densities of the fine network.
     pub fn finish(self, start: Reconstructed) -> Reconstructed {
         let field = self.fitted().sampled(&start.field);
         let mut notes = self.notes();
@@ -70,7 +71,7 @@ impl Training {
 }
 
 impl Fitted {
-    /// The same with another number of stratified samples a ray: the paper evaluates with 1,024.
+    /// Changes the number of stratified samples a ray: the paper evaluates with 1,024.
     #[must_use]
     pub fn with_coarse(self, coarse: usize) -> Self {
         let settings = Settings {
@@ -80,7 +81,7 @@ impl Fitted {
         Self { settings, ..self }
     }
 
-    /// Densities of the fine network, 1/m.
+    /// Returns the densities of the fine network, 1/m.
     pub fn densities(&self, places: &[Vec3]) -> Vec<f32> {
         let mut out = Vec::with_capacity(places.len());
         for some in places.chunks(PLACES) {
@@ -90,13 +91,14 @@ impl Fitted {
         out
     }
 
-    /// The densities at the nodes of a grid, as far as it can hold them: up to 4/h.
+    /// Returns the densities at the nodes of a grid, limited to the range that it can represent: up
+    /// to 4/h.
     pub fn sampled(&self, grid: &Field) -> Field {
         let mut field = grid.clone();
         let logit = |density: f32| {
             let share = density * field.spacing / PEAK;
             let u = libm::logf(share / (1.0 - share).max(0.0));
-            // An empty node has −∞; max and min drop the NaN of what is too dense.
+            // An empty node has −∞; max and min drop the NaN of a density that exceeds the range.
             if share >= 1.0 {
                 SOLID
             } else {
@@ -113,7 +115,7 @@ impl Fitted {
         field
     }
 
-    /// Rays from one place along unit directions, with even samples.
+    /// Renders rays from one position along unit directions, with even samples.
     pub fn view(&self, origin: Vec3, directions: &[Vec3]) -> Vec<Ray> {
         let s = &self.settings;
         let sampling = Sampling {

@@ -1,10 +1,12 @@
-//! PlatoNeRF (Klinghoffer et al., CVPR 2024): two small networks that become the density of one room, from light that
-//! bounced twice.
+//! PlatoNeRF (Klinghoffer et al., CVPR 2024): two small networks that learn the density of one room
+//! from light that bounced twice.
 //!
-//! It is the oracle of `picofarm-reconstruct`, whose grid does the same job in seconds: the same measurements, the method of
-//! the paper with its two stages, losses, samples and schedule. What it makes is sampled on that crate's grid
-//! ([`Fitted::sampled`]), so meshes, files and errors of both are made by the same code. Sampling loses detail finer than a
-//! node; [`Fitted::view`] renders novel views through the network itself, so that the loss can be measured.
+//! The crate is a reference for `picofarm-reconstruct`, which does the same in seconds with a grid.
+//! It uses the same measurements and the paper's method with its two stages, losses, samples and
+//! schedule. Its result is sampled on that crate's grid ([`Fitted::sampled`]), so meshes, files and
+//! errors of both are computed by the same code. Sampling loses detail finer than a node;
+//! [`Fitted::view`] renders novel views through the network itself, so that the loss can be
+//! measured.
 
 mod adam;
 mod checkpoint;

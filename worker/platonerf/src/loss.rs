@@ -1,5 +1,5 @@
-//! PlatoNeRF's two losses. Means are over a whole batch; parts of it are computed one after the other, so each ray brings
-//! its share of its mean along.
+//! PlatoNeRF's two losses. Means are over a whole batch. Parts of it are computed one after the
+//! other, so each ray is weighted with its share of the mean.
 
 use burn::tensor::{Device, Tensor};
 
@@ -13,12 +13,12 @@ use crate::{
     settings::Settings,
 };
 
-/// Factor of both losses.
+/// The factor of both losses.
 const FACTOR: f32 = 100.0;
-/// Keeps transmittances from 0 and 1 in the cross-entropy.
+/// The distance of transmittances from 0 and 1 in the cross-entropy.
 const MARGIN: f32 = 1e-3;
 
-/// The part of the fit.
+/// The stage of the fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
     /// Distances of lit rays.
@@ -27,17 +27,17 @@ pub enum Stage {
     Shadow,
 }
 
-/// Rays of a batch by class.
+/// The number of rays of a batch by class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Counts {
-    /// Lit ones.
+    /// The number of lit rays.
     pub lit: usize,
-    /// Those in shadow.
+    /// The number of shadowed rays.
     pub shadow: usize,
 }
 
 impl Counts {
-    /// Of a whole batch.
+    /// Counts the rays of a whole batch.
     pub fn of(batch: &Batch) -> Self {
         let lit = batch.lit_rays();
         Self {
@@ -47,10 +47,11 @@ impl Counts {
     }
 }
 
-/// Random numbers for each time that rays are rendered: camera rays, light paths from the fine depth, those from the coarse.
+/// Random numbers for each rendering of rays: camera rays, light paths from the fine depth, and
+/// light paths from the coarse depth.
 pub type AllDraws = [Draws; 3];
 
-/// What a part of a batch adds to the batch's loss: a tensor of one number.
+/// Returns the contribution of a part of a batch to the batch's loss: a tensor of one number.
 pub fn loss(
     settings: &Settings,
     stage: Stage,
@@ -75,7 +76,7 @@ pub fn loss(
         direction: direction.clone(),
         far: matrix(&vec![settings.far_m; n], [n, 1], device),
     };
-    // An empty class has no mean, and brings nothing.
+    // An empty class has no mean and contributes nothing.
     let share = |of: f32, count: usize| move |l: &f32| f32::from(*l == of) / count.max(1) as f32;
     let column = |f: &dyn Fn(&f32) -> f32| {
         let values: Vec<f32> = part.lit.iter().map(f).collect();
@@ -108,7 +109,7 @@ pub fn loss(
     sum.mul_scalar(FACTOR).reshape([1])
 }
 
-/// The comparison of transmittances with the mask.
+/// Compares transmittances with the mask.
 fn shadows(
     how: ShadowLoss,
     rendered: Rendered,

@@ -1,32 +1,32 @@
-//! The network of one density field: encoded place → eight layers → density (NeRF, Mildenhall et al. 2020; PlatoNeRF keeps
-//! the density alone). The weights lie flat, layer by layer, each layer's matrix (outputs, inputs) before its bias: PyTorch's
-//! shapes.
+//! The network of one density field: encoded position → eight layers → density (NeRF, Mildenhall et
+//! al. 2020; PlatoNeRF retains only the density). The weights are a flat array, layer by layer,
+//! with each layer's matrix (outputs, inputs) before its bias: PyTorch's shapes.
 
 use burn::tensor::{Device, Gradients, Tensor, TensorData, activation::relu};
 
 use crate::random::{Purpose, Random};
 
-/// Frequencies of the encoding, in 1/m: 1, 2, 4, … 512.
+/// The number of frequencies of the encoding, in 1/m: 1, 2, 4, … 512.
 pub const FREQUENCIES: usize = 10;
-/// Numbers that a place becomes.
+/// The number of values that encode a position.
 pub const ENCODED: usize = 3 + 6 * FREQUENCIES;
 
 /// Sizes of a network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shape {
-    /// Numbers between layers.
+    /// The number of values between layers.
     pub width: usize,
-    /// Layers before the density.
+    /// The number of layers before the density.
     pub layers: usize,
 }
 
 impl Shape {
-    /// The layer whose output is joined by the encoded place: 4 of 0..8.
+    /// Returns the layer after which the encoded position is joined: 4 of 0..8.
     fn joined(self) -> usize {
         self.layers / 2
     }
 
-    /// Outputs and inputs of each layer; the density is the last.
+    /// Returns the numbers of outputs and inputs of each layer; the density is the last.
     pub fn sizes(self) -> Vec<[usize; 2]> {
         let inputs = |layer: usize| match layer {
             0 => ENCODED,
@@ -39,13 +39,13 @@ impl Shape {
             .collect()
     }
 
-    /// Number of weights.
+    /// Returns the number of weights.
     pub fn weights(self) -> usize {
         self.sizes().iter().map(|[o, i]| o * i + o).sum()
     }
 
-    /// Weights to start from: uniform in ±1/√inputs, PyTorch's default for linear layers. `which` tells networks apart, and
-    /// `draw` the attempts at one.
+    /// Returns the initial weights: uniform in ±1/√inputs, PyTorch's default for linear layers.
+    /// `which` distinguishes the networks, and `draw` the attempts for one network.
     pub fn begin(self, seed: u64, draw: u32, which: usize) -> Vec<f32> {
         let mut random = Random::new(seed, Purpose::Weights, u64::from(draw), which as u64);
         let mut out = Vec::with_capacity(self.weights());
@@ -66,7 +66,8 @@ pub struct Network {
 }
 
 impl Network {
-    /// From flat weights, [`Shape::weights`] of them. On an autodiff device its weights get gradients.
+    /// Creates a network from [`Shape::weights`] flat weights. On an autodiff device, the weights
+    /// have gradients.
     pub fn new(shape: Shape, flat: &[f32], device: &Device) -> Self {
         let mut rest = flat;
         let mut take = |count: usize| {
@@ -90,7 +91,7 @@ impl Network {
         }
     }
 
-    /// Densities in 1/m at places in metres: (P, 3) to (P).
+    /// Returns the densities in 1/m at positions in metres: (P, 3) to (P).
     pub fn density(&self, places: Tensor<2>) -> Tensor<1> {
         let encoded = encode(places);
         let mut x = encoded.clone();
@@ -109,7 +110,7 @@ impl Network {
         unreachable!("the last layer returns")
     }
 
-    /// The gradient by the flat weights; 0 where the loss does not depend on them.
+    /// Returns the gradient of the flat weights; 0 if the loss does not depend on them.
     pub fn gradient(&self, of: &mut Gradients) -> Vec<f32> {
         let mut out = Vec::new();
         for (matrix, bias) in &self.layers {
@@ -127,7 +128,8 @@ impl Network {
     }
 }
 
-/// x, then sin(f·x) and cos(f·x) for each frequency: (P, 3) to (P, 63). No scaling to a unit box, no factor π.
+/// Encodes positions as x, then sin(f·x) and cos(f·x) for each frequency: (P, 3) to (P, 63). There
+/// is no scaling to a unit box and no factor π.
 fn encode(places: Tensor<2>) -> Tensor<2> {
     let device = places.device();
     let [points, _] = places.dims();
@@ -139,7 +141,7 @@ fn encode(places: Tensor<2>) -> Tensor<2> {
     Tensor::cat(vec![places, waves.reshape([points, 6 * FREQUENCIES])], 1)
 }
 
-/// The values of a tensor, row by row.
+/// Returns the values of a tensor, row by row.
 pub(crate) fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     let data = tensor.into_data_as::<f32>();
     data.try_into_vec().expect("asked for f32")

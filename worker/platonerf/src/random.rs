@@ -1,7 +1,7 @@
-//! Random numbers that are a function of what they are drawn for: SplitMix64 (Steele et al. 2014) of a seed and names, and
-//! a shuffled order that is computed place by place.
+//! Random numbers that depend only on their purpose: SplitMix64 (Steele et al. 2014) of a seed and
+//! names, and a shuffled order with elements that can be computed one by one.
 
-/// What numbers are drawn for.
+/// The purpose of random numbers.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Purpose {
     Weights = 1,
@@ -9,7 +9,7 @@ pub(crate) enum Purpose {
     Samples = 3,
 }
 
-/// One sequence of numbers.
+/// A sequence of random numbers.
 #[derive(Debug, Clone)]
 pub(crate) struct Random(u64);
 
@@ -20,7 +20,7 @@ fn mix(mut z: u64) -> u64 {
 }
 
 impl Random {
-    /// The sequence of a purpose and two numbers.
+    /// Returns the sequence of a purpose and two numbers.
     pub fn new(seed: u64, purpose: Purpose, a: u64, b: u64) -> Self {
         let mut state = mix(seed ^ 0x9e37_79b9_7f4a_7c15);
         for part in [purpose as u64, a, b] {
@@ -34,14 +34,15 @@ impl Random {
         mix(self.0)
     }
 
-    /// Uniform in [0, 1), a multiple of 2⁻²⁴.
+    /// Returns a uniform number in [0, 1), a multiple of 2⁻²⁴.
     pub fn unit(&mut self) -> f32 {
         (self.bits() >> 40) as f32 * (1.0 / 16_777_216.0)
     }
 }
 
-/// Element `place` of the numbers 0..n in the shuffled order of an epoch: four Feistel rounds over the next power of four,
-/// repeated until the result lies below n. `place < n`.
+/// Returns element `place` of the numbers 0..n in the shuffled order of an epoch: four Feistel
+/// rounds over the next power of four, repeated until the result is below n. `place` must be less
+/// than n.
 pub(crate) fn shuffled(seed: u64, epoch: u64, n: u64, place: u64) -> u64 {
     let half = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
     let mask = (1u64 << half) - 1;

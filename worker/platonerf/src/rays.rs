@@ -1,49 +1,50 @@
-//! The rays that a network learns from: one for each spot and pixel that takes part, and the batches of a step.
+//! The rays from which a network learns, one for each spot and pixel in use, and the batches of a
+//! step.
 
 use picofarm_reconstruct::{Measured, ReconstructError};
 use picofarm_scene::Vec3;
 
 use crate::random::shuffled;
 
-/// Rays of measurements.
+/// The rays of measurements.
 #[derive(Debug, Clone)]
 pub struct Pool {
     measured: Measured,
-    /// Numbers spot · pixels + pixel of all rays that take part, ascending.
+    /// The numbers spot · pixels + pixel of all rays in use, ascending.
     all: Vec<u32>,
-    /// Those whose pixel is lit.
+    /// Those with a lit pixel.
     lit: Vec<u32>,
 }
 
-/// Some rays with what was measured on them, on the host. Vectors are x, y, z, one after the other.
+/// Some rays with their measurements, on the host. Vectors are x, y, z, one after the other.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Batch {
-    /// Origin of all: the camera.
+    /// The origin of all rays: the camera.
     pub origin: [f32; 3],
-    /// Unit directions: (R, 3).
+    /// The unit directions: (R, 3).
     pub direction: Vec<f32>,
-    /// Spots L, metres: (R, 3).
+    /// The spots L, metres: (R, 3).
     pub spot: Vec<f32>,
-    /// Path from laser to spot, metres: (R).
+    /// The path from laser to spot, metres: (R).
     pub path_m: Vec<f32>,
-    /// Two-bounce path, metres; 0 where not lit: (R).
+    /// The two-bounce path, metres; 0 if not lit: (R).
     pub tau_m: Vec<f32>,
-    /// 1 where lit, 0 in shadow: (R).
+    /// 1 if lit, 0 in shadow: (R).
     pub lit: Vec<f32>,
 }
 
 impl Batch {
-    /// Number of rays.
+    /// Returns the number of rays.
     pub fn rays(&self) -> usize {
         self.lit.len()
     }
 
-    /// Lit rays.
+    /// Returns the number of lit rays.
     pub fn lit_rays(&self) -> usize {
         self.lit.iter().filter(|l| **l > 0.0).count()
     }
 
-    /// Rays `from..to` of it.
+    /// Returns rays `from..to` of the batch.
     pub fn part(&self, from: usize, to: usize) -> Self {
         Self {
             origin: self.origin,
@@ -57,10 +58,10 @@ impl Batch {
 }
 
 impl Pool {
-    /// The rays of measurements, and what somebody should know about them.
+    /// Returns the rays of measurements, with notes for users.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] naming what cannot be used.
+    /// [`ReconstructError::Invalid`] naming the unusable value.
     pub fn new(measured: Measured) -> Result<(Self, Vec<String>), ReconstructError> {
         let notes = measured.check()?;
         let used = (0..measured.used.len() as u32).filter(|&q| measured.used[q as usize] != 0);
@@ -70,12 +71,12 @@ impl Pool {
         Ok((Self { measured, all, lit }, notes))
     }
 
-    /// The measurements.
+    /// Returns the measurements.
     pub fn measured(&self) -> &Measured {
         &self.measured
     }
 
-    /// `rays` rays beginning at a place in the endless shuffled order: of lit ones, or of all.
+    /// Returns `rays` rays from a position in the endless shuffled order: of lit rays, or of all.
     pub fn batch(&self, lit_only: bool, seed: u64, place: u64, rays: usize) -> Batch {
         let of = if lit_only { &self.lit } else { &self.all };
         let m = &self.measured;

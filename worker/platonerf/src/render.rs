@@ -1,6 +1,6 @@
-//! Volume rendering of rays through one network or two (NeRF, equations 3 and 5), with what PlatoNeRF takes from it: depth
-//! D = Σ wᵢ zᵢ, not divided by Σ wᵢ, and transmittance before the last two samples, so that the wall that a spot lies on stops
-//! nothing.
+//! Volume rendering of rays through one network or two (NeRF, equations 3 and 5), with PlatoNeRF's
+//! outputs: depth D = Σ wᵢ zᵢ, not divided by Σ wᵢ, and transmittance before the last two samples,
+//! so that the wall at a spot stops nothing.
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -9,26 +9,26 @@ use crate::{
     sample::{Draws, Places},
 };
 
-/// Length of the last sample, metres.
+/// The length of the last sample, metres.
 const ENDLESS_M: f32 = 1e10;
-/// Added to what each sample lets through.
+/// A constant added to the transmittance of each sample.
 const LEAK: f32 = 1e-10;
-/// Shortest part of a light path that is looked at, metres: the paper has no bound, and turns samples round where a surface
-/// point is closer to the spot than `near`.
+/// The least length of the sampled part of a light path, metres. The paper has no bound, and
+/// reverses the samples if a surface point is closer to the spot than `near`.
 const SHORTEST_M: f32 = 1e-3;
 
-/// What R rays give.
+/// The result of R rays.
 #[derive(Debug, Clone)]
 pub struct Rendered {
     /// Σ w z, metres: (R).
     pub depth: Tensor<1>,
-    /// Share of light before the last two samples: (R).
+    /// The share of light before the last two samples: (R).
     pub transmittance: Tensor<1>,
-    /// Weights w: (R, samples).
+    /// The weights w: (R, samples).
     pub weights: Tensor<2>,
 }
 
-/// Depth, transmittance and weights of densities (R, S) at distances (R, S).
+/// Returns depth, transmittance and weights for densities (R, S) at distances (R, S).
 pub fn volume(density: Tensor<2>, z: Tensor<2>) -> Rendered {
     let [rays, samples] = z.dims();
     let device = z.device();
@@ -38,7 +38,8 @@ pub fn volume(density: Tensor<2>, z: Tensor<2>) -> Rendered {
     let length = Tensor::cat(vec![next - this, last], 1);
     let opacity = (density * length).neg().exp().neg().add_scalar(1.0);
     let passed = opacity.clone().neg().add_scalar(1.0).add_scalar(LEAK);
-    // Π of what the samples before let through, as exp Σ log: its gradient needs no division.
+    // The product of the previous samples' transmittances, as exp Σ log: its gradient needs no
+    // division.
     let logs = passed.log().slice([0..rays, 0..samples - 1]);
     let zero = Tensor::<2>::zeros([rays, 1], &device);
     let light = Tensor::cat(vec![zero, logs.cumsum(1)], 1).exp();
@@ -55,16 +56,16 @@ pub fn volume(density: Tensor<2>, z: Tensor<2>) -> Rendered {
 /// R rays on a device: origins (R, 3), unit directions (R, 3), ends (R, 1), metres.
 #[derive(Debug, Clone)]
 pub struct Rays {
-    /// Where they begin.
+    /// The starts of the rays.
     pub origin: Tensor<2>,
-    /// Where they go.
+    /// The directions of the rays.
     pub direction: Tensor<2>,
-    /// How far.
+    /// The ends of the rays.
     pub far: Tensor<2>,
 }
 
 impl Rays {
-    /// From points towards others, up to there.
+    /// Returns rays from points to other points.
     pub fn between(from: Tensor<2>, to: Tensor<2>, near: f32) -> Self {
         let way = to - from.clone();
         let length = length(way.clone());
@@ -76,24 +77,26 @@ impl Rays {
     }
 }
 
-/// Lengths of the rows: (R, 3) to (R, 1). Bounded below, because a root has no slope at 0.
+/// Returns the lengths of the rows: (R, 3) to (R, 1). They are bounded below, because a root has no
+/// slope at 0.
 pub(crate) fn length(rows: Tensor<2>) -> Tensor<2> {
     (rows.clone() * rows).sum_dim(1).clamp_min(1e-12).sqrt()
 }
 
-/// How rays are sampled.
+/// The sampling of rays.
 #[derive(Debug, Clone, Copy)]
 pub struct Sampling {
-    /// Where samples begin, metres.
+    /// The start of samples, metres.
     pub near: f32,
-    /// Stratified samples.
+    /// The number of stratified samples.
     pub coarse: usize,
-    /// Samples by importance.
+    /// The number of samples by importance.
     pub fine: usize,
 }
 
 impl Sampling {
-    /// Renders rays with the coarse network, then with the fine one where the coarse one has matter: \[coarse, fine\].
+    /// Renders rays with the coarse network, then with the fine one where the coarse one has
+    /// matter: \[coarse, fine\].
     pub fn render(self, networks: &[Network; 2], rays: &Rays, draws: &Draws) -> [Rendered; 2] {
         let far = host(rays.far.clone());
         let first = Places::stratified(far.len(), self.coarse, self.near, &draws.jitter);
@@ -105,7 +108,7 @@ impl Sampling {
     }
 }
 
-/// Renders rays with one network at given places.
+/// Renders rays with one network at given positions.
 fn look(network: &Network, rays: &Rays, places: &Places) -> Rendered {
     let device = rays.origin.device();
     let (n, samples) = (places.rays, places.count);
@@ -118,7 +121,7 @@ fn look(network: &Network, rays: &Rays, places: &Places) -> Rendered {
     volume(density.reshape([n, samples]), z)
 }
 
-/// Host values as a matrix.
+/// Converts host values to a matrix.
 pub(crate) fn matrix(values: &[f32], shape: [usize; 2], device: &Device) -> Tensor<2> {
     Tensor::from_data(TensorData::new(values.to_vec(), shape), device)
 }

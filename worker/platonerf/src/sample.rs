@@ -1,25 +1,26 @@
-//! Where a ray is looked at: stratified places for the coarse network, then more of them where it has matter (NeRF, section
-//! 5.2). Places are functions of where the ray ends: z = base + far · slope, so that gradients reach the end of a light path
-//! through the stratified places. Those by importance are fixed numbers.
+//! The samples of a ray: stratified positions for the coarse network, then more of them where it
+//! has matter (NeRF, section 5.2). Positions are functions of the ray's end, z = base + far ·
+//! slope, so that gradients reach the end of a light path through the stratified positions.
+//! Positions by importance are fixed numbers.
 
-/// Added to weights before they become a distribution.
+/// A constant added to weights before they are normalised to a distribution.
 const FLOOR: f32 = 1e-5;
 
-/// Places along rays, row by row: z = base + far · slope, metres.
+/// Positions along rays, row by row: z = base + far · slope, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Places {
-    /// Rays.
+    /// The number of rays.
     pub rays: usize,
-    /// Places of a ray.
+    /// The number of positions of a ray.
     pub count: usize,
-    /// What does not depend on the end.
+    /// The part that does not depend on the ray's end.
     pub base: Vec<f32>,
-    /// Share of the end.
+    /// The factor of the ray's end.
     pub slope: Vec<f32>,
 }
 
-/// Random numbers in [0, 1) for some rays: where in its interval each stratified place lies, and which share of the
-/// distribution each further one stands for. Empty = the even choice that evaluation uses.
+/// Random numbers in [0, 1) for some rays: the offset of each stratified position in its interval,
+/// and the quantile of each further one. Empty = the even choice, which evaluation uses.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Draws {
     /// (rays, coarse).
@@ -29,7 +30,8 @@ pub struct Draws {
 }
 
 impl Places {
-    /// `count` places between `near` and the end: even, or one in each interval between the middles of the even ones.
+    /// Returns `count` positions between `near` and the end: even, or one in each interval between
+    /// the middles of the even ones.
     pub fn stratified(rays: usize, count: usize, near: f32, jitter: &[f32]) -> Self {
         let even = |i: usize| i as f32 / (count - 1) as f32;
         let place = |k: usize| {
@@ -52,14 +54,15 @@ impl Places {
         }
     }
 
-    /// The places for given ends.
+    /// Returns the positions for given ends.
     pub fn at(&self, far: &[f32]) -> Vec<f32> {
         let end = |k: usize| far[k / self.count];
         let each = self.base.iter().zip(&self.slope).enumerate();
         each.map(|(k, (b, s))| b + end(k) * s).collect()
     }
 
-    /// These places and `count` more a ray by the coarse weights, sorted. `weights` has one number a place.
+    /// Returns these positions and `count` more a ray by the coarse weights, sorted. `weights` has
+    /// one number a position.
     pub fn refined(&self, far: &[f32], weights: &[f32], count: usize, share: &[f32]) -> Self {
         let z = self.at(far);
         let both = self.count + count;
@@ -92,8 +95,8 @@ impl Places {
     }
 }
 
-/// Places distributed as the weights say: the inverse of a distribution that is even between the middles of neighbouring
-/// places. The first and the last weight count for nothing.
+/// Returns positions distributed by the weights: the inverse of a distribution with even density
+/// between the middles of neighbouring positions. The first and the last weight are not used.
 fn by_importance(z: &[f32], weights: &[f32], share: &[f32]) -> Vec<f32> {
     let middles: Vec<f32> = z.windows(2).map(|w| 0.5 * (w[0] + w[1])).collect();
     let inner = &weights[1..weights.len() - 1];

@@ -1,11 +1,12 @@
-//! How a network is fitted to a scene. The defaults are the paper's for its simulated scenes.
+//! The settings for fitting networks to a scene. The defaults are the paper's for its simulated
+//! scenes.
 
 use picofarm_reconstruct::{ReconstructError, Reconstructed};
 use picofarm_settings::{GridSettings, MlpSettings, ShadowLoss, Shadows};
 use serde::Serialize;
 
-/// The grid on which networks are sampled: they have no planes, and learn from shadows themselves. Its evidence is that of
-/// carving.
+/// Returns the settings of the grid on which networks are sampled. It has no planes, and the
+/// networks themselves learn from shadows. Its evidence comes from carving.
 pub fn grid(settings: GridSettings) -> GridSettings {
     GridSettings {
         planes: false,
@@ -14,38 +15,40 @@ pub fn grid(settings: GridSettings) -> GridSettings {
     }
 }
 
-/// Settings of a fit. Lengths are metres.
+/// The settings of a fit. Lengths are metres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Settings {
-    /// Width of the layers.
+    /// The width of the layers.
     pub width: usize,
-    /// Layers before the density. The encoded place enters again after the middle one.
+    /// The number of layers before the density. The encoded position is joined again after the
+    /// middle one.
     pub layers: usize,
-    /// Stratified samples of a ray, for the coarse network.
+    /// The number of stratified samples of a ray, for the coarse network.
     pub coarse: usize,
-    /// Further samples of a ray where the coarse network has matter; the fine network takes both.
+    /// The number of further samples of a ray where the coarse network has matter; the fine network
+    /// uses both.
     pub fine: usize,
-    /// Where samples begin, metres from the origin of a ray.
+    /// The start of samples, metres from the origin of a ray.
     pub near_m: f32,
-    /// Where samples of camera rays end, metres. Those of light paths end at the spot.
+    /// The end of samples of camera rays, metres. Samples of light paths end at the spot.
     pub far_m: f32,
-    /// What lengths are divided by in the losses, metres: the paper's gate.
+    /// The divisor of lengths in the losses, metres: the paper's gate.
     pub scale_m: f32,
-    /// Weight of the distances in stage 2, beside 1 for each mean of transmittances.
+    /// The weight of the distances in stage 2; each mean of transmittances has the weight 1.
     pub distance_weight: f32,
     /// Stage 2's comparison of transmittances.
     pub shadow_loss: ShadowLoss,
-    /// Steps of stage 1: distances of lit pixels.
+    /// The number of steps of stage 1: distances of lit pixels.
     pub distance_steps: u32,
-    /// Steps of stage 2: distances and shadows.
+    /// The number of steps of stage 2: distances and shadows.
     pub shadow_steps: u32,
-    /// Rays of a step.
+    /// The number of rays of a step.
     pub batch: usize,
     /// Adam's learning rate at the first step.
     pub learning_rate: f64,
-    /// Steps over which the learning rate falls to a tenth.
+    /// The number of steps over which the learning rate decreases to a tenth.
     pub decay_steps: f64,
-    /// Seed of weights, batches and samples.
+    /// The seed of weights, batches and samples.
     pub seed: u64,
 }
 
@@ -72,7 +75,8 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// As a job or a command has them, for the box of [`grid`]: nothing that was seen lies farther away.
+    /// Returns the settings from those of a job or command. Camera rays end at the diagonal of the
+    /// box of [`grid`], because no visible surface is farther away.
     pub fn of(asked: &MlpSettings, start: &Reconstructed, seed: u64) -> Self {
         let paper = Self {
             width: asked.width as usize,
@@ -85,7 +89,7 @@ impl Settings {
         paper.with_steps(asked.steps)
     }
 
-    /// The same with so many steps in all: an eighth for stage 1, as in the paper.
+    /// Sets the total number of steps: an eighth for stage 1, as in the paper.
     #[must_use]
     pub fn with_steps(self, steps: u32) -> Self {
         let distance_steps = steps / 8;
@@ -96,12 +100,12 @@ impl Settings {
         }
     }
 
-    /// Steps of both stages.
+    /// Returns the number of steps of both stages.
     pub fn steps(&self) -> u32 {
         self.distance_steps.saturating_add(self.shadow_steps)
     }
 
-    /// Learning rate of a step, counted from 0.
+    /// Returns the learning rate of a step, counted from 0.
     pub fn rate(&self, step: u32) -> f64 {
         self.learning_rate * libm::pow(0.1, f64::from(step) / self.decay_steps)
     }

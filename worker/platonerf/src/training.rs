@@ -1,8 +1,9 @@
-//! The fit of both networks to the measurements of one scene, which can stop and go on.
+//! The fit of both networks to the measurements of one scene, which can stop and resume.
 //!
-//! Batches, samples and first weights are functions of the seed and the step. A batch is computed in parts of a fixed number
-//! of rays, whose gradients are added in order, so the bits depend neither on the number of threads nor on stops. (They may
-//! differ between kinds of processors, whose matrix products add in another order.)
+//! Batches, samples and first weights depend only on the seed and the step. A batch is computed in
+//! parts of a fixed number of rays, and their gradients are added in order, so the bits depend
+//! neither on the number of threads nor on stops. They may differ between kinds of processors with
+//! matrix products that add in another order.
 
 use burn::tensor::Device;
 use picofarm_reconstruct::{Measured, Phase, Progress, ReconstructError};
@@ -17,33 +18,35 @@ use crate::{
     settings::{Settings, invalid},
 };
 
-/// Rays that are computed at once: what they need fits into memory many times, and their matrices are large enough.
+/// The number of rays that are computed at once: their memory is small, and their matrices are
+/// large enough.
 const AT_ONCE: usize = 64;
-/// Work of a step of stage 2 beside one of stage 1: light paths of two depths beside camera rays.
+/// The ratio of the work of a step of stage 2 to one of stage 1: it renders light paths of two
+/// depths in addition to camera rays.
 const SHADOW_WORK: f32 = 3.0;
-/// Steps in which a network without any gradient is drawn anew. Later, a batch that happens to have none must not throw away
-/// what was learned.
+/// The number of steps in which a network without any gradient is initialised again. Later, a batch
+/// that happens to have no gradient must not discard the learned weights.
 const WATCHED: u32 = 1000;
-/// First weights that are drawn at most.
+/// The greatest number of initialisations.
 const DRAWS: u32 = 100;
 
-/// What changes as a network learns. Coarse first, then fine.
+/// The state that learning changes, first of the coarse and then of the fine network.
 #[derive(Debug, Clone, PartialEq)]
 pub struct State {
-    /// Weights: see [`crate::network`].
+    /// The weights: see [`crate::network`].
     pub weights: [Vec<f32>; 2],
     /// Adam's moments.
     pub moments: [Moments; 2],
-    /// Steps taken.
+    /// The number of steps taken.
     pub step: u32,
-    /// How often the first weights were drawn anew.
+    /// The number of times that the weights were initialised again.
     pub draw: u32,
-    /// Loss of the last step.
+    /// The loss of the last step.
     pub loss: f32,
 }
 
 impl State {
-    /// Before the first step.
+    /// Returns the state before the first step.
     pub fn begin(settings: &Settings, draw: u32) -> Self {
         let shape = shape(settings);
         let count = shape.weights();
@@ -57,7 +60,7 @@ impl State {
     }
 }
 
-/// A fit that is under way.
+/// A fit in progress.
 #[derive(Debug)]
 pub struct Training {
     pub(crate) settings: Settings,
@@ -75,7 +78,7 @@ pub(crate) fn shape(settings: &Settings) -> Shape {
 }
 
 impl Training {
-    /// A fit that has not begun.
+    /// Creates a fit in its initial state.
     ///
     /// # Errors
     /// [`ReconstructError::Invalid`] naming a setting or a measurement that cannot be used.
@@ -91,22 +94,22 @@ impl Training {
         })
     }
 
-    /// Its settings.
+    /// Returns the settings.
     pub fn settings(&self) -> &Settings {
         &self.settings
     }
 
-    /// Steps done.
+    /// Returns the number of finished steps.
     pub fn step(&self) -> u64 {
         self.state.step.into()
     }
 
-    /// Weights, moments and counts.
+    /// Returns weights, moments and counts.
     pub fn state(&self) -> &State {
         &self.state
     }
 
-    /// What somebody should know before trusting the result.
+    /// Returns notes that users should read before they trust the result.
     pub fn notes(&self) -> Vec<String> {
         let mut notes = self.notes.clone();
         if self.state.draw > 0 {
@@ -118,18 +121,20 @@ impl Training {
         notes
     }
 
-    /// Learns until it is done (`true`) or `progress` stops it (`false`); call it again to go on.
+    /// Learns until the fit is finished (`true`) or `progress` stops it (`false`). Call it again to
+    /// continue.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] where the loss is no number any more, or no first weights give any density.
+    /// [`ReconstructError::Invalid`] if the loss becomes NaN or infinite, or if no initial weights
+    /// give any density.
     pub fn run(&mut self, progress: &dyn Progress) -> Result<bool, ReconstructError> {
         self.run_with(progress, &mut |_| ())
     }
 
-    /// The same, and calls `after` after each step.
+    /// Like [`Training::run`], and calls `after` after each step.
     ///
     /// # Errors
-    /// As [`Training::run`].
+    /// As for [`Training::run`].
     pub fn run_with(
         &mut self,
         progress: &dyn Progress,
@@ -158,7 +163,8 @@ impl Training {
         Ok(true)
     }
 
-    /// Begins again with other weights: a network without any density has no gradient, and never gets one. The paper's code looks at the coarse one alone.
+    /// Starts again with other weights. A network without any density has no gradient, and never
+    /// gets one. The paper's code checks only the coarse network.
     fn draw_anew(&mut self) -> Result<(), ReconstructError> {
         if self.state.draw + 1 >= DRAWS {
             let what = format!(
@@ -179,7 +185,7 @@ impl Training {
         }
     }
 
-    /// Loss of the next step and its gradients; `None` where it was stopped.
+    /// Returns the loss of the next step and its gradients, or `None` if `progress` stopped it.
     fn gradients(&self, progress: &dyn Progress) -> Option<(f32, [Vec<f32>; 2])> {
         let (s, step) = (&self.settings, self.state.step);
         let stage = match step < s.distance_steps {
@@ -212,7 +218,7 @@ impl Training {
         )
     }
 
-    /// Share of the work that is done when a share of the next step is.
+    /// Returns the finished share of the work when the share `part` of the next step is finished.
     fn share(&self, part: f32) -> f32 {
         let (s, step) = (&self.settings, self.state.step as f32 + part);
         let early = s.distance_steps as f32;
@@ -221,8 +227,8 @@ impl Training {
     }
 }
 
-/// Loss of a batch and its gradient by the weights of both networks; `None` where `watch`, which gets the share that is
-/// done, says so.
+/// Returns the loss of a batch and its gradient for the weights of both networks, or `None` if
+/// `watch` stopped it. `watch` receives the finished share.
 pub(crate) fn gradients(
     settings: &Settings,
     stage: Stage,
@@ -255,7 +261,7 @@ pub(crate) fn gradients(
     Some((sum, sums))
 }
 
-/// The random numbers of some rays of a step.
+/// Returns the random numbers of some rays of a step.
 pub(crate) fn draws(settings: &Settings, step: u32, from: usize, rays: usize) -> AllDraws {
     [0u64, 1, 2].map(|time| {
         let mut draws = Draws::default();

@@ -1,8 +1,9 @@
-//! Figures of agreement of consistent and of wrong measurements in many rooms, a line each; arguments are scene files. The limits
-//! of `src/agreement.rs` were chosen by the sets `right` and `tuned`; the set `kept` was only looked at afterwards.
+//! Prints the agreement of consistent and of wrong measurements in many rooms, a line each;
+//! arguments are scene files. The limits of `src/agreement.rs` were chosen with the sets `right`
+//! and `tuned`; the set `kept` was only evaluated afterwards.
 //!
-//! In the environment, `QUICK` leaves times out, `CAPTURES` renders captures too, `FIT` shows held-out losses instead, and
-//! `ROOMS=4` takes every fourth room.
+//! In the environment, `QUICK` omits times, `CAPTURES` also renders captures, `FIT` shows held-out
+//! losses instead, and `ROOMS=4` takes every fourth room.
 
 use picofarm_reconstruct::{
     Measured, Reconstruction, Settings, Unwatched, reconstruct,
@@ -93,7 +94,7 @@ const WRONG: [Wrong; 15] = [
     ("kept", "start +3cm", |m| late(m, 0.03)),
     ("kept", "start -10cm", |m| late(m, -0.1)),
     ("kept", "masks inverted", |m| {
-        // Times stay where they are known.
+        // Known times are not changed.
         for q in 0..m.lit.len() {
             m.lit[q] = 1 - m.lit[q];
             if m.lit[q] != 0 && m.tau[q] <= m.spots[q / m.pixels()].path_m {
@@ -123,7 +124,7 @@ const WRONG: [Wrong; 15] = [
     }),
 ];
 
-/// What is impossible takes no part, as sources leave it out.
+/// Excludes impossible measurements, as sources do.
 fn clean(m: &mut Measured) {
     let pixels = m.pixels();
     for q in 0..m.lit.len() {
@@ -161,7 +162,8 @@ fn late(m: &mut Measured, by: f32) {
     clean(m);
 }
 
-/// All light comes late by so much, that of one bounce too: captures, whose spots are found by it, lie farther away.
+/// Delays all light by this amount, one-bounce light included. The spots of captures, which are
+/// located by it, are then farther away.
 fn gate(m: &mut Measured, by: f32) {
     late(m, by);
     for s in &mut m.spots {

@@ -1,9 +1,11 @@
-//! The figures of docs/benchmarks.md: L1 of novel views against CPU-seconds.
+//! Measures the figures of docs/benchmarks.md: L1 of novel views against CPU-seconds.
 //!
-//! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
-//! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered
-//! histograms, an hour), `ambient` (photon noise and ambient light in them), `peers` (other methods), `sampling` (bins, pixels and grids of spots), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view), `=TEXT` (rows whose name
-//! holds the text).
+//! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with our
+//! own furniture, from times and shadows of its truth in bins of 128 ps. Further words select:
+//! `captures` (times and shadows from rendered histograms, an hour), `ambient` (photon noise and
+//! ambient light in them), `peers` (other methods), `sampling` (bins, pixels and grids of spots),
+//! `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every
+//! seventh view), `=TEXT` (rows with a name that contains the text).
 
 use std::error::Error;
 
@@ -29,11 +31,11 @@ use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
 use picofarm_transient::{Gate, Progress, render};
 use rustix::time::{ClockId, clock_gettime};
 
-/// Width of a bin of 128 ps, metres.
+/// The width of a bin of 128 ps, metres.
 const BIN_M: f32 = 0.0384;
-/// Pixels a side of a novel view.
+/// The number of pixels along a side of a novel view.
 const SIDE: u32 = 128;
-/// Unseen rooms of each kind.
+/// The number of unseen rooms of each kind.
 const ROOMS: u64 = 8;
 
 struct Unstopped;
@@ -52,16 +54,16 @@ struct Row {
     how: Disturbed,
     settings: Settings,
     captures: bool,
-    /// Spots of a regular grid over the image, as multiplexed captures have them; 0 = the room's own.
+    /// The spots of a regular grid over the image, as in multiplexed captures; 0 = the room's own.
     grid: u32,
-    /// How the field is made.
+    /// The method that computes the field.
     method: Method,
 }
 
-/// A way from measurements to a field.
+/// A method that computes a field from measurements.
 #[derive(Clone, Copy)]
 enum Method {
-    /// This crate's.
+    /// This crate's method.
     Grid,
     BounceFlash,
     DepthAlone(Behind),
@@ -101,7 +103,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// PlatoNeRF's room from the truth in bins of 128 ps.
+/// Returns PlatoNeRF's room from the truth in bins of 128 ps.
 fn usual() -> Row {
     Row {
         name: "chair, 192 nodes",
@@ -117,7 +119,7 @@ fn usual() -> Row {
     }
 }
 
-/// Coarser times and images, and grids of spots.
+/// Returns rows with coarser times and images, and grids of spots.
 fn sampling() -> Vec<Row> {
     let base = usual();
     let bins = |name, times: f32| Row {
@@ -260,7 +262,7 @@ fn rows() -> Vec<Row> {
     ]
 }
 
-/// Rooms from rendered captures, each with several settings.
+/// Evaluates rooms from rendered captures, each with several settings.
 fn captured(every: usize) -> Result<(), Box<dyn Error>> {
     let s = Settings::default();
     let dark = Settings {
@@ -303,7 +305,7 @@ fn captured(every: usize) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The chair from captures of 256 pixels as a detector counts them.
+/// Evaluates the chair from captures of 256 pixels with a simulated detector.
 fn ambient(every: usize) -> Result<(), Box<dyn Error>> {
     let room = PlatoSettings {
         resolution: 256,
@@ -357,7 +359,7 @@ fn ambient(every: usize) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Each method on two rooms; from captures, at 256 pixels.
+/// Returns each method on two rooms; from captures, at 256 pixels.
 fn peers(captures: bool) -> Vec<Row> {
     let rooms = [
         ("chair", PlatoObject::Chair),
@@ -403,7 +405,7 @@ fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
     judge(row.name, &scene, timed(|| row.field(measured))?, every)
 }
 
-/// A field's errors in PlatoNeRF's views, every so manieth.
+/// Prints a field's errors in every `every`-th of PlatoNeRF's views.
 fn judge(
     name: &str,
     scene: &Scene,
@@ -429,7 +431,7 @@ fn judge(
     Ok(())
 }
 
-/// This crate's field, and the iterations that it took.
+/// Returns this crate's field, and its number of iterations.
 fn grid(measured: Measured, settings: Settings) -> Result<(Field, u32), ReconstructError> {
     let made = reconstruct(measured, settings, &Unwatched)?;
     Ok((made.field, made.iterations))
@@ -442,7 +444,7 @@ fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, 
     Ok(captures_of(scene, &rendering(), &|_, _| true)?)
 }
 
-/// How captures are rendered.
+/// Returns the settings for rendering captures.
 fn rendering() -> CaptureSettings {
     CaptureSettings {
         gate: Gate {
@@ -466,7 +468,7 @@ impl Row {
     }
 }
 
-/// What is made, and the CPU-seconds it took.
+/// Returns the result of `make`, and its CPU-seconds.
 fn timed<T>(
     make: impl FnOnce() -> Result<T, ReconstructError>,
 ) -> Result<(T, f64), Box<dyn Error>> {
@@ -487,7 +489,7 @@ fn show(name: &str, s: &ViewScore, (chamfer, floating): (f64, f64), iterations: 
     );
 }
 
-/// Means over unseen rooms of 256 pixels and 25 spots.
+/// Prints means over unseen rooms of 256 pixels and 25 spots.
 fn rooms(furnished: bool, captures: bool) -> Result<(), Box<dyn Error>> {
     let library = AssetLibrary::parametric();
     let (mut sums, mut seconds, mut count) = ([0.0f64; 4], 0.0, 0.0f64);

@@ -1,5 +1,6 @@
-//! Whether measurements agree with one another: times of several spots with one depth, spots with the surfaces around
-//! them, shadows and light with what the camera looks through. Needs no true scene.
+//! The agreement of measurements with one another: times of several spots with one depth, spots
+//! with the surrounding surfaces, and shadows and light with the space that the camera sees
+//! through. No true scene is required.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -7,74 +8,74 @@ use serde::Serialize;
 
 use crate::{Depth, Measured, closed_form::smooth, paths::Paths};
 
-/// Pixels whose paths are followed, at most about.
+/// The approximate greatest number of pixels with evaluated paths.
 const PIXELS: usize = 2048;
-/// Spots that a pixel's times need: fewer agree always.
+/// The least number of spots for comparing a pixel's times: fewer always agree.
 const FEWEST_SPOTS: usize = 3;
-/// Times of a spot below which nothing is said of it alone.
+/// The least number of times for judging a single spot.
 const FEWEST_TIMES: usize = 50;
-/// Share of a spot's pixels below which the same holds.
+/// The least share of lit pixels for judging a single spot.
 const LEAST_LIT: f32 = 0.15;
-/// Residuals beyond this do not count for the common offset, metres.
+/// Residuals beyond this are excluded from the common offset, metres.
 const FAR_M: f32 = 0.3;
-/// Step along a path, metres.
+/// The step along a path, metres.
 const STEP_M: f32 = 0.03;
-/// A place is in front of a surface, or behind it, from this distance on, metres.
+/// The least distance of a position in front of a surface, or behind it, metres.
 const CLEAR_M: f32 = 0.06;
-/// Neighbours whose depths differ by less than this share are one surface.
+/// Neighbours with a smaller relative difference in depth are one surface.
 const SMOOTH: f32 = 0.04;
 
-/// How well times agree with one depth a pixel, before spots are refined.
+/// The agreement of times with one depth a pixel, before spots are refined.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Times {
-    /// Pairs of a pixel and a spot.
+    /// The number of pairs of a pixel and a spot.
     pub pairs: usize,
-    /// Median of the absolute residuals, metres.
+    /// The median of the absolute residuals, metres.
     pub residual_m: f32,
-    /// What all times have in common beyond geometry, metres: positive where they are late.
+    /// The offset that all times have in common beyond geometry, metres: positive if they are late.
     pub offset_m: f32,
-    /// Of each spot the median of its absolute residuals, metres; NaN where it has none.
+    /// Each spot's median of its absolute residuals, metres; NaN if it has none.
     pub by_spot_m: Vec<f32>,
 }
 
-/// What follows from the figures.
+/// The verdict on the figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// Nothing contradicts.
+    /// No figure shows a contradiction.
     Agrees,
-    /// Somebody should look.
+    /// The measurements should be examined.
     Doubtful,
-    /// It cannot be right.
+    /// The measurements cannot be right.
     Contradicts,
 }
 
-/// Whether measurements agree with one another, with the figures.
+/// The agreement of measurements with one another, with its figures.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Agreement {
-    /// What follows.
+    /// The verdict.
     pub verdict: Verdict,
-    /// Why they contradict one another, a sentence each.
+    /// The contradictions, a sentence each.
     pub reasons: Vec<String>,
-    /// Pairs of a pixel and a spot whose times are compared.
+    /// The number of compared pairs of a pixel and a spot.
     pub times: usize,
-    /// Median difference between a time and the depth that all spots' times give, metres of path.
+    /// The median difference between a time and the depth from all spots' times, metres of path.
     pub time_residual_m: Option<f32>,
     /// The spot with the largest such median, and that median.
     pub worst_spot: Option<(usize, f32)>,
-    /// What all times have in common beyond geometry, metres of path.
+    /// The offset that all times have in common beyond geometry, metres of path.
     pub time_offset_m: Option<f32>,
-    /// Median distance of spots from the surfaces that are seen around them, metres.
+    /// The median distance of spots from the visible surfaces around them, metres.
     pub spots_off_surface_m: Option<f32>,
-    /// Share of the pixels that take part and are lit by no spot.
+    /// The share of the pixels in use that no spot lights.
     pub unlit_pixels: Option<f32>,
-    /// Share of shadowed paths that run through nothing but space that the camera looks through.
+    /// The share of shadowed paths that only pass through space that the camera sees through.
     pub shadows_without_cause: Option<f32>,
-    /// Share of lit paths that run through a surface that the camera sees.
+    /// The share of lit paths that pass through a surface that the camera sees.
     pub light_through_surfaces: Option<f32>,
 }
 
-/// Residuals of times where depths along the rays are `range`.
+/// Returns the residuals of times if depths along the rays are `range`.
 pub(crate) fn times(measured: &Measured, range: &[f32]) -> Times {
     let pixels = measured.pixels();
     let foci: Vec<Vec3> = measured
@@ -110,7 +111,7 @@ pub(crate) fn times(measured: &Measured, range: &[f32]) -> Times {
         for &(i, _, late) in &found {
             by_spot[i].push(late.abs());
         }
-        // What is orthogonal to a change of depth tells of an offset that all times share.
+        // The component orthogonal to a change of depth shows an offset that all times share.
         let near = || found.iter().filter(|f| f.2.abs() < FAR_M);
         let (sum, squares) = near().fold((0.0f64, 0.0f64), |(a, b), f| {
             (a + f64::from(f.1), b + f64::from(f.1) * f64::from(f.1))
@@ -134,7 +135,7 @@ pub(crate) fn times(measured: &Measured, range: &[f32]) -> Times {
             .iter_mut()
             .zip(used)
             .map(|(all, used)| {
-                // Of a spot that lights next to nothing, most times may be false returns.
+                // If a spot lights almost nothing, most of its times may be false returns.
                 let enough = all.len() >= FEWEST_TIMES.max((LEAST_LIT * used as f32) as usize);
                 if enough { median(all) } else { f32::NAN }
             })
@@ -143,7 +144,8 @@ pub(crate) fn times(measured: &Measured, range: &[f32]) -> Times {
 }
 
 impl Agreement {
-    /// Of depths that were not found from times: distances along the rays, and spots; with `masks` their shadows too.
+    /// Computes the agreement of depths that do not come from times: distances along the rays, and
+    /// spots; if `masks` is set, also their shadows.
     pub fn of_depths(measured: &Measured, range: &[f32], masks: bool) -> Self {
         let depth = Depth {
             range: range.to_vec(),
@@ -155,7 +157,7 @@ impl Agreement {
     }
 }
 
-/// The verdict on measurements, with depths and normals that follow from them.
+/// Computes the agreement of measurements with the depths and normals computed from them.
 pub(crate) fn check(measured: &Measured, depth: &Depth, times: &Times) -> Agreement {
     judge(measured, figures(measured, depth, Some(times), true))
 }
@@ -187,8 +189,9 @@ fn figures(measured: &Measured, depth: &Depth, times: Option<&Times>, masks: boo
     }
 }
 
-/// Adds what follows from the figures. Thresholds lie between those of consistent rooms and of wrong input; the example
-/// `agreement` measures both, and docs/benchmarks.md has the figures.
+/// Adds the verdict on the figures. The thresholds are between the figures of consistent rooms and
+/// those of wrong input; the example `agreement` measures both, and docs/benchmarks.md has the
+/// figures.
 fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
     let bin = measured.bin_width_m;
     let mut say = |refused: bool, text: String| {
@@ -271,7 +274,8 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
     of
 }
 
-/// From where on a figure is doubtful, and from where on it cannot be right: so many bins, and at least so much.
+/// The limits from which a figure is doubtful, and from which it cannot be right: a number of bins,
+/// and a minimum.
 struct Limit {
     doubtful: [f32; 2],
     refused: [f32; 2],
@@ -287,52 +291,53 @@ impl Limit {
     }
 }
 
-/// What a weak network predicts may be this wrong: it is stated, and not refused.
+/// The predictions of a weak network may be this wrong: this is reported, but not refused.
 const NEVER: [f32; 2] = [0.0, f32::INFINITY];
-/// Of the median difference of times.
+/// The limit of the median difference of times.
 const RESIDUAL: Limit = Limit {
     doubtful: [0.75, 0.03],
     refused: [2.0, 0.1],
 };
-/// Of the median difference of one spot's times,
+/// The limit of the median difference of one spot's times,
 const SPOT: Limit = Limit {
     doubtful: [1.5, 0.06],
     refused: [3.0, 0.15],
 };
-/// which is so many times that of all spots.
+/// which must also exceed that of all spots by this factor.
 const SPOT_TIMES: f32 = 4.0;
-/// Spots from which on an offset of all times is judged. With fewer, errors of single times pass for one: of 64 rooms with 4
-/// spots, 32×32 pixels and bins of 0.077 m, one right room was off by 0.215 m.
+/// The number of spots from which an offset of all times is judged. With fewer, errors of single
+/// times resemble an offset: of 64 rooms with 4 spots, 32×32 pixels and bins of 0.077 m, one right
+/// room had an offset of 0.215 m.
 const OFFSET_SPOTS: usize = 9;
-/// Of what all times have in common.
+/// The limit of the offset that all times have in common.
 const OFFSET: Limit = Limit {
     doubtful: [0.55, 0.01],
     refused: [1.5, 0.05],
 };
-/// Of the spots' distance from surfaces, metres.
+/// The limit of the spots' distance from surfaces, metres.
 const OFF_SURFACE: Limit = Limit {
     doubtful: [0.0, 0.1],
     refused: NEVER,
 };
-/// Of the share of pixels that no spot lights.
+/// The limit of the share of pixels that no spot lights.
 const UNLIT: Limit = Limit {
     doubtful: [0.0, 0.2],
     refused: [0.0, 0.9],
 };
-/// Of the share of shadows that nothing casts.
+/// The limit of the share of shadows without a cause.
 const SHADOWS: Limit = Limit {
     doubtful: [0.0, 0.3],
     refused: NEVER,
 };
-/// Of the share of light through surfaces.
+/// The limit of the share of light through surfaces.
 const LIGHT: Limit = Limit {
     doubtful: [0.0, 0.08],
     refused: NEVER,
 };
-/// Standard error of depths of which none is known, metres.
+/// The standard error of depths if it is unknown, metres.
 const UNKNOWN_M: f32 = 0.01;
 
-/// Pixels of a sample.
+/// Returns the pixels of a sample.
 fn sample(pixels: usize) -> impl Iterator<Item = usize> {
     let stride = pixels.div_ceil(PIXELS).max(1);
     (stride / 2..pixels).step_by(stride)
@@ -343,7 +348,7 @@ fn median(all: &mut [f32]) -> f32 {
     all.get(all.len() / 2).copied().unwrap_or(f32::NAN)
 }
 
-/// The share of the pixels that take part for any spot and are lit by none.
+/// Returns the share of the pixels in use for any spot that no spot lights.
 fn unlit(measured: &Measured) -> Option<f32> {
     let pixels = measured.pixels();
     let (mut all, mut dark) = (0usize, 0usize);
@@ -358,7 +363,7 @@ fn unlit(measured: &Measured) -> Option<f32> {
     (all > 0).then(|| dark as f32 / all as f32)
 }
 
-/// Where a place is in the image; `None` outside of it.
+/// Returns the pixel of a position, or `None` outside the image.
 fn pixel_of(measured: &Measured, place: Vec3) -> Option<(i64, i64)> {
     let i = &measured.camera.intrinsics;
     let q = measured.camera.to_camera(place);
@@ -367,7 +372,8 @@ fn pixel_of(measured: &Measured, place: Vec3) -> Option<(i64, i64)> {
     inside.then_some((u as i64, v as i64))
 }
 
-/// The median over spots in view of the least distance to the planes of surfaces seen around them.
+/// Returns the median over visible spots of the least distance to the planes of surrounding
+/// surfaces.
 fn off_surface(measured: &Measured, depth: &Depth) -> Option<f32> {
     let i = &measured.camera.intrinsics;
     let (width, height) = (i64::from(i.width), i64::from(i.height));
@@ -398,7 +404,8 @@ fn off_surface(measured: &Measured, depth: &Depth) -> Option<f32> {
     middle.is_finite().then_some(middle)
 }
 
-/// Paths of one spot, or of all: how many there are, and how many contradict what the camera sees.
+/// The paths of one spot, or of all: their number, and the number that contradict the camera's
+/// view.
 #[derive(Debug, Clone, Copy, Default)]
 struct Count {
     shadowed: [usize; 2],
@@ -415,7 +422,8 @@ impl Count {
     }
 }
 
-/// Shadowed paths through free space alone, and lit ones through a surface, of each spot.
+/// Counts shadowed paths that only pass through free space, and lit ones through a surface, for
+/// each spot.
 fn paths(measured: &Measured, depth: &Depth) -> Vec<Count> {
     let (near, far) = extremes(measured, depth);
     let paths = Paths::new(measured, depth);
@@ -438,7 +446,7 @@ fn paths(measured: &Measured, depth: &Depth) -> Vec<Count> {
                 let smooth = far[p] - near[p] < SMOOTH * near[p];
                 behind = smooth && away > far[p] + CLEAR_M && away < far[p] + 4.0 * CLEAR_M;
             }
-            // Next to the surfaces at its ends a path is not clear of them.
+            // Next to the surfaces at its ends, a path cannot be clear of them.
             let low = |normal: Vec3, foot: Vec3| normal.dot(place - foot) < CLEAR_M;
             let ends = low(here, path.origin) || (there != Vec3::ZERO && low(there, end));
             free &= front || ends;
@@ -465,7 +473,8 @@ fn paths(measured: &Measured, depth: &Depth) -> Vec<Count> {
     (0..paths.spots()).map(of).collect()
 }
 
-/// Least and greatest range of each pixel and its eight neighbours; NaN where one is not known.
+/// Returns the least and greatest range of each pixel and its eight neighbours; NaN if one is
+/// unknown.
 fn extremes(measured: &Measured, depth: &Depth) -> (Vec<f32>, Vec<f32>) {
     let i = &measured.camera.intrinsics;
     let (width, height) = (i.width as usize, i.height as usize);

@@ -1,5 +1,5 @@
-//! Other ways from the same measurements to a field, to compare with: bounce-flash lidar's space carving, and a depth map
-//! alone. The scores read their fields like those of a reconstruction.
+//! Baseline methods that compute a field from the same measurements: bounce-flash lidar's space
+//! carving, and a depth map alone. Their fields are scored like those of a reconstruction.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -12,18 +12,19 @@ use crate::{
     start::{State, bounds, start},
 };
 
-/// Chance that a lit path goes through an occupied voxel (PlatoNeRF's run of bounce-flash lidar; Henley et al. 2022).
+/// The probability that a lit path goes through an occupied voxel (PlatoNeRF's run of bounce-flash
+/// lidar; Henley et al. 2022).
 const ETA: f64 = 0.05;
-/// Chance that a path through an empty voxel is in shadow, likewise.
+/// The probability that a path through an empty voxel is in shadow; same source.
 const XI: f64 = 0.5;
-/// Share of voxels that are empty, and occupied, before anything is measured, likewise.
+/// The prior shares of empty and of occupied voxels; same source.
 const PRIOR: [f64; 2] = [0.8, 0.2];
-/// A voxel is occupied from this probability on, likewise.
+/// The probability from which a voxel is occupied; same source.
 const OCCUPIED: f64 = 0.3;
-/// Steps of a path, voxels.
+/// The step along a path, voxels.
 const STEP: f32 = 0.7;
 
-/// What is taken to be behind the surfaces that the camera sees.
+/// The assumption about the space behind the surfaces that the camera sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Behind {
     /// Solid matter: the visible surface extruded away from the camera.
@@ -32,11 +33,13 @@ pub enum Behind {
     Empty,
 }
 
-/// Bounce-flash lidar: the median over the spots of the depths on their ellipsoids, then space carving on a grid with `nodes`
-/// nodes along its longest side, in metres. A voxel that M spots see by lit paths alone and N by any shadowed path is
-/// occupied with probability p₁·ηᴹ·(1−η)ᴺ / (p₀·(1−ξ)ᴹ·ξᴺ + p₁·ηᴹ·(1−η)ᴺ); η = 0.05, ξ = 0.5, p₀ = 0.8, p₁ = 0.2,
-/// threshold 0.3 (Henley et al. 2022; numbers of Klinghoffer et al., CVPR 2024). Paths end at the surface point; what the
-/// camera sees, or sees through, is taken from the depth. There are no planes of a room.
+/// Computes bounce-flash lidar: the median over the spots of the depths on their ellipsoids,
+/// followed by space carving on a grid with `nodes` nodes along its longest side, in metres. If M
+/// spots see a voxel by lit paths alone and N by any shadowed path, it is occupied with probability
+/// p₁·ηᴹ·(1−η)ᴺ / (p₀·(1−ξ)ᴹ·ξᴺ + p₁·ηᴹ·(1−η)ᴺ); η = 0.05, ξ = 0.5, p₀ = 0.8, p₁ = 0.2, threshold
+/// 0.3 (Henley et al. 2022; numbers of Klinghoffer et al., CVPR 2024). Paths end at the surface
+/// point. Voxels that the camera sees, or sees through, are set from the depth. Planes of a room
+/// are not used.
 ///
 /// # Errors
 /// [`ReconstructError::Invalid`] for measurements that cannot be used, or fewer than 16 nodes.
@@ -72,7 +75,8 @@ pub fn bounce_flash(measured: &Measured, nodes: u32) -> Result<Field, Reconstruc
     Ok(field)
 }
 
-/// The depth map alone: the visible surface from times and planes as in a reconstruction, and nothing from shadows.
+/// Computes a field from the depth map alone: the visible surface from times and planes as in a
+/// reconstruction, without shadows.
 ///
 /// # Errors
 /// [`ReconstructError::Invalid`] for settings or measurements that cannot be used.
@@ -122,7 +126,7 @@ fn some_depth(depth: &Depth) -> Result<(), ReconstructError> {
     }
 }
 
-/// Of each pixel the median over its lit spots; no normals.
+/// Returns each pixel's median over its lit spots, without normals.
 fn median_depth(measured: &Measured) -> Depth {
     let pixels = measured.pixels();
     let of = |p: usize| {
@@ -152,7 +156,7 @@ fn median_depth(measured: &Measured) -> Depth {
 const LIT: u8 = 1;
 const SHADOWED: u8 = 2;
 
-/// Which kinds of paths of one spot each node meets.
+/// Returns the kinds of paths of one spot that pass each node.
 fn met(field: &Field, skip: &Skip, measured: &Measured, depth: &Depth, spot: usize) -> Vec<u8> {
     let mut met = vec![0u8; field.logit.len()];
     let [_, y, z] = field.strides();
@@ -182,7 +186,8 @@ fn met(field: &Field, skip: &Skip, measured: &Measured, depth: &Depth, spot: usi
     met
 }
 
-/// Posterior probability of a voxel seen by M spots by lit paths alone and N by shadowed ones.
+/// Returns the posterior probability that a voxel is occupied, if M spots see it by lit paths alone
+/// and N by shadowed ones.
 fn occupied([lit, shadowed]: [u16; 2]) -> f64 {
     let power = |base: f64, n: u16| (0..n).fold(1.0, |x, _| x * base);
     let solid = PRIOR[1] * power(ETA, lit) * power(1.0 - ETA, shadowed);

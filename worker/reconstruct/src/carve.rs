@@ -1,6 +1,6 @@
-//! Carving by light paths: how empty an unseen node is, as the largest share over the spots of the paths through it that are
-//! lit. One spot that shines through a place proves it empty; a share forgives single wrong mask pixels, which ruin
-//! space carving with hard decisions.
+//! Carving by light paths. The emptiness of an unseen node is the largest share, over the spots, of
+//! lit paths among those through it. A single spot that shines through a position proves it empty.
+//! A share tolerates single wrong mask pixels, which ruin space carving with hard decisions.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -13,17 +13,18 @@ use crate::{
     start::State,
 };
 
-/// Steps of a path, voxels.
+/// The step along a path, voxels.
 const STEP: f32 = 0.7;
-/// Paths that a share needs at least.
+/// The least number of paths for a share.
 const FEWEST: u16 = 2;
-/// Paths below which a share counts less.
+/// The number of paths below which a share has less weight.
 const FEW: u16 = 4;
 
-/// What light paths say of a grid's nodes.
+/// The emptiness of a grid's nodes according to light paths.
 #[derive(Debug, Clone)]
 pub struct Carved {
-    /// How empty each unseen node is, in [0, 1]; −1 where no path goes, and at nodes that are seen.
+    /// The emptiness of each unseen node, in [0, 1]; −1 for nodes without paths, and for visible
+    /// nodes.
     pub empty: Vec<f32>,
 }
 
@@ -51,7 +52,8 @@ pub fn carve(
             .then(|| count(field, (&skip, &slot, unseen.len()), paths, spot))
     };
     let mut best = vec![-1.0f32; unseen.len()];
-    // A wave of spots at a time bounds the memory; a maximum does not depend on the order.
+    // Processing a limited number of spots at a time bounds the memory; a maximum does not depend
+    // on the order.
     let wave = rayon::current_num_threads().max(1);
     let spots: Vec<usize> = (0..paths.spots()).collect();
     for some in spots.chunks(wave) {
@@ -74,7 +76,7 @@ pub fn carve(
     Ok(Carved { empty })
 }
 
-/// Lit paths and all paths of one spot through each unseen node.
+/// Counts lit paths and all paths of one spot through each unseen node.
 fn count(
     field: &Field,
     (skip, slot, unseen): (&Skip, &[u32], usize),

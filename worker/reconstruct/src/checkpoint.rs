@@ -1,15 +1,15 @@
-//! A reconstruction's state as bytes, for going on later or elsewhere. Only the optimisation is kept: what comes before is
-//! made again in a few seconds, to the same bits.
+//! A reconstruction's state as bytes, for resuming later or elsewhere. Only the state of the
+//! optimisation is stored; the earlier steps are repeated in a few seconds with the same bits.
 
 use crate::{
     Measured, Progress, ReconstructError, Reconstruction, Settings, reconstruction::Saved,
 };
 
-/// First bytes of a checkpoint: its form and version.
+/// The first bytes of a checkpoint: its format and version.
 const MAGIC: &[u8; 8] = b"pfrecon2";
 
 impl Reconstruction {
-    /// The state as bytes: little-endian, a few MB.
+    /// Returns the state as bytes: little-endian, a few MB.
     pub fn checkpoint(&self) -> Vec<u8> {
         let mut out = MAGIC.to_vec();
         out.extend(self.fingerprint().to_le_bytes());
@@ -27,10 +27,11 @@ impl Reconstruction {
         out
     }
 
-    /// Goes on from a checkpoint of the same measurements and settings.
+    /// Resumes from a checkpoint of the same measurements and settings.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] for bytes that are no checkpoint of these; otherwise as [`Reconstruction::begin`].
+    /// [`ReconstructError::Invalid`] for bytes that are not a checkpoint of these; otherwise as for
+    /// [`Reconstruction::begin`].
     pub fn resume(
         measured: Measured,
         settings: Settings,
@@ -81,7 +82,7 @@ impl Reconstruction {
         Ok(begun)
     }
 
-    /// FNV-1a over what the optimisation starts from.
+    /// Returns the FNV-1a hash of the optimisation's inputs.
     fn fingerprint(&self) -> u64 {
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         let mut take = |x: u32| {

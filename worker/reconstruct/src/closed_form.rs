@@ -1,6 +1,7 @@
-//! Depth in closed form: a two-bounce time puts the surface point on an ellipsoid with the spot and the camera as foci,
-//! which a pixel's ray meets once (Henley et al. 2022, bounce-flash lidar). Several spots are joined by weighted least
-//! squares; neighbouring pixels by a plane in inverse depth.
+//! Depth in closed form: a two-bounce time defines an ellipsoid for the surface point, with the
+//! spot and the camera as foci, and a pixel's ray intersects it once (Henley et al. 2022,
+//! bounce-flash lidar). Several spots are combined by weighted least squares; neighbouring pixels
+//! by a plane in inverse depth.
 
 mod smooth;
 
@@ -14,29 +15,31 @@ use crate::{
 
 pub use smooth::smooth;
 
-/// Rounds of refining the spots' distances.
+/// The number of rounds that refine the spots' distances.
 const ROUNDS: usize = 4;
-/// Newton steps of the least squares of a pixel.
+/// The number of Newton steps in the least squares of a pixel.
 const STEPS: usize = 4;
-/// Least sensitivity of a time to depth: below it (surface point and camera on opposite sides of the spot) a time says
-/// nothing about depth.
+/// The least sensitivity of a time to depth. A less sensitive time (with surface point and camera
+/// on opposite sides of the spot) contains no information about depth.
 const LEAST_SENSITIVITY: f32 = 0.1;
-/// Residuals are trusted to at least this, metres, where times are exact.
+/// The lower bound of the residuals' scale for exact times, metres.
 const FINEST: f32 = 1e-3;
 
-/// What every pixel sees.
+/// The surface that every pixel sees.
 #[derive(Debug, Clone)]
 pub struct Depth {
-    /// Distance along the ray, metres; NaN where no time is known. `[row][column]`.
+    /// The distance along the ray, metres; NaN if no time is known. `[row][column]`.
     pub range: Vec<f32>,
-    /// Its standard error from the residuals of the spots' times, metres; NaN likewise.
+    /// The standard error of the distance from the residuals of the spots' times, metres; NaN if no
+    /// time is known.
     pub error: Vec<f32>,
-    /// Unit normal in world axes, facing the camera; zero where unknown.
+    /// The unit normal in world axes, facing the camera; zero if unknown.
     pub normal: Vec<Vec3>,
 }
 
-/// Depth of every pixel. The distances of spots that lie straight along their beams are refined on the way, since each is
-/// known to half a bin only. And how well the times agreed before that.
+/// Computes the depth of every pixel, and the agreement of the times before spots are refined. The
+/// distances of spots that are straight along their beams are refined, because each is only known
+/// to half a bin.
 pub fn closed_form(measured: &mut Measured) -> (Depth, Times) {
     let mut range = fit(measured, &medians(measured)).0;
     let times = agreement::times(measured, &range);
@@ -54,22 +57,24 @@ pub fn closed_form(measured: &mut Measured) -> (Depth, Times) {
     (depth, times)
 }
 
-/// A spot relative to the camera, which is one focus.
+/// Returns a spot relative to the camera, which is one focus.
 fn seen(measured: &Measured, spot: &MeasuredSpot) -> Vec3 {
     spot.point - measured.camera.origin
 }
 
-/// Distance along the unit ray `r` at which |x| + |x − l| = s; not positive where there is none.
+/// Returns the distance along the unit ray `r` at which |x| + |x − l| = s; it is not positive if
+/// there is none.
 pub(crate) fn on_ellipsoid(s: f32, l: Vec3, r: Vec3) -> f32 {
     (s * s - l.dot(l)) / (2.0 * (s - r.dot(l)))
 }
 
-/// How much a time grows with depth: 1 + cos of the angle between the ray and the way from spot to point. In [0, 2].
+/// Returns the derivative of a time with respect to depth: 1 + cos of the angle between the ray and
+/// the direction from spot to point. In [0, 2].
 fn sensitivity(to_point: Vec3, r: Vec3) -> f32 {
     1.0 + to_point.dot(r) / to_point.length().max(1e-3)
 }
 
-/// Of each pixel the weighted median over its lit spots.
+/// Returns each pixel's weighted median over its lit spots.
 fn medians(measured: &Measured) -> Vec<f32> {
     let pixels = measured.pixels();
     let foci: Vec<Vec3> = measured.spots.iter().map(|s| seen(measured, s)).collect();
@@ -99,8 +104,9 @@ fn medians(measured: &Measured) -> Vec<f32> {
     (0..pixels).into_par_iter().map(of).collect()
 }
 
-/// Weighted least squares of each pixel over its lit spots from a first guess: depth and its standard error. Residuals
-/// within half a bin count little (a time is somewhere in its bin), far ones hardly.
+/// Fits each pixel by weighted least squares over its lit spots, starting from a guess. Returns
+/// depth and its standard error. Residuals within half a bin have little influence, because a time
+/// is anywhere in its bin; large residuals have almost none.
 fn fit(measured: &Measured, guess: &[f32]) -> (Vec<f32>, Vec<f32>) {
     let pixels = measured.pixels();
     let dead = (0.5 * measured.bin_width_m).max(FINEST);
@@ -142,7 +148,7 @@ fn fit(measured: &Measured, guess: &[f32]) -> (Vec<f32>, Vec<f32>) {
     (0..pixels).into_par_iter().map(of).unzip()
 }
 
-/// Moves each straight spot along its beam to where the depths of all pixels say that it is.
+/// Moves each straight spot along its beam to the position that best fits the depths of all pixels.
 fn refine_spots(measured: &mut Measured, range: &[f32]) {
     let pixels = measured.pixels();
     let this = &*measured;
@@ -162,7 +168,8 @@ fn refine_spots(measured: &mut Measured, range: &[f32]) {
             let length = way.length();
             let g = 1.0 - way.dot(spot.direction) / length;
             let miss = depth + length + spot.path_m - this.tau[q];
-            // Pixels near the spot are sensitive to its place sideways, and outliers to anything.
+            // Pixels near the spot are sensitive to its lateral position, and outliers are
+            // unreliable.
             if length < 0.2 || miss.abs() > limit {
                 continue;
             }

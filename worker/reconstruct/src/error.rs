@@ -1,28 +1,28 @@
-//! Why a reconstruction cannot be made.
+//! The errors of reconstructions.
 
 use picofarm_transient::RenderError;
 
-/// Why a reconstruction cannot be made or scored.
+/// The reason why a reconstruction cannot be made or scored.
 #[derive(Debug, thiserror::Error)]
 pub enum ReconstructError {
-    /// A value is unusable.
+    /// A value cannot be used.
     #[error("{field}: {what}")]
     Invalid {
-        /// Field, e.g. `spots[3].path_m`.
+        /// The field, e.g. `spots[3].path_m`.
         field: String,
-        /// What was found, what was expected, and how to mend it.
+        /// The value, the expected values, and how to correct it.
         what: String,
     },
     /// The measurements contradict one another.
     #[error("the measurements contradict one another: {}", reasons.join("; "))]
     Inconsistent {
-        /// Why, a sentence each.
+        /// The reasons, a sentence each.
         reasons: Vec<String>,
     },
-    /// The renderer that made the measurements or the truth refused.
+    /// The renderer that makes the measurements or the truth failed.
     #[error(transparent)]
     Render(#[from] RenderError),
-    /// [`crate::Progress::at`] asked to stop before there was anything to keep.
+    /// [`crate::Progress::at`] requested a stop before there was a result.
     #[error("reconstruction stopped on request")]
     Stopped,
 }

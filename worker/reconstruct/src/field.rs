@@ -1,6 +1,6 @@
-//! The density field: a logit u at the nodes of a regular grid, trilinear between them, with density
-//! σ = (4/h) · sigmoid(u) in 1/m, where h is the distance between nodes. A logit that is linear across a surface puts it
-//! anywhere between nodes.
+//! The density field: a logit u at the nodes of a regular grid, trilinear between them, with
+//! density σ = (4/h) · sigmoid(u) in 1/m and the distance h between nodes. A logit that is linear
+//! across a surface can place it anywhere between nodes.
 
 mod skip;
 
@@ -8,37 +8,40 @@ use picofarm_scene::Vec3;
 
 pub use skip::Skip;
 
-/// Density of solid matter times the distance between nodes: half the light is gone after a sixth of a voxel.
+/// The density of solid matter times the distance between nodes: half the light is absorbed after a
+/// sixth of a voxel.
 pub const PEAK: f32 = 4.0;
-/// Change of the logit over one voxel across a surface at its start.
+/// The change of the logit over one voxel across a surface at its start.
 pub const GAIN: f32 = 6.0;
-/// Logit of empty space.
+/// The logit of empty space.
 pub const EMPTY: f32 = -9.0;
-/// Logit of solid matter.
+/// The logit of solid matter.
 pub const SOLID: f32 = 9.0;
 
-/// Logit at a surface. A flat surface at which the logit grows by [`GAIN`] a voxel stops half of a ray that meets it at a
-/// right angle exactly where the logit is this: ∫σ = (4/GAIN)·ln(1 + eᵘ) = ln 2.
+/// Returns the logit at a surface. If the logit grows by [`GAIN`] a voxel at a flat surface, half
+/// the light of a ray at a right angle is absorbed exactly where the logit has this value: ∫σ =
+/// (4/GAIN)·ln(1 + eᵘ) = ln 2.
 pub fn surface_logit() -> f32 {
     // 2^(6/4) − 1 = 1.828…
     libm::logf(libm::powf(2.0, GAIN / PEAK) - 1.0)
 }
 
-/// Logits on a grid. Node (i, j, k) lies at origin + h·(i, j, k); its index is (k·ny + j)·nx + i.
+/// Logits on a grid. Node (i, j, k) is at origin + h·(i, j, k); its index is (k·ny + j)·nx + i.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Field {
-    /// Nodes along x, y and z, at least two each.
+    /// The number of nodes along x, y and z, at least two each.
     pub nodes: [usize; 3],
-    /// Place of node (0, 0, 0), metres, the scene's axes.
+    /// The position of node (0, 0, 0), metres, in the scene's axes.
     pub origin: Vec3,
-    /// Distance h between neighbouring nodes, metres.
+    /// The distance h between neighbouring nodes, metres.
     pub spacing: f32,
-    /// Logits u.
+    /// The logits u.
     pub logit: Vec<f32>,
 }
 
 impl Field {
-    /// Empty space over the box from `lo` to `hi`, with `nodes` nodes along its longest side.
+    /// Returns empty space over the box from `lo` to `hi`, with `nodes` nodes along its longest
+    /// side.
     pub fn over(lo: Vec3, hi: Vec3, nodes: usize) -> Self {
         let size = hi - lo;
         let spacing = size.x.max(size.y).max(size.z) / (nodes.max(2) - 1) as f32;
@@ -52,31 +55,31 @@ impl Field {
         }
     }
 
-    /// Place of a node, metres.
+    /// Returns the position of a node, metres.
     pub fn at(&self, index: usize) -> Vec3 {
         let [nx, ny, _] = self.nodes;
         let (i, j, k) = (index % nx, index / nx % ny, index / (nx * ny));
         self.origin + Vec3::new(i as f32, j as f32, k as f32) * self.spacing
     }
 
-    /// Index steps to the next node along x, y and z.
+    /// Returns the index steps to the next node along x, y and z.
     pub fn strides(&self) -> [usize; 3] {
         [1, self.nodes[0], self.nodes[0] * self.nodes[1]]
     }
 
-    /// Density at a node, 1/m.
+    /// Returns the density at a node, 1/m.
     pub fn density(&self, index: usize) -> f32 {
         PEAK / self.spacing * sigmoid(self.logit[index])
     }
 
-    /// The far corner of the grid.
+    /// Returns the far corner of the grid.
     pub fn end(&self) -> Vec3 {
         let [x, y, z] = self.nodes.map(|n| (n - 1) as f32 * self.spacing);
         self.origin + Vec3::new(x, y, z)
     }
 
-    /// The part of a ray inside the grid: the t at which it enters and leaves; the first is greater than the second where
-    /// it misses.
+    /// Returns the t at which a ray enters and leaves the grid. If it misses the grid, the first is
+    /// greater than the second.
     pub fn span(&self, origin: Vec3, direction: Vec3) -> (f32, f32) {
         let (lo, hi) = (self.origin, self.end());
         let (mut near, mut far) = (f32::NEG_INFINITY, f32::INFINITY);
@@ -90,7 +93,7 @@ impl Field {
         (near, far)
     }
 
-    /// Logit inside a cell at the fractions `f` from its first node.
+    /// Returns the logit inside a cell at the fractions `f` from its first node.
     #[inline(always)]
     pub fn interpolate(&self, cell: usize, f: [f32; 3]) -> f32 {
         let [_, y, z] = self.strides();
@@ -101,9 +104,9 @@ impl Field {
         low + f[2] * (high - low)
     }
 
-    /// Visits the middles of steps along a ray between t = `near` and `far`, leaving out cells that `skip` says are of no
-    /// interest. The visitor gets t, the cell and the place in it, and returns whether to go on. The first step begins
-    /// `offset` steps before the usual place, in [−0.5, 0.5].
+    /// Visits the middles of steps along a ray between t = `near` and `far`, except in cells that
+    /// `skip` excludes. The visitor receives t, the cell and the position in it, and returns
+    /// whether to continue. The first step is shifted by `offset` steps, in [−0.5, 0.5].
     #[inline(always)]
     pub fn march(
         &self,
@@ -146,13 +149,14 @@ impl Field {
     }
 }
 
-/// 1/(1 + e⁻ᵘ), the same bits on every machine. Relative error below 1e-6 for |u| < 80.
+/// Returns 1/(1 + e⁻ᵘ), with the same bits on every machine. The relative error is below 1e-6 for
+/// |u| < 80.
 #[inline(always)]
 pub fn sigmoid(u: f32) -> f32 {
     1.0 / (1.0 + exp(-u))
 }
 
-/// eˣ for |x| < 80 by 2ⁿ times a polynomial (Cephes' expf); beyond, the value there.
+/// Returns eˣ for |x| < 80 by 2ⁿ times a polynomial (Cephes' expf). Larger arguments are clamped.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     let x = x.clamp(-80.0, 80.0);

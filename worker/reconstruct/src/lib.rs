@@ -1,9 +1,10 @@
-//! Reconstruction of one scene from light that bounced twice: a density field of a room, fitted to two-bounce times and
-//! shadow masks, in seconds on a CPU.
+//! Reconstruction of one scene from light that bounced twice: a density field of a room, fitted to
+//! two-bounce times and shadow masks, in seconds on a CPU.
 //!
-//! The problem is PlatoNeRF's (Klinghoffer et al., CVPR 2024); the method is not a network but a grid whose start comes in
-//! closed form and from carving. `closed_form`, `planes`, `start`, `carve` and `optimise` explain the steps in this order;
-//! `docs/benchmarks.md` has the figures. This crate knows nothing of jobs or stores; files are the caller's.
+//! The problem is PlatoNeRF's (Klinghoffer et al., CVPR 2024). The method is not a network but a
+//! grid with a start from closed-form depth and carving. `closed_form`, `planes`, `start`, `carve`
+//! and `optimise` explain the steps in this order; `docs/benchmarks.md` has the figures. This crate
+//! is independent of jobs and stores; the caller handles files.
 
 mod agreement;
 pub mod baseline;
@@ -39,5 +40,6 @@ pub use progress::{Phase, Progress, Unwatched};
 pub use reconstruction::{Evidence, Reconstructed, Reconstruction, reconstruct};
 pub use world::{Hit, World};
 
-/// Version of the reconstruction: part of every task key. Change it whenever any bit of a result may change.
+/// The version of the reconstruction, which is part of every task key. Change it whenever any bit
+/// of a result may change.
 pub const VERSION: &str = "reconstruct-5";

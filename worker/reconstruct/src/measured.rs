@@ -1,75 +1,78 @@
-//! What a reconstruction is made from: two-bounce times and shadow masks of K spots, whatever their source.
+//! The input of a reconstruction: two-bounce times and shadow masks of K spots, from any source.
 
 use picofarm_scene::{Camera, Vec3};
 
 use crate::ReconstructError;
 
-/// Pixels whose ray is nearer to a laser beam than this (sine of the angle) take no part for that spot: its one-bounce
-/// light drowns theirs (PlatoNeRF, `src/run_platonerf.py`).
+/// The sine of the least angle between a pixel's ray and a laser beam. Pixels at smaller angles are
+/// not used for that spot, because its one-bounce light drowns their light (PlatoNeRF,
+/// `src/run_platonerf.py`).
 pub const NEAR_SPOT_SINE: f32 = 0.05;
 
 /// An illumination spot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredSpot {
-    /// Index of its beam in the scene.
+    /// The index of its beam in the scene.
     pub beam: usize,
-    /// Unit direction from the laser.
+    /// The unit direction from the laser.
     pub direction: Vec3,
-    /// Position L, metres, world axes.
+    /// The position L, metres, in world axes.
     pub point: Vec3,
-    /// Optical path from laser to spot, metres.
+    /// The optical path from laser to spot, metres.
     pub path_m: f32,
-    /// The beam came by way of a mirror: the spot does not lie along `direction`.
+    /// Whether a mirror reflected the beam, so that the spot is not along `direction`.
     pub folded: bool,
 }
 
-/// A spot that takes no part.
+/// An excluded spot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LeftOut {
-    /// Index of its beam in the scene.
+    /// The index of its beam in the scene.
     pub beam: usize,
-    /// Why.
+    /// The reason.
     pub why: String,
 }
 
-/// Two-bounce times and shadow masks of one camera. Arrays over pixels are row-major, `[row][column]`; those over spots
-/// too are `[spot][row][column]`.
+/// The two-bounce times and shadow masks of one camera. Arrays over pixels are row-major,
+/// `[row][column]`; those that are also over spots are `[spot][row][column]`.
 #[derive(Debug, Clone)]
 pub struct Measured {
     /// The camera.
     pub camera: Camera,
-    /// Where the laser stands, metres.
+    /// The laser's position, metres.
     pub laser: Vec3,
     /// The K spots.
     pub spots: Vec<MeasuredSpot>,
-    /// Two-bounce path laser → spot → surface → camera, metres; meaningless where not lit.
+    /// The two-bounce path laser → spot → surface → camera, metres; undefined for pixels in shadow.
     pub tau: Vec<f32>,
     /// 1 = lit, 0 = in shadow.
     pub lit: Vec<u8>,
-    /// 1 = takes part, 0 = unknown.
+    /// 1 = used, 0 = unknown.
     pub used: Vec<u8>,
-    /// Width of the bins that the times were read from, metres; 0 = times are exact. A time is the middle of its bin.
+    /// The width of the bins of the times, metres; 0 = times are exact. A time is the middle of its
+    /// bin.
     pub bin_width_m: f32,
-    /// Pixels that see a mirror, where that is known, and take no part in anything; empty = none known.
+    /// The pixels known to see a mirror, which are not used at all; empty = none known.
     pub mirror: Vec<u8>,
-    /// Spots that take no part.
+    /// The spots that are not used.
     pub left_out: Vec<LeftOut>,
 }
 
 impl Measured {
-    /// Number of pixels.
+    /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.camera.intrinsics.width as usize * self.camera.intrinsics.height as usize
     }
 
-    /// Unit direction through the middle of a pixel.
+    /// Returns the unit direction through the middle of a pixel.
     pub fn ray(&self, pixel: usize) -> Vec3 {
         let width = self.camera.intrinsics.width as usize;
         let (x, y) = ((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
         self.camera.ray(x, y).normalized()
     }
 
-    /// Checks what the reconstruction relies on, and says what cannot be found from these measurements.
+    /// Checks the assumptions of the reconstruction, and returns notes on properties that cannot be
+    /// determined from these measurements.
     ///
     /// # Errors
     /// [`ReconstructError::Invalid`] naming the first unusable field.

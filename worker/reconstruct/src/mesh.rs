@@ -1,9 +1,10 @@
 //! The surface of a density field as triangles.
 //!
-//! The surface lies where a ray that meets it at a right angle has lost half its light (T = 0.5): at the logit
-//! [`surface_logit`]. Naive surface nets (Gibson 1998; crate `fast-surface-nets`) give one vertex for each cell that the
-//! surface crosses, at the mean of its crossings; Newton steps along the gradient then move it onto the surface between the
-//! nodes. Where the grid ends, solid matter is left open.
+//! The surface is defined as the points where a ray at a right angle to it has lost half its light
+//! (T = 0.5): the logit [`surface_logit`]. Naive surface nets (Gibson 1998; crate
+//! `fast-surface-nets`) give one vertex for each cell that the surface crosses, at the mean of its
+//! crossings; Newton steps along the gradient then move it onto the surface between the nodes. The
+//! surface is open at the ends of the grid.
 
 mod glb;
 
@@ -14,21 +15,22 @@ use rayon::prelude::*;
 
 use crate::field::{Field, surface_logit};
 
-/// Newton steps of a vertex.
+/// The number of Newton steps of a vertex.
 const STEPS: usize = 3;
-/// Longest way of a vertex from where surface nets put it, voxels.
+/// The greatest distance of a vertex from its position in the surface nets, voxels.
 const FARTHEST: f32 = 0.7;
 
-/// A triangle mesh in metres, the scene's axes. Facets are counter-clockwise seen from empty space.
+/// A triangle mesh in metres, in the scene's axes. Facets are counter-clockwise seen from empty
+/// space.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Surface {
-    /// Vertices.
+    /// The vertices.
     pub positions: Vec<Vec3>,
-    /// Vertex indices.
+    /// The vertex indices.
     pub triangles: Vec<[u32; 3]>,
 }
 
-/// The surface of a field.
+/// Returns the surface of a field.
 pub fn surface(field: &Field) -> Surface {
     let level = surface_logit();
     let shape = RuntimeShape::<u32, 3>::new(field.nodes.map(|n| n as u32));
@@ -47,7 +49,7 @@ pub fn surface(field: &Field) -> Surface {
     }
 }
 
-/// A vertex in grid coordinates moved onto the level along the gradient.
+/// Moves a vertex in grid coordinates onto the level along the gradient.
 fn settled(field: &Field, start: Vec3, level: f32) -> Vec3 {
     let mut p = start;
     for _ in 0..STEPS {
@@ -67,7 +69,7 @@ fn settled(field: &Field, start: Vec3, level: f32) -> Vec3 {
     if p.is_finite() { p } else { start }
 }
 
-/// Logit and its gradient by grid coordinates; `None` outside the grid.
+/// Returns the logit and its gradient in grid coordinates, or `None` outside the grid.
 fn value_and_gradient(field: &Field, p: Vec3) -> Option<(f32, Vec3)> {
     let inside = |k: usize| p[k] >= 0.0 && p[k] < (field.nodes[k] - 1) as f32;
     if !(0..3).all(inside) {
@@ -89,7 +91,7 @@ fn value_and_gradient(field: &Field, p: Vec3) -> Option<(f32, Vec3)> {
 }
 
 impl Surface {
-    /// Binary little-endian PLY.
+    /// Encodes the surface as binary little-endian PLY.
     pub fn ply(&self) -> Vec<u8> {
         let mut out = format!(
             "ply\nformat binary_little_endian 1.0\ncomment picofarm reconstruction, metres\nelement vertex {}\n\
@@ -109,7 +111,7 @@ impl Surface {
         out
     }
 
-    /// Corners of every triangle.
+    /// Returns the corners of every triangle.
     pub(crate) fn corners(&self) -> Vec<[Vec3; 3]> {
         let at = |v: u32| self.positions[v as usize];
         self.triangles.iter().map(|t| t.map(at)).collect()

@@ -1,12 +1,14 @@
 //! Optimisation of the logits on the transmittance of rays, by stochastic gradients.
 //!
-//! Along a ray, ∂T/∂σ is the same everywhere, so gradients need no graph: one march collects the optical depth and the
-//! places, a second pass over them spreads the derivative. The loss of a ray whose light gets through is its optical depth
-//! s (saturating: 10·ln(1 + s/10)); of one whose light is stopped −ln(1 − T + 0.02). Both classes and the camera's rays
-//! make a third of a batch each. Gradients are summed in fixed point: integer sums are the same in any order.
+//! Along a ray, ∂T/∂σ is the same everywhere, so gradients need no graph: one march collects the
+//! optical depth and the positions, and a second pass over them distributes the derivative. The
+//! loss of a free ray is its optical depth s, with saturation: 10·ln(1 + s/10). The loss of a
+//! stopped ray is −ln(1 − T + 0.02). Both classes and the camera's rays make up a third of a batch
+//! each. Gradients are summed in fixed point, because integer sums are the same in any order.
 //!
-//! One ray of twenty is held out. Every ten iterations their loss is looked at. Once it was hardly lower twice in a row, half as many
-//! iterations at a lower rate follow, and then the end.
+//! One ray in twenty is held out. The loss of the held-out rays is evaluated every ten iterations.
+//! When it has hardly decreased twice in a row, half as many further iterations follow at a lower
+//! rate, and then the optimisation ends.
 
 mod adam;
 mod cast;
@@ -27,64 +29,65 @@ pub use cast::{Cast, cast_ray};
 
 /// Gradients are multiples of 2⁻²⁴.
 const UNIT: f32 = 16_777_216.0;
-/// Voxels round unseen space that may change too.
+/// The distance around unseen space in which nodes may change too, voxels.
 const REACH: usize = 2;
-/// Emptiness from which on a node that no ray contradicts starts as empty.
+/// The emptiness from which a node that no ray contradicts starts as empty.
 const SURELY: f32 = 0.9;
-/// Emptiness at which a node starts half full.
+/// The emptiness at which a node starts half full.
 const EVEN: f32 = 0.35;
 
-/// Iterations from one look at the held-out rays to the next.
+/// The number of iterations between evaluations of the held-out rays.
 const LOOK: u32 = 10;
-/// Share of the held-out loss by which it must fall to count as lower.
+/// The share of the held-out loss by which it must decrease to count as lower.
 const GAIN: f64 = 0.01;
-/// Looks in a row that find it not so much lower, after which the rate is lowered.
+/// The number of consecutive evaluations without such a decrease after which the rate is lowered.
 const PATIENCE: u32 = 2;
-/// Least iterations at the lower rate.
+/// The least number of iterations at the lower rate.
 const SETTLE: u32 = 10;
 
-/// How a node may change.
+/// The way in which a node may change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// Freely, with a pull towards emptiness.
     Unknown,
-    /// Near where it started: the camera saw a surface there.
+    /// Near its start, because the camera saw a surface there.
     Anchored,
 }
 
-/// A field under optimisation.
+/// A field during optimisation.
 pub(crate) struct Optimiser<'a> {
     rays: Rays<'a>,
     skip: Skip,
     nodes: Vec<u32>,
     kinds: Vec<Kind>,
     start: Vec<f32>,
-    /// Node → index in `nodes`; `u32::MAX` where fixed.
+    /// Node → index in `nodes`; `u32::MAX` if fixed.
     slot: Vec<u32>,
     moments: Moments,
     settings: Steps,
-    /// Iterations done.
+    /// The number of finished iterations.
     pub done: u32,
-    /// Loss per ray of the last iteration.
+    /// The loss per ray of the last iteration.
     pub loss: f64,
-    /// Least loss per held-out ray so far.
+    /// The least loss per held-out ray so far.
     pub held_out: f64,
-    /// Looks since then that found it no lower.
+    /// The number of evaluations since then without a decrease.
     pub misses: u32,
-    /// Iteration from which on the rate is lower.
+    /// The iteration from which the rate is lower.
     pub settles: Option<u32>,
 }
 
-/// How long and how.
+/// The settings of the optimisation.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Steps {
-    /// At most.
+    /// The greatest number of iterations.
     pub iterations: u32,
     pub batch: u32,
     pub seed: u64,
 }
 
-/// Starts unseen nodes from how empty they are, and says which nodes may change: unseen ones, and those within two voxels.
+/// Sets the start of unseen nodes from their emptiness, and returns the nodes that may change:
+/// unseen ones, and those within two voxels.
 pub(crate) fn trainable(
     field: &mut Field,
     states: &[State],
@@ -157,7 +160,7 @@ impl<'a> Optimiser<'a> {
         })
     }
 
-    /// Runs until the iterations are done (`true`) or it shall stop (`false`).
+    /// Runs until all iterations are finished (`true`) or `progress` stops it (`false`).
     pub fn run(&mut self, field: &mut Field, progress: &dyn Progress) -> bool {
         let threads = rayon::current_num_threads().max(1);
         let mut sums = vec![vec![0i64; self.nodes.len()]; threads];
@@ -175,7 +178,7 @@ impl<'a> Optimiser<'a> {
         true
     }
 
-    /// Iterations at which it ends, as far as is known.
+    /// Returns the iteration at which the optimisation ends, as far as is known.
     fn end(&self) -> u32 {
         let all = self.settings.iterations;
         match self.settles {
@@ -184,7 +187,8 @@ impl<'a> Optimiser<'a> {
         }
     }
 
-    /// Looks at the held-out rays: the rate is lowered once their loss hardly falls, or where two thirds are done.
+    /// Evaluates the held-out rays. The rate is lowered when their loss hardly decreases, or after
+    /// two thirds of the iterations.
     fn look(&mut self, field: &Field) {
         let loss = |q: &u32| -> i64 {
             let ray = self.rays.get(*q).expect("candidates are rays that exist");
@@ -262,13 +266,13 @@ impl<'a> Optimiser<'a> {
         }
     }
 
-    /// The nodes that may change, and the moments of their gradients.
+    /// Returns the nodes that may change, and the moments of their gradients.
     pub fn state(&mut self) -> (&[u32], &mut Moments) {
         (&self.nodes, &mut self.moments)
     }
 }
 
-/// A number as a multiple of 2⁻²⁴; `as` saturates, and NaN becomes 0.
+/// Converts a number to a multiple of 2⁻²⁴; `as` saturates, and NaN becomes 0.
 #[inline(always)]
 fn fixed(x: f32) -> i64 {
     (x * UNIT) as i64

@@ -1,27 +1,30 @@
-//! The light paths between seen surface points and spots: secondary rays, whose transmittance the shadow masks tell.
+//! The light paths between visible surface points and spots: secondary rays, with transmittances
+//! known from the shadow masks.
 
 use picofarm_scene::Vec3;
 
 use crate::{Depth, Measured};
 
-/// Left out at both ends of a lit path, metres: the surfaces there are no obstacles.
+/// The length omitted at both ends of a lit path, metres: the surfaces there are not obstacles.
 pub const MARGIN_LIT_M: f32 = 0.08;
-/// Left out where a shadowed path leaves its surface point, metres: what stands on a surface may cast the shadow.
+/// The length omitted at the surface point of a shadowed path, metres. It is short because an
+/// object on the surface may cast the shadow.
 pub const MARGIN_SHADOW_M: f32 = 0.03;
-/// Paths that meet the surface at either end at less than this cosine tell nothing: a surface that faces away is dark by
-/// itself, and a path along a wall runs through the wall's voxels.
+/// The least cosine between a path and the surface normal at either end. Paths at smaller angles
+/// are not evidence: a surface that faces away is dark by itself, and a path along a wall runs
+/// through the wall's voxels.
 const GRAZING: f32 = 0.08;
 
-/// The part of a light path that the mask tells of.
+/// The part of a light path that the mask describes.
 #[derive(Debug, Clone, Copy)]
 pub struct LightPath {
-    /// Surface point, metres.
+    /// The surface point, metres.
     pub origin: Vec3,
-    /// Unit direction to the spot.
+    /// The unit direction to the spot.
     pub direction: Vec3,
-    /// Distances from the origin between which light is free or stopped, metres.
+    /// The distances from the origin between which light passes or is stopped, metres.
     pub span: (f32, f32),
-    /// Whether light came through.
+    /// Whether light arrived.
     pub lit: bool,
 }
 
@@ -31,12 +34,12 @@ pub struct Paths<'a> {
     measured: &'a Measured,
     points: Vec<Vec3>,
     normals: &'a [Vec3],
-    /// Normal of the surface that each spot lies on; zero where unknown.
+    /// The normal of the surface at each spot; zero if unknown.
     spot_normals: Vec<Vec3>,
 }
 
 impl<'a> Paths<'a> {
-    /// Of depths in the camera's frame.
+    /// Creates the light paths for depths in the camera's frame.
     pub fn new(measured: &'a Measured, depth: &'a Depth) -> Self {
         let camera = &measured.camera;
         let points = (0..measured.pixels())
@@ -48,7 +51,7 @@ impl<'a> Paths<'a> {
             let (u, v) = (i.fx * q.x / q.z + i.cx, i.fy * q.y / q.z + i.cy);
             let inside =
                 q.z > 0.0 && u >= 0.0 && v >= 0.0 && u < i.width as f32 && v < i.height as f32;
-            // Times next to a spot are unknown: the normals of pixels around are asked.
+            // Times next to a spot are unknown, so the normals of surrounding pixels are used.
             let (u, v) = (u as i64, v as i64);
             let reach = i64::from(i.width / 12 + 2);
             let near = (0..=reach).flat_map(|r| [(r, 0), (-r, 0), (0, r), (0, -r)]);
@@ -70,18 +73,19 @@ impl<'a> Paths<'a> {
         }
     }
 
-    /// Number of spots.
+    /// Returns the number of spots.
     pub fn spots(&self) -> usize {
         self.measured.spots.len()
     }
 
-    /// Number of pixels.
+    /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.points.len()
     }
 
-    /// What light loses on the way from a spot to a pixel's surface by geometry: cos · cos / r², 1/m², for matt surfaces. `None`
-    /// where depth or a normal is unknown, or the path tells nothing.
+    /// Returns the geometric attenuation of light from a spot to a pixel's surface: cos · cos / r²,
+    /// 1/m², for matt surfaces. Returns `None` if depth or a normal is unknown, or if the path is
+    /// not evidence.
     pub fn geometry(&self, spot: usize, pixel: usize) -> Option<f32> {
         let (here, there) = (self.normals[pixel], self.spot_normals[spot]);
         let way = self.measured.spots[spot].point - self.points[pixel];
@@ -92,7 +96,8 @@ impl<'a> Paths<'a> {
         known.then(|| a * b / square)
     }
 
-    /// Whether the path meets a surface, whose normal is known, at so small an angle that it tells nothing.
+    /// Returns whether the path reaches a surface with a known normal at so small an angle that it
+    /// is not evidence.
     #[inline]
     pub fn grazes(&self, spot: usize, pixel: usize) -> bool {
         let (here, there) = (self.normals[pixel], self.spot_normals[spot]);
@@ -102,18 +107,19 @@ impl<'a> Paths<'a> {
         grazes(here, direction) || grazes(there, -direction)
     }
 
-    /// Path of light laser → spot → what a pixel sees → camera, metres; NaN where depth is unknown.
+    /// Returns the path of light laser → spot → visible surface → camera, metres; NaN if depth is
+    /// unknown.
     pub fn length(&self, spot: usize, pixel: usize) -> f32 {
         let (x, spot) = (self.points[pixel], &self.measured.spots[spot]);
         spot.path_m + (x - spot.point).length() + (x - self.measured.camera.origin).length()
     }
 
-    /// Normals of what a pixel sees and of what a spot lies on; zero where unknown.
+    /// Returns the normals at a pixel's visible surface and at a spot; zero if unknown.
     pub fn normals(&self, spot: usize, pixel: usize) -> (Vec3, Vec3) {
         (self.normals[pixel], self.spot_normals[spot])
     }
 
-    /// The path from what a pixel sees to a spot; `None` where it tells nothing.
+    /// Returns the path from a pixel's visible surface to a spot, or `None` if it is not evidence.
     #[inline]
     pub fn get(&self, spot: usize, pixel: usize) -> Option<LightPath> {
         let q = spot * self.points.len() + pixel;

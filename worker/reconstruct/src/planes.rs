@@ -1,5 +1,5 @@
-//! Planes of the room: large planes behind which hardly anything is seen. They close the room where the camera does not
-//! look, and steady the depth of what lies on them.
+//! Planes of the room: large planes with hardly any visible points behind them. They close the room
+//! outside the camera's view, and stabilise the depth of points on them.
 
 use picofarm_scene::Vec3;
 
@@ -8,46 +8,46 @@ use crate::{
     rng::{Rng, Stream},
 };
 
-/// Most planes.
+/// The greatest number of planes.
 const MOST: usize = 8;
-/// Candidates tried for each.
+/// The number of candidates for each plane.
 const TRIES: usize = 300;
-/// Every so many pixels counts.
+/// The distance between the pixels that are used.
 const STRIDE: usize = 7;
-/// Points within this are on a plane, metres; more where times are noisy.
+/// The distance within which points are on a plane, metres; larger if times are noisy.
 const CLOSE_M: f32 = 0.02;
-/// Least cosine between a point's normal and the plane's.
+/// The least cosine between a point's normal and the plane's.
 const ALIKE: f32 = 0.9;
-/// Least share of the pixels on a plane.
+/// The least share of the pixels on a plane.
 const LEAST_SHARE: f32 = 1.0 / 40.0;
-/// Largest share of the points that may lie behind a plane.
+/// The largest share of the points behind a plane.
 const MOST_BEHIND: f32 = 0.02;
-/// Points are behind beyond so many times the tolerance.
+/// The distance from which points are behind a plane, as a multiple of the tolerance.
 const BEHIND: f32 = 3.0;
 
 /// The half space n·x ≤ c of the room.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plane {
-    /// Unit normal, out of the room.
+    /// The unit normal, pointing out of the room.
     pub normal: Vec3,
-    /// Offset, metres.
+    /// The offset, metres.
     pub offset: f32,
 }
 
 impl Plane {
-    /// Distance into the room, metres; negative behind the plane.
+    /// Returns the distance into the room, metres; negative behind the plane.
     #[inline]
     pub fn inside(&self, x: Vec3) -> f32 {
         self.offset - self.normal.dot(x)
     }
 }
 
-/// A pixel's point and its normal out of the room.
+/// A pixel's point and its normal, pointing out of the room.
 type Point = (Vec3, Vec3);
 
-/// Planes by random sample consensus (Fischler and Bolles 1981) over the pixels' points and normals, the largest first,
-/// each refined by least squares. One with more than 2 % of the points behind it (a table's top, a wardrobe's front) is no
-/// wall and rejected.
+/// Finds planes by random sample consensus (Fischler and Bolles 1981) over the pixels' points and
+/// normals, the largest first, each refined by least squares. A plane with more than 2 % of the
+/// points behind it (a table's top, a wardrobe's front) is not a wall and is rejected.
 pub fn planes(measured: &Measured, depth: &Depth, seed: u64) -> Vec<Plane> {
     let mut errors: Vec<f32> = depth
         .error
@@ -121,7 +121,8 @@ pub fn planes(measured: &Measured, depth: &Depth, seed: u64) -> Vec<Plane> {
     found
 }
 
-/// The plane through points with the least sum of squared distances, facing as `plane` does.
+/// Returns the plane through points with the least sum of squared distances, facing as `plane`
+/// does.
 fn least_squares(points: impl Iterator<Item = Vec3>, plane: Plane) -> Plane {
     let (mut n, mut mean, mut square) = (0.0f64, [0f64; 3], [[0f64; 3]; 3]);
     for x in points {
@@ -145,7 +146,8 @@ fn least_squares(points: impl Iterator<Item = Vec3>, plane: Plane) -> Plane {
     Plane { normal, offset }
 }
 
-/// The unit eigenvector of the smallest eigenvalue of a covariance, on the side of `near`, by inverse iteration.
+/// Returns the unit eigenvector of the smallest eigenvalue of a covariance, on the side of `near`,
+/// by inverse iteration.
 fn smallest_axis(mut cov: [[f64; 3]; 3], near: Vec3) -> Vec3 {
     let trace = cov[0][0] + cov[1][1] + cov[2][2];
     for (a, row) in cov.iter_mut().enumerate() {
@@ -159,7 +161,7 @@ fn smallest_axis(mut cov: [[f64; 3]; 3], near: Vec3) -> Vec3 {
             u[0] * v[1] - u[1] * v[0],
         ]
     };
-    // Rows of the adjugate: the inverse but for a factor.
+    // Rows of the adjugate, which is the inverse up to a factor.
     let adjugate = [cross(b, c), cross(c, a), cross(a, b)];
     let mut n = [near.x, near.y, near.z].map(f64::from);
     for _ in 0..30 {
@@ -174,7 +176,8 @@ fn smallest_axis(mut cov: [[f64; 3]; 3], near: Vec3) -> Vec3 {
     if n.dot(near) < 0.0 { -n } else { n }
 }
 
-/// Moves the depth of pixels that lie on a plane, by place and normal, onto it, and takes its normal.
+/// Moves pixels that are on a plane, by position and normal, onto it, and sets their normal to the
+/// plane's.
 pub fn settle(measured: &Measured, depth: &mut Depth, planes: &[Plane]) {
     for p in 0..depth.range.len() {
         let (range, normal) = (depth.range[p], depth.normal[p]);

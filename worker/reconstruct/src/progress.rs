@@ -1,26 +1,26 @@
-//! How far a reconstruction is, and the wish to stop it.
+//! The progress of a reconstruction, and requests to stop it.
 
 use crate::ReconstructError;
 
-/// What a reconstruction does, in this order.
+/// The phases of a reconstruction, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// Depth of every pixel from its ellipsoids.
+    /// Computing the depth of every pixel from its ellipsoids.
     Depth,
-    /// Planes of the room.
+    /// Finding planes of the room.
     Planes,
-    /// The field's start from depth and planes.
+    /// Setting the field's start from depth and planes.
     Start,
     /// Carving by light paths.
     Carve,
-    /// Selection of the rays that are worth casting.
+    /// Selecting the rays for optimisation.
     Rays,
-    /// Optimisation on transmittance.
+    /// Optimising on transmittance.
     Optimise,
 }
 
 impl Phase {
-    /// Its name, for people.
+    /// Returns the phase's name, for people.
     pub fn name(self) -> &'static str {
         match self {
             Self::Depth => "depth",
@@ -33,13 +33,14 @@ impl Phase {
     }
 }
 
-/// Called with the progress of a reconstruction; may end it.
+/// Receives the progress of a reconstruction, and may stop it.
 pub trait Progress: Sync {
-    /// Share of the phase that is done in [0, 1], and the loss per ray where there is one. Return `false` to stop.
+    /// Receives the finished share of the phase in [0, 1], and the loss per ray if there is one.
+    /// Returns `false` to stop.
     fn at(&self, phase: Phase, done: f32, loss: Option<f64>) -> bool;
 }
 
-/// Nobody watches and nobody stops it.
+/// A [`Progress`] that ignores reports and never stops.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Unwatched;
 
@@ -49,7 +50,7 @@ impl Progress for Unwatched {
     }
 }
 
-/// Begins a phase, unless it shall stop.
+/// Begins a phase, unless `progress` stops it.
 pub(crate) fn begin(progress: &dyn Progress, phase: Phase) -> Result<(), ReconstructError> {
     match progress.at(phase, 0.0, None) {
         true => Ok(()),

@@ -1,4 +1,4 @@
-//! The rays that the optimisation casts: those that meet at least one node that it may change, by class.
+//! The rays for the optimisation: those that pass at least one node that may change, by class.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -10,20 +10,21 @@ use crate::{
     progress::{Phase, Progress},
 };
 
-/// Most light paths that are looked at; beyond, every n-th is.
+/// The greatest number of light paths that are examined; if there are more, every n-th is.
 const MOST: usize = 2_200_000;
-/// Most rays of a class that are held out, and one of at least so many.
+/// The greatest number of held-out rays of a class. At most one ray in `HELD_OUT_EVERY` is held
+/// out.
 const HELD_OUT: usize = 4096;
 const HELD_OUT_EVERY: usize = 20;
-/// Steps of the look, voxels.
+/// The step of the examination, voxels.
 const STEP: f32 = 0.7;
 
-/// What shall become of the light along a ray.
+/// The measured fate of the light along a ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Wanted {
-    /// All of it gets through.
+    /// All of it passes.
     Free,
-    /// None of it does.
+    /// None of it passes.
     Stopped,
 }
 
@@ -36,7 +37,7 @@ pub(crate) struct Ray {
     pub wanted: Wanted,
 }
 
-/// Candidates by class: light paths that are lit, those that are in shadow, and camera rays.
+/// Candidates by class: lit light paths, shadowed ones, and camera rays.
 pub(crate) struct Rays<'a> {
     paths: Paths<'a>,
     camera: Vec3,
@@ -45,12 +46,13 @@ pub(crate) struct Rays<'a> {
     spacing: f32,
     /// Class → candidates, each a number for [`Rays::get`].
     pub classes: [Vec<u32>; 3],
-    /// Class → candidates that are never learnt from: their loss says whether learning still helps.
+    /// Class → candidates that are never used for learning. Their loss shows whether learning still
+    /// improves the field.
     pub held_out: [Vec<u32>; 3],
 }
 
 impl<'a> Rays<'a> {
-    /// Chooses among the rays of a measurement.
+    /// Selects rays of a measurement.
     pub fn choose(
         (measured, depth): (&'a Measured, &'a Depth),
         (field, trainable): (&Field, &Skip),
@@ -88,7 +90,7 @@ impl<'a> Rays<'a> {
                 return Err(ReconstructError::Stopped);
             }
             let every = if spot < k { stride } else { 1 };
-            // Spots begin at different pixels, so that together they cover the image.
+            // Spots start at different pixels, so that together they cover the image.
             let of = (spot * pixels + spot % every..(spot + 1) * pixels).step_by(every);
             let found: Vec<(usize, u32)> = of
                 .collect::<Vec<_>>()
@@ -122,7 +124,8 @@ impl<'a> Rays<'a> {
         Ok(rays)
     }
 
-    /// Ray number `spot · pixels + pixel`; spot K is the camera ray in front of the surface, K + 1 the one through it.
+    /// Returns ray number `spot · pixels + pixel`; spot K is the camera ray in front of the
+    /// surface, K + 1 the one through it.
     #[inline]
     pub fn get(&self, number: u32) -> Option<Ray> {
         let (pixels, k) = (self.directions.len(), self.paths.spots());

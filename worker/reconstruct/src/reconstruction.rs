@@ -1,5 +1,5 @@
-//! A reconstruction from beginning to end: closed form → planes → start → carving → optimisation, which can stop and go
-//! on.
+//! A reconstruction from start to end: closed form → planes → start → carving → optimisation, which
+//! can stop and resume.
 
 use picofarm_scene::Vec3;
 use picofarm_settings::{GridSettings as Settings, Shadows};
@@ -17,17 +17,17 @@ use crate::{
     start::{State, bounds, start},
 };
 
-/// What is known of a node of the result.
+/// The kind of evidence for a node of the result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Evidence {
-    /// No ray tells of it: its density is a guess.
+    /// No ray passes near the node: its density is a guess.
     None = 0,
-    /// A plane of the room puts it at or behind a wall.
+    /// A plane of the room passes the node or is in front of it.
     Plane = 1,
-    /// Light paths go through it.
+    /// Light paths pass the node.
     Paths = 2,
-    /// The camera sees it, or through it.
+    /// The camera sees the node, or sees through it.
     Seen = 3,
 }
 
@@ -36,27 +36,27 @@ pub enum Evidence {
 pub struct Reconstructed {
     /// The density field.
     pub field: Field,
-    /// What is known of each node, in the field's order.
+    /// The evidence for each node, in the field's order.
     pub evidence: Vec<Evidence>,
-    /// Depth of every pixel, from closed form and planes.
+    /// The depth of every pixel, from closed form and planes.
     pub depth: Depth,
     /// The room's planes.
     pub planes: Vec<Plane>,
-    /// Measurements with refined spots.
+    /// The measurements with refined spots.
     pub measured: Measured,
-    /// Loss per ray of the last iteration, where there was one.
+    /// The loss per ray of the last iteration, if there was one.
     pub loss: Option<f64>,
-    /// Least loss per ray that was held out.
+    /// The least loss per held-out ray.
     pub held_out_loss: Option<f64>,
-    /// Iterations done.
+    /// The number of iterations.
     pub iterations: u32,
-    /// How well the measurements agree with one another.
+    /// The agreement of the measurements with one another.
     pub agreement: Agreement,
-    /// What somebody should know before trusting it.
+    /// Notes that users should read before they trust the result.
     pub notes: Vec<String>,
 }
 
-/// A reconstruction that is under way.
+/// A reconstruction in progress.
 pub struct Reconstruction {
     settings: Settings,
     measured: Measured,
@@ -72,7 +72,7 @@ pub struct Reconstruction {
 
 type Trainable = (Vec<u32>, Vec<crate::optimise::Kind>);
 
-/// How far the optimisation is.
+/// The progress of the optimisation.
 #[derive(Debug, Clone)]
 pub(crate) struct Saved {
     pub done: u32,
@@ -86,10 +86,11 @@ pub(crate) struct Saved {
 }
 
 impl Reconstruction {
-    /// Everything before the optimisation: a few seconds.
+    /// Runs all steps before the optimisation, which takes a few seconds.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] for settings or measurements that cannot be used; [`ReconstructError::Stopped`].
+    /// [`ReconstructError::Invalid`] for settings or measurements that cannot be used;
+    /// [`ReconstructError::Stopped`].
     pub fn begin(
         mut measured: Measured,
         settings: Settings,
@@ -154,12 +155,12 @@ impl Reconstruction {
         })
     }
 
-    /// Optimises until it is done (`true`) or `progress` stops it (`false`); call it again to go on. The bits of the result
-    /// depend neither on stops nor on the number of threads.
+    /// Optimises until it is finished (`true`) or `progress` stops it (`false`). Call it again to
+    /// continue. The bits of the result depend neither on stops nor on the number of threads.
     ///
     /// # Errors
-    /// [`ReconstructError::Stopped`] where it was stopped before the first iteration; [`ReconstructError::Invalid`] where a
-    /// density is no finite number.
+    /// [`ReconstructError::Stopped`] if it was stopped before the first iteration;
+    /// [`ReconstructError::Invalid`] if a density is NaN or infinite.
     pub fn run(&mut self, progress: &dyn Progress) -> Result<bool, ReconstructError> {
         if self.settings.shadows != Shadows::Optimise || self.trainable.0.is_empty() {
             return Ok(true);
@@ -172,7 +173,7 @@ impl Reconstruction {
         let of = (&self.measured, &self.depth);
         let mut optimiser =
             Optimiser::new(of, &self.field, self.trainable.clone(), steps, progress)?;
-        // What rays are cast at is decided by the start, so the start stays as it was until the end.
+        // The choice of rays depends on the start, so the start is left unchanged until the end.
         let mut field = self.field.clone();
         if let Some(saved) = self.saved.take() {
             let (nodes, moments) = optimiser.state();
@@ -209,7 +210,7 @@ impl Reconstruction {
         Ok(ended)
     }
 
-    /// The result so far.
+    /// Returns the current result.
     pub fn finish(self) -> Reconstructed {
         let mut field = self.field;
         let (mut loss, mut held_out_loss, mut iterations) = (None, None, 0);
@@ -235,12 +236,12 @@ impl Reconstruction {
         }
     }
 
-    /// How well the measurements agree with one another.
+    /// Returns the agreement of the measurements with one another.
     pub fn agreement(&self) -> &Agreement {
         &self.agreement
     }
 
-    /// Its settings.
+    /// Returns the settings.
     pub fn settings(&self) -> &Settings {
         &self.settings
     }
@@ -262,10 +263,11 @@ impl Reconstruction {
     }
 }
 
-/// A whole reconstruction in one go. Runs on the caller's rayon pool; the same bits for any number of threads.
+/// Runs a whole reconstruction on the caller's rayon pool. The bits are the same for any number of
+/// threads.
 ///
 /// # Errors
-/// As [`Reconstruction::begin`]; [`ReconstructError::Stopped`] where it was stopped.
+/// As for [`Reconstruction::begin`]; [`ReconstructError::Stopped`] if it was stopped.
 pub fn reconstruct(
     measured: Measured,
     settings: Settings,
@@ -278,7 +280,7 @@ pub fn reconstruct(
     }
 }
 
-/// Unseen nodes by carving alone, or all empty.
+/// Sets unseen nodes by carving alone, or makes all of them empty.
 fn without_optimisation(field: &mut Field, states: &[State], empty: Option<&[f32]>) {
     for (i, u) in field.logit.iter_mut().enumerate() {
         if states[i] == State::Unseen {

@@ -1,30 +1,33 @@
-//! Volume rendering of a density field: transmittance T = exp(−∫σ) along a ray, and depth as the distance at which T has
-//! fallen to one half (the median of where light is stopped; PlatoNeRF takes the mean, which blurs edges).
+//! Volume rendering of a density field: transmittance T = exp(−∫σ) along a ray, and depth as the
+//! distance at which T has decreased to one half. This is the median of the distances at which
+//! light is stopped; PlatoNeRF takes the mean, which blurs edges.
 
 use picofarm_scene::{Camera, Vec3};
 use rayon::prelude::*;
 
 use crate::field::{EMPTY, Field, PEAK, Skip, sigmoid};
 
-/// Steps a voxel.
+/// The number of steps a voxel.
 const STEPS: f32 = 4.0;
-/// Rays start this far from their origin, metres.
+/// The distance of the start of rays from their origin, metres.
 const NEAR_M: f32 = 0.02;
 /// Nodes with logits up to this are empty.
 const BARELY: f32 = EMPTY + 0.1;
 
-/// Where a ray is stopped.
+/// The end of a ray.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stopped {
-    /// Distance along the unit direction, metres; where nothing is met, that at which looking ends.
+    /// The distance along the unit direction, metres. If the ray hits nothing, the distance at
+    /// which the search ended.
     pub or_end_m: f32,
-    /// Whether something is met.
+    /// Whether the ray hits matter.
     pub met: bool,
 }
 
-/// Distances of novel views, whatever the field is made of: a grid ([`Renderer`]) or a network.
+/// The distances of novel views for any representation of the field: a grid ([`Renderer`]) or a
+/// network.
 pub trait Distances: Sync {
-    /// Where rays from one place along unit directions are stopped, in their order.
+    /// Returns the ends of rays from one position along unit directions, in their order.
     fn distances(&self, origin: Vec3, directions: &[Vec3]) -> Vec<Stopped>;
 }
 
@@ -41,7 +44,7 @@ impl Distances for Renderer<'_> {
     }
 }
 
-/// A field ready to be looked at.
+/// A field prepared for rendering.
 #[derive(Debug, Clone)]
 pub struct Renderer<'a> {
     field: &'a Field,
@@ -49,14 +52,14 @@ pub struct Renderer<'a> {
 }
 
 impl<'a> Renderer<'a> {
-    /// Gets a field ready.
+    /// Prepares a field.
     pub fn new(field: &'a Field) -> Self {
         let skip = Skip::to_nodes(field, |i| field.logit[i] > BARELY);
         Self { field, skip }
     }
 
-    /// Distance along a unit direction at which half the light is stopped, metres; `None` where the ray leaves the grid
-    /// before.
+    /// Returns the distance along a unit direction at which half the light is stopped, metres, or
+    /// `None` if the ray leaves the grid first.
     pub fn depth(&self, origin: Vec3, direction: Vec3) -> Option<f32> {
         let field = self.field;
         let step = field.spacing / STEPS;
@@ -81,19 +84,20 @@ impl<'a> Renderer<'a> {
         found
     }
 
-    /// The same, or where the ray leaves the grid: the grid bounds what was observed.
+    /// Like [`Self::depth`], but returns the distance to the end of the grid if nothing was hit,
+    /// because the grid bounds the observed space.
     pub fn depth_or_end(&self, origin: Vec3, direction: Vec3) -> f32 {
         self.depth(origin, direction)
             .unwrap_or_else(|| self.end(origin, direction))
     }
 
-    /// Where a ray leaves the grid.
+    /// Returns the distance at which a ray leaves the grid.
     fn end(&self, origin: Vec3, direction: Vec3) -> f32 {
         let (near, far) = self.field.span(origin, direction);
         if far > near { far.max(0.0) } else { 0.0 }
     }
 
-    /// Share of light that gets from `a` to `b`, in [0, 1].
+    /// Returns the share of light that passes from `a` to `b`, in [0, 1].
     pub fn transmittance(&self, a: Vec3, b: Vec3) -> f32 {
         let field = self.field;
         let length = (b - a).length();
@@ -110,7 +114,8 @@ impl<'a> Renderer<'a> {
         libm::expf(-sum)
     }
 
-    /// Distances along the rays through the pixels' middles, metres, row-major; `None` where nothing is met.
+    /// Returns the distances along the rays through the pixels' middles, metres, row-major; `None`
+    /// if a ray hits nothing.
     pub fn view(&self, camera: &Camera) -> Vec<Option<f32>> {
         let width = camera.intrinsics.width as usize;
         let pixels = width * camera.intrinsics.height as usize;

@@ -1,4 +1,4 @@
-//! How good a reconstruction is, against the true scene.
+//! Scores of a reconstruction, relative to the true scene.
 
 mod mesh;
 mod views;

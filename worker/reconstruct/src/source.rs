@@ -1,4 +1,4 @@
-//! Where measurements come from.
+//! The sources of measurements.
 
 mod captures;
 mod counted;

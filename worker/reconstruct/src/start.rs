@@ -1,5 +1,5 @@
-//! Where the optimisation starts: the grid's box, and at every node a signed distance to what the camera saw and to the
-//! room's planes.
+//! The start of the optimisation: the grid's box, and for every node a signed distance to the
+//! visible surfaces and to the room's planes.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -10,7 +10,7 @@ use crate::{
     planes::Plane,
 };
 
-/// What is known of a node before light paths are asked.
+/// The state of a node before light paths are evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum State {
@@ -20,24 +20,26 @@ pub enum State {
     Free,
     /// Within 1.5 voxels of a surface that the camera sees.
     Band,
-    /// Behind what the camera sees, or where no depth is known.
+    /// Behind a visible surface, or without known depth.
     Unseen,
     /// Within 1.5 voxels of a plane of the room, or behind it.
     Wall,
 }
 
-/// Half width of the band round a seen surface, voxels.
+/// The half width of the band around a visible surface, voxels.
 const BAND: f32 = 1.5;
-/// Share of the points left out at each end of an axis when the box is laid round them.
+/// The share of the points excluded at each end of an axis when computing the box.
 const OUTLIERS: f32 = 5e-4;
-/// Voxels added to the box on each side.
+/// The margin of the box on each side, voxels.
 const MARGIN: f32 = 4.0;
-/// Supersampling where states change: so many places a side of a voxel.
+/// The number of supersampling positions along a side of a voxel where states change.
 const PLACES: i32 = 3;
-/// Places of a voxel that must lie in the band before unseen space is taken for a surface.
+/// The number of positions of a voxel that must be in the band before unseen space counts as a
+/// surface.
 const LEAST_IN_BAND: u32 = 9;
 
-/// The box of the points that the camera sees and of the camera itself, without outliers, with a margin of four voxels.
+/// Returns the bounding box of the visible points and of the camera itself, without outliers, with
+/// a margin of four voxels.
 pub fn bounds(measured: &Measured, depth: &Depth, nodes: usize) -> (Vec3, Vec3) {
     let mut axes: [Vec<f32>; 3] = Default::default();
     for (p, &range) in depth.range.iter().enumerate() {
@@ -71,7 +73,7 @@ pub fn bounds(measured: &Measured, depth: &Depth, nodes: usize) -> (Vec3, Vec3) 
     (lo - margin, hi + margin)
 }
 
-/// What is seen from one place.
+/// The surfaces visible from one position.
 struct Seen<'a> {
     measured: &'a Measured,
     depth: &'a Depth,
@@ -115,7 +117,8 @@ impl Seen<'_> {
         let normal = self.depth.normal[p];
         let known = normal != Vec3::ZERO;
         let slope = if known { -normal.dot(ray) } else { 0.7 };
-        // Distance to the surface on the camera's side, metres: to its tangent plane nearby, along the ray further off.
+        // The distance to the surface on the camera's side, metres: to its tangent plane nearby,
+        // and along the ray further away.
         let front = if known && (range - far).abs() < 4.0 * h {
             normal.dot(x - (camera.origin + ray * range))
         } else {
@@ -129,8 +132,9 @@ impl Seen<'_> {
         }
     }
 
-    /// The mean over places in the voxel of a node, where its state and those of its neighbours differ: an edge between
-    /// nodes is then where it is, to a fraction of a voxel. `None` = leave it.
+    /// Returns the mean over positions in the voxel of a node if its state differs from those of
+    /// its neighbours. This places an edge between nodes to a fraction of a voxel. `None` = leave
+    /// the node unchanged.
     fn averaged(&self, x: Vec3, own: State) -> Option<(State, f32)> {
         let (mut sum, mut count, mut free, mut band) = (0.0f32, 0u32, 0u32, 0u32);
         let limit = GAIN * 0.77;
@@ -156,7 +160,7 @@ impl Seen<'_> {
     }
 }
 
-/// Sets the logits of every node, and says what is known of it.
+/// Sets the logits of every node, and returns the nodes' states.
 pub fn start(
     field: &mut Field,
     measured: &Measured,

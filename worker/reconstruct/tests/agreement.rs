@@ -1,5 +1,5 @@
-//! Measurements that agree are taken, and those that cannot be right are refused with the reason: in bins, with noise, and in
-//! rooms that the thresholds were not chosen in.
+//! Measurements that agree are accepted, and those that cannot be right are refused with the
+//! reason: in bins, with noise, and in rooms for which the thresholds were not chosen.
 
 mod common;
 
@@ -56,7 +56,7 @@ fn begun(measured: Measured) -> Result<Agreement, String> {
     }
 }
 
-/// What cannot be takes no part, as sources leave it out.
+/// Excludes impossible measurements, as sources do.
 fn clean(measured: &mut Measured) {
     let (pixels, eye) = (measured.pixels(), measured.camera.origin);
     for q in 0..measured.lit.len() {
@@ -154,7 +154,8 @@ fn a_gate_that_is_off_by_a_bin_is_doubtful_and_stated() {
     assert!(found.reasons[0].contains("too late"), "{found:?}");
 }
 
-/// In an open room most pixels are lit by every spot, so inverted masks leave them dark. Rooms with many shadows hide it.
+/// In an open room most pixels are lit by every spot, so with inverted masks they are dark. In
+/// rooms with many shadows, the error cannot be detected.
 #[test]
 fn masks_of_the_wrong_polarity_are_doubtful_in_an_open_room_where_times_follow_from_depth() {
     let (scene, rendered) = room(PlatoObject::Chair, 16, 48);

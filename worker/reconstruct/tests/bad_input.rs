@@ -1,4 +1,5 @@
-//! Input that cannot be used is refused by name; input that says little gives a stated result; never NaN.
+//! Unusable input is refused by name; input with little information gives a defined result; there
+//! is never NaN.
 
 mod common;
 
@@ -125,7 +126,7 @@ fn a_single_pixel_is_no_reason_to_break() {
 #[test]
 fn a_spot_on_a_mirror_is_left_out_and_named() {
     let (mut scene, _) = room(PlatoObject::Empty, 3, 48);
-    // The wall that beam 1 meets becomes a mirror: its beam folds away.
+    // The wall that beam 1 hits becomes a mirror, which folds the beam away.
     let wall = &mut scene.objects[3];
     let mut mesh = (*wall.mesh).clone();
     mesh.materials[0] = Material::mirror("mirror", 0.01);

@@ -1,4 +1,4 @@
-//! The ways to compare with.
+//! The baseline methods.
 
 mod common;
 

@@ -11,7 +11,7 @@ use picofarm_scene::{Scene, plato::PlatoObject};
 use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
 use picofarm_transient::{Gate, render};
 
-/// Renders a capture of each beam and gives it to all of these.
+/// Renders a capture of each beam and adds it to all of these.
 fn capture<const N: usize>(scene: &Scene, behind: [Option<Sensor>; N]) -> [Captures; N] {
     let settings = CaptureSettings {
         gate: Gate {
@@ -42,7 +42,8 @@ fn capture<const N: usize>(scene: &Scene, behind: [Option<Sensor>; N]) -> [Captu
     all
 }
 
-/// Pixels and spots that are taken for lit (1) or shadowed (0), and are the other.
+/// Counts the pixels and spots that are classified as lit (1) or shadowed (0), but are the
+/// opposite.
 fn wrong(truth: &Measured, of: &Measured, lit: u8) -> usize {
     let wrong = |q: &usize| {
         truth.used[*q] != 0 && of.used[*q] != 0 && truth.lit[*q] == 1 - lit && of.lit[*q] == lit
@@ -63,7 +64,7 @@ fn fewer_pixels_are_falsely_lit_than_by_the_plain_threshold() {
     assert_eq!(expected.spots.len(), truth.spots.len());
     let falsely_lit = [&plain, &expected].map(|m| wrong(&truth, m, 1));
     assert!(falsely_lit[1] * 2 < falsely_lit[0], "{falsely_lit:?}");
-    // Most pixels still take part.
+    // Most pixels are still used.
     let used = [&plain, &expected].map(used);
     assert!(used[1] * 10 > used[0] * 8, "{used:?}");
     expected.check().unwrap();

@@ -37,7 +37,7 @@ fn visible_depth_is_found_to_a_centimetre() {
     );
     let mean = errors.iter().sum::<f32>() / errors.len() as f32;
     assert!(mean < 0.01, "closed form: {mean} m");
-    // The same through the field, whose voxels are 2.7 cm wide.
+    // The same depths through the field, with voxels of 2.7 cm.
     let view = Renderer::new(&made.field).view(&scene.camera);
     let mut errors: Vec<f32> = view
         .iter()
@@ -96,7 +96,7 @@ fn the_mesh_lies_on_the_true_surfaces_and_little_floats() {
     assert!(score.chamfer_m < 0.04 && score.f_score > 0.85, "{score:?}");
     let floats = floaters(&made.field, &world, 1).unwrap();
     assert!(floats.volume_m3 < 0.1, "{floats:?}");
-    // Facets look at empty space: the room's inner faces enclose its air with their backs outwards.
+    // Facets face empty space: the room's inner faces enclose its air with their backs outwards.
     let volume: f64 = mesh
         .triangles
         .iter()
@@ -106,7 +106,8 @@ fn the_mesh_lies_on_the_true_surfaces_and_little_floats() {
     assert!(volume < 0.0, "signed volume {volume}");
     let ply = mesh.ply();
     assert!(ply.starts_with(b"ply\nformat binary_little_endian 1.0\n"));
-    // The importer of scenes reads the other form exactly, with the camera and the beams of the measurement.
+    // The importer of scenes reads the other format exactly, with the camera and the beams of the
+    // measurement.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mesh.glb");
     std::fs::write(&path, mesh.glb(&made.measured).unwrap()).unwrap();

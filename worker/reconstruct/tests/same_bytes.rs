@@ -36,7 +36,7 @@ fn one_two_and_three_threads_give_the_same_bytes() {
     assert!(one == with(3), "three threads");
 }
 
-/// Stops after so many iterations.
+/// Stops after the given number of iterations.
 struct StopAfter(AtomicU32);
 
 impl Progress for StopAfter {
@@ -55,10 +55,10 @@ fn stopped_and_resumed_is_undisturbed() {
         "it was stopped"
     );
     let kept = under_way.checkpoint();
-    // On in the same process.
+    // Resumes in the same process.
     assert!(under_way.run(&Unwatched).unwrap());
     assert!(bits(&under_way.finish()) == whole, "after a stop");
-    // On from bytes, and stopped again.
+    // Resumes from bytes, and stops again.
     let mut again = Reconstruction::resume(input.clone(), small(), &kept, &Unwatched).unwrap();
     assert!(!again.run(&StopAfter(AtomicU32::new(1))).unwrap());
     let kept = again.checkpoint();

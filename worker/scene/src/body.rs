@@ -1,5 +1,5 @@
-//! Bodies of glass: the renderer takes what lies behind a facet's normal for glass. So the facets of a body must bound a volume
-//! and face away from it.
+//! Bodies of glass. The renderer treats the space behind a facet's normal as glass, so the facets
+//! of a body must enclose a volume and face away from it.
 
 use std::{
     collections::{BTreeMap, btree_map::Entry},
@@ -8,22 +8,23 @@ use std::{
 
 use crate::{Affine, Bsdf, Mesh, Object, Vec3};
 
-/// Volumes below this share of the cube of the box's diagonal are rounding: a sheet, not a body.
+/// Volumes below this share of the cube of the bounding box's diagonal are rounding errors: a
+/// sheet, not a body.
 const NO_VOLUME: f64 = 1e-12;
 
-/// The bodies that the facets of one material bound.
+/// The bodies that the facets of one material enclose.
 #[derive(Debug, Clone, Copy)]
 struct Bodies {
-    /// Index of the material in its mesh.
+    /// The index of the material in its mesh.
     material: usize,
-    /// The facets face away from the bodies, in the mesh's own frame.
+    /// Whether the facets face away from the bodies, in the mesh's own frame.
     outwards: bool,
 }
 
 /// A connected part of a surface.
 #[derive(Debug, Clone, Copy)]
 struct Part {
-    /// By the divergence theorem; positive where the facets face outwards.
+    /// The volume by the divergence theorem; positive if the facets face outwards.
     volume: f64,
     lo: Vec3,
     hi: Vec3,
@@ -40,7 +41,8 @@ impl Part {
     }
 }
 
-/// Checks the bodies of glass of placed meshes, whose indices are in range; the error is the field and what is wrong with it.
+/// Checks the glass bodies of placed meshes with valid indices. The error is the field and its
+/// fault.
 pub(crate) fn check(objects: &[Object]) -> Result<(), (String, String)> {
     let mut known: BTreeMap<*const Mesh, Vec<Bodies>> = BTreeMap::new();
     for (i, object) in objects.iter().enumerate() {
@@ -61,7 +63,7 @@ pub(crate) fn check(objects: &[Object]) -> Result<(), (String, String)> {
     Ok(())
 }
 
-/// The same of a mesh in its own frame.
+/// Like [`check`], for a mesh in its own frame.
 pub(crate) fn check_mesh(mesh: &Mesh) -> Result<(), String> {
     of_mesh(mesh)
         .map_err(|(_, what)| what)?
@@ -69,7 +71,7 @@ pub(crate) fn check_mesh(mesh: &Mesh) -> Result<(), String> {
         .try_for_each(|body| placed(body, &Affine::IDENTITY))
 }
 
-/// Which way the normals of bodies face in the world.
+/// Checks in which direction the normals of bodies face in the world.
 fn placed(body: Bodies, to_world: &Affine) -> Result<(), String> {
     let [x, y, z] = to_world.linear.map(|r| [r.x, r.y, r.z].map(f64::from));
     let minor = |a: usize, b: usize| y[a] * z[b] - y[b] * z[a];
@@ -90,7 +92,8 @@ fn placed(body: Bodies, to_world: &Affine) -> Result<(), String> {
     }
 }
 
-/// The bodies of glass of a mesh; the error is the index of the material and what is wrong with its facets.
+/// Returns the glass bodies of a mesh. The error is the index of the material and the fault in its
+/// facets.
 fn of_mesh(mesh: &Mesh) -> Result<Vec<Bodies>, (usize, String)> {
     let glass = mesh.materials.iter().enumerate();
     glass
@@ -108,7 +111,8 @@ fn of_mesh(mesh: &Mesh) -> Result<Vec<Bodies>, (usize, String)> {
         .collect()
 }
 
-/// Whether the facets of a material face away from what they bound; `None` without facets. Cavities face the other way.
+/// Returns whether the facets of a material face away from the enclosed volume, or `None` without
+/// facets. Facets of cavities face the other way.
 fn bodies(mesh: &Mesh, material: u32) -> Result<Option<bool>, String> {
     let facets = mesh.triangles.iter().zip(&mesh.triangle_material);
     let facets: Vec<[u32; 3]> = facets.filter(|f| *f.1 == material).map(|f| *f.0).collect();
@@ -149,7 +153,7 @@ fn point(p: Vec3) -> String {
     format!("[{}, {}, {}]", p.x, p.y, p.z)
 }
 
-/// Facets over places: vertices in one place are one.
+/// Facets over positions: vertices at one position count as one.
 struct Surface {
     places: Vec<Vec3>,
     facets: Vec<[u32; 3]>,
@@ -157,7 +161,7 @@ struct Surface {
 
 impl Surface {
     fn new(mesh: &Mesh, facets: &[[u32; 3]]) -> Self {
-        // −0 is 0.
+        // −0 equals 0.
         let key =
             |v: u32| <[f32; 3]>::from(mesh.positions[v as usize]).map(|x| (x + 0.0).to_bits());
         let mut keys: Vec<[u32; 3]> = facets.iter().flatten().map(|v| key(*v)).collect();
@@ -176,14 +180,14 @@ impl Surface {
         }
     }
 
-    /// Along every edge as many facets go one way as the other.
+    /// Checks that along every edge as many facets go one way as the other.
     fn check_edges(&self) -> Result<(), String> {
-        // (lower place, higher place, against this order)
+        // The elements are (lower index, higher index, against this order).
         let mut edges: Vec<(u32, u32, bool)> = self
             .facets
             .iter()
             .flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)])
-            // Degenerate facets have such.
+            // Degenerate facets have edges of equal ends.
             .filter(|(a, b)| a != b)
             .map(|(a, b)| (a.min(b), a.max(b), a > b))
             .collect();
@@ -211,7 +215,7 @@ impl Surface {
         Ok(())
     }
 
-    /// Its connected parts.
+    /// Returns the connected parts.
     fn parts(&self) -> Vec<Part> {
         let mut leader: Vec<u32> = (0..self.places.len() as u32).collect();
         fn find(leader: &mut [u32], mut p: u32) -> u32 {
@@ -231,7 +235,7 @@ impl Surface {
         let mut parts: BTreeMap<u32, Part> = BTreeMap::new();
         for &facet in &self.facets {
             let root = find(&mut leader, facet[0]);
-            // Any point will do; one near by keeps the digits.
+            // Any origin is valid; a nearby one preserves precision.
             let origin = self.places[root as usize];
             let part = parts.entry(root).or_insert(Part {
                 volume: 0.0,
@@ -248,7 +252,7 @@ impl Surface {
     }
 }
 
-/// Signed volume of the tetrahedron from `origin` to a facet.
+/// Returns the signed volume of the tetrahedron from `origin` to a facet.
 fn tetrahedron(origin: Vec3, corners: [Vec3; 3]) -> f64 {
     let [a, b, c] = corners
         .map(|p| std::array::from_fn::<f64, 3, _>(|k| f64::from(p[k]) - f64::from(origin[k])));
@@ -272,7 +276,7 @@ mod tests {
         shape.ellipsoid(Vec3::new(x, 0.0, 0.0), [radius, radius], 8, m);
     }
 
-    /// The facets from the k-th on turned.
+    /// Reverses the facets from the k-th on.
     fn turned_from(mut mesh: Mesh, k: usize) -> Mesh {
         for t in &mut mesh.triangles[k..] {
             t.swap(1, 2);
@@ -295,7 +299,7 @@ mod tests {
         check_mesh(&turned_from(hollow, n)).expect("a hollow ball");
         let far = glass(|s, m| s.cuboid([1e4, 0.0, 0.0], [1e4 + 0.01, 2.0, 1.0], m));
         check_mesh(&far).expect("a pane far away");
-        // A degenerate facet is none.
+        // A degenerate facet is ignored.
         let mut mesh = one;
         mesh.triangles.push([3, 3, 4]);
         mesh.triangle_material.push(0);

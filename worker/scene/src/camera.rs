@@ -1,29 +1,29 @@
-//! Pinhole cameras in the measurement contract's convention.
+//! Pinhole cameras in the convention of the measurement contract.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Vec3;
 
-/// Pinhole intrinsics in pixels; pixel (u, v) has its centre at (u+0.5, v+0.5).
+/// Pinhole intrinsics in pixels; the centre of pixel (u, v) is at (u+0.5, v+0.5).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
-    /// Focal length along columns, pixels.
+    /// The focal length along columns, pixels.
     pub fx: f32,
-    /// Focal length along rows, pixels.
+    /// The focal length along rows, pixels.
     pub fy: f32,
-    /// Principal point, columns.
+    /// The principal point, columns.
     pub cx: f32,
-    /// Principal point, rows.
+    /// The principal point, rows.
     pub cy: f32,
-    /// Image width in pixels.
+    /// The image width in pixels.
     pub width: u32,
-    /// Image height in pixels.
+    /// The image height in pixels.
     pub height: u32,
 }
 
 impl Intrinsics {
-    /// Square pixels, centred principal point, horizontal field of view in degrees.
-    /// 90° at 256×256 gives fx = fy = cx = cy = 128.
+    /// Returns intrinsics with square pixels, a centred principal point and a horizontal field of
+    /// view in degrees. 90° at 256×256 gives fx = fy = cx = cy = 128.
     pub fn from_fov(fov_x_deg: f32, width: u32, height: u32) -> Self {
         let fx = if fov_x_deg == 90.0 {
             width as f32 * 0.5
@@ -40,7 +40,7 @@ impl Intrinsics {
         }
     }
 
-    /// The same field of view at another resolution.
+    /// Returns the same field of view at another resolution.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (
             width as f32 / self.width as f32,
@@ -60,20 +60,20 @@ impl Intrinsics {
 /// A pinhole camera: intrinsics and pose. The axes are orthonormal world-space directions.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
-    /// Intrinsics.
+    /// The intrinsics.
     pub intrinsics: Intrinsics,
-    /// Pinhole centre x_c in world space, metres.
+    /// The pinhole centre x_c in world space, metres.
     pub origin: Vec3,
-    /// Image +x (to the right) in world space.
+    /// The image's +x axis (to the right) in world space.
     pub right: Vec3,
-    /// Image +y (downwards) in world space.
+    /// The image's +y axis (downwards) in world space.
     pub down: Vec3,
-    /// Viewing direction, camera +z, in world space.
+    /// The viewing direction, camera +z, in world space.
     pub forward: Vec3,
 }
 
 impl Camera {
-    /// A camera at `origin` looking at `target`, with world +y up in the image.
+    /// Returns a camera at `origin` looking at `target`, with world +y up in the image.
     pub fn look_at(origin: Vec3, target: Vec3, intrinsics: Intrinsics) -> Self {
         let forward = (target - origin).normalized();
         let right = forward.cross(Vec3::new(0.0, 1.0, 0.0)).normalized();
@@ -87,25 +87,26 @@ impl Camera {
         }
     }
 
-    /// Unnormalised ray direction through film position (x, y) in pixels: z-component 1 in the camera
-    /// frame, so a hit at parameter t has z-depth t.
+    /// Returns the unnormalised ray direction through film position (x, y) in pixels. Its
+    /// z-component is 1 in the camera frame, so a hit at parameter t has z-depth t.
     #[inline]
     pub fn ray(&self, x: f32, y: f32) -> Vec3 {
         let i = &self.intrinsics;
         self.right * ((x - i.cx) / i.fx) + self.down * ((y - i.cy) / i.fy) + self.forward
     }
 
-    /// World point → camera frame (x right, y down, z forward).
+    /// Converts a world point to the camera frame (x right, y down, z forward).
     pub fn to_camera(&self, p: Vec3) -> Vec3 {
         self.direction_to_camera(p - self.origin)
     }
 
-    /// World direction → camera frame.
+    /// Converts a world direction to the camera frame.
     pub fn direction_to_camera(&self, d: Vec3) -> Vec3 {
         Vec3::new(self.right.dot(d), self.down.dot(d), self.forward.dot(d))
     }
 
-    /// Finite, orthonormal and with a positive size; otherwise (field, what is wrong).
+    /// Checks that the camera is finite, orthonormal and of a positive size. The error is (field,
+    /// fault).
     pub(crate) fn check(&self) -> Result<(), (String, String)> {
         let i = &self.intrinsics;
         if i.width == 0 || i.height == 0 {
@@ -118,7 +119,8 @@ impl Camera {
                 "focal lengths must be positive and finite".into(),
             ));
         }
-        // A plane of pixels never spans half a turn; near it, the outermost pixels take nearly all of the view.
+        // A plane of pixels always spans less than half a turn; close to that, the outermost pixels
+        // take nearly all of the view.
         for (side, pixels, focal) in [("wide", i.width, i.fx), ("high", i.height, i.fy)] {
             let half = libm::atan2(f64::from(pixels) * 0.5, f64::from(focal));
             let degrees = 2.0 * half.to_degrees();
@@ -142,7 +144,7 @@ impl Camera {
     }
 }
 
-/// Limits of a generated view: (field, what was expected).
+/// Checks the limits of a generated view. The error is (field, expected values).
 pub(crate) fn check_view(
     width: u32,
     height: u32,

@@ -1,32 +1,35 @@
-//! What the canonical glTF keeps in `extras`, where glTF itself has no words for it.
+//! The `extras` of canonical glTF, which contain the data that glTF itself cannot represent.
 //!
 //! - scene: [`SceneExtras`] under the key `picofarm`: name, label vocabulary, camera pose and
 //!   intrinsics, laser beams and spots, provenance.
 //! - node with a mesh: `label` (category name) and `instance` (instance id).
-//! - material: [`MaterialExtras`] under the key `picofarm`: the exact BSDF, beside the standard
-//!   parameters that other programs read.
+//! - material: [`MaterialExtras`] under the key `picofarm`: the exact BSDF, in addition to the
+//!   standard parameters that other programs read.
 //!
-//! Files of other makers may state a laser in the extras of any node: `"laser_spots": 25` (a grid over the
-//! camera's view, or `{"random": 16}`, or `{"at": [[x, y], …]}`) or `"laser_directions": [[x, y, z], …]` in that node's frame.
+//! Files from other programs may define a laser in the extras of any node: `"laser_spots": 25` (a
+//! grid over the camera's view, or `{"random": 16}`, or `{"at": [[x, y], …]}`) or
+//! `"laser_directions": [[x, y, z], …]` in that node's frame.
 //!
-//! They may also state what a material reflects by wavelength, in that material's extras (custom properties in Blender):
-//! `"spectrum": [{"nm": 532, "reflectance": 0.3}, {"nm": 905, "reflectance": 0.7}]`, by ascending wavelength in nanometres.
-//! Metals in part may have a `specular_reflectance` beside each reflectance, for their conductor. Colour and BSDF stay those of
-//! the standard parameters: only renders of stated wavelengths look at a spectrum.
+//! They may also define a material's reflectance by wavelength, in that material's extras (custom
+//! properties in Blender):
+//! `"spectrum": [{"nm": 532, "reflectance": 0.3}, {"nm": 905, "reflectance": 0.7}]`, by ascending
+//! wavelength in nanometres. Partly metallic materials may have a `specular_reflectance` in
+//! addition to each reflectance, for their conductor. Colour and BSDF remain those of the standard
+//! parameters: only renders with a wavelength use a spectrum.
 //!
-//! Our own material extras count while metalness and roughness are as we wrote them. Where someone edited these, the
-//! spectrum in our extras is left out with the BSDF, and a note says so. A `spectrum` outside `picofarm` always counts, in files
-//! of ours too.
+//! Our own material extras are used as long as metalness and roughness are unchanged. If they were
+//! edited, the BSDF and spectrum in our extras are ignored, and the importer adds a note. A
+//! `spectrum` outside `picofarm` is always used, in our own files too.
 
 use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
 
 use crate::{Bsdf, Camera, Laser, Material, Provenance, SpectrumPoint, Vec3};
 
-/// Version of the extras, raised when their meaning changes.
+/// The version of the extras, raised when their meaning changes.
 pub(crate) const FORMAT: u32 = 1;
 
-/// Everything about a scene that is not a mesh.
+/// All scene data except meshes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SceneExtras {
     pub(crate) format: u32,
@@ -37,7 +40,7 @@ pub(crate) struct SceneExtras {
     pub(crate) provenance: Provenance,
 }
 
-/// A material as this program knows it.
+/// A material with all properties of our model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct MaterialExtras {
     pub(crate) bsdf: Bsdf,
@@ -46,19 +49,19 @@ pub(crate) struct MaterialExtras {
     pub(crate) spectrum: Vec<SpectrumPoint>,
 }
 
-/// What anyone may state in a material's extras.
+/// The properties that any program may define in a material's extras.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub(crate) struct StatedSpectrum {
     pub(crate) spectrum: Vec<SpectrumPoint>,
 }
 
-/// The key under which scene and material extras lie.
+/// Extras of scenes and materials under our key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Keyed<T> {
     pub(crate) picofarm: T,
 }
 
-/// Extras of a node.
+/// The extras of a node.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct NodeExtras {
     #[serde(default, skip_serializing_if = "Option::is_none")]

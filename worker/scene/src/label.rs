@@ -1,6 +1,7 @@
 //! The fixed vocabulary of categories that every generated scene uses.
 
-/// Category names of generated scenes, in the order of their ids. Append only: data sets store ids.
+/// The category names of generated scenes, in the order of their ids. Append only, because data
+/// sets store ids.
 pub const LABELS: [&str; 62] = [
     "floor",
     "ceiling",
@@ -66,12 +67,12 @@ pub const LABELS: [&str; 62] = [
     "umbrella",
 ];
 
-/// The vocabulary as a scene stores it.
+/// Returns the vocabulary in the form that a scene stores.
 pub(crate) fn vocabulary() -> Vec<String> {
     LABELS.iter().map(|&l| l.to_owned()).collect()
 }
 
-/// Id of a name of the vocabulary; generators only ask for names that are in it.
+/// Returns the id of a name of the vocabulary. Generators only use names that are in it.
 pub(crate) fn label_id(name: &str) -> u16 {
     LABELS
         .iter()

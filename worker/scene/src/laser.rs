@@ -1,4 +1,4 @@
-//! The laser: where it stands, where its beams point, and the spots they make.
+//! The laser: its position, the directions of its beams, and their spots.
 
 use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
@@ -8,55 +8,57 @@ use crate::{Camera, Vec3, rng::Rng, trace::World};
 /// One collimated (delta) beam of unit pulse energy.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Beam {
-    /// Unit direction in world space at the laser.
+    /// The unit direction at the laser, in world space.
     pub direction: Vec3,
-    /// The spot it makes, where the scene's source states it; otherwise the renderer traces the beam.
+    /// The beam's spot, if the scene's source gives it; otherwise the renderer traces the beam.
     pub spot: Option<Spot>,
 }
 
-/// An illumination spot L_i: where a beam meets the first diffuse surface.
+/// An illumination spot L_i: the point at which a beam hits the first diffuse surface.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Spot {
-    /// World position, metres.
+    /// The world position, metres.
     pub point: Vec3,
-    /// Unit geometric normal of the facet, on the side from which the beam arrives.
+    /// The unit geometric normal of the facet, on the side from which the beam arrives.
     pub normal: Vec3,
-    /// Unit direction in which the beam arrives (towards the surface).
+    /// The unit direction in which the beam arrives (towards the surface).
     pub arriving: Vec3,
-    /// Optical path from the laser to the spot, metres (folded through mirrors).
+    /// The optical path from the laser to the spot, metres (folded through mirrors).
     pub path_m: f32,
-    /// Index of the object hit.
+    /// The index of the object.
     pub object: u32,
-    /// Index of the material in that object's mesh.
+    /// The index of the material in that object's mesh.
     pub material: u32,
 }
 
 /// The laser of a scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Laser {
-    /// Position x_l in world space, metres (usually the camera's).
+    /// The position x_l in world space, metres (usually the camera's).
     pub origin: Vec3,
-    /// Its beams, one a spot.
+    /// The beams, one a spot.
     pub beams: Vec<Beam>,
 }
 
-/// Where in the camera's view the beams of a laser are aimed.
+/// The points of the camera's view at which the beams of a laser are aimed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Aim(Vec<[f32; 2]>);
 
-/// Stream of the random numbers that places of spots are drawn from: no attempt at a room has its number.
+/// The stream of the random numbers that determine the positions of spots. No attempt at a room
+/// uses this number.
 const PLACES: u64 = u64::MAX;
 
 impl Aim {
-    /// At the grid of `spots` spots; `None` unless there is one of so many.
+    /// Returns the grid of `spots` spots, or `None` if there is no grid of that size.
     pub fn grid(spots: u32) -> Option<Self> {
         Self::of(&Spots::Grid(spots), 0).ok()
     }
 
-    /// At the spots of the scene of `seed`. Random places depend on nothing but seed and number: the first of more are the fewer.
+    /// Returns the spots of the scene of `seed`. Random positions depend only on seed and index, so
+    /// a smaller number of spots gives the first of a larger number.
     ///
     /// # Errors
-    /// What is wrong with the spots.
+    /// The fault in the spots.
     pub fn of(spots: &Spots, seed: u64) -> Result<Self, String> {
         spots.check()?;
         Ok(Self(match spots {
@@ -69,12 +71,12 @@ impl Aim {
         }))
     }
 
-    /// Film positions in `[0, 1]²` (x right, y down).
+    /// Returns the film positions in `[0, 1]²` (x right, y down).
     pub fn film(&self) -> &[[f32; 2]] {
         &self.0
     }
 
-    /// Beams from the camera's centre.
+    /// Returns a laser with beams from the camera's centre.
     pub fn laser(&self, camera: &Camera) -> Laser {
         let beam = |direction: Vec3| Beam {
             direction: direction.normalized(),
@@ -86,8 +88,10 @@ impl Aim {
         }
     }
 
-    /// Beams from a laser at `place` in the camera's frame (x right, y down, z forward; metres), at the points that the camera sees
-    /// there, as a lab steers its mirrors; `None` where a ray of the camera meets nothing, or the laser stands outside of the room.
+    /// Returns a laser at `place` in the camera's frame (x right, y down, z forward; metres). Its
+    /// beams are aimed at the points that the camera sees at the film positions, as a laboratory
+    /// steers its mirrors. Returns `None` if a ray of the camera hits nothing, or if the laser is
+    /// outside the room.
     pub(crate) fn laser_at(&self, camera: &Camera, place: Vec3, world: &World) -> Option<Laser> {
         if place == Vec3::default() {
             return Some(self.laser(camera));
@@ -120,8 +124,9 @@ impl Aim {
     }
 }
 
-/// Film positions of a grid, row by row. 4 and 25 are subsets of the 10×10 grid of cell centres: 25 = rows 0,2,4,6,8 × columns
-/// 1,3,5,7,9; 4 = indices 22, 27, 72, 77. 16 is a 4×4 grid of its own; 1 is the centre.
+/// Returns the film positions of a grid, row by row. 4 and 25 are subsets of the 10×10 grid of cell
+/// centres: 25 = rows 0,2,4,6,8 × columns 1,3,5,7,9; 4 = indices 22, 27, 72, 77. 16 is a separate
+/// 4×4 grid; 1 is the centre.
 fn grid(spots: u32) -> Vec<[f32; 2]> {
     let cell = |i: u32, n: u32| (i as f32 + 0.5) / n as f32;
     let of_hundred = |i: u32| [cell(i % 10, 10), cell(i / 10, 10)];
@@ -183,7 +188,7 @@ mod tests {
                 quarters[usize::from(x >= 0.5) + 2 * usize::from(y >= 0.5)] += 1;
             }
         }
-        // 4,000 places: 1,000 ± 27.4 in each quarter.
+        // 4,000 positions: 1,000 ± 27.4 in each quarter.
         assert!(
             quarters.iter().all(|n| (863..1137).contains(n)),
             "{quarters:?}"

@@ -1,4 +1,4 @@
-//! Plan geometry: the room's rectangle, and upright boxes that must not run into each other.
+//! Plan geometry: the room's rectangle, and upright boxes that must not overlap.
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
@@ -7,11 +7,11 @@ use crate::{Material, Mesh, Vec3, shape::Shape};
 /// A rectangular room centred on the origin, its floor at y = 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Room {
-    /// Extent along x, metres.
+    /// The extent along x, metres.
     pub(crate) width: f32,
-    /// Extent along z, metres.
+    /// The extent along z, metres.
     pub(crate) depth: f32,
-    /// Height, metres.
+    /// The height, metres.
     pub(crate) height: f32,
 }
 
@@ -24,11 +24,11 @@ pub(crate) struct Footprint {
     heights: [f32; 2],
 }
 
-/// Boxes that touch within this do not overlap (metres).
+/// The tolerance within which boxes may touch without overlapping, metres.
 const TOUCH: f32 = 1e-4;
 
 impl Footprint {
-    /// The box of a model placed at `at` (its bottom centre) and turned by `yaw` about +y.
+    /// Returns the box of a model placed at `at` (its bottom centre) and turned by `yaw` about +y.
     pub(crate) fn new(at: [f32; 3], yaw: f32, half: [f32; 2], height: f32) -> Self {
         let (s, c) = (libm::sinf(yaw), libm::cosf(yaw));
         Self {
@@ -39,13 +39,14 @@ impl Footprint {
         }
     }
 
-    /// Half of the box's extent along a unit direction of the plan.
+    /// Returns half of the box's extent along a unit direction of the plan.
     fn reach(&self, [x, z]: [f32; 2]) -> f32 {
         let along = |k: usize| self.half[k] * (self.axes[k][0] * x + self.axes[k][1] * z).abs();
         along(0) + along(1)
     }
 
-    /// Separating-axis test on the plan, and the height intervals.
+    /// Returns whether boxes overlap, by the separating-axis test on the plan and the height
+    /// intervals.
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
         if self.heights[1] <= other.heights[0] + TOUCH
             || other.heights[1] <= self.heights[0] + TOUCH
@@ -62,7 +63,7 @@ impl Footprint {
         })
     }
 
-    /// True if a point lies in the box grown by `margin` metres.
+    /// Returns whether a point is in the box enlarged by `margin` metres.
     pub(crate) fn contains(&self, p: Vec3, margin: f32) -> bool {
         let d = [p.x - self.centre[0], p.z - self.centre[1]];
         let within = |k: usize| {
@@ -73,15 +74,16 @@ impl Footprint {
 }
 
 impl Room {
-    /// True if the box stands inside the walls and under the ceiling.
+    /// Returns whether the box is inside the walls and under the ceiling.
     pub(crate) fn holds(&self, foot: &Footprint) -> bool {
         foot.centre[0].abs() + foot.reach([1.0, 0.0]) <= self.width * 0.5 - TOUCH
             && foot.centre[1].abs() + foot.reach([0.0, 1.0]) <= self.depth * 0.5 - TOUCH
             && foot.heights[1] <= self.height - TOUCH
     }
 
-    /// Plan position and yaw of a box with its back to wall `k` (−z, +z, −x, +x), its front facing the
-    /// room; `along` in [−1, 1] slides it from corner to corner, `gap` keeps it off the wall.
+    /// Returns the plan position and yaw of a box with its back to wall `k` (−z, +z, −x, +x) and
+    /// its front facing the room. `along` in [−1, 1] slides it from corner to corner, and `gap` is
+    /// its distance from the wall.
     pub(crate) fn against_wall(
         &self,
         k: usize,
@@ -90,7 +92,7 @@ impl Room {
         gap: f32,
     ) -> ([f32; 2], f32) {
         let (x, z) = (self.width * 0.5, self.depth * 0.5);
-        // A corner box stays `gap` off the side wall too.
+        // A box in a corner also has the distance `gap` from the side wall.
         let slide = |extent: f32| along * (extent - half[0] - gap).max(0.0);
         let off = half[1] + gap;
         match k {
@@ -101,7 +103,7 @@ impl Room {
         }
     }
 
-    /// The six inner faces, each a mesh of its own facing inwards, with its label.
+    /// Returns the six inner faces, each a separate mesh facing inwards, with its label.
     pub(crate) fn shell(
         &self,
         floor: Material,
@@ -149,7 +151,7 @@ impl Room {
         ]
     }
 
-    /// Width × depth × height for notes.
+    /// Returns width × depth × height for notes.
     pub(crate) fn describe(&self) -> String {
         format!("{:.3} x {:.3} x {:.3}", self.width, self.depth, self.height)
     }

@@ -1,5 +1,5 @@
-//! Scene descriptions: meshes, materials, cameras and laser beams; where they come from (generators,
-//! import) and how they are written. Knows nothing of rendering or of the farm.
+//! Scene descriptions: meshes, materials, cameras and laser beams; their sources (generators,
+//! import) and their export. The crate is independent of rendering and of the farm.
 //!
 //! World space is right-handed, metres, +y up. Cameras follow the measurement contract: the camera
 //! frame has x right, y **down** (image rows grow with y) and z forward.

@@ -1,4 +1,4 @@
-//! Materials: how a surface scatters at the laser's wavelength, and what colour a camera sees.
+//! Materials: the scattering of a surface at the laser's wavelength, and its colour for a camera.
 
 use std::sync::Arc;
 
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{SpectrumPoint, Texture};
 
-/// Microfacet normal distribution of a rough conductor.
+/// The microfacet normal distribution of a rough conductor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Distribution {
@@ -16,37 +16,37 @@ pub enum Distribution {
     Ggx,
 }
 
-/// Scattering at the laser's wavelength. f is the BRDF in 1/sr.
+/// The scattering at the laser's wavelength. f is the BRDF in 1/sr.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Bsdf {
     /// Lambertian: f = reflectance/π.
     Diffuse {
-        /// Albedo at the laser's wavelength, in [0, 1].
+        /// The albedo at the laser's wavelength, in [0, 1].
         reflectance: f32,
     },
-    /// Rough conductor with Fresnel term 1 scaled by `reflectance`:
-    /// f = reflectance · D(h) G1(i) G1(o) / (4 cos_i cos_o); separable G1, no multiple-scattering term.
+    /// Rough conductor with Fresnel term 1 scaled by `reflectance`: f = reflectance · D(h) G1(i)
+    /// G1(o) / (4 cos_i cos_o); separable G1, no multiple-scattering term.
     RoughConductor {
-        /// Roughness α > 0 of the microfacet distribution (0.01 = near-mirror).
+        /// The roughness α > 0 of the microfacet distribution (0.01 = near-mirror).
         alpha: f32,
         /// The microfacet distribution.
         distribution: Distribution,
-        /// Scale in [0, 1]; 1 is lossless apart from masking.
+        /// The scale in [0, 1]; 1 is lossless apart from masking.
         reflectance: f32,
     },
-    /// A Lambertian and a rough conductor side by side (Mitsuba's `blendbsdf` of `diffuse` and `roughconductor`):
-    /// f = (1 − weight) · reflectance/π + weight · conductor.
+    /// A blend of a Lambertian and a rough conductor (Mitsuba's `blendbsdf` of `diffuse` and
+    /// `roughconductor`): f = (1 − weight) · reflectance/π + weight · conductor.
     Mixed {
-        /// Albedo of the Lambertian part, in [0, 1].
+        /// The albedo of the Lambertian part, in [0, 1].
         reflectance: f32,
-        /// Roughness α of the conductor.
+        /// The roughness α of the conductor.
         alpha: f32,
         /// The conductor's microfacet distribution.
         distribution: Distribution,
-        /// Scale of the conductor, in [0, 1].
+        /// The scale of the conductor, in [0, 1].
         specular_reflectance: f32,
-        /// Share of the conductor, in [0, 1].
+        /// The share of the conductor, in [0, 1].
         weight: f32,
     },
     /// Thin glass: a pane. Light goes straight on through it, or is reflected as by a plane mirror. A pane lets through
@@ -56,31 +56,34 @@ pub enum Bsdf {
     /// Thin glass is no surface of the ground truth, and no beam makes its spot on it. A beam goes on straight through, and makes a
     /// further spot where what is reflected of it ends.
     ThinDielectric {
-        /// Index of refraction against air, in [1, 4]; 1 reflects nothing.
+        /// The index of refraction relative to air, in [1, 4]; 1 reflects nothing.
         ior: f32,
-        /// Share of the light that is not reflected which a whole pane lets through: its tint at the laser's wavelength, in [0, 1].
+        /// The share of the unreflected light that a whole pane transmits: its tint at the laser's
+        /// wavelength, in [0, 1].
         transmittance: f32,
-        /// The surface is one of the two faces of a pane whose thickness the mesh has: each lets through √T. The side of the
-        /// normal reflects R, for the whole pane; the other side reflects nothing. Otherwise a surface is a whole pane, with R on
-        /// both sides.
+        /// Whether the surface is one of the two faces of a pane with a thickness in the mesh. If
+        /// so, each face transmits √T. The side of the normal reflects R, for the whole pane; the
+        /// other side reflects nothing. If not, a surface is a whole pane, with R on both sides.
         face: bool,
     },
-    /// The smooth surface of a body of glass or of a liquid: light is refracted (Snell) and reflected (Fresnel, unpolarised, without
-    /// a tint). The body lies behind the surface's normal, air or vacuum before it. The facets of a material must be closed and
-    /// face outwards ([`Scene::validate`](crate::Scene::validate)); cavities face inwards. Bodies do not touch one another, nor lie
-    /// within one another. Reflections count as bounces, refraction does not. A body of glass is a surface of the ground truth, in
-    /// the specular mask. A beam goes on by refraction, and makes a further spot where what is reflected of it ends.
+    /// The smooth surface of a body of glass or of a liquid: light is refracted (Snell) and
+    /// reflected (Fresnel, unpolarised, without a tint). The body is behind the surface's normal,
+    /// and air or vacuum is in front of it. The facets of a material must be closed and face
+    /// outwards ([`Scene::validate`](crate::Scene::validate)); those of cavities face inwards.
+    /// Bodies must not touch or contain one another. Reflections count as bounces, refraction does
+    /// not. A body of glass is a surface of the ground truth, in the specular mask. A beam
+    /// continues by refraction, and its reflected part makes a further spot at its end.
     Dielectric {
-        /// Index of refraction of the body against what is around it, in [1, 4].
+        /// The index of refraction of the body relative to its surroundings, in [1, 4].
         ior: f32,
-        /// Share of the light that is refracted which each passing of the surface lets through: its tint at the laser's wavelength,
-        /// in [0, 1].
+        /// The share of the refracted light that each crossing of the surface transmits: its tint
+        /// at the laser's wavelength, in [0, 1].
         transmittance: f32,
     },
 }
 
 impl Bsdf {
-    /// Its kind, as scene files name it.
+    /// Returns the kind's name in scene files.
     pub fn name(&self) -> &'static str {
         match self {
             Bsdf::Diffuse { .. } => "diffuse",
@@ -91,7 +94,7 @@ impl Bsdf {
         }
     }
 
-    /// The same surface with every reflectance multiplied by `factor`: what a texel does to it.
+    /// Returns the surface with every reflectance multiplied by `factor`, e.g. by a texel.
     pub fn scaled(self, factor: f32) -> Self {
         match self {
             Bsdf::Diffuse { reflectance } => Bsdf::Diffuse {
@@ -126,29 +129,32 @@ impl Bsdf {
 
 /// A named surface material.
 ///
-/// With a texture, the albedo at a point is `rgb` times the texel's linear RGB, channel by channel, and every
-/// reflectance of `bsdf` is multiplied by the **mean of the texel's three channels**: nobody knows a texture at the
-/// laser's wavelength, and so a grey texture does to the laser just what it does to the image.
+/// With a texture, the albedo at a point is `rgb` times the texel's linear RGB, channel by channel.
+/// Every reflectance of `bsdf` is multiplied by the **mean of the texel's three channels**: a
+/// texture's value at the laser's wavelength is unknown, so a grey texture has the same effect on
+/// the laser as on the image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Material {
-    /// Name, for people.
+    /// The name, for people.
     pub name: String,
-    /// Scattering at the laser's wavelength.
+    /// The scattering at the laser's wavelength.
     pub bsdf: Bsdf,
-    /// Linear RGB albedo for the companion image, each in [0, 1]; of glass what it lets through: a pane, or each passing of the
-    /// surface of a body.
+    /// The linear RGB albedo for the companion image, each in [0, 1]. For glass, the transmission
+    /// of a pane, or of each crossing of the surface of a body.
     pub rgb: [f32; 3],
-    /// Scales the albedo from point to point; needs a mesh with texture coordinates.
+    /// A texture that scales the albedo from point to point. It requires a mesh with texture
+    /// coordinates.
     pub texture: Option<Arc<Texture>>,
-    /// Scatters on both sides of the facet; otherwise black from behind.
+    /// Whether both sides of the facet scatter; if not, the facet is black from behind.
     pub two_sided: bool,
-    /// What it reflects by wavelength, ascending; empty where nobody measured it. Only renders of stated wavelengths look at it
-    /// ([`Material::at`]).
+    /// The reflectance by wavelength, ascending; empty if it was not measured. Only renders with a
+    /// wavelength use it ([`Material::at`]).
     pub spectrum: Vec<SpectrumPoint>,
 }
 
 impl Material {
-    /// A two-sided Lambertian whose laser reflectance is the mean of its linear RGB albedo.
+    /// Returns a two-sided Lambertian with the mean of its linear RGB albedo as its laser
+    /// reflectance.
     pub fn diffuse(name: impl Into<String>, rgb: [f32; 3]) -> Self {
         let reflectance = (rgb[0] + rgb[1] + rgb[2]) / 3.0;
         Self {
@@ -161,7 +167,7 @@ impl Material {
         }
     }
 
-    /// A two-sided Beckmann near-mirror of roughness `alpha`.
+    /// Returns a two-sided Beckmann near-mirror of roughness `alpha`.
     pub fn mirror(name: impl Into<String>, alpha: f32) -> Self {
         Self {
             name: name.into(),
@@ -177,7 +183,8 @@ impl Material {
         }
     }
 
-    /// A clear pane of window glass, index of refraction 1.5: 92 % of the light passes at a right angle.
+    /// Returns a clear pane of window glass, index of refraction 1.5: 92 % of the light passes at a
+    /// right angle.
     pub fn glass(name: impl Into<String>) -> Self {
         Self {
             name: name.into(),
@@ -193,7 +200,7 @@ impl Material {
         }
     }
 
-    /// A body of clear glass, index of refraction 1.5.
+    /// Returns a body of clear glass, index of refraction 1.5.
     pub fn solid_glass(name: impl Into<String>) -> Self {
         Self {
             bsdf: Bsdf::Dielectric {
@@ -204,12 +211,13 @@ impl Material {
         }
     }
 
-    /// True for thin glass, which is no surface but lets light through.
+    /// Returns whether the material is thin glass, which is not a surface but transmits light.
     pub fn is_glass(&self) -> bool {
         matches!(self.bsdf, Bsdf::ThinDielectric { .. })
     }
 
-    /// True for glass of both kinds, which has neither texture nor spectrum.
+    /// Returns whether the material is glass of either kind, which has neither texture nor
+    /// spectrum.
     pub(crate) fn transmits(&self) -> bool {
         matches!(
             self.bsdf,
@@ -217,8 +225,8 @@ impl Material {
         )
     }
 
-    /// Factors of the albedo at a point of texture space: that of `rgb`, and the one of the reflectances
-    /// (the mean of the three). Ones without a texture.
+    /// Returns the factors of the albedo at a point of texture space: those of `rgb`, and that of
+    /// the reflectances (the mean of the three). Without a texture, all are 1.
     pub fn factors(&self, uv: [f32; 2]) -> ([f32; 3], f32) {
         match &self.texture {
             None => ([1.0; 3], 1.0),
@@ -241,11 +249,12 @@ impl Material {
         }
     }
 
-    /// Roughness up to which a conductor counts as a mirror for masks and for aiming beams.
+    /// The roughness up to which a conductor counts as a mirror for masks and for aiming beams.
     pub const SPECULAR_ALPHA: f32 = 0.1;
 
-    /// Thin glass that a file describes by its opacity alone: what covers at most half of what is behind it, with the index of
-    /// refraction of window glass where the file knows none. `None` for what is more opaque.
+    /// Returns thin glass for a material described only by its opacity, or `None` if it covers more
+    /// than half of the background. If the file has no index of refraction, that of window glass is
+    /// used.
     pub(crate) fn by_opacity(opacity: f32, ior: Option<f32>, face: bool) -> Option<Bsdf> {
         let transmittance = (1.0 - opacity).clamp(0.0, 1.0);
         let ior = ior.filter(|ior| *ior > 1.0).unwrap_or(Self::IOR);
@@ -256,18 +265,18 @@ impl Material {
         })
     }
 
-    /// Share of the light that must pass a material of a file for it to be glass.
+    /// The least share of transmitted light for a file's material to count as glass.
     pub(crate) const LEAST_GLASS: f32 = 0.5;
-    /// Index of refraction of window glass.
+    /// The index of refraction of window glass.
     pub(crate) const IOR: f32 = 1.5;
 
-    /// Largest index of refraction of glass.
+    /// The largest index of refraction of glass.
     pub const MAX_IOR: f32 = 4.0;
 
-    /// Smallest roughness of a conductor.
+    /// The smallest roughness of a conductor.
     pub const MIN_ALPHA: f32 = 1e-3;
 
-    /// Physical limits; the message says what was expected.
+    /// Checks physical limits; the message names the allowed values.
     pub(crate) fn check(&self) -> Result<(), String> {
         let unit = |name: &str, v: f32| {
             if (0.0..=1.0).contains(&v) {

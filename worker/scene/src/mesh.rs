@@ -7,23 +7,23 @@ use crate::{Material, Vec3};
 /// An indexed triangle mesh with flat geometric normals (v1−v0)×(v2−v0).
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Mesh {
-    /// Name, for people and errors.
+    /// The name, for people and errors.
     pub name: String,
-    /// Vertex positions in the mesh's own frame, metres.
+    /// The vertex positions in the mesh's own frame, metres.
     pub positions: Vec<Vec3>,
-    /// Texture coordinates (u, v), one a vertex, v down; empty without textures.
+    /// The texture coordinates (u, v), one a vertex, v down; empty without textures.
     pub uv: Vec<[f32; 2]>,
-    /// Vertex indices, three a triangle.
+    /// The vertex indices, three a triangle.
     pub triangles: Vec<[u32; 3]>,
-    /// Index into `materials`, one a triangle.
+    /// The index into `materials`, one a triangle.
     pub triangle_material: Vec<u32>,
     /// The materials of this mesh.
     pub materials: Vec<Material>,
 }
 
 impl Mesh {
-    /// The canonical order on disk: triangles by material, in their order otherwise; unused materials
-    /// dropped.
+    /// Sorts the mesh into the canonical order on disk: triangles by material, otherwise in their
+    /// order. Unused materials are dropped.
     pub(crate) fn make_canonical(&mut self) {
         let mut order: Vec<usize> = (0..self.triangles.len()).collect();
         order.sort_by_key(|&k| self.triangle_material[k]);
@@ -45,13 +45,13 @@ impl Mesh {
             .collect();
     }
 
-    /// Whether the facets of a material have no rim: an even number of them meet along every edge, so that they bound a
-    /// volume. Vertices in one place are one.
+    /// Returns whether the facets of a material have no rim: along every edge, an even number of
+    /// facets join, so that they enclose a volume. Vertices at one position count as one.
     pub(crate) fn is_closed(&self, material: u32) -> bool {
         let mut edges: BTreeMap<[[u32; 3]; 2], u32> = BTreeMap::new();
         let facets = self.triangles.iter().zip(&self.triangle_material);
         for (t, _) in facets.filter(|f| *f.1 == material) {
-            // −0 is 0.
+            // −0 equals 0.
             let place =
                 |v: u32| <[f32; 3]>::from(self.positions[v as usize]).map(|x| (x + 0.0).to_bits());
             let corners = t.map(place);
@@ -63,7 +63,7 @@ impl Mesh {
         edges.values().all(|n| n % 2 == 0)
     }
 
-    /// Smallest and largest coordinates over the vertices; `None` without vertices.
+    /// Returns the smallest and largest coordinates over the vertices, or `None` without vertices.
     pub fn bounds(&self) -> Option<(Vec3, Vec3)> {
         let first = *self.positions.first()?;
         Some(

@@ -1,4 +1,4 @@
-//! A whole scene: placed objects, a camera and a laser, with where it came from; and its validation.
+//! A whole scene, with placed objects, a camera, a laser and its provenance; and its validation.
 
 use std::{collections::BTreeMap, path::PathBuf, sync::Arc};
 
@@ -9,47 +9,48 @@ use crate::{Affine, Camera, Laser, Mesh, body};
 /// A mesh placed in the world. Its index in [`Scene::objects`] is its instance id.
 #[derive(Debug, Clone)]
 pub struct Object {
-    /// Shared geometry.
+    /// The shared geometry.
     pub mesh: Arc<Mesh>,
-    /// Mesh frame → world.
+    /// The map from mesh frame to world.
     pub to_world: Affine,
-    /// Category, an index into [`Scene::labels`].
+    /// The category, an index into [`Scene::labels`].
     pub label: u16,
-    /// Name, for people.
+    /// The name, for people.
     pub name: String,
 }
 
-/// Where a scene came from, stored beside every histogram.
+/// The origin of a scene, which is stored with every histogram.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// Generator or importer with its version, e.g. `furnished-2`, `gltf`.
+    /// The generator or importer with its version, e.g. `furnished-2`, `gltf`.
     pub source: String,
-    /// Seed of a generator.
+    /// The seed of a generator.
     pub seed: Option<u64>,
-    /// Attribution lines of the assets used (creator, licence).
+    /// The attribution lines of the assets used (creator, licence).
     pub attribution: Vec<String>,
-    /// Free-form facts (room type, size, what was dropped on import, …).
+    /// Free-form facts (room type, size, parts dropped on import, …).
     pub notes: BTreeMap<String, String>,
 }
 
-/// Everything the renderer needs, in world space.
+/// The input of the renderer, in world space.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    /// Name, for people.
+    /// The name, for people.
     pub name: String,
-    /// Placed objects; the index is the instance id.
+    /// The placed objects; the index is the instance id.
     pub objects: Vec<Object>,
-    /// Category names; [`Object::label`] indexes this. Fixed vocabulary for generated scenes.
+    /// The category names, which [`Object::label`] indexes. Generated scenes have a fixed
+    /// vocabulary.
     pub labels: Vec<String>,
     /// The camera.
     pub camera: Camera,
     /// The laser and its beams.
     pub laser: Laser,
-    /// Where it came from.
+    /// The scene's origin.
     pub provenance: Provenance,
 }
 
-/// Why a scene cannot be read, generated or used.
+/// The reason why a scene cannot be read, generated or used.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
     /// A file cannot be read.
@@ -57,10 +58,10 @@ pub enum SceneError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A scene file names a file that it may not.
+    /// A scene file names a file outside the allowed folders.
     #[error(transparent)]
     Refused(picofarm_files::FileError),
     /// A file cannot be written.
@@ -68,76 +69,77 @@ pub enum SceneError {
     Write {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A file's content is not what its format demands.
+    /// A file's content violates its format.
     #[error("{path}: {what}")]
     Format {
         /// The file.
         path: PathBuf,
-        /// Field, what was expected, what was found, and how to correct it.
+        /// The field, the expected and actual values, and how to correct it.
         what: String,
     },
-    /// A file states no laser, and none was stated on import.
+    /// A file contains no laser, and none was given on import.
     #[error("{path}: has no laser: {hint}")]
     NoLaser {
         /// The file.
         path: PathBuf,
-        /// How to state one in this format.
+        /// How to add a laser in this format.
         hint: &'static str,
     },
-    /// A scene's content is unusable, whatever its source.
+    /// A scene's content cannot be used, whatever its source.
     #[error("scene {scene:?}: {field}: {what}")]
     Invalid {
-        /// Scene name.
+        /// The scene's name.
         scene: String,
-        /// Field, e.g. `objects[3].mesh.positions[17]`.
+        /// The field, e.g. `objects[3].mesh.positions[17]`.
         field: String,
-        /// What is wrong, what was expected, and how to correct it.
+        /// The fault, the expected values, and how to correct it.
         what: String,
     },
-    /// A generator ran out of tries.
+    /// A generator exhausted its attempts.
     #[error(
         "generator {generator} found no acceptable scene for seed {seed} in {attempts} attempts; use another seed"
     )]
     Exhausted {
-        /// Generator.
+        /// The generator.
         generator: String,
-        /// Seed.
+        /// The seed.
         seed: u64,
-        /// Tries made.
+        /// The number of attempts.
         attempts: u32,
     },
-    /// Furniture assets that the job names are not here.
+    /// The furniture assets that the job names are not installed.
     #[error("assets {name:?} are not installed ({looked}); {hint}, or set assets = \"parametric\"")]
     Assets {
-        /// Which asset source.
+        /// The asset source.
         name: String,
-        /// Where it was looked for.
+        /// The places that were searched.
         looked: String,
-        /// How to come by them.
+        /// How to obtain the assets.
         hint: &'static str,
     },
-    /// Furniture assets cannot be fetched.
+    /// Furniture assets cannot be downloaded.
     #[error("assets cannot be installed: {what}")]
     Install {
-        /// What failed and what to do instead.
+        /// The failure, and an alternative.
         what: String,
     },
 }
 
 impl Scene {
-    /// Number of triangles over all placed objects.
+    /// Returns the number of triangles over all placed objects.
     pub fn triangle_count(&self) -> usize {
         self.objects.iter().map(|o| o.mesh.triangles.len()).sum()
     }
 
-    /// Checks everything the renderer relies on: finite vertices, indices in range, materials within
-    /// their physical limits, bodies of glass closed and facing outwards as placed, orthonormal camera, unit beams.
+    /// Checks the renderer's requirements: finite vertices, valid indices, materials within their
+    /// physical limits, glass bodies closed and facing outwards as placed, an orthonormal camera,
+    /// and unit beams.
     ///
     /// # Errors
-    /// [`SceneError::Invalid`] naming the first offending field.
+    /// [`SceneError::Invalid`] naming the first invalid field.
     pub fn validate(&self) -> Result<(), SceneError> {
         let bad = |field: String, what: String| {
             Err(SceneError::Invalid {

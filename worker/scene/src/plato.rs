@@ -1,8 +1,9 @@
-//! PlatoNeRF's measuring room with furniture of our own: one object in a box that is open behind, the published laser
-//! targets, and the published novel views.
+//! PlatoNeRF's measuring room with our own furniture: one object in a box without a rear wall, the
+//! published laser targets, and the published novel views.
 //!
-//! Room, targets and views are those of PlatoNeRF's scripts (facebookresearch/PlatoNeRF, `src/render_test_depth.py` and the
-//! scenes' configuration). Its meshes are not public; the object is a chair of our own, so figures compare in kind only.
+//! Room, targets and views are those of PlatoNeRF's scripts (facebookresearch/PlatoNeRF,
+//! `src/render_test_depth.py` and the scenes' configuration). Its meshes are not public. The object
+//! is our own chair, so figures can only be compared qualitatively.
 
 use std::{collections::BTreeMap, f32::consts::PI, sync::Arc};
 
@@ -19,7 +20,7 @@ use crate::{
 /// Changes whenever the same settings would give another scene.
 pub const GENERATOR_VERSION: &str = "plato-1";
 
-/// What stands in the room, with its origin at (0, −2, 3).
+/// The object in the room, with its origin at (0, −2, 3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PlatoObject {
@@ -27,14 +28,14 @@ pub enum PlatoObject {
     Chair,
     /// A bulky armchair.
     Armchair,
-    /// A box that an upright board hides from the camera.
+    /// A box behind an upright board that hides it from the camera.
     HiddenBox,
     /// Nothing: the walls alone.
     Empty,
 }
 
 impl PlatoObject {
-    /// All of them, by name.
+    /// All objects, by name.
     pub const ALL: [(&str, Self); 4] = [
         ("chair", Self::Chair),
         ("armchair", Self::Armchair),
@@ -43,15 +44,16 @@ impl PlatoObject {
     ];
 }
 
-/// What a measuring room is made for.
+/// The settings of a measuring room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlatoSettings {
-    /// What stands in it.
+    /// The object in the room.
     pub object: PlatoObject,
-    /// Laser spots, 1 to 16: the first so many of the 16 that PlatoNeRF uses, both side walls in turn.
+    /// The number of laser spots, 1 to 16: the first of the 16 that PlatoNeRF uses, alternating
+    /// between the side walls.
     pub spots: usize,
-    /// Image width and height in pixels.
+    /// The image width and height in pixels.
     pub resolution: u32,
 }
 
@@ -65,8 +67,9 @@ impl Default for PlatoSettings {
     }
 }
 
-/// Targets of the 16 laser beams that PlatoNeRF uses (of 24; it leaves out 0, 1, 2, 3, 10, 13, 20 and 22), as seen from
-/// the origin, metres. Reordered, so that the first so many of them light the room from both sides.
+/// The targets of the 16 laser beams that PlatoNeRF uses (of 24; it omits 0, 1, 2, 3, 10, 13, 20
+/// and 22), relative to the origin, metres. They are reordered, so that the first few light the
+/// room from both sides.
 const TARGETS: [[f32; 3]; 16] = [
     [2.0, -1.1078, 3.1002],
     [-2.0, -1.7324, 2.7181],
@@ -86,11 +89,12 @@ const TARGETS: [[f32; 3]; 16] = [
     [1.8562, -2.7640, 3.4686],
 ];
 
-/// Where the object's origin stands, metres.
+/// The position of the object's origin, metres.
 const PLACE: Vec3 = Vec3::new(0.0, -2.0, 3.0);
 
-/// The measuring room: x and y in [−2, 2], z in [0, 4], without a wall at z = 0. Camera and laser are at the origin; the
-/// camera looks along +z with a field of view of 90°. Every surface is Lambertian with reflectance 0.5.
+/// Returns the measuring room: x and y in [−2, 2], z in [0, 4], without a wall at z = 0. Camera and
+/// laser are at the origin; the camera looks along +z with a field of view of 90°. Every surface is
+/// Lambertian with reflectance 0.5.
 ///
 /// # Errors
 /// [`SceneError::Invalid`] for settings out of range.
@@ -137,8 +141,9 @@ pub fn generate(settings: &PlatoSettings) -> Result<Scene, SceneError> {
     })
 }
 
-/// PlatoNeRF's 139 test views: 39 that move into the room at 1.5 m below the camera, and 100 on a circle of radius 0.99 m
-/// round the object, looking at it. 90° each, `resolution` pixels a side.
+/// Returns PlatoNeRF's 139 test views: 39 that move into the room at 1.5 m below the camera, and
+/// 100 on a circle of radius 0.99 m around the object, looking at it. 90° each, `resolution` pixels
+/// a side.
 pub fn views(resolution: u32) -> Vec<Camera> {
     let ahead = (0..39).map(|k| {
         let eye = Vec3::new(0.0, -1.5, 0.062_821_5 * k as f32);
@@ -166,7 +171,7 @@ fn grey(name: &str) -> Material {
     Material::diffuse(name, [0.5; 3])
 }
 
-/// Floor, ceiling and three walls, facing inwards.
+/// Returns floor, ceiling and three walls, facing inwards.
 fn room() -> Vec<Object> {
     let corner = |x: f32, y: f32, z: f32| Vec3::new(2.0 * x, 2.0 * y, 4.0 * z);
     let faces = [
@@ -205,9 +210,9 @@ fn room() -> Vec<Object> {
     faces.map(object).into()
 }
 
-/// The meshes of an object in the room's frame, with their labels.
+/// Returns the meshes of an object in the room's frame, with their labels.
 fn pieces(object: PlatoObject) -> Vec<(&'static str, Mesh)> {
-    // Half turned away from the camera, whose side is −z.
+    // Half turned away from the camera, which is on the −z side.
     let turned = Affine::yaw_then_move(PI + 0.5, PLACE);
     match object {
         PlatoObject::Chair => vec![("chair", furniture("chair", 1.75, &turned))],
@@ -220,7 +225,7 @@ fn pieces(object: PlatoObject) -> Vec<(&'static str, Mesh)> {
     }
 }
 
-/// A piece of our own furniture, `scale` times as large, grey.
+/// Returns a grey piece of our own furniture, `scale` times as large.
 fn furniture(label: &str, scale: f32, place: &Affine) -> Mesh {
     let library = AssetLibrary::parametric();
     let mut mesh = library.first(label);
@@ -233,7 +238,8 @@ fn furniture(label: &str, scale: f32, place: &Affine) -> Mesh {
     mesh
 }
 
-/// A box on the floor: middle of its bottom from the object's place, half width, height, half depth, and turn.
+/// Returns a box on the floor from the middle of its bottom relative to the object's position, half
+/// width, height, half depth, and turn.
 fn upright(at: [f32; 3], [x, height, z]: [f32; 3], yaw: f32) -> Mesh {
     let mut shape = Shape::new("box");
     let material = shape.material(grey("box"));

@@ -1,5 +1,6 @@
-//! The paper's primitive rooms: a cube, a cylinder and a mirror in a bare room of varying scale, seen by
-//! a camera whose place and field of view jitter. Of the size of living rooms, or of a box on a desk.
+//! The paper's primitive rooms: a cube, a cylinder and a mirror in a bare room of varying scale,
+//! seen by a camera with random position and field of view. The rooms have the size of living
+//! rooms, or of a box on a desk.
 
 use std::{collections::BTreeMap, f32::consts::TAU, sync::Arc};
 
@@ -19,28 +20,29 @@ use crate::{
 /// Changes whenever the same seed would give another scene.
 pub const GENERATOR_VERSION: &str = "primitive-2";
 
-/// Rooms tried for one seed before giving up.
+/// The number of rooms to try for one seed.
 const ATTEMPTS: u32 = 64;
-/// Cameras tried for one room.
+/// The number of cameras to try for one room.
 const CAMERAS: u32 = 24;
-/// The wall that cameras look at ([`Room::against_wall`]).
+/// The wall in view of the cameras ([`Room::against_wall`]).
 const BACK: usize = 0;
 
-/// What a primitive room is made for.
+/// The settings of a primitive room.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PrimitiveSettings {
-    /// Laser spots.
+    /// The laser spots.
     pub spots: Spots,
-    /// Where the laser stands in the camera's frame (x right, y down, z forward), metres.
+    /// The laser's position in the camera's frame (x right, y down, z forward), metres.
     pub laser_m: [f32; 3],
-    /// Image width in pixels.
+    /// The image width in pixels.
     pub width: u32,
-    /// Image height in pixels.
+    /// The image height in pixels.
     pub height: u32,
-    /// Middle of the horizontal field of view, degrees.
+    /// The middle of the range of the horizontal field of view, degrees.
     pub fov_deg: f32,
-    /// Sizes of rooms and objects, bounds of depth, the mirror's wall, and how much the field of view varies.
+    /// The sizes of rooms and objects, bounds of depth, the mirror's wall, and the variation of the
+    /// field of view.
     pub rooms: PrimitiveRooms,
 }
 
@@ -58,7 +60,8 @@ impl Default for PrimitiveSettings {
 }
 
 impl PrimitiveSettings {
-    /// A box on a desk, as in the laboratory of appendix F.1: 46° wide, 16 spots.
+    /// Returns settings for a box on a desk, as in the laboratory of appendix F.1: 46° wide, 16
+    /// spots.
     pub fn desktop() -> Self {
         Self {
             spots: Spots::Grid(16),
@@ -69,11 +72,11 @@ impl PrimitiveSettings {
     }
 }
 
-/// The primitive room of `seed`: the same scene, bit for bit, on every machine.
+/// Generates the primitive room of `seed`: the same scene, bit for bit, on every machine.
 ///
 /// # Errors
 /// [`SceneError::Invalid`] for settings out of range, [`SceneError::Exhausted`] if no camera of any
-/// sub-seed keeps the depth within the bounds of [`PrimitiveRooms::depth_m`].
+/// sub-seed has its depth within the bounds of [`PrimitiveRooms::depth_m`].
 pub fn generate(seed: u64, settings: &PrimitiveSettings) -> Result<Scene, SceneError> {
     let aim = settings.check(seed)?;
     for attempt in 0..ATTEMPTS {
@@ -116,7 +119,7 @@ fn drawn(rng: &mut Rng, [lo, hi]: [f64; 2]) -> f32 {
     rng.range(lo as f32, hi as f32)
 }
 
-/// Half a width, and a height.
+/// Returns half a width, and a height.
 fn size(rng: &mut Rng, sizes: &Sizes) -> (f32, f32) {
     (drawn(rng, sizes.width_m) * 0.5, drawn(rng, sizes.height_m))
 }
@@ -144,7 +147,7 @@ fn cylinder(rng: &mut Rng, sizes: &Sizes) -> Mesh {
     shape.finish()
 }
 
-/// A thin planar near-mirror (α = 0.01) with its back at z = 0 and its front towards +z.
+/// Builds a thin planar near-mirror (α = 0.01) with its back at z = 0 and its front towards +z.
 fn mirror(rng: &mut Rng, sizes: &Sizes) -> Mesh {
     let (half, height) = size(rng, sizes);
     let mut shape = Shape::new("mirror");
@@ -235,7 +238,7 @@ fn attempt_room(
         let Some(laser) = aim.laser_at(&camera, settings.laser_m.into(), &world) else {
             continue;
         };
-        // Everything that is not the room itself must be in view.
+        // Every object other than the room itself must be in view.
         if seen[6..].contains(&0) || !beams_land(&world, &laser, &objects) {
             continue;
         }

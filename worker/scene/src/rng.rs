@@ -1,7 +1,7 @@
-//! The generators' own random numbers: PCG-XSH-RR 64/32, seeded through SplitMix64.
+//! The generators' random numbers: PCG-XSH-RR 64/32, seeded through SplitMix64.
 //!
-//! Written out here because a scene must be the same for the same seed for ever: no dependency may
-//! change the stream, and every derived number is plain integer or IEEE arithmetic.
+//! It is implemented here because the same seed must always give the same scene: no dependency may
+//! change the stream, and every derived number uses only integer or IEEE arithmetic.
 
 /// A stream of random numbers (O'Neill 2014, PCG-XSH-RR 64/32).
 #[derive(Debug, Clone)]
@@ -10,7 +10,8 @@ pub(crate) struct Rng {
     increment: u64,
 }
 
-/// One step of SplitMix64 (Steele et al. 2014): spreads neighbouring seeds far apart.
+/// Computes one step of SplitMix64 (Steele et al. 2014), which spreads neighbouring seeds far
+/// apart.
 fn splitmix(x: u64) -> u64 {
     let z = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -19,7 +20,7 @@ fn splitmix(x: u64) -> u64 {
 }
 
 impl Rng {
-    /// The stream number `stream` of `seed`; different pairs give unrelated streams.
+    /// Returns stream number `stream` of `seed`; different pairs give unrelated streams.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
         let mut rng = Self {
             state: splitmix(seed ^ splitmix(stream)),
@@ -29,7 +30,7 @@ impl Rng {
         rng
     }
 
-    /// 32 uniform bits.
+    /// Returns 32 uniform bits.
     pub(crate) fn next_u32(&mut self) -> u32 {
         let old = self.state;
         self.state = old
@@ -39,28 +40,29 @@ impl Rng {
         xorshifted.rotate_right((old >> 59) as u32)
     }
 
-    /// Uniform in [0, 1), a multiple of 2⁻²⁴.
+    /// Returns a uniform number in [0, 1), a multiple of 2⁻²⁴.
     pub(crate) fn unit(&mut self) -> f32 {
         (self.next_u32() >> 8) as f32 * (1.0 / 16_777_216.0)
     }
 
-    /// Uniform in [lo, hi).
+    /// Returns a uniform number in [lo, hi).
     pub(crate) fn range(&mut self, lo: f32, hi: f32) -> f32 {
         lo + (hi - lo) * self.unit()
     }
 
-    /// Uniform in 0..n by multiply and shift; `n` must be positive. The bias is below n/2³².
+    /// Returns a uniform integer in 0..n by multiply and shift; `n` must be positive. The bias is
+    /// below n/2³².
     pub(crate) fn below(&mut self, n: usize) -> usize {
         debug_assert!(n > 0, "a choice needs at least one option");
         ((u64::from(self.next_u32()) * n as u64) >> 32) as usize
     }
 
-    /// One of `options`, which must not be empty.
+    /// Returns one of `options`, which must not be empty.
     pub(crate) fn pick<'a, T>(&mut self, options: &'a [T]) -> &'a T {
         &options[self.below(options.len())]
     }
 
-    /// True with probability `p`.
+    /// Returns true with probability `p`.
     pub(crate) fn chance(&mut self, p: f32) -> bool {
         self.unit() < p
     }

@@ -1,4 +1,4 @@
-//! Building meshes from boxes, lathes and quads: the vocabulary of our own furniture and rooms.
+//! Builds meshes from boxes, lathes and quads, for our own furniture and rooms.
 
 use std::f32::consts::TAU;
 
@@ -12,7 +12,7 @@ pub(crate) struct Shape {
 }
 
 impl Shape {
-    /// An empty mesh.
+    /// Creates an empty mesh.
     pub(crate) fn new(name: &str) -> Self {
         Self {
             mesh: Mesh {
@@ -23,13 +23,13 @@ impl Shape {
         }
     }
 
-    /// Adds a material; its index is passed to the solids.
+    /// Adds a material, and returns the index to pass to the solids.
     pub(crate) fn material(&mut self, material: Material) -> u32 {
         self.mesh.materials.push(material);
         self.mesh.materials.len() as u32 - 1
     }
 
-    /// Solids added inside `build` are placed by `frame`.
+    /// Places the solids added inside `build` by `frame`.
     pub(crate) fn placed(&mut self, frame: Affine, build: impl FnOnce(&mut Self)) {
         let outer = self.frame.replace(frame);
         debug_assert!(outer.is_none(), "frames do not nest");
@@ -48,14 +48,14 @@ impl Shape {
         self.mesh.triangle_material.push(material);
     }
 
-    /// A quadrilateral a→b→c→d, counter-clockwise seen from its front.
+    /// Adds a quadrilateral a→b→c→d, counter-clockwise seen from its front.
     pub(crate) fn quad(&mut self, corners: [Vec3; 4], material: u32) {
         let [a, b, c, d] = corners.map(|p| self.vertex(p));
         self.face([a, b, c], material);
         self.face([a, c, d], material);
     }
 
-    /// An axis-aligned box from `lo` to `hi`.
+    /// Adds an axis-aligned box from `lo` to `hi`.
     pub(crate) fn cuboid(&mut self, lo: [f32; 3], hi: [f32; 3], material: u32) {
         let v: Vec<u32> = (0..8)
             .map(|i| {
@@ -76,8 +76,8 @@ impl Shape {
         }
     }
 
-    /// A body of revolution about the vertical through (cx, cz): `profile` lists (radius, y) along the
-    /// outer surface, from the bottom round to the end; radius 0 at an end closes it.
+    /// Adds a body of revolution about the vertical through (cx, cz): `profile` lists (radius, y)
+    /// along the outer surface, from the bottom round to the end; radius 0 at an end closes it.
     pub(crate) fn lathe(
         &mut self,
         [cx, cz]: [f32; 2],
@@ -115,7 +115,7 @@ impl Shape {
         }
     }
 
-    /// A closed upright cylinder or cone frustum.
+    /// Adds a closed upright cylinder or cone frustum.
     pub(crate) fn cylinder(
         &mut self,
         centre: [f32; 2],
@@ -128,7 +128,7 @@ impl Shape {
         self.lathe(centre, &profile, segments, material);
     }
 
-    /// An ellipsoid of revolution of the given radii.
+    /// Adds an ellipsoid of revolution of the given radii.
     pub(crate) fn ellipsoid(
         &mut self,
         centre: Vec3,
@@ -150,7 +150,7 @@ impl Shape {
         self.lathe([centre.x, centre.z], &profile, rings * 2, material);
     }
 
-    /// The finished mesh, its triangles grouped by material as the canonical format stores them.
+    /// Returns the finished mesh, with triangles grouped by material as in the canonical format.
     pub(crate) fn finish(self) -> Mesh {
         let mut mesh = self.mesh;
         mesh.make_canonical();
@@ -163,7 +163,7 @@ mod tests {
     use super::{Shape, TAU};
     use crate::{Material, Mesh, Vec3};
 
-    /// Volume by the divergence theorem: positive only if the facets look outwards.
+    /// Returns the volume by the divergence theorem: positive only if the facets face outwards.
     fn volume(mesh: &Mesh) -> f32 {
         let corner = |v: u32| mesh.positions[v as usize];
         mesh.triangles

@@ -1,18 +1,18 @@
-//! What surfaces reflect by wavelength: as a material states it, or else as its colour stands for it.
+//! Reflectance by wavelength, from a material's spectrum or else from its colour.
 
 use picofarm_settings::WAVELENGTHS_NM;
 use serde::{Deserialize, Serialize};
 
 use crate::{Bsdf, Material};
 
-/// What a material reflects at one wavelength; between two of them reflectances are interpolated linearly, beyond the last
-/// ones they stay.
+/// The reflectance at one wavelength. Between two points, reflectances are interpolated linearly;
+/// beyond the last points, they are constant.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpectrumPoint {
-    /// Wavelength, nanometres.
+    /// The wavelength, nanometres.
     pub nm: f32,
-    /// Reflectance of the Lambertian part, or of a conductor alone, in [0, 1].
+    /// The reflectance of the Lambertian part, or of a conductor alone, in [0, 1].
     pub reflectance: f32,
     /// Reflectance of the conductor of a mix, in [0, 1]; without it that of the material's [`Bsdf`]. Other
     /// materials have none.
@@ -23,22 +23,23 @@ pub struct SpectrumPoint {
 /// A material at a wavelength.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AtWavelength {
-    /// Reflectance of the Lambertian part.
+    /// The reflectance of the Lambertian part.
     pub lambertian: f32,
-    /// Reflectance of the conductor.
+    /// The reflectance of the conductor.
     pub conductor: f32,
-    /// With a texture: what both are multiplied by is this times the texel's linear RGB, summed over the channels, and no
-    /// more than makes the larger of them 1.
+    /// For a texture: both reflectances are multiplied by this times the texel's linear RGB, summed
+    /// over the channels. The factor is limited so that the larger reflectance is at most 1.
     pub texel: [f32; 3],
 }
 
-/// Wavelengths between which a colour stands for reflectances, nanometres.
+/// The wavelengths between which a colour determines reflectances, nanometres.
 const VISIBLE_NM: (f32, f32) = (400.0, 700.0);
-/// Dominant wavelengths of the primaries of linear RGB (ITU-R BT.709), nanometres: blue, green, red.
+/// The dominant wavelengths of the primaries of linear RGB (ITU-R BT.709), nanometres: blue, green,
+/// red.
 pub(crate) const PRIMARIES_NM: [f32; 3] = [464.3, 549.1, 611.4];
 
-/// The share of red, green and blue in what a colour reflects at a wavelength: that of the primary there, between two primaries both,
-/// linearly. `None` where colours say nothing.
+/// Returns the weights of red, green and blue in a colour's reflectance at a wavelength: 1 at a
+/// primary, and linear between two primaries. Returns `None` outside the range of colours.
 fn of_colour(nm: f32) -> Option<[f32; 3]> {
     if !(VISIBLE_NM.0..=VISIBLE_NM.1).contains(&nm) {
         return None;
@@ -105,7 +106,7 @@ impl Material {
         })
     }
 
-    /// Physical limits of its spectrum; the message says what was expected.
+    /// Checks the physical limits of the spectrum; the message names the allowed values.
     pub(crate) fn check_spectrum(&self) -> Result<(), String> {
         match self.spectrum.is_empty() || !self.transmits() {
             true => check_points(&self.spectrum, Some(self.bsdf)),
@@ -114,7 +115,8 @@ impl Material {
     }
 }
 
-/// What rows hold at a wavelength: in between linearly, beyond the ends as at them. `None` without rows.
+/// Interpolates rows at a wavelength: linearly between rows, constant beyond the ends. Returns
+/// `None` without rows.
 pub(crate) fn interpolated<const N: usize>(
     rows: &[SpectrumPoint],
     nm: f32,
@@ -133,7 +135,8 @@ pub(crate) fn interpolated<const N: usize>(
     }
 }
 
-/// Physical limits of rows, of a material or of a part alone; the message says what was expected.
+/// Checks the physical limits of rows, of a material or of a part alone; the message names the
+/// allowed values.
 pub(crate) fn check_points(rows: &[SpectrumPoint], bsdf: Option<Bsdf>) -> Result<(), String> {
     let unit = 0.0..=1.0;
     let (least, most) = WAVELENGTHS_NM;

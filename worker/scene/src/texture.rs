@@ -1,25 +1,25 @@
-//! Albedo textures: 8-bit sRGB texels, looked up bilinearly in linear light.
+//! Albedo textures: 8-bit sRGB texels with bilinear interpolation in linear light.
 
 use std::sync::LazyLock;
 
 use serde::{Deserialize, Serialize};
 
-/// What lies outside `[0, 1)` of texture space.
+/// The texels outside `[0, 1)` of texture space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Wrap {
-    /// The image again.
+    /// The image is repeated.
     #[default]
     Repeat,
-    /// The image again, every second time mirrored.
+    /// The image is repeated, and mirrored every second time.
     Mirror,
-    /// The nearest texel of the border.
+    /// The nearest texel of the border is used.
     Clamp,
 }
 
 /// An image that scales a material's albedo from point to point.
 ///
-/// Texels are stored by rows from the top, sRGB-encoded as in the file they came from. Texture space
+/// Texels are stored by rows from the top, sRGB-encoded as in the source file. Texture space
 /// follows glTF: (0, 0) is the outer corner of the first texel, u runs along the row, v **down**.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Texture {
@@ -43,7 +43,7 @@ impl std::fmt::Debug for Texture {
     }
 }
 
-/// Linear light of every sRGB byte (IEC 61966-2-1).
+/// The linear light of every sRGB byte (IEC 61966-2-1).
 static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| {
     std::array::from_fn(|i| {
         let s = i as f64 / 255.0;
@@ -57,15 +57,16 @@ static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| {
 });
 
 impl Texture {
-    /// Most texels along one side.
+    /// The greatest number of texels along one side.
     pub const MAX_SIDE: u32 = 16_384;
-    /// Most texels of one texture (201 MB).
+    /// The greatest number of texels of one texture (201 MB).
     pub const MAX_TEXELS: u64 = 1 << 26;
 
-    /// A texture of `width` × `height` sRGB texels, rows from the top.
+    /// Creates a texture of `width` × `height` sRGB texels, rows from the top.
     ///
     /// # Errors
-    /// What was expected, where a side is 0 or too long, or the number of texels is not their product.
+    /// A message with the allowed values, if a side is 0 or too long, or if the number of texels is
+    /// not the product of the sides.
     pub fn new(
         name: impl Into<String>,
         width: u32,
@@ -104,32 +105,32 @@ impl Texture {
         ))
     }
 
-    /// Name, for people; also the stem of the file it is exported to.
+    /// Returns the name, for people; it is also the stem of the exported file.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Texels a row.
+    /// Returns the number of texels a row.
     pub fn width(&self) -> u32 {
         self.width
     }
 
-    /// Rows.
+    /// Returns the number of rows.
     pub fn height(&self) -> u32 {
         self.height
     }
 
-    /// What lies outside the image.
+    /// Returns the treatment of points outside the image.
     pub fn wrap(&self) -> Wrap {
         self.wrap
     }
 
-    /// sRGB texels, by rows from the top.
+    /// Returns the sRGB texels, by rows from the top.
     pub fn texels(&self) -> &[[u8; 3]] {
         &self.texels
     }
 
-    /// Linear RGB at a point of texture space, bilinear between the centres of texels.
+    /// Returns the linear RGB at a point of texture space, bilinear between the centres of texels.
     pub fn at(&self, uv: [f32; 2]) -> [f32; 3] {
         let (x0, x1, fx) = self.wrap.neighbours(uv[0], self.width);
         let (y0, y1, fy) = self.wrap.neighbours(uv[1], self.height);
@@ -146,7 +147,7 @@ impl Texture {
         })
     }
 
-    /// Mean linear RGB over all texels.
+    /// Returns the mean linear RGB over all texels.
     pub fn mean(&self) -> [f32; 3] {
         let mut sum = [0.0f64; 3];
         for t in &self.texels {
@@ -158,12 +159,12 @@ impl Texture {
     }
 }
 
-/// Linear light of an sRGB byte.
+/// Returns the linear light of an sRGB byte.
 pub(crate) fn linear(byte: u8) -> f32 {
     LINEAR[usize::from(byte)]
 }
 
-/// The sRGB byte nearest to a linear value; values outside [0, 1] are clamped.
+/// Returns the sRGB byte nearest to a linear value; values outside [0, 1] are clamped.
 pub(crate) fn srgb_byte(linear: f32) -> u8 {
     let table = &*LINEAR;
     let above = table.partition_point(|&l| l < linear).min(255);
@@ -175,11 +176,12 @@ pub(crate) fn srgb_byte(linear: f32) -> u8 {
 }
 
 impl Wrap {
-    /// The two texels around a coordinate, and the second one's share.
+    /// Returns the two texels around a coordinate, and the second one's weight.
     #[inline]
     fn neighbours(self, coordinate: f32, size: u32) -> (u32, u32, f32) {
         let n = size as f32;
-        // One period first: keeps the fraction's digits and the casts in range for any finite coordinate.
+        // Reducing to one period first preserves the fraction's precision and bounds the casts for
+        // any finite coordinate.
         let inside = match self {
             Wrap::Repeat => coordinate - coordinate.floor(),
             Wrap::Mirror => {

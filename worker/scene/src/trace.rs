@@ -1,7 +1,8 @@
 //! Closest-hit rays against placed meshes, for the generators' own checks (support, view, beams).
 //!
-//! Acceleration is `obvhs`; the triangle test is our own scalar arithmetic, so that the depths on which
-//! a scene is accepted are the same on every machine. Each mesh keeps its tree, whatever scene it is in.
+//! Acceleration is `obvhs`. The triangle test is our own scalar arithmetic, so that the depths by
+//! which a scene is accepted are the same on every machine. Each mesh has its own tree, independent
+//! of the scene.
 
 use std::{sync::Arc, time::Duration};
 
@@ -14,33 +15,34 @@ use obvhs::{
 
 use crate::{Affine, Mesh, Vec3};
 
-/// A mesh with its ray tree and the box round it.
+/// A mesh with its ray tree and its bounding box.
 #[derive(Debug)]
 pub(crate) struct Model {
     /// The geometry.
     pub(crate) mesh: Arc<Mesh>,
-    /// Smallest coordinates.
+    /// The smallest coordinates.
     pub(crate) lo: Vec3,
-    /// Largest coordinates.
+    /// The largest coordinates.
     pub(crate) hi: Vec3,
     tree: CwBvh,
 }
 
-/// Where a ray meets a scene.
+/// The intersection of a ray with a scene.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Hit {
-    /// Ray parameter in units of the direction's length.
+    /// The ray parameter in units of the direction's length.
     pub(crate) t: f32,
-    /// Index of the placed object.
+    /// The index of the placed object.
     pub(crate) object: usize,
-    /// Index of the triangle in its mesh.
+    /// The index of the triangle in its mesh.
     pub(crate) triangle: u32,
 }
 
-/// Slack in barycentric coordinates: closes the seams between neighbouring triangles.
+/// The tolerance of barycentric coordinates, which closes the seams between neighbouring triangles.
 const SEAM: f32 = 1e-6;
 
-/// Möller–Trumbore (1997), both sides; `None` for a miss or a degenerate triangle.
+/// Computes the intersection by Möller and Trumbore (1997), for both sides. Returns `None` for a
+/// miss or a degenerate triangle.
 fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> Option<f32> {
     let (e1, e2) = (b - a, c - a);
     let p = direction.cross(e2);
@@ -58,7 +60,7 @@ fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> Option<f32>
 }
 
 impl Model {
-    /// Builds the tree; `None` for a mesh without triangles or with a vertex that is not finite.
+    /// Builds the tree. Returns `None` for a mesh without triangles or with a non-finite vertex.
     pub(crate) fn new(mesh: Mesh) -> Option<Self> {
         if mesh.triangles.is_empty() || !mesh.positions.iter().all(|p| p.is_finite()) {
             return None;
@@ -87,17 +89,17 @@ impl Model {
         })
     }
 
-    /// Extents along x, y and z.
+    /// Returns the extents along x, y and z.
     pub(crate) fn size(&self) -> [f32; 3] {
         (self.hi - self.lo).into()
     }
 
-    /// Closest hit with t in (0, `limit`) in the mesh's own frame: (t, triangle).
+    /// Returns the closest hit with t in (0, `limit`) in the mesh's own frame: (t, triangle).
     pub(crate) fn closest(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<(f32, u32)> {
         self.closest_of(origin, direction, limit, |_| true)
     }
 
-    /// The same, of the triangles that `counts` is true for.
+    /// Like [`Self::closest`], but considers only triangles for which `counts` is true.
     fn closest_of(
         &self,
         origin: Vec3,
@@ -144,11 +146,11 @@ struct Placed {
     hi: Vec3,
 }
 
-/// Boxes are widened by this, so that flat meshes have a volume (metres).
+/// The margin by which boxes are enlarged, so that flat meshes have a volume (metres).
 const PAD: f32 = 1e-4;
 
 impl World {
-    /// Adds a model; its index is the number added before.
+    /// Adds a model. Its index is the number of models added earlier.
     pub(crate) fn add(&mut self, model: Arc<Model>, to_world: Affine) {
         let (mut lo, mut hi) = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
         for i in 0..8 {
@@ -170,7 +172,8 @@ impl World {
         });
     }
 
-    /// Closest hit with t > 0 over all placed models, through glass; the first added wins ties.
+    /// Returns the closest hit with t > 0 over all placed models, ignoring thin glass. In a tie,
+    /// the model added first wins.
     pub(crate) fn closest(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let inverse = Vec3::new(1.0 / direction.x, 1.0 / direction.y, 1.0 / direction.z);
         let mut best: Option<Hit> = None;
@@ -201,13 +204,13 @@ impl World {
         best
     }
 
-    /// World-space unit normal of the facet hit, turned against `direction`.
+    /// Returns the world-space unit normal of the hit facet, turned against `direction`.
     pub(crate) fn normal(&self, hit: Hit, direction: Vec3) -> Vec3 {
         let n = self.facing(hit);
         if n.dot(direction) > 0.0 { -n } else { n }
     }
 
-    /// World-space unit normal of the facet hit, by the order of its corners.
+    /// Returns the world-space unit normal of the hit facet, by the order of its corners.
     pub(crate) fn facing(&self, hit: Hit) -> Vec3 {
         let placed = &self.placed[hit.object];
         let mesh = &placed.model.mesh;

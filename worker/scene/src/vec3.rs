@@ -1,7 +1,7 @@
 //! Three-component f32 vectors and affine maps, in plain scalar arithmetic.
 //!
-//! No SIMD library and no fused multiply-add on purpose: the same operations in the same order give the
-//! same bits on every machine, and task outputs must be bit-identical.
+//! SIMD libraries and fused multiply-add are avoided on purpose: the same operations in the same
+//! order give the same bits on every machine, and task outputs must be bit-identical.
 
 use std::ops::{Add, AddAssign, Div, Index, Mul, Neg, Sub};
 
@@ -11,11 +11,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "[f32; 3]", into = "[f32; 3]")]
 pub struct Vec3 {
-    /// First component.
+    /// The first component.
     pub x: f32,
-    /// Second component.
+    /// The second component.
     pub y: f32,
-    /// Third component.
+    /// The third component.
     pub z: f32,
 }
 
@@ -23,23 +23,23 @@ impl Vec3 {
     /// The origin.
     pub const ZERO: Vec3 = Vec3::new(0.0, 0.0, 0.0);
 
-    /// A vector from its components.
+    /// Creates a vector from its components.
     pub const fn new(x: f32, y: f32, z: f32) -> Self {
         Self { x, y, z }
     }
 
-    /// All three components equal to `v`.
+    /// Creates a vector with all three components equal to `v`.
     pub const fn splat(v: f32) -> Self {
         Self::new(v, v, v)
     }
 
-    /// Inner product.
+    /// Returns the inner product.
     #[inline(always)]
     pub fn dot(self, o: Self) -> f32 {
         self.x * o.x + self.y * o.y + self.z * o.z
     }
 
-    /// Vector product (right-handed).
+    /// Returns the vector product (right-handed).
     #[inline(always)]
     pub fn cross(self, o: Self) -> Self {
         Self::new(
@@ -49,31 +49,31 @@ impl Vec3 {
         )
     }
 
-    /// Euclidean length.
+    /// Returns the Euclidean length.
     #[inline(always)]
     pub fn length(self) -> f32 {
         self.dot(self).sqrt()
     }
 
-    /// Unit vector of the same direction; not finite for the zero vector.
+    /// Returns the unit vector of the same direction; it is non-finite for the zero vector.
     #[inline(always)]
     pub fn normalized(self) -> Self {
         self / self.length()
     }
 
-    /// Component-wise minimum.
+    /// Returns the component-wise minimum.
     #[inline(always)]
     pub fn min(self, o: Self) -> Self {
         Self::new(self.x.min(o.x), self.y.min(o.y), self.z.min(o.z))
     }
 
-    /// Component-wise maximum.
+    /// Returns the component-wise maximum.
     #[inline(always)]
     pub fn max(self, o: Self) -> Self {
         Self::new(self.x.max(o.x), self.y.max(o.y), self.z.max(o.z))
     }
 
-    /// True where no component is NaN or infinite.
+    /// Returns whether no component is NaN or infinite.
     pub fn is_finite(self) -> bool {
         self.x.is_finite() && self.y.is_finite() && self.z.is_finite()
     }
@@ -153,9 +153,9 @@ impl Neg for Vec3 {
 /// An affine map: `linear * p + translation`. `linear` is stored by rows.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Affine {
-    /// Rows of the 3×3 linear part.
+    /// The rows of the 3×3 linear part.
     pub linear: [Vec3; 3],
-    /// Translation in metres.
+    /// The translation in metres.
     pub translation: Vec3,
 }
 
@@ -170,7 +170,8 @@ impl Affine {
         translation: Vec3::ZERO,
     };
 
-    /// Rotation by `yaw` (radians) about +y, then translation. Positive yaw turns +z towards +x.
+    /// Returns a rotation by `yaw` (radians) about +y, followed by a translation. Positive yaw
+    /// turns +z towards +x.
     pub fn yaw_then_move(yaw: f32, translation: Vec3) -> Self {
         let (s, c) = (libm::sinf(yaw), libm::cosf(yaw));
         Affine {

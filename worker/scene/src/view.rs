@@ -1,22 +1,22 @@
-//! What a generated scene's camera and laser must see: bounded depth over the whole image, enough to
-//! look at, and every beam landing on a diffuse surface.
+//! The requirements on a generated scene's camera and laser: bounded depth over the whole image,
+//! enough visible objects, and every beam ending on a diffuse surface.
 
 use crate::{Bsdf, Camera, Intrinsics, Laser, Material, Object, Vec3, trace::World};
 
-/// Smallest z-depth of a furnished room's view, metres.
+/// The smallest z-depth of a furnished room's view, metres.
 pub const MIN_DEPTH_M: f32 = 0.5;
-/// Largest z-depth of a furnished room's view, metres.
+/// The largest z-depth of a furnished room's view, metres.
 pub const MAX_DEPTH_M: f32 = 4.5;
 
-/// Pixels along the longer side of the image by which a view is accepted. It is the same for every image
-/// size: a seed shows the same view at 64 pixels as at 1,024.
+/// The number of pixels along the longer side of the image for the acceptance test. It is the same
+/// for every image size, so a seed shows the same view at 64 pixels as at 1,024.
 const ACCEPTED_AT: u32 = 256;
-/// Rows and columns of the coarse look before the full check.
+/// The number of rows and columns of the coarse test before the full one.
 const COARSE: u32 = 24;
-/// Mirrors and surfaces of bodies of glass that a beam may meet before it has to land.
+/// The greatest number of mirrors and surfaces of glass bodies on a beam's path before it must end.
 const MAX_FOLDS: usize = 8;
 
-/// Intrinsics by which the view of an image of `width` × `height` pixels is accepted.
+/// Returns the intrinsics for the acceptance test of an image of `width` × `height` pixels.
 pub(crate) fn acceptance(fov_x_deg: f32, width: u32, height: u32) -> Intrinsics {
     let longer = width.max(height).max(1);
     let side = |pixels: u32| {
@@ -26,8 +26,9 @@ pub(crate) fn acceptance(fov_x_deg: f32, width: u32, height: u32) -> Intrinsics 
     Intrinsics::from_fov(fov_x_deg, side(width), side(height))
 }
 
-/// Pixels of the coarse look (of COARSE²) that see each object; `None` where any lies outside the
-/// bounds of z-depth. The film's corners are looked at too, since extremes tend to lie there.
+/// Returns the number of pixels of the coarse test (of COARSE²) that see each object, or `None` if
+/// any z-depth is out of bounds. The film's corners are tested too, because extremes tend to be
+/// there.
 pub(crate) fn coarse_view(
     world: &World,
     camera: &Camera,
@@ -55,7 +56,8 @@ pub(crate) fn coarse_view(
     Some(seen)
 }
 
-/// Smallest and largest z-depth over every pixel centre; `None` where one lies outside the bounds.
+/// Returns the smallest and largest z-depth over every pixel centre, or `None` if one is out of
+/// bounds.
 pub(crate) fn full_view(world: &World, camera: &Camera, bounds: [f32; 2]) -> Option<[f32; 2]> {
     let i = &camera.intrinsics;
     let (mut near, mut far) = (f32::INFINITY, 0.0f32);
@@ -68,7 +70,7 @@ pub(crate) fn full_view(world: &World, camera: &Camera, bounds: [f32; 2]) -> Opt
     Some([near, far])
 }
 
-/// Object and z-depth at a film position, if within the bounds.
+/// Returns the object and z-depth at a film position, if within the bounds.
 fn bounded(
     world: &World,
     camera: &Camera,
@@ -81,7 +83,8 @@ fn bounded(
     (near..=far).contains(&hit.t).then_some((hit.object, hit.t))
 }
 
-/// True if every beam ends on a diffuse surface: straight, folded by mirrors or refracted by bodies of glass.
+/// Returns whether every beam ends on a diffuse surface: straight, folded by mirrors or refracted
+/// by glass bodies.
 pub(crate) fn beams_land(world: &World, laser: &Laser, objects: &[Object]) -> bool {
     laser
         .beams
@@ -104,7 +107,7 @@ fn lands(world: &World, mut origin: Vec3, mut direction: Vec3, objects: &[Object
         let normal = world.normal(hit, direction);
         let refracted = match material.bsdf {
             Bsdf::Dielectric { ior, .. } => {
-                // Before the facet is air, behind it glass.
+                // There is air in front of the facet, and glass behind it.
                 let enters = world.facing(hit).dot(direction) <= 0.0;
                 refracted(direction, normal, if enters { 1.0 / ior } else { ior })
             }
@@ -121,8 +124,9 @@ fn lands(world: &World, mut origin: Vec3, mut direction: Vec3, objects: &[Object
     false
 }
 
-/// Snell's law: the unit direction behind a surface whose unit normal is turned against the unit `direction`. `ratio` is the index
-/// of refraction before the surface over that behind it. `None` where all is reflected.
+/// Returns the unit direction behind a surface by Snell's law. The surface's unit normal must be
+/// turned against the unit `direction`. `ratio` is the index of refraction in front of the surface
+/// over the index behind it. Returns `None` for total reflection.
 fn refracted(direction: Vec3, normal: Vec3, ratio: f32) -> Option<Vec3> {
     let cos = -direction.dot(normal);
     let square = 1.0 - ratio * ratio * (1.0 - cos * cos);
@@ -130,7 +134,7 @@ fn refracted(direction: Vec3, normal: Vec3, ratio: f32) -> Option<Vec3> {
         .then(|| (direction * ratio + normal * (ratio * cos - square.sqrt())).normalized())
 }
 
-/// True for objects with a specular material.
+/// Returns whether an object has a specular material.
 pub(crate) fn is_specular(object: &Object) -> bool {
     object.mesh.materials.iter().any(Material::is_specular)
 }
@@ -157,7 +161,7 @@ mod tests {
         shape.finish()
     }
 
-    /// Whether a beam along +z from the origin lands.
+    /// Returns whether a beam along +z from the origin ends on a diffuse surface.
     fn beam_lands(meshes: Vec<Mesh>) -> bool {
         let mut world = World::default();
         let place = |mesh| {
@@ -184,7 +188,7 @@ mod tests {
             assert!((inside.x * 1.5 - sin).abs() < 1e-6, "{inside:?}");
             let left = refracted(inside, n, 1.5).expect("leaves");
             assert!((left - came).length() < 1e-6, "{left:?}");
-            // The critical angle has a sine of 1/1.5.
+            // The sine of the critical angle is 1/1.5.
             assert_eq!(refracted(came, n, 1.5).is_none(), sin > 1.0 / 1.5);
         }
     }
@@ -204,7 +208,7 @@ mod tests {
         };
         assert!(beam_lands(vec![slab(), wall([-9.0, 9.0], 3.0)]));
         assert!(!beam_lands(vec![slab()]));
-        // A ball above the beam turns it up, towards its axis.
+        // A ball above the beam deflects it upwards, towards the ball's axis.
         let ball = || {
             solid(GLASS, |s, m| {
                 s.ellipsoid(Vec3::new(0.003, 0.5, 2.0), [1.0, 1.0], 64, m)
@@ -212,7 +216,7 @@ mod tests {
         };
         assert!(beam_lands(vec![ball(), wall([0.5, 9.0], 5.0)]));
         assert!(!beam_lands(vec![ball(), wall([-9.0, 0.5], 5.0)]));
-        // A prism turns it down, by total reflection: 45° are beyond the critical angle.
+        // A prism deflects it downwards by total reflection: 45° exceeds the critical angle.
         let prism = solid(GLASS, |s, m| {
             let (a, b, c) = ([-1.0, 1.0], [-1.0, 3.0], [1.0, 1.0]);
             let at = |x: f32, [y, z]: [f32; 2]| Vec3::new(x, y, z);

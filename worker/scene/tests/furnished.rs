@@ -1,4 +1,5 @@
-//! Furnished rooms: reproducible on any machine, acceptable for ordinary seeds, checked by brute force.
+//! Furnished rooms: reproducible on any machine, acceptable for ordinary seeds, and checked by
+//! brute force.
 
 use std::path::PathBuf;
 
@@ -20,7 +21,7 @@ fn settings(assets: &str) -> FurnishedSettings {
     }
 }
 
-/// World-space triangles of every object with the sphere round it, for rays without any tree.
+/// The world-space triangles of every object with its bounding sphere, for rays without a tree.
 struct Soup(Vec<(Vec<[Vec3; 3]>, Vec3, f32)>);
 
 impl Soup {
@@ -37,7 +38,8 @@ impl Soup {
         Self(objects.collect())
     }
 
-    /// (t, object) of the closest hit, by Möller and Trumbore with a little slack at the edges.
+    /// Returns the (t, object) of the closest hit, by Möller and Trumbore with a small tolerance at
+    /// the edges.
     fn closest(&self, origin: Vec3, direction: Vec3) -> Option<(f32, usize)> {
         let mut best: Option<(f32, usize)> = None;
         for (object, (triangles, centre, radius)) in self.0.iter().enumerate() {
@@ -63,7 +65,7 @@ impl Soup {
     }
 }
 
-/// Depth bounds, beams and specular pixels of a scene, all by brute force.
+/// Checks depth bounds, beams and specular pixels of a scene, all by brute force.
 fn is_acceptable(seed: u64, scene: &Scene) {
     scene.validate().expect("generated scenes are valid");
     assert_eq!(scene.labels, LABELS, "seed {seed}: the vocabulary is fixed");
@@ -123,7 +125,7 @@ fn the_same_seed_gives_the_same_bytes_for_ever() {
     let room = hash(&parametric());
     assert_eq!(room, hash(&parametric()));
     let primitive = primitive::generate(5, &PrimitiveSettings::default()).expect("succeeds");
-    // A change here means that published seeds give other scenes: raise the GENERATOR_VERSION constants.
+    // If this changes, published seeds give other scenes: raise the GENERATOR_VERSION constants.
     insta::assert_snapshot!(format!("furnished {room}\nprimitive {}", hash(&primitive)));
 }
 

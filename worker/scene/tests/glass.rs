@@ -1,4 +1,4 @@
-//! Bodies of glass: files bring them back, Mitsuba's are understood, and what is no body is refused.
+//! Bodies of glass: files restore them, Mitsuba's are supported, and invalid bodies are refused.
 
 #[allow(dead_code)]
 mod common;
@@ -11,13 +11,13 @@ use picofarm_scene::{
     primitive::{self, PrimitiveSettings},
 };
 
-/// An octahedron whose facets face outwards.
+/// Returns an octahedron with facets facing outwards.
 fn octahedron(material: Material) -> Mesh {
     let tip = |k: usize| {
         let axis = |a: usize| if k / 2 == a { [0.3, -0.3][k % 2] } else { 0.0 };
         Vec3::new(axis(0), axis(1), axis(2))
     };
-    // Of +x, +y and +z in this order, turned for each negative one.
+    // Facets of +x, +y and +z in this order, reversed for each negative one.
     let facet = |k: u32| {
         let [x, y, z] = [k & 1, 2 + (k >> 1 & 1), 4 + (k >> 2 & 1)];
         if k.count_ones().is_multiple_of(2) {
@@ -86,7 +86,7 @@ fn bodies_of_glass_read_back_exactly() {
     assert_eq!(stone(&back), stone(&scene));
     assert_eq!(back.provenance, scene.provenance);
 
-    // Mitsuba's words alone say the same.
+    // Mitsuba's elements alone give the same material.
     let text = std::fs::read_to_string(&xml).expect("the file");
     let plain: Vec<&str> = text.lines().filter(|l| !l.starts_with("<!--")).collect();
     std::fs::write(&xml, plain.join("\n")).expect("writes");
@@ -230,7 +230,7 @@ fn mitsubas_glass_that_is_no_body_is_refused_with_a_way_out() {
     }
 }
 
-/// What is wrong with the scene, if the field is that of the glass.
+/// Returns the fault of the scene, if the field is that of the glass.
 fn refusal(mesh: Mesh) -> String {
     let scene = room_with(mesh);
     let k = scene.objects.len() - 1;

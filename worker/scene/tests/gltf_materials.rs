@@ -1,4 +1,5 @@
-//! Foreign glTF materials: textures, partial metals and extensions, and what is said of the rest.
+//! Materials of other glTF files: textures, partial metals and extensions, and the notes on other
+//! features.
 
 #[allow(dead_code)]
 mod common;
@@ -9,7 +10,7 @@ use common::data_uri;
 use image::{ImageFormat, RgbImage};
 use picofarm_scene::{Bsdf, Distribution, Scene, SceneError, SpectrumPoint, Wrap, export, import};
 
-/// Left half `a`, right half `b`.
+/// Returns a picture with `a` in the left half and `b` in the right.
 fn picture(format: ImageFormat, a: [u8; 3], b: [u8; 3]) -> Vec<u8> {
     let image = RgbImage::from_fn(16, 8, |x, _| image::Rgb(if x < 8 { a } else { b }));
     let mut out = Cursor::new(Vec::new());
@@ -17,7 +18,7 @@ fn picture(format: ImageFormat, a: [u8; 3], b: [u8; 3]) -> Vec<u8> {
     out.into_inner()
 }
 
-/// A triangle with texture coordinates, `material` and `more` top-level keys.
+/// Returns a file with a triangle with texture coordinates, `material` and `more` top-level keys.
 fn file(material: &str, more: &str) -> String {
     let numbers = [
         0., 0., 0., 1., 0., 0., 0., 1., 0., 0., 0., 1., 0., 0., 1.0f32,
@@ -200,12 +201,12 @@ fn what_lets_light_through_is_thin_glass() {
     );
     assert_eq!(tinted.bsdf, glass(1.6, 0.6, false));
     assert_eq!(tinted.rgb, [0.8, 0.4, 0.6]);
-    // A solid, which has two faces; what it absorbs on the way.
+    // A solid, which has two faces, with absorption along the path.
     let solid = of(r#"{"pbrMetallicRoughness":{"metallicFactor":0},
             "extensions":{"KHR_materials_transmission":{"transmissionFactor":1},
             "KHR_materials_volume":{"thicknessFactor":0.02,"attenuationDistance":0.01,"attenuationColor":[0.5,0.5,0.5]}}}"#);
     assert_eq!(solid.bsdf, glass(1.5, 0.25, true));
-    // By opacity, in the mode that blends and in no other.
+    // Glass by opacity, in the blending mode only.
     let text = |mode: &str, opacity: f32| {
         format!(
             r#"{{"alphaMode":"{mode}","pbrMetallicRoughness":{{"baseColorFactor":[1,1,1,{opacity}],"metallicFactor":0}}}}"#
@@ -215,7 +216,7 @@ fn what_lets_light_through_is_thin_glass() {
     for opaque in [text("BLEND", 0.75), text("OPAQUE", 0.25)] {
         assert_eq!(of(&opaque).bsdf, Bsdf::Diffuse { reflectance: 1.0 });
     }
-    // A metal lets nothing through.
+    // A metal transmits nothing.
     let metal = of(
         r#"{"pbrMetallicRoughness":{"metallicFactor":1,"roughnessFactor":0.5},
             "extensions":{"KHR_materials_transmission":{"transmissionFactor":1}}}"#,
@@ -252,7 +253,7 @@ fn anyone_may_state_a_spectrum_in_a_materials_extras() {
     let at = scene.objects[0].mesh.materials[0].at(905.0);
     assert_eq!((at.lambertian, at.conductor), (0.7, 0.9));
 
-    // Extras of another shape are none of our business.
+    // Extras of another type are ignored.
     for extras in ["[[1]]", "\"spectrum\"", "{\"colour\":1}"] {
         let scene = read(file(&format!(r#"{{"extras":{extras}}}"#), ""));
         assert_eq!(scene.objects[0].mesh.materials[0].spectrum, []);

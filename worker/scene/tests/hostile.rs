@@ -1,4 +1,5 @@
-//! Damaged and hostile files of every format: no panic, no scene that fails validation, bounded memory.
+//! Damaged and hostile files of every format: no panic, no scene that fails validation, bounded
+//! memory.
 
 #[allow(dead_code)]
 mod common;
@@ -12,10 +13,10 @@ use picofarm_scene::{
 use proptest::{prelude::*, test_runner::TestRunner};
 use serde_json::Value as Json;
 
-/// Virtual memory that reading small files may add at its peak, kB.
+/// The virtual memory that reading small files may add at its peak, kB.
 const MAX_GROWTH_KB: u64 = 3 << 20;
 
-/// One way to damage a file, at a place given as a share of its length.
+/// A way to damage a file, at a position given as a share of its length.
 #[derive(Debug, Clone)]
 enum Damage {
     Flip(u8),
@@ -23,7 +24,7 @@ enum Damage {
     Cut,
     Remove(u8),
     Repeat(u8),
-    /// Replaces the number at or after the place by another.
+    /// Replaces the number at or after the position by another.
     Number(&'static str),
     /// Swaps two parts.
     Swap(f64),
@@ -72,7 +73,7 @@ fn damaged(whole: &[u8], all: &[(f64, Damage)]) -> Vec<u8> {
         match kind {
             Damage::Flip(bit) => bytes[at] ^= 1 << bit,
             Damage::Set(value) => bytes[at] = *value,
-            // A cut keeps most of the file, so that the others still find something.
+            // A cut leaves most of the file, so that other damage still has an effect.
             Damage::Cut => bytes.truncate(bytes.len() - at / 8),
             Damage::Remove(n) => {
                 let end = (at + usize::from(*n)).min(bytes.len());
@@ -100,7 +101,7 @@ fn damaged(whole: &[u8], all: &[(f64, Damage)]) -> Vec<u8> {
     bytes
 }
 
-/// Reads `bytes` as the file `name` beside the files of [`folder`]; whatever is accepted must be sound.
+/// Reads `bytes` as the file `name` among the files of [`folder`]. An accepted scene must be valid.
 fn survives(folder: &Path, name: &str, bytes: &[u8]) -> Result<(), TestCaseError> {
     let path = folder.join(name);
     std::fs::write(&path, bytes).expect("writes");
@@ -161,7 +162,7 @@ fn room() -> picofarm_scene::Scene {
     scene
 }
 
-/// The undamaged files, in the order of [`FILES`].
+/// Returns the undamaged files, in the order of [`FILES`].
 fn files() -> &'static [Vec<u8>] {
     static ALL: OnceLock<Vec<Vec<u8>>> = OnceLock::new();
     ALL.get_or_init(|| {
@@ -189,7 +190,7 @@ fn files() -> &'static [Vec<u8>] {
     })
 }
 
-/// A folder with everything that the scenes refer to.
+/// Returns a folder with all files that the scenes refer to.
 fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     let scene = room();
@@ -198,7 +199,7 @@ fn folder() -> tempfile::TempDir {
     folder
 }
 
-/// `PICOFARM_FUZZ` multiplies the number of cases.
+/// Returns a test runner. `PICOFARM_FUZZ` multiplies the number of cases.
 fn runner(cases: u32) -> TestRunner {
     let times = std::env::var("PICOFARM_FUZZ").ok();
     let times = times.and_then(|n| n.parse::<u32>().ok()).unwrap_or(1);
@@ -217,7 +218,7 @@ fn count(json: &Json) -> usize {
     }
 }
 
-/// Replaces the value at a place in depth-first order, or removes it. Counts `place` down to it.
+/// Replaces the value at a position in depth-first order, or removes it. Counts `place` down to it.
 fn edit(json: &mut Json, place: &mut usize, value: Option<&Json>) {
     let mut step = |child: &mut Json| {
         if *place == 0 {
@@ -312,7 +313,8 @@ fn the_undamaged_files_are_read() {
     for (name, bytes) in FILES.iter().zip(files()) {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).expect("writes");
-        // Meshes are reached by the scenes that name them; one may be edge-on to a framing camera.
+        // Meshes are read through the scenes that name them; one may be edge-on to a framing
+        // camera.
         if !name.ends_with(".obj") && !name.starts_with("meshes/") {
             import::read_scene_with(&path, &options, &Bounds::default()).expect(name);
         }
@@ -328,7 +330,7 @@ fn damaged_files_never_panic_nor_pass_as_sound_nor_fill_the_memory() {
     let outcome = runner.run(&strategy, |(which, all)| {
         let bytes = damaged(&files()[which], &all);
         let name = FILES[which];
-        // Meshes are reached by the scenes that name them.
+        // Meshes are read through the scenes that name them.
         let (scene, as_scene) = match name {
             "meshes/0000-0.ply" => ("room.xml", 2),
             "part.obj" => ("scene.json", 3),

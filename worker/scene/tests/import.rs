@@ -1,4 +1,4 @@
-//! Foreign files: what is understood, and errors that name the file, the field and the way out.
+//! Imported files: supported features, and errors that name the file, the field and a remedy.
 
 #[allow(dead_code)]
 mod common;
@@ -12,7 +12,7 @@ use picofarm_scene::{
     primitive::{self, PrimitiveSettings},
 };
 
-/// One triangle under a turned, moved node.
+/// Returns one triangle under a turned, moved node.
 fn gltf(buffer_uri: &str, camera_and_laser: &str) -> String {
     format!(
         r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
@@ -50,7 +50,7 @@ impl Folder {
     }
 }
 
-/// The error's text, which must name the file.
+/// Returns the error's text, which must name the file.
 fn refusal(path: &Path) -> String {
     let error = read_scene(path).expect_err("must be refused").to_string();
     let name = path
@@ -223,7 +223,7 @@ fn malformed_reference_scenes_are_refused_by_field() {
     }
 }
 
-/// The reference scenes' folder, or `None` with a message where this checkout has none.
+/// Returns the reference scenes' folder, or `None` with a message if this checkout has none.
 fn reference(name: &str) -> Option<PathBuf> {
     let path = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
         .join("../../../shared/reference/transients")
@@ -235,7 +235,8 @@ fn reference(name: &str) -> Option<PathBuf> {
     None
 }
 
-/// Distance of a point from a triangle's plane and whether it lies within its edges (with slack).
+/// Returns the distance of a point from a triangle's plane, and whether it is within the triangle's
+/// edges (with a tolerance).
 fn on_triangle(p: Vec3, [a, b, c]: [Vec3; 3]) -> bool {
     let n = (b - a).cross(c - a).normalized();
     let inside = [(a, b), (b, c), (c, a)]

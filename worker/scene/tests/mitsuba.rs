@@ -1,4 +1,4 @@
-//! Mitsuba scenes: ours come back, foreign ones are understood or refused by element.
+//! Mitsuba scenes: ours are restored, and others are read or refused by element.
 
 #[allow(dead_code)]
 mod common;
@@ -13,7 +13,7 @@ use picofarm_scene::{
 /// Object, corners, texture coordinates and material.
 type Facet = (usize, [Vec3; 3], Vec<[f32; 2]>, String);
 
-/// Corners of all triangles in world space with their materials' names, in order.
+/// Returns the corners of all triangles in world space with their materials' names, in order.
 fn soup(scene: &Scene) -> Vec<Facet> {
     let mut all = Vec::new();
     for (k, o) in scene.objects.iter().enumerate() {
@@ -58,7 +58,7 @@ fn an_exported_scene_comes_back() {
     }
     assert_eq!(soup(&back), soup(&scene));
 
-    // Edited elements count as they stand.
+    // Edited elements are read as they are.
     let text = std::fs::read_to_string(&path).expect("the file");
     let edited = text.replace(
         "name=\"weight\" value=\"0.25\"",
@@ -403,7 +403,7 @@ fn thin_glass_comes_back_as_it_went_and_is_read_from_others() {
         export::write_glb(&scene, &glb).expect("writes");
         assert_eq!(all(&import::read_scene(&glb).expect("reads")), [glass]);
     }
-    // Mitsuba's own words: named media; of its reflections only those without a tint.
+    // Mitsuba's own terms: named media; reflections only without a tint.
     let plain = r#"{"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}"#;
     let text = |glass: &str| {
         DICTIONARY.replacen(

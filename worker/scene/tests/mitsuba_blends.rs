@@ -5,7 +5,8 @@ use picofarm_scene::{
 };
 use proptest::prelude::*;
 
-/// A wall of a BSDF with the id `m`; the image `a.png` lies beside it, and `b.png` of other texels.
+/// Reads a wall with a BSDF with the id `m`. The images `a.png` and `b.png`, with other texels, are
+/// in the same folder.
 fn read(bsdf: &str) -> Result<Scene, SceneError> {
     let text = format!(
         r#"<scene version="3.0.0">
@@ -40,7 +41,7 @@ fn blend(weight: f32, a: &str, b: &str) -> String {
     format!(r#"<bsdf type="blendbsdf"><float name="weight" value="{weight}"/>{a}{b}</bsdf>"#)
 }
 
-/// The outermost element with the id that the wall refers to.
+/// Returns the outermost element with the id that the wall refers to.
 fn named(bsdf: &str) -> String {
     bsdf.replacen("<bsdf ", "<bsdf id=\"m\" ", 1)
 }
@@ -154,7 +155,7 @@ fn what_is_one_part_or_one_of_each_stays_what_it_was() {
         weight: 0.3,
     };
     assert_eq!(plain.bsdf, expected);
-    // Alike parts are one, and parts without a share are none.
+    // Equal parts are merged, and parts without a share are dropped.
     for tree in [
         blend(0.5, &pair, &pair),
         blend(0.0, &pair, &diffuse("0.9")),
@@ -170,7 +171,7 @@ fn what_is_one_part_or_one_of_each_stays_what_it_was() {
         let (found, alone) = (material(&named(&tree)), material(&named(bsdf)));
         assert_eq!((found.bsdf, found.rgb), (alone.bsdf, alone.rgb), "{tree}");
     }
-    // A mix without a share of one part is a mix still.
+    // A mix in which one part has no share remains a mix.
     let m = material(&named(&blend(0.0, &d, &c)));
     assert!(matches!(m.bsdf, Bsdf::Mixed { weight: 0.0, .. }));
     let m = material(&named(&blend(0.3, &c, &d)));

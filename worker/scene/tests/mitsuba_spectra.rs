@@ -1,4 +1,5 @@
-//! Spectra in Mitsuba scenes: ours come back, those of others are read or refused by element.
+//! Spectra in Mitsuba scenes: ours are restored, and those of others are read or refused by
+//! element.
 
 #[allow(dead_code)]
 mod common;
@@ -24,7 +25,7 @@ fn read_text(name: &str, text: &str) -> Result<Scene, SceneError> {
     read_scene(&path)
 }
 
-/// A wall of a BSDF with the id `m`, in XML.
+/// Reads a wall with a BSDF with the id `m`, in XML.
 fn read(bsdf: &str) -> Result<Scene, SceneError> {
     let text = format!(
         r#"<scene version="3.0.0">

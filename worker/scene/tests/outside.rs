@@ -1,4 +1,5 @@
-//! What a scene file names is opened only where it may lie, and no error tells what else lies on the machine.
+//! The files that a scene names are opened only within the allowed folders, and no error reveals
+//! other files of the machine.
 
 use std::{
     os::unix::fs::symlink,
@@ -17,7 +18,7 @@ struct Place {
 }
 
 impl Place {
-    /// A folder `scenes` beside a file that is nobody's business.
+    /// Creates a folder `scenes` next to a file outside the allowed folders.
     fn new() -> Self {
         let dir = tempfile::tempdir().unwrap();
         let place = Self { dir };
@@ -42,7 +43,7 @@ impl Place {
         path
     }
 
-    /// Names that mean the secret, or would on another system.
+    /// Returns names of the secret, including those that would be valid on another system.
     fn tricks(&self) -> Vec<String> {
         let whole = self.secret().display().to_string();
         [
@@ -71,7 +72,8 @@ fn options() -> ImportOptions {
     }
 }
 
-/// Neither reading nor the fingerprint opens what the scene names, and neither says what is in it.
+/// Checks that neither reading nor the fingerprint opens the named file, and that neither error
+/// reveals its content.
 fn refused(path: &Path, bounds: &Bounds, what: &str) {
     let read = read_scene_with(path, &options(), bounds).map(drop);
     let print = fingerprint(path, bounds).map(drop);
@@ -119,7 +121,7 @@ fn mitsuba_names_no_file_outside_its_folder() {
         let path = place.scene("a.xml", &mitsuba("rectangle", &texture));
         refused(&path, &bounds, &format!("bitmap {name}"));
     }
-    // A parameter may hold the name too.
+    // A parameter may contain the name too.
     let text = mitsuba("ply", &filename("$x"))
         .replace("<sensor", r#"<default name="x" value="../secret"/><sensor"#);
     refused(&place.scene("a.xml", &text), &bounds, "default");
@@ -179,7 +181,7 @@ fn a_root_lets_scenes_share_meshes_and_an_operators_bounds_hold_all_the_same() {
         ..bounds
     };
     refused(&path, &within, "operator");
-    // The scene file itself counts too.
+    // The scene file itself is also checked.
     let own = place.scenes().join("link");
     let said = read_scene_with(&own, &options(), &within).unwrap_err();
     assert!(matches!(said, SceneError::Refused(_)), "{said}");

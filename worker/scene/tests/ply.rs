@@ -1,4 +1,4 @@
-//! PLY: every encoding of the same mesh reads alike; damage is named.
+//! PLY: every encoding of the same mesh gives the same result; damage is reported by name.
 
 use std::path::PathBuf;
 

@@ -94,7 +94,7 @@ fn named<'a>(scene: &'a Scene, label: &str) -> &'a picofarm_scene::Object {
     scene.objects.iter().find(is).expect("it is there")
 }
 
-/// Extent of an object's mesh along its own axes.
+/// Returns the extent of an object's mesh along its own axes.
 fn extent(scene: &Scene, label: &str) -> Vec3 {
     let (lo, hi) = named(scene, label).mesh.bounds().expect("triangles");
     hi - lo
@@ -110,7 +110,7 @@ fn a_box_on_a_desk_has_the_laboratorys_sizes_and_its_mirror_on_the_back_wall() {
         assert!((cylinder.x - 0.0254).abs() < 1e-5, "one inch: {cylinder:?}");
         let cube = extent(&scene, "cube");
         assert!((0.06..=0.16).contains(&cube.x) && (0.06..=0.2).contains(&cube.y));
-        // The camera looks to -z: the back wall is the one of least z.
+        // The camera looks towards -z, so the back wall has the least z.
         let back = scene.objects[..6].iter().filter_map(|o| o.mesh.bounds());
         let back = back.map(|(lo, _)| lo.z).fold(f32::INFINITY, f32::min);
         let mirror = named(&scene, "mirror").to_world.translation.z;
@@ -136,7 +136,7 @@ fn random_spots_differ_from_room_to_room_and_change_nothing_else() {
         let grid = primitive::generate(seed, &desktop()).expect("ordinary seeds succeed");
         assert_eq!(scene.laser.beams.len(), 16);
         assert_ne!(scene.laser, grid.laser);
-        // Only where a beam of one of them is lost among mirrors another camera is taken.
+        // Another camera is used only if a beam of one of them is lost among mirrors.
         same += usize::from(scene.camera == grid.camera);
     }
     assert!(same >= 18, "{same} of 20 cameras are the same");
@@ -163,7 +163,8 @@ fn a_laser_beside_the_camera_lights_the_points_that_the_camera_sees_there() {
         let camera = &scene.camera;
         let away = camera.right * 0.05 + camera.down * -0.03 + camera.forward * 0.01;
         assert!((scene.laser.origin - (camera.origin + away)).length() < 1e-6);
-        // Both beams of a spot are in a plane with the base line, and meet before the farthest wall.
+        // Both beams of a spot are in a plane with the base line, and intersect in front of the
+        // farthest wall.
         for (a, b) in scene.laser.beams.iter().zip(&other.laser.beams) {
             let normal = away.cross(b.direction);
             assert!(a.direction.dot(normal).abs() < 1e-6);

@@ -1,4 +1,4 @@
-//! Canonical `.glb` files come back exactly, and appear whole or not at all.
+//! Canonical `.glb` files are restored exactly, and appear completely or not at all.
 
 use picofarm_scene::{
     Bsdf, Material, Scene, export,
@@ -107,7 +107,7 @@ fn normals_are_of_unit_length_and_do_not_change_what_is_read() {
     }
 }
 
-/// The scene as a file in which another program gave the mirror a roughness of 0.5.
+/// Returns the scene as a file in which another program changed the mirror's roughness to 0.5.
 fn edited(scene: &Scene) -> Vec<u8> {
     let mut bytes = export::glb_bytes(scene).expect("valid");
     let factor = b"\"roughnessFactor\":0.1}";

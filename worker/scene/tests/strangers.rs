@@ -1,4 +1,5 @@
-//! Files as other programs and people write them: each is read right, or refused with a word that helps.
+//! Files as written by other programs and people: each is read correctly, or refused with a helpful
+//! message.
 
 #[allow(dead_code)]
 mod common;
@@ -9,11 +10,12 @@ use picofarm_scene::{
 };
 use serde_json::{Value as Json, json};
 
-/// What reading a file should come to.
+/// The expected result of reading a file.
 enum Expected {
-    /// Box of the last object's triangles in world space, their area, and a note that must be there (or empty).
+    /// The bounding box of the last object's triangles in world space, their area, and a required
+    /// note (or empty).
     Read([f32; 3], [f32; 3], f32, &'static str),
-    /// Part of the error.
+    /// A part of the error.
     Refused(&'static str),
 }
 use Expected::{Read, Refused};
@@ -481,7 +483,7 @@ fn a_scene_without_a_laser_is_known_by_its_type() {
     assert!(matches!(said, SceneError::NoLaser { .. }), "{said}");
 }
 
-/// A glTF file in the making: a wall, a camera with a laser, and a quad 2 m in front of it.
+/// A glTF file under construction: a wall, a camera with a laser, and a quad 2 m in front of it.
 struct Gltf {
     json: Json,
     data: Vec<u8>,
@@ -549,12 +551,12 @@ impl Gltf {
         self.accessor(&bytes, 5126, kind, numbers.len() / each)
     }
 
-    /// The second mesh's primitive.
+    /// Returns the second mesh's primitive.
     fn primitive(&mut self) -> &mut Json {
         &mut self.json["meshes"][1]["primitives"][0]
     }
 
-    /// A texture of an image on the second mesh, as its base colour.
+    /// Adds a texture of an image to the second mesh, as its base colour.
     fn textured(&mut self, image: &[u8], mime: &str) {
         let uv = self.floats(&[0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 1.0], "VEC2");
         self.primitive()["attributes"]["TEXCOORD_0"] = json!(uv);
@@ -578,7 +580,7 @@ impl Gltf {
     }
 }
 
-/// A PNG of 2×1 texels with these values of alpha.
+/// Returns a PNG of 2×1 texels with these values of alpha.
 fn png(alpha: [u8; 2]) -> Vec<u8> {
     let image =
         image::RgbaImage::from_fn(2, 1, |x, _| image::Rgba([200, 200, 200, alpha[x as usize]]));
@@ -599,7 +601,7 @@ fn scenes_in_gltf() {
         |value: Json| -> Edit { Box::new(move |f| f.json["nodes"][2]["extras"] = value.clone()) };
     let skinned = |weight: f32| -> Edit {
         Box::new(move |f| {
-            // A joint a metre further back, for a mesh of a hundredth of its size.
+            // A joint one metre further back, for a mesh of a hundredth of its size.
             let small: Vec<f32> = QUAD.iter().map(|x| x * 100.0).collect();
             let places = f.floats(&small, "VEC3");
             f.json["accessors"][places]["min"] = json!([-50, -50, 0]);

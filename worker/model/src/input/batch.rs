@@ -1,42 +1,43 @@
-//! Visits to scenes, and batches of what was seen there.
+//! Visits to scenes, and batches of examples.
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
 use super::{Question, ShadowVariant, Target, intensity, merged, planes, planes_of};
 use crate::{ModelError, net::Input, scene::Scene};
 
-/// How a scene is looked at once.
+/// The parameters of one visit to a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Visit {
-    /// The spot in question, where a network is asked spot by spot.
+    /// The spot in question, if a network is queried spot by spot.
     pub spot: usize,
-    /// Left and right change places.
+    /// Whether left and right are exchanged.
     pub flip_columns: bool,
-    /// Top and bottom change places.
+    /// Whether top and bottom are exchanged.
     pub flip_rows: bool,
 }
 
-/// What was seen and what is true: (N, channels, H, W) each.
+/// Inputs and true outputs of a network: (N, channels, H, W) each.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Batch {
-    /// Scenes.
+    /// The number of scenes.
     pub images: usize,
-    /// Rows.
+    /// The number of rows.
     pub height: usize,
-    /// Columns.
+    /// The number of columns.
     pub width: usize,
-    /// Dense channels.
+    /// The dense channels.
     pub dense: Vec<f32>,
-    /// Bins of the one-hot channels, -1 = none; empty where the network has none.
+    /// The bins of the one-hot channels, -1 = none; empty if the network has no such channels.
     pub one_hot: Vec<i32>,
-    /// What the network should say.
+    /// The true outputs of the network.
     pub target: Vec<f32>,
 }
 
-/// Adds a visit to a batch. What an empty batch still holds of another one is overwritten.
+/// Adds a visit to a batch. Leftover contents of an empty batch are overwritten.
 ///
 /// # Errors
-/// [`ModelError::Invalid`] where the scene has another size than the batch, or not what the question needs.
+/// [`ModelError::Invalid`] if the scene's size differs from the batch's, or the scene lacks data
+/// that the question requires.
 pub fn example(
     batch: &mut Batch,
     question: &Question,
@@ -48,7 +49,8 @@ pub fn example(
     Ok(())
 }
 
-/// The same of a scene that nobody needs afterwards: its histogram may become the batch's, and the batch's room the scene's.
+/// Like [`example`], but consumes the scene, so that its histogram can be reused as the batch's
+/// buffer and the batch's buffer as the scene's.
 ///
 /// # Errors
 /// Those of [`example`].
@@ -68,7 +70,8 @@ pub(crate) fn example_of(
     Ok(())
 }
 
-/// What was checked; with `ready` the histogram's planes are in the batch already.
+/// Adds a visit that was already checked. If `ready` is set, the histogram's planes are already in
+/// the batch.
 fn add(batch: &mut Batch, question: &Question, scene: &Scene, visit: Visit, ready: bool) {
     (batch.height, batch.width) = (scene.height, scene.width);
     if batch.images == 0 {
@@ -144,7 +147,8 @@ fn add(batch: &mut Batch, question: &Question, scene: &Scene, visit: Visit, read
     }
 }
 
-/// What a depth network should say: z over the question's scale, within 0..1; 1 where nothing is seen.
+/// Returns the true output of a depth network: z over the question's scale, limited to 0..1; 1 if
+/// no surface is visible.
 fn depth_target(z: f32, scale_m: f32) -> f32 {
     let scaled = z / scale_m;
     if scaled.is_finite() {
@@ -154,7 +158,7 @@ fn depth_target(z: f32, scale_m: f32) -> f32 {
     }
 }
 
-/// The bin of a path length, -1 outside of the gate.
+/// Returns the bin of a path length, -1 outside the gate.
 fn bin(scene: &Scene, bins: usize, path_m: f32) -> i32 {
     let stored = ((f64::from(path_m) - scene.first_m) / scene.bin_width_m).floor();
     if !(stored >= 0.0 && stored < scene.bins as f64) {
@@ -226,15 +230,16 @@ fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelE
 }
 
 impl Batch {
-    /// About how much memory it takes.
+    /// Returns the approximate memory that the batch takes, bytes.
     pub fn bytes(&self) -> usize {
         4 * (self.dense.len() + self.one_hot.len() + self.target.len())
     }
 
-    /// Appends another one, of `of` that will be joined in all, and gives back its room, empty, to be used again.
+    /// Appends another batch, of `of` images that will be joined in total. Returns the other's
+    /// buffers, empty, for reuse.
     ///
     /// # Errors
-    /// [`ModelError::Invalid`] where it has another size.
+    /// [`ModelError::Invalid`] if the sizes differ.
     pub(crate) fn join(&mut self, mut other: Self, of: usize) -> Result<Self, ModelError> {
         if self.images == 0 {
             if of == other.images {
@@ -255,7 +260,7 @@ impl Batch {
         Ok(other)
     }
 
-    /// On a device: what the network sees, and what it should say.
+    /// Transfers the batch to a device. Returns the network's input and its true output.
     pub fn into_input(self, device: &Device) -> (Input, Vec<f32>) {
         let (n, h, w) = (self.images, self.height, self.width);
         let channels = self.dense.len() / (n * h * w);
@@ -271,7 +276,7 @@ impl Batch {
         (input, self.target)
     }
 
-    /// The same where the batch is still needed.
+    /// Like [`Self::into_input`], but leaves the batch in place.
     pub fn input(&self, device: &Device) -> Input {
         let seen = Self {
             target: Vec::new(),

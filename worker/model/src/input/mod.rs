@@ -1,5 +1,5 @@
-//! From scenes to what networks see and what they should say: normalisation, rebinning, shadow transients, flips.
-//! Formulas are those of Shoot-Bounce-3D: section 4, appendices A.1 and B.
+//! Converts scenes to inputs and true outputs of networks: normalisation, rebinning, shadow
+//! transients, flips. The formulas are those of Shoot-Bounce-3D: section 4, appendices A.1 and B.
 
 mod batch;
 mod normalise;
@@ -13,21 +13,22 @@ pub use normalise::{intensity, merged, planes, planes_of};
 
 use crate::{ModelError, net::NetSpec};
 
-/// How histograms are scaled (appendix B).
+/// The scaling of histograms (appendix B).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Normalise {
-    /// (h − min)/(max − min) of each pixel; an all-equal histogram gives zeros.
+    /// (h − min)/(max − min) for each pixel; a histogram of equal values gives zeros.
     #[default]
     MinMax,
-    /// clip((log10(h + 1e-8) + 8)/(log10 h_max + 8), 0, 1), with the greatest value of the data set.
+    /// clip((log10(h + 1e-8) + 8)/(log10 h_max + 8), 0, 1), with the greatest value of the data
+    /// set.
     Log {
-        /// Greatest value in the data set.
+        /// The greatest value in the data set.
         greatest: f32,
     },
 }
 
-/// By how many metres depths of furnished rooms are divided.
+/// The divisor of depths in furnished rooms, metres.
 pub const DEPTH_SCALE_M: f32 = 4.5;
 
 fn of_rooms() -> f32 {
@@ -39,33 +40,34 @@ fn is_of_rooms(scale: &f32) -> bool {
     *scale == DEPTH_SCALE_M
 }
 
-/// What is asked of a network, and how.
+/// The question that a network answers, and the form of its input.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Question {
-    /// What.
+    /// The quantity to predict.
     pub target: Target,
-    /// For shadows: how.
+    /// For shadows: the form of the question.
     #[serde(default)]
     pub variant: ShadowVariant,
-    /// How histograms are scaled.
+    /// The scaling of histograms.
     #[serde(default)]
     pub normalise: Normalise,
-    /// Bins after rebinning.
+    /// The number of bins after rebinning.
     pub bins: usize,
-    /// The time-integrated image instead of histograms.
+    /// Whether the input is the time-integrated image instead of histograms.
     #[serde(default)]
     pub intensity_only: bool,
-    /// Spots of each scene; for shadows.
+    /// For shadows: the number of spots of each scene.
     #[serde(default)]
     pub spots: usize,
-    /// By how many metres depths are divided, so that they lie within 0 to 1; for depths.
+    /// For depths: the divisor in metres that scales depths to 0..1.
     #[serde(default = "of_rooms", skip_serializing_if = "is_of_rooms")]
     pub depth_scale_m: f32,
 }
 
 impl Question {
-    /// Dense channels, one-hot channels, outputs of a network for it.
+    /// Returns the numbers of dense channels, one-hot channels and outputs of a network for this
+    /// question.
     pub fn channels(&self) -> (usize, usize, usize) {
         let seen = if self.intensity_only { 1 } else { self.bins };
         match (self.target, self.variant) {
@@ -78,7 +80,7 @@ impl Question {
         }
     }
 
-    /// What a combined checkpoint of the released code calls the network for it.
+    /// Returns the name of this question's network in a combined checkpoint of the released code.
     pub fn part(&self) -> &'static str {
         match self.target {
             Target::Shadow => "shadow",
@@ -86,24 +88,24 @@ impl Question {
         }
     }
 
-    /// Whether a scene is visited once for each spot.
+    /// Returns whether a scene is visited once for each spot.
     pub fn by_spot(&self) -> bool {
         self.target == Target::Shadow && self.variant != ShadowVariant::All
     }
 
-    /// Whether it is given two-bounce times.
+    /// Returns whether the input includes two-bounce times.
     pub fn timed(&self) -> bool {
         self.target == Target::Shadow && self.variant.is_timed()
     }
 
-    /// Whether mirrored scenes may be shown: not where spots are known by their number, because a mirrored spot is at
-    /// another spot's place.
+    /// Returns whether mirrored scenes may be used. They may not if spots are identified by their
+    /// number, because a mirrored spot is at the position of another spot.
     pub fn may_flip(&self) -> bool {
         let numbered = matches!(self.variant, ShadowVariant::Index | ShadowVariant::All);
         self.target != Target::Shadow || !numbered
     }
 
-    /// Checks it against itself and the network.
+    /// Checks the question for consistency, and against the network.
     ///
     /// # Errors
     /// [`ModelError::Invalid`] naming the field.

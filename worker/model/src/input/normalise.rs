@@ -1,18 +1,20 @@
-//! Histograms as planes: rebinned, scaled, bin by bin.
+//! Converts histograms to planes: rebinned, scaled, bin by bin.
 
 use super::Normalise;
 use crate::scene::{Order, Scene};
 
-/// Pixels that change from pixel by pixel to bin by bin together: they fill a cache line of each bin's plane.
+/// The number of pixels that are transposed together from pixel order to bin order: they fill a
+/// cache line of each bin's plane.
 const BLOCK: usize = 16;
-/// Pixels whose planes are scaled together: 0.7 MB of 637 bins.
+/// The number of pixels that are scaled together: 0.7 MB for 637 bins.
 const STRIP: usize = 256;
 
-/// How many adjacent bins of `stored` are summed for one of `bins`. What is left over at the end, and dropped, must be fewer
-/// than are summed: otherwise most of a gate could go without a word.
+/// Returns the number of adjacent bins of `stored` that are summed into one of `bins`. The bins
+/// that remain at the end are dropped and must be fewer than those summed; otherwise most of a gate
+/// could be dropped unnoticed.
 ///
 /// # Errors
-/// What is wrong, with the nearest numbers of bins that will do.
+/// The fault, with the nearest valid numbers of bins.
 pub fn merged(stored: usize, bins: usize) -> Result<usize, String> {
     if bins == 0 || bins > stored {
         return Err(format!(
@@ -33,11 +35,11 @@ pub fn merged(stored: usize, bins: usize) -> Result<usize, String> {
     ))
 }
 
-/// m of a scene, `[bin][row][column]`, with `bins` bins: adjacent ones are summed, those left over at the end dropped, then
-/// scaled; see [`merged`].
+/// Computes m of a scene, `[bin][row][column]`, with `bins` bins: adjacent bins are summed, the
+/// rest at the end dropped, and the sums scaled; see [`merged`].
 ///
 /// # Panics
-/// Where the scene has fewer.
+/// If the scene has fewer bins.
 pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
     let pixels = scene.pixels();
     assert!(bins <= scene.bins, "bins are summed, not divided");
@@ -67,11 +69,11 @@ pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32])
     }
 }
 
-/// [`planes`] into room of any length, of a scene that nobody needs afterwards: where each number stays in its place, it is scaled
-/// there, and the scene is left with the room that `out` had.
+/// Like [`planes`], but consumes the scene and takes a buffer of any length. If every number stays
+/// in its place, the histogram is scaled there, and the scene receives the buffer of `out`.
 ///
 /// # Panics
-/// As [`planes`].
+/// As for [`planes`].
 pub fn planes_of(scene: &mut Scene, bins: usize, normalise: Normalise, out: &mut Vec<f32>) {
     if scene.order == Order::Bins && scene.bins == bins && normalise == Normalise::MinMax {
         std::mem::swap(&mut scene.histogram, out);
@@ -81,7 +83,7 @@ pub fn planes_of(scene: &mut Scene, bins: usize, normalise: Normalise, out: &mut
     planes(scene, bins, normalise, out);
 }
 
-/// (h − min)/(max − min) of each pixel, bin by bin.
+/// Computes (h − min)/(max − min) for each pixel, bin by bin.
 fn in_place(planes: &mut [f32], pixels: usize) {
     let (mut least, mut most) = ([0.0f32; STRIP], [0.0f32; STRIP]);
     for from in (0..pixels).step_by(STRIP) {
@@ -101,20 +103,21 @@ fn in_place(planes: &mut [f32], pixels: usize) {
     }
 }
 
-/// The least and the greatest of each pixel so far.
+/// Updates the least and the greatest value of each pixel.
 #[inline]
 fn widen(plane: &[f32], least: &mut [f32], most: &mut [f32]) {
     for ((h, least), most) in plane.iter().zip(least).zip(most) {
-        // As `f32::min` and `max` do, which compilers do not make one instruction of.
+        // This gives the same results as `f32::min` and `max`, which compilers do not translate to
+        // one instruction.
         *least = if *h < *least { *h } else { *least };
         *most = if *h > *most { *h } else { *most };
     }
 }
 
-/// The greatest of each pixel becomes its range.
+/// Replaces the greatest value of each pixel by its range.
 fn ranges(least: &mut [f32], most: &mut [f32]) {
     for (least, most) in least.iter_mut().zip(most) {
-        // A range of infinity makes zeros of all.
+        // An infinite range makes all values zero.
         let range = *most - *least;
         *most = match range > 0.0 && range.is_finite() {
             true => range,
@@ -126,8 +129,8 @@ fn ranges(least: &mut [f32], most: &mut [f32]) {
     }
 }
 
-/// [`planes`] of what lies so already: to the same bits. What a strip of pixels holds is looked at twice, and stays in the
-/// second-level cache meanwhile.
+/// Computes [`planes`] of a histogram in bin order, with the same bits. A strip of pixels is read
+/// twice, and stays in the second-level cache meanwhile.
 fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
     let (pixels, merged) = (scene.pixels(), scene.bins / bins);
     let (mut least, mut most) = ([0.0f32; STRIP], [0.0f32; STRIP]);
@@ -182,7 +185,7 @@ fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
     }
 }
 
-/// (h − least)/range; 0 where that is not finite.
+/// Returns (h − least)/range, or 0 if that value is NaN or infinite.
 #[inline]
 fn within(h: f32, least: f32, range: f32) -> f32 {
     let scaled = (h - least) / range;
@@ -206,7 +209,7 @@ fn scale(pixel: &mut [f32], normalise: Normalise) {
     }
 }
 
-/// (h − min)/(max − min); zeros where all are equal, and where a value is not finite.
+/// Computes (h − min)/(max − min); zeros if all values are equal or one is NaN or infinite.
 fn min_max(values: &mut [f32]) {
     let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
     for h in values.iter() {
@@ -223,7 +226,7 @@ fn min_max(values: &mut [f32]) {
     }
 }
 
-/// Σ_b h, scaled to 0..1 over the image.
+/// Computes Σ_b h, scaled to 0..1 over the image.
 pub fn intensity(scene: &Scene, out: &mut [f32]) {
     match scene.order {
         Order::Pixels => {
@@ -232,7 +235,7 @@ pub fn intensity(scene: &Scene, out: &mut [f32]) {
             }
         }
         Order::Bins => {
-            // From where sums begin, so that they have the same bits.
+            // Starts from the initial value of a sum, so that the bits are the same.
             out.fill(std::iter::empty::<f32>().sum());
             for plane in scene.histogram.chunks_exact(out.len()) {
                 out.iter_mut().zip(plane).for_each(|(sum, h)| *sum += h);
@@ -335,7 +338,7 @@ mod tests {
         for (stored, bins) in [(637, 128), (10, 6), (8, 0), (8, 9)] {
             assert!(merged(stored, bins).is_err(), "{bins} of {stored}");
         }
-        // Those that an error names are right themselves.
+        // The numbers that an error suggests are themselves valid.
         for (stored, bins) in [(637, 320), (637, 128), (100, 30)] {
             let k = stored / bins;
             assert_eq!(merged(stored, stored / k), Ok(k));

@@ -1,29 +1,29 @@
 //! The AdamW update of one parameter, in one pass.
 //!
-//! Source: Loshchilov and Hutter, "Decoupled weight decay regularization", with PyTorch's order of operations
-//! (`torch.optim.AdamW`: decay first, bias corrections apart, ε outside the root).
+//! Source: Loshchilov and Hutter, "Decoupled weight decay regularization", with PyTorch's order of
+//! operations (`torch.optim.AdamW`: decay first, separate bias corrections, ε outside the root).
 
 use rayon::prelude::*;
 
 use super::simd::{Kernels, LANES, Lanes, Op};
 
-/// Values of one task.
+/// The number of values in a task.
 const PART: usize = 1 << 16;
 
 /// The settings of one update.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdamW {
-    /// Learning rate of this step.
+    /// The learning rate of this step.
     pub learning_rate: f64,
-    /// Decay of the first moment.
+    /// The decay of the first moment.
     pub beta1: f64,
-    /// Decay of the second moment.
+    /// The decay of the second moment.
     pub beta2: f64,
-    /// Added to the root of the second moment.
+    /// The constant added to the root of the second moment.
     pub eps: f64,
-    /// Weight decay.
+    /// The weight decay.
     pub decay: f64,
-    /// Number of this step, from 1.
+    /// The number of this step, from 1.
     pub step: u32,
 }
 
@@ -60,7 +60,7 @@ impl Kernels {
     }
 }
 
-/// x^n by squaring: the same bits on every machine.
+/// Returns x^n by squaring. It has the same bits on every machine.
 fn power(x: f64, mut n: u32) -> f64 {
     let (mut square, mut result) = (x, 1.0);
     while n > 0 {
@@ -73,7 +73,7 @@ fn power(x: f64, mut n: u32) -> f64 {
     result
 }
 
-/// The settings as the inner loop wants them.
+/// The settings in the form that the inner loop uses.
 #[derive(Clone, Copy)]
 struct Factors {
     keep: f32,

@@ -1,12 +1,15 @@
-//! Multi-head attention within windows of an image, and its gradient, window by window: scores never leave the cache.
+//! Multi-head attention within windows of an image, and its gradient, window by window: scores
+//! never leave the cache.
 //!
-//! A window's scores are w²×w² a head, ten times its features where heads are narrow, so passes over them are what the composed
-//! form spends its time on. Here sixteen queries are asked at once, one a lane: scores, their largest, the
-//! exponentials and the sums run along the keys, without sums across lanes. The gradient computes the scores again (Dao et al.,
-//! FlashAttention, 2022) and turns blocks of sixteen queries by sixteen keys for the gradients by keys and values.
+//! A window's scores are w²×w² a head. If heads are narrow, this is ten times its features, so the
+//! composed form spends its time on passes over scores. Here sixteen queries are processed at once,
+//! one a lane: scores, their largest, the exponentials and the sums run along the keys, without
+//! sums across lanes. The gradient computes the scores again (Dao et al., FlashAttention, 2022) and
+//! transposes blocks of sixteen queries by sixteen keys for the gradients of keys and values.
 //!
-//! The windows lie `shift` rows and columns further than the image's first pixel, around its ends: what is shifted, cut into
-//! windows, put together and shifted back elsewhere is read and written in place here.
+//! The windows are offset cyclically by `shift` rows and columns from the image's first pixel. The
+//! pixels are read and written in place, whereas other implementations shift the image, cut it into
+//! windows, join them and shift back.
 
 use rayon::prelude::*;
 
@@ -17,12 +20,13 @@ use super::{
     simd::{Kernels, LANES, Lanes, Op, Positions, outer},
 };
 
-/// Windows whose gradients by the bias are summed in one go: fixed, so that threads change no bit.
+/// The number of windows in a group for the sum of bias gradients. It is fixed, so the number of
+/// threads does not affect the bits.
 const TOGETHER: usize = 16;
 
 impl Kernels {
-    /// Attention: a head's scores are ⟨q, k⟩·size^−½ + `bias` (heads, queries, keys), softmax over the keys. Writes all of
-    /// `out`.
+    /// Computes attention: a head's scores are ⟨q, k⟩·size^−½ + `bias` (heads, queries, keys),
+    /// softmax over the keys. Writes all of `out`.
     pub fn window_attention(self, s: &AttentionShape, qkv: &[f32], bias: &[f32], out: &mut [f32]) {
         s.check();
         let (tokens, channels) = (s.tokens(), s.channels());
@@ -50,7 +54,8 @@ impl Kernels {
         s.scatter(&windows, channels, out);
     }
 
-    /// Gradient of [`Kernels::window_attention`] from its inputs and the output's gradient: writes all of `dqkv` and `dbias`.
+    /// Computes the gradient of [`Kernels::window_attention`] from its inputs and the output's
+    /// gradient. Writes all of `dqkv` and `dbias`.
     pub fn window_attention_grad(
         self,
         s: &AttentionShape,
@@ -120,7 +125,8 @@ impl Kernels {
     }
 }
 
-/// One window: queries, keys and values [tokens][3·channels] to [tokens][channels].
+/// The attention of one window: queries, keys and values [tokens][3·channels] to
+/// [tokens][channels].
 struct Attend<'a> {
     s: &'a AttentionShape,
     qkv: &'a [f32],
@@ -151,7 +157,7 @@ fn sums<L: Lanes, const N: usize>(
     sums.map(|[[sum]]| sum)
 }
 
-/// [`sums`] for any number of results, some at a time: the n-th goes to `to[16·n..]`.
+/// Computes [`sums`] for any number of results, some at a time: the n-th is stored at `to[16·n..]`.
 #[inline(always)]
 fn products<L: Lanes>(
     scalars: &[f32],
@@ -184,7 +190,8 @@ fn products<L: Lanes>(
 }
 
 impl Attend<'_> {
-    /// Exponentials of sixteen queries' scores less their largest, [keys][16], and one over their sums.
+    /// Computes the exponentials of sixteen queries' scores minus their largest, [keys][16].
+    /// Returns the reciprocals of their sums.
     #[inline(always)]
     fn exponentials<L: Lanes>(
         &self,
@@ -218,7 +225,7 @@ impl Attend<'_> {
         L::splat(1.0).div(sum)
     }
 
-    /// A head's part of rows, [size][padded tokens], times `factor`.
+    /// Transposes a head's part of rows to [size][padded tokens] and multiplies it by `factor`.
     #[inline(always)]
     fn turn(&self, rows: &[f32], wide: usize, at: usize, factor: f32, to: &mut [f32]) {
         let padded = self.s.padded();
@@ -235,7 +242,8 @@ impl Attend<'_> {
     }
 }
 
-/// [features][16] times `factor` to sixteen rows of tokens from `group` on, those that there are, from feature `at` on.
+/// Multiplies [features][16] by `factor` and transposes it into up to sixteen rows of tokens from
+/// `group` on, starting at feature `at`.
 #[inline(always)]
 fn spread<L: Lanes>(from: &[f32], factor: L, to: &mut [f32], group: usize, wide: usize, at: usize) {
     for (d, row) in from.chunks_exact(LANES).enumerate() {
@@ -269,7 +277,8 @@ impl Op for Attend<'_> {
     }
 }
 
-/// The gradient of one window: writes `of.out`, [tokens][3·channels], and adds to `dbias`, [heads][keys][padded queries].
+/// The gradient of one window: writes `of.out`, [tokens][3·channels], and adds to `dbias`,
+/// [heads][keys][padded queries].
 struct AttendGrad<'a> {
     of: Attend<'a>,
     dy: &'a [f32],
@@ -290,7 +299,7 @@ impl Op for AttendGrad<'_> {
         let mut weights = Scratch::take(padded * LANES);
         let mut slopes = Scratch::take(padded * LANES);
         let mut part = Scratch::take(s.size * LANES);
-        // By keys and by values, [groups of keys][size][16].
+        // The gradients of keys and of values, [groups of keys][size][16].
         let mut by_key = Scratch::take(s.size * padded);
         let mut by_value = Scratch::take(s.size * padded);
         weights[tokens * LANES..].fill(0.0);
@@ -357,7 +366,7 @@ impl Op for AttendGrad<'_> {
     }
 }
 
-/// Sixteen rows of sixteen lanes, rows and lanes exchanged.
+/// Transposes sixteen rows of sixteen lanes.
 #[inline(always)]
 fn turn_block<L: Lanes>(from: &[f32], to: &mut [f32; LANES * LANES]) {
     let mut rows = [L::splat(0.0); LANES];

@@ -1,48 +1,51 @@
-//! The shape of attention within windows: which pixels a window holds, and which of its pairs are apart.
+//! The shape of attention within windows: the pixels of each window, and the pairs of tokens that
+//! are masked.
 
 use rayon::prelude::*;
 
 use super::simd::LANES;
 
-/// Attention within windows: queries, keys and values beside each other, (images, height, width, 3·heads·size), each head after
-/// head, to (images, height, width, heads·size).
+/// Attention within windows. The input contains queries, keys and values in this order, (images,
+/// height, width, 3·heads·size), each head after head. The output is (images, height, width,
+/// heads·size).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AttentionShape {
-    /// Images in the batch.
+    /// The number of images in the batch.
     pub images: usize,
-    /// Rows of an image; a multiple of `window`.
+    /// The number of rows of an image; a multiple of `window`.
     pub height: usize,
-    /// Columns of an image; a multiple of `window`.
+    /// The number of columns of an image; a multiple of `window`.
     pub width: usize,
-    /// Rows and columns of a window.
+    /// The number of rows and columns of a window.
     pub window: usize,
-    /// How far windows lie from the first pixel, less than a window.
+    /// The offset of windows from the first pixel, less than a window.
     pub shift: usize,
-    /// Heads.
+    /// The number of heads.
     pub heads: usize,
-    /// Features of a head.
+    /// The number of features of a head.
     pub size: usize,
-    /// Added to the scores of tokens that the shift brings together from different ends of the image.
+    /// The value added to the scores of tokens that the shift brings together from different ends
+    /// of the image.
     pub apart: f32,
 }
 
 impl AttentionShape {
-    /// Tokens of a window.
+    /// Returns the number of tokens of a window.
     pub fn tokens(&self) -> usize {
         self.window * self.window
     }
 
-    /// Features of a token.
+    /// Returns the number of features of a token.
     pub fn channels(&self) -> usize {
         self.heads * self.size
     }
 
-    /// Pixels of all images.
+    /// Returns the number of pixels of all images.
     pub fn pixels(&self) -> usize {
         self.images * self.height * self.width
     }
 
-    /// Tokens rounded up to whole lanes.
+    /// Returns the number of tokens rounded up to whole lanes.
     pub(super) fn padded(&self) -> usize {
         self.tokens().next_multiple_of(LANES)
     }
@@ -55,7 +58,7 @@ impl AttentionShape {
         );
     }
 
-    /// The pixel, of all images, where a token of a window lies.
+    /// Returns the index, among the pixels of all images, of a token of a window.
     fn pixel(&self, window: usize, token: usize) -> usize {
         let columns = self.width / self.window;
         let of_image = self.height / self.window * columns;
@@ -65,7 +68,7 @@ impl AttentionShape {
         (image * self.height + row % self.height) * self.width + column % self.width
     }
 
-    /// The window and the token of a pixel.
+    /// Returns the window and the token of a pixel.
     fn token(&self, pixel: usize) -> (usize, usize) {
         let (columns, of_image) = (self.width / self.window, self.height * self.width);
         let (image, at) = (pixel / of_image, pixel % of_image);
@@ -77,7 +80,8 @@ impl AttentionShape {
         (window, token)
     }
 
-    /// For each token of a window, from which ends of the image it comes; none where all come from one.
+    /// Returns the end of the image from which each token of a window comes, or `None` if all come
+    /// from one end.
     fn regions(&self, window: usize) -> Option<Vec<u8>> {
         if self.shift == 0 {
             return None;
@@ -94,7 +98,7 @@ impl AttentionShape {
         regions.iter().any(|r| *r != regions[0]).then_some(regions)
     }
 
-    /// What is added to a window's scores besides the bias, [keys][padded queries].
+    /// Returns the mask added to a window's scores in addition to the bias, [keys][padded queries].
     pub(super) fn mask(&self, window: usize) -> Option<Vec<f32>> {
         let regions = self.regions(window)?;
         let (tokens, padded) = (self.tokens(), self.padded());
@@ -109,7 +113,7 @@ impl AttentionShape {
         Some(mask)
     }
 
-    /// `bias` (heads, queries, keys) as [heads][keys][padded queries].
+    /// Converts `bias` (heads, queries, keys) to [heads][keys][padded queries].
     pub(super) fn turned(&self, bias: &[f32]) -> Vec<f32> {
         let (tokens, padded) = (self.tokens(), self.padded());
         let mut turned = vec![0.0; self.heads * tokens * padded];
@@ -124,7 +128,7 @@ impl AttentionShape {
         turned
     }
 
-    /// The rows of a window's tokens, one after the other, of `x` with `wide` values a pixel.
+    /// Copies the rows of a window's tokens from `x`, which has `wide` values a pixel.
     pub(super) fn gather(&self, x: &[f32], wide: usize, window: usize, to: &mut [f32]) {
         for (token, to) in to.chunks_exact_mut(wide).enumerate() {
             let at = self.pixel(window, token) * wide;
@@ -132,7 +136,7 @@ impl AttentionShape {
         }
     }
 
-    /// The reverse for all windows: rows window by window to rows pixel by pixel.
+    /// Copies the rows of all windows back, from window order to pixel order.
     pub(super) fn scatter(&self, windows: &[f32], wide: usize, to: &mut [f32]) {
         let row = self.width * wide;
         to.par_chunks_mut(row).enumerate().for_each(|(y, to)| {

@@ -1,42 +1,43 @@
-//! What stands around convolutions that see a border repeated: images with one more pixel at every side, cut off again behind the
-//! convolution, and leaky ReLU.
+//! The operations around convolutions with repeated borders: extending images by one pixel at every
+//! side, removing that border after the convolution, and leaky ReLU.
 
 use rayon::prelude::*;
 
 use super::simd::{Kernels, LANES, Lanes, Op};
 
-/// Values of one task where values do not belong together.
+/// The number of values in a task of elementwise operations.
 const PART: usize = 1 << 14;
 
-/// Images, each one of some moments.
+/// A batch of images, grouped into volumes of some moments.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BorderShape {
-    /// All images.
+    /// The number of images, counting each moment.
     pub images: usize,
-    /// Images in a row that are moments of one thing; the first and the last are repeated too.
+    /// The number of consecutive images that are moments of one volume. The first and the last
+    /// moment are repeated too.
     pub moments: usize,
-    /// Whether the channels of the moments before and after lie beside those of each.
+    /// Whether the channels of the moments before and after are concatenated with those of each.
     pub volume: bool,
-    /// Channels.
+    /// The number of channels.
     pub channels: usize,
-    /// Rows.
+    /// The number of rows.
     pub height: usize,
-    /// Columns.
+    /// The number of columns.
     pub width: usize,
 }
 
 impl BorderShape {
-    /// Values of the images.
+    /// Returns the number of values of the images.
     pub fn len(&self) -> usize {
         self.images * self.channels * self.height * self.width
     }
 
-    /// True without values.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Images beside each other in one with its border.
+    /// Returns the number of images that are concatenated in one with its border.
     fn parts(&self) -> usize {
         if self.volume { 3 } else { 1 }
     }
@@ -45,12 +46,12 @@ impl BorderShape {
         self.channels * self.height * self.width
     }
 
-    /// Values of an image with its border, one part of it.
+    /// Returns the number of values of an image with its border, for one part.
     fn around(&self) -> usize {
         self.channels * (self.height + 2) * (self.width + 2)
     }
 
-    /// The image that is part `part` of one.
+    /// Returns the index of the image used as part `part` of another.
     fn seen(&self, image: usize, part: usize) -> usize {
         if !self.volume {
             return image;
@@ -61,8 +62,9 @@ impl BorderShape {
 }
 
 impl Kernels {
-    /// Images with their border repeated, and the moments before, at and after each beside each other where the shape says so:
-    /// writes all of `out`, (images, 1 or 3 times channels, height + 2, width + 2).
+    /// Extends images by repeating their border. If the shape is a volume, also concatenates the
+    /// moments before, at and after each. Writes all of `out`, (images, 1 or 3 times channels,
+    /// height + 2, width + 2).
     pub fn surround(self, s: &BorderShape, x: &[f32], out: &mut [f32]) {
         assert_eq!(x.len(), s.len(), "input length");
         assert_eq!(
@@ -89,7 +91,7 @@ impl Kernels {
         });
     }
 
-    /// Gradient of [`Kernels::surround`]: writes all of `dx`.
+    /// Computes the gradient of [`Kernels::surround`]. Writes all of `dx`.
     pub fn surround_grad(self, s: &BorderShape, dy: &[f32], dx: &mut [f32]) {
         assert_eq!(dx.len(), s.len(), "input gradient length");
         assert_eq!(
@@ -119,8 +121,8 @@ impl Kernels {
         });
     }
 
-    /// Images without their outermost pixels, and each channel's bias added: writes all of `out`, which has the shape's size;
-    /// `x` has two rows and columns more.
+    /// Removes the outermost pixels of images and adds each channel's bias. Writes all of `out`,
+    /// which has the shape's size; `x` has two more rows and columns.
     pub fn crop(self, s: &BorderShape, x: &[f32], bias: &[f32], out: &mut [f32]) {
         assert_eq!(x.len(), s.images * s.around(), "input length");
         assert_eq!((out.len(), bias.len()), (s.len(), s.channels), "lengths");
@@ -135,7 +137,8 @@ impl Kernels {
         });
     }
 
-    /// Gradient of [`Kernels::crop`] by the images: writes all of `dx`, zeros around.
+    /// Computes the gradient of [`Kernels::crop`] for the images. Writes all of `dx`, with zeros at
+    /// the border.
     pub fn crop_grad(self, s: &BorderShape, dy: &[f32], dx: &mut [f32]) {
         assert_eq!(dx.len(), s.images * s.around(), "input gradient length");
         assert_eq!(dy.len(), s.len(), "gradient length");
@@ -153,14 +156,15 @@ impl Kernels {
         });
     }
 
-    /// x where it is above 0, else `slope`·x, with a slope below 1: writes all of `y`.
+    /// Computes x where it is above 0, else `slope`·x, with a slope below 1. Writes all of `y`.
     pub fn leaky_relu(self, slope: f32, x: &[f32], y: &mut [f32]) {
         assert_eq!(x.len(), y.len(), "one length for all");
         let parts = x.par_chunks(PART).zip(y.par_chunks_mut(PART));
         parts.for_each(|(x, y)| self.run(Leaky { slope, x, y }));
     }
 
-    /// Gradient of [`Kernels::leaky_relu`] from its input or its output: writes all of `dx`.
+    /// Computes the gradient of [`Kernels::leaky_relu`] from its input or its output. Writes all of
+    /// `dx`.
     pub fn leaky_relu_grad(self, slope: f32, x: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert_eq!(
             (x.len(), dy.len()),

@@ -1,9 +1,9 @@
 //! Convolution and its input gradient: a shifted matrix product over padded bands, without im2col.
 //!
-//! A task is a band of rows and a group of output channels. It packs a chunk of input channels into padded
-//! planes that stay in the second-level cache and adds the chunk to its outputs, tile by tile: eight output
-//! channels by three units of sixteen pixels. Each output is one chain of fused multiply-adds over input
-//! channels, then taps, whatever the tile, chunk or task.
+//! A task is a band of rows and a group of output channels. It packs a chunk of input channels into
+//! padded planes that stay in the second-level cache and adds the chunk to its outputs, tile by
+//! tile: eight output channels by three units of sixteen pixels. Each output is one chain of fused
+//! multiply-adds over input channels, then taps, whatever the tile, chunk or task.
 
 use rayon::prelude::*;
 
@@ -13,23 +13,25 @@ use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, shifted};
 use super::winograd;
 
-/// Input channels packed at a time.
+/// The number of input channels packed at a time.
 const CHUNK: usize = 32;
-/// Pixels of a band.
+/// The number of pixels of a band.
 const BAND: usize = 1024;
 
 impl Kernels {
-    /// 3×3 convolution with zero padding 1: writes all of `out`.
+    /// Computes a 3×3 convolution with zero padding 1. Writes all of `out`.
     pub fn conv3x3(self, s: &ConvShape, x: &[f32], w: &[f32], out: &mut [f32]) {
         self.convolve::<3>(s, x, w, None, out);
     }
 
-    /// Gradient of [`Kernels::conv3x3`] by its input, from `dy` (as the output): writes all of `dx`.
+    /// Computes the input's gradient of [`Kernels::conv3x3`] from `dy`, which has the output's
+    /// shape. Writes all of `dx`.
     pub fn conv3x3_input_grad(self, s: &ConvShape, dy: &[f32], w: &[f32], dx: &mut [f32]) {
         self.input_grad::<3>(s, dy, w, dx);
     }
 
-    /// 1×1 convolution with an optional bias (one value an output channel): writes all of `out`.
+    /// Computes a 1×1 convolution with an optional bias (one value an output channel). Writes all
+    /// of `out`.
     pub fn conv1x1(
         self,
         s: &ConvShape,
@@ -41,7 +43,7 @@ impl Kernels {
         self.convolve::<1>(s, x, w, bias, out);
     }
 
-    /// Gradient of [`Kernels::conv1x1`] by its input: writes all of `dx`.
+    /// Computes the input's gradient of [`Kernels::conv1x1`]. Writes all of `dx`.
     pub fn conv1x1_input_grad(self, s: &ConvShape, dy: &[f32], w: &[f32], dx: &mut [f32]) {
         self.input_grad::<1>(s, dy, w, dx);
     }
@@ -77,7 +79,7 @@ impl Kernels {
         }
     }
 
-    /// The product with packed weights, `[outputs / 8][inputs][K·K][8]`.
+    /// Computes the product with packed weights, `[outputs / 8][inputs][K·K][8]`.
     fn product<const K: usize>(
         self,
         s: &ConvShape,
@@ -94,14 +96,14 @@ impl Kernels {
         if bands.is_empty() || s.outputs == 0 {
             return;
         }
-        // How the work is shared out changes no bit.
+        // The division of the work among tasks does not affect the bits.
         let wanted = (4 * rayon::current_num_threads()).div_ceil(bands.len());
         let blocks = s.outputs.div_ceil(BLOCK);
         let group = blocks.div_ceil(wanted).max(blocks.min(2)) * BLOCK;
         let groups = s.outputs.div_ceil(group);
         let parts = split(grid, s.outputs, group, &bands, out);
         let input = Input { s, grid, x };
-        // Where several tasks share a band, it is packed once before.
+        // If several tasks share a band, it is packed once in advance.
         let shared = (groups > 1).then(|| input.pack_all(&bands));
         let lens: Vec<usize> = bands
             .iter()
@@ -171,7 +173,7 @@ impl Input<'_> {
         self.grid.pack(band, image, to);
     }
 
-    /// All bands, each `[channel][packed plane]`.
+    /// Packs all bands, each as `[channel][packed plane]`.
     fn pack_all(&self, bands: &[Band]) -> Scratch {
         let each = |band: &Band| self.grid.packed_len(band);
         let total = bands.iter().map(each).sum::<usize>() * self.s.inputs;
@@ -189,7 +191,7 @@ impl Input<'_> {
     }
 }
 
-/// One chunk of input channels added to one task's outputs.
+/// The addition of one chunk of input channels to one task's outputs.
 struct Chunk<'a, 'b, const K: usize> {
     x: &'a [f32],
     inputs: usize,
@@ -197,13 +199,13 @@ struct Chunk<'a, 'b, const K: usize> {
     row: usize,
     units: &'a [Unit],
     weights: &'a [f32],
-    /// Distance of two blocks of weights.
+    /// The distance between two blocks of weights.
     block: usize,
     channels: usize,
     bias: Option<&'a [f32]>,
-    /// True for the first chunk: outputs start from the bias.
+    /// Whether this is the first chunk, in which outputs start from the bias.
     fresh: bool,
-    /// Image by image, channel by channel.
+    /// The outputs, image by image and channel by channel.
     out: &'a mut [&'b mut [f32]],
 }
 
@@ -216,7 +218,7 @@ impl<const K: usize> Op for Chunk<'_, '_, K> {
         while u < self.units.len() {
             let left = self.units.len() - u;
             if L::WIDE {
-                // Four units left go as two pairs.
+                // The last four units are processed as two pairs.
                 let n = if left == 4 { 2 } else { left.min(3) };
                 for b in 0..self.channels.div_ceil(BLOCK) {
                     match n {
@@ -238,7 +240,7 @@ impl<const K: usize> Op for Chunk<'_, '_, K> {
 }
 
 impl<const K: usize> Chunk<'_, '_, K> {
-    /// One register tile: `M` channels from `half` on of block `b`, `V` units from `u` on.
+    /// Computes one register tile: `M` channels from `half` on of block `b`, `V` units from `u` on.
     #[inline(always)]
     fn tile<L: Lanes, const M: usize, const V: usize>(&mut self, b: usize, half: usize, u: usize) {
         let first = b * BLOCK + half;
@@ -259,7 +261,7 @@ impl<const K: usize> Chunk<'_, '_, K> {
         for (v, at) in at.iter_mut().enumerate() {
             *at = self.units[u + v].at;
         }
-        // Without inputs there are no weights.
+        // If there are no inputs, there are no weights.
         let weights = (b * self.block + half).min(self.weights.len());
         let acc = shifted::<L, M, V, K>(
             self.x,
@@ -307,7 +309,7 @@ impl<const K: usize> Chunk<'_, '_, K> {
     }
 }
 
-/// Weights as `[outputs / 8][inputs][taps][8]`, missing channels zero.
+/// Packs weights as `[outputs / 8][inputs][taps][8]`; missing channels are zero.
 fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Scratch {
     let depth = s.inputs * taps;
     let mut packed = Scratch::take(s.outputs.div_ceil(BLOCK) * depth * BLOCK);
@@ -318,7 +320,7 @@ fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Scratch {
         .par_chunks_mut(depth * BLOCK)
         .zip(w.par_chunks(depth * BLOCK))
         .for_each(|(to, from)| {
-            // Rows that are missing repeat the first one and are cleared after.
+            // Missing rows repeat the first one and are cleared afterwards.
             let rows: [&[f32]; BLOCK] = std::array::from_fn(|m| {
                 let m = if m * depth < from.len() { m } else { 0 };
                 &from[m * depth..][..depth]
@@ -337,7 +339,8 @@ fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Scratch {
     packed
 }
 
-/// Weights of the input gradient, transposed and with the taps in reverse: `[inputs / 8][outputs][taps][8]`.
+/// Packs the weights of the input gradient, transposed and with the taps reversed:
+/// `[inputs / 8][outputs][taps][8]`.
 fn pack_transposed<const K: usize>(s: &ConvShape, w: &[f32]) -> Scratch {
     let taps = K * K;
     let depth = s.outputs * taps;
@@ -345,7 +348,7 @@ fn pack_transposed<const K: usize>(s: &ConvShape, w: &[f32]) -> Scratch {
     if depth == 0 {
         return packed;
     }
-    // Four blocks at a time: longer pieces of each output's weights.
+    // Four blocks at a time give longer pieces of each output's weights.
     packed
         .par_chunks_mut(4 * depth * BLOCK)
         .enumerate()
@@ -377,7 +380,7 @@ fn pack_transposed<const K: usize>(s: &ConvShape, w: &[f32]) -> Scratch {
     packed
 }
 
-/// The band of all rows of one image.
+/// Returns the band of all rows of one image.
 pub(super) fn image_band(grid: Grid, image: usize) -> Band {
     Band {
         images: image..image + 1,

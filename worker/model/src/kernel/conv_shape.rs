@@ -2,42 +2,42 @@
 
 use super::plane::Grid;
 
-/// Output channels of a block of packed weights.
+/// The number of output channels of a block of packed weights.
 pub(super) const BLOCK: usize = 8;
 
-/// A convolution of stride 1: input (images, inputs, height, width), output (images, outputs, height,
-/// width), weights (outputs, inputs, k, k), all contiguous in this order.
+/// A convolution of stride 1: input (images, inputs, height, width), output (images, outputs,
+/// height, width), weights (outputs, inputs, k, k), all contiguous in this order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConvShape {
-    /// Images in the batch.
+    /// The number of images in the batch.
     pub images: usize,
-    /// Input channels.
+    /// The number of input channels.
     pub inputs: usize,
-    /// Output channels.
+    /// The number of output channels.
     pub outputs: usize,
-    /// Rows of a plane.
+    /// The number of rows of a plane.
     pub height: usize,
-    /// Pixels of a row.
+    /// The number of pixels of a row.
     pub width: usize,
 }
 
 impl ConvShape {
-    /// Values of the input.
+    /// Returns the number of values of the input.
     pub fn input_len(&self) -> usize {
         self.images * self.inputs * self.height * self.width
     }
 
-    /// Values of the output.
+    /// Returns the number of values of the output.
     pub fn output_len(&self) -> usize {
         self.images * self.outputs * self.height * self.width
     }
 
-    /// Values of the weights of a K×K kernel.
+    /// Returns the number of weights of a K×K kernel.
     pub fn weight_len(&self, k: usize) -> usize {
         self.outputs * self.inputs * k * k
     }
 
-    /// The planes with the padding of a K×K kernel.
+    /// Returns the planes with the padding of a K×K kernel.
     pub(super) fn grid(&self, k: usize) -> Grid {
         Grid {
             images: self.images,
@@ -47,7 +47,7 @@ impl ConvShape {
         }
     }
 
-    /// The same with input and output exchanged.
+    /// Returns the shape with input and output exchanged.
     pub(super) fn swapped(&self) -> Self {
         Self {
             inputs: self.outputs,

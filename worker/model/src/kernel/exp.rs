@@ -1,22 +1,25 @@
-//! The exponential function, and what transformers make of it: GELU and its gradient, each value in one pass.
+//! The exponential function, and GELU and its gradient, which use it. Each value is computed in one
+//! pass.
 
 use rayon::prelude::*;
 
 use super::simd::{Kernels, LANES, Lanes, Op};
 
-/// Values of one task.
+/// The number of values in a task.
 const PART: usize = 1 << 14;
 
-/// e^x for x ≤ 0, to two units in the last place; below −87.3, where results would be subnormal, e^−87.3. NaN stays NaN.
+/// Returns e^x for x ≤ 0, to two units in the last place. Below −87.3, where results would be
+/// subnormal, it is e^−87.3. NaN stays NaN.
 ///
-/// 2^n·e^r with whole n and |r| ≤ ln 2 / 2; the polynomial is Cephes' (S. L. Moshier, `expf`).
+/// The formula is 2^n·e^r with whole n and |r| ≤ ln 2 / 2; the polynomial is Cephes' (S. L.
+/// Moshier, `expf`).
 #[inline(always)]
 pub(super) fn exp<L: Lanes>(x: L) -> L {
-    // Adding and taking away 1.5·2^23 rounds to whole numbers.
+    // Adding and subtracting 1.5·2^23 rounds to whole numbers.
     let (log2_e, round) = (L::splat(std::f32::consts::LOG2_E), L::splat(12_582_912.0));
     let x = L::splat(-87.3).max(x);
     let n = x.fma(log2_e, round).sub(round);
-    // ln 2 in two parts, so that n·ln 2 is exact enough.
+    // ln 2 is split in two parts, so that n·ln 2 is exact enough.
     let r = n.fma(L::splat(-0.693_359_4), x);
     let r = n.fma(L::splat(2.121_944_4e-4), r);
     let polynomial = [
@@ -34,10 +37,10 @@ pub(super) fn exp<L: Lanes>(x: L) -> L {
     r.mul(r).fma(p, r).add(one).mul(n.power_of_two())
 }
 
-/// Φ(x), the standard normal distribution's share below x, to 10⁻⁷, and e^(−x²/2).
+/// Returns Φ(x), the standard normal distribution's share below x, to 10⁻⁷, and e^(−x²/2).
 ///
-/// Φ(−|x|) = ½·erfc(u), u = |x|/√2, and erfc(u)·e^(u²) is a polynomial of t = 1/(1 + u/2) to 2·10⁻⁸ once e^(−u²) weighs it;
-/// fitted for least greatest error.
+/// Φ(−|x|) = ½·erfc(u), u = |x|/√2. erfc(u)·e^(u²) is approximated by a polynomial of t = 1/(1 +
+/// u/2), fitted for the least greatest error after weighting with e^(−u²): 2·10⁻⁸.
 #[inline(always)]
 fn normal<L: Lanes>(x: L) -> (L, L) {
     let (one, half) = (L::splat(1.0), L::splat(0.5));
@@ -62,14 +65,16 @@ fn normal<L: Lanes>(x: L) -> (L, L) {
 }
 
 impl Kernels {
-    /// x·Φ(x), Hendrycks and Gimpel's "Gaussian error linear unit" in its exact form: writes all of `y`.
+    /// Computes x·Φ(x), Hendrycks and Gimpel's "Gaussian error linear unit" in its exact form.
+    /// Writes all of `y`.
     pub fn gelu(self, x: &[f32], y: &mut [f32]) {
         assert_eq!(x.len(), y.len(), "one length for all");
         let parts = x.par_chunks(PART).zip(y.par_chunks_mut(PART));
         parts.for_each(|(x, y)| self.run(Gelu { x, y }));
     }
 
-    /// Gradient of [`Kernels::gelu`] from its input and the output's gradient: writes all of `dx`.
+    /// Computes the gradient of [`Kernels::gelu`] from its input and the output's gradient. Writes
+    /// all of `dx`.
     pub fn gelu_grad(self, x: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert_eq!(
             (x.len(), dy.len()),

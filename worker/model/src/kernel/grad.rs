@@ -1,9 +1,10 @@
 //! Weight and bias gradients of the convolutions.
 //!
-//! The output gradient is transposed once to `[block of channels][pixel][32]`, so that the gradient of one
-//! weight row is a chain of outer products: scalars of the packed input times vectors over output channels,
-//! without a reduction across lanes. The chain runs over a block of [`BLOCK_PIXELS`] pixels of one image; the
-//! blocks' sums are added in order. Tasks share out channels, never pixels.
+//! The output gradient is transposed once to `[block of channels][pixel][32]`, so that the gradient
+//! of one weight row is a chain of outer products: scalars of the packed input times vectors over
+//! output channels, without a reduction across lanes. The chain runs over a block of
+//! [`BLOCK_PIXELS`] pixels of one image; the blocks' sums are added in order. Tasks share out
+//! channels, never pixels.
 
 use rayon::prelude::*;
 
@@ -14,26 +15,28 @@ use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, Positions, outer};
 use super::winograd_grad;
 
-/// Least pixels of one chain, in whole rows.
+/// The least number of pixels of one chain, rounded up to whole rows.
 const BLOCK_PIXELS: usize = 128;
-/// Pixels packed at a time.
+/// The number of pixels packed at a time.
 const BAND: usize = 1024;
-/// Scalars beside each other in [`outer`].
+/// The number of adjacent scalars in [`outer`].
 const SCALARS: usize = 9;
 
 impl Kernels {
-    /// Gradient of [`Kernels::conv3x3`] by its weights, from the input and the output's gradient: writes
-    /// all of `dw` (outputs, inputs, 3, 3).
+    /// Computes the weights' gradient of [`Kernels::conv3x3`] from the input and the output's
+    /// gradient. Writes all of `dw` (outputs, inputs, 3, 3).
     pub fn conv3x3_weight_grad(self, s: &ConvShape, x: &[f32], dy: &[f32], dw: &mut [f32]) {
         self.weight_grad::<3>(s, x, dy, dw);
     }
 
-    /// Gradient of [`Kernels::conv1x1`] by its weights: writes all of `dw` (outputs, inputs).
+    /// Computes the weights' gradient of [`Kernels::conv1x1`]. Writes all of `dw` (outputs,
+    /// inputs).
     pub fn conv1x1_weight_grad(self, s: &ConvShape, x: &[f32], dy: &[f32], dw: &mut [f32]) {
         self.weight_grad::<1>(s, x, dy, dw);
     }
 
-    /// Gradient of a convolution by its bias: `db` gets one sum over images and pixels for each channel.
+    /// Computes a convolution's bias gradient: `db` receives one sum over images and pixels for
+    /// each channel.
     pub fn bias_grad(self, s: &ConvShape, dy: &[f32], db: &mut [f32]) {
         assert_eq!(dy.len(), s.output_len(), "output gradient length");
         assert_eq!(db.len(), s.outputs, "bias gradient length");
@@ -64,10 +67,10 @@ impl Kernels {
         let blocks = s.outputs.div_ceil(wide);
         let g = self.transposed(s.images, s.outputs, grid.pixels(), dy, wide);
 
-        // One pass of `outer` takes one channel's nine taps, or nine channels.
+        // One pass of `outer` processes one channel's nine taps, or nine channels.
         let each = if K == 3 { 1 } else { SCALARS };
         let passes = s.inputs.div_ceil(each);
-        // How the channels are shared out changes no bit.
+        // The division of the channels among tasks does not affect the bits.
         let wanted = (4 * rayon::current_num_threads()).div_ceil(blocks);
         let share = passes.div_ceil(wanted).clamp(1, 32);
         let shares = passes.div_ceil(share);
@@ -96,7 +99,7 @@ impl Kernels {
                 for n in 0..s.images {
                     task.image::<K>(self, n, scratch, &mut sums);
                 }
-                // Both kernels hold their sums as [weight of a row][output channel].
+                // Both kernels store their sums as [weight of a row][output channel].
                 for (o, row) in rows.iter_mut().enumerate() {
                     for (to, from) in row.iter_mut().zip(sums.chunks_exact(wide)) {
                         *to = from[o];
@@ -105,7 +108,7 @@ impl Kernels {
             });
     }
 
-    /// NCHW as `[channels / wide][image][pixel][wide]`, missing channels zero.
+    /// Transposes NCHW to `[channels / wide][image][pixel][wide]`; missing channels are zero.
     pub(super) fn transposed(
         self,
         images: usize,
@@ -134,14 +137,14 @@ impl Kernels {
     }
 }
 
-/// A share of input channels against one block of output channels.
+/// The gradients of a share of input channels and one block of output channels.
 struct Task<'a> {
     s: &'a ConvShape,
     grid: Grid,
     x: &'a [f32],
     g: &'a [f32],
     wide: usize,
-    /// First pass of the share, and their number.
+    /// The first pass of the share, and the number of passes.
     first: usize,
     passes: usize,
 }
@@ -218,7 +221,7 @@ struct Blocks<'a, const K: usize> {
     g: &'a [f32],
     wide: usize,
     width: usize,
-    /// Rows of a block, and of the band.
+    /// The numbers of rows of a block and of the band.
     rows: usize,
     all: usize,
     sums: &'a mut [f32],
@@ -310,7 +313,7 @@ impl Op for Sum<'_> {
     }
 }
 
-/// Planes to vectors over channels.
+/// The transposition of planes to vectors over channels.
 struct Transpose<'a> {
     from: &'a [f32],
     pixels: usize,

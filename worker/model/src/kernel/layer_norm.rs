@@ -1,28 +1,29 @@
 //! Layer norm over the last dimension, and its gradient, row by row in one pass each over memory.
 //!
-//! The gradient computes mean and deviation of a row again. Sums over rows are taken over runs of [`ROWS`], then over the runs in
-//! order, so that threads change no bit.
+//! The gradient computes mean and deviation of a row again. Sums over rows are computed over runs
+//! of [`ROWS`], and then over the runs in order, so the number of threads does not affect the bits.
 
 use rayon::prelude::*;
 
 use super::simd::{Kernels, LANES, Lanes, Op};
 
-/// Rows of one task.
+/// The number of rows in a task.
 const ROWS: usize = 512;
 
-/// Scale and shift of each value of a row.
+/// The scale and shift of each value of a row.
 #[derive(Clone, Copy, Debug)]
 pub struct LayerNorm<'a> {
-    /// Scale.
+    /// The scale.
     pub gamma: &'a [f32],
-    /// Shift.
+    /// The shift.
     pub beta: &'a [f32],
-    /// Added to the variance.
+    /// The constant added to the variance.
     pub eps: f32,
 }
 
 impl Kernels {
-    /// (x − mean)/√(variance + ε)·γ + β of each row, as long as γ: writes all of `y`.
+    /// Computes (x − mean)/√(variance + ε)·γ + β of each row, which is as long as γ. Writes all of
+    /// `y`.
     pub fn layer_norm(self, norm: &LayerNorm, x: &[f32], y: &mut [f32]) {
         let wide = norm.gamma.len();
         assert_eq!(norm.beta.len(), wide, "one shift for each scale");
@@ -32,7 +33,8 @@ impl Kernels {
         runs.for_each(|(x, y)| self.run(Apply { norm, x, y }));
     }
 
-    /// Gradient of [`Kernels::layer_norm`] from its input and the output's gradient: writes all of `dx`, `dgamma` and `dbeta`.
+    /// Computes the gradient of [`Kernels::layer_norm`] from its input and the output's gradient.
+    /// Writes all of `dx`, `dgamma` and `dbeta`.
     pub fn layer_norm_grad(
         self,
         norm: &LayerNorm,
@@ -76,7 +78,7 @@ impl Kernels {
     }
 }
 
-/// Mean of a row, and one over its deviation.
+/// Returns the mean of a row, and the reciprocal of its deviation.
 #[inline(always)]
 fn statistics<L: Lanes>(row: &[f32], eps: f32) -> (f32, f32) {
     let over = 1.0 / row.len() as f32;
@@ -120,7 +122,7 @@ impl Op for Apply<'_> {
     }
 }
 
-/// Adds by γ and by β to `sums`, two padded rows.
+/// Adds the gradients of γ and β to `sums`, which has two padded rows.
 struct Grad<'a> {
     norm: &'a LayerNorm<'a>,
     x: &'a [f32],

@@ -1,13 +1,15 @@
-//! CPU kernels of the model runtime: 3×3 and 1×1 convolutions, batch norm with ReLU, pooling, AdamW, the convolution over
-//! one-hot bins, attention within windows, layer norm, GELU, and what is done along time and around borders; all on `f32` slices, in
-//! NCHW order unless said.
+//! CPU kernels of the model runtime: 3×3 and 1×1 convolutions, batch norm with ReLU, pooling,
+//! AdamW, the convolution over one-hot bins, attention within windows, layer norm, GELU, and
+//! operations along time and at borders. All work on `f32` slices, in NCHW order unless documented
+//! otherwise.
 //!
-//! **The same bits everywhere**: every result is a fixed-order chain of fused multiply-adds or a fixed tree
-//! over a fixed number of virtual lanes; neither the number of threads nor the instruction set
-//! ([`simd::Isa`]) changes a bit. The portable path uses [`f32::mul_add`], which is slow without hardware and equal.
+//! **The same bits everywhere**: every result is a fixed-order chain of fused multiply-adds, or a
+//! fixed tree over a fixed number of virtual lanes. Neither the number of threads nor the
+//! instruction set ([`simd::Isa`]) changes a bit. The portable path uses [`f32::mul_add`], which
+//! gives equal results but is slow without hardware support.
 //!
-//! All functions are methods of [`Kernels`], which holds the instruction set. They panic where a slice's
-//! length disagrees with the shape: shapes are the caller's invariant.
+//! All functions are methods of [`Kernels`], which contains the instruction set. They panic if a
+//! slice's length disagrees with the shape, because shapes are the caller's invariant.
 
 mod adam;
 mod attention;

@@ -1,33 +1,34 @@
-//! What a network does along time where each moment is an image of its own: (images, moments, values), a moment's values, all
-//! channels, in a row.
+//! Operations along time in networks with one image for each moment: (images, moments, values),
+//! with the values of all channels of a moment in a row.
 
 use rayon::prelude::*;
 
 use super::simd::{Kernels, LANES, Lanes, Op};
 
-/// Images of some moments each.
+/// A batch of images with several moments each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MomentShape {
-    /// Images in the batch.
+    /// The number of images in the batch.
     pub images: usize,
-    /// Moments of an image.
+    /// The number of moments of an image.
     pub moments: usize,
-    /// Values of a moment.
+    /// The number of values of a moment.
     pub values: usize,
 }
 
 impl MomentShape {
-    /// Values of the tensor.
+    /// Returns the number of values of the tensor.
     pub fn len(&self) -> usize {
         self.images * self.moments * self.values
     }
 
-    /// True for a tensor without values.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The moment `by` after one of all images' moments, within the same image; `by` is 0, 1 or 2, less one.
+    /// Returns the index of the moment at distance `by` − 1 from moment `at`, if it is in the same
+    /// image; `by` is 0, 1 or 2.
     fn beside(&self, at: usize, by: usize) -> Option<usize> {
         let moment = (at % self.moments + by).checked_sub(1)?;
         (moment < self.moments).then(|| at / self.moments * self.moments + moment)
@@ -35,8 +36,8 @@ impl MomentShape {
 }
 
 impl Kernels {
-    /// The values of the moments before, at and after each, beside each other, zeros beyond the ends: writes all of `out`,
-    /// three times as long as `x`.
+    /// Concatenates the values of the moments before, at and after each, with zeros beyond the
+    /// ends. Writes all of `out`, which is three times as long as `x`.
     pub fn beside(self, s: &MomentShape, x: &[f32], out: &mut [f32]) {
         assert_eq!((x.len(), out.len()), (s.len(), 3 * s.len()), "lengths");
         if s.is_empty() {
@@ -53,7 +54,7 @@ impl Kernels {
         });
     }
 
-    /// Gradient of [`Kernels::beside`]: writes all of `dx`.
+    /// Computes the gradient of [`Kernels::beside`]. Writes all of `dx`.
     pub fn beside_grad(self, s: &MomentShape, dy: &[f32], dx: &mut [f32]) {
         assert_eq!((dx.len(), dy.len()), (s.len(), 3 * s.len()), "lengths");
         if s.is_empty() {
@@ -61,7 +62,7 @@ impl Kernels {
         }
         let each = dx.par_chunks_exact_mut(s.values).enumerate();
         each.for_each(|(at, dx)| {
-            // A moment is the first of three for the next one, and the last for the one before.
+            // A moment is the first of three for the next one, and the last for the previous one.
             let part = |by: usize| {
                 let of = s.beside(at, by)?;
                 Some(&dy[(3 * of + 2 - by) * s.values..][..s.values])
@@ -73,7 +74,9 @@ impl Kernels {
         });
     }
 
-    /// The greater of each two moments in a row, the first of equals, NaN above all: writes all of `y`; `s` has an even number of moments.
+    /// Computes the greater of each two consecutive moments. Of equal values, the first is
+    /// selected; NaN is greater than any number. Writes all of `y`; `s` must have an even number of
+    /// moments.
     pub fn halve_time(self, s: &MomentShape, x: &[f32], y: &mut [f32]) {
         assert_eq!((x.len(), 2 * y.len()), (s.len(), s.len()), "lengths");
         if s.is_empty() {
@@ -88,7 +91,7 @@ impl Kernels {
             });
     }
 
-    /// Gradient of [`Kernels::halve_time`] from its input: writes all of `dx`.
+    /// Computes the gradient of [`Kernels::halve_time`] from its input. Writes all of `dx`.
     pub fn halve_time_grad(self, s: &MomentShape, x: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert_eq!((x.len(), 2 * dy.len()), (s.len(), s.len()), "lengths");
         assert_eq!(dx.len(), s.len(), "input gradient length");
@@ -113,7 +116,7 @@ impl Kernels {
     }
 }
 
-/// The sum of what there is, the first of it always.
+/// The sum of the existing parts; the first part always exists.
 struct Sum<'a> {
     parts: [Option<&'a [f32]>; 3],
     to: &'a mut [f32],
@@ -159,7 +162,7 @@ impl Op for Greater<'_> {
     }
 }
 
-/// Whether the second of two is the greater; NaN is greater than anything.
+/// Returns whether the second value is the greater; NaN is greater than any number.
 #[inline(always)]
 fn wins(first: f32, second: f32) -> bool {
     (second > first) | second.is_nan()
@@ -181,7 +184,7 @@ impl Op for GreaterGrad<'_> {
         let from = self.first.iter().zip(self.second).zip(self.dy);
         let to = self.to_first.iter_mut().zip(self.to_second);
         for (((first, second), dy), (to_first, to_second)) in from.zip(to) {
-            // All bits or none: the compiler makes vectors of this, not of a choice.
+            // A mask of all bits or none, which the compiler vectorises, unlike a branch.
             let later = u32::from(wins(*first, *second)).wrapping_neg();
             *to_first = f32::from_bits(dy.to_bits() & !later);
             *to_second = f32::from_bits(dy.to_bits() & later);

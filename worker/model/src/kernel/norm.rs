@@ -1,8 +1,9 @@
 //! Batch norm fused with ReLU: training, its gradient, and evaluation.
 //!
-//! Each channel is one task: mean, then centred variance, then one pass that normalises and clips. Sums run
-//! over four times sixteen lanes in one plane and in `f64` over the planes. The gradient recomputes the
-//! clipped value with the forward pass's own operations, so that both see the same pixels as clipped.
+//! Each channel is one task: mean, then centred variance, then one pass that normalises and clips.
+//! Sums run over four times sixteen lanes in one plane and in `f64` over the planes. The gradient
+//! recomputes the clipped value with the forward pass's own operations, so that both see the same
+//! pixels as clipped.
 
 use rayon::prelude::*;
 
@@ -11,33 +12,33 @@ use super::simd::{Kernels, LANES, Lanes, Op};
 /// A tensor (images, channels, pixels), contiguous in this order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NormShape {
-    /// Images in the batch.
+    /// The number of images in the batch.
     pub images: usize,
-    /// Channels.
+    /// The number of channels.
     pub channels: usize,
-    /// Pixels of a plane.
+    /// The number of pixels of a plane.
     pub pixels: usize,
 }
 
 impl NormShape {
-    /// Values of the tensor.
+    /// Returns the number of values of the tensor.
     pub fn len(&self) -> usize {
         self.images * self.channels * self.pixels
     }
 
-    /// True for a tensor without values.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The planes of one channel.
+    /// Returns the planes of one channel.
     fn planes<'a>(&self, x: &'a [f32], channel: usize) -> impl Iterator<Item = &'a [f32]> {
         x.chunks_exact(self.pixels)
             .skip(channel)
             .step_by(self.channels)
     }
 
-    /// The planes of each channel, to write.
+    /// Returns the planes of each channel for writing.
     fn split<'a>(&self, x: &'a mut [f32]) -> Vec<Vec<&'a mut [f32]>> {
         let mut parts: Vec<Vec<&mut [f32]>> = Vec::new();
         parts.resize_with(self.channels, || Vec::with_capacity(self.images));
@@ -48,23 +49,23 @@ impl NormShape {
     }
 }
 
-/// Parameters and statistics of a batch norm, one value a channel each.
+/// The parameters and statistics of a batch norm, one value a channel each.
 #[derive(Clone, Copy, Debug)]
 pub struct BatchNorm<'a> {
-    /// Scale.
+    /// The scale.
     pub gamma: &'a [f32],
-    /// Shift.
+    /// The shift.
     pub beta: &'a [f32],
-    /// Mean: of the batch in training, the running one in evaluation.
+    /// The mean: of the batch in training, the running one in evaluation.
     pub mean: &'a [f32],
-    /// Variance: biased in training.
+    /// The variance: biased in training.
     pub var: &'a [f32],
-    /// Added to the variance.
+    /// The constant added to the variance.
     pub eps: f32,
 }
 
 impl BatchNorm<'_> {
-    /// `x·scale + shift` of one channel, and 1/σ.
+    /// Returns scale and shift of one channel, for `x·scale + shift`, and 1/σ.
     fn affine(&self, c: usize) -> (f32, f32, f32) {
         let inverse = 1.0 / (self.var[c] + self.eps).sqrt();
         let scale = self.gamma[c] * inverse;
@@ -79,7 +80,7 @@ impl BatchNorm<'_> {
 }
 
 impl Kernels {
-    /// Mean and biased variance of each channel over images and pixels.
+    /// Computes the mean and biased variance of each channel over images and pixels.
     pub fn batch_statistics(self, s: &NormShape, x: &[f32], mean: &mut [f32], var: &mut [f32]) {
         assert_eq!(x.len(), s.len(), "input length");
         assert_eq!(
@@ -105,14 +106,14 @@ impl Kernels {
                     .planes(x, c)
                     .map(|x| f64::from(self.run(Moment::<true> { x, mean: *mean })))
                     .sum();
-                // The mean was rounded: take its error out of the variance.
+                // The mean was rounded, so its error is subtracted from the variance.
                 let off = m - f64::from(*mean);
                 *var = (sum / count - off * off).max(0.0) as f32;
             });
     }
 
-    /// Batch norm by the batch's own statistics, then ReLU: writes all of `y`, and the mean and biased variance
-    /// of each channel, which the gradient needs again.
+    /// Computes batch norm by the batch's own statistics, then ReLU. Writes all of `y`, and the
+    /// mean and biased variance of each channel, which the gradient requires.
     #[expect(clippy::too_many_arguments, reason = "three inputs, three outputs")]
     pub fn batch_norm_relu(
         self,
@@ -136,7 +137,7 @@ impl Kernels {
         self.norm_relu(s, x, &norm, y);
     }
 
-    /// Batch norm by given statistics, then ReLU (the evaluation form): writes all of `y`.
+    /// Computes batch norm by given statistics, then ReLU (the evaluation form). Writes all of `y`.
     pub fn norm_relu(self, s: &NormShape, x: &[f32], norm: &BatchNorm, y: &mut [f32]) {
         assert_eq!(x.len(), s.len(), "input length");
         assert_eq!(y.len(), s.len(), "output length");
@@ -155,8 +156,8 @@ impl Kernels {
             });
     }
 
-    /// Gradient of [`Kernels::batch_norm_relu`] from its input, its statistics and the output's gradient:
-    /// writes all of `dx`, `dgamma` and `dbeta`.
+    /// Computes the gradient of [`Kernels::batch_norm_relu`] from its input, its statistics and the
+    /// output's gradient. Writes all of `dx`, `dgamma` and `dbeta`.
     #[expect(clippy::too_many_arguments, reason = "three inputs, three outputs")]
     pub fn batch_norm_relu_grad(
         self,

@@ -1,8 +1,9 @@
-//! The 3×3 convolution over a one-hot input: a gather of weight columns, and its weight gradient, a scatter.
+//! The 3×3 convolution over a one-hot input, a gather of weight columns, and its weight gradient, a
+//! scatter.
 //!
-//! The input is one bin per pixel, so each output is a sum of at most nine weights, whatever the number of
-//! bins. Weights are turned to `[tap][bin][outputs]` with one zero column for "no bin"; each output sums its
-//! taps in order. The gradient adds pixels in order.
+//! The input is one bin per pixel, so each output is a sum of at most nine weights, whatever the
+//! number of bins. Weights are transposed to `[tap][bin][outputs]` with one zero column for "no
+//! bin"; each output sums its taps in order. The gradient adds pixels in order.
 
 use rayon::prelude::*;
 
@@ -10,27 +11,27 @@ use super::conv_shape::ConvShape;
 use super::plane::{Grid, split};
 use super::simd::{Kernels, LANES, Lanes, Op};
 
-/// Pixels of a band.
+/// The number of pixels of a band.
 const BAND: usize = 2048;
 
-/// A 3×3 convolution of stride 1 and padding 1 over one-hot bins: input one bin a pixel (images, height,
-/// width), weights (outputs, bins, 3, 3), output (images, outputs, height, width).
+/// A 3×3 convolution of stride 1 and padding 1 over one-hot bins: input one bin a pixel (images,
+/// height, width), weights (outputs, bins, 3, 3), output (images, outputs, height, width).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OneHotShape {
-    /// Images in the batch.
+    /// The number of images in the batch.
     pub images: usize,
-    /// Number of bins: input channels of the dense form.
+    /// The number of bins: the input channels of the dense form.
     pub bins: usize,
-    /// Output channels.
+    /// The number of output channels.
     pub outputs: usize,
-    /// Rows of a plane.
+    /// The number of rows of a plane.
     pub height: usize,
-    /// Pixels of a row.
+    /// The number of pixels of a row.
     pub width: usize,
 }
 
 impl OneHotShape {
-    /// The dense form.
+    /// Returns the dense form.
     pub fn dense(&self) -> ConvShape {
         ConvShape {
             images: self.images,
@@ -45,7 +46,8 @@ impl OneHotShape {
         self.dense().grid(3)
     }
 
-    /// Bins in padded planes, `[image][height + 2][width + 2]`, "no bin" as `bins`.
+    /// Returns the bins in padded planes, `[image][height + 2][width + 2]`, with `bins` for "no
+    /// bin".
     fn padded(&self, bins: &[u16]) -> Vec<u32> {
         let row = self.width + 2;
         let none = u32::try_from(self.bins).expect("bins fit 32 bits");
@@ -62,8 +64,8 @@ impl OneHotShape {
 }
 
 impl Kernels {
-    /// Adds the convolution over one-hot bins to `out`. A bin of [`OneHotShape::bins`] or more (such as
-    /// `u16::MAX`) means that all channels are zero at that pixel.
+    /// Adds the convolution over one-hot bins to `out`. A bin of [`OneHotShape::bins`] or more
+    /// (such as `u16::MAX`) means that all channels are zero at that pixel.
     pub fn onehot_conv3x3(self, s: &OneHotShape, bins: &[u16], w: &[f32], out: &mut [f32]) {
         let d = s.dense();
         assert_eq!(bins.len(), s.images * s.height * s.width, "one bin a pixel");
@@ -96,7 +98,8 @@ impl Kernels {
             });
     }
 
-    /// Gradient of [`Kernels::onehot_conv3x3`] by its weights: writes all of `dw` (outputs, bins, 3, 3).
+    /// Computes the weights' gradient of [`Kernels::onehot_conv3x3`]. Writes all of `dw` (outputs,
+    /// bins, 3, 3).
     pub fn onehot_conv3x3_weight_grad(
         self,
         s: &OneHotShape,
@@ -148,7 +151,7 @@ impl Kernels {
     }
 }
 
-/// Weights as `[tap][bins + 1][wide]`, the last column zero.
+/// Converts weights to `[tap][bins + 1][wide]`, with the last column zero.
 fn columns(s: &OneHotShape, w: &[f32], wide: usize) -> Vec<f32> {
     let plane = (s.bins + 1) * wide;
     let mut columns = vec![0.0; 9 * plane];
@@ -177,7 +180,7 @@ struct Gather<'a, 'b> {
     columns: &'a [f32],
     blocks: usize,
     tap: usize,
-    /// Channel by channel.
+    /// The outputs, channel by channel.
     out: &'a mut [&'b mut [f32]],
 }
 

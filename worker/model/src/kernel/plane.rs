@@ -1,14 +1,15 @@
-//! Planes with shared zero padding: bands of rows, the vector units that cover them, and their packing.
+//! Planes with shared zero padding: bands of rows, the vector units that cover them, and their
+//! packing.
 //!
-//! A padded row holds one zero and then the row; its right neighbour is the next row's zero. Padded images
-//! follow each other with one zero row between them, so that a stencil tap is one constant offset in a
-//! whole band, and one unit of sixteen lanes may cover several short rows or images.
+//! A padded row starts with one zero, which is also the right neighbour of the previous row. Padded
+//! images follow each other with one zero row between them. A stencil tap is therefore one constant
+//! offset in a whole band, and one unit of sixteen lanes may cover several short rows or images.
 
 use std::ops::Range;
 
 use super::simd::LANES;
 
-/// Images of one size and the padding of the stencil that runs over them (0 or 1).
+/// Images of one size, and the padding of the stencil that is applied to them (0 or 1).
 #[derive(Clone, Copy)]
 pub(super) struct Grid {
     pub images: usize,
@@ -17,7 +18,7 @@ pub(super) struct Grid {
     pub pad: usize,
 }
 
-/// Whole images, or some rows of one image.
+/// A band: whole images, or some rows of one image.
 #[derive(Clone)]
 pub(super) struct Band {
     pub images: Range<usize>,
@@ -26,7 +27,7 @@ pub(super) struct Band {
 
 /// Sixteen neighbouring positions of a packed band and the pixels among them.
 pub(super) struct Unit {
-    /// Offset of the first tap of the first lane in a packed plane.
+    /// The offset of the first tap of the first lane in a packed plane.
     pub at: usize,
     /// The pixels among the lanes.
     pub runs: Vec<Run>,
@@ -36,24 +37,24 @@ pub(super) struct Unit {
 pub(super) struct Run {
     pub lane: usize,
     pub len: usize,
-    /// Image, counted in the band.
+    /// The image's index in the band.
     pub image: usize,
-    /// First pixel, counted in the band's rows of that image.
+    /// The first pixel's index in the band's rows of that image.
     pub pixel: usize,
 }
 
 impl Grid {
-    /// Pixels of one image.
+    /// Returns the number of pixels of one image.
     pub fn pixels(self) -> usize {
         self.height * self.width
     }
 
-    /// Length of a packed row.
+    /// Returns the length of a packed row.
     pub fn stride(self) -> usize {
         self.width + self.pad
     }
 
-    /// Cuts all rows into bands of about `pixels` pixels.
+    /// Divides all rows into bands of about `pixels` pixels.
     pub fn bands(self, pixels: usize) -> Vec<Band> {
         let all = self.pixels();
         if all == 0 || self.images == 0 {
@@ -85,23 +86,23 @@ impl Grid {
         bands
     }
 
-    /// Packed rows of a band, with the padding above and below.
+    /// Returns the number of packed rows of a band, with the padding above and below.
     fn packed_rows(self, band: &Band) -> usize {
         band.images.len() * (band.rows.len() + self.pad) + self.pad
     }
 
-    /// Length of one packed plane of a band, with room for the last unit's lanes.
+    /// Returns the length of one packed plane of a band, including the last unit's lanes.
     pub fn packed_len(self, band: &Band) -> usize {
         (self.packed_rows(band) * self.stride() + self.pad + LANES).next_multiple_of(LANES)
     }
 
-    /// The units that cover a band: exact pieces of rows where the width allows it, else runs over the
-    /// packed plane that skip what padding they can.
+    /// Returns the units that cover a band. If the width allows it, they are exact pieces of rows;
+    /// otherwise they are runs over the packed plane that skip as much padding as possible.
     pub fn units(self, band: &Band) -> Vec<Unit> {
         self.cover(band, self.stride())
     }
 
-    /// The units that cover a band of planes whose rows have no padding.
+    /// Returns the units that cover a band of planes without row padding.
     pub fn units_unpadded(self, band: &Band) -> Vec<Unit> {
         self.cover(band, self.width)
     }
@@ -138,7 +139,8 @@ impl Grid {
         units
     }
 
-    /// Packs one plane of a band: `image(i)` is the plane of image `i`. `to` has [`Grid::packed_len`] values.
+    /// Packs one plane of a band: `image(i)` is the plane of image `i`. `to` has
+    /// [`Grid::packed_len`] values.
     pub fn pack<'a>(self, band: &Band, image: impl Fn(usize) -> &'a [f32], to: &mut [f32]) {
         let (w, stride, pad) = (self.width, self.stride(), self.pad);
         let mut at = 0;
@@ -152,7 +154,8 @@ impl Grid {
             }
             let first = i == band.images.start;
             let above = usize::from(first);
-            // The row above is packed for the first image only: later ones share the zero row before them.
+            // The row above is packed for the first image only; later images share the zero row in
+            // front of them.
             for y in 1 - above..band.rows.len() + 2 {
                 let y = band.rows.start + y;
                 if y == 0 || y > self.height {
@@ -168,7 +171,7 @@ impl Grid {
     }
 }
 
-/// Copies a row; short ones without a call.
+/// Copies a row, without a call if it is short.
 #[inline(always)]
 fn copy(from: &[f32], to: &mut [f32]) {
     if from.len().is_multiple_of(8) {
@@ -180,8 +183,8 @@ fn copy(from: &[f32], to: &mut [f32]) {
     }
 }
 
-/// Hands out the pieces of an NCHW tensor: `parts[band · groups + group]` gets, image by image of the band,
-/// the band's rows of each channel of the group.
+/// Splits an NCHW tensor into pieces: `parts[band · groups + group]` receives, image by image of
+/// the band, the band's rows of each channel of the group.
 pub(super) fn split<'a>(
     grid: Grid,
     channels: usize,

@@ -7,26 +7,26 @@ use super::simd::{Kernels, Lanes, Op};
 /// Planes of one size; for pooling the large ones, for upsampling the small ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PlaneShape {
-    /// Number of planes: images times channels.
+    /// The number of planes: images times channels.
     pub planes: usize,
-    /// Rows of a plane.
+    /// The number of rows of a plane.
     pub height: usize,
-    /// Pixels of a row.
+    /// The number of pixels of a row.
     pub width: usize,
 }
 
 impl PlaneShape {
-    /// Values of the planes.
+    /// Returns the number of values of the planes.
     pub fn len(&self) -> usize {
         self.planes * self.height * self.width
     }
 
-    /// True without values.
+    /// Returns whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The planes halved; an odd last row or column is dropped.
+    /// Returns the planes at half the size; an odd last row or column is dropped.
     pub fn halved(&self) -> Self {
         Self {
             height: self.height / 2,
@@ -35,7 +35,7 @@ impl PlaneShape {
         }
     }
 
-    /// The planes doubled.
+    /// Returns the planes at twice the size.
     pub fn doubled(&self) -> Self {
         Self {
             height: self.height * 2,
@@ -46,8 +46,9 @@ impl PlaneShape {
 }
 
 impl Kernels {
-    /// Max-pool 2×2 with stride 2 of planes `s`: writes `y` and, for the gradient, `which` of the four pixels
-    /// won (0 to 3, row by row), both as [`PlaneShape::halved`]. The first of equals wins; NaN wins always.
+    /// Computes max-pool 2×2 with stride 2 of planes `s`. Writes `y` and, for the gradient, the
+    /// index `which` of the selected pixel of four (0 to 3, row by row), both as
+    /// [`PlaneShape::halved`]. Of equal values, the first is selected; NaN is always selected.
     pub fn max_pool(self, s: &PlaneShape, x: &[f32], y: &mut [f32], which: &mut [u8]) {
         let small = s.halved();
         assert_eq!(x.len(), s.len(), "input length");
@@ -73,7 +74,7 @@ impl Kernels {
             });
     }
 
-    /// Gradient of [`Kernels::max_pool`]: writes all of `dx`.
+    /// Computes the gradient of [`Kernels::max_pool`]. Writes all of `dx`.
     pub fn max_pool_grad(self, s: &PlaneShape, dy: &[f32], which: &[u8], dx: &mut [f32]) {
         let small = s.halved();
         assert_eq!(dx.len(), s.len(), "input gradient length");
@@ -99,7 +100,7 @@ impl Kernels {
             });
     }
 
-    /// Nearest upsampling ×2 of planes `s`: writes all of `y`, as [`PlaneShape::doubled`].
+    /// Computes nearest upsampling ×2 of planes `s`. Writes all of `y`, as [`PlaneShape::doubled`].
     pub fn upsample(self, s: &PlaneShape, x: &[f32], y: &mut [f32]) {
         assert_eq!(
             (x.len(), y.len()),
@@ -121,7 +122,8 @@ impl Kernels {
             });
     }
 
-    /// Gradient of [`Kernels::upsample`]: each pixel of `dx` is the sum of its four of `dy`.
+    /// Computes the gradient of [`Kernels::upsample`]: each pixel of `dx` is the sum of its four
+    /// pixels of `dy`.
     pub fn upsample_grad(self, s: &PlaneShape, dy: &[f32], dx: &mut [f32]) {
         assert_eq!(
             (dx.len(), dy.len()),
@@ -202,7 +204,7 @@ impl Op for Unpool<'_> {
             }
             let pairs = top.chunks_exact_mut(2).zip(bottom.chunks_exact_mut(2));
             for ((dy, which), (t, b)) in dy.iter().zip(which).zip(pairs) {
-                // All bits or none: the compiler makes vectors of this, not of a choice.
+                // A mask of all bits or none, which the compiler vectorises, unlike a branch.
                 let of =
                     |i: u8| f32::from_bits(dy.to_bits() & u32::from(*which == i).wrapping_neg());
                 t[0] = of(0);

@@ -1,24 +1,24 @@
-//! Buffers kept between calls: fresh memory costs a page fault for every 4 KiB, as much as the work itself
-//! for small layers.
+//! Buffers that are reused between calls. Allocating new memory costs a page fault for every 4 KiB,
+//! which for small layers takes as long as the computation.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, PoisonError};
 
-/// Most buffers kept.
+/// The greatest number of buffers in the pool.
 const KEPT: usize = 32;
-/// Longest buffer kept: 64 MiB.
+/// The length of the longest buffer in the pool: 64 MiB.
 const LONGEST: usize = 16 << 20;
 
 static POOL: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
 
-/// A buffer of some length with **any** contents: whoever takes it writes all of it before reading.
+/// A buffer of a given length with **any** contents. The user must write all of it before reading.
 pub(super) struct Scratch {
     buffer: Vec<f32>,
     len: usize,
 }
 
 impl Scratch {
-    /// Takes a kept buffer, the smallest that is long enough, or makes one.
+    /// Takes the smallest buffer of the pool that is long enough, or allocates one.
     pub fn take(len: usize) -> Self {
         let mut pool = POOL.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = (0..pool.len())

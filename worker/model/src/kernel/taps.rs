@@ -1,4 +1,5 @@
-//! What a 3×3×3 convolution with stride 2 sees of a volume, as channels of a 1×1 convolution.
+//! Gathers the inputs of a 3×3×3 convolution with stride 2 over a volume as channels of a 1×1
+//! convolution.
 
 use rayon::prelude::*;
 
@@ -7,27 +8,28 @@ use super::simd::Kernels;
 /// Volumes (images, moments, streams, height, width).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TapShape {
-    /// Volumes in the batch.
+    /// The number of volumes in the batch.
     pub images: usize,
-    /// Moments of a volume.
+    /// The number of moments of a volume.
     pub moments: usize,
-    /// Streams of a moment.
+    /// The number of streams of a moment.
     pub streams: usize,
-    /// Rows.
+    /// The number of rows.
     pub height: usize,
-    /// Columns.
+    /// The number of columns.
     pub width: usize,
-    /// Whether what lies beyond the ends is what lies there; else it is 0.
+    /// Whether the outermost values are repeated beyond the ends; if not, values there are 0.
     pub repeated: bool,
 }
 
 impl TapShape {
-    /// Moments, rows and columns of what is seen.
+    /// Returns the numbers of output moments, rows and columns.
     pub fn halved(&self) -> [usize; 3] {
         [self.moments.div_ceil(2), self.height / 2, self.width / 2]
     }
 
-    /// `by` less one from `at`, within 0..`len` or repeated.
+    /// Returns position 2·`at` + `by` − 1. A position outside 0..`len` is clamped if ends are
+    /// repeated, and `None` otherwise.
     fn place(&self, at: usize, by: usize, len: usize) -> Option<usize> {
         let place = 2 * at + by;
         match self.repeated {
@@ -38,7 +40,8 @@ impl TapShape {
 }
 
 impl Kernels {
-    /// Writes all of `out`, (images·⌈moments/2⌉, 27, streams, height/2, width/2), taps of a moment first, then of a row.
+    /// Writes all of `out`, (images·⌈moments/2⌉, 27, streams, height/2, width/2), ordered by the
+    /// tap's moment, then by its row.
     pub fn taps(self, s: &TapShape, x: &[f32], out: &mut [f32]) {
         let ([moments, rows, columns], plane) = (s.halved(), s.height * s.width);
         let len = s.images * s.moments * s.streams * plane;

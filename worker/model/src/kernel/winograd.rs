@@ -1,10 +1,11 @@
-//! The 3×3 convolution by Winograd's F(2×2, 3×3): sixteen small matrix products in place of nine taps, 2.25
-//! times fewer multiplications.
+//! The 3×3 convolution by Winograd's F(2×2, 3×3): sixteen small matrix products instead of nine
+//! taps, with 2.25 times fewer multiplications.
 //!
-//! Source: Lavin and Gray, "Fast algorithms for convolutional neural networks" (2016). A tile is 2×2 outputs
-//! from 4×4 inputs. A task is a band of tile rows and a group of output channels: it splits the input rows into
-//! the tiles' columns, so that lanes are neighbouring tiles, transforms them, multiplies, and transforms back. The
-//! products are chains over input channels; the transforms are sums of a fixed order.
+//! Source: Lavin and Gray, "Fast algorithms for convolutional neural networks" (2016). A tile is
+//! 2×2 outputs from 4×4 inputs. A task is a band of tile rows and a group of output channels. It
+//! splits the input rows into the tiles' columns, so that lanes are neighbouring tiles, transforms
+//! them, multiplies, and transforms back. The products are chains over input channels; the
+//! transforms are sums in a fixed order.
 
 use rayon::prelude::*;
 
@@ -13,18 +14,19 @@ use super::plane::{Band, Grid, Unit, split};
 use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, shifted};
 
-/// Values of a tile, and so the number of products.
+/// The number of values of a tile, which is also the number of products.
 const TILE: usize = 16;
-/// Bytes of a task's transformed input, about: half of a second-level cache.
+/// The approximate size of a task's transformed input in bytes: half of a second-level cache.
 const BYTES: usize = 512 << 10;
 
-/// True where this form is faster than the direct one.
+/// Returns whether this form is faster than the direct one.
 pub(super) fn pays(s: &ConvShape) -> bool {
     s.inputs >= 16 && s.outputs >= 16 && s.height >= 4 && s.width >= 4
 }
 
 impl Kernels {
-    /// The convolution with weights packed for the direct form, `[outputs / 8][inputs][9][8]`.
+    /// Computes the convolution with weights packed for the direct form,
+    /// `[outputs / 8][inputs][9][8]`.
     pub(super) fn winograd(self, s: &ConvShape, x: &[f32], packed: &[f32], out: &mut [f32]) {
         let tiles = Grid {
             images: s.images,
@@ -45,7 +47,7 @@ impl Kernels {
                 rows: 2 * b.rows.start..(2 * b.rows.end).min(s.height),
             })
             .collect();
-        // How the work is shared out changes no bit.
+        // The division of the work among tasks does not affect the bits.
         let wanted = (2 * rayon::current_num_threads()).div_ceil(bands.len());
         let group = s.outputs.div_ceil(BLOCK).div_ceil(wanted) * BLOCK;
         let groups = s.outputs.div_ceil(group);
@@ -58,7 +60,7 @@ impl Kernels {
                 let channels = group.min(s.outputs - first);
                 let units = tiles.units_unpadded(band);
                 let len = units.len() * LANES;
-                // One line more than the data keeps the sixteen streams out of one cache set.
+                // One extra cache line keeps the sixteen streams out of one cache set.
                 let step = s.inputs * len + LANES;
                 let blocks = channels.div_ceil(BLOCK);
                 let mut v = Scratch::take(TILE * step);
@@ -100,7 +102,7 @@ impl Kernels {
             });
     }
 
-    /// `[outputs / 8][16][inputs][8]`: G g Gᵀ of each 3×3 kernel.
+    /// Returns `[outputs / 8][16][inputs][8]`: G g Gᵀ of each 3×3 kernel.
     fn transform_weights(self, s: &ConvShape, packed: &[f32]) -> Scratch {
         let mut to = Scratch::take(s.outputs.div_ceil(BLOCK) * TILE * s.inputs * BLOCK);
         to.par_chunks_exact_mut(TILE * s.inputs * BLOCK)
@@ -159,7 +161,7 @@ struct Input<'a> {
     units: &'a [Unit],
     x: &'a [f32],
     channel: usize,
-    /// Length of one plane of columns, which starts and ends with slack.
+    /// The length of one plane of columns, with slack at both ends.
     plane: usize,
     columns: &'a mut [f32],
     to: &'a mut [f32],
@@ -192,7 +194,7 @@ impl Op for Input<'_> {
                 at += width;
             }
         }
-        // Eight streams at a time: sixteen would be as many pages as a core can keep track of for stores.
+        // Eight streams at a time: sixteen would be as many pages as a core can track for stores.
         for lower in [false, true] {
             let (columns, to) = (&*self.columns, &mut *self.to);
             for (u, unit) in self.units.iter().enumerate() {
@@ -228,8 +230,8 @@ impl Op for Input<'_> {
     }
 }
 
-/// The four columns of a row's tiles, each at `at` of its plane: pixels 2j − 1, 2j, 2j + 1 and 2j + 2 of tile
-/// j. May write one value before and, in the first plane, up to one after.
+/// Writes the four columns of a row's tiles, each at `at` of its plane: pixels 2j − 1, 2j, 2j + 1
+/// and 2j + 2 of tile j. May write one value before and, in the first plane, up to one after.
 #[inline(always)]
 fn columns_of<L: Lanes>(row: &[f32], at: usize, width: usize, columns: &mut [f32]) {
     let plane = columns.len() / 4;
@@ -252,7 +254,7 @@ fn columns_of<L: Lanes>(row: &[f32], at: usize, width: usize, columns: &mut [f32
         columns[d + j - 1] = even;
         j += 1;
     }
-    // What lies outside the row; before it lies the end of the row above.
+    // These values are outside the row, where the end of the previous row was written.
     columns[a] = 0.0;
     columns[d - 1] = 0.0;
     columns[d + width - 1] = 0.0;
@@ -279,7 +281,7 @@ impl Op for Multiply<'_> {
             while at < self.len {
                 let left = (self.len - at) / LANES;
                 if L::WIDE {
-                    // Four units left go as two pairs.
+                    // The last four units are processed as two pairs.
                     let n = if left == 4 { 2 } else { left.min(3) };
                     for b in 0..self.blocks {
                         match n {
@@ -314,7 +316,7 @@ impl Multiply<'_> {
         for (v, start) in starts.iter_mut().enumerate() {
             *start = at + v * LANES;
         }
-        // Without inputs there are no weights.
+        // If there are no inputs, there are no weights.
         let weights = ((b * TILE + f) * self.inputs * BLOCK + half).min(self.weights.len());
         let acc = shifted::<L, M, V, 1>(
             &self.v[f * self.step..],

@@ -1,9 +1,9 @@
 //! The weight gradient of the 3×3 convolution by Winograd's tiles: the adjoint of the forward form.
 //!
-//! dW = Gᵀ [ Σ over tiles (A dy Aᵀ) ⊙ (Bᵀ x B) ] G. Input and output gradient are turned to sixteen channels a
-//! pixel and transformed with lanes over channels; the sum over tiles is cut into chains of outer
-//! products, whose sums are added in order. Tasks share out channels and tile values,
-//! never tiles.
+//! dW = Gᵀ [ Σ over tiles (A dy Aᵀ) ⊙ (Bᵀ x B) ] G. Input and output gradient are transposed to
+//! sixteen channels a pixel and transformed with lanes over channels. The sum over tiles is divided
+//! into chains of outer products, whose sums are added in order. Tasks divide channels and tile
+//! values, never tiles.
 
 use rayon::prelude::*;
 
@@ -11,19 +11,19 @@ use super::conv_shape::ConvShape;
 use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, Positions, outer};
 
-/// Values of a tile.
+/// The number of values of a tile.
 const TILE: usize = 16;
-/// Bytes of a band's transformed values, about.
+/// The approximate size of a band's transformed values in bytes.
 const BYTES: usize = 2 << 20;
-/// Most tiles of one chain.
+/// The greatest number of tiles of one chain.
 const CHAIN: usize = 128;
-/// Input channels of one product.
+/// The number of input channels of one product.
 const SCALARS: usize = 8;
 
-/// True where this form is faster than the direct one.
+/// Returns whether this form is faster than the direct one.
 pub(super) fn pays(s: &ConvShape) -> bool {
     let tiles = s.images * s.height.div_ceil(2) * s.width.div_ceil(2);
-    // The transforms cost what about 24 channels on both sides save.
+    // The transforms cost as much as about 24 channels on both sides save.
     s.inputs * s.outputs > 24 * (s.inputs + s.outputs) && tiles >= 64
 }
 
@@ -40,13 +40,13 @@ impl Kernels {
         let row = width * TILE * LANES * (inputs + outputs) * size_of::<f32>();
         let step = (BYTES / row).max(64usize.div_ceil(width)).min(all);
 
-        // Sums as [tile value][pair of output blocks][input][32].
+        // The sums as [tile value][pair of output blocks][input][32].
         let depth = inputs * LANES * 2 * LANES;
         let mut sums = Scratch::take(TILE * pairs * depth);
         let mut values = Scratch::take((inputs + outputs) * TILE * (step * width + 1) * LANES);
         for first in (0..all).step_by(step) {
             let rows = step.min(all - first);
-            // One line more than the data keeps the sixteen streams out of one cache set.
+            // One extra cache line keeps the sixteen streams out of one cache set.
             let line = rows * width * LANES + LANES;
             let block = TILE * line;
             values[..(inputs + outputs) * block]
@@ -118,10 +118,11 @@ impl Op for Transform<'_> {
         for row in 0..self.rows {
             let (image, ty) = ((self.first + row) / height, (self.first + row) % height);
             let image = &self.from[image * h * w * LANES..][..h * w * LANES];
-            // Row −1 wraps to the far end and so counts as outside.
+            // Row −1 wraps to a large number, which also counts as outside.
             let line_of = |y: usize| (y < h).then(|| &image[y * w * LANES..(y + 1) * w * LANES]);
             let to = &mut self.to[row * width * LANES..];
-            // Eight streams at a time: sixteen would be as many pages as a core can keep track of for stores.
+            // Eight streams at a time: sixteen would be as many pages as a core can track for
+            // stores.
             for lower in [false, true] {
                 if self.of_gradient {
                     let lines = [line_of(2 * ty), line_of(2 * ty + 1)];
@@ -162,7 +163,7 @@ fn write<L: Lanes>(four: [[L; 4]; 2], lower: bool, tx: usize, line: usize, to: &
     }
 }
 
-/// Half of Bᵀ d for one column of the input.
+/// Returns half of Bᵀ d for one column of the input.
 #[inline(always)]
 fn column<L: Lanes>(lines: [Option<&[f32]>; 4], x: usize, lower: bool) -> [L; 2] {
     let (d1, d2) = (at::<L>(lines[1], x), at::<L>(lines[2], x));
@@ -173,19 +174,19 @@ fn column<L: Lanes>(lines: [Option<&[f32]>; 4], x: usize, lower: bool) -> [L; 2]
     }
 }
 
-/// Half of A y for one column of the gradient.
+/// Returns half of A y for one column of the gradient.
 #[inline(always)]
 fn spread_column<L: Lanes>(lines: [Option<&[f32]>; 2], x: usize, lower: bool) -> [L; 2] {
     halves(spread(at::<L>(lines[0], x), at::<L>(lines[1], x)), lower)
 }
 
-/// The first or the last two of four.
+/// Returns the first or the last two of four values.
 #[inline(always)]
 fn halves<L: Lanes>(x: [L; 4], lower: bool) -> [L; 2] {
     if lower { [x[2], x[3]] } else { [x[0], x[1]] }
 }
 
-/// Sixteen channels of a pixel, zero outside.
+/// Returns sixteen channels of a pixel, zero outside the image.
 #[inline(always)]
 fn at<L: Lanes>(line: Option<&[f32]>, x: usize) -> L {
     match line {
@@ -194,13 +195,13 @@ fn at<L: Lanes>(line: Option<&[f32]>, x: usize) -> L {
     }
 }
 
-/// A (a, b): the adjoint of the output transform.
+/// Returns A (a, b): the adjoint of the output transform.
 #[inline(always)]
 fn spread<L: Lanes>(a: L, b: L) -> [L; 4] {
     [a, a.add(b), a.sub(b), L::splat(0.0).sub(b)]
 }
 
-/// Bᵀ d.
+/// Returns Bᵀ d.
 #[inline(always)]
 fn differences<L: Lanes>(d: [L; 4]) -> [L; 4] {
     [
@@ -215,7 +216,7 @@ fn differences<L: Lanes>(d: [L; 4]) -> [L; 4] {
 struct Products<'a> {
     v: &'a [f32],
     g: &'a [f32],
-    /// Distance of two blocks of channels.
+    /// The distance between two blocks of channels.
     block: usize,
     tiles: usize,
     inputs: usize,
@@ -279,10 +280,10 @@ fn keep<L: Lanes, const V: usize, const C: usize>(
     }
 }
 
-/// Gᵀ ŵ G for a pair of output blocks, written as (outputs, inputs, 3, 3).
+/// Computes Gᵀ ŵ G for a pair of output blocks, and writes it as (outputs, inputs, 3, 3).
 struct Back<'a> {
     sums: &'a [f32],
-    /// Distance of two tile values.
+    /// The distance between two tile values.
     step: usize,
     inputs: usize,
     dw: &'a mut [f32],
@@ -324,7 +325,7 @@ impl Op for Back<'_> {
     }
 }
 
-/// Gᵀ w.
+/// Returns Gᵀ w.
 #[inline(always)]
 fn gather<L: Lanes>(w: [L; 4]) -> [L; 3] {
     let half = L::splat(0.5);

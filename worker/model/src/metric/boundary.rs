@@ -1,15 +1,17 @@
-//! Boundary F1 of depth (Depth Pro, section 3.3; the code released with Shoot-Bounce-3D reports it): whether edges of the
-//! true depth are edges of the estimate, whatever its scale.
+//! The boundary F1 of depth (Depth Pro, section 3.3), which the code released with Shoot-Bounce-3D
+//! reports. It measures whether edges of the true depth are edges of the estimate, regardless of
+//! its scale.
 
-/// Ratios of neighbouring depths from which there is an edge: ten, evenly from 1.05 to 1.25; each counts by its size.
+/// The ratios of neighbouring depths above which there is an edge: ten, evenly from 1.05 to 1.25.
+/// Each is weighted by its size.
 const FROM: f64 = 1.05;
 const TO: f64 = 1.25;
 const STEPS: usize = 10;
 
-/// Depths count as no less: 1e-6 m over 4.5 m, of what networks say.
+/// The lower bound of depths, in units of a network's output: 1e-6 m over 4.5 m.
 const NEAREST: f32 = 1e-6 / 4.5;
 
-/// The figure of one image, 0 to 1; depths in any unit, `[row][column]`.
+/// Returns the boundary F1 of an image, 0 to 1. Depths have any unit, `[row][column]`.
 pub(super) fn boundary_f1(said: &[f32], truth: &[f32], width: usize) -> f64 {
     let mut weights = 0.0;
     let mut sum = 0.0;
@@ -21,11 +23,12 @@ pub(super) fn boundary_f1(said: &[f32], truth: &[f32], width: usize) -> f64 {
     sum / weights
 }
 
-/// At one ratio: precision and recall are means over the four directions in which a neighbour lies farther away.
+/// Returns F1 at one ratio. Precision and recall are averages over the four directions in which a
+/// neighbour is farther away.
 fn f1(said: &[f32], truth: &[f32], width: usize, ratio: f32) -> f64 {
     let edge =
         |z: &[f32], near: usize, far: usize| z[far].max(NEAREST) / z[near].max(NEAREST) > ratio;
-    // In each direction: edges of both, of the estimate, of the truth.
+    // For each direction, the number of edges in both images, in the estimate, and in the truth.
     let mut counts = [[0u64; 3]; 4];
     let mut compare = |direction: usize, near: usize, far: usize| {
         let (a, b) = (edge(said, near, far), edge(truth, near, far));
@@ -59,7 +62,8 @@ fn f1(said: &[f32], truth: &[f32], width: usize, ratio: f32) -> f64 {
 mod tests {
     use super::*;
 
-    /// A square of 1 m before a wall of 2 m, from column and row `from`.
+    /// Returns an image of a 1 m distant square in front of a 2 m distant wall, from column and row
+    /// `from`.
     fn image(from: usize) -> Vec<f32> {
         let inside = |x: usize| (from..from + 4).contains(&x);
         (0..144)
@@ -84,14 +88,16 @@ mod tests {
     fn edges_elsewhere_are_no_edges_and_those_in_part_count_in_part() {
         let truth = image(3);
         assert_eq!(boundary_f1(&image(5), &truth, 12), 0.0);
-        // Farther to the right by one: of the upper edge's four pixels three are the truth's, of the sides none.
+        // The image is shifted right by one pixel: of the upper edge's four pixels three are the
+        // truth's, of the sides none.
         let mut moved = truth.clone();
         for row in moved.chunks_mut(12) {
             row.rotate_right(1);
         }
         let half = boundary_f1(&moved, &truth, 12);
         assert!((half - 0.375).abs() < 1e-12, "{half}");
-        // An edge of ratio 1.1 is one at the lower thresholds alone: 1.05, 1.0722 and 1.0944 of ten.
+        // An edge of ratio 1.1 exceeds only the lowest three of the ten thresholds: 1.05, 1.0722
+        // and 1.0944.
         let faint: Vec<f32> = truth
             .iter()
             .map(|z| if *z > 1.5 { 1.1 } else { 1.0 })

@@ -1,4 +1,4 @@
-//! What U-Nets are made of: convolution without bias, batch norm, ReLU (`cbr`), twice in a block.
+//! The layers of U-Nets: convolution without bias, batch norm and ReLU (`cbr`), twice in a block.
 
 use burn::tensor::{Int, Tensor};
 
@@ -8,7 +8,7 @@ use crate::{
     parameters::{Begin, Declarations, Id},
 };
 
-/// Declares a batch norm over `channels` by PyTorch's names.
+/// Declares a batch norm over `channels` with PyTorch's names.
 pub(super) fn norm(d: &mut Declarations, at: &str, channels: usize) -> Norm {
     let one = |d: &mut Declarations, name: &str, value: f32, learned: bool| {
         d.add(
@@ -36,13 +36,13 @@ pub(super) fn norm(d: &mut Declarations, at: &str, channels: usize) -> Norm {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cbr {
     weight: Id,
-    /// Of one-hot channels after the dense ones, in the first layer only.
+    /// The weight of one-hot channels, which follow the dense ones; in the first layer only.
     one_hot: Option<Id>,
     norm: Norm,
 }
 
 impl Cbr {
-    /// Of `inputs` dense channels and `one_hot` others.
+    /// Declares a layer with `inputs` dense and `one_hot` one-hot channels.
     pub(super) fn declare(
         d: &mut Declarations,
         at: &str,
@@ -54,7 +54,7 @@ impl Cbr {
         let name = format!("{at}.conv.weight");
         let weight = d.add(name.clone(), &[outputs, inputs, 3, 3], begin, true);
         let one_hot = (one_hot > 0).then(|| {
-            // PyTorch has one tensor for both; the two are joined where weights are written.
+            // PyTorch has one tensor for both; the two are joined when weights are written.
             d.add(
                 format!("{name}{ONE_HOT}"),
                 &[outputs, one_hot, 3, 3],
@@ -84,15 +84,16 @@ impl Cbr {
     }
 }
 
-/// Ends the names of weights that belong to one-hot channels.
+/// The suffix of the names of weights that belong to one-hot channels.
 pub const ONE_HOT: &str = ".one_hot";
 
-/// Two [`Cbr`].
+/// Two [`Cbr`] layers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Block([Cbr; 2]);
 
 impl Block {
-    /// In the encoder the first keeps at least half of the output's channels (released code: `DoubleConv`).
+    /// Declares an encoder block. Its first layer has at least half of the output's channels
+    /// (released code: `DoubleConv`).
     pub(super) fn encoder(
         d: &mut Declarations,
         at: &str,
@@ -104,7 +105,7 @@ impl Block {
         Self::declare(d, at, inputs, one_hot, between, outputs)
     }
 
-    /// In the decoder both have the output's channels.
+    /// Declares a decoder block. Both layers have the output's channels.
     pub(super) fn decoder(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
         Self::declare(d, at, inputs, 0, outputs, outputs)
     }
@@ -136,7 +137,7 @@ impl Block {
     }
 }
 
-/// Weights (outputs, inputs) and a bias, over channels.
+/// A linear layer over channels: weights (outputs, inputs) and a bias.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Linear {
     weight: Id,
@@ -152,7 +153,7 @@ impl Linear {
         }
     }
 
-    /// Channels that it takes.
+    /// Returns the number of input channels.
     pub(super) fn inputs(&self, pass: &Pass) -> usize {
         pass.declared(self.weight).shape[1]
     }
@@ -168,7 +169,7 @@ impl Linear {
         ))
     }
 
-    /// The same of one-hot channels.
+    /// Applies the layer to one-hot channels.
     pub(super) fn one_hot(&self, pass: &Pass, bins: Tensor<3, Int>) -> Tensor<4> {
         let bias: Tensor<1> = pass.get(self.bias);
         let [outputs, inputs] = [bias.dims()[0], self.inputs(pass)];

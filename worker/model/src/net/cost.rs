@@ -1,4 +1,5 @@
-//! What a pass costs: multiply-adds, counted from the shape alone. Norms, activations, softmax and pooling are not counted.
+//! The cost of a pass: multiply-adds, computed from the shape alone. Norms, activations, softmax
+//! and pooling are not counted.
 
 use super::{
     nlost,
@@ -7,7 +8,8 @@ use super::{
 };
 
 impl NetSpec {
-    /// Multiply-adds of a pass forward over an image of `side`² pixels, one-hot channels counted as dense ones.
+    /// Returns the multiply-adds of a forward pass over an image of `side`² pixels. One-hot
+    /// channels count as dense ones.
     pub fn multiply_adds(&self, side: usize) -> f64 {
         match self.architecture {
             Architecture::Unet2d => self.of_unet2d(side),
@@ -66,14 +68,15 @@ impl NetSpec {
         sum + self.of_decoder(side)
     }
 
-    /// Half of time, rows and columns: a filter for each stream, a convolution to `width` channels, four others.
+    /// The part that halves time, rows and columns: a filter for each stream, a convolution to
+    /// `width` channels, and four others.
     fn of_downsample(&self, side: usize, width: usize) -> f64 {
         let streams = self.streams();
         let voxel = 27 * (streams + streams * width + 4 * width * width);
         (voxel * self.dense.div_ceil(2) * (side / 2).pow(2)) as f64
     }
 
-    /// From a volume of `channels`, half as many rows and columns, to the output.
+    /// The part from a volume of `channels`, with half as many rows and columns, to the output.
     fn of_rendering(&self, side: usize, channels: usize) -> f64 {
         let (pixels, coarse) = (side * side, (side / 2).pow(2));
         let (features, outputs) = (2 * channels, self.outputs);
@@ -96,7 +99,8 @@ impl NetSpec {
         let scales = 27 * 2 * (features * part + part * part) * second;
         let halved = 27 * 6 * c * c * third;
         let embedded = 125 * c * c * fourth + (125 + 1) * c * c * fifth;
-        // Queries, keys, values and what follows from them over the image and over time; scores and their sums of values.
+        // Queries, keys, values and the output layers over the image and over time; scores and the
+        // weighted sums of values.
         let attention = |tokens: usize| {
             let layers = (8 + 2 * nlost::BETWEEN) * c * c;
             (layers + 2 * (tokens + fifth) * c) * fifth
@@ -120,7 +124,8 @@ impl NetSpec {
         let convolutions =
             self.dense + self.one_hot + e * (swin.groups as usize + 1) + self.outputs;
         let tokens = (swin.window as usize).pow(2);
-        // Queries, keys, values and what follows from them; the perceptron; scores and their sums of values.
+        // Queries, keys, values and the output layer; the perceptron; scores and the weighted sums
+        // of values.
         let block = 4 * e * e + 2 * swinir::BETWEEN * e * e + 2 * tokens * e;
         let blocks = (swin.groups * swin.depth) as usize;
         ((9 * e * convolutions + blocks * block) * side * side) as f64

@@ -1,5 +1,5 @@
-//! The first part of networks of volumes: time, rows and columns are halved, once by a learnt filter and once by convolutions
-//! (Chen et al., SIGGRAPH Asia 2020, released code).
+//! The first part of networks of volumes: time, rows and columns are halved, once by a learned
+//! filter and once by convolutions (Chen et al., SIGGRAPH Asia 2020, released code).
 
 use burn::tensor::Tensor;
 
@@ -12,7 +12,7 @@ use crate::{
     parameters::{Begin, Declarations, Id},
 };
 
-/// The mean of the last two taps of each dimension: what the learnt box filter begins with.
+/// The mean of the last two taps of each dimension: the initial value of the learned box filter.
 pub(super) const BOX: [f32; 27] = {
     let mut taps = [0.0; 27];
     let mut k = 0;
@@ -27,7 +27,7 @@ pub(super) const BOX: [f32; 27] = {
 
 #[derive(Debug, Clone)]
 pub(super) struct Downsample {
-    /// Of measurement and shadow transient, a filter each.
+    /// One filter for the measurement and one for the shadow transient.
     filters: Id,
     first: First,
     blocks: [Residual; 2],
@@ -41,7 +41,7 @@ struct First {
 }
 
 impl Downsample {
-    /// To one channel for each stream by the filters, and `width` by convolutions.
+    /// Declares filters to one channel for each stream, and convolutions to `width` channels.
     pub(super) fn declare(d: &mut Declarations, at: &str, streams: usize, width: usize) -> Self {
         let begin = Begin::FanIn(27 * streams);
         let name = |name: &str| format!("{at}.{name}");
@@ -65,7 +65,7 @@ impl Downsample {
         }
     }
 
-    /// Features (N·T/2, streams + width, H/2, W/2), and T/2.
+    /// Returns features (N·T/2, streams + width, H/2, W/2), and T/2.
     pub(super) fn forward(&self, pass: &Pass, input: Input) -> (Tensor<4>, usize) {
         let bins = input.dense.dims()[1];
         let mut streams = vec![input.dense.unsqueeze_dim::<5>(2)];
@@ -80,7 +80,7 @@ impl Downsample {
         let seen = ops::taps(x.clone(), true);
         let weight: Tensor<5> = pass.get(self.first.weight);
         let width = weight.dims()[0];
-        // Taps, then streams, are the channels of a 1×1 convolution.
+        // The channels of a 1×1 convolution are ordered by tap, then by stream.
         let weight = weight
             .permute([0, 2, 3, 4, 1])
             .reshape([width, 27 * channels, 1, 1]);
@@ -93,7 +93,7 @@ impl Downsample {
             features = block.forward(pass, features, time);
         }
 
-        // A filter of its own for each stream: zeros for those of the others.
+        // Each stream has its own filter; the entries of other streams are zero.
         let seen = ops::taps(x, false);
         let device = seen.device();
         let filters = pass.flat(self.filters).reshape([channels, 27, 1]);

@@ -1,8 +1,10 @@
-//! Learned feature embeddings (Chen et al., SIGGRAPH Asia 2020, released code): a volume of features of half the size, its
-//! greatest values over depth and where they lie, and a network over those images.
+//! Learned feature embeddings (Chen et al., SIGGRAPH Asia 2020, released code): a volume of
+//! features of half the size, its greatest values over depth and their positions, and a network
+//! over those images.
 //!
-//! Between the two stands a transform of light in theirs, for confocal scans of a wall; here it is the identity. All depths are
-//! kept, depth grows with time as what is learnt does, and the output is not clamped: gradients end where it is.
+//! The released code transforms light between the two parts, for confocal scans of a wall; here
+//! this step is the identity. All depths are kept, depth grows with time like the learned quantity,
+//! and the output is not clamped because clamping would stop its gradients.
 
 use burn::tensor::Tensor;
 

@@ -1,4 +1,5 @@
-//! Layers of the networks that are no U-Nets: convolutions with a bias, linear layers and norms over channels.
+//! Layers of networks other than U-Nets: convolutions with a bias, linear layers and norms over
+//! channels.
 
 use burn::tensor::{Int, Tensor};
 
@@ -8,20 +9,21 @@ use crate::{
     parameters::{Begin, Declarations, Id},
 };
 
-/// Deviation of the normal distribution that weights of transformers begin with (SwinIR's released code).
+/// The deviation of the normal distribution of initial transformer weights (SwinIR's released
+/// code).
 const DEVIATION: f32 = 0.02;
 
 /// 3×3 convolution with a bias.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Conv {
     weight: Id,
-    /// Of one-hot channels after the dense ones, in the first layer only.
+    /// The weight of one-hot channels, which follow the dense ones; in the first layer only.
     one_hot: Option<Id>,
     bias: Id,
 }
 
 impl Conv {
-    /// Of `inputs` dense channels and `one_hot` others.
+    /// Declares a convolution of `inputs` dense and `one_hot` one-hot channels.
     pub(super) fn declare(
         d: &mut Declarations,
         at: &str,
@@ -40,7 +42,7 @@ impl Conv {
         }
     }
 
-    /// With zeros around the image.
+    /// Applies the convolution with zero padding.
     pub(super) fn forward(
         &self,
         pass: &Pass,
@@ -65,13 +67,13 @@ pub(super) struct Dense {
 }
 
 impl Dense {
-    /// As layers of transformers begin, with a bias.
+    /// Declares a layer with a bias and the initialisation of transformers.
     pub(super) fn declare(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
         let begin = [Begin::Normal(DEVIATION), Begin::Constant(0.0)];
         Self::begun(d, at, inputs, outputs, begin)
     }
 
-    /// As PyTorch's begin, with a bias.
+    /// Declares a layer with a bias and PyTorch's initialisation.
     pub(super) fn usual(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
         Self::begun(d, at, inputs, outputs, [Begin::FanIn(inputs); 2])
     }
@@ -141,7 +143,7 @@ impl LayerNorm {
     }
 }
 
-/// A learnt table of rows, each as a transformer's weights begin.
+/// Declares a learned table of rows with the initialisation of transformers.
 pub(super) fn table(d: &mut Declarations, name: String, rows: usize, columns: usize) -> Id {
     d.add(name, &[rows, columns], Begin::Normal(DEVIATION), true)
 }

@@ -1,4 +1,4 @@
-//! The networks: what they are made of, and passes through them.
+//! The networks: their layers, and passes through them.
 
 mod block;
 mod cost;
@@ -33,7 +33,7 @@ use swinir::Swinir;
 use unet2d::Unet2d;
 use unet25d::Unet25d;
 
-/// A network without its numbers.
+/// A network without its parameters' values.
 #[derive(Debug, Clone)]
 pub struct Net {
     spec: NetSpec,
@@ -52,7 +52,7 @@ enum Body {
 }
 
 impl Net {
-    /// The network of a spec.
+    /// Creates the network of a spec.
     ///
     /// # Errors
     /// [`ModelError::Invalid`] naming the first field that cannot be used.
@@ -80,26 +80,27 @@ impl Net {
         })
     }
 
-    /// Its shape.
+    /// Returns the network's spec.
     pub fn spec(&self) -> &NetSpec {
         &self.spec
     }
 
-    /// Its parameters.
+    /// Returns the declarations of the network's parameters.
     pub fn declared(&self) -> &[Declared] {
         &self.declared
     }
 
-    /// Parts of a network by what they need of one another, as ranges of its parameters: the gradients of the last segment are
-    /// there first, while those of the others are still to be computed.
+    /// Returns the segments of the network as ranges of its parameters. The gradients of the last
+    /// segment are available first, while those of the earlier ones are still to be computed.
     pub fn segments(&self) -> &[Range<usize>] {
         &self.segments
     }
 
-    /// (N, C, H, W) to (N, outputs, H, W): logits or depths, no activation.
+    /// Maps (N, C, H, W) to (N, outputs, H, W): logits or depths without an activation.
     ///
     /// # Panics
-    /// Where the input has not the spec's channels, or H or W is no multiple of [`NetSpec::multiple`].
+    /// If the input does not have the spec's channels, or if H or W is not a multiple of
+    /// [`NetSpec::multiple`].
     pub fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
         let [_, channels, h, w] = input.dense.dims();
         let multiple = self.spec.multiple();

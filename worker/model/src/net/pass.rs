@@ -1,4 +1,4 @@
-//! One pass through a network: which values its parameters have, and what is to be remembered.
+//! One pass through a network: the values of its parameters, and the statistics that it updates.
 
 use burn::tensor::{Int, Tensor};
 
@@ -8,42 +8,43 @@ use crate::{
     parameters::{Declared, Id, Parameters, shaped},
 };
 
-/// What a network sees.
+/// The input of a network.
 #[derive(Debug, Clone)]
 pub struct Input {
     /// (N, C, H, W).
     pub dense: Tensor<4>,
-    /// Bins of the one-hot channels (N, H, W); outside of them = none.
+    /// The bins of the one-hot channels (N, H, W); a bin out of range gives zeros in all channels.
     pub one_hot: Option<Tensor<3, Int>>,
 }
 
-/// How much a batch moves running statistics: PyTorch's default.
+/// The weight of a batch in the running statistics: PyTorch's default.
 pub const MOMENTUM: f64 = 0.1;
 
-/// A pass.
+/// A pass through a network.
 pub struct Pass<'a> {
     declared: &'a [Declared],
     leaves: &'a [Tensor<1>],
     training: bool,
     precision: Precision,
-    /// Statistics after this batch.
+    /// The running statistics after this batch.
     moved: Vec<(Id, Tensor<1>)>,
-    /// What segments hand on, where the graph is cut between them.
+    /// The outputs of segments, if the graph is cut between them.
     cuts: Option<Vec<Cut>>,
 }
 
-/// What a segment of a network hands on to later ones, where the graph of a pass is cut: two graphs instead of one.
+/// The output of a segment that later segments use, at a place where the graph of a pass is cut
+/// into two.
 pub struct Cut {
-    /// The segment that it comes from.
+    /// The segment that computed the output.
     pub segment: usize,
-    /// As that segment made it.
+    /// The tensor in the graph of that segment.
     pub made: Tensor<4>,
-    /// The same as later segments see it: a leaf of theirs.
+    /// The same values in the graph of later segments, as a leaf.
     pub seen: Tensor<4>,
 }
 
 impl<'a> Pass<'a> {
-    /// A pass that learns: `leaves` are the parameters with gradients.
+    /// Creates a training pass. `leaves` are the parameters with gradients.
     pub fn training(declared: &'a [Declared], leaves: &'a [Tensor<1>]) -> Self {
         Self {
             declared,
@@ -55,7 +56,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// The same with a graph for each segment, so that gradients come one segment after the other.
+    /// Gives each segment a graph of its own, so that gradients are computed segment by segment.
     #[must_use]
     pub fn in_segments(self) -> Self {
         Self {
@@ -64,7 +65,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// What a segment hands on, as later segments see it.
+    /// Passes a segment's output on. Returns the tensor that later segments use.
     pub(super) fn hand_on(&mut self, segment: usize, made: Tensor<4>) -> Tensor<4> {
         let Some(cuts) = &mut self.cuts else {
             return made;
@@ -78,7 +79,7 @@ impl<'a> Pass<'a> {
         seen
     }
 
-    /// A pass that only looks: batch norm by its running statistics.
+    /// Creates an evaluation pass, in which batch norm uses the running statistics.
     pub fn evaluation(parameters: &'a Parameters) -> Self {
         Self {
             declared: parameters.declared(),
@@ -90,12 +91,12 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Numbers in which convolutions are computed from now on.
+    /// Sets the number format of subsequent convolutions.
     pub(super) fn compute_in(&mut self, precision: Precision) {
         self.precision = precision;
     }
 
-    /// A number as convolutions take it.
+    /// Converts a tensor to the number format of convolutions.
     pub(super) fn lower<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         match self.precision {
             Precision::F32 => x,
@@ -103,7 +104,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// What a convolution gave, as all else takes it.
+    /// Converts a convolution's output to the number format of other operations.
     pub(super) fn raise<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         match self.precision {
             Precision::F32 => x,
@@ -111,7 +112,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Does something in evaluation: batch norm by its running statistics.
+    /// Runs `work` in evaluation mode: batch norm uses the running statistics.
     pub(super) fn frozen<T>(&mut self, work: impl FnOnce(&mut Self) -> T) -> T {
         let before = std::mem::replace(&mut self.training, false);
         let out = work(self);
@@ -119,23 +120,23 @@ impl<'a> Pass<'a> {
         out
     }
 
-    /// A parameter in its declared shape.
+    /// Returns a parameter in its declared shape.
     pub fn get<const D: usize>(&self, id: Id) -> Tensor<D> {
         shaped(&self.declared[id.0], self.leaves[id.0].clone())
     }
 
-    /// How a parameter was declared.
+    /// Returns a parameter's declaration.
     pub(super) fn declared(&self, id: Id) -> &Declared {
         &self.declared[id.0]
     }
 
-    /// A parameter as one row.
+    /// Returns a parameter as one row.
     pub(super) fn flat(&self, id: Id) -> Tensor<1> {
         self.leaves[id.0].clone()
     }
 
-    /// Batch norm and ReLU; in training by the batch's statistics, of which it keeps the running mean and the
-    /// **unbiased** running variance, as PyTorch does.
+    /// Applies batch norm and ReLU. In training, the batch's statistics are used, and the running
+    /// mean and the **unbiased** running variance are updated, as in PyTorch.
     pub fn norm_relu(&mut self, norm: &Norm, x: Tensor<4>) -> Tensor<4> {
         let (gamma, beta) = (self.get(norm.gamma), self.get(norm.beta));
         if !self.training {
@@ -156,7 +157,7 @@ impl<'a> Pass<'a> {
         y
     }
 
-    /// Statistics after this batch, and what segments handed on.
+    /// Returns the running statistics after this batch, and the cuts between segments.
     pub fn into_moved(self) -> (Vec<(Id, Tensor<1>)>, Vec<Cut>) {
         (self.moved, self.cuts.unwrap_or_default())
     }
@@ -165,14 +166,14 @@ impl<'a> Pass<'a> {
 /// A batch norm's parameters.
 #[derive(Debug, Clone, Copy)]
 pub struct Norm {
-    /// Scale.
+    /// The scale.
     pub gamma: Id,
-    /// Shift.
+    /// The shift.
     pub beta: Id,
-    /// Running mean.
+    /// The running mean.
     pub mean: Id,
-    /// Running unbiased variance.
+    /// The running unbiased variance.
     pub variance: Id,
-    /// Number of batches seen (PyTorch keeps it; nothing reads it).
+    /// The number of batches seen. PyTorch stores it; it is not used.
     pub batches: Id,
 }

@@ -1,5 +1,5 @@
-//! The last part of networks of volumes: the greatest values over time and where they lie, and a network over those images
-//! (Chen et al., SIGGRAPH Asia 2020, released code).
+//! The last part of networks of volumes: the greatest values over time and their positions, and a
+//! network over those images (Chen et al., SIGGRAPH Asia 2020, released code).
 
 use burn::tensor::{Tensor, activation::relu};
 
@@ -9,19 +9,19 @@ use crate::{
     parameters::{Begin, Declarations, Id},
 };
 
-/// Added to the greatest value that features are divided by.
+/// A constant added to the greatest value before features are divided by it.
 const LEAST: f64 = 1e-15;
 
 #[derive(Debug, Clone)]
 pub(super) struct Rendering {
-    /// Weights of the first features' greatest value and depth in the output.
+    /// The weights of the first features' greatest value and depth in the output.
     raw: Id,
     coarse: Chain,
     fine: Chain,
 }
 
 impl Rendering {
-    /// Of volumes with `channels`.
+    /// Declares the part for volumes with `channels`.
     pub(super) fn declare(d: &mut Declarations, at: &str, channels: usize, outputs: usize) -> Self {
         let features = 2 * channels;
         Self {
@@ -42,7 +42,7 @@ impl Rendering {
         }
     }
 
-    /// (N, C, T, H·W) with `rows` to (N, outputs, 2·H, 2·W).
+    /// Maps (N, C, T, H·W) with `rows` to (N, outputs, 2·H, 2·W).
     pub(super) fn forward(&self, pass: &Pass, volume: Tensor<4>, rows: usize) -> Tensor<4> {
         let flat = flattened(volume, rows);
         let half = flat.dims()[1] / 2;
@@ -61,23 +61,25 @@ impl Rendering {
     }
 }
 
-/// Images of moments (N·T, C, H, W) as (N, C, T, H·W).
+/// Reorders images of moments (N·T, C, H, W) as (N, C, T, H·W).
 pub(super) fn by_channel(x: Tensor<4>, time: usize) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     x.reshape([images / time, time, c, h * w]).swap_dims(1, 2)
 }
 
-/// Features (N, C, T, H·W) without what is negative, (f − min)/(max − min) of each channel of a volume.
+/// Removes negative values from features (N, C, T, H·W), and scales each channel of a volume by (f
+/// − min)/(max − min).
 pub(super) fn normalised(x: Tensor<4>) -> Tensor<4> {
     let [n, c, time, pixels] = x.dims();
-    // All voxels of a channel in one row: of equal ones, the first has the gradient.
+    // All voxels of a channel form one row. Of equal values, the first has the gradient.
     let x = relu(x).reshape([n, c, time * pixels]);
     let x = x.clone() - x.min_dim(2);
     let greatest = x.clone().max_dim(2);
     (x / (greatest + LEAST)).reshape([n, c, time, pixels])
 }
 
-/// The greatest values over time, and the moments of those from 0 to 1: (N, C, T, H·W) to (N, 2·C, H, W).
+/// Returns the greatest values over time, and their moments scaled to 0..1: (N, C, T, H·W) to (N,
+/// 2·C, H, W).
 fn flattened(x: Tensor<4>, rows: usize) -> Tensor<4> {
     let [n, c, time, pixels] = x.dims();
     let (values, moments) = x.max_dim_with_indices(2);
@@ -86,7 +88,7 @@ fn flattened(x: Tensor<4>, rows: usize) -> Tensor<4> {
     Tensor::cat(each.into(), 1)
 }
 
-/// Twice as many rows and columns, between pixels in proportion to how near they are (bilinear, corners not aligned).
+/// Doubles rows and columns with bilinear interpolation (corners not aligned).
 fn doubled(mut x: Tensor<4>) -> Tensor<4> {
     for dim in [2, 3] {
         let mut shape = x.dims();

@@ -1,7 +1,7 @@
-//! What the networks of volumes are made of: convolutions that repeat the borders around images and volumes, and residual
-//! blocks of two of them (Chen et al., SIGGRAPH Asia 2020, released code).
+//! Layers of networks of volumes: convolutions that repeat the borders of images and volumes, and
+//! residual blocks of two such convolutions (Chen et al., SIGGRAPH Asia 2020, released code).
 //!
-//! A volume lies as (N·T, C, H, W), an image for each moment, as in the 2.5D U-Net.
+//! A volume is stored as (N·T, C, H, W), one image for each moment, as in the 2.5D U-Net.
 
 use burn::tensor::Tensor;
 
@@ -11,15 +11,15 @@ use crate::{
     parameters::{Begin, Declarations, Id},
 };
 
-/// Slope of leaky ReLU below 0.
+/// The slope of leaky ReLU below 0.
 pub(super) const SLOPE: f32 = 0.2;
 
-/// 3×3 or 3×3×3 convolution with a bias, whose border is repeated around what it sees.
+/// A 3×3 or 3×3×3 convolution with a bias. The border of its input is repeated outwards.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bordered {
     weight: Id,
     bias: Id,
-    /// Over time too.
+    /// Whether it also extends over time.
     volume: bool,
 }
 
@@ -41,7 +41,7 @@ impl Bordered {
         }
     }
 
-    /// Of `time` moments; 1 for images.
+    /// Applies the convolution to `time` moments; 1 for images.
     pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
         let c = x.dims()[1];
         let weight = match self.volume {
@@ -49,7 +49,7 @@ impl Bordered {
             true => {
                 let weight: Tensor<5> = pass.get(self.weight);
                 let outputs = weight.dims()[0];
-                // Channels of a moment lie beside each other.
+                // The channels of the three moments are concatenated.
                 weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3])
             }
         };
@@ -65,7 +65,7 @@ pub(super) struct Residual([Bordered; 2]);
 
 impl Residual {
     pub(super) fn declare(d: &mut Declarations, at: &str, channels: usize, volume: bool) -> Self {
-        // Paddings and the activation between count as modules in PyTorch.
+        // PyTorch counts paddings and the activation between the convolutions as modules.
         Self(
             [1, 4].map(|k| {
                 Bordered::declare(d, &format!("{at}.tmp.{k}"), channels, channels, volume)
@@ -80,7 +80,7 @@ impl Residual {
     }
 }
 
-/// A convolution and two residual blocks, and another convolution where `outputs` says so.
+/// A convolution and two residual blocks, followed by another convolution if `outputs` is set.
 #[derive(Debug, Clone)]
 pub(super) struct Chain {
     first: Bordered,
@@ -89,7 +89,7 @@ pub(super) struct Chain {
 }
 
 impl Chain {
-    /// Of images.
+    /// Declares a chain for images.
     pub(super) fn declare(
         d: &mut Declarations,
         at: &str,

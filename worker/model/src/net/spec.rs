@@ -1,4 +1,4 @@
-//! What a network looks like: everything that decides its parameters, and nothing else.
+//! The shape of a network: all settings that determine its parameters, and nothing else.
 
 pub use picofarm_settings::{Architecture, Precision, StemForm, Swin, TimeProjection};
 use serde::{Deserialize, Serialize};
@@ -6,40 +6,42 @@ use serde::{Deserialize, Serialize};
 use super::nlost;
 use crate::ModelError;
 
-/// Shape of a network.
+/// The shape of a network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetSpec {
-    /// Which one.
+    /// The architecture.
     pub architecture: Architecture,
-    /// Channels of the dense input: bins, and planes that say something else.
+    /// The number of channels of the dense input: bins and other planes.
     pub dense: usize,
-    /// Bins of the one-hot input; 0 where there is none.
+    /// The number of bins of the one-hot input; 0 if there is none.
     pub one_hot: usize,
-    /// Channels of the output.
+    /// The number of output channels.
     pub outputs: usize,
-    /// Channels of a U-Net's first level; each further one has twice as many. Of the others the channels of all features, or of the
-    /// volume's.
+    /// For U-Nets, the number of channels of the first level; each further level has twice as many.
+    /// For other networks, the number of channels of all features, or of the volume's.
     pub width: usize,
-    /// Levels of a U-Net's encoder and decoder, the bottleneck among them.
+    /// The number of levels of a U-Net's encoder and decoder, the bottleneck included.
     pub levels: usize,
-    /// Channels of a convolution before the first level (the appendix's form: 128); 0 = none (the released code's).
+    /// The number of channels of a convolution in front of the first level (the appendix's form:
+    /// 128); 0 = none (the released code's form).
     pub stem: usize,
-    /// What that convolution is.
+    /// The form of that convolution.
     #[serde(default, skip_serializing_if = "is_default")]
     pub stem_form: StemForm,
-    /// Length of the time axis after the first projection, `Unet25d` only (the paper: 160).
+    /// For `Unet25d`: the length of the time axis after the first projection (the paper: 160).
     pub time: usize,
-    /// Whether two streams share that projection, `Unet25d` only.
+    /// For `Unet25d`: whether two streams share that projection.
     #[serde(default, skip_serializing_if = "is_default")]
     pub time_projection: TimeProjection,
-    /// Groups, blocks, heads and windows, `Swinir` only.
+    /// For `Swinir`: groups, blocks, heads and windows.
     #[serde(default, skip_serializing_if = "is_default")]
     pub swin: Swin,
-    /// The encoder stays as it is, its batch norms too: a decoder learns on another network's features.
+    /// Whether the encoder is fixed, its batch norms included. A decoder is then trained on another
+    /// network's features.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub frozen: bool,
-    /// Numbers in which convolutions are computed.
+    /// The number format of convolutions.
     #[serde(default, skip_serializing_if = "is_default")]
     pub precision: Precision,
 }
@@ -49,7 +51,8 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 }
 
 impl NetSpec {
-    /// The released depth network: 637 bins, 256×256 pixels, 356,404,556 parameters.
+    /// Returns the shape of the released depth network: 637 bins, 256×256 pixels, 356,404,556
+    /// parameters.
     pub fn released(dense: usize, one_hot: usize, outputs: usize) -> Self {
         Self {
             architecture: Architecture::Unet2d,
@@ -68,12 +71,12 @@ impl NetSpec {
         }
     }
 
-    /// Channels of each level, from the finest.
+    /// Returns the number of channels of each level, from the finest.
     pub fn widths(&self) -> Vec<usize> {
         (0..self.levels).map(|k| self.width << k).collect()
     }
 
-    /// Width and height must be multiples of this.
+    /// Returns the required divisor of width and height.
     pub fn multiple(&self) -> usize {
         match self.architecture {
             Architecture::Unet2d | Architecture::Unet25d => 1 << (self.levels - 1),
@@ -83,7 +86,7 @@ impl NetSpec {
         }
     }
 
-    /// Why, and the setting that says so.
+    /// Returns the reason for [`Self::multiple`], and the setting that determines it.
     pub fn why_multiple(&self) -> (&'static str, String) {
         match self.architecture {
             Architecture::Unet2d | Architecture::Unet25d => {
@@ -105,12 +108,13 @@ impl NetSpec {
         }
     }
 
-    /// Measurement, and shadow transient where there is one, of networks in which time is a dimension.
+    /// Returns the number of input streams of networks with a time dimension: the measurement, and
+    /// the shadow transient if there is one.
     pub(super) fn streams(&self) -> usize {
         if self.one_hot > 0 { 2 } else { 1 }
     }
 
-    /// Checks what can be built.
+    /// Checks that the network can be built.
     ///
     /// # Errors
     /// [`ModelError::Invalid`] naming the field.
@@ -154,7 +158,7 @@ impl NetSpec {
         self.check_other()
     }
 
-    /// What networks that are no U-Nets lack or need.
+    /// Checks the settings of networks other than U-Nets.
     fn check_other(&self) -> Result<(), ModelError> {
         if matches!(
             self.architecture,

@@ -1,8 +1,8 @@
-//! SwinIR (Liang et al., ICCVW 2021): attention within windows, without any change of the image's size. Names and order of its
-//! parameters are the released code's.
+//! SwinIR (Liang et al., ICCVW 2021): attention within windows, at a constant image size. The names
+//! and order of its parameters are the released code's.
 //!
-//! The network for images of noise adds what it finds to its input; here output and input are different things, so nothing is
-//! added. Stochastic depth is left out.
+//! The original network removes noise and adds its result to its input. Here input and output are
+//! different quantities, so nothing is added. Stochastic depth is omitted.
 
 use burn::tensor::Tensor;
 
@@ -16,13 +16,14 @@ use crate::{
     parameters::{Declarations, Id},
 };
 
-/// Channels between the two layers of a block's perceptron, over those of the features.
+/// The ratio of the channels between the two layers of a block's perceptron to those of the
+/// features.
 pub(super) const BETWEEN: usize = 2;
 
 #[derive(Debug, Clone)]
 pub(super) struct Swinir {
     first: Conv,
-    /// Norm of the first features, before the groups.
+    /// The norm of the first features, in front of the groups.
     embedded: LayerNorm,
     groups: Vec<Group>,
     norm: LayerNorm,
@@ -31,7 +32,7 @@ pub(super) struct Swinir {
     window: usize,
 }
 
-/// Blocks, a convolution, and what went in added to it.
+/// Blocks and a convolution. Their result is added to the input.
 #[derive(Debug, Clone)]
 struct Group {
     blocks: Vec<Block>,
@@ -46,7 +47,7 @@ struct Block {
     qkv: Dense,
     project: Dense,
     perceptron: [Dense; 2],
-    /// Whether its windows lie half a window further.
+    /// Whether its windows are shifted by half a window.
     shifted: bool,
 }
 
@@ -81,7 +82,7 @@ impl Swinir {
     pub(super) fn forward(&self, pass: &Pass, input: Input) -> Tensor<4> {
         let first = self.first.forward(pass, input.dense, input.one_hot);
         let [_, _, h, w] = first.dims();
-        // An image of one window has nothing to shift to (released code).
+        // An image of one window cannot be shifted (released code).
         let shift = match h.min(w) > self.window {
             true => self.window / 2,
             false => 0,
@@ -128,7 +129,7 @@ impl Block {
         }
     }
 
-    /// (N, H, W, C) to the same.
+    /// Maps (N, H, W, C) to the same shape.
     fn forward(&self, pass: &Pass, x: Tensor<4>, windows: &ops::Windows) -> Tensor<4> {
         let seen = self.norms[0].forward(pass, x.clone());
         let qkv = self.qkv.forward(pass, seen);
@@ -141,12 +142,12 @@ impl Block {
     }
 }
 
-/// (N, C, H, W) to (N, H, W, C).
+/// Reorders (N, C, H, W) to (N, H, W, C).
 fn tokens_last(x: Tensor<4>) -> Tensor<4> {
     x.permute([0, 2, 3, 1])
 }
 
-/// (N, H, W, C) to (N, C, H, W).
+/// Reorders (N, H, W, C) to (N, C, H, W).
 fn channels_first(x: Tensor<4>) -> Tensor<4> {
     x.permute([0, 3, 1, 2])
 }

@@ -1,8 +1,10 @@
-//! The 2.5D U-Net of Shoot-Bounce-3D: time is a dimension of the encoder, the decoder is two-dimensional.
+//! The 2.5D U-Net of Shoot-Bounce-3D: time is a dimension of the encoder, and the decoder is
+//! two-dimensional.
 //!
-//! Features lie as (N·T, C, H, W): an image for each moment. A 3×3×3 convolution is then a 3×3 convolution over the
-//! channels of three moments beside each other, batch norm over images is batch norm over time too, and a projection of
-//! time is a 1×1 convolution: everything runs on the operations of the 2D network.
+//! Features are stored as (N·T, C, H, W), one image for each moment. A 3×3×3 convolution is then a
+//! 3×3 convolution over the concatenated channels of three moments, batch norm over images includes
+//! time, and a projection of time is a 1×1 convolution. All layers therefore use the operations of
+//! the 2D network.
 
 use burn::tensor::{Tensor, activation::relu};
 
@@ -20,10 +22,11 @@ use crate::{
 #[derive(Debug, Clone)]
 pub(super) struct Unet25d {
     time: usize,
-    /// Bins to moments: one for both streams (the released code's form), or one for each.
+    /// The projections of bins to moments: one for both streams (the released code's form), or one
+    /// for each.
     projections: Vec<Linear>,
     encoders: Vec<[Cbr; 2]>,
-    /// One for each level: moments to one.
+    /// The projections of each level's moments to one.
     skips: Vec<Vec<Linear>>,
     decoder: Decoder,
 }
@@ -70,7 +73,7 @@ impl Unet25d {
                 let pairs = sizes.iter().zip(&sizes[1..]).enumerate();
                 pairs
                     .map(|(k, (from, to))| {
-                        // The activations between count as modules in PyTorch.
+                        // PyTorch counts the activations between the layers as modules.
                         let at = format!("skip_projections.{level}.{}", 2 * k);
                         Linear::declare(d, &at, &[*to, *from])
                     })
@@ -98,10 +101,10 @@ impl Unet25d {
         self.decoder.forward(pass, flat)
     }
 
-    /// What the encoder gives at each level, (N·T, C, H, W), from the finest.
+    /// Returns the encoder's features at each level, (N·T, C, H, W), from the finest.
     fn features(&self, pass: &mut Pass, input: Input, frozen: bool) -> Vec<Tensor<4>> {
         let [n, _, h, w] = input.dense.dims();
-        // A shared projection is the first and the last.
+        // A shared projection is both the first and the last.
         let (Some(of_dense), Some(of_one_hot)) =
             (self.projections.first(), self.projections.last())
         else {
@@ -134,7 +137,7 @@ impl Unet25d {
     }
 }
 
-/// (N·T, C, H, W) to (N, C, H, W) through layers over time, with ReLU between them.
+/// Maps (N·T, C, H, W) to (N, C, H, W) through layers over time, with ReLU between them.
 fn project(pass: &Pass, x: Tensor<4>, time: usize, layers: &[Linear]) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     let n = images / time;
@@ -148,8 +151,9 @@ fn project(pass: &Pass, x: Tensor<4>, time: usize, layers: &[Linear]) -> Tensor<
     x.reshape([n, c, h, w])
 }
 
-/// Sizes from a level's moments to one: 160-128-32-1, 80-64-32-1, 40-32-1, 20-16-1 (the appendix), others alike: the
-/// greatest power of two below, 32 if that is greater, one.
+/// Returns the sizes from a level's moments to one: 160-128-32-1, 80-64-32-1, 40-32-1, 20-16-1 (the
+/// appendix). Other numbers follow the same rule: the greatest power of two below, then 32 if the
+/// power is greater, then one.
 pub(super) fn steps(time: usize) -> Vec<usize> {
     let mut sizes = vec![time];
     if time > 2 {

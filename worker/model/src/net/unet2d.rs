@@ -9,7 +9,8 @@ use super::{
 };
 use crate::{ops, parameters::Declarations};
 
-/// Encoder blocks with max-pooling between them, decoder blocks over upsampled features beside the encoder's.
+/// Encoder blocks with max-pooling between them, and decoder blocks over upsampled features joined
+/// with the encoder's.
 #[derive(Debug, Clone)]
 pub(super) struct Unet2d {
     stem: Option<Stem>,
@@ -18,7 +19,7 @@ pub(super) struct Unet2d {
     decoder: Decoder,
 }
 
-/// The projection before the first level.
+/// The projection in front of the first level.
 #[derive(Debug, Clone, Copy)]
 enum Stem {
     Block(Cbr),
@@ -61,7 +62,7 @@ impl Unet2d {
         }
     }
 
-    /// What the encoder gives at each level, from the finest.
+    /// Returns the encoder's features at each level, from the finest.
     pub(super) fn features(&self, pass: &mut Pass, input: Input) -> Vec<Tensor<4>> {
         let Input { dense, one_hot } = input;
         let mut one_hot = one_hot.as_ref();
@@ -94,12 +95,14 @@ impl Unet2d {
     }
 }
 
-/// Whether a level of an encoder is its last: a segment of its own, which has half of its parameters and few pixels.
+/// Returns whether a level is the last of an encoder. The last level is a segment of its own, with
+/// half of the encoder's parameters and few pixels.
 pub(super) fn is_bottleneck(level: usize, levels: usize) -> bool {
     level + 1 == levels
 }
 
-/// What a level of an encoder hands on to the decoder and to the next level.
+/// Passes the features of an encoder level on. Returns the tensors for the decoder and for the next
+/// level.
 pub(super) fn hand_on(
     pass: &mut Pass,
     level: usize,
@@ -108,7 +111,7 @@ pub(super) fn hand_on(
 ) -> (Tensor<4>, Tensor<4>) {
     let bottleneck = is_bottleneck(level, levels);
     let seen = pass.hand_on(usize::from(bottleneck), x.clone());
-    // The next level is of the same segment, unless it is the bottleneck.
+    // The next level belongs to the same segment, unless it is the bottleneck.
     match bottleneck || is_bottleneck(level + 1, levels) {
         true => (seen.clone(), seen),
         false => (seen, x),
@@ -168,7 +171,7 @@ impl Decoder {
         }
     }
 
-    /// From features at each level, from the finest.
+    /// Computes the output from the features at each level, from the finest.
     pub(super) fn forward(&self, pass: &mut Pass, mut features: Vec<Tensor<4>>) -> Tensor<4> {
         let mut x = features.pop().expect("there are at least two levels");
         for block in &self.blocks {

@@ -1,34 +1,35 @@
 //! Convolutions of volumes as 3×3 convolutions of images.
 //!
-//! A volume lies as (N·T, C, H, W), an image for each moment. What a convolution sees in time becomes channels beside each other;
-//! what it sees in space is cut or turned until a 3×3 kernel is left, so that every convolution runs on the one kernel.
-//! Weights have the shapes of PyTorch's `Conv3d` and `ConvTranspose3d`. The oracle is burn's own three-dimensional
-//! convolution (tests below).
+//! A volume is stored as (N·T, C, H, W), one image for each moment. The moments that a convolution
+//! reads become concatenated channels. Its kernel in space is split or reordered into 3×3 kernels,
+//! so every convolution uses the same 3×3 kernel code. Weights have the shapes of PyTorch's
+//! `Conv3d` and `ConvTranspose3d`. The tests below compare the results with burn's own
+//! three-dimensional convolution.
 
 use burn::tensor::Tensor;
 
 use super::pass::Pass;
 use crate::ops;
 
-/// What each moment of a convolution's output sees in time.
+/// The moments that each output of a convolution reads.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seen {
-    /// Moments, an odd number, around the one that it stands at.
+    /// The number of moments, which is odd; they are centred on the output's own.
     pub taps: usize,
-    /// Moments between two of them.
+    /// The distance between two of these moments.
     pub apart: usize,
-    /// Moments from one output to the next: 1 or 2.
+    /// The distance in moments from one output to the next: 1 or 2.
     pub stride: usize,
 }
 
 impl Seen {
-    /// Moments of what comes out of `time`.
+    /// Returns the number of output moments for `time` input moments.
     pub(super) fn moments(&self, time: usize) -> usize {
         time.div_ceil(self.stride)
     }
 }
 
-/// Every second image of each volume, from its first.
+/// Returns every second image of each volume, starting with the first.
 pub(super) fn every_second(x: Tensor<4>, time: usize) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     let (n, half) = (images / time, time.div_ceil(2));
@@ -42,8 +43,8 @@ pub(super) fn every_second(x: Tensor<4>, time: usize) -> Tensor<4> {
         .reshape([n * half, c, h, w])
 }
 
-/// The images that each output sees as channels beside each other, dark ones beyond the ends: (N·T, C, H, W) to (N·T', taps·C, H,
-/// W).
+/// Concatenates the images that each output reads as channels, with zeros beyond the ends: (N·T, C,
+/// H, W) to (N·T', taps·C, H, W).
 fn seen(x: Tensor<4>, time: usize, seen: Seen) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     let (n, moments) = (images / time, seen.moments(time));
@@ -55,7 +56,7 @@ fn seen(x: Tensor<4>, time: usize, seen: Seen) -> Tensor<4> {
         };
     }
     let reach = seen.taps / 2 * seen.apart;
-    // The last output's last tap ends what is needed.
+    // The input ends with the last tap of the last output.
     let after = (moments - 1) * seen.stride + reach + seen.stride - time;
     let values = c * h * w;
     let dark = |count| Tensor::zeros([n, count, values], &x.device());
@@ -76,18 +77,18 @@ fn seen(x: Tensor<4>, time: usize, seen: Seen) -> Tensor<4> {
     Tensor::cat(each.collect(), 1)
 }
 
-/// 3×3 convolution of images with a kernel (O, C, 3, 3).
+/// Computes a 3×3 convolution of images with a kernel (O, C, 3, 3).
 fn conv3x3(pass: &Pass, x: Tensor<4>, kernel: Tensor<4>) -> Tensor<4> {
     pass.raise(ops::conv3x3(pass.lower(x), pass.lower(kernel)))
 }
 
-/// (O, C, T, H, W) as a kernel of images of several moments: (O, T·C, H, W).
+/// Converts (O, C, T, H, W) to a kernel for images of several moments: (O, T·C, H, W).
 fn kernel(weight: Tensor<5>) -> Tensor<4> {
     let [o, c, t, h, w] = weight.dims();
     weight.swap_dims(1, 2).reshape([o, t * c, h, w])
 }
 
-/// Convolution with (O, C, taps, 3, 3) and zeros beyond the ends.
+/// Computes a convolution with (O, C, taps, 3, 3) and zeros beyond the ends.
 pub(super) fn conv(
     pass: &Pass,
     x: Tensor<4>,
@@ -98,7 +99,7 @@ pub(super) fn conv(
     conv3x3(pass, seen(x, time, over_time), kernel(weight))
 }
 
-/// The same with every second pixel around each, and zeros beyond the ends; rows and columns are even in number.
+/// Like [`conv`], but with every second pixel in space; rows and columns must be even in number.
 pub(super) fn dilated(
     pass: &Pass,
     x: Tensor<4>,
@@ -108,7 +109,7 @@ pub(super) fn dilated(
 ) -> Tensor<4> {
     let x = seen(x, time, over_time);
     let [images, c, h, w] = x.dims();
-    // Pixels of even and odd rows and columns never meet: four images.
+    // Pixels of even and odd rows and columns do not interact, so they form four images.
     let apart = x
         .reshape([images, c, h / 2, 2, w / 2, 2])
         .permute([0, 3, 5, 1, 2, 4])
@@ -120,7 +121,7 @@ pub(super) fn dilated(
         .reshape([images, outputs, h, w])
 }
 
-/// (O, C, T, 5, 5) as (O, T·C, 6, 6), with zeros in the last row and column.
+/// Converts (O, C, T, 5, 5) to (O, T·C, 6, 6), with zeros in the last row and column.
 fn kernel6(weight: Tensor<5>) -> Tensor<4> {
     let weight = kernel(weight);
     let [o, c, ..] = weight.dims();
@@ -129,7 +130,7 @@ fn kernel6(weight: Tensor<5>) -> Tensor<4> {
     Tensor::cat(vec![Tensor::cat(vec![weight, column], 3), row], 2)
 }
 
-/// Convolution with (O, C, 5, 5, 5) and zeros beyond the ends.
+/// Computes a convolution with (O, C, 5, 5, 5) and zeros beyond the ends.
 pub(super) fn conv5(
     pass: &Pass,
     x: Tensor<4>,
@@ -141,7 +142,7 @@ pub(super) fn conv5(
     let [images, c, h, w] = x.dims();
     let weight = kernel6(weight);
     let outputs = weight.dims()[0];
-    // Four kernels of 3×3, whose centres lie a pixel before and two after.
+    // Four 3×3 kernels, with centres one pixel before and two pixels after the output's pixel.
     let weight = weight
         .reshape([outputs, c, 2, 3, 2, 3])
         .permute([2, 4, 0, 1, 3, 5])
@@ -161,8 +162,8 @@ pub(super) fn conv5(
     part(0) + part(1) + (part(2) + part(3))
 }
 
-/// Convolution with (O, C, 5, 5, 5) of every second row and column, and zeros beyond the ends: (N·T, C, H, W) to (N·T, O, H/2,
-/// W/2).
+/// Computes a convolution with (O, C, 5, 5, 5) at every second row and column, and zeros beyond the
+/// ends: (N·T, C, H, W) to (N·T, O, H/2, W/2).
 pub(super) fn conv5_halved(pass: &Pass, x: Tensor<4>, time: usize, weight: Tensor<5>) -> Tensor<4> {
     let over_time = Seen {
         taps: 5,
@@ -173,7 +174,7 @@ pub(super) fn conv5_halved(pass: &Pass, x: Tensor<4>, time: usize, weight: Tenso
     let [images, c, h, w] = x.dims();
     let weight = kernel6(weight);
     let outputs = weight.dims()[0];
-    // Two rows and columns become channels of one pixel: six taps are three of those.
+    // Two rows and two columns become the channels of one pixel, so six taps become three.
     let weight = weight
         .reshape([outputs, c, 3, 2, 3, 2])
         .permute([0, 3, 5, 1, 2, 4])
@@ -185,7 +186,8 @@ pub(super) fn conv5_halved(pass: &Pass, x: Tensor<4>, time: usize, weight: Tenso
     conv3x3(pass, x, weight)
 }
 
-/// Transposed convolution with (C, O, 6, 3, 3), stride 2 in time, padding 2 there and 1 in space: (N·T, C, H, W) to (N·2T, O, H, W).
+/// Computes a transposed convolution with (C, O, 6, 3, 3), stride 2 in time, padding 2 there and 1
+/// in space: (N·T, C, H, W) to (N·2T, O, H, W).
 pub(super) fn doubled_in_time(
     pass: &Pass,
     x: Tensor<4>,
@@ -194,7 +196,8 @@ pub(super) fn doubled_in_time(
 ) -> Tensor<4> {
     let [images, _, h, w] = x.dims();
     let [c, o, ..] = weight.dims();
-    // An even moment sees taps 4, 2 and 0 of the moments before, at and after it, an odd one 5, 3 and 1.
+    // An even moment uses taps 4, 2 and 0 of the moments before, at and after it, an odd one taps
+    // 5, 3 and 1.
     let weight = weight
         .reshape([c, o, 3, 2, 3, 3])
         .flip([2, 4, 5])
@@ -204,8 +207,8 @@ pub(super) fn doubled_in_time(
     y.reshape([2 * images, o, h, w])
 }
 
-/// Transposed convolution with (C, O, 3, 6, 6), stride 2 in space, padding 2 there and 1 in time: (N·T, C, H, W) to (N·T, O, 2H,
-/// 2W).
+/// Computes a transposed convolution with (C, O, 3, 6, 6), stride 2 in space, padding 2 there and 1
+/// in time: (N·T, C, H, W) to (N·T, O, 2H, 2W).
 pub(super) fn doubled_in_space(
     pass: &Pass,
     x: Tensor<4>,
@@ -225,8 +228,8 @@ pub(super) fn doubled_in_space(
         .reshape([images, o, 2 * h, 2 * w])
 }
 
-/// Convolution with (O, C, 3, 3, 3) whose borders are repeated in time and space, every second moment: to (N·⌈T/2⌉, O, H + 2, W + 2),
-/// of which the outermost pixels say nothing.
+/// Computes a convolution with (O, C, 3, 3, 3) at every second moment, with borders repeated in
+/// time and space. The result is (N·⌈T/2⌉, O, H + 2, W + 2); its outermost pixels have no meaning.
 pub(super) fn conv_bordered_halved(
     pass: &Pass,
     x: Tensor<4>,
@@ -255,7 +258,7 @@ mod tests {
         Tensor::from_data(TensorData::new(values, shape), &Device::flex())
     }
 
-    /// (N, C, T, H, W) as images of moments.
+    /// Converts (N, C, T, H, W) to images of moments.
     fn images(x: Tensor<5>) -> Tensor<4> {
         let [n, c, t, h, w] = x.dims();
         x.swap_dims(1, 2).reshape([n * t, c, h, w])
@@ -268,7 +271,8 @@ mod tests {
         assert!(apart < 1e-4, "{what}: {apart}");
     }
 
-    /// Volumes of 2 images with 3 channels in 8×12 pixels, of an even and an odd number of moments.
+    /// Returns volumes of 2 images with 3 channels and 8×12 pixels, with an even and an odd number
+    /// of moments.
     fn volumes() -> impl Iterator<Item = (usize, Tensor<5>)> {
         [6, 7]
             .into_iter()

@@ -14,7 +14,7 @@ use crate::kernel::{
     NormShape, OneHotShape, PlaneShape, TapShape,
 };
 
-/// Operations of networks; shapes as in [`super`].
+/// The operations of networks; shapes as in [`super`].
 #[backend_extension(Flex, Autodiff)]
 pub trait NetOps: Backend {
     fn conv3x3(x: FloatTensor<Self>, w: FloatTensor<Self>) -> FloatTensor<Self>;
@@ -71,7 +71,7 @@ pub(super) fn dims<const D: usize>(x: &Cpu) -> [usize; D] {
     x.shape().dims()
 }
 
-/// The values in order; copied only where they lie otherwise.
+/// Returns the values in order. They are copied only if they are stored in another order.
 pub(super) fn contiguous(x: Cpu) -> Cpu {
     match x.as_slice::<f32>() {
         Some(_) => x,
@@ -88,14 +88,14 @@ pub(super) fn tensor<const D: usize>(values: Vec<f32>, dims: [usize; D]) -> Cpu 
     Cpu::from_data(TensorData::new(values, Shape::from(dims)))
 }
 
-/// A tensor that `fill` writes all of.
+/// Creates a tensor; `fill` writes all its values.
 pub(super) fn made<const D: usize>(dims: [usize; D], fill: impl FnOnce(&mut [f32])) -> Cpu {
     let mut out = vec![0.0; dims.iter().product()];
     fill(&mut out);
     tensor(out, dims)
 }
 
-/// [`made`] in the shape of another, whichever that is.
+/// Like [`made`], with the shape of another tensor of any rank.
 pub(super) fn alike(like: &Cpu, fill: impl FnOnce(&mut [f32])) -> Cpu {
     let shape = like.shape();
     let mut out = vec![0.0; shape.num_elements()];
@@ -133,7 +133,7 @@ pub(super) fn planes([n, c, height, width]: [usize; 4]) -> PlaneShape {
     }
 }
 
-/// The parameters of a layer norm.
+/// Returns the parameters of a layer norm.
 pub(super) fn layer<'a>(gamma: &'a Cpu, beta: &'a Cpu) -> LayerNorm<'a> {
     LayerNorm {
         gamma: values(gamma),
@@ -142,7 +142,7 @@ pub(super) fn layer<'a>(gamma: &'a Cpu, beta: &'a Cpu) -> LayerNorm<'a> {
     }
 }
 
-/// Images without their border, of which `moments` in a row belong together.
+/// Returns the shape of images without their border, grouped into volumes of `moments`.
 pub(super) fn border_shape(
     [images, channels, height, width]: [usize; 4],
     moments: usize,
@@ -158,7 +158,7 @@ pub(super) fn border_shape(
     }
 }
 
-/// Images of `moments` each.
+/// Returns the shape of images of `moments` each.
 pub(super) fn moment_shape([all, c, h, w]: [usize; 4], moments: usize) -> MomentShape {
     MomentShape {
         images: all / moments,
@@ -167,7 +167,7 @@ pub(super) fn moment_shape([all, c, h, w]: [usize; 4], moments: usize) -> Moment
     }
 }
 
-/// Bins as the kernels read them.
+/// Converts bins to the format that the kernels read.
 pub(super) fn bins(bins: IntTensor<Flex>) -> Vec<u16> {
     let data = bins.into_data();
     data.iter::<i64>()
@@ -185,7 +185,7 @@ pub(super) fn one_hot_shape([images, height, width]: [usize; 3], w: [usize; 4]) 
     }
 }
 
-/// The same memory where nobody else looks at it.
+/// Returns the tensor's own memory if there are no other references to it.
 fn owned(x: Cpu) -> Vec<f32> {
     let x = contiguous(x);
     x.into_data()

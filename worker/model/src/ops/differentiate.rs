@@ -16,7 +16,7 @@ use crate::kernel::{AdamW, AttentionShape};
 type Cpu = FloatTensor<Flex>;
 type Tracked = FloatTensor<Autodiff<Flex>>;
 
-/// Registers a gradient for a parent that wants one.
+/// Registers a gradient for a parent that requires one.
 macro_rules! give {
     ($grads:ident, $parent:expr, $value:expr) => {
         if let Some(node) = $parent {
@@ -100,7 +100,7 @@ impl Backward<Flex, 1> for Pool {
 #[derive(Debug)]
 struct Join;
 impl Backward<Flex, 2> for Join {
-    /// Channels of the first part.
+    /// The number of channels of the first part.
     type State = usize;
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = grads.consume::<Flex>(&ops.node);
@@ -155,7 +155,7 @@ impl Backward<Flex, 3> for Layer {
 #[derive(Debug)]
 struct Surround;
 impl Backward<Flex, 1> for Surround {
-    /// Moments in a row, and whether they lie beside each other.
+    /// The number of consecutive moments, and whether their channels are concatenated.
     type State = (usize, bool);
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = grads.consume::<Flex>(&ops.node);
@@ -190,7 +190,7 @@ impl Backward<Flex, 1> for Leaky {
 #[derive(Debug)]
 struct Beside;
 impl Backward<Flex, 1> for Beside {
-    /// Moments of an image.
+    /// The number of moments of an image.
     type State = usize;
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = grads.consume::<Flex>(&ops.node);
@@ -330,7 +330,7 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
         }
     }
 
-    /// Without a gradient, as its users say.
+    /// Has no gradient, as documented for its users.
     fn taps(x: Tracked, repeated: bool) -> Tracked {
         Tracked::new(Flex::taps(x.into_primitive(), repeated))
     }

@@ -1,4 +1,5 @@
-//! The gradients of the operations on the CPU, from the output's gradient and what the operation kept.
+//! The gradients of the operations on the CPU, computed from the output's gradient and the state
+//! that the operation saved.
 
 use burn::backend::{Flex, TensorMetadata, tensor::IntTensor};
 
@@ -11,7 +12,7 @@ use super::{
 };
 use crate::kernel::{AttentionShape, BatchNorm, Kernels};
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn conv3x3_by_input(dy: Cpu, w: Cpu) -> Cpu {
     let (dy, w) = (contiguous(dy), contiguous(w));
     let ([n, o, h, wide], [_, c, ..]) = (dims(&dy), dims::<4>(&w));
@@ -21,7 +22,7 @@ pub(super) fn conv3x3_by_input(dy: Cpu, w: Cpu) -> Cpu {
     })
 }
 
-/// By the weights.
+/// Returns the gradient of the weights.
 pub(super) fn conv3x3_by_weight(x: Cpu, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     let (at, [_, o, ..]) = (dims(&x), dims::<4>(&dy));
@@ -31,7 +32,7 @@ pub(super) fn conv3x3_by_weight(x: Cpu, dy: Cpu) -> Cpu {
     })
 }
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn conv1x1_by_input(dy: Cpu, w: Cpu) -> Cpu {
     let (dy, w) = (contiguous(dy), contiguous(w));
     let ([n, o, h, wide], [_, c, ..]) = (dims(&dy), dims::<4>(&w));
@@ -41,7 +42,7 @@ pub(super) fn conv1x1_by_input(dy: Cpu, w: Cpu) -> Cpu {
     })
 }
 
-/// By the weights.
+/// Returns the gradient of the weights.
 pub(super) fn conv1x1_by_weight(x: Cpu, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     let (at, [_, o, ..]) = (dims(&x), dims::<4>(&dy));
@@ -51,7 +52,7 @@ pub(super) fn conv1x1_by_weight(x: Cpu, dy: Cpu) -> Cpu {
     })
 }
 
-/// By the bias.
+/// Returns the gradient of the bias.
 pub(super) fn conv1x1_by_bias(dy: Cpu) -> Cpu {
     let dy = contiguous(dy);
     let at = dims::<4>(&dy);
@@ -59,7 +60,7 @@ pub(super) fn conv1x1_by_bias(dy: Cpu) -> Cpu {
     made([at[1]], |db| Kernels::best().bias_grad(&s, values(&dy), db))
 }
 
-/// By the weights, of which there are `channels` a pixel of the kernel.
+/// Returns the gradient of the weights, which have `channels` for each pixel of the kernel.
 pub(super) fn one_hot_conv3x3_by_weight(at: IntTensor<Flex>, dy: Cpu, channels: usize) -> Cpu {
     let dy = contiguous(dy);
     let [_, o, ..] = dims::<4>(&dy);
@@ -70,7 +71,7 @@ pub(super) fn one_hot_conv3x3_by_weight(at: IntTensor<Flex>, dy: Cpu, channels: 
     })
 }
 
-/// By input, scale and shift.
+/// Returns the gradients of input, scale and shift.
 pub(super) fn batch_norm_relu_grad(
     x: Cpu,
     gamma: Cpu,
@@ -108,12 +109,12 @@ pub(super) fn batch_norm_relu_grad(
     (dx, tensor(dgamma, [at[1]]), tensor(dbeta, [at[1]]))
 }
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn max_pool_grad(x: Cpu, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     let at = dims::<4>(&x);
     let s = planes(at);
-    // Which pixel won is cheaper found again than kept.
+    // Finding the maximum's position again is cheaper than storing it.
     let (mut y, mut which) = (vec![0.0; s.halved().len()], vec![0; s.halved().len()]);
     Kernels::best().max_pool(&s, values(&x), &mut y, &mut which);
     made(at, |dx| {
@@ -121,7 +122,7 @@ pub(super) fn max_pool_grad(x: Cpu, dy: Cpu) -> Cpu {
     })
 }
 
-/// By the first part, which has `c` channels, and by the second.
+/// Returns the gradients of the first part, which has `c` channels, and of the second.
 pub(super) fn join_upsampled_grad(dy: Cpu, c: usize) -> (Cpu, Cpu) {
     let dy = contiguous(dy);
     let [n, both, h, w] = dims(&dy);
@@ -139,7 +140,7 @@ pub(super) fn join_upsampled_grad(dy: Cpu, c: usize) -> (Cpu, Cpu) {
     (tensor(dskip, [n, c, h, w]), dx)
 }
 
-/// By queries, keys and values, and by the bias.
+/// Returns the gradients of queries, keys and values, and of the bias.
 pub(super) fn window_attention_grad(
     qkv: Cpu,
     bias: Cpu,
@@ -155,7 +156,7 @@ pub(super) fn window_attention_grad(
     (dqkv, tensor(dbias, [s.heads, s.tokens(), s.tokens()]))
 }
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn gelu_grad(x: Cpu, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     alike(&x, |dx| {
@@ -163,7 +164,7 @@ pub(super) fn gelu_grad(x: Cpu, dy: Cpu) -> Cpu {
     })
 }
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn beside_grad(dy: Cpu, moments: usize) -> Cpu {
     let dy = contiguous(dy);
     let [n, c, h, w] = dims(&dy);
@@ -173,7 +174,7 @@ pub(super) fn beside_grad(dy: Cpu, moments: usize) -> Cpu {
     })
 }
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn halve_time_grad(x: Cpu, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     let s = moment_shape(dims(&x), 2);
@@ -182,7 +183,7 @@ pub(super) fn halve_time_grad(x: Cpu, dy: Cpu) -> Cpu {
     })
 }
 
-/// By input, scale and shift.
+/// Returns the gradients of input, scale and shift.
 pub(super) fn layer_norm_grad(x: Cpu, gamma: Cpu, beta: Cpu, dy: Cpu) -> (Cpu, Cpu, Cpu) {
     let [x, gamma, beta, dy] = [x, gamma, beta, dy].map(contiguous);
     let norm = layer(&gamma, &beta);
@@ -201,7 +202,7 @@ pub(super) fn layer_norm_grad(x: Cpu, gamma: Cpu, beta: Cpu, dy: Cpu) -> (Cpu, C
     (dx, tensor(dgamma, [wide]), tensor(dbeta, [wide]))
 }
 
-/// By the input, which has the output's size without its border.
+/// Returns the gradient of the input, which has the output's size without its border.
 pub(super) fn surround_grad(dy: Cpu, moments: usize, volume: bool) -> Cpu {
     let dy = contiguous(dy);
     let [n, c, h, w] = dims(&dy);
@@ -210,7 +211,7 @@ pub(super) fn surround_grad(dy: Cpu, moments: usize, volume: bool) -> Cpu {
     made(at, |dx| Kernels::best().surround_grad(&s, values(&dy), dx))
 }
 
-/// By the input; by the bias it is [`conv1x1_by_bias`].
+/// Returns the gradient of the input; [`conv1x1_by_bias`] computes that of the bias.
 pub(super) fn crop_grad(dy: Cpu) -> Cpu {
     let dy = contiguous(dy);
     let [n, c, h, w] = dims(&dy);
@@ -220,7 +221,7 @@ pub(super) fn crop_grad(dy: Cpu) -> Cpu {
     })
 }
 
-/// By the input.
+/// Returns the gradient of the input.
 pub(super) fn leaky_relu_grad(x: Cpu, slope: f32, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     alike(&x, |dx| {

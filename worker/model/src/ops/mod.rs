@@ -1,6 +1,7 @@
-//! The operations that networks are made of, each with its gradient. On the CPU they are our own kernels, behind burn's
-//! `extension` (`burn`'s own convolutions reach 0.4 to 0.55 of PyTorch's speed on CPUs, and its batch norm and ReLU are
-//! apart); everywhere else they are burn's operations, composed in [`plain`], which is the oracle of the kernels too.
+//! The operations of networks, each with its gradient. On the CPU they are our own kernels, which
+//! use burn's `extension`, because `burn`'s own convolutions reach 0.4 to 0.55 of PyTorch's speed
+//! on CPUs and its batch norm and ReLU are separate. On other devices they are burn's operations,
+//! composed in [`plain`]; the kernels are tested against these.
 
 mod cpu;
 mod differentiate;
@@ -20,10 +21,10 @@ pub use window::{
     relative_positions, shifted, shifted_back, window_attention, window_mask, windows,
 };
 
-/// Added to variances: PyTorch's default.
+/// A constant added to variances: PyTorch's default.
 pub const EPSILON: f64 = 1e-5;
 
-/// Whether tensors of a device go through our kernels.
+/// Returns whether tensors of a device use our kernels.
 pub fn has_kernels(device: &Device) -> bool {
     match device.as_dispatch() {
         DispatchDevice::Flex(_) => true,
@@ -33,8 +34,9 @@ pub fn has_kernels(device: &Device) -> bool {
     }
 }
 
-/// What a convolution in bfloat16 is given: rounded to it, and its gradient too. Our kernels compute on with 32 bits, which
-/// hold such numbers exactly; on other devices the tensor itself is bfloat16.
+/// Converts the input of a convolution in bfloat16: the values and their gradients are rounded to
+/// bfloat16. Our kernels compute with 32 bits, which represent such numbers exactly; on other
+/// devices the tensor itself is bfloat16.
 pub fn to_bf16<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let kernels = has_kernels(&x.device());
     let rounded = x.cast(FloatDType::BF16);
@@ -44,7 +46,7 @@ pub fn to_bf16<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     }
 }
 
-/// What a convolution in bfloat16 gives, rounded to it, as 32 bits.
+/// Rounds the output of a convolution in bfloat16 to that format, and returns it in 32 bits.
 pub fn from_bf16<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     match has_kernels(&x.device()) {
         true => to_bf16(x),
@@ -72,8 +74,8 @@ pub fn conv1x1(x: Tensor<4>, w: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     ))
 }
 
-/// [`conv3x3`] of the one-hot tensor of `bins` (N, H, W) with (O, B, 3, 3), without making that tensor; a bin outside
-/// 0..B is a pixel of zeros. The bins have no gradient.
+/// [`conv3x3`] of the one-hot tensor of `bins` (N, H, W) with (O, B, 3, 3), without creating that
+/// tensor. A bin outside 0..B gives a pixel of zeros. The bins have no gradient.
 pub fn one_hot_conv3x3(bins: Tensor<3, Int>, w: Tensor<4>) -> Tensor<4> {
     if !has_kernels(&w.device()) {
         return plain::one_hot_conv3x3(bins, w);
@@ -84,13 +86,13 @@ pub fn one_hot_conv3x3(bins: Tensor<3, Int>, w: Tensor<4>) -> Tensor<4> {
     ))
 }
 
-/// What [`batch_norm_relu`] gives.
+/// The result of [`batch_norm_relu`].
 pub struct Normalised {
-    /// As the input.
+    /// The output, in the shape of the input.
     pub y: Tensor<4>,
-    /// Mean of each channel, without gradient.
+    /// The mean of each channel, without gradient.
     pub mean: Tensor<1>,
-    /// Biased variance of each channel, without gradient.
+    /// The biased variance of each channel, without gradient.
     pub variance: Tensor<1>,
 }
 
@@ -131,7 +133,7 @@ pub fn norm_relu(
     ))
 }
 
-/// Max-pool 2×2 with stride 2; the first of equals wins.
+/// Max-pool 2×2 with stride 2. Of equal values, the first is selected.
 pub fn max_pool(x: Tensor<4>) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::max_pool(x);
@@ -139,7 +141,8 @@ pub fn max_pool(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::max_pool(x.into_dispatch()))
 }
 
-/// `skip` (N, C, H, W) and `x` (N, D, H/2, W/2), each pixel of it four times, as (N, C + D, H, W).
+/// Upsamples `x` (N, D, H/2, W/2) by repeating each pixel four times, and appends it to `skip` (N,
+/// C, H, W): (N, C + D, H, W).
 pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::join_upsampled(skip, x);
@@ -150,9 +153,9 @@ pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
     ))
 }
 
-/// One pixel more at every side of images (N·T, C, H, W), as what lies there: (N·T, C, H + 2, W + 2). In a volume of `moments` with
-/// the channels of the moments before, at and after each beside each other, the first and the last repeated: (N·T, 3·C, H + 2,
-/// W + 2).
+/// Extends images (N·T, C, H, W) by repeating the outermost pixels once at each side: (N·T, C, H +
+/// 2, W + 2). For a volume of `moments`, also concatenates the channels of the moments before, at
+/// and after each, with the first and the last moment repeated: (N·T, 3·C, H + 2, W + 2).
 pub fn surround(x: Tensor<4>, moments: usize, volume: bool) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::surround(x, moments, volume);
@@ -160,9 +163,9 @@ pub fn surround(x: Tensor<4>, moments: usize, volume: bool) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::surround(x.into_dispatch(), moments, volume))
 }
 
-/// What a 3×3×3 convolution with stride 2 sees of volumes (N, T, S, H, W), their ends repeated or dark beyond them: (N·⌈T/2⌉,
-/// 27·S, H/2, W/2), taps of a moment first, then of a row, a tap's streams beside each other. **It has no gradient**: it is for
-/// inputs.
+/// Gathers the inputs of a 3×3×3 convolution with stride 2 from volumes (N, T, S, H, W), with ends
+/// repeated or zeros beyond them: (N·⌈T/2⌉, 27·S, H/2, W/2). Channels are ordered by moment, then
+/// by row, with a tap's streams adjacent. **It has no gradient**: it is for inputs.
 pub fn taps(x: Tensor<5>, repeated: bool) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::taps(x.detach(), repeated);
@@ -170,7 +173,7 @@ pub fn taps(x: Tensor<5>, repeated: bool) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::taps(x.into_dispatch(), repeated))
 }
 
-/// Images (N, C, H + 2, W + 2) without their outermost pixels, and a bias (C) added: (N, C, H, W).
+/// Removes the outermost pixels of images (N, C, H + 2, W + 2) and adds a bias (C): (N, C, H, W).
 pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::crop(x, bias);
@@ -178,7 +181,7 @@ pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::crop(x.into_dispatch(), bias.into_dispatch()))
 }
 
-/// x where it is above 0, else `slope`·x; the slope lies below 1.
+/// x if it is above 0, else `slope`·x; the slope must be less than 1.
 pub fn leaky_relu(x: Tensor<4>, slope: f32) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return activation::leaky_relu(x, f64::from(slope));
@@ -186,8 +189,8 @@ pub fn leaky_relu(x: Tensor<4>, slope: f32) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::leaky_relu(x.into_dispatch(), slope))
 }
 
-/// Images of `moments` each, (N·T, C, H, W), with the channels of the moments before, at and after each beside each other: (N·T,
-/// 3·C, H, W), zeros beyond the first and the last.
+/// Concatenates the channels of the moments before, at and after each, for images of `moments` each
+/// (N·T, C, H, W): (N·T, 3·C, H, W), with zeros beyond the first and the last.
 pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::beside(x, moments);
@@ -195,7 +198,8 @@ pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::beside(x.into_dispatch(), moments))
 }
 
-/// The greater of each two images in a row, (N, C, H, W) to (N/2, C, H, W); the first of equals wins.
+/// The greater value of each two consecutive images, (N, C, H, W) to (N/2, C, H, W). Of equal
+/// values, the first is selected.
 pub fn halve_time(x: Tensor<4>) -> Tensor<4> {
     if !has_kernels(&x.device()) {
         return plain::halve_time(x);
@@ -203,8 +207,9 @@ pub fn halve_time(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::halve_time(x.into_dispatch()))
 }
 
-/// [`conv1x1`] of the one-hot tensor of `bins` (N, H, W) with (O, B, 1, 1) and a bias (O), without making that tensor: a row of
-/// the weights for each pixel. A bin outside 0..B is a pixel of zeros.
+/// [`conv1x1`] of the one-hot tensor of `bins` (N, H, W) with (O, B, 1, 1) and a bias (O), without
+/// creating that tensor: it selects a row of the weights for each pixel. A bin outside 0..B gives a
+/// pixel of zeros.
 pub fn one_hot_conv1x1(bins: Tensor<3, Int>, w: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     let ([n, h, wide], [outputs, channels, ..]) = (bins.dims(), w.dims());
     let none = Tensor::<2>::zeros([1, outputs], &w.device()).cast(w.dtype());
@@ -215,7 +220,7 @@ pub fn one_hot_conv1x1(bins: Tensor<3, Int>, w: Tensor<4>, bias: Tensor<1>) -> T
     y.permute([0, 3, 1, 2])
 }
 
-/// One step of AdamW over one parameter: the parameter and its two moments after it.
+/// Takes one step of AdamW for one parameter. Returns the parameter and its two moments.
 pub fn adamw(
     settings: AdamW,
     parameter: Tensor<1>,

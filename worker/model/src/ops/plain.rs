@@ -1,4 +1,5 @@
-//! The operations as compositions of burn's: for devices without kernels of ours, and to test the kernels against.
+//! The operations as compositions of burn's operations, for devices without our kernels and as a
+//! reference for testing the kernels.
 
 use burn::tensor::{
     Int, Tensor,
@@ -9,11 +10,12 @@ use burn::tensor::{
 use super::{EPSILON, Normalised, attend, from_windows, shifted, shifted_back, windows};
 use crate::kernel::AdamW;
 
-/// Channels that matrix units take at once. Where a layer has another number (637 bins, say), kernels of graphics processors read value by
-/// value.
+/// The number of channels that matrix units process at once. If a layer has another number than a
+/// multiple (e.g. 637 bins), kernels of graphics processors read its values one by one.
 const ALIGNED: usize = 16;
 
-/// See [`super::conv3x3`]. Channels are filled up to a multiple of [`ALIGNED`] with zeros, unless there are fewer.
+/// See [`super::conv3x3`]. Channels are padded with zeros to a multiple of [`ALIGNED`], unless
+/// there are fewer.
 pub fn conv3x3(x: Tensor<4>, w: Tensor<4>) -> Tensor<4> {
     let outputs = w.dims()[0];
     let x = filled(x, 1);
@@ -25,7 +27,7 @@ pub fn conv3x3(x: Tensor<4>, w: Tensor<4>) -> Tensor<4> {
     }
 }
 
-/// Zeros after the last of a dimension, up to a multiple of [`ALIGNED`]; as it is where there are fewer than that.
+/// Pads a dimension with zeros to a multiple of [`ALIGNED`], unless it is smaller.
 fn filled(x: Tensor<4>, dim: usize) -> Tensor<4> {
     let mut shape = x.dims();
     let there = shape[dim];
@@ -47,7 +49,7 @@ pub fn conv1x1(x: Tensor<4>, w: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     )
 }
 
-/// The one-hot tensor of `bins` (N, H, W): (N, B, H, W).
+/// Returns the one-hot tensor of `bins` (N, H, W): (N, B, H, W).
 pub fn one_hot(bins: Tensor<3, Int>, channels: usize) -> Tensor<4> {
     let [n, h, w] = bins.dims();
     let device = bins.device();
@@ -102,7 +104,7 @@ pub fn layer_norm<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1
     module::layer_norm(x, gamma, Some(beta), EPSILON)
 }
 
-/// See [`super::window_attention`]; `mask` is [`super::window_mask`] where windows are shifted.
+/// See [`super::window_attention`]; `mask` is [`super::window_mask`] if windows are shifted.
 pub fn window_attention(
     qkv: Tensor<4>,
     bias: Tensor<3>,
@@ -117,7 +119,7 @@ pub fn window_attention(
     shifted_back(said, shift)
 }
 
-/// One more at either end of a dimension, as what lies there.
+/// Extends a dimension by repeating its first and last entries once.
 pub fn bordered<const D: usize>(x: Tensor<D>, dim: usize) -> Tensor<D> {
     let last = x.dims()[dim] - 1;
     let ends = [0, last].map(|at| x.clone().narrow(dim, at, 1));
@@ -148,15 +150,16 @@ pub fn taps(x: Tensor<5>, repeated: bool) -> Tensor<4> {
     seen.reshape([n * time, 27 * s, h / 2, w / 2])
 }
 
-/// What a 3×3×3 convolution with stride 2 sees, one more at either end of T, H and W given: (N, T + 2, S, H + 2, W + 2) to (N·T/2, 27,
-/// S, H/2, W/2), those of a moment first, then those of a row.
+/// Gathers the inputs of a 3×3×3 convolution with stride 2 from a tensor that is already extended
+/// by one at both ends of T, H and W: (N, T + 2, S, H + 2, W + 2) to (N·T/2, 27, S, H/2, W/2),
+/// ordered by moment, then by row.
 fn tapped(x: Tensor<5>, time: usize) -> Tensor<5> {
     let [n, there, s, h, w] = x.dims();
     let (rows, columns) = (h / 2 - 1, w / 2 - 1);
     let short = 2 * time + 2 - there;
     let mut x = x;
     if short > 0 {
-        // An odd number of moments: what is beside the last is never seen.
+        // If the number of moments is odd, the entry after the last is never read.
         let none = Tensor::zeros([n, short, s, h, w], &x.device());
         x = Tensor::cat(vec![x, none], 1);
     }
@@ -186,7 +189,7 @@ fn tapped(x: Tensor<5>, time: usize) -> Tensor<5> {
     Tensor::cat(all, 1)
 }
 
-/// A zero more at either end of a dimension.
+/// Extends a dimension by a zero at both ends.
 fn dark(x: Tensor<5>, dim: usize) -> Tensor<5> {
     let mut shape = x.dims();
     shape[dim] = 1;

@@ -1,9 +1,11 @@
-//! Attention within windows, as in Swin transformers (Liu et al., ICCV 2021, sections 3.2 and 3.3) and SwinIR (Liang et al.,
-//! ICCVW 2021). [`window_attention`], [`gelu`] and [`layer_norm`] have kernels of ours; the rest are compositions of burn's operations, of which
-//! the plain form of attention is made too.
+//! Attention within windows, as in Swin transformers (Liu et al., ICCV 2021, sections 3.2 and 3.3)
+//! and SwinIR (Liang et al., ICCVW 2021). [`window_attention`], [`gelu`] and [`layer_norm`] have
+//! our own kernels. The other functions, and the plain form of attention, are compositions of
+//! burn's operations.
 //!
-//! A *token* is a pixel's row of features. Feature maps lie with their channels last here, (N, H, W, C), and windows of
-//! w×w tokens as (N·H/w·W/w, w², C), windows row by row within an image, tokens row by row within a window.
+//! A *token* is the row of features of a pixel. Feature maps have their channels last here, (N, H,
+//! W, C). Windows of w×w tokens are stored as (N·H/w·W/w, w², C): windows row by row within an
+//! image, and tokens row by row within a window.
 
 use burn::{
     backend::Dispatch,
@@ -13,10 +15,12 @@ use burn::{
 use super::{cpu::NetOps, has_kernels, plain};
 use crate::kernel::AttentionShape;
 
-/// What keeps tokens apart that a shift brought into one window: added to their scores, as in the released code.
+/// The value added to the scores of tokens that a shift brought into one window, which separates
+/// them; as in the released code.
 pub const APART: f64 = -100.0;
 
-/// Layer norm over the last dimension, with PyTorch's epsilon: (…, C), scale (C) and shift (C) to (…, C).
+/// Layer norm over the last dimension, with PyTorch's epsilon: (…, C), scale (C) and shift (C) to
+/// (…, C).
 pub fn layer_norm<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<D> {
     if !has_kernels(&x.device()) {
         return plain::layer_norm(x, gamma, beta);
@@ -39,10 +43,10 @@ pub fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, bias: Tensor<1>) -> Te
     y.reshape(shape)
 }
 
-/// (N, H, W, C) to its windows.
+/// Cuts (N, H, W, C) into windows.
 ///
 /// # Panics
-/// Where H or W is no multiple of `window`.
+/// If H or W is not a multiple of `window`.
 pub fn windows(x: Tensor<4>, window: usize) -> Tensor<3> {
     let [n, h, w, c] = x.dims();
     let (rows, columns) = (h / window, w / window);
@@ -51,7 +55,7 @@ pub fn windows(x: Tensor<4>, window: usize) -> Tensor<3> {
         .reshape([n * rows * columns, window * window, c])
 }
 
-/// Windows to (N, H, W, C).
+/// Joins windows to (N, H, W, C).
 pub fn from_windows(x: Tensor<3>, window: usize, [h, w]: [usize; 2]) -> Tensor<4> {
     let [all, _, c] = x.dims();
     let (rows, columns) = (h / window, w / window);
@@ -61,7 +65,8 @@ pub fn from_windows(x: Tensor<3>, window: usize, [h, w]: [usize; 2]) -> Tensor<4
         .reshape([n, h, w, c])
 }
 
-/// Rows and columns moved by `shift` towards the origin; what leaves comes in at the other end. `shift` lies in 0..H and 0..W.
+/// Moves rows and columns cyclically by `shift` towards the origin. `shift` must be in 0..H and
+/// 0..W.
 pub fn shifted(x: Tensor<4>, shift: usize) -> Tensor<4> {
     let turn = |x: Tensor<4>, dim: usize| {
         let len = x.dims()[dim];
@@ -87,8 +92,9 @@ pub fn shifted_back(x: Tensor<4>, shift: usize) -> Tensor<4> {
     }
 }
 
-/// For each pair of tokens of a window, (w², w²) row by row, the entry of a table of (2w − 1)² differences of places, those of
-/// rows first: (row of a − row of b + w − 1)·(2w − 1) + column of a − column of b + w − 1.
+/// Returns, for each pair of tokens of a window, (w², w²) row by row, the index into a table of (2w
+/// − 1)² position differences, ordered by row first: (row of a − row of b + w − 1)·(2w − 1) +
+/// column of a − column of b + w − 1.
 pub fn relative_positions(window: usize) -> Vec<usize> {
     let tokens = window * window;
     let place = |token: usize| (token / window, token % window);
@@ -100,10 +106,12 @@ pub fn relative_positions(window: usize) -> Vec<usize> {
     (0..tokens * tokens).map(entry).collect()
 }
 
-/// What is added to scores in each window of an image of (H, W) tokens that was [`shifted`], (H/w·W/w, w², w²) row by row:
-/// [`APART`] where a shift brought two tokens together from different ends of the image, else 0.
+/// Returns the values added to the scores in each window of an image of (H, W) tokens that was
+/// [`shifted`], (H/w·W/w, w², w²) row by row: [`APART`] if a shift brought two tokens together from
+/// different ends of the image, else 0.
 pub fn window_mask([h, w]: [usize; 2], window: usize, shift: usize) -> Vec<f32> {
-    // Three bands: whole windows, what was in the last window before the shift, what came from the other end.
+    // There are three bands: whole windows, tokens that were in the last window before the shift,
+    // and tokens from the other end.
     let band = |at: usize, len: usize| match (at < len - window, at < len - shift) {
         (true, _) => 0,
         (false, true) => 1,
@@ -131,19 +139,20 @@ pub fn window_mask([h, w]: [usize; 2], window: usize, shift: usize) -> Vec<f32> 
     mask
 }
 
-/// How an image is cut into windows.
+/// The division of an image into windows.
 #[derive(Debug, Clone)]
 pub struct Windows {
-    /// Rows and columns of a window.
+    /// The number of rows and columns of a window.
     pub window: usize,
-    /// How far the windows lie from the first pixel, around the image's ends.
+    /// The cyclic offset of the windows from the first pixel.
     pub shift: usize,
-    /// [`window_mask`], where a device needs it.
+    /// The [`window_mask`], if a device needs it.
     mask: Option<Tensor<3>>,
 }
 
 impl Windows {
-    /// Windows of an image of (H, W) tokens; H and W are multiples of `window`, `shift` is less.
+    /// Divides an image of (H, W) tokens into windows. H and W must be multiples of `window`, and
+    /// `shift` must be less.
     pub fn new([h, w]: [usize; 2], window: usize, shift: usize, device: &Device) -> Self {
         let mask = (shift > 0 && !has_kernels(device)).then(|| {
             let tokens = window * window;
@@ -176,8 +185,9 @@ impl Windows {
 
 /// Multi-head attention within windows of a map.
 ///
-/// `qkv` (N, H, W, 3·C) has queries, keys and values beside each other, each head after head. A head's scores are ⟨q, k⟩ times
-/// (C/heads)^−½, plus `bias` (heads, w², w²), plus [`window_mask`]. Gives (N, H, W, C), head after head.
+/// `qkv` (N, H, W, 3·C) contains queries, keys and values in this order, each head after head. A
+/// head's scores are ⟨q, k⟩ times (C/heads)^−½, plus `bias` (heads, w², w²), plus [`window_mask`].
+/// Returns (N, H, W, C), head after head.
 pub fn window_attention(qkv: Tensor<4>, bias: Tensor<3>, windows: &Windows) -> Tensor<4> {
     if !has_kernels(&qkv.device()) {
         let mask = windows.mask.clone();
@@ -199,11 +209,13 @@ pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     Tensor::from_dispatch(Dispatch::gelu(x.into_dispatch()))
 }
 
-/// Multi-head attention within windows that are cut out already: what [`window_attention`] is elsewhere than on the CPU.
+/// Multi-head attention within windows that are already cut out; devices other than the CPU use it
+/// for [`window_attention`].
 ///
-/// `qkv` (windows, w², 3·C) has queries, keys and values beside each other, each head after head. A head's scores are ⟨q, k⟩
-/// times (C/heads)^−½, plus `bias` (heads, w², w²), plus `mask` (windows of an image, w², w²), the same for every image. Gives
-/// (windows, w², C), head after head. Instead of w² there may be any number of tokens.
+/// `qkv` (windows, w², 3·C) contains queries, keys and values in this order, each head after head.
+/// A head's scores are ⟨q, k⟩ times (C/heads)^−½, plus `bias` (heads, w², w²), plus `mask` (windows
+/// of an image, w², w²), the same for every image. Returns (windows, w², C), head after head. The
+/// number of tokens need not be w².
 pub fn attend(
     qkv: Tensor<3>,
     heads: usize,
@@ -240,7 +252,7 @@ pub fn attend(
         .reshape([all, tokens, heads * size])
 }
 
-/// Rows of a table ((2w − 1)², heads) for each pair of tokens: (heads, w², w²).
+/// Returns the rows of a table ((2w − 1)², heads) for each pair of tokens: (heads, w², w²).
 pub fn position_bias(table: Tensor<2>, window: usize) -> Tensor<3> {
     let (tokens, [_, heads]) = (window * window, table.dims());
     let entries = relative_positions(window).into_iter().map(|at| at as i64);

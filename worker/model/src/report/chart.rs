@@ -6,32 +6,32 @@ use super::{text::Safe, ticks::Scale};
 
 /// An axis.
 pub(super) struct Axis<'a> {
-    /// What it shows, with its unit.
+    /// The quantity, with its unit.
     pub label: &'a str,
-    /// Decades are equally far apart.
+    /// Whether the axis is logarithmic.
     pub log: bool,
-    /// It begins at 0, where it is not logarithmic.
+    /// Whether a linear axis starts at 0.
     pub zero: bool,
-    /// How a tick is written.
+    /// Formats a tick's value.
     pub write: fn(f64) -> String,
 }
 
-/// Points that belong together.
+/// A series of points.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Series {
-    /// What a pointer over it says.
+    /// The text shown when a pointer is over it.
     pub label: String,
-    /// Which colour and which mark.
+    /// The number of its colour and mark.
     pub style: usize,
-    /// x, y, and how far y spreads to either side.
+    /// x, y, and the spread of y to either side.
     pub points: Vec<(f64, f64, f64)>,
-    /// Points are joined; a point that cannot be drawn breaks the line.
+    /// Whether points are joined; a point that cannot be drawn breaks the line.
     pub joined: bool,
-    /// Each point has a mark.
+    /// Whether each point has a mark.
     pub marks: bool,
 }
 
-/// Colours there are.
+/// The number of colours.
 pub(super) const COLOURS: usize = 8;
 
 const WIDTH: f64 = 420.0;
@@ -41,7 +41,7 @@ const RIGHT: f64 = 22.0;
 const TOP: f64 = 28.0;
 const BOTTOM: f64 = 44.0;
 
-/// A chart, or a sentence where there is nothing to draw.
+/// Returns a chart, or a sentence if there is nothing to draw.
 pub(super) fn chart(title: &str, x: &Axis, y: &Axis, series: &[Series]) -> String {
     let points = || series.iter().flat_map(|s| &s.points);
     let drawn = |p: &&(f64, f64, f64)| {
@@ -156,12 +156,12 @@ fn draw(
             );
         }
     }
-    // A line of one point is none; it gets a mark instead.
+    // A line of one point is invisible, so the point has a mark.
     let alone = series.points.iter().filter(|p| at(p).is_some()).count() == 1;
     if series.marks || alone {
         for point in &series.points {
             let Some((px, py)) = at(point) else { continue };
-            // What reaches below the axis ends there.
+            // A spread that extends below the axis ends at it.
             let low = at_y(point.1 - point.2).unwrap_or(HEIGHT - BOTTOM);
             let high = at_y(point.1 + point.2);
             if let (true, Some(high)) = (point.2 > 0.0, high) {
@@ -178,7 +178,7 @@ fn draw(
 
 const DASHES: [&str; 4] = ["none", "6 3", "2 2", "8 2 2 2"];
 
-/// The mark of a style: as many shapes as there are dashes.
+/// Returns the mark of a style; there are as many shapes as dash patterns.
 fn mark(style: usize, x: f64, y: f64) -> String {
     match style / COLOURS % DASHES.len() {
         0 => format!("<circle class=\"mark\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\"/>"),
@@ -188,7 +188,7 @@ fn mark(style: usize, x: f64, y: f64) -> String {
     }
 }
 
-/// Which colour and mark means what.
+/// Returns the legend of colours and marks.
 pub(super) fn legend<'a>(entries: impl Iterator<Item = (usize, &'a str)>) -> String {
     let mut out = String::from("<ul class=\"legend\">");
     for (style, label) in entries {
@@ -221,7 +221,7 @@ mod tests {
         }
     }
 
-    /// Numbers of every attribute that has some.
+    /// Returns the numbers in every attribute that contains some.
     fn numbers(svg: &str) -> Vec<String> {
         let attributes = svg.split('"').skip(1).step_by(2);
         let drawn = attributes.filter(|a| a.starts_with(|c: char| c.is_ascii_digit() || c == 'M'));

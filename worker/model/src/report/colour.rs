@@ -3,7 +3,7 @@
 /// Red, green, blue.
 pub(super) type Rgb = [u8; 3];
 
-/// Where a plane says nothing: no number.
+/// The colour of pixels without a finite value.
 pub(super) const UNKNOWN: Rgb = [255, 0, 255];
 
 /// Viridis at nine places, from dark to light.
@@ -33,10 +33,10 @@ pub(super) const INFERNO: [Rgb; 7] = [
 /// Grey.
 pub(super) const GREY: [Rgb; 2] = [[0, 0, 0], [255, 255, 255]];
 
-/// How two masks lie to each other: neither, both, only said, only true.
+/// The colours of two masks' overlap: neither, both, only predicted, only true.
 pub(super) const OVERLAP: [Rgb; 4] = [[38, 38, 42], [228, 228, 228], [230, 97, 1], [65, 105, 225]];
 
-/// The colour of a value between 0 and 1.
+/// Returns the colour of a value between 0 and 1.
 pub(super) fn colour(map: &[Rgb], value: f64) -> Rgb {
     if !value.is_finite() {
         return UNKNOWN;
@@ -51,12 +51,12 @@ pub(super) fn colour(map: &[Rgb], value: f64) -> Rgb {
     })
 }
 
-/// As CSS writes it.
+/// Returns a colour in CSS notation.
 pub(super) fn css([r, g, b]: Rgb) -> String {
     format!("#{r:02x}{g:02x}{b:02x}")
 }
 
-/// A map from its low end to its high one, as a CSS gradient to the right.
+/// Returns a colour map from its low end to its high end, as a CSS gradient to the right.
 pub(super) fn gradient(map: &[Rgb]) -> String {
     let stops: Vec<String> = map.iter().map(|c| css(*c)).collect();
     format!("linear-gradient(to right,{})", stops.join(","))

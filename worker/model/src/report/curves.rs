@@ -1,4 +1,4 @@
-//! Curves: training loss and validation figure over epochs.
+//! Curves: training loss and validation metric over epochs.
 
 use super::{
     Entry, Group, Report, Summary,
@@ -13,7 +13,7 @@ use crate::{
     train::{Line, epochs_at},
 };
 
-/// Charts of all tasks.
+/// Returns the charts of all targets.
 pub(super) fn curves(report: &Report, summary: &Summary) -> String {
     let mut out = String::new();
     for target in TARGETS {
@@ -83,7 +83,8 @@ fn over_epochs(title: &str, label: &str, series: &[Series]) -> String {
     chart(title, &x, &y, series)
 }
 
-/// Whether values are all positive and lie so far apart that small ones would vanish.
+/// Returns whether values are all positive and span so wide a range that small ones would be
+/// invisible.
 fn wide(values: impl Iterator<Item = f64>) -> bool {
     let (mut low, mut high) = (f64::INFINITY, 0f64);
     for v in values.filter(|v| v.is_finite()) {
@@ -92,7 +93,7 @@ fn wide(values: impl Iterator<Item = f64>) -> bool {
     low > 0.0 && high > 5.0 * low
 }
 
-/// A line for each model, in its experiment's colour.
+/// Returns a line for each model, in its experiment's colour.
 fn series(report: &Report, groups: &[&Group], value: &dyn Fn(&Entry, &Line) -> f64) -> Vec<Series> {
     let mut out = Vec::new();
     for (style, group) in groups.iter().enumerate() {

@@ -1,11 +1,11 @@
-//! Pictures as PNG inside of the page.
+//! Pictures as PNG inside the page.
 
 use super::colour::Rgb;
 
-/// A data URL of a picture, row by row.
+/// Returns a data URL of a picture, row by row.
 ///
 /// # Panics
-/// Where `pixels` are not as many as the size says, or there are none.
+/// If the number of `pixels` does not match the size, or is 0.
 pub(super) fn data_url(width: usize, height: usize, pixels: &[Rgb]) -> String {
     assert!(
         !pixels.is_empty() && pixels.len() == width * height,

@@ -1,10 +1,11 @@
-//! What models were made of: lineage and settings.
+//! The origin of models: lineage and settings.
 
 use std::fmt::Write;
 
 use super::{Entry, Report, text::Safe};
 
-/// Lineage as a table, what all models share apart from what differs; then each model's settings.
+/// Returns the lineage as a table, with the entries that all models share separate from those that
+/// differ, followed by each model's settings.
 pub(super) fn made(report: &Report) -> String {
     let models = &report.models;
     let mut keys: Vec<&str> = Vec::new();

@@ -1,4 +1,4 @@
-//! Example maps: what was measured, what is true, what was said, and where that differs.
+//! Example maps: the measurement, the truth, the prediction, and their difference.
 
 use std::fmt::Write;
 
@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{input::Target, metric::Metrics};
 
-/// Examples of all models that have some.
+/// Returns the examples of all models that have some.
 pub(super) fn maps(report: &Report) -> String {
     let with: Vec<&Entry> = report
         .models
@@ -29,7 +29,8 @@ pub(super) fn maps(report: &Report) -> String {
     with.into_iter().map(|m| of_model(m, &depths)).collect()
 }
 
-/// Ends of the colour scales of all depth pictures, metres: models can be compared by their colours.
+/// The ends of the colour scales of all depth pictures, metres. They are shared, so colours can be
+/// compared between models.
 struct Depths {
     low: f64,
     high: f64,
@@ -119,7 +120,7 @@ fn depths<'a>(pictures: impl Iterator<Item = &'a Picture>) -> Depths {
     if low > high {
         (low, high) = (0.0, 1.0);
     }
-    // A few pixels at edges shall not darken all others.
+    // A few pixels at edges must not darken all others.
     errors.sort_unstable_by(f64::total_cmp);
     let error = errors.get(errors.len().saturating_sub(1) * 99 / 100);
     Depths {
@@ -138,7 +139,7 @@ fn painted(plane: &Plane, paint: impl Fn(f64) -> Rgb) -> String {
     data_url(plane.width(), plane.height(), &pixels)
 }
 
-/// What was said and what is true, pixel by pixel; empty where they have not the same size.
+/// Returns a picture of prediction and truth, pixel by pixel; empty if their sizes differ.
 fn differing(picture: &Picture, paint: impl Fn(f64, f64) -> Rgb) -> String {
     let (said, truth) = (&picture.said, &picture.truth);
     if (said.width(), said.height()) != (truth.width(), truth.height()) {
@@ -193,7 +194,7 @@ fn figures(metrics: &Metrics) -> String {
     }
 }
 
-/// A colour map with its values.
+/// Returns a colour map with its values.
 fn bar(label: &str, map: &[Rgb], low: f64, high: f64) -> String {
     let places = [0.0, 0.25, 0.5, 0.75, 1.0];
     let step = (high - low).max(1e-12) / 4.0;
@@ -210,7 +211,7 @@ fn bar(label: &str, map: &[Rgb], low: f64, high: f64) -> String {
     )
 }
 
-/// What the colours of masks mean.
+/// Returns the legend of the colours of masks.
 fn key([no, yes]: [&str; 2], what: &str) -> String {
     let texts = [
         format!("{no}, as said"),

@@ -1,7 +1,8 @@
-//! What was trained, as one page that needs nothing beside it, and the same as JSON: figures beside trivial answers and
-//! published ones, curves, pictures, speed against error, error against the number of scenes, lineage.
+//! A report on trained models as one self-contained page, and as JSON: metrics compared with
+//! trivial answers and published ones, curves, pictures, speed against error, error against the
+//! number of scenes, lineage.
 //!
-//! Pure: a [`Report`] goes in, text comes out. The same report gives the same text.
+//! Reports are pure functions: the same [`Report`] gives the same text.
 
 mod chart;
 mod colour;
@@ -30,91 +31,92 @@ pub use paper::{Published, published, unlike};
 pub use picture::{Picture, Plane, pictures};
 pub use summary::{Group, Order, Scaling, Spread, Summary, json, summary};
 
-/// What a page tells of.
+/// The contents of a report.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Report {
-    /// Its title.
+    /// The title.
     pub title: String,
-    /// When it was made, as it shall stand there; empty = not said.
+    /// The date of the report, in the form to be shown; empty = none.
     pub date: String,
-    /// Models, in the order in which they shall appear.
+    /// The models, in the order in which they appear.
     pub models: Vec<Entry>,
 }
 
-/// A model, and what is known of it.
+/// A model and its properties.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Entry {
-    /// Its name.
+    /// The model's name.
     pub name: String,
-    /// How it was trained, and what it is asked.
+    /// The plan by which it was trained.
     pub plan: Plan,
-    /// What it learned from.
+    /// The training data.
     pub data: Data,
-    /// What else sets it apart, by name: where two-bounce times come from, precision. Models with the same plan but for
-    /// the seed, the same data and the same conditions are one experiment.
+    /// Other distinguishing conditions, by name: the source of two-bounce times, precision. Models
+    /// with the same plan except for the seed, the same data and the same conditions are one
+    /// experiment.
     #[serde(default)]
     pub conditions: Vec<(String, String)>,
-    /// Learned values.
+    /// The number of learned values.
     pub parameters: u64,
-    /// Multiply-adds of a pass forward over one image, where they are known.
+    /// The multiply-adds of a forward pass over one image, if known.
     #[serde(default)]
     pub multiply_adds: Option<f64>,
     /// A line for each epoch.
     #[serde(default)]
     pub history: Vec<Line>,
-    /// Figures on scenes that it has not seen, where it was asked.
+    /// The metrics on unseen scenes, if it was evaluated.
     #[serde(default)]
     pub evaluated: Option<Evaluated>,
-    /// How fast it was trained, where that is known.
+    /// The training speed, if known.
     #[serde(default)]
     pub speed: Option<Speed>,
-    /// Where it comes from, by name: data version, code, worker, digests. A name stands for itself once.
+    /// The model's origin, by name: data version, code, worker, digests. Each name occurs once.
     #[serde(default)]
     pub lineage: Vec<(String, String)>,
-    /// Examples; [`pictures`] makes them.
+    /// Example pictures, which [`pictures`] creates.
     #[serde(default)]
     pub pictures: Vec<Picture>,
 }
 
-/// What a model learned from.
+/// The training data of a model.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Data {
-    /// Name and version of the data set.
+    /// The name and version of the data set.
     pub name: String,
-    /// Scenes to learn from, where their number is known.
+    /// The number of training scenes, if known.
     #[serde(default)]
     pub scenes: Option<u64>,
-    /// Bounces in the measurement at most; 0 = all that there are, 2 = experiment A.4's.
+    /// The greatest number of bounces in the measurement; 0 = unlimited, 2 = experiment A.4's.
     #[serde(default)]
     pub max_bounces: u32,
-    /// Rows and columns of its images, and spots that light at once, where they are known.
+    /// The rows and columns of its images, if known.
     #[serde(default)]
     pub images: Option<[u32; 2]>,
-    /// See [`Self::images`].
+    /// The number of spots that are lit at once, if known.
     #[serde(default)]
     pub spots: Option<u32>,
-    /// Photon noise is in the measurement.
+    /// Whether the measurement contains photon noise.
     #[serde(default)]
     pub noise: bool,
 }
 
-/// How fast a training was.
+/// The speed of a training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Speed {
-    /// Training examples a second.
+    /// Training examples per second.
     pub samples_per_s: f64,
-    /// Seconds of the whole training, where they are known.
+    /// The seconds of the whole training, if known.
     #[serde(default)]
     pub seconds: Option<f64>,
 }
 
 impl Entry {
-    /// What a model says of itself; `side` is the number of rows and of columns of its images. The rest is for the caller
-    /// to fill in.
+    /// Creates an entry from a model; `side` is the number of rows and of columns of its images.
+    /// The caller sets the other fields.
     pub fn new(name: impl Into<String>, model: &Model, side: usize) -> Self {
         let plan = model.plan().clone();
         Self {

@@ -1,10 +1,11 @@
-//! The page.
+//! The report's page.
 
 use picofarm_figures::STYLE;
 
 use super::{Report, curves, made, maps, summary::summary, table, text::Safe, trade};
 
-/// The report as one HTML page that needs nothing beside it: no script, no other file, no network.
+/// Returns the report as one self-contained HTML page, without scripts, other files or network
+/// access.
 pub fn html(report: &Report) -> String {
     let summary = summary(report);
     let sections = [

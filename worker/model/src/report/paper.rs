@@ -1,4 +1,4 @@
-//! What Shoot-Bounce-3D published, experiment by experiment.
+//! The metrics that Shoot-Bounce-3D published, by experiment.
 
 use serde::Serialize;
 
@@ -8,38 +8,39 @@ use crate::{
     net::Architecture,
 };
 
-/// A published figure; what was not published is none.
+/// Published metrics of an experiment; `None` if a metric was not published.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Published {
-    /// Which experiment it is of.
+    /// The name of the experiment.
     pub experiment: &'static str,
-    /// Mean absolute error: of depth in metres, of masks as a share.
+    /// The mean absolute error: of depth in metres, of masks as a share.
     pub mae: Option<f64>,
-    /// Intersection over union, of masks.
+    /// The intersection over union of masks.
     pub iou: Option<f64>,
 }
 
 impl Published {
-    /// Less is better: MAE of depth, or one less IoU.
+    /// Returns a loss (less is better): MAE of depth, or 1 − IoU.
     pub(super) fn loss(&self) -> Option<f64> {
         self.iou.map_or(self.mae, |iou| Some(1.0 - iou))
     }
 }
 
-/// What has to be said beside them.
+/// The note shown with published metrics.
 pub(super) const NOTE: &str = "Published figures are of Shoot-Bounce-3D. They stand only beside experiments of its size: 25 spots, \
     rooms of 256 × 256 pixels and 637 bins, 87,688 scenes to learn from, networks of width 128 and 6 levels. Others are \
     compared in order alone. Data sets say how many spots there are and not how they were aimed: spots that were aimed at random pass \
     for the paper's grid.";
 
-/// The paper's size.
+/// The settings of the paper.
 const SPOTS: u32 = 25;
 const IMAGES: [u32; 2] = [256, 256];
 const BINS: usize = 637;
 const SCENES: u64 = 87_688;
 const NET: [usize; 2] = [128, 6];
 
-/// In what a model's settings differ from those that figures were published for; empty = in nothing that is known here.
+/// Returns the settings in which a model differs from the published experiments; empty if no
+/// difference is known.
 pub fn unlike(entry: &Entry) -> Vec<String> {
     let (data, question, net) = (&entry.data, &entry.plan.question, &entry.plan.net);
     let mut differs = Vec::new();
@@ -72,8 +73,8 @@ pub fn unlike(entry: &Entry) -> Vec<String> {
     differs
 }
 
-/// The published figure of the experiment that a model repeats, where it is one of the paper's; [`unlike`] says whether its
-/// size is.
+/// Returns the published metrics of the experiment that a model repeats, if it is one of the
+/// paper's. [`unlike`] compares its size with the paper's.
 pub fn published(entry: &Entry) -> Option<Published> {
     let question = &entry.plan.question;
     if entry.plan.net.architecture != Architecture::Unet2d || entry.data.noise {

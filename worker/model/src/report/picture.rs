@@ -1,4 +1,4 @@
-//! Examples: what was measured, what is true, what a network said.
+//! Example pictures: the measurement, the truth, and a network's prediction.
 
 use base64::{Engine, engine::general_purpose::STANDARD};
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
@@ -11,7 +11,7 @@ use crate::{
     scene::Scenes,
 };
 
-/// Values of an image, row by row from the top left.
+/// The values of an image, row by row from the top left.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written")]
 pub struct Plane {
@@ -34,23 +34,23 @@ struct Written {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Picture {
-    /// Which scene, and which spot where the network is asked spot by spot.
+    /// The scene, and the spot if the network is queried spot by spot.
     pub label: String,
-    /// What is seen: the histogram's sum over time, 0..1.
+    /// The visible scene: the histogram's sum over time, 0..1.
     pub intensity: Plane,
-    /// What is true: z-depth in metres, or a mask of 0 and 1.
+    /// The truth: z-depth in metres, or a mask of 0 and 1.
     pub truth: Plane,
-    /// What the network said: z-depth in metres, or the probability of 1.
+    /// The prediction: z-depth in metres, or the probability of 1.
     pub said: Plane,
-    /// Its figures.
+    /// The metrics of this example.
     pub metrics: Metrics,
 }
 
 impl Plane {
-    /// Of a size.
+    /// Creates an image of a given size.
     ///
     /// # Errors
-    /// [`ModelError::Invalid`] where the values are not width · height, or there are none.
+    /// [`ModelError::Invalid`] if the number of values is not width · height, or is 0.
     pub fn new(width: usize, height: usize, values: Vec<f32>) -> Result<Self, ModelError> {
         if values.is_empty() || width.checked_mul(height) != Some(values.len()) {
             let what = format!(
@@ -66,17 +66,17 @@ impl Plane {
         })
     }
 
-    /// Columns.
+    /// Returns the number of columns.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Rows.
+    /// Returns the number of rows.
     pub fn height(&self) -> usize {
         self.height
     }
 
-    /// The values.
+    /// Returns the values.
     pub fn values(&self) -> &[f32] {
         &self.values
     }
@@ -90,7 +90,7 @@ impl TryFrom<Written> for Plane {
     }
 }
 
-/// As the base64 of little-endian bytes: short, exact, and it has a word for what is no number.
+/// Writes the values as base64 of little-endian bytes: short, exact, and able to represent NaN.
 fn write<S: Serializer>(values: &[f32], to: S) -> Result<S::Ok, S::Error> {
     let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
     to.serialize_str(&STANDARD.encode(bytes))
@@ -106,10 +106,12 @@ fn read<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<f32>, D::Error> {
     Ok(values.iter().map(|b| f32::from_le_bytes(*b)).collect())
 }
 
-/// Examples of a model: of the scenes with these indices, and of each the first `spots` spots where shadows are asked.
+/// Returns example pictures of a model for the scenes with these indices. For a shadow network,
+/// there is one for each of the first `spots` spots.
 ///
 /// # Errors
-/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or are not there.
+/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not exist or do not fit the
+/// model.
 pub fn pictures(
     model: &Model,
     scenes: &dyn Scenes,

@@ -1,5 +1,5 @@
-//! What models say together: seeds of one experiment as mean and spread, the order of experiments, error against the
-//! number of scenes; and all of it as JSON.
+//! A summary of models: the mean and spread over the seeds of an experiment, the order of
+//! experiments, and the error against the number of scenes; and the whole report as JSON.
 
 use std::collections::BTreeMap;
 
@@ -11,95 +11,98 @@ use super::{
 };
 use crate::{Evaluated, input::Target, metric::Metrics, train::Line, train::Plan};
 
-/// Figures by name: `mae_m` and `rmse_m` of depths in metres; `iou`, `mae` and `f1` of masks.
+/// Metrics by name: `mae_m` and `rmse_m` of depths in metres; `iou`, `mae` and `f1` of masks.
 pub type Figures = BTreeMap<&'static str, Spread>;
 
-/// A figure of several runs.
+/// A metric over several runs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Spread {
-    /// Mean.
+    /// The mean.
     pub mean: f64,
-    /// Standard deviation over n - 1; none of a single run.
+    /// The standard deviation over n - 1; `None` for a single run.
     pub deviation: Option<f64>,
-    /// Runs.
+    /// The number of runs.
     pub runs: usize,
 }
 
-/// An experiment: models that differ in nothing but the seed.
+/// An experiment: models that differ only in the seed.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Group {
-    /// What its models' names have in common.
+    /// The common part of its models' names.
     pub label: String,
-    /// What is learned.
+    /// The learned quantity.
     pub target: Target,
-    /// Its models, as indices into the report's.
+    /// The indices of its models in the report.
     pub models: Vec<usize>,
-    /// Their seeds, each once.
+    /// The seeds, each once.
     pub seeds: Vec<u64>,
-    /// Figures of those that were evaluated; empty where none was.
+    /// The metrics of the evaluated models; empty if none was evaluated.
     pub figures: Figures,
-    /// Figures of trivial answers on the same scenes, by their name.
+    /// The metrics of trivial answers on the same scenes, by name.
     pub baselines: BTreeMap<String, Figures>,
-    /// The trivial answer that errs least, and this experiment's error over its: depth MAE, or 1 - IoU.
+    /// The trivial answer with the least error, and the ratio of this experiment's error to it:
+    /// depth MAE, or 1 - IoU.
     pub beside_best_baseline: Option<(String, f64)>,
-    /// Error of single scenes: what 10, 50 and 90 % of them stay below.
+    /// The 10, 50 and 90 % quantiles of the error of single scenes.
     pub scene_errors: Option<[f64; 3]>,
-    /// What was published of the same experiment, where its size is the paper's.
+    /// The published metrics of the same experiment, if its size is the paper's.
     pub published: Option<Published>,
-    /// What was published of it at the paper's size, to compare orders with.
+    /// The published metrics of the experiment at the paper's size, for comparing orders.
     pub repeats: Option<Published>,
-    /// In what its size is not the paper's.
+    /// The settings of size in which it differs from the paper.
     pub unlike: Vec<String>,
-    /// Training examples a second.
+    /// Training examples per second.
     pub samples_per_s: Option<Spread>,
-    /// Error of those that were evaluated: depth MAE in metres, or 1 - IoU.
+    /// The error of the evaluated models: depth MAE in metres, or 1 - IoU.
     pub error: Option<Spread>,
 }
 
-/// Whether experiments stand in the order that was published.
+/// A comparison of the order of experiments with the published one.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Order {
-    /// Of this target.
+    /// The target of the experiments.
     pub target: Target,
-    /// Pairs of experiments that have a figure here and a published one.
+    /// The number of pairs of experiments that have a metric here and a published one.
     pub pairs: usize,
-    /// Those in the published order.
+    /// The number of pairs in the published order.
     pub kept: usize,
-    /// Those in the other: what is better here, and than what. Equal figures are in neither.
+    /// The pairs in the opposite order: the better experiment here, then the worse. Pairs with
+    /// equal metrics are not counted in either order.
     pub turned: Vec<[String; 2]>,
-    /// Pairs whose figures lie closer together than their seeds' spread (√(s₁² + s₂²)).
+    /// The number of pairs with a difference of metrics below the spread of their seeds, √(s₁² +
+    /// s₂²).
     pub close: usize,
 }
 
-/// Models that differ in nothing but the number of scenes to learn from (and the seed).
+/// Models that differ only in the number of training scenes (and in the seed).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scaling {
-    /// What their names have in common.
+    /// The common part of their names.
     pub label: String,
-    /// What is learned.
+    /// The learned quantity.
     pub target: Target,
-    /// Number of scenes and error, ascending.
+    /// The number of scenes and the error, ascending.
     pub points: Vec<(u64, Spread)>,
 }
 
-/// All of that.
+/// The summary of a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
-    /// Experiments, by target, then in the report's order.
+    /// The experiments, by target, then in the report's order.
     pub groups: Vec<Group>,
-    /// Order of experiments, where there are two to compare.
+    /// The comparisons of orders, if there are two experiments to compare.
     pub orders: Vec<Order>,
-    /// Error against number of scenes.
+    /// The error against the number of scenes.
     pub scalings: Vec<Scaling>,
 }
 
 pub(super) const TARGETS: [Target; 3] = [Target::Tof, Target::Shadow, Target::Specular];
 
 impl Spread {
-    /// Of values; none of no values.
+    /// Returns the spread of values, or `None` if there are none.
     pub fn of(values: &[f64]) -> Option<Self> {
         let (first, n) = (*values.first()?, values.len() as f64);
-        // From the first on: equal values have no deviation, not that of rounding.
+        // Relative to the first value: equal values then have no deviation from rounding.
         let mean = first + values.iter().map(|v| v - first).sum::<f64>() / n;
         let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
         Some(Self {
@@ -110,7 +113,7 @@ impl Spread {
     }
 }
 
-/// What the models of a report say together.
+/// Summarises the models of a report.
 pub fn summary(report: &Report) -> Summary {
     let mut groups = Vec::new();
     for target in TARGETS {
@@ -130,7 +133,7 @@ pub fn summary(report: &Report) -> Summary {
     }
 }
 
-/// Experiments whose names say the same are called after their first model.
+/// Renames experiments that share a label after their first model.
 fn tell_apart(report: &Report, groups: &mut [Group]) {
     let labels: Vec<String> = groups.iter().map(|g| g.label.clone()).collect();
     for group in groups {
@@ -140,7 +143,7 @@ fn tell_apart(report: &Report, groups: &mut [Group]) {
     }
 }
 
-/// Models of a target that have the same key, in order.
+/// Groups the models of a target that have the same key, in order.
 fn partition<K: PartialEq>(
     models: &[Entry],
     target: Target,
@@ -229,7 +232,7 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
     }
 }
 
-/// Each figure of several runs.
+/// Returns each metric over several runs.
 fn figures(runs: impl Iterator<Item = Vec<(&'static str, f64)>>) -> Figures {
     let mut each: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
     for (name, value) in runs.flatten() {
@@ -241,7 +244,7 @@ fn figures(runs: impl Iterator<Item = Vec<(&'static str, f64)>>) -> Figures {
     spreads.collect()
 }
 
-/// The words that names begin with together, without what only counts them.
+/// Returns the common first words of names, without a trailing "seed".
 fn common(names: &[&str]) -> String {
     let Some((first, others)) = names.split_first() else {
         return String::new();
@@ -372,8 +375,8 @@ struct Example<'a> {
     metrics: &'a Metrics,
 }
 
-/// The report as JSON: everything about the models, the pictures' figures without their pixels, and
-/// [`summary`]. A figure that is no number is null.
+/// Returns the report as JSON: everything about the models, the pictures' metrics without their
+/// pixels, and [`summary`]. A non-finite metric is null.
 pub fn json(report: &Report) -> String {
     let document = Document {
         format: "picofarm-model-report-1",

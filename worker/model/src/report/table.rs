@@ -1,4 +1,4 @@
-//! The table of figures: each experiment beside trivial answers and what was published.
+//! The table of metrics: each experiment compared with trivial answers and published results.
 
 use std::fmt::Write;
 
@@ -14,7 +14,7 @@ use crate::{
     net::{Architecture, StemForm, TimeProjection},
 };
 
-/// What a target is called.
+/// Returns the name of a target.
 pub(super) fn target_name(target: Target) -> &'static str {
     match target {
         Target::Tof => "Depth",
@@ -23,7 +23,7 @@ pub(super) fn target_name(target: Target) -> &'static str {
     }
 }
 
-/// What errors of a target are, with their unit.
+/// Returns the name of a target's error, with its unit.
 pub(super) fn error_name(target: Target) -> &'static str {
     match target {
         Target::Tof => "depth MAE (m)",
@@ -36,7 +36,8 @@ const BY_32: &str =
 const BOUNDARY: &str =
     "as the released code has it: how many edges are where they are in truth, at any scale";
 
-/// Columns of a target's figures, the one that counts first: name, heading, and what it is where that does not say.
+/// Returns the columns of a target's metrics, the main one first: name, heading, and an explanation
+/// if the heading is not clear.
 fn columns(target: Target) -> &'static [(&'static str, &'static str, &'static str)] {
     match target {
         Target::Tof => &[
@@ -55,12 +56,12 @@ fn columns(target: Target) -> &'static [(&'static str, &'static str, &'static st
     }
 }
 
-/// The figure that counts.
+/// Returns the name of the main metric.
 pub(super) fn main_figure(target: Target) -> &'static str {
     columns(target)[0].0
 }
 
-/// Mean ± spread of a figure, by its name.
+/// Formats the mean ± spread of a metric, by its name.
 pub(super) fn spread(name: &str, figure: Spread) -> String {
     let in_metres = name.ends_with("_m");
     let write = if in_metres { metres } else { share };
@@ -72,7 +73,7 @@ pub(super) fn spread(name: &str, figure: Spread) -> String {
     }
 }
 
-/// All tables.
+/// Returns all tables.
 pub(super) fn tables(report: &Report, summary: &Summary) -> String {
     let mut out = String::new();
     let missing = report
@@ -115,7 +116,7 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
     out
 }
 
-/// What an experiment is worth beside the best trivial answer, in a line.
+/// Returns a line that compares an experiment with the best trivial answer.
 pub(super) fn verdict(group: &Group) -> Option<String> {
     let (name, ratio) = group.beside_best_baseline.as_ref()?;
     let (class, better) = match *ratio < 1.0 {
@@ -129,7 +130,7 @@ pub(super) fn verdict(group: &Group) -> Option<String> {
     ))
 }
 
-/// The table of one target.
+/// Returns the table of one target.
 pub(super) fn table(report: &Report, target: Target, groups: &[&Group]) -> String {
     let mut trivial: Vec<&String> = groups.iter().flat_map(|g| g.baselines.keys()).collect();
     trivial.sort_unstable();
@@ -209,7 +210,7 @@ fn row(
     }
     for name in trivial {
         let figure = cell(group.baselines.get(*name), main);
-        // The same scenes give trivial answers the same figures.
+        // On the same scenes, trivial answers always have the same metrics.
         let figure = figure
             .trim_end_matches(" ± 0")
             .trim_end_matches(" ± 0.0000");
@@ -267,7 +268,7 @@ fn seeds(group: &Group) -> String {
     format!("{count} <small>({}{again})</small>", list.join(", "))
 }
 
-/// What an experiment is, in a line.
+/// Describes an experiment in a line.
 pub(super) fn sees(report: &Report, group: &Group) -> String {
     let entry = &report.models[group.models[0]];
     let (question, net) = (&entry.plan.question, &entry.plan.net);
@@ -284,7 +285,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
         };
         words.extend([variant.to_owned(), format!("{} spots", question.spots)]);
         if question.variant == ShadowVariant::All {
-            // The others learn from a mask a visit.
+            // The other variants learn from one mask a visit.
             words.push(format!("{} masks a visit", question.spots));
         }
     }

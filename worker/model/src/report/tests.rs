@@ -196,7 +196,7 @@ fn the_json_says_everything() {
     }];
     let mut said: Value =
         serde_json::from_str(&json(&report(vec![one, depth("tof-2", 2, 0.375)]))).unwrap();
-    // Whether a map keeps its order is a feature that other crates of the workspace decide.
+    // Whether a map preserves its order is a feature that other crates of the workspace decide.
     said.sort_all_objects();
     insta::assert_json_snapshot!(said);
 }

@@ -1,4 +1,4 @@
-//! Axes: where values lie on them, and where their ticks are.
+//! Axes: the positions of values on them, and their ticks.
 
 /// An axis over values.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -9,7 +9,8 @@ pub(super) struct Scale {
 }
 
 impl Scale {
-    /// Over all values that can be drawn; none where there are none. `log` draws positive values only.
+    /// Creates an axis over all values that can be drawn, or `None` if there are none. If `log` is
+    /// set, only positive values can be drawn.
     pub(super) fn over(values: impl Iterator<Item = f64>, log: bool) -> Option<Self> {
         let fits = |v: &f64| v.is_finite() && v.abs() < 1e300 && (!log || *v > 1e-300);
         let mut range: Option<(f64, f64)> = None;
@@ -22,7 +23,7 @@ impl Scale {
             true => (libm::log10(low), libm::log10(high)),
             false => (low, high),
         };
-        // A range of nothing, or of rounding errors, is widened to one that can be read.
+        // An empty range, or one within rounding errors, is widened to a readable one.
         let least = if log {
             0.3
         } else {
@@ -40,7 +41,7 @@ impl Scale {
         })
     }
 
-    /// The same axis from 0 on, where it is not logarithmic and nothing lies below.
+    /// Extends a linear axis to 0 if no value is below 0.
     pub(super) fn with_zero(mut self) -> Self {
         let rim = (self.high - self.low) * 0.06 / 1.12;
         if !self.log && self.low + 1.001 * rim >= 0.0 {
@@ -49,7 +50,8 @@ impl Scale {
         self
     }
 
-    /// 0 at the low end, 1 at the high one; none where it cannot be drawn.
+    /// Returns a value's position, 0 at the low end and 1 at the high end, or `None` if it cannot
+    /// be drawn.
     pub(super) fn at(&self, value: f64) -> Option<f64> {
         let value = match self.log {
             true if value > 0.0 => libm::log10(value),
@@ -60,7 +62,7 @@ impl Scale {
         (-1e-6..=1.0 + 1e-6).contains(&at).then_some(at)
     }
 
-    /// Values that get a tick, ascending: about `count` of them.
+    /// Returns about `count` values for ticks, ascending.
     pub(super) fn ticks(&self, count: usize) -> Vec<f64> {
         if !self.log {
             return linear(self.low, self.high, count);
@@ -79,7 +81,7 @@ impl Scale {
     }
 }
 
-/// 1, 2 or 5 times a power of ten apart.
+/// Returns ticks at distances of 1, 2 or 5 times a power of ten.
 fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
     let rough = (high - low) / count.max(1) as f64;
     if !(rough > 0.0 && rough.is_finite()) {

@@ -1,4 +1,4 @@
-//! What error costs: speed, size and multiply-adds against it, and the number of scenes.
+//! Trade-offs: speed, size and multiply-adds against error, and error against the number of scenes.
 
 use std::fmt::Write;
 
@@ -11,10 +11,10 @@ use super::{
     text::Safe,
 };
 
-/// What a panel shows of an experiment.
+/// The horizontal value of an experiment in a panel.
 type Across<'a> = &'a dyn Fn(&Group) -> Option<f64>;
 
-/// Speed against error.
+/// Returns the charts of speed against error.
 pub(super) fn speed(report: &Report, summary: &Summary) -> String {
     let mut out = String::new();
     for target in TARGETS {
@@ -81,7 +81,7 @@ fn both_log(title: &str, x: &str, write: fn(f64) -> String, y: &str, series: &[S
     chart(title, &axis(x, write), &axis(y, short), series)
 }
 
-/// What each experiment costs, as a table.
+/// Returns a table of each experiment's cost.
 fn costs(report: &Report, summary: &Summary) -> String {
     if summary.groups.is_empty() {
         return String::new();
@@ -136,7 +136,7 @@ fn unit(group: &Group) -> &'static str {
     }
 }
 
-/// Error against the number of scenes.
+/// Returns the charts of error against the number of scenes.
 pub(super) fn scale(summary: &Summary) -> String {
     if summary.scalings.is_empty() {
         return "<p class=\"none\">No two evaluated experiments differ only in the number of scenes to learn from.</p>"

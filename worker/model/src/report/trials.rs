@@ -1,5 +1,5 @@
-//! A sweep as a page: its trials from the best to the worst, how they fared over epochs, and how each parameter's values
-//! went with the error.
+//! A sweep as a page: its trials from the best to the worst, their progress over epochs, and the
+//! error by each parameter's values.
 
 use std::fmt::Write;
 
@@ -17,13 +17,13 @@ use crate::train::{Line, epochs_at};
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sweep {
-    /// Its name: that of its models.
+    /// The sweep's name, which is also the prefix of its models' names.
     pub name: String,
-    /// When the page was made, as it shall stand there.
+    /// The date of the page, in the form to be shown.
     pub date: String,
-    /// What is less for a better trial, with its unit.
+    /// The name of the error, with its unit; a smaller error is better.
     pub error: String,
-    /// Its trials, by number.
+    /// The trials, by number.
     pub trials: Vec<Tried>,
 }
 
@@ -31,22 +31,22 @@ pub struct Sweep {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tried {
-    /// Its number.
+    /// The trial's number.
     pub index: u64,
-    /// Its model's name.
+    /// The model's name.
     pub model: String,
-    /// Its values, by parameter.
+    /// The values, by parameter.
     pub values: Vec<(String, Value)>,
-    /// How it ended.
+    /// The trial's outcome.
     pub end: End,
-    /// Why, where that needs words.
+    /// The reason for the outcome, if it requires one.
     #[serde(default)]
     pub why: String,
-    /// Epochs done.
+    /// The number of finished epochs.
     pub epochs: u64,
-    /// The error at its end, or at the last rung that it reached.
+    /// The error at the end, or at the last rung that the trial reached.
     pub loss: Option<f64>,
-    /// A line for each epoch, once it has ended.
+    /// A line for each epoch, once the trial has ended.
     #[serde(default)]
     pub history: Vec<Line>,
 }
@@ -61,22 +61,22 @@ pub enum Value {
     Text(String),
 }
 
-/// How a trial ended.
+/// The outcome of a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum End {
-    /// It came to its end.
+    /// The trial finished.
     Finished,
-    /// It fell behind at a rung.
+    /// The trial was stopped at a rung because it was behind.
     Pruned,
-    /// Its numbers broke.
+    /// The trial produced NaN or infinite values.
     Diverged,
-    /// It has not ended; nobody may be running it.
+    /// The trial has not ended; it may not be running.
     Open,
 }
 
 impl End {
-    /// In a word.
+    /// Returns a word for the outcome.
     pub fn name(self) -> &'static str {
         match self {
             Self::Finished => "finished",
@@ -99,7 +99,7 @@ impl End {
 const ENDS: [End; 4] = [End::Finished, End::Pruned, End::Diverged, End::Open];
 
 impl Sweep {
-    /// The best of the trials that came to their end.
+    /// Returns the best of the finished trials.
     pub fn best(&self) -> Option<&Tried> {
         let finished = self.trials.iter().filter(|t| t.end == End::Finished);
         finished.filter(|t| t.loss.is_some()).min_by(|a, b| {
@@ -109,12 +109,12 @@ impl Sweep {
         })
     }
 
-    /// How many ended in this way.
+    /// Returns the number of trials with this outcome.
     pub fn count(&self, end: End) -> usize {
         self.trials.iter().filter(|t| t.end == end).count()
     }
 
-    /// The names of the parameters.
+    /// Returns the names of the parameters.
     pub fn parameters(&self) -> Vec<&str> {
         let mut names: Vec<&str> = Vec::new();
         for (name, _) in self.trials.iter().flat_map(|t| &t.values) {
@@ -125,7 +125,7 @@ impl Sweep {
         names
     }
 
-    /// In a sentence: how many trials ended how, and which is the best.
+    /// Returns a sentence with the number of trials by outcome, and the best trial.
     pub fn summary(&self) -> String {
         let ends = ENDS.map(|end| (self.count(end), end.name()));
         let ends = ends.iter().filter(|(n, _)| *n > 0);
@@ -152,7 +152,7 @@ impl Tried {
 }
 
 impl Value {
-    /// For people.
+    /// Returns the value in readable form.
     pub fn text(&self) -> String {
         match self {
             Self::Number(x) => format!("{x}"),
@@ -161,7 +161,7 @@ impl Value {
     }
 }
 
-/// The page: it needs nothing beside it.
+/// Returns the page, which is self-contained.
 pub fn html(sweep: &Sweep) -> String {
     let (title, date) = (Safe(&sweep.name), Safe(&sweep.date));
     let summary = sweep.summary();
@@ -185,7 +185,7 @@ pub fn html(sweep: &Sweep) -> String {
 fn table(sweep: &Sweep) -> String {
     let parameters = sweep.parameters();
     let mut order: Vec<&Tried> = sweep.trials.iter().collect();
-    // Those that went further come first, and of them the better.
+    // Trials that went further come first, and among them the better ones.
     order.sort_by(|a, b| {
         let key = |t: &Tried| (t.loss.is_none(), std::cmp::Reverse(t.epochs));
         let loss = |t: &Tried| t.loss.unwrap_or(f64::INFINITY);
@@ -304,7 +304,7 @@ fn axis(label: &str, log: bool) -> Axis<'_> {
     }
 }
 
-/// Whether values are positive and lie over more than a decade.
+/// Returns whether values are positive and span more than a decade.
 fn far_apart(values: impl Iterator<Item = f64>) -> bool {
     let (mut low, mut high) = (f64::INFINITY, 0f64);
     for v in values {
@@ -313,7 +313,7 @@ fn far_apart(values: impl Iterator<Item = f64>) -> bool {
     low > 0.0 && high > 10.0 * low
 }
 
-/// What [`crate::metric::Metrics::loss`] is called for what a network predicts.
+/// Returns the name of [`crate::metric::Metrics::loss`] for a kind of prediction.
 pub fn error_name(kind: &str) -> &'static str {
     match kind {
         "tof" => "MAE (m)",

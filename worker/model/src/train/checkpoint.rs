@@ -1,5 +1,6 @@
-//! A training, stopped anywhere between two steps, as bytes: weights, moments, statistics, position, curves. What goes on
-//! from them is to the bit what would have gone on without stopping.
+//! Checkpoints: a training stopped between two steps, as bytes with its weights, moments,
+//! statistics, position and curves. A training that resumes from a checkpoint gives the same bits
+//! as one that never stopped.
 
 use std::collections::BTreeMap;
 
@@ -19,30 +20,31 @@ use crate::{
 
 const FORMAT: &str = "picofarm-checkpoint-4";
 
-/// Before the names of kept values, and of averages.
+/// The prefixes of the names of kept values and of averages.
 const KEPT: &str = "kept/";
 const AVERAGE: &str = "average/";
 
-/// What a checkpoint holds beside tensors.
+/// The contents of a checkpoint other than tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Header {
     format: String,
     steps: u64,
     pub(super) position: Position,
-    /// The plan's text: a checkpoint goes on only with the plan it was made with.
+    /// The plan's text. A checkpoint can only be resumed with the plan that made it.
     pub(super) plan: String,
 }
 
-/// What a training is between two steps. It shares its numbers with the training, which goes on meanwhile: whatever changes
-/// them in place makes a copy first.
+/// The state of a training between two steps. It shares its tensors with the training, which
+/// continues meanwhile: changing a shared tensor in place makes a copy first.
 pub struct Snapshot {
     header: String,
-    /// In the order of their names.
+    /// The tensors, in the order of their names.
     tensors: BTreeMap<String, (Vec<usize>, Tensor<1>)>,
 }
 
 impl Snapshot {
-    /// `kept` are the values at the best validation, where those count at the end.
+    /// Takes a snapshot. `kept` contains the values at the best validation, if the training returns
+    /// those.
     pub(super) fn of(
         learner: &Learner,
         position: &Position,
@@ -83,8 +85,9 @@ impl Snapshot {
         Self { header, tensors }
     }
 
-    /// The checkpoint as safetensors of at most `most` bytes each, but for a tensor that is larger, and their headers. The first
-    /// says where the training stands.
+    /// Returns the checkpoint as safetensors of at most `most` bytes each, excluding their headers.
+    /// A tensor larger than `most` has a piece of its own. The first piece contains the training's
+    /// position.
     pub fn pieces(self, most: usize) -> impl Iterator<Item = Vec<u8>> + Send {
         let mut tensors = self.tensors.into_iter().peekable();
         let mut header = Some(self.header);
@@ -108,7 +111,7 @@ impl Snapshot {
     }
 }
 
-/// All tensors of a checkpoint's pieces, and its header.
+/// Returns all tensors of a checkpoint's pieces, and its header.
 fn gathered(pieces: &[impl AsRef<[u8]>]) -> Result<(Named, Header), ModelError> {
     let none = || ModelError::weights("these are no checkpoint of a training, only weights");
     let (mut named, mut header) = (Named::new(), None);
@@ -122,7 +125,7 @@ fn gathered(pieces: &[impl AsRef<[u8]>]) -> Result<(Named, Header), ModelError> 
     Ok((named, header))
 }
 
-/// Puts a learner where a checkpoint was made, and gives the values that were kept.
+/// Restores a learner to the state of a checkpoint, and returns the kept values.
 pub(super) fn read(
     pieces: &[impl AsRef<[u8]>],
     learner: &mut Learner,
@@ -172,10 +175,11 @@ pub(super) fn read(
     Ok((header, kept))
 }
 
-/// What a training would leave if it ended where a checkpoint was made: the weights, as safetensors, and the line of each epoch.
+/// Returns the result of a training that ends at a checkpoint: the weights as safetensors, and the
+/// line of each epoch.
 ///
 /// # Errors
-/// [`ModelError::Weights`] where it is no checkpoint.
+/// [`ModelError::Weights`] if the bytes are not a checkpoint.
 pub fn left_by(pieces: &[impl AsRef<[u8]>]) -> Result<(Vec<u8>, Vec<Line>), ModelError> {
     let (named, header) = gathered(pieces)?;
     let there = |part: &&str| named.keys().any(|name| name.starts_with(part));

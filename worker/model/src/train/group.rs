@@ -1,20 +1,23 @@
 //! Processes that train one network together.
 //!
-//! A step has [`super::Plan::accumulate`] batches. Each process takes a part of them, their gradients are summed over all
-//! processes, and every process takes the same step of the optimiser, so that all stand at the same numbers. Batch norm sees a
-//! batch of one process at a time, and running statistics follow the first batch of a step, as in PyTorch's
-//! `DistributedDataParallel` with the released code's settings.
+//! A step has [`super::Plan::accumulate`] batches. Each process computes a part of them. The
+//! gradients are summed over all processes, and every process takes the same optimiser step, so all
+//! have the same parameters. Batch norm uses the statistics of one batch of one process at a time.
+//! Running statistics follow the first batch of a step, as in PyTorch's `DistributedDataParallel`
+//! with the released code's settings.
 //!
-//! Sums have one order, whoever has which batches: blocks of 2^k batches that begin at a multiple of 2^k are summed in pairs
-//! ([`Blocks`]). So the bits do not depend on the number of processes, processes may come and go between two steps, and one
-//! process alone comes to what many come to.
+//! The order of summation does not depend on the assignment of batches to processes: blocks of 2^k
+//! batches that begin at a multiple of 2^k are summed in pairs ([`Blocks`]). The bits of the result
+//! are therefore independent of the number of processes, and processes may join and leave between
+//! two steps. One process alone computes the same result as many.
 
 use std::ops::Range;
 
 use super::position::Line;
 use crate::ModelError;
 
-/// Where a training stands: steps done, lines of its history written. Two processes that stand at the same place have the same numbers.
+/// The progress of a training: finished steps and written lines of its history. Two processes with
+/// the same standing have the same parameters.
 #[derive(
     Debug,
     Clone,
@@ -28,108 +31,117 @@ use crate::ModelError;
     serde::Deserialize,
 )]
 pub struct Standing {
-    /// Steps of the optimiser.
+    /// The number of finished optimiser steps.
     pub step: u64,
-    /// Lines of the history: a step that ends an epoch, or that a validation follows, is done before its line is.
+    /// The number of lines of the history. If a step ends an epoch or is followed by a validation,
+    /// the step is finished before its line is written.
     pub lines: u64,
 }
 
-/// A training as a group sees it.
+/// The interface of a training that a [`Group`] uses.
 pub trait Member {
-    /// Where it stands.
+    /// Returns the training's progress.
     fn standing(&self) -> Standing;
 
-    /// Batches of a step.
+    /// Returns the number of batches in a step.
     fn batches(&self) -> usize;
 
-    /// Everything that it is, as bytes.
+    /// Returns the whole state of the training as bytes.
     fn state(&self) -> Vec<u8>;
 
-    /// Becomes what another one was.
+    /// Takes over the state of another process.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] for bytes that are of no such training.
+    /// [`ModelError::Weights`] if the bytes are not a state of this training.
     fn become_state(&mut self, state: &[u8]) -> Result<(), ModelError>;
 }
 
-/// What a process does next.
+/// The next action of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Next {
-    /// It trains: these are its batches of each step, until the group changes. `leads` where it validates and keeps what comes out.
+    /// The process trains a share of each step's batches until the group changes. If `leads` is
+    /// set, it also validates and stores the result.
     Train {
-        /// Which of a step's batches.
+        /// The range of a step's batches.
         share: Range<usize>,
-        /// It leads.
+        /// Whether the process leads.
         leads: bool,
     },
-    /// The training is over, and the leading process has kept what came out.
+    /// The training is over, and the leading process has stored the result.
     Over,
-    /// This process was asked to stop.
+    /// This process was told to stop.
     Stop,
 }
 
-/// What a process has of a segment ([`crate::net::Net::segments`]) of a step: the sums of blocks of batches; with the first segment,
-/// which comes last, running statistics where it has the step's first batch.
+/// A process's part of a step's gradients for one segment of the network
+/// ([`crate::net::Net::segments`]): sums of blocks of batches. The first segment comes last; its
+/// part also contains the running statistics if the process has the step's first batch.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Part {
-    /// Values of each block's sum.
+    /// The number of values in each block's sum.
     pub len: usize,
-    /// Gradients of the segment's learned parameters by declaration, one after the other, and the loss, summed over blocks of
-    /// batches.
+    /// The gradients of the segment's learned parameters in the order of declaration, concatenated,
+    /// and the loss, summed over blocks of batches.
     pub blocks: Blocks<Vec<f32>>,
-    /// Running statistics after the first batch, each by the place of its declaration.
+    /// The running statistics after the first batch, each with the index of its declaration.
     pub moved: Vec<(usize, Vec<f32>)>,
 }
 
-/// Computes what a process has of a step, and hands over one part after the other.
+/// Computes a process's gradients of a step, and passes them on part by part.
 pub type Compute<'a> = &'a mut dyn FnMut(&mut dyn FnMut(Part)) -> Result<(), ModelError>;
 
-/// Processes that train one network together, as one of them sees them.
+/// A group of processes that train one network together, as seen by one of them.
 pub trait Group {
-    /// Agrees with the others on who does what; a process that is behind is put where the furthest stands. Called at the
-    /// beginning and whenever the group has changed.
+    /// Agrees with the other processes on the assignment of work. A process that is behind takes
+    /// over the state of the most advanced one. Called at the start and whenever the group has
+    /// changed.
     ///
     /// # Errors
-    /// [`ModelError`] where this process cannot go on.
+    /// [`ModelError`] if this process cannot continue.
     fn agree(&mut self, member: &mut dyn Member) -> Result<Next, ModelError>;
 
-    /// Whether all go on as agreed; called before each step. `false`: [`Self::agree`] again.
+    /// Returns whether all processes continue as agreed; called before each step. If it returns
+    /// `false`, call [`Self::agree`] again.
     ///
     /// # Errors
-    /// As [`Self::agree`].
+    /// As for [`Self::agree`].
     fn go_on(&mut self) -> Result<bool, ModelError>;
 
-    /// Whether there is no other process now: then there is nothing to add up.
+    /// Returns whether there is currently no other process, so that no sums are needed.
     fn is_alone(&self) -> bool;
 
-    /// The sums over all processes of what each of them computes, part by part; a part is added up while the next is computed.
-    /// `None` where a process was lost on the way: nothing is decided, [`Self::agree`] again.
+    /// Returns the sums of the parts over all processes. A part is summed while the next is
+    /// computed. If a process was lost meanwhile, returns `None`: the step is undecided, and
+    /// [`Self::agree`] must be called again.
     ///
     /// # Errors
-    /// What `compute` fails with; as [`Self::agree`].
+    /// The errors of `compute`, and those of [`Self::agree`].
     fn sum(&mut self, step: u64, compute: Compute<'_>) -> Result<Option<Vec<Part>>, ModelError>;
 
-    /// Tells the others the line of an epoch's end or of a validation, by whoever leads; `digest` is of its numbers.
+    /// Sends the line of an epoch's end or of a validation to the other processes. Called by the
+    /// leading process; `digest` is the digest of its parameters.
     fn tell(&mut self, line: &Line, digest: u64);
 
-    /// The line that the leading process wrote; `None` where it was lost.
+    /// Returns the line that the leading process wrote, or `None` if that process was lost.
     ///
     /// # Errors
-    /// [`ModelError::Group`] where the leading process has other numbers than those of `digest`; as [`Self::agree`].
+    /// [`ModelError::Group`] if the leading process's parameters do not have this `digest`; those
+    /// of [`Self::agree`].
     fn hear(&mut self, digest: u64) -> Result<Option<Line>, ModelError>;
 }
 
-/// Sums of blocks of items 0, 1, 2, …, in the one order that does not depend on who has which: blocks have 2^k items, begin at
-/// a multiple of 2^k, and are as large as what is there allows.
+/// Sums of blocks of items 0, 1, 2, …, in an order that does not depend on the process which
+/// computed an item. A block has 2^k items, begins at a multiple of 2^k, and is as large as the
+/// available items allow.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Blocks<T>(Vec<Block<T>>);
 
 /// The sum of a block.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Block<T> {
-    /// Its first item.
+    /// The index of its first item.
     pub begin: usize,
-    /// How many: a power of two.
+    /// The number of items: a power of two.
     pub len: usize,
     /// The sum.
     pub sum: T,
@@ -142,10 +154,10 @@ impl<T> Default for Blocks<T> {
 }
 
 impl<T> Blocks<T> {
-    /// Adds a block that begins where the last one ends, or later.
+    /// Adds a block that begins at or after the end of the last one.
     ///
     /// # Panics
-    /// Where it begins before.
+    /// If it begins before that end.
     pub fn push(&mut self, block: Block<T>, add: &mut dyn FnMut(T, T) -> T) {
         let end = self.0.last().map_or(0, |last| last.begin + last.len);
         assert!(block.begin >= end, "blocks come in order");
@@ -165,12 +177,12 @@ impl<T> Blocks<T> {
         self.0.push(block);
     }
 
-    /// The blocks, in order.
+    /// Returns the blocks, in order.
     pub fn as_slice(&self) -> &[Block<T>] {
         &self.0
     }
 
-    /// One block of items 0 to `count`.
+    /// Returns one block of items 0 to `count`.
     pub fn whole(count: usize, sum: T) -> Self {
         Self(vec![Block {
             begin: 0,
@@ -179,13 +191,14 @@ impl<T> Blocks<T> {
         }])
     }
 
-    /// Whether a block may be pushed: it begins where the last one ends, or later, and is one of those that there may be.
+    /// Returns whether a block may be pushed: it must be valid and begin at or after the end of the
+    /// last one.
     pub fn fits(&self, block: &Block<T>) -> bool {
         let end = self.0.last().map_or(0, |last| last.begin + last.len);
         block.begin >= end && block.len.is_power_of_two() && block.begin.is_multiple_of(block.len)
     }
 
-    /// Whether it holds items 0 to `count` and nothing else.
+    /// Returns whether the blocks cover exactly items 0 to `count`.
     pub fn is_whole(&self, count: usize) -> bool {
         let mut end = 0;
         for block in &self.0 {
@@ -197,7 +210,8 @@ impl<T> Blocks<T> {
         end == count
     }
 
-    /// The sum of all, from the last to the first; `None` where there is nothing.
+    /// Returns the sum of all blocks, added from the last to the first, or `None` if there are
+    /// none.
     pub fn total(mut self, add: &mut dyn FnMut(T, T) -> T) -> Option<T> {
         let mut sum = self.0.pop()?.sum;
         while let Some(block) = self.0.pop() {
@@ -206,7 +220,7 @@ impl<T> Blocks<T> {
         Some(sum)
     }
 
-    /// The same blocks with what follows from each sum.
+    /// Returns the same blocks with a value computed from each sum.
     pub fn each<U>(&self, mut of: impl FnMut(&T) -> U) -> Blocks<U> {
         let blocks = self.0.iter();
         Blocks(
@@ -220,7 +234,7 @@ impl<T> Blocks<T> {
         )
     }
 
-    /// The same blocks with other sums.
+    /// Converts each block's sum.
     pub fn map<U>(self, mut of: impl FnMut(T) -> U) -> Blocks<U> {
         let blocks = self.0.into_iter();
         Blocks(
@@ -236,7 +250,7 @@ impl<T> Blocks<T> {
 }
 
 impl Blocks<Vec<f32>> {
-    /// The same blocks with some of their values.
+    /// Returns the same blocks with a range of each sum's values.
     pub fn clone_slice(&self, values: &Range<usize>) -> Vec<Block<Vec<f32>>> {
         let blocks = self.0.iter();
         blocks
@@ -249,10 +263,10 @@ impl Blocks<Vec<f32>> {
     }
 }
 
-/// Adds one to another, value by value.
+/// Adds the values of `other` to those of `one`.
 ///
 /// # Panics
-/// Where they have other lengths.
+/// If the lengths differ.
 pub fn add_values(mut one: Vec<f32>, other: &[f32]) -> Vec<f32> {
     assert_eq!(one.len(), other.len(), "sums are of one length");
     for (a, b) in one.iter_mut().zip(other) {
@@ -261,7 +275,7 @@ pub fn add_values(mut one: Vec<f32>, other: &[f32]) -> Vec<f32> {
     one
 }
 
-/// The batches of a step that the `which`th of `of` processes computes.
+/// Returns the batches of a step that process `which` of `of` computes.
 pub fn share(batches: usize, which: usize, of: usize) -> Range<usize> {
     which * batches / of..(which + 1) * batches / of
 }

@@ -1,4 +1,4 @@
-//! A network with its numbers and the optimiser's, one step at a time.
+//! A network with its parameters and the optimiser's state, trained step by step.
 
 use burn::tensor::{Device, Tensor};
 use rayon::{iter::ParallelIterator, slice::ParallelSlice};
@@ -22,39 +22,39 @@ const BETA2: f64 = 0.999;
 /// AdamW's epsilon: PyTorch's default.
 const EPSILON: f64 = 1e-8;
 
-/// A network that learns.
+/// A network in training.
 pub struct Learner {
     pub(super) net: Net,
     pub(super) parameters: Parameters,
-    /// AdamW's moments of each parameter; empty for those that are not learned.
+    /// AdamW's moments of each parameter; empty for parameters that are not learned.
     pub(super) moments: Vec<[Tensor<1>; 2]>,
-    /// Steps taken.
+    /// The number of steps taken.
     pub(super) steps: u64,
-    /// The average of its numbers, where one is wanted.
+    /// The average of the parameters, if the plan requires one.
     pub(super) average: Option<Average>,
-    /// Greatest norm of a step's gradient.
+    /// The greatest norm of a step's gradient.
     clip_norm: Option<f64>,
     target: Target,
     decay: f64,
     pub(super) device: Device,
 }
 
-/// An exponential moving average of all numbers of a network, running statistics too.
+/// An exponential moving average of all parameters of a network, running statistics included.
 pub struct Average {
     decay: f64,
     pub(super) values: Parameters,
 }
 
-/// Values whose squares are summed at a time.
+/// The number of values in a partial sum of squares.
 const SQUARED: usize = 1 << 16;
 
-/// What follows from a batch: gradients and loss, and running statistics after it.
+/// The results of a batch: gradients, loss, and the running statistics after it.
 struct OfBatch {
     summed: Summed,
     moved: Vec<(Id, Tensor<1>)>,
 }
 
-/// A pass forward.
+/// The result of a forward pass.
 pub(super) struct Forward {
     pub(super) leaves: Vec<Tensor<1>>,
     output: Tensor<4>,
@@ -64,30 +64,31 @@ pub(super) struct Forward {
     pub(super) cuts: Vec<Cut>,
 }
 
-/// Gradients of a step's batches, summed as [`Blocks`] are.
+/// The gradients of a step's batches, summed as [`Blocks`] are.
 #[derive(Default)]
 pub struct Gradients {
     pub(super) blocks: Blocks<Summed>,
-    /// Running statistics after the step's first batch, where that is among them.
+    /// The running statistics after the step's first batch, if the sum includes it.
     pub(super) moved: Vec<(Id, Tensor<1>)>,
-    /// Of the batch that was added last.
+    /// The loss of the batch added last.
     pub(super) latest: Option<Loss>,
 }
 
-/// A batch on the device of a learner.
+/// A batch on a learner's device.
 pub struct Brought {
     input: Input,
     target: Vec<f32>,
 }
 
-/// Gradients of every parameter by declaration, none of those that are not learned, and losses; summed over batches.
+/// Gradients and losses summed over batches. There is a gradient for each declared parameter; it is
+/// `None` if the parameter is not learned.
 pub(super) struct Summed {
     pub(super) gradients: Vec<Option<Tensor<1>>>,
     pub(super) losses: Loss,
 }
 
 impl Summed {
-    /// So many numbers: gradients by declaration, and the loss.
+    /// Returns `len` numbers: the gradients in the order of declaration, and the loss.
     pub(super) fn numbers(&self, len: usize) -> Vec<f32> {
         let mut values = Vec::with_capacity(len);
         for gradient in self.gradients.iter().flatten() {
@@ -107,7 +108,7 @@ impl Summed {
 }
 
 impl Learner {
-    /// A learner that has taken no step; without autodiff on `device`.
+    /// Creates a learner that has taken no step. `device` has no autodiff.
     pub fn new(net: Net, parameters: Parameters, target: Target, decay: f64) -> Self {
         let device = parameters.values()[0].device();
         let zeros = |d: &Declared| {
@@ -128,7 +129,7 @@ impl Learner {
         }
     }
 
-    /// The same whose gradients are at most so long.
+    /// Limits the norm of the learner's gradients.
     #[must_use]
     pub fn clipped(self, norm: Option<f64>) -> Self {
         Self {
@@ -137,8 +138,9 @@ impl Learner {
         }
     }
 
-    /// The same that keeps an average of its numbers, which begins with those it has. After step t an average is d times what it was
-    /// plus (1 − d) times the numbers, with d the lesser of `decay` and (1 + t)/(10 + t).
+    /// Makes the learner maintain an average of its parameters, starting with their current values.
+    /// After step t the average is d times its previous value plus (1 − d) times the parameters,
+    /// with d the lesser of `decay` and (1 + t)/(10 + t).
     #[must_use]
     pub fn averaging(self, decay: Option<f64>) -> Self {
         let values = || self.parameters.clone();
@@ -149,7 +151,7 @@ impl Learner {
         Self { average, ..self }
     }
 
-    /// The numbers that are validated and kept: their average where there is one.
+    /// Returns the parameters that are validated and stored: their average if there is one.
     pub fn kept(&self) -> &Parameters {
         match &self.average {
             Some(average) => &average.values,
@@ -157,31 +159,31 @@ impl Learner {
         }
     }
 
-    /// The network.
+    /// Returns the network.
     pub fn net(&self) -> &Net {
         &self.net
     }
 
-    /// Its numbers.
+    /// Returns the parameters.
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
     }
 
-    /// Waits until the device has done all it was given: what is measured ends then.
+    /// Waits until the device has finished all its work, so that a measurement of time is complete.
     ///
     /// # Errors
-    /// What its driver failed with.
+    /// The driver's error.
     pub fn wait(&self) -> Result<(), String> {
         self.device.sync().map_err(|error| error.to_string())
     }
 
-    /// Steps taken.
+    /// Returns the number of steps taken.
     pub fn steps(&self) -> u64 {
         self.steps
     }
 
-    /// What the network said, loss, and the gradient of every learned parameter by declaration; moves the running
-    /// statistics.
+    /// Returns the network's output, the loss, and the gradient of every learned parameter in the
+    /// order of declaration. Updates the running statistics.
     pub(crate) fn gradients(&mut self, batch: Batch) -> (Vec<f32>, f32, Vec<Option<Tensor<1>>>) {
         let (output, of) = self.backward(self.bring(batch));
         self.move_statistics(of.moved);
@@ -196,18 +198,20 @@ impl Learner {
         }
     }
 
-    /// Brings a batch to the device. What a graphics processor was given before it still computes meanwhile.
+    /// Transfers a batch to the device. A graphics processor continues its earlier work meanwhile.
     pub fn bring(&self, batch: Batch) -> Brought {
         let (input, target) = batch.into_input(&self.device.clone().autodiff());
         Brought { input, target }
     }
 
-    /// Whether the device computes by itself, so that batches are better brought while it does.
+    /// Returns whether the device computes asynchronously, so that batches are best transferred
+    /// while it computes.
     pub fn computes_apart(&self) -> bool {
         !ops::has_kernels(&self.device)
     }
 
-    /// What the network says of a batch, and what its gradients are computed from; `apart` with a graph for each segment.
+    /// Computes the network's output for a batch, and the graph from which its gradients are
+    /// computed. If `apart` is set, each segment has a graph of its own.
     pub(super) fn forward(&self, batch: Brought, apart: bool) -> Forward {
         let leaves: Vec<Tensor<1>> = self
             .net
@@ -248,10 +252,11 @@ impl Learner {
         (forward.output.inner(), OfBatch { summed, moved })
     }
 
-    /// One step of the optimiser over batches, whose gradients are averaged. Returns the mean loss.
+    /// Takes one optimiser step along the averaged gradients of some batches. Returns the mean
+    /// loss.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; everything is then as before.
+    /// [`ModelError::NotFinite`]; the learner is then unchanged.
     pub fn step(&mut self, batches: Vec<Batch>, pace: Pace) -> Result<f32, ModelError> {
         let mut sum = Gradients::default();
         let count = batches.len();
@@ -261,10 +266,11 @@ impl Learner {
         self.finish(sum, count, pace)
     }
 
-    /// A step along each of some batches, as a training takes them: a graphics processor gets the next one while it computes.
+    /// Takes a step along each of some batches, as a training does: the next batch is transferred
+    /// to a graphics processor while it computes.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; everything is then as after the step before.
+    /// [`ModelError::NotFinite`]; the learner is then in the state after the previous step.
     pub fn steps_along(&mut self, batches: Vec<Batch>, pace: Pace) -> Result<(), ModelError> {
         let mut batches = batches.into_iter();
         let mut ahead = None;
@@ -279,11 +285,12 @@ impl Learner {
         Ok(())
     }
 
-    /// Adds the gradients of batch `at` of a step to those before it, and lets go of the batch. Running statistics follow the
-    /// first batch of a step. A graphics processor has then begun with it, and is done with the batch before.
+    /// Adds the gradients of batch `at` of a step to those of earlier batches, and releases the
+    /// batch. Running statistics follow the first batch of a step. When this returns, a graphics
+    /// processor has started this batch and finished the previous one.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; everything is then as before.
+    /// [`ModelError::NotFinite`]; the learner is then unchanged.
     pub fn add(&self, sum: &mut Gradients, at: usize, batch: Brought) -> Result<(), ModelError> {
         if let Some(latest) = sum.latest.take() {
             self.finite(latest)?;
@@ -303,7 +310,7 @@ impl Learner {
         Ok(())
     }
 
-    /// Where a loss is known already, whether it is a number.
+    /// If a loss is already known, checks that it is finite.
     pub(super) fn unbroken(&self, losses: &Loss) -> Result<(), ModelError> {
         match losses.is_broken() {
             true => Err(self.not_finite(losses.clone().value())),
@@ -311,7 +318,7 @@ impl Learner {
         }
     }
 
-    /// What a loss is; waits for the device.
+    /// Returns the value of a loss; waits for the device.
     pub(super) fn finite(&self, loss: Loss) -> Result<f32, ModelError> {
         let loss = loss.value();
         match loss.is_finite() {
@@ -320,13 +327,14 @@ impl Learner {
         }
     }
 
-    /// Takes the step of the optimiser along the mean of the gradients of all its batches. Returns the mean loss.
+    /// Takes the optimiser step along the mean of the gradients of all its batches. Returns the
+    /// mean loss.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; everything is then as before.
+    /// [`ModelError::NotFinite`]; the learner is then unchanged.
     ///
     /// # Panics
-    /// Where some of them are missing.
+    /// If some of the batches are missing.
     pub fn finish(
         &mut self,
         sum: Gradients,
@@ -338,7 +346,7 @@ impl Learner {
             .blocks
             .total(&mut Summed::add)
             .expect("a step has a batch");
-        // Of all batches, those of other processes too.
+        // The loss over all batches, including those of other processes.
         let losses = self.finite(summed.losses)?;
         self.move_statistics(sum.moved);
         let share = 1.0 / batches as f32;
@@ -370,13 +378,14 @@ impl Learner {
         Ok(losses * share)
     }
 
-    /// What a step's gradient, `share` times `summed`, is to be multiplied by so that it is not too long.
+    /// Returns the factor that limits the norm of a step's gradient, which is `share` times
+    /// `summed`.
     fn shortened(&self, summed: &[Option<Tensor<1>>], share: f32) -> f32 {
         let Some(most) = self.clip_norm else {
             return 1.0;
         };
         let squares: f64 = summed.iter().flatten().map(squares).sum();
-        // PyTorch's constant.
+        // The constant is PyTorch's.
         let scale = most / (squares.sqrt() * f64::from(share) + 1e-6);
         match scale < 1.0 {
             true => scale as f32,
@@ -384,7 +393,7 @@ impl Learner {
         }
     }
 
-    /// Moves the average after a step.
+    /// Updates the average after a step.
     fn follow(&mut self) {
         let Some(average) = &mut self.average else {
             return;
@@ -398,7 +407,8 @@ impl Learner {
         }
     }
 
-    /// A digest of all parameters (FNV-1a over their bits): processes that train together have the same.
+    /// Returns a digest of all parameters (FNV-1a over their bits). Processes that train together
+    /// have the same digest.
     pub fn digest(&self) -> u64 {
         let values = self.parameters.values().iter().flat_map(download);
         values.fold(0xcbf2_9ce4_8422_2325, |hash, value| {
@@ -406,12 +416,12 @@ impl Learner {
         })
     }
 
-    /// What the network says in evaluation: (N, outputs, H, W), row by row.
+    /// Returns the network's output in evaluation: (N, outputs, H, W), row by row.
     pub fn predict(&self, batch: &Batch) -> Vec<f32> {
         predict(&self.net, self.kept(), batch)
     }
 
-    /// The name of the first parameter that is not finite.
+    /// Returns the name of the first parameter with a non-finite value.
     pub fn broken(&self) -> Option<&str> {
         let each = self.net.declared().iter().zip(self.parameters.values());
         for (d, value) in each {
@@ -435,7 +445,7 @@ impl Learner {
     }
 }
 
-/// The sum of squares, in one order whatever the threads.
+/// Returns the sum of squares, in an order that does not depend on the threads.
 fn squares(values: &Tensor<1>) -> f64 {
     let values = download(values);
     let parts: Vec<f64> = values
@@ -445,7 +455,7 @@ fn squares(values: &Tensor<1>) -> f64 {
     parts.iter().sum()
 }
 
-/// What a network says in evaluation: (N, outputs, H, W), row by row.
+/// Returns a network's output in evaluation: (N, outputs, H, W), row by row.
 pub fn predict(net: &Net, parameters: &Parameters, batch: &Batch) -> Vec<f32> {
     let device = parameters.values()[0].device();
     let mut pass = Pass::evaluation(parameters);

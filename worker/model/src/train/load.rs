@@ -1,7 +1,8 @@
-//! Examples ahead of the network: threads read and prepare what comes next while it learns, as far ahead as memory allows.
+//! Loads examples ahead of the network: threads read and prepare the next examples while it learns,
+//! as far ahead as memory allows.
 //!
-//! Each thread takes the next visit in order and works on it alone; the network gets examples in that order. So what comes
-//! out does not depend on the number of threads.
+//! Each thread takes the next visit in order and works on it alone. The network receives examples
+//! in that order, so the result does not depend on the number of threads.
 
 use std::{
     collections::BTreeMap,
@@ -17,20 +18,21 @@ use crate::{
     scene::Scenes,
 };
 
-/// Batches of examples that wait for the network, at most.
+/// The greatest number of batches of examples that wait for the network.
 const AHEAD: usize = 2;
 
-/// How examples are made ready for the network.
+/// The resources for preparing examples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Loading {
-    /// Threads that read and prepare scenes.
+    /// The number of threads that read and prepare scenes.
     pub threads: usize,
-    /// Bytes of scenes in hand and of examples that wait; one scene is always in hand.
+    /// The bytes that scenes in preparation and waiting examples may take. At least one scene is
+    /// always in preparation.
     pub room: usize,
 }
 
 impl Default for Loading {
-    /// The threads of the pool in which it is called, and 1 GiB.
+    /// Uses the threads of the current pool, and 1 GiB.
     fn default() -> Self {
         Self {
             threads: rayon::current_num_threads(),
@@ -43,13 +45,13 @@ impl Default for Loading {
 pub(super) struct Course<'a> {
     plan: &'a Plan,
     scenes: usize,
-    /// Visits of an epoch.
+    /// The number of visits in an epoch.
     each: u64,
-    /// Visits done.
+    /// The number of finished visits.
     first: u64,
-    /// Which batches of each step are visited here.
+    /// The range of each step's batches that this process visits.
     share: Range<usize>,
-    /// The orders of the epochs asked for last.
+    /// The orders of the most recently used epochs.
     orders: Mutex<BTreeMap<u64, Arc<Vec<usize>>>>,
 }
 
@@ -71,7 +73,7 @@ impl<'a> Course<'a> {
         }
     }
 
-    /// Visits of a step, and those of them that are made here.
+    /// Returns the number of visits in a step, and how many of them this process makes.
     fn of_step(&self) -> (u64, u64) {
         let batch = self.plan.batch as u64;
         (
@@ -80,13 +82,14 @@ impl<'a> Course<'a> {
         )
     }
 
-    /// How many are left.
+    /// Returns the number of remaining visits.
     pub(super) fn len(&self) -> u64 {
         let (all, ours) = self.of_step();
         (self.plan.epochs * self.each - self.first) / all * ours
     }
 
-    /// One of them: the scene's index, how it is visited, and its number among all visits of the training.
+    /// Returns a visit: the scene's index, the visit's parameters, and its number among all visits
+    /// of the training.
     pub(super) fn visit(&self, which: u64) -> (usize, Visit, Option<u64>) {
         let (all, ours) = self.of_step();
         let before = self.share.start as u64 * self.plan.batch as u64;
@@ -106,19 +109,20 @@ impl<'a> Course<'a> {
     }
 }
 
-/// What examples are made of.
+/// The inputs from which examples are made.
 pub(super) struct Making<'a> {
     pub(super) plan: &'a Plan,
     pub(super) scenes: &'a dyn Scenes,
-    /// The visits, in order: which scene, how, and the number of a visit where scenes look different at each.
+    /// Returns a visit by its position: the scene, the visit's parameters, and the visit's number
+    /// if scenes look different at each visit.
     pub(super) visit: &'a (dyn Fn(u64) -> (usize, Visit, Option<u64>) + Sync),
-    /// How many visits.
+    /// The number of visits.
     pub(super) count: u64,
     pub(super) loading: Loading,
 }
 
 impl Making<'_> {
-    /// Makes examples ready while `use_them` runs, and ends with it.
+    /// Prepares examples while `use_them` runs. The preparation ends when `use_them` returns.
     pub(super) fn ahead<R>(&self, use_them: impl FnOnce(&Ready<'_>) -> R) -> R {
         let exchange = Exchange::default();
         thread::scope(|scope| {
@@ -131,20 +135,21 @@ impl Making<'_> {
                 count: self.count,
                 room: self.loading.room,
             };
-            // However it ends, the threads do.
+            // However `use_them` ends, the threads end too.
             let _over = Closing(&exchange);
             use_them(&ready)
         })
     }
 
-    /// A thread's work. Its own pool has one thread, so that a scene is decoded where it was taken up: in a pool of more,
-    /// whoever waits for a part would begin with another scene in the middle of this one.
+    /// Runs a thread's work. The thread has its own pool of one thread, so a scene is decoded by
+    /// the thread that started it. In a larger pool, a thread that waits for a part would start
+    /// another scene in the middle of this one.
     fn serve(&self, exchange: &Exchange) {
         let broken = Broken(exchange);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
         match pool {
             Ok(pool) => pool.install(|| self.work(exchange)),
-            // Without one, the process's own pool decodes.
+            // If the pool cannot be created, the process's own pool decodes.
             Err(_) => self.work(exchange),
         }
         drop(broken);
@@ -158,7 +163,7 @@ impl Making<'_> {
         }
     }
 
-    /// The example of a visit alone; `bytes` becomes what it took to make it.
+    /// Makes the example of one visit; sets `bytes` to the memory that making it took.
     fn example(&self, which: u64, mut made: Batch, bytes: &mut usize) -> Result<Batch, ModelError> {
         let (index, visit, number) = (self.visit)(which);
         let scene = match number {
@@ -186,7 +191,7 @@ impl Making<'_> {
     }
 }
 
-/// Examples between the threads that make them and the network.
+/// The queue of examples between the threads that make them and the network.
 #[derive(Default)]
 struct Exchange {
     state: Mutex<State>,
@@ -195,24 +200,25 @@ struct Exchange {
 
 #[derive(Default)]
 struct State {
-    /// The next visit that nobody has taken up.
+    /// The next visit that no thread has started.
     next: u64,
-    /// Visits that the network has got.
+    /// The number of visits that the network has received.
     taken: u64,
     in_hand: usize,
-    /// Examples that are made, and their bytes.
+    /// The finished examples, and their bytes.
     made: BTreeMap<u64, Result<Batch, ModelError>>,
     waiting: usize,
-    /// Room of examples that have joined their batch: fresh memory takes as long as what is written there.
+    /// Buffers of examples that have joined their batch. They are reused because clearing new
+    /// memory takes as long as writing an example.
     spare: Vec<Batch>,
-    /// The most bytes that it took to make one; 0 = none is made yet.
+    /// The greatest number of bytes that making an example took; 0 before the first is made.
     largest: usize,
     closed: bool,
     broken: bool,
 }
 
 impl State {
-    /// Whether another scene may be taken up.
+    /// Returns whether another scene may be started.
     fn may_begin(&self, making: &Making<'_>) -> bool {
         let idle = self.in_hand == 0 && self.made.is_empty();
         let loading = making.loading;
@@ -235,7 +241,8 @@ impl Exchange {
         woken.unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The next visit to make an example of; `None` where there is none, or nobody wants one any more.
+    /// Returns the next visit for which to make an example, or `None` if there is none or the
+    /// network has stopped.
     fn take(&self, making: &Making<'_>) -> Option<u64> {
         let mut state = self.lock();
         loop {
@@ -251,7 +258,7 @@ impl Exchange {
         }
     }
 
-    /// An empty example, with the room of one before if there is any.
+    /// Returns an empty example that reuses an earlier buffer if there is one.
     fn spare(&self) -> Batch {
         self.lock().spare.pop().unwrap_or_default()
     }
@@ -267,7 +274,7 @@ impl Exchange {
     }
 }
 
-/// Nobody wants examples any more.
+/// A guard that ends the threads when it is dropped.
 struct Closing<'a>(&'a Exchange);
 
 impl Drop for Closing<'_> {
@@ -277,7 +284,8 @@ impl Drop for Closing<'_> {
     }
 }
 
-/// Tells the network where a thread panicked; it would wait for ever for what that thread had in hand.
+/// A guard that reports a thread's panic to the network. Without it, the network would wait for
+/// ever for the examples of that thread.
 struct Broken<'a>(&'a Exchange);
 
 impl Drop for Broken<'_> {
@@ -289,28 +297,28 @@ impl Drop for Broken<'_> {
     }
 }
 
-/// Where the network gets its examples.
+/// The network's end of the queue of examples.
 pub(super) struct Ready<'a> {
     exchange: &'a Exchange,
     batch: u64,
     count: u64,
-    /// Bytes, as in [`Loading::room`].
+    /// The limit in bytes, as in [`Loading::room`].
     room: usize,
 }
 
 impl Ready<'_> {
-    /// Whether all visits have been asked for.
+    /// Returns whether all visits have been received.
     pub(super) fn is_over(&self) -> bool {
         self.exchange.lock().taken == self.count
     }
 
-    /// The next batch; a smaller one at the very end, if visits are left over.
+    /// Returns the next batch. The last batch is smaller if fewer visits remain.
     ///
     /// # Errors
-    /// What kept one of its examples from being made.
+    /// The error of an example that could not be made.
     ///
     /// # Panics
-    /// Where a thread that makes examples did, and where there are no more.
+    /// If a thread that makes examples has panicked, or if no visits remain.
     pub(super) fn next(&self) -> Result<Batch, ModelError> {
         let begun = self.exchange.lock().taken;
         let size = self.batch.min(self.count - begun);
@@ -322,7 +330,8 @@ impl Ready<'_> {
             let mut state = self.exchange.lock();
             let held = state.in_hand + state.spare.len() + 1;
             let held = held.saturating_mul(state.largest);
-            // No more than are made at once, and no more than there is room for.
+            // Limits the spare buffers to the number of examples in preparation and to the
+            // available memory.
             if state.spare.len() <= state.in_hand && state.waiting.saturating_add(held) <= self.room
             {
                 state.spare.push(empty);

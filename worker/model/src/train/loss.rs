@@ -1,10 +1,10 @@
-//! What is minimised: L1 for depths, binary cross-entropy for masks.
+//! The loss functions: L1 for depths, binary cross-entropy for masks.
 
 use burn::tensor::{Tensor, TensorData};
 
 use crate::{input::Target, ops};
 
-/// A mean loss, or a sum of them, which a device may still be computing.
+/// A mean loss, or a sum of mean losses, which a device may still be computing.
 #[derive(Debug, Clone)]
 pub enum Loss {
     Known(f32),
@@ -12,7 +12,7 @@ pub enum Loss {
 }
 
 impl Loss {
-    /// Waits for all that the device was given before.
+    /// Returns the value. Waits until the device has finished its earlier work.
     pub fn value(self) -> f32 {
         match self {
             Self::Known(loss) => loss,
@@ -20,7 +20,8 @@ impl Loss {
         }
     }
 
-    /// Whether it is known to be no number; of a device nothing is known.
+    /// Returns whether the loss is known to be NaN or infinite. The value of a loss on a device is
+    /// not known.
     pub fn is_broken(&self) -> bool {
         matches!(self, Self::Known(loss) if !loss.is_finite())
     }
@@ -33,10 +34,12 @@ impl Loss {
     }
 }
 
-/// Mean loss of a batch, and what to go backward from: outputs and truth (N, C, H, W).
+/// Returns the mean loss of a batch, and the tensor from which to run the backward pass. Outputs
+/// and truth are (N, C, H, W).
 ///
-/// On the CPU both are computed here, in a fixed order and with `libm`, so that neither the instruction set nor the
-/// system's mathematics changes a bit; elsewhere by the device.
+/// On the CPU both are computed here, in a fixed order and with `libm`, so that the bits do not
+/// depend on the instruction set or the system's mathematics library. On other devices, the device
+/// computes them.
 pub fn loss(target: Target, output: Tensor<4>, truth: &[f32]) -> (Loss, Tensor<1>) {
     if !ops::has_kernels(&output.device()) {
         let truth = TensorData::new(truth.to_vec(), output.dims());
@@ -52,7 +55,7 @@ pub fn loss(target: Target, output: Tensor<4>, truth: &[f32]) -> (Loss, Tensor<1
     (Loss::Known(loss), (output * gradient).sum())
 }
 
-/// Loss and gradient, value by value.
+/// Computes loss and gradient value by value.
 fn by_hand(target: Target, said: &[f32], truth: &[f32]) -> (f32, Vec<f32>) {
     let share = 1.0 / said.len() as f32;
     let mut sum = 0.0f64;

@@ -23,43 +23,47 @@ pub use schedule::Pace;
 
 use crate::{ModelError, input::Question, net::NetSpec};
 
-/// Everything that decides what a training gives, but the scenes and the weights it begins with.
+/// All settings that determine the result of a training, except for the scenes and the initial
+/// weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
-    /// What is asked.
+    /// The question that the network learns to answer.
     pub question: Question,
-    /// The network that learns to answer.
+    /// The network.
     pub net: NetSpec,
-    /// Times that each scene is visited.
+    /// The number of visits to each scene.
     pub epochs: u64,
-    /// Examples a batch.
+    /// The number of examples in a batch.
     pub batch: usize,
-    /// Batches a step.
+    /// The number of batches in a step.
     pub accumulate: usize,
-    /// Greatest learning rate.
+    /// The greatest learning rate.
     pub learning_rate: f64,
-    /// Weight decay.
+    /// The weight decay.
     pub decay: f64,
-    /// How the rate moves.
+    /// The schedule of the learning rate.
     pub schedule: Schedule,
-    /// Epochs of the first cycle, and how many times as long each further one is: for [`Schedule::Restarts`].
+    /// For [`Schedule::Restarts`]: the number of epochs of the first cycle, and the factor by which
+    /// each further cycle is longer.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub restarts: Option<(u64, u64)>,
-    /// Greatest norm of a step's gradient; none without it.
+    /// The greatest norm of a step's gradient; unlimited if `None`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clip_norm: Option<f64>,
-    /// Decay of an average of the weights that is validated and kept in their place.
+    /// The decay of an average of the weights. If set, the average is validated and stored instead
+    /// of the weights.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ema: Option<f64>,
-    /// Mirrored scenes are shown too, where the target allows it.
+    /// Whether mirrored scenes are used too, if the target allows it.
     pub augment: bool,
-    /// Validations without improvement after which it ends; 0 = never.
+    /// The number of validations without improvement after which the training ends; 0 = never.
     pub early_stop: u64,
-    /// Steps after which it is validated within an epoch too; 0 = at the end of each only.
+    /// The number of steps between validations within an epoch; 0 = validate only at the end of
+    /// each epoch.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub validate_every: u64,
-    /// Of weights, order, spots and mirroring.
+    /// The seed of weights, order, spots and mirroring.
     pub seed: u64,
 }
 
@@ -69,18 +73,19 @@ fn is_zero(n: &u64) -> bool {
 }
 
 impl Plan {
-    /// Batches of an epoch over so many scenes, those left over dropped.
+    /// Returns the number of batches in an epoch over the given number of scenes. Remaining scenes
+    /// are dropped.
     pub fn batches(&self, scenes: usize) -> u64 {
         let steps = scenes / (self.batch * self.accumulate);
         (steps * self.accumulate) as u64
     }
 
-    /// Steps of the whole training.
+    /// Returns the number of steps of the whole training.
     pub fn steps(&self, scenes: usize) -> u64 {
         self.epochs * self.batches(scenes) / self.accumulate as u64
     }
 
-    /// Checks it against itself and the number of scenes to learn from.
+    /// Checks the plan for consistency, and against the number of training scenes.
     ///
     /// # Errors
     /// [`ModelError::Invalid`] naming the first field that cannot be used.

@@ -1,52 +1,53 @@
-//! Where a training stands, and what it has seen.
+//! The position of a training, and its history.
 
 use serde::{Deserialize, Serialize};
 
 use crate::metric::Metrics;
 
-/// Where a training stands, and what it has seen.
+/// The position of a training, and its history.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Position {
-    /// Whole epochs done.
+    /// The number of finished epochs.
     pub epoch: u64,
-    /// Batches done of the next one.
+    /// The number of finished batches of the next epoch.
     pub batches: u64,
-    /// Sum of the losses of the steps since the last line.
+    /// The sum of the losses of the steps since the last line.
     pub losses: f64,
-    /// Steps since then.
+    /// The number of steps since the last line.
     pub steps: u64,
     /// The smallest validation loss so far.
     pub best: Option<f64>,
-    /// Validations since then.
+    /// The number of validations since the best one.
     pub since_best: u64,
-    /// The step after which the weights are kept that count at the end; 0 = the last one.
+    /// The step with the weights that the training returns; 0 = the last one.
     pub kept_step: u64,
-    /// A line for each epoch done, and for each validation on the way.
+    /// A line for each finished epoch, and for each validation within an epoch.
     pub history: Vec<Line>,
-    /// It ended before its last epoch, because it no longer became better.
+    /// Whether the training ended before its last epoch because it no longer improved.
     pub stopped_early: bool,
 }
 
-/// What is known at the end of an epoch, or of a validation on the way to it.
+/// The figures at the end of an epoch, or at a validation within one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Line {
-    /// From 1.
+    /// The epoch, from 1.
     pub epoch: u64,
-    /// The epoch went on after it.
+    /// Whether the line was written within the epoch.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub within: bool,
-    /// Steps of the optimiser until then.
+    /// The number of optimiser steps up to this line.
     pub step: u64,
-    /// Mean loss of the steps since the line before.
+    /// The mean loss of the steps since the previous line.
     pub loss: f64,
-    /// Learning rate of the last step.
+    /// The learning rate of the last step.
     pub learning_rate: f64,
-    /// On the validation scenes, where there are any.
+    /// The metrics on the validation scenes, if there are any.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub validation: Option<Metrics>,
 }
 
-/// Where each line of a history lies, in epochs: the whole ones at whole numbers, those within in between.
+/// Returns each line of a history with its time in epochs: a whole number at the end of an epoch, a
+/// fraction within one.
 pub fn epochs_at(history: &[Line]) -> impl Iterator<Item = (f64, &Line)> {
     let whole = history.iter().find(|line| !line.within);
     let steps = whole.map_or(0.0, |line| line.step as f64 / line.epoch as f64);

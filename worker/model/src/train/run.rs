@@ -1,4 +1,4 @@
-//! A training from where it stands to its end.
+//! Runs a training from its current position to its end.
 
 use std::{
     ops::Range,
@@ -29,55 +29,56 @@ use crate::{
     weights,
 };
 
-/// What happens.
+/// An event of a training.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
-    /// A step of the optimiser.
+    /// A finished optimiser step.
     Step {
-        /// Steps done.
+        /// The number of finished steps.
         step: u64,
-        /// Steps of the whole training.
+        /// The number of steps of the whole training.
         of: u64,
-        /// Epochs, the running one among them, from 1.
+        /// The current epoch, from 1.
         epoch: u64,
-        /// Its mean loss.
+        /// The mean loss of the step.
         loss: f32,
-        /// Training examples a second, of all processes that train it together, since this one took it up.
+        /// Training examples per second, over all processes of the training, since this process
+        /// started or resumed.
         samples_per_s: f64,
-        /// Share of that time in which the network waited for data.
+        /// The share of that time in which the network waited for data.
         data_wait_share: f64,
     },
-    /// It was validated within an epoch.
+    /// A validation within an epoch.
     Validated(Line),
-    /// An epoch is over.
+    /// The end of an epoch.
     Epoch(Line),
 }
 
-/// What shall happen next.
+/// Whether to continue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Control {
-    /// Go on.
+    /// Continue.
     Continue,
     /// Stop after this step.
     Stop,
 }
 
-/// How a run ended.
+/// The reason why a run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {
-    /// Everything is done.
+    /// The training is finished.
     Finished,
-    /// It was asked to stop; it can go on from a checkpoint.
+    /// The caller stopped the training; it can resume from a checkpoint.
     Stopped,
-    /// Everything is done, and another process keeps what came out.
+    /// The training is finished, and another process stores the result.
     Elsewhere,
 }
 
-/// What it learns from, and beside what.
+/// The scenes of a training.
 pub struct Sources {
-    /// Scenes to learn from.
+    /// The training scenes.
     pub train: Arc<dyn Scenes>,
-    /// Scenes to look at after each epoch; may be none.
+    /// The validation scenes, evaluated after each epoch; may be empty.
     pub validation: Arc<dyn Scenes>,
 }
 
@@ -94,38 +95,39 @@ pub struct Training {
     leads: bool,
 }
 
-/// What comes out.
+/// The result of a training.
 #[derive(Debug, Clone)]
 pub struct Trained {
-    /// Safetensors by PyTorch's names.
+    /// The weights as safetensors, by PyTorch's names.
     pub weights: Vec<u8>,
     /// A line for each epoch, and for each validation within one.
     pub history: Vec<Line>,
-    /// It ended before its last epoch did.
+    /// Whether the training ended before its last epoch.
     pub stopped_early: bool,
-    /// The step after which the network had these weights: with `early_stop` the one whose validation was the best, else the
-    /// last.
+    /// The step that produced these weights: with `early_stop` the one with the best validation,
+    /// else the last.
     pub kept_step: u64,
 }
 
 impl Trained {
-    /// The line that says how good these weights are.
+    /// Returns the line with the metrics of these weights.
     pub fn kept(&self) -> Option<&Line> {
         self.history.iter().find(|line| line.step == self.kept_step)
     }
 
-    /// Whole epochs.
+    /// Returns the number of whole epochs.
     pub fn epochs(&self) -> usize {
         self.history.iter().filter(|line| !line.within).count()
     }
 }
 
 impl Training {
-    /// A training at its beginning, from random weights or, with `from` (safetensors), from others. A frozen encoder
-    /// needs `from`; what `from` does not have of the rest begins at random.
+    /// Starts a training from random weights or from `from` (safetensors). A frozen encoder
+    /// requires `from`. Other parameters that are missing in `from` start at random.
     ///
     /// # Errors
-    /// [`ModelError::Invalid`] for a plan that cannot be used, [`ModelError::Weights`] where `from` is of another network.
+    /// [`ModelError::Invalid`] for a plan that cannot be used, [`ModelError::Weights`] if `from`
+    /// belongs to another network.
     pub fn start(
         plan: Plan,
         from: Option<&[u8]>,
@@ -161,10 +163,11 @@ impl Training {
         })
     }
 
-    /// A training where a checkpoint of the same plan was made, from its pieces in any order.
+    /// Resumes a training from the pieces of a checkpoint of the same plan, in any order.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] for a checkpoint that is damaged or of another plan; those of [`Self::start`].
+    /// [`ModelError::Weights`] for a checkpoint that is damaged or of another plan; those of
+    /// [`Self::start`].
     pub fn resume(
         plan: Plan,
         checkpoint: &[impl AsRef<[u8]>],
@@ -189,15 +192,15 @@ impl Training {
         })
     }
 
-    /// The same with scenes made ready in another way: it changes how long it takes and how much memory, and no bit of what
-    /// comes out.
+    /// Changes the resources for loading scenes. They affect the time and memory of the training,
+    /// but no bit of its result.
     #[must_use]
     pub fn loading(mut self, loading: Loading) -> Self {
         self.loading = loading;
         self
     }
 
-    /// The training as it is now, to be written while it goes on.
+    /// Returns the training's current state, which can be written while it continues.
     pub fn snapshot(&self) -> Snapshot {
         Snapshot::of(
             &self.learner,
@@ -207,37 +210,38 @@ impl Training {
         )
     }
 
-    /// The training as bytes, to go on from.
+    /// Returns the training's state as bytes, from which it can resume.
     pub fn checkpoint(&self) -> Vec<u8> {
         let mut pieces = self.snapshot().pieces(usize::MAX);
         pieces.next().expect("there is a first piece")
     }
 
-    /// Where it stands.
+    /// Returns the training's position.
     pub fn position(&self) -> &Position {
         &self.position
     }
 
-    /// The network and its numbers.
+    /// Returns the network and its parameters.
     pub fn learner(&self) -> &Learner {
         &self.learner
     }
 
-    /// Steps of the whole training.
+    /// Returns the number of steps of the whole training.
     pub fn steps(&self) -> u64 {
         self.plan.steps(self.sources.train.len())
     }
 
-    /// Whether this process validates and keeps what comes out: not where another one leads.
+    /// Returns whether this process validates and stores the result. It is `false` if another
+    /// process leads.
     pub fn leads(&self) -> bool {
         self.leads
     }
 
-    /// Goes on until the end, or until `say` wants it to stop. `say` is given the training, so that it may take a
-    /// checkpoint of it.
+    /// Runs until the end, or until `say` returns [`Control::Stop`]. `say` receives the training,
+    /// so that it can take a checkpoint.
     ///
     /// # Errors
-    /// [`ModelError::Scene`] where a scene cannot be read, [`ModelError::NotFinite`].
+    /// [`ModelError::Scene`] if a scene cannot be read, [`ModelError::NotFinite`].
     pub fn run(
         &mut self,
         say: &mut dyn FnMut(&Self, &Event) -> Control,
@@ -247,10 +251,10 @@ impl Training {
             .map(|ended| ended.expect("nobody else is lost"))
     }
 
-    /// The same together with other processes, to the same bits.
+    /// Like [`Self::run`], but together with other processes. The result has the same bits.
     ///
     /// # Errors
-    /// As [`Self::run`], and what keeps this process from going on with the others.
+    /// Those of [`Self::run`], and any reason why this process cannot continue with the others.
     pub fn run_among(
         &mut self,
         group: &mut dyn Group,
@@ -266,7 +270,7 @@ impl Training {
                 }
             };
             if self.is_over() && !self.leads {
-                // The leading process keeps what came out, and says so.
+                // The leading process stores the result and announces the end.
                 continue;
             }
             if let Some(ended) = self.go(&share, Some(group), say)? {
@@ -278,7 +282,7 @@ impl Training {
         }
     }
 
-    /// Trains with a share of each step's batches; `None` where the group has changed.
+    /// Trains with a share of each step's batches. Returns `None` if the group has changed.
     fn go(
         &mut self,
         share: &Range<usize>,
@@ -311,7 +315,7 @@ impl Training {
         let mut clock = Clock::new();
         let of = self.steps();
         let batches = self.plan.accumulate;
-        // Brought to a graphics processor while it computes.
+        // The next batch, transferred to a graphics processor while it computes.
         let mut ahead = None;
         while !self.is_over() {
             let mut events = Vec::new();
@@ -388,7 +392,7 @@ impl Training {
         Ok(Some(Ended::Finished))
     }
 
-    /// The optimiser's pace at a step.
+    /// Returns the optimiser's settings at a step.
     fn pace(&self, step: u64) -> schedule::Pace {
         schedule::pace(&self.plan, step, self.sources.train.len())
     }
@@ -401,7 +405,7 @@ impl Training {
         self.position.batches == self.plan.batches(self.sources.train.len())
     }
 
-    /// Whether an epoch has just ended, or a validation within it is due.
+    /// Returns whether an epoch has just ended, or a validation within it is due.
     fn line_is_due(&self) -> bool {
         let (step, every) = (self.learner.steps(), self.plan.validate_every);
         let validate =
@@ -409,7 +413,8 @@ impl Training {
         self.ends_epoch() || (validate && self.position.steps > 0)
     }
 
-    /// Validates where this process leads, and hears it from the one that does where not; `None` where that was lost.
+    /// Validates if this process leads, or else receives the line from the leading process. Returns
+    /// `None` if that process was lost.
     fn write_line(
         &mut self,
         group: Option<&mut (dyn Group + '_)>,
@@ -438,7 +443,7 @@ impl Training {
             position.batches = 0;
         }
         if let Some(loss) = validation.map(|m| m.loss()) {
-            // A loss that is no number is never the best.
+            // A NaN or infinite loss is never the best.
             if loss.is_finite() && position.best.is_none_or(|best| loss < best) {
                 position.best = Some(loss);
                 position.since_best = 0;
@@ -455,7 +460,7 @@ impl Training {
         Ok(Some(line))
     }
 
-    /// The line of where it stands, with figures on the validation scenes.
+    /// Returns the line of the current position, with metrics on the validation scenes.
     fn line(&self) -> Result<Line, ModelError> {
         let validation = match self.sources.validation.is_empty() {
             true => None,
@@ -472,7 +477,8 @@ impl Training {
         })
     }
 
-    /// Figures on the validation scenes, as they are; of each scene another spot, always the same.
+    /// Returns the metrics on the unmodified validation scenes. The spot of a scene depends only on
+    /// the scene's index.
     fn validate(&self) -> Result<Metrics, ModelError> {
         let scenes = &*self.sources.validation;
         let mut tally = Tally::default();
@@ -514,7 +520,7 @@ impl Training {
         Ok(tally.metrics(self.plan.question.target))
     }
 
-    /// What came out.
+    /// Returns the result.
     pub fn finish(self) -> Trained {
         let parameters = self.kept.as_ref().unwrap_or(self.learner.kept());
         let named = weights::to_torch(parameters.to_named());
@@ -531,7 +537,7 @@ impl Training {
     }
 }
 
-/// What takes a plan's steps.
+/// Returns the learner of a plan.
 fn learner(plan: &Plan, net: Net, parameters: Parameters) -> Learner {
     Learner::new(net, parameters, plan.question.target, plan.decay)
         .clipped(plan.clip_norm)
@@ -561,7 +567,7 @@ impl Member for Training {
     }
 }
 
-/// Puts a learner where a checkpoint of the same plan was made; its position, and what is kept.
+/// Restores a learner from a checkpoint of the same plan. Returns its position and the kept values.
 fn restored(
     plan: &Plan,
     checkpoint: &[impl AsRef<[u8]>],
@@ -576,7 +582,7 @@ fn restored(
     Ok((header.position, kept))
 }
 
-/// How long the network waited.
+/// Measures the time for which the network waited.
 struct Clock {
     began: Instant,
     waited: Duration,

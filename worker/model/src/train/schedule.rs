@@ -1,34 +1,35 @@
-//! How fast is learned, step by step.
+//! The schedule of the learning rate.
 
 use picofarm_settings::Schedule;
 
 use super::Plan;
 use crate::ModelError;
 
-/// Where the rate and the first moment stand at a step.
+/// The optimiser settings at a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pace {
-    /// Learning rate.
+    /// The learning rate.
     pub learning_rate: f64,
-    /// β₁ of AdamW. PyTorch's one cycle moves it too, against the rate.
+    /// β₁ of AdamW. PyTorch's one-cycle schedule varies it too, in the opposite direction to the
+    /// rate.
     pub beta1: f64,
 }
 
-/// Steps of the released code's cycle.
+/// The number of steps of the released code's cycle.
 const PAPER_STEPS: u64 = 1_000_000;
-/// Share of the warm-up.
+/// The share of the steps in which the rate rises.
 const WARM_UP: f64 = 0.01;
-/// The cycle begins at the greatest rate over this …
+/// The ratio of the greatest rate to the first one.
 const START: f64 = 25.0;
-/// … and ends at its beginning over this.
+/// The ratio of the first rate to the last one.
 const END: f64 = 1e4;
-/// β₁ between these (PyTorch's `base_momentum` and `max_momentum`).
+/// The range of β₁ (PyTorch's `base_momentum` and `max_momentum`).
 const BETA1: (f64, f64) = (0.85, 0.95);
 
-/// Checks the run's length, and its cycles.
+/// Checks the run's length and its cycles.
 ///
 /// # Errors
-/// [`ModelError::Invalid`] where a cycle is shorter than the run, or its length is not known.
+/// [`ModelError::Invalid`] if a cycle is shorter than the run, or its length is not known.
 pub(super) fn check(plan: &Plan, scenes: usize) -> Result<(), ModelError> {
     let steps = plan.steps(scenes);
     if plan.schedule == Schedule::OnecyclePaper && steps > PAPER_STEPS {
@@ -47,7 +48,7 @@ pub(super) fn check(plan: &Plan, scenes: usize) -> Result<(), ModelError> {
     Ok(())
 }
 
-/// The pace at a step (from 0) of a plan's run over so many scenes.
+/// Returns the settings at a step (from 0) of a plan's run over the given number of scenes.
 pub(super) fn pace(plan: &Plan, step: u64, scenes: usize) -> Pace {
     let (steps, learning_rate) = (plan.steps(scenes), plan.learning_rate);
     let constant = |learning_rate| Pace {
@@ -81,7 +82,7 @@ fn cycle(step: u64, steps: u64, learning_rate: f64) -> Pace {
     let top = WARM_UP * steps as f64 - 1.0;
     let end = steps as f64 - 1.0;
     if step <= top {
-        // Of a run of 100 steps the first is the top.
+        // In a run of 100 steps, the first step has the greatest rate.
         let at = if top > 0.0 { step / top } else { 1.0 };
         return Pace {
             learning_rate: between(first, learning_rate, at),
@@ -99,7 +100,7 @@ fn cycle(step: u64, steps: u64, learning_rate: f64) -> Pace {
     }
 }
 
-/// From `a` to `b` on half a cosine.
+/// Interpolates from `a` to `b` along half a cosine.
 fn between(a: f64, b: f64, at: f64) -> f64 {
     b + (a - b) / 2.0 * (libm::cos(std::f64::consts::PI * at) + 1.0)
 }
@@ -114,7 +115,7 @@ mod tests {
         net::NetSpec,
     };
 
-    /// Steps of one scene each.
+    /// Returns a plan with steps of one scene each.
     fn plan(schedule: Schedule, epochs: u64) -> Plan {
         Plan {
             question: Question {
@@ -169,7 +170,8 @@ mod tests {
         }
     }
 
-    /// The documented formula of PyTorch's `CosineAnnealingWarmRestarts` with T_0 = 4 and T_mult = 2, computed in Python.
+    /// The expected values are those of the documented formula of PyTorch's
+    /// `CosineAnnealingWarmRestarts` with T_0 = 4 and T_mult = 2, computed in Python.
     #[test]
     fn restarts_are_pytorchs() {
         let mut plan = plan(Schedule::Restarts, 14);

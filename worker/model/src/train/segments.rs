@@ -1,4 +1,5 @@
-//! Gradients of a step one segment of the network after the other, as processes of a training exchange them.
+//! The gradients of a step, computed segment by segment. The processes of a training exchange them
+//! in this form.
 
 use std::ops::Range;
 
@@ -15,12 +16,12 @@ use crate::{
     parameters::{Declared, Id, download, upload},
 };
 
-/// The way back through a pass whose graph is cut between segments, from the last to the first.
+/// The backward pass over a graph with cuts between segments, from the last segment to the first.
 struct Backward {
     leaves: Vec<Tensor<1>>,
     losses: Loss,
     root: Option<Tensor<1>>,
-    /// What segments handed on, and the gradients of it so far.
+    /// The values at the cuts between segments, and their gradients so far.
     cuts: Vec<(Cut, Option<Tensor<4>>)>,
 }
 
@@ -34,7 +35,8 @@ impl Backward {
         }
     }
 
-    /// Gradients of the parameters of a segment, after those of all later segments.
+    /// Returns the gradients of the parameters of a segment. Those of all later segments must have
+    /// been computed.
     fn segment(&mut self, segment: usize, range: &Range<usize>) -> Vec<Option<Tensor<1>>> {
         let Some(root) = self.root.take() else {
             return vec![None; range.len()];
@@ -50,7 +52,8 @@ impl Backward {
         }
         let of = self.leaves[range.clone()].iter();
         let found = of.map(|leaf| leaf.grad_remove(&mut gradients)).collect();
-        // The slope of the loss along what the segment before handed on, as the gradient of a product.
+        // The gradient of the loss with respect to the values from the previous segment, computed
+        // as the gradient of a product.
         for (cut, so_far) in &mut self.cuts {
             if cut.segment + 1 == segment
                 && let Some(gradient) = so_far.take()
@@ -67,12 +70,12 @@ impl Backward {
 }
 
 impl Learner {
-    /// What a process has of a step: what is summed already, and its last batch, where it has any. Gradients are handed over as numbers
-    /// one segment of the network after the other, the last segment's first, while those of the others are still to be
-    /// computed.
+    /// Computes a process's gradients of a step from the sum so far and its last batch, if it has
+    /// one. The gradients of the last segment are passed on first, while those of the earlier
+    /// segments are still to be computed.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; nothing has changed.
+    /// [`ModelError::NotFinite`]; the learner is then unchanged.
     pub fn parts(
         &self,
         mut sum: Gradients,
@@ -123,10 +126,11 @@ impl Learner {
         Ok(())
     }
 
-    /// The sums of all processes of a step of so many batches, from [`Self::parts`] of each.
+    /// Returns the sum of a step's gradients over all processes, from the [`Self::parts`] of each.
+    /// `batches` is the number of batches in the step.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] where there are more or fewer numbers than a step has.
+    /// [`ModelError::Weights`] if there are more or fewer numbers than a step has.
     pub fn gradients_of(&self, parts: Vec<Part>, batches: usize) -> Result<Gradients, ModelError> {
         let wrong = |what: &str, there: usize, needed: usize| {
             ModelError::weights(format!("a step's {what} have {there} values, not {needed}"))
@@ -171,7 +175,7 @@ impl Learner {
         })
     }
 
-    /// Gradients of all learned parameters of a segment, and the loss.
+    /// Returns the number of gradients of a segment's learned parameters, plus one for the loss.
     fn gradient_len(&self, segment: &Range<usize>) -> usize {
         let learned = self.net.declared()[segment.clone()]
             .iter()

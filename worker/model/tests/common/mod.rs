@@ -10,12 +10,13 @@ use picofarm_model::{
     train::{Plan, Schedule, Sources},
 };
 
-/// A slanted wall whose two-bounce peaks lie where its depth says, with one mirror and half of it lit.
+/// Returns a slanted wall with two-bounce peaks at the times of its depth, with one mirror and half
+/// of it lit.
 pub fn scene(seed: u64) -> Arc<Scene> {
     sized(seed, 8)
 }
 
-/// The same in `side`² pixels.
+/// Like [`scene`], with `side`² pixels.
 pub fn sized(seed: u64, side: usize) -> Arc<Scene> {
     let (height, width, bins) = (side, side, 16);
     let mut random = Random::new(seed, &[9]);

@@ -19,7 +19,7 @@ fn one_two_and_three_threads_give_the_same_bytes() {
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
         pool.unwrap().install(|| {
-            // Wide enough for matrix products on several threads.
+            // The layers are wide enough for matrix products on several threads.
             let settings = crate::Settings {
                 width: 128,
                 distance_steps: 2,
@@ -36,7 +36,7 @@ fn one_two_and_three_threads_give_the_same_bytes() {
     assert!(one == with(3), "three threads");
 }
 
-/// Stops when it is asked for the n-th time: a step asks once for each part of its batch.
+/// Stops at the n-th call: a step calls it once for each part of its batch.
 struct StopAfter(AtomicU32);
 
 impl Progress for StopAfter {

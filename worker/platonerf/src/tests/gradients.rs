@@ -1,4 +1,4 @@
-//! Gradients against differences of the loss.
+//! Gradients compared with differences of the loss.
 
 use burn::tensor::Device;
 
@@ -11,10 +11,12 @@ use crate::{
     training::{draws, shape},
 };
 
-/// How far the slope of the loss along the gradient by one network's weights is from central differences, as a share.
+/// Returns the relative error of the loss's slope along the gradient of one network's weights,
+/// compared with central differences.
 ///
-/// The gradient takes samples by importance as fixed, but they move with the weights. So there is one a ray, at the lower
-/// end of its distribution: beside the ray's origin, where it hardly moves.
+/// The gradient treats samples by importance as fixed, but they move with the weights. The test
+/// therefore uses one such sample a ray, at the lower end of its distribution next to the ray's
+/// origin, where it hardly moves.
 fn error(settings: &Settings, stage: Stage, which: usize) -> f64 {
     let (pool, _) = Pool::new(room()).unwrap();
     let batch = pool.batch(stage == Stage::Distance, 1, 0, settings.batch);
@@ -36,8 +38,9 @@ fn error(settings: &Settings, stage: Stage, which: usize) -> f64 {
         each.for_each(|(w, g)| *w += (step * f64::from(*g)) as f32);
         f64::from(host(of(&weights, &Device::flex()).1)[0])
     };
-    // Short steps drown in rounding. On long ones the loss bends: light paths begin at the depth, and frequencies of 512/m
-    // turn within a millimetre. So the best of some lengths counts.
+    // Short steps drown in rounding. On long ones the loss is nonlinear, because light paths begin
+    // at the depth and frequencies of 512/m turn within a millimetre. The test therefore takes the
+    // best of some lengths.
     let slope = |length: f64| {
         let step = length / norm.sqrt();
         (moved(step) - moved(-step)) / (2.0 * step)
@@ -52,11 +55,12 @@ fn gradients_are_slopes_of_the_loss_in_both_stages() {
     for (stage, shadow_loss, distance_weight) in [
         (Stage::Distance, squares, 6000.0),
         (Stage::Shadow, squares, 6000.0),
-        // Shadows alone: they reach the distance through the origin and the end of light paths.
+        // Shadows alone: they affect the distance through the origin and the end of light paths.
         (Stage::Shadow, squares, 1e-9),
         (Stage::Shadow, ShadowLoss::CrossEntropy, 1e-9),
     ] {
-        // What shadows alone say to the fine network hangs on its one sample by importance; the twin checks it.
+        // The gradient of shadows alone for the fine network depends on its one sample by
+        // importance; the comparison with PyTorch checks it.
         let networks: &[usize] = if distance_weight > 1.0 { &[0, 1] } else { &[0] };
         for &which in networks {
             let settings = Settings {

@@ -1,4 +1,5 @@
-//! Input that cannot be used is refused by name; input that says little gives a stated result; never NaN.
+//! Unusable input is refused by name; input with little information gives a defined result; there
+//! is never NaN.
 
 use burn::tensor::Device;
 use picofarm_reconstruct::{Measured, Unwatched};
@@ -15,7 +16,7 @@ fn refused(measured: Measured, settings: Settings) -> String {
     Training::begin(measured, settings).unwrap_err().to_string()
 }
 
-/// Fits, and returns the notes.
+/// Runs a fit and returns its notes.
 fn fits(measured: Measured, settings: Settings) -> Vec<String> {
     let mut training = Training::begin(measured, settings).unwrap();
     assert!(training.run(&Unwatched).unwrap());

@@ -1,4 +1,5 @@
-//! What holds of the fit: gradients, closed forms, bytes, refusals, and agreement with a twin in PyTorch.
+//! Tests of the fit: gradients, closed forms, bytes, refusals, and agreement with a twin in
+//! PyTorch.
 
 mod bytes;
 mod gradients;
@@ -18,7 +19,8 @@ use crate::{
     training::{State, gradients},
 };
 
-/// A wall 2 m ahead, 16×16 pixels, three spots beside it; every third pixel is in shadow. Times are exact.
+/// Returns a wall 2 m ahead with 16×16 pixels and three spots next to it; every third pixel is in
+/// shadow. Times are exact.
 fn room() -> Measured {
     let camera = Camera::look_at(
         Vec3::ZERO,
@@ -61,7 +63,7 @@ fn room() -> Measured {
     measured
 }
 
-/// A fit of milliseconds a step.
+/// Returns settings with steps of milliseconds.
 fn small() -> Settings {
     Settings {
         width: 16,
@@ -74,7 +76,7 @@ fn small() -> Settings {
     }
 }
 
-/// The first weights that give both networks a density on the first step's rays.
+/// Returns the first weights that give both networks a density on the first step's rays.
 fn alive(settings: &Settings) -> State {
     let (pool, _) = Pool::new(room()).unwrap();
     let batch = pool.batch(true, settings.seed, 0, settings.batch);

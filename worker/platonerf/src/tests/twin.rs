@@ -1,14 +1,17 @@
-//! Agreement with PyTorch: the same weights, rays and random draws through `tests/twin/twin.py`, whose results lie beside it.
+//! Agreement with PyTorch: the same weights, rays and random draws through `tests/twin/twin.py`,
+//! with stored results in the same folder.
 //!
-//! To make them again (needs Python with torch and safetensors, from the crate's folder):
+//! To compute the results again (in the crate's folder; requires Python with torch and
+//! safetensors):
 //!
 //! ```sh
 //! PICOFARM_TWIN=input.safetensors cargo test --release -p picofarm-platonerf writes_what_the_twin_reads -- --ignored
 //! python tests/twin/twin.py input.safetensors tests/twin/twin.safetensors
 //! ```
 //!
-//! The twin computes in 64 bits and prints how far the same program in 32 bits is off. The tolerances below are a few times
-//! that: frequencies of 512/m turn rounding of places into angles that are off by 1e-4.
+//! The twin computes in 64 bits and prints the deviation of the same program in 32 bits. The
+//! tolerances below are a few times that deviation: with frequencies of 512/m, rounding of
+//! positions gives errors of 1e-4 in angles.
 
 use std::collections::HashMap;
 
@@ -27,14 +30,14 @@ use crate::{
 
 const STEPS: u32 = 100;
 
-/// Tolerances, as shares of the norm. Found: outputs 8e-5, gradients 6e-4, losses 2e-5, weights after 100 steps 2e-3. The
-/// twin in 32 bits is off by 1e-4, 6e-4, 1e-5 and 2e-3.
+/// Tolerances relative to the norm. Measured errors: outputs 8e-5, gradients 6e-4, losses 2e-5,
+/// weights after 100 steps 2e-3. The twin in 32 bits deviates by 1e-4, 6e-4, 1e-5 and 2e-3.
 const OUTPUTS: f64 = 5e-4;
-/// Of the first step.
+/// Gradients of the first step.
 const GRADIENTS: f64 = 3e-3;
-/// Of all steps.
+/// Losses of all steps.
 const LOSSES: f64 = 1e-4;
-/// After the last step.
+/// Weights after the last step.
 const WEIGHTS: f64 = 1e-2;
 
 fn settings() -> Settings {
@@ -115,7 +118,7 @@ fn writes_what_the_twin_reads() {
     std::fs::write(path, bytes).unwrap();
 }
 
-/// Largest difference, and the difference's norm as a share of the norm.
+/// Returns the largest difference, and the norm of the differences relative to the norm.
 fn apart(found: &[f32], wanted: &[f32]) -> (f64, f64) {
     assert_eq!(found.len(), wanted.len());
     let (mut worst, mut square, mut norm) = (0.0f64, 0.0f64, 0.0f64);
@@ -128,7 +131,7 @@ fn apart(found: &[f32], wanted: &[f32]) -> (f64, f64) {
     (worst, (square / norm).sqrt())
 }
 
-/// Depths, and in stage 2 transmittances, of the first batch: the twin's order.
+/// Returns the depths, and in stage 2 the transmittances, of the first batch, in the twin's order.
 fn seen(stage: Stage, weights: &[Vec<f32>; 2], b: &Batch) -> Vec<f32> {
     let (s, n, device) = (settings(), b.rays(), Device::flex());
     let networks = [0, 1].map(|k| Network::new(shape(&s), &weights[k], &device));

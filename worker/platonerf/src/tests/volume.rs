@@ -7,7 +7,7 @@ use crate::{
     render::{matrix, volume},
 };
 
-/// A slab of density σ between two distances, seen with even samples.
+/// Renders a slab of density σ between two distances, with even samples.
 fn slab(density: f32, from: f32, to: f32) -> (f32, f32) {
     let device = Device::flex();
     let n = 4001;

@@ -1,5 +1,6 @@
-//! Neighbouring pixels joined: a plane is linear in inverse z-depth over the image, so a plane fitted to a pixel's
-//! neighbours in inverse depth gives its depth with less noise, and its normal.
+//! Smoothing over neighbouring pixels: a plane is linear in inverse z-depth over the image, so a
+//! plane fitted to a pixel's neighbours in inverse depth gives its depth with less noise, and its
+//! normal.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -7,24 +8,25 @@ use rayon::prelude::*;
 use super::Depth;
 use crate::Measured;
 
-/// Pixels on each side of the one in the middle, at a focal length of 256 pixels or more; in coarser images fewer, so that the
-/// fit does not span edges.
+/// The number of pixels on each side of the central one, at a focal length of 256 pixels or more.
+/// Coarser images use fewer, so that the fit does not span edges.
 const REACH: i64 = 3;
-/// Focal length in pixels for each pixel of reach.
+/// The focal length in pixels for each pixel of reach.
 const FOCAL: f32 = 128.0;
-/// Relative difference in inverse depth up to which a neighbour counts as on the same surface: this, and as much again
-/// for each pixel of distance.
+/// The relative difference in inverse depth up to which a neighbour counts as on the same surface.
+/// The same amount is added for each pixel of distance.
 const SLOPE: f32 = 0.012;
-/// Fewest neighbours of a fit.
+/// The least number of neighbours of a fit.
 const FEWEST: f64 = 6.0;
 
-/// Depth with each pixel replaced by the plane through its neighbours on the same surface, weighted by their errors, and
-/// normals. A pixel without enough neighbours keeps its depth and has no normal.
+/// Replaces each pixel's depth by the plane through its neighbours on the same surface, weighted by
+/// their errors, and computes normals. A pixel without enough neighbours retains its depth and has
+/// no normal.
 pub fn smooth(measured: &Measured, depth: &Depth) -> Depth {
     let camera = &measured.camera;
     let i = camera.intrinsics;
     let (width, height) = (i64::from(i.width), i64::from(i.height));
-    // Coarse images see larger steps from pixel to pixel.
+    // In coarse images, the difference between neighbouring pixels is larger.
     let slope = SLOPE * (512.0 * 0.5 / i.fx.min(i.fy)).max(1.0);
     let reach = ((i.fx.min(i.fy) / FOCAL).round() as i64).clamp(1, REACH);
     let rays: Vec<(Vec3, f32)> = (0..measured.pixels())
@@ -101,7 +103,8 @@ pub fn smooth(measured: &Measured, depth: &Depth) -> Depth {
     }
 }
 
-/// Gauss–Jordan without pivoting: the matrix is symmetric and positive. `None` where it is singular.
+/// Solves the equations by Gauss–Jordan without pivoting, because the matrix is symmetric and
+/// positive. Returns `None` if it is singular.
 fn solve(mut m: [[f64; 4]; 3]) -> Option<[f64; 3]> {
     for a in 0..3 {
         m[a][a] += 1e-9;

@@ -1,14 +1,15 @@
-//! Which cells of a grid a ray has to look at, and blocks of 8×8×8 cells without any, which it jumps over.
+//! Selects the cells of a grid that a ray has to visit. A ray skips blocks of 8×8×8 cells that
+//! contain none.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
 
 use super::Field;
 
-/// Cells a side of a block.
+/// The number of cells along a side of a block.
 const SIDE: usize = 8;
 
-/// Cells of interest.
+/// The cells of interest.
 #[derive(Debug, Clone)]
 pub struct Skip {
     cells: Vec<u8>,
@@ -17,7 +18,7 @@ pub struct Skip {
 }
 
 impl Skip {
-    /// Cells of which at least one of the eight nodes is of interest.
+    /// Selects cells with at least one node of interest among their eight.
     pub fn to_nodes(field: &Field, of_interest: impl Fn(usize) -> bool + Sync) -> Self {
         let [nx, ny, nz] = field.nodes;
         let [_, y, z] = field.strides();
@@ -61,7 +62,8 @@ impl Skip {
         self.blocks[((k / SIDE) * self.across[1] + j / SIDE) * self.across[0] + i / SIDE] != 0
     }
 
-    /// Distance in t from the grid place `p` to where a ray leaves the block of cell (i, j, k); `slope` is t a voxel.
+    /// Returns the distance in t from the grid position `p` to the point at which a ray leaves the
+    /// block of cell (i, j, k); `slope` is t a voxel.
     #[inline(always)]
     pub(super) fn leave(&self, p: Vec3, slope: Vec3, (i, j, k): (usize, usize, usize)) -> f32 {
         let mut ahead = f32::INFINITY;
@@ -72,7 +74,7 @@ impl Skip {
             } else {
                 block * SIDE
             };
-            // A ray parallel to the wall has an infinite slope: it leaves elsewhere.
+            // A ray parallel to the wall has an infinite slope and leaves through another wall.
             let t = (wall as f32 - p[axis]) * slope[axis];
             if t < ahead {
                 ahead = t;

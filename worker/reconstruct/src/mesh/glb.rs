@@ -1,5 +1,5 @@
-//! The surface as binary glTF: a scene with the camera and the laser that measured it, which viewers open and the importer
-//! of scenes reads.
+//! The surface as binary glTF: a scene with the camera and the laser of the measurement, for
+//! viewers and for the importer of scenes.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -10,16 +10,17 @@ use picofarm_scene::{
 use super::Surface;
 use crate::{Measured, ReconstructError, VERSION};
 
-/// Reflectance of the surface: no colour is measured.
+/// The reflectance of the surface: colour is not measured.
 const GREY: f32 = 0.5;
 
 impl Surface {
-    /// Binary glTF 2.0 in metres and the scene's axes, y up, with normals and a grey two-sided material. A surface without
-    /// triangles gives a file that holds the camera and the laser alone.
+    /// Encodes the surface as binary glTF 2.0 in metres and the scene's axes, y up, with normals
+    /// and a grey two-sided material. If the surface has no triangles, the file contains only the
+    /// camera and the laser.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] where the measuring camera's axes are not orthonormal, or for more than the 4 GiB of a
-    /// `.glb`.
+    /// [`ReconstructError::Invalid`] if the measuring camera's axes are not orthonormal, or if the
+    /// file would exceed the 4 GiB of a `.glb`.
     pub fn glb(&self, measured: &Measured) -> Result<Vec<u8>, ReconstructError> {
         let mesh = Mesh {
             name: "surface".into(),

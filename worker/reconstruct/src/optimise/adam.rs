@@ -1,21 +1,21 @@
-//! The step of a node: Adam (Kingma and Ba 2015), and what pulls at it besides the rays.
+//! The update of a node: Adam (Kingma and Ba 2015), and the pulls on it other than the rays.
 
 use super::Kind;
 use crate::field::{EMPTY, sigmoid};
 
-/// Learning rate, and of the last third.
+/// The learning rate, and that of the last third.
 const RATES: [f32; 2] = [0.2, 0.06];
 const FIRST: f32 = 0.9;
 const SECOND: f32 = 0.99;
 const SMALL: f32 = 1e-3;
-/// Pull towards emptiness: more erodes the backs of things, less leaves mist.
+/// The pull towards emptiness: more erodes the backs of objects, less leaves mist.
 const SPARSE: f32 = 0.003;
-/// Pull of seen surfaces to where they were.
+/// The pull of visible surfaces towards their start.
 const ANCHOR: f32 = 0.05;
-/// Logits beyond this hardly feel a gradient.
+/// The logit beyond which the gradient almost vanishes.
 const FULL: f32 = 6.0;
 
-/// Running means of the gradients and their squares.
+/// The running means of the gradients and of their squares.
 #[derive(Debug, Clone)]
 pub(crate) struct Moments {
     pub first: Vec<f32>,
@@ -31,7 +31,7 @@ impl Moments {
     }
 }
 
-/// What is common to the steps of an iteration.
+/// The values common to all updates of an iteration.
 pub(super) struct Rate {
     rate: f32,
     first: f32,
@@ -49,7 +49,7 @@ impl Rate {
     }
 }
 
-/// Derivative of what pulls at a node besides rays.
+/// Returns the derivative of the pulls on a node other than the rays.
 #[inline(always)]
 pub(super) fn pull(kind: Kind, u: f32, start: f32) -> f32 {
     match kind {
@@ -61,7 +61,7 @@ pub(super) fn pull(kind: Kind, u: f32, start: f32) -> f32 {
     }
 }
 
-/// The new logit.
+/// Returns the new logit.
 #[inline(always)]
 pub(super) fn step(u: f32, g: f32, (m, v): (&mut f32, &mut f32), rate: &Rate) -> f32 {
     *m = FIRST * *m + (1.0 - FIRST) * g;

@@ -1,4 +1,5 @@
-//! One ray: its loss, and the derivative of the loss by the logit of every node that it passes.
+//! One ray: its loss, and the derivative of the loss with respect to the logit of every node that
+//! it passes.
 
 use crate::{
     field::{Field, PEAK, Skip, sigmoid},
@@ -6,16 +7,16 @@ use crate::{
 };
 use picofarm_scene::Vec3;
 
-/// Steps a voxel.
+/// The number of steps a voxel.
 const STEPS: f32 = 2.0;
-/// Keeps the loss of a stopped ray finite where nothing stops it.
+/// A constant that limits the loss of a stopped ray if no matter stops it.
 const FLOOR: f32 = 0.02;
-/// Optical depths of free rays beyond this count less and less.
+/// The optical depth beyond which the loss of a free ray saturates.
 const SATURATES: f32 = 10.0;
-/// Derivatives below this are left out.
+/// Derivatives below this are omitted.
 const LEAST: f32 = 1e-6;
 
-/// Scratch memory: the places along a ray.
+/// Scratch memory: the positions along a ray.
 #[derive(Debug, Default)]
 pub struct Cast {
     places: Vec<(usize, [f32; 3], f32)>,
@@ -47,7 +48,7 @@ impl Cast {
         f64::from(loss)
     }
 
-    /// Tells the derivative of the loss by the logit of each node, in parts.
+    /// Passes on the derivative of the loss with respect to the logit of each node, in parts.
     #[inline]
     pub(crate) fn spread(&self, field: &Field, mut tell: impl FnMut(usize, f32)) {
         let [_, y, z] = field.strides();
@@ -73,7 +74,7 @@ impl Cast {
     }
 }
 
-/// Loss of a ray by its optical depth, and its derivative.
+/// Returns the loss of a ray for its optical depth, and the derivative.
 #[inline(always)]
 fn loss(wanted: Wanted, depth: f32) -> (f32, f32) {
     match wanted {
@@ -89,8 +90,9 @@ fn loss(wanted: Wanted, depth: f32) -> (f32, f32) {
     }
 }
 
-/// The loss of the way from `a` to `b` through a field, and its derivative by every logit: what the optimisation follows,
-/// for one ray. `free` = all light shall get through; otherwise none shall.
+/// Returns the loss of the path from `a` to `b` through a field, and its derivative with respect to
+/// every logit, as in the optimisation, for one ray. If `free`, all light should pass; otherwise
+/// none should.
 pub fn cast_ray(field: &Field, a: Vec3, b: Vec3, free: bool) -> (f64, Vec<f64>) {
     let skip = Skip::to_nodes(field, |_| true);
     let length = (b - a).length();

@@ -1,4 +1,4 @@
-//! Distances between the reconstructed and the true surfaces, and matter where there is none.
+//! Distances between the reconstructed and the true surfaces, and matter in empty space.
 
 use kdtree::{KdTree, distance::squared_euclidean};
 use picofarm_scene::Vec3;
@@ -12,48 +12,49 @@ use crate::{
     world::{World, sample},
 };
 
-/// Points on each surface.
+/// The number of points on each surface.
 const POINTS: usize = 100_000;
-/// Points on the true surfaces from which the distance of floating matter is measured.
+/// The number of points on the true surfaces from which the distance of floating matter is
+/// measured.
 const DENSE: usize = 400_000;
-/// Matter farther than this from any surface floats, metres.
+/// Matter at a larger distance from any surface floats, metres.
 const FLOATS_M: f32 = 0.05;
-/// Points closer than this count as found, metres.
+/// The distance within which points match, metres.
 const CLOSE_M: f64 = 0.05;
-/// Share of light that matter stops over one voxel.
+/// The share of light that matter stops over one voxel.
 const OPAQUE: f32 = 0.5;
-/// Points in a leaf of a tree.
+/// The number of points in a leaf of a tree.
 const LEAF: usize = 16;
 
-/// How near two surfaces are to each other.
+/// The distances between two surfaces.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MeshScore {
-    /// Mean of the two mean distances, metres.
+    /// The mean of the two mean distances, metres.
     pub chamfer_m: f64,
-    /// Mean distance from the reconstruction to the truth, metres.
+    /// The mean distance from the reconstruction to the truth, metres.
     pub accuracy_m: f64,
-    /// Mean distance from the truth to the reconstruction, metres.
+    /// The mean distance from the truth to the reconstruction, metres.
     pub completeness_m: f64,
-    /// Harmonic mean of precision and recall at `close_m`.
+    /// The harmonic mean of precision and recall at `close_m`.
     pub f_score: f64,
-    /// Share of the reconstruction's points within `close_m` of the truth.
+    /// The share of the reconstruction's points within `close_m` of the truth.
     pub precision: f64,
-    /// Share of the truth's points within `close_m` of the reconstruction.
+    /// The share of the truth's points within `close_m` of the reconstruction.
     pub recall: f64,
     /// The distance of the F-score, metres.
     pub close_m: f64,
-    /// Points on each surface before the box.
+    /// The number of points on each surface before they are limited to the box.
     pub points: usize,
 }
 
 /// Matter that floats in free space.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Floaters {
-    /// Its volume, m³.
+    /// The volume, m³.
     pub volume_m3: f64,
-    /// Density from which on a node counts, 1/m: half the light stopped over one voxel.
+    /// The density from which a node counts, 1/m: half the light is stopped over one voxel.
     pub threshold_per_m: f64,
-    /// Least distance to any surface, metres.
+    /// The least distance to any surface, metres.
     pub farther_than_m: f64,
 }
 
@@ -83,11 +84,12 @@ fn distance(tree: &Tree, x: Vec3) -> f64 {
     first.map_or(f64::INFINITY, f64::sqrt)
 }
 
-/// Distances between a reconstructed surface and the true ones, over the box of the grid, as means over points uniform by
-/// area. The truth's points include surfaces that nobody can see (a seat's inside against its legs).
+/// Computes the distances between a reconstructed surface and the true ones within the grid's box,
+/// as means over points uniform by area. The truth's points include invisible surfaces (the inside
+/// of a seat against its legs).
 ///
 /// # Errors
-/// [`ReconstructError::Invalid`] where either has no surface.
+/// [`ReconstructError::Invalid`] if either has no surface.
 pub fn mesh_score(
     surface: &Surface,
     world: &World,
@@ -126,11 +128,12 @@ pub fn mesh_score(
     })
 }
 
-/// Matter farther than 5 cm from any surface, within the box round the scene's surfaces and outside of solids. (Planes of the
-/// room go on beyond an open side; that is no floating matter.)
+/// Computes the matter farther than 5 cm from any surface, within the bounding box of the scene's
+/// surfaces and outside solids. Planes of the room that extend beyond an open side are therefore
+/// not counted.
 ///
 /// # Errors
-/// [`ReconstructError::Invalid`] where the scene has no surface inside the grid.
+/// [`ReconstructError::Invalid`] if the scene has no surface inside the grid.
 pub fn floaters(field: &Field, world: &World, seed: u64) -> Result<Floaters, ReconstructError> {
     let truth = world.surface_points(DENSE, seed, field.origin, field.end());
     if truth.is_empty() {

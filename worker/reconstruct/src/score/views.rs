@@ -1,4 +1,5 @@
-//! Depth of views from elsewhere, as distance along the ray at T = 0.5, against the true distance.
+//! Scores of depth in novel views: the distance along the ray at T = 0.5 compared with the true
+//! distance.
 
 use picofarm_scene::{Camera, Intrinsics, Vec3};
 use rayon::prelude::*;
@@ -6,58 +7,58 @@ use serde::Serialize;
 
 use crate::{Measured, render::Distances, world::World};
 
-/// What a pixel of a novel view sees.
+/// The kind of surface that a pixel of a novel view sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Class {
-    /// A surface that the measuring camera saw too.
+    /// A surface that the measuring camera also saw.
     Visible,
-    /// One within its view that something hid.
+    /// A surface within the measuring camera's view that an object hid.
     Occluded,
-    /// One outside its view.
+    /// A surface outside the measuring camera's view.
     Outside,
-    /// A mirror, wherever it is.
+    /// A mirror anywhere.
     Specular,
-    /// Nothing: the ray leaves the scene. Not part of any error.
+    /// Nothing: the ray leaves the scene. Not included in any error.
     Open,
 }
 
-/// Errors over some pixels.
+/// The errors over some pixels.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Split {
-    /// Pixels.
+    /// The number of pixels.
     pub pixels: u64,
-    /// Mean absolute error, metres; 0 without pixels.
+    /// The mean absolute error, metres; 0 without pixels.
     pub l1_m: f64,
-    /// Root of the mean squared error, metres.
+    /// The root mean square error, metres.
     pub rmse_m: f64,
 }
 
-/// Errors over all views.
+/// The errors over all views.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ViewScore {
-    /// Views.
+    /// The number of views.
     pub views: usize,
-    /// All pixels that see a surface, mirrors left out.
+    /// All pixels that see a surface, except mirrors.
     pub all: Split,
-    /// Those within the measuring camera's view.
+    /// Pixels within the measuring camera's view.
     pub within_view: Split,
     /// See [`Class::Visible`].
     pub visible: Split,
     /// See [`Class::Occluded`].
     pub occluded: Split,
-    /// Occluded ones that are neither floor, ceiling nor wall.
+    /// Occluded pixels except floor, ceiling and wall.
     pub occluded_objects: Split,
     /// See [`Class::Outside`].
     pub outside: Split,
     /// See [`Class::Specular`].
     pub specular: Split,
-    /// Pixels that see nothing, and the share of them at which the reconstruction has a surface.
+    /// The number of pixels that see nothing.
     pub open_pixels: u64,
-    /// See `open_pixels`.
+    /// The share of open pixels at which the reconstruction has a surface.
     pub open_filled: f64,
-    /// Peak signal-to-noise ratio over `all`, dB.
+    /// The peak signal-to-noise ratio over `all`, dB.
     pub psnr_db: f64,
-    /// Its peak: the largest true distance, metres.
+    /// The peak: the largest true distance, metres.
     pub psnr_range_m: f64,
 }
 
@@ -95,7 +96,8 @@ impl Sum {
     }
 }
 
-/// Sums by class (see [`Class`]), then occluded objects; open pixels that are filled; the largest distance.
+/// Sums by class (see [`Class`]), then for occluded objects; the number of filled open pixels; the
+/// largest distance.
 #[derive(Debug, Clone, Copy, Default)]
 struct Sums {
     of: [Sum; 6],
@@ -114,7 +116,7 @@ impl Sums {
     }
 }
 
-/// Scores a field by its depth in other views. `measured` says what the measuring camera saw.
+/// Scores a field by its depth in other views. `measured` is the measuring camera.
 pub fn score_views(
     renderer: &dyn Distances,
     measured: &Camera,
@@ -185,16 +187,17 @@ fn of_row(
     sums
 }
 
-/// Whether a place is within a camera's view, hidden or not.
+/// Returns whether a position is within a camera's view, hidden or not.
 fn in_view(camera: &Camera, x: Vec3) -> bool {
     let (q, i) = (camera.to_camera(x), &camera.intrinsics);
     let (u, v) = (i.fx * q.x / q.z + i.cx, i.fy * q.y / q.z + i.cy);
     q.z > 0.02 && (0.0..i.width as f32).contains(&u) && (0.0..i.height as f32).contains(&v)
 }
 
-/// `count` views on a circle round the middle of what the camera sees, at the camera's height, looking at that middle: those
-/// that stand in the open, at least 0.25 m from any surface and with nothing of the scene's outside before them. The circle
-/// has half the distance of the camera from the middle as its radius.
+/// Returns up to `count` views on a circle around the middle of the visible points, at the camera's
+/// height and looking at that middle. The circle's radius is half the distance of the camera from
+/// the middle. Views are omitted if they are within 0.25 m of a surface, inside a solid, or behind
+/// a wall.
 pub fn around(
     measured: &Measured,
     range: &[f32],

@@ -1,9 +1,10 @@
-//! Measurements from K separate single-spot histograms, as PlatoNeRF makes them (its `src/run_platonerf.py` and
-//! `utils/load_tof.py`; numbers in the code are the steps of its preprocessing).
+//! Measurements from K separate single-spot histograms, as in PlatoNeRF (its `src/run_platonerf.py`
+//! and `utils/load_tof.py`; numbers in the code are the steps of its preprocessing).
 //!
-//! What differs: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin late), and pixels near a spot
-//! take no part (PlatoNeRF zeroes their histograms, which then count as shadow). [`Captures::finish`] goes on from there
-//! and compares each pixel's two-bounce light with what a lit pixel would return; [`Captures::finish_plain`] does not.
+//! Two steps differ: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin
+//! late), and pixels near a spot are not used (PlatoNeRF sets their histograms to zero, which then
+//! count as shadow). [`Captures::finish`] continues from there and compares each pixel's two-bounce
+//! light with the expected light of a lit pixel; [`Captures::finish_plain`] does not.
 
 use picofarm_scene::{Beam, Camera, Laser, Vec3};
 use picofarm_settings::Sensor;
@@ -16,16 +17,18 @@ use super::{
 };
 use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
 
-/// A pixel is lit where the matched filter's response reaches this (PlatoNeRF's threshold in all four of its scenes).
+/// A pixel is lit if the matched filter's response is at least this (PlatoNeRF's threshold in all
+/// four of its scenes).
 pub const LIT_THRESHOLD: f32 = 0.15;
-/// Largest angle between a beam's spot and the brightest pixel, radians: beyond it the beam met a mirror.
+/// The largest angle between a beam's spot and the brightest pixel, radians. A larger angle means
+/// that a mirror reflected the beam.
 const ASTRAY: f32 = 0.04;
-/// Bins of the pulse template below this share of it are left out.
+/// Bins of the pulse template below this share of its peak are omitted.
 const TEMPLATE_FLOOR: f32 = 1e-3;
-/// With photon noise, a return is one from so many standard deviations of it on.
+/// With photon noise, the number of standard deviations from which a peak counts as a return.
 const CERTAIN: f32 = 3.0;
 
-/// Takes captures one by one, so that the histograms of one spot are in memory at a time.
+/// Processes captures one by one, so that only the histograms of one spot are in memory at a time.
 #[derive(Debug)]
 pub struct Captures {
     gate: Gate,
@@ -38,7 +41,7 @@ pub struct Captures {
 }
 
 impl Captures {
-    /// Begins with the camera, the laser and its beams' directions, and the gate of the histograms.
+    /// Starts with the camera, the laser and its beams' directions, and the gate of the histograms.
     pub fn new(camera: Camera, laser: Laser, gate: Gate, threshold: f32) -> Self {
         let measured = Measured {
             camera,
@@ -61,11 +64,12 @@ impl Captures {
         }
     }
 
-    /// Puts a detector before the captures: photon noise, ambient light, pulse and jitter. The ambient light of each pixel is
-    /// estimated from its own bins and taken off.
+    /// Simulates a detector in front of the captures: photon noise, ambient light, pulse and
+    /// jitter. The ambient light of each pixel is estimated from its own bins and subtracted.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] for a sensor that cannot be, or that sums bins: captures keep theirs.
+    /// [`ReconstructError::Invalid`] for an invalid sensor, or one that sums bins: captures retain
+    /// their bins.
     pub fn behind(self, sensor: &Sensor, seed: u64) -> Result<Self, ReconstructError> {
         sensor
             .check()
@@ -84,15 +88,16 @@ impl Captures {
         })
     }
 
-    /// Pixels of which it is known that they see a mirror (1), `[row][column]`; they take no part.
+    /// Sets the pixels that are known to see a mirror (1), `[row][column]`; they are not used.
     pub fn mirrors(&mut self, mirror: Vec<u8>) {
         self.measured.mirror = mirror;
     }
 
-    /// Takes the capture of beam `beam`: histograms `[row][column][bin]`.
+    /// Adds the capture of beam `beam`: histograms `[row][column][bin]`.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] for a histogram of another size, a value that is no number, or a beam that is not there.
+    /// [`ReconstructError::Invalid`] for a histogram of another size, a NaN or infinite value, or a
+    /// beam that does not exist.
     pub fn add(&mut self, beam: usize, histogram: &[f32]) -> Result<(), ReconstructError> {
         let (pixels, bins) = (self.measured.pixels(), self.gate.bins as usize);
         let field = || format!("captures[{beam}]");
@@ -126,18 +131,19 @@ impl Captures {
         Ok(())
     }
 
-    /// Leaves a beam out, and says why.
+    /// Excludes a beam for the given reason.
     pub fn leave_out(&mut self, beam: usize, why: &str) {
         let why = why.to_owned();
         self.measured.left_out.push(LeftOut { beam, why });
     }
 
-    /// What was measured: masks by the light that a lit pixel is expected to return.
+    /// Returns the measurements, with masks from the expected light of a lit pixel.
     pub fn finish(self) -> Measured {
         expected(self.measured, &self.returns)
     }
 
-    /// The same with PlatoNeRF's masks: lit where the matched filter's response reaches the threshold.
+    /// Returns the measurements with PlatoNeRF's masks: lit if the matched filter's response
+    /// reaches the threshold.
     pub fn finish_plain(self) -> Measured {
         self.measured
     }
@@ -146,7 +152,8 @@ impl Captures {
         (self.gate.start_m + (bin as f64 + 0.5) * self.gate.bin_width_m) as f32
     }
 
-    /// Step 2 and 4: the spot from the brightest pixel's one-bounce peak, and the pulse from that pixel; or why there is none.
+    /// Steps 2 and 4: returns the spot from the brightest pixel's one-bounce peak, and the pulse
+    /// from that pixel, or the reason why there is none.
     fn spot(
         &self,
         direction: Vec3,
@@ -214,7 +221,8 @@ impl Captures {
             let mirror = this.measured.mirror.get(p).is_some_and(|&m| m != 0);
             let sum: f32 = h.iter().sum();
             if near || mirror || sum <= 0.0 {
-                // A histogram without any light says nothing: not even light of three bounces came.
+                // A histogram without any light is not evidence: not even light of three bounces
+                // arrived.
                 return (0.0, 0, 0, Return::default());
             }
             let (bin, _) = peak(h);
@@ -230,7 +238,7 @@ impl Captures {
             let tau = this.middle(bin);
             let around = &h[bin.saturating_sub(1)..(bin + 2).min(bins)];
             let near: f32 = around.iter().sum();
-            // Counts are their own variance, ambient ones included.
+            // The variance of counts is their sum, ambient counts included.
             let noise = counted.map_or(0.0, |c| {
                 (near.max(0.0) + c.ambient[p] * around.len() as f32).sqrt()
             });
@@ -255,7 +263,7 @@ impl Captures {
     }
 }
 
-/// The first highest bin and its value.
+/// Returns the first highest bin and its value.
 fn peak(h: &[f32]) -> (usize, f32) {
     let better =
         |best: (usize, f32), (b, &v): (usize, &f32)| if v > best.1 { (b, v) } else { best };

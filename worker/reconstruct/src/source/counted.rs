@@ -1,4 +1,4 @@
-//! Captures as a detector counts them: photon noise and ambient light.
+//! Captures as counted by a detector: with photon noise and ambient light.
 
 use picofarm_settings::{PS_PER_M, Sensor};
 use picofarm_transient::{
@@ -16,14 +16,15 @@ pub(super) struct Detector {
     pub seed: u64,
 }
 
-/// A capture's photons without the ambient light, `[row][column][bin]`, and each pixel's ambient photons a bin.
+/// A capture's photons without the ambient light, `[row][column][bin]`, and each pixel's ambient
+/// photons a bin.
 pub(super) struct Counted {
     pub light: Vec<f32>,
     pub ambient: Vec<f32>,
 }
 
 impl Detector {
-    /// What it makes of a capture of so many bins a pixel.
+    /// Returns the detector's counts for a capture with the given number of bins a pixel.
     pub fn count(
         &self,
         beam: usize,
@@ -43,7 +44,8 @@ impl Detector {
             Values::Counts(counts) => counts.into_iter().map(|n| n as f32).collect(),
             Values::Rate(rate) => rate,
         };
-        // Most bins hold no more than ambient light: what of it there is, the lower half of the bins tells.
+        // Most bins contain only ambient light, so its level is estimated from the lower half of
+        // the bins.
         let ambient = |h: &mut [f32]| -> f32 {
             let level = lower_mean(h);
             h.iter_mut().for_each(|n| *n -= level);
@@ -54,8 +56,8 @@ impl Detector {
     }
 }
 
-/// The mean of the bins up to the median. For counts of ambient light alone the median is a whole number, and their mean is
-/// not; so the bins within twice the spread of the median are averaged.
+/// Returns the level of ambient light: the mean of the bins up to two spreads above the median. The
+/// median itself is too coarse, because it is a whole number for counts of ambient light alone.
 fn lower_mean(h: &[f32]) -> f32 {
     let mut sorted = h.to_vec();
     let middle = (sorted.len() - 1) / 2;
@@ -97,7 +99,7 @@ mod tests {
             let detector = Detector { sensor, seed: 1 };
             let counted = detector.count(0, &histogram, &gate).unwrap();
             let mean = counted.ambient.iter().sum::<f32>() / 64.0;
-            // Cutting off at two spreads leaves out some of the ambient light.
+            // The cutoff at two spreads excludes some of the ambient light.
             assert!(
                 (f64::from(mean) - dark).abs() < 0.05 * dark + 0.02,
                 "{mean} {dark}"

@@ -1,9 +1,11 @@
-//! Shadow masks by the light that a lit pixel is expected to return.
+//! Shadow masks computed from the light that a lit pixel is expected to return.
 //!
-//! A threshold on the share of a pixel's light in its strongest return calls a pixel lit whose edge alone is, and light of three
-//! bounces in a corner, too. Here depth and normals in closed form say when the two-bounce light of each spot has to come and, up to
-//! a factor of the pixel and one of the spot (their albedos), how much: cos · cos / r². The factors are medians over what
-//! agrees in time. A pixel is in shadow where less than half of that comes, lit where seven tenths do.
+//! A threshold on the share of a pixel's light in its strongest return has two errors: it
+//! classifies a pixel as lit if only its edge is, and it accepts light of three bounces in a
+//! corner. Here, depth and normals in closed form give the time of the two-bounce light of each
+//! spot and, up to a factor of the pixel and one of the spot (their albedos), its amount: cos · cos
+//! / r². The factors are medians over the returns that agree in time. A pixel is in shadow if less
+//! than half of that light arrives, and lit if at least seven tenths do.
 
 use rayon::prelude::*;
 
@@ -13,33 +15,35 @@ use crate::{
     paths::Paths,
 };
 
-/// Share of the expected light below which a pixel is in shadow.
+/// The share of the expected light below which a pixel is in shadow.
 const DARK: f32 = 0.5;
-/// Share of the expected light from which on a pixel is lit. One in between is lit in part, and takes no part.
+/// The share of the expected light from which a pixel is lit. A pixel in between is partly lit and
+/// is not used.
 const BRIGHT: f32 = 0.7;
-/// A return belongs to the depth if it comes within so many bins of the expected time.
+/// A return belongs to the depth if it is within this number of bins of the expected time.
 const BINS: f32 = 2.0;
-/// A return with a lower share of a pixel's light is no peak.
+/// A return with a lower share of a pixel's light is not a peak.
 const LEAST_SHARE: f32 = 0.05;
-/// Where photons are counted: noise beyond this share of the expected light leaves the pixel undecided.
+/// For counted photons: if noise exceeds this share of the expected light, the pixel is undecided.
 const UNDECIDED: f32 = 0.25;
-/// Rounds between factors of pixels and of spots.
+/// The number of alternations between factors of pixels and of spots.
 const ROUNDS: usize = 2;
 
 /// The strongest return of a histogram.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Return {
-    /// Its path, metres.
+    /// The path, metres.
     pub path_m: f32,
-    /// Light in its bin and those on either side.
+    /// The light in its bin and the two adjacent ones.
     pub energy: f32,
-    /// Its share of all light.
+    /// The share of all light.
     pub share: f32,
-    /// Standard deviation of the light, where photons were counted.
+    /// The standard deviation of the light, if photons were counted.
     pub noise: f32,
 }
 
-/// Replaces masks and times by those that agree with the depth from all spots. `returns`: `[spot][row][column]`.
+/// Replaces masks and times by those that agree with the depth from all spots. `returns`:
+/// `[spot][row][column]`.
 pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
     let (pixels, k) = (measured.pixels(), measured.spots.len());
     let tolerance = BINS * measured.bin_width_m;
@@ -47,7 +51,7 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
     let raw = closed_form(&mut refined).0;
     let depth = smooth(&refined, &raw);
     let paths = Paths::new(&refined, &depth);
-    // Return over geometry where both are known and agree in time.
+    // The ratio of the return to the geometry, if both are known and agree in time.
     let agrees = |s: usize, p: usize| {
         (paths.length(s, p) - returns[s * pixels + p].path_m).abs() <= tolerance
     };
@@ -92,20 +96,22 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
         let expected = paths.geometry(s, p).map(|g| g * of_pixel[p] * of_spot[s]);
         let share = expected.map_or(f32::NAN, |e| found.energy / e);
         match agrees {
-            // No normal: the pixel lies on an edge, and its depth and light belong to both sides.
+            // Without a normal, the pixel is on an edge, and its depth and light belong to both
+            // sides.
             _ if !share.is_finite() => (0, 0),
             _ if expected.is_some_and(|e| found.noise > UNDECIDED * e) => (0, 0),
             true if share < DARK => (0, 1),
             true if share >= BRIGHT && found.share >= LEAST_SHARE => (1, 1),
             true => (0, 0),
-            // Light of two bounces would have been the strongest return.
+            // Two-bounce light would have been the strongest return.
             false if share < DARK => (0, 1),
             false => (0, 0),
         }
     };
     let decided: Vec<(u8, u8)> = (0..k * pixels).into_par_iter().map(decide).collect();
     if !decided.contains(&(1, 1)) {
-        // Too coarse an image for normals, or no times that agree: the threshold is all there is.
+        // The image is too coarse for normals, or no times agree, so only the threshold is
+        // available.
         return measured;
     }
     for (q, (lit, used)) in decided.into_iter().enumerate() {
@@ -116,7 +122,7 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
     measured
 }
 
-/// The lower median; NaN of nothing.
+/// Returns the lower median, or NaN if there are no values.
 fn median(mut of: Vec<f32>) -> f32 {
     if of.is_empty() {
         return f32::NAN;

@@ -1,48 +1,53 @@
-//! Measurements from masks that are given, and from depth or two-bounce paths: a data set's truth, what networks predict of one
-//! multiplexed histogram (Shoot-Bounce-3D, appendices C and E: two-bounce times follow from depth by geometry), or what another
-//! instrument's own processing found.
+//! Measurements from given masks and from depth or two-bounce paths. Sources are a data set's
+//! truth, the predictions of networks from one multiplexed histogram (Shoot-Bounce-3D, appendices C
+//! and E: two-bounce times follow from depth by geometry), and the results of another instrument's
+//! own processing.
 
 use picofarm_scene::{Camera, Vec3};
 
 use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
 
-/// Depth and masks of one scene. Images are row-major, `[row][column]`.
+/// The depth and masks of one scene. Images are row-major, `[row][column]`.
 #[derive(Debug, Clone, Copy)]
 pub struct Given<'a> {
     /// The camera.
     pub camera: Camera,
-    /// Where the laser stands, metres.
+    /// The laser's position, metres.
     pub laser: Vec3,
-    /// The spots, by beam: place and path from the laser in metres; `None` where a beam meets nothing.
+    /// The spots, by beam: position and path from the laser in metres; `None` if a beam hits
+    /// nothing.
     pub spots: &'a [Option<(Vec3, f32)>],
-    /// The beams that are used, ascending.
+    /// The indices of the beams in use, ascending.
     pub beams: &'a [u32],
-    /// Where two-bounce times come from.
+    /// The source of two-bounce times.
     pub times: Times<'a>,
-    /// 1 where lit, of each used beam: `[beam][row][column]`.
+    /// 1 if lit, for each beam in use: `[beam][row][column]`.
     pub lit: &'a [u8],
-    /// 1 where a mirror is seen: such pixels take no part, since what light they show came by other ways.
+    /// 1 if a mirror is visible. Such pixels are not used, because their light came by other paths.
     pub mirror: &'a [u8],
 }
 
-/// Where two-bounce times come from.
+/// The source of two-bounce times.
 #[derive(Debug, Clone, Copy)]
 pub enum Times<'a> {
-    /// They follow from the distance along each pixel's ray, metres; 0 or not finite = nothing is seen.
+    /// Times are computed from the distance along each pixel's ray, metres; 0 or a non-finite value
+    /// = nothing is visible.
     Range(&'a [f32]),
-    /// They were measured.
+    /// Times were measured.
     Paths {
-        /// Optical path of each used beam, `[beam][row][column]`; 0 or not finite = not measured.
+        /// The optical path of each beam in use, `[beam][row][column]`; 0 or a non-finite value =
+        /// not measured.
         metres: &'a [f32],
-        /// Width of the bins in which they were measured, metres.
+        /// The width of the bins in which paths were measured, metres.
         bin_width_m: f32,
     },
 }
 
-/// Times as they were measured, else by geometry; and the masks as they are.
+/// Returns the measurements with the given masks. Times are the measured ones, or are computed by
+/// geometry.
 ///
 /// # Errors
-/// [`ReconstructError::Invalid`] naming what has another size.
+/// [`ReconstructError::Invalid`] naming the input of a wrong size.
 pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
     let mut measured = Measured {
         camera: given.camera,
@@ -98,13 +103,13 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
         };
         let straight = (point - given.laser).length();
         let to_spot = (point - given.camera.origin).normalized();
-        // No light of two bounces is faster.
+        // Two-bounce light cannot have a shorter path.
         let shortest = path_m + (point - given.camera.origin).length();
         for (p, &lit) in lit.iter().enumerate() {
             let ray = measured.ray(p);
             let near = ray.cross(to_spot).length() < NEAR_SPOT_SINE && ray.dot(to_spot) > 0.0;
             let (usable, path) = match given.times {
-                // In shadow there is no path to be measured.
+                // In shadow there is no path to measure.
                 Times::Paths { metres, .. } => {
                     let path = metres[image * pixels + p];
                     let possible = path.is_finite() && path > shortest;

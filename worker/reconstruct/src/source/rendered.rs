@@ -1,4 +1,4 @@
-//! Measurements of a scene file: what has to be rendered for them.
+//! Measurements of a scene file, and the renders that they require.
 
 use picofarm_scene::Scene;
 use picofarm_settings::Sensor;
@@ -9,24 +9,24 @@ use picofarm_transient::{
 use super::{Captures, LIT_THRESHOLD};
 use crate::{Measured, ReconstructError};
 
-/// Share of a capture's light outside the gate from which on its times are not to be trusted.
+/// The share of a capture's light outside the gate from which its times are unreliable.
 const MOST_OUTSIDE: f64 = 0.5;
 
-/// How captures are rendered.
+/// The settings for rendering captures.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CaptureSettings {
     /// The gate of the histograms.
     pub gate: Gate,
-    /// Camera paths per pixel for three bounces and more.
+    /// The number of camera paths per pixel for three bounces and more.
     pub samples: u32,
-    /// Seed of the renders, and of the detector's noise.
+    /// The seed of the renders, and of the detector's noise.
     pub seed: u64,
-    /// The detector; `None`: what is rendered is what is measured.
+    /// The detector; if `None`, the rendered light is measured without noise.
     pub sensor: Option<Sensor>,
 }
 
 impl CaptureSettings {
-    /// The renderer's settings for one capture.
+    /// Returns the renderer's settings for one capture.
     pub fn render_settings(&self) -> Settings {
         Settings {
             gate: self.gate,
@@ -44,7 +44,7 @@ impl CaptureSettings {
     }
 }
 
-/// Ground truth and spots of a scene, at next to no cost: no histogram is rendered.
+/// Computes the ground truth and spots of a scene, which is fast because no histogram is rendered.
 ///
 /// # Errors
 /// [`ReconstructError::Render`].
@@ -69,7 +69,8 @@ pub fn truth_of(scene: &Scene, progress: &dyn Progress) -> Result<Rendered, Reco
     Ok(render(scene, &settings, progress)?)
 }
 
-/// Called with the progress of captures: the number of the capture, from 0, and the share of it that is done. Returns `false` to stop.
+/// A callback for the progress of captures: the number of the capture, from 0, and its finished
+/// share. It returns `false` to stop.
 pub type CaptureProgress<'a> = &'a (dyn Fn(usize, f32) -> bool + Sync);
 
 struct OfCapture<'a>(usize, CaptureProgress<'a>);
@@ -80,11 +81,11 @@ impl Progress for OfCapture<'_> {
     }
 }
 
-/// Renders a capture of each beam by itself, all bounces, and measures times and masks in it.
+/// Renders a separate capture of each beam, with all bounces, and measures times and masks in it.
 ///
 /// # Errors
-/// [`ReconstructError::Render`]; [`ReconstructError::Invalid`] where most of a capture's light lies outside the gate, and for a sensor that
-/// cannot be.
+/// [`ReconstructError::Render`]; [`ReconstructError::Invalid`] if most of a capture's light is
+/// outside the gate, or if the sensor is invalid.
 pub fn captures_of(
     scene: &Scene,
     settings: &CaptureSettings,

@@ -1,4 +1,5 @@
-//! Measurements from a rendered scene's ground truth, exact or disturbed in a known way. For tests and tables.
+//! Measurements from a rendered scene's ground truth, exact or with known errors. For tests and
+//! tables.
 
 use picofarm_scene::{Scene, Vec3};
 use picofarm_transient::Rendered;
@@ -8,26 +9,29 @@ use crate::{
     rng::{Rng, Stream},
 };
 
-/// What is done to the truth.
+/// The errors that are added to the truth.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Disturbed {
-    /// Times and paths to spots are those of the middles of bins this wide, metres; 0 = exact.
+    /// The width of bins, metres: times and paths to spots are rounded to the middles of such bins;
+    /// 0 = exact.
     pub bin_width_m: f32,
-    /// Standard deviation of normal noise on every time, metres.
+    /// The standard deviation of normal noise on every time, metres.
     pub noise_m: f32,
-    /// Amplitude of a depth error that varies smoothly over the image, metres: what a network's predictions have.
+    /// The amplitude of a depth error that varies smoothly over the image, as in a network's
+    /// predictions, metres.
     pub smooth_m: f32,
-    /// Share of mask pixels that are wrong, drawn independently.
+    /// The share of mask pixels that are wrong, drawn independently.
     pub flipped: f32,
-    /// Seed of noise and flips.
+    /// The seed of noise and flips.
     pub seed: u64,
 }
 
-/// Measurements of a rendered scene: times by geometry from its depth, masks from its visibility. Pixels that see nothing
-/// or a mirror take no part. A beam that met a mirror keeps its folded path.
+/// Returns the measurements of a rendered scene: times by geometry from its depth, masks from its
+/// visibility. Pixels that see nothing or a mirror are not used. A beam that was reflected by a
+/// mirror has its folded path.
 ///
 /// # Errors
-/// [`ReconstructError::Invalid`] where `rendered` is not of this scene.
+/// [`ReconstructError::Invalid`] if `rendered` does not belong to this scene.
 pub fn from_truth(
     scene: &Scene,
     rendered: &Rendered,
@@ -75,7 +79,7 @@ pub fn from_truth(
         let straight = (spot.point - scene.laser.origin).length();
         let folded = (straight - spot.path_m).abs() > 1e-2;
         let direction = scene.laser.beams[beam].direction;
-        // There and back: a lidar measures twice the distance.
+        // A lidar measures twice the distance, there and back.
         let path_m = if folded {
             spot.path_m
         } else {
@@ -117,7 +121,7 @@ pub fn from_truth(
     Ok(measured)
 }
 
-/// A smooth pattern over the image with values in about [−1.6, 1.6].
+/// Returns a smooth pattern over the image with values in about [−1.6, 1.6].
 fn wave(camera: &picofarm_scene::Camera, pixel: usize) -> f32 {
     let width = camera.intrinsics.width as usize;
     let a = (pixel % width) as f32 / width as f32;
@@ -125,7 +129,8 @@ fn wave(camera: &picofarm_scene::Camera, pixel: usize) -> f32 {
     libm::sinf(a * 31.0 + 1.0) * libm::cosf(b * 27.0) + 0.6 * libm::sinf(a * 83.0 + b * 71.0)
 }
 
-/// The truth's normals in world axes, `[row][column]`, facing the camera; zero where a pixel sees nothing.
+/// Returns the truth's normals in world axes, `[row][column]`, facing the camera; zero if a pixel
+/// sees nothing.
 pub fn surface_normals(scene: &Scene, rendered: &Rendered) -> Vec<Vec3> {
     let c = &scene.camera;
     let world = |n: &[f32]| c.right * n[0] + c.down * n[1] + c.forward * n[2];

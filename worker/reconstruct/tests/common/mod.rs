@@ -11,7 +11,7 @@ use picofarm_scene::{
 };
 use picofarm_transient::{Progress, Rendered};
 
-/// Nobody stops the renderer.
+/// A progress callback that never stops the renderer.
 pub struct Unstopped;
 
 impl Progress for Unstopped {
@@ -20,7 +20,7 @@ impl Progress for Unstopped {
     }
 }
 
-/// PlatoNeRF's room with an object, and its truth.
+/// Returns PlatoNeRF's room with an object, and its truth.
 pub fn room(object: PlatoObject, spots: usize, resolution: u32) -> (Scene, Rendered) {
     let settings = PlatoSettings {
         object,
@@ -32,7 +32,7 @@ pub fn room(object: PlatoObject, spots: usize, resolution: u32) -> (Scene, Rende
     (scene, rendered)
 }
 
-/// Its measurements in bins of 128 ps.
+/// Returns its measurements in bins of 128 ps.
 pub fn measured(scene: &Scene, rendered: &Rendered) -> Measured {
     let how = Disturbed {
         bin_width_m: 0.0384,
@@ -41,7 +41,7 @@ pub fn measured(scene: &Scene, rendered: &Rendered) -> Measured {
     from_truth(scene, rendered, &how).unwrap()
 }
 
-/// Settings that take a second.
+/// Returns settings for a run of one second.
 pub fn small() -> Settings {
     Settings {
         nodes: 64,

@@ -16,7 +16,7 @@ use crate::SceneError;
 use super::category::category_of;
 
 const CATALOGUE: &str = "PluginFurnitureCatalog.properties";
-/// Largest entry read, bytes: catalogues have some hundred kilobytes.
+/// The greatest size of an entry, bytes: catalogues have some hundred kilobytes.
 const MAX_ENTRY: u64 = 64 << 20;
 
 /// An open `.sh3f` file, shared by the threads that load models.
@@ -31,18 +31,18 @@ pub(super) struct Archive {
 pub(super) struct Item {
     pub(super) name: String,
     pub(super) label: &'static str,
-    /// Width, height, depth in metres.
+    /// The width, height and depth in metres.
     pub(super) size: [f32; 3],
-    /// Metres over the floor.
+    /// The height above the floor, metres.
     pub(super) elevation: f32,
-    /// Rows of the rotation that turns the model upright with its front towards +z.
+    /// The rows of the rotation that turns the model upright with its front towards +z.
     pub(super) rotation: Option<[f32; 9]>,
-    /// Entry of the OBJ file in the zip.
+    /// The entry of the OBJ file in the zip.
     pub(super) model: String,
     pub(super) attribution: String,
 }
 
-/// What one library holds.
+/// The contents of one library.
 #[derive(Debug)]
 pub(super) struct Catalogue {
     pub(super) version: String,
@@ -66,7 +66,7 @@ impl Archive {
     }
 
     fn with_zip<T>(&self, use_zip: impl FnOnce(&mut ZipArchive<BufReader<File>>) -> T) -> T {
-        // A panic of another reader leaves the archive usable: every read seeks first.
+        // A panic of another reader leaves the archive usable, because every read seeks first.
         let mut zip = self
             .zip
             .lock()
@@ -74,7 +74,7 @@ impl Archive {
         use_zip(&mut zip)
     }
 
-    /// The bytes of one entry.
+    /// Returns the bytes of one entry.
     pub(super) fn read(&self, entry: &str) -> Result<Vec<u8>, SceneError> {
         let bytes = self.with_zip(|zip| {
             let file = zip.by_name(entry).map_err(|e| e.to_string())?;
@@ -87,8 +87,8 @@ impl Archive {
         })
     }
 
-    /// Feeds the name, size and checksum of every entry to `hash`: they name the exact content without
-    /// reading all of it.
+    /// Adds the name, size and checksum of every entry to `hash`. They identify the exact content
+    /// without reading all of it.
     pub(super) fn fingerprint(&self, hash: &mut Sha256) -> Result<(), SceneError> {
         self.with_zip(|zip| {
             for k in 0..zip.len() {
@@ -104,7 +104,7 @@ impl Archive {
         })
     }
 
-    /// Uncompressed size of an entry in bytes; 0 if there is none.
+    /// Returns the uncompressed size of an entry in bytes, or 0 if there is none.
     fn entry_size(&self, entry: &str) -> u64 {
         self.with_zip(|zip| {
             let index = zip.index_for_name(entry);
@@ -114,8 +114,8 @@ impl Archive {
         })
     }
 
-    /// The items that have a category of ours, a free licence, a plausible size and an OBJ of at most
-    /// `max_bytes`, in catalogue order.
+    /// Returns the items that have one of our categories, a free licence, a plausible size and an
+    /// OBJ of at most `max_bytes`, in catalogue order.
     pub(super) fn catalogue(&self, max_bytes: u64) -> Result<Catalogue, SceneError> {
         let text = latin1(&self.read(CATALOGUE)?);
         let properties = properties(&text);
@@ -141,7 +141,7 @@ impl Archive {
     }
 }
 
-/// One entry, or `None` if it is of no use here.
+/// Returns one entry, or `None` if it cannot be used.
 fn item<'a>(get: &dyn Fn(&str) -> Option<&'a str>, library_licence: &str) -> Option<Item> {
     let (name, creator) = (get("name")?, get("creator").unwrap_or("unknown"));
     let licence = short_licence(get("license").unwrap_or(library_licence))?;
@@ -179,7 +179,7 @@ fn item<'a>(get: &dyn Fn(&str) -> Option<&'a str>, library_licence: &str) -> Opt
     })
 }
 
-/// CC0 or CC BY; `None` for every other licence.
+/// Returns CC0 or CC BY, or `None` for every other licence.
 fn short_licence(text: &str) -> Option<&'static str> {
     let lower = text.to_lowercase();
     if [
@@ -201,12 +201,13 @@ fn short_licence(text: &str) -> Option<&'static str> {
     (lower.contains("creative commons") && lower.contains("attribution")).then_some("CC BY 3.0")
 }
 
-/// Java properties are ISO 8859-1: every byte is the character of that number.
+/// Decodes ISO 8859-1, the encoding of Java properties: every byte is the character with that
+/// number.
 fn latin1(bytes: &[u8]) -> String {
     bytes.iter().map(|&b| b as char).collect()
 }
 
-/// `key=value` lines; `#` and `!` start comments; `\uXXXX` escapes are decoded.
+/// Parses `key=value` lines; `#` and `!` start comments; `\uXXXX` escapes are decoded.
 fn properties(text: &str) -> BTreeMap<String, String> {
     text.lines()
         .map(str::trim)

@@ -1,6 +1,6 @@
-//! From the catalogue's own words to our categories.
+//! Maps the catalogue's categories and names to our categories.
 
-/// Catalogue categories with nothing to put into a room.
+/// The catalogue categories without objects for a room.
 const OUTSIDE: [&str; 5] = [
     "Exterior",
     "Vehicles",
@@ -9,7 +9,8 @@ const OUTSIDE: [&str; 5] = [
     "Doors and windows",
 ];
 
-/// (category, words of which the English name must contain one); the first rule that matches wins.
+/// Rules: (category, words of which the English name must contain one). The first matching rule
+/// wins.
 const RULES: &[(&str, &[&str])] = &[
     ("sofa", &["sofa", "couch"]),
     ("armchair", &["armchair", "ryokan"]),
@@ -171,8 +172,8 @@ const RULES: &[(&str, &[&str])] = &[
     ("table", &["table"]),
 ];
 
-/// Our category of a catalogue item, by its catalogue category and English name; `None` for what does
-/// not belong into a room.
+/// Returns our category of a catalogue item, by its catalogue category and English name, or `None`
+/// for objects that do not belong into a room.
 pub(super) fn category_of(catalogue_category: &str, name: &str) -> Option<&'static str> {
     if OUTSIDE.contains(&catalogue_category) {
         return None;

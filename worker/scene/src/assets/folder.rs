@@ -1,4 +1,4 @@
-//! A folder of glTF models and its list, as one would make for the Amazon Berkeley Objects.
+//! A folder of glTF models with a list, e.g. one made from the Amazon Berkeley Objects.
 
 use std::{
     io::{Read, Seek, SeekFrom},
@@ -12,14 +12,14 @@ use crate::{LABELS, Mesh, SceneError, Vec3, body, import};
 
 use super::obj::drop_degenerate;
 
-/// Name of the list.
+/// The file name of the list.
 pub(super) const LIST: &str = "assets.csv";
 pub(super) const WRITE: &str = "write one beside the models (path,label,up,front,scale)";
-/// Larger models are left out: they cost more than they show.
+/// Models with more triangles are omitted: they cost more than they show.
 const MAX_TRIANGLES: usize = 100_000;
-/// Longest list read, bytes.
+/// The greatest length of a list, bytes.
 const MAX_LIST: u64 = 64 << 20;
-/// Bytes of a model's start and end that its fingerprint covers.
+/// The number of bytes at a model's start and end that its fingerprint covers.
 const SAMPLE: u64 = 64 << 10;
 const NEEDED: [&str; 5] = ["path", "label", "up", "front", "scale"];
 
@@ -27,7 +27,7 @@ const NEEDED: [&str; 5] = ["path", "label", "up", "front", "scale"];
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     pub(super) file: PathBuf,
-    /// Opens it and what it names: the list's folder.
+    /// Opens the model and the files that it names: the list's folder.
     files: Opener,
     pub(super) name: String,
     pub(super) label: &'static str,
@@ -42,11 +42,11 @@ pub(super) struct Row {
 #[derive(Debug)]
 pub(super) struct List {
     pub(super) rows: Vec<Row>,
-    /// First 16 digits of the content's SHA-256.
+    /// The first 16 digits of the content's SHA-256.
     pub(super) digest: String,
 }
 
-/// Reads the list and looks at every file that it names.
+/// Reads the list and checks every file that it names.
 pub(super) fn open(dir: &Path) -> Result<List, SceneError> {
     let path = dir.join(LIST);
     if !path.is_file() {
@@ -91,7 +91,7 @@ pub(super) fn open(dir: &Path) -> Result<List, SceneError> {
     })
 }
 
-/// Feeds a file's length, start and end to `hash`.
+/// Adds a file's length, start and end to `hash`.
 fn sample(row: &Row, hash: &mut Sha256) -> Result<(), FileError> {
     let mut file = row.files.open(&row.file)?;
     let failed = |source| FileError::Io {
@@ -110,13 +110,13 @@ fn sample(row: &Row, hash: &mut Sha256) -> Result<(), FileError> {
     Ok(())
 }
 
-/// A line of the list, or several where quotes hold line breaks.
+/// A line of the list, or several if quotes contain line breaks.
 struct Record {
     line: usize,
     fields: Vec<String>,
 }
 
-/// Comma-separated values (RFC 4180); empty lines and those that start with # are skipped.
+/// Parses comma-separated values (RFC 4180). Empty lines and those that start with # are skipped.
 fn records(text: &str) -> Result<Vec<Record>, String> {
     let (mut out, mut line, mut rest) = (Vec::new(), 1, text);
     while !rest.is_empty() {
@@ -164,7 +164,7 @@ fn records(text: &str) -> Result<Vec<Record>, String> {
     Ok(out)
 }
 
-/// A field after its opening quote, and what follows its closing one.
+/// Returns a field after its opening quote, and the text after its closing one.
 fn quoted_field(text: &str) -> Option<(String, &str)> {
     let (mut field, mut rest) = (String::new(), text);
     loop {
@@ -181,7 +181,7 @@ fn quoted_field(text: &str) -> Option<(String, &str)> {
     }
 }
 
-/// Where each column is.
+/// The position of each column.
 struct Columns(Vec<String>);
 
 impl Columns {
@@ -266,8 +266,8 @@ fn axis(name: &str) -> Option<Vec3> {
     })
 }
 
-/// Reads, turns and scales a model, and says whether something transparent was made opaque; `None` if it cannot
-/// be used.
+/// Reads, turns and scales a model, and returns whether a transparent material was made opaque.
+/// Returns `None` if the model cannot be used.
 pub(super) fn load(row: &Row) -> Option<(Mesh, bool)> {
     let loaded = parse(row);
     if let Err(why) = &loaded {
@@ -308,7 +308,8 @@ mod tests {
     use super::*;
     use crate::{AssetLibrary, rng::Rng};
 
-    /// A model of 10 × 30 × 20 units, up along z and its front along −y, as a .glb with textures.
+    /// Writes a model of 10 × 30 × 20 units, up along z and its front along −y, as a .glb with
+    /// textures.
     fn model(path: &Path) {
         use crate::{Aim, Camera, Intrinsics, Material, Object, Provenance, Scene, shape::Shape};
         let mut shape = Shape::new("crate");
@@ -342,7 +343,7 @@ mod tests {
         std::fs::write(dir.path().join(LIST), list).unwrap();
         let library = AssetLibrary::gltf(dir.path());
         if let Ok(library) = &library {
-            // Before the folder goes.
+            // The model is drawn before the folder is deleted.
             library.draw(&mut Rng::new(1, 0), "box", |_, _| true);
         }
         library

@@ -1,4 +1,4 @@
-//! Fetching Sweet Home 3D's furniture from Debian, with the distribution's own client.
+//! Downloads Sweet Home 3D's furniture from Debian, with the distribution's own client.
 
 use std::{
     io::ErrorKind,
@@ -8,18 +8,19 @@ use std::{
 
 use crate::SceneError;
 
-/// The Debian package that holds the furniture.
+/// The Debian package that contains the furniture.
 const PACKAGE: &str = "sweethome3d-furniture";
-/// Where the package keeps its libraries.
+/// The folder of the libraries within the package.
 pub(super) const INSIDE_PACKAGE: &str = "usr/share/sweethome3d/furniture";
-/// Folder of this asset source inside an assets folder.
+/// The folder of this asset source inside an assets folder.
 pub(super) const FOLDER: &str = "sweethome3d";
 
-/// Fetches the package (about 120 MB) with `apt-get download`, unpacks it with `dpkg-deb`, and puts its
-/// `.sh3f` files into `dest/sweethome3d`. Needs no root. Returns that folder; does nothing if it is filled.
+/// Downloads the package (about 120 MB) with `apt-get download`, unpacks it with `dpkg-deb`, and
+/// stores its `.sh3f` files in `dest/sweethome3d`. Requires no root privileges. Returns that
+/// folder. If the folder already has files, nothing is downloaded.
 ///
 /// # Errors
-/// [`SceneError::Install`] if a program is missing or fails, with what to do instead;
+/// [`SceneError::Install`] if a program is missing or fails, with an alternative;
 /// [`SceneError::Write`] if the folder cannot be written.
 pub fn install(dest: &Path) -> Result<PathBuf, SceneError> {
     let folder = dest.join(FOLDER);
@@ -29,7 +30,7 @@ pub fn install(dest: &Path) -> Result<PathBuf, SceneError> {
     let partial = dest.join(format!("{FOLDER}.{}.partial", std::process::id()));
     std::fs::create_dir_all(&partial).map_err(|e| cannot_write(&partial, e))?;
     let outcome = fetch(&partial, &folder);
-    // Whatever is left of the download is ours alone and of no further use.
+    // The remains of the download belong to this function only and are of no further use.
     let _ = std::fs::remove_dir_all(&partial);
     outcome.map(|()| folder)
 }
@@ -95,7 +96,7 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
     paths
 }
 
-/// The `.sh3f` files of a folder, sorted by name; none if it does not exist.
+/// Returns the `.sh3f` files of a folder, sorted by name; none if it does not exist.
 pub(super) fn libraries_in(folder: &Path) -> Vec<PathBuf> {
     entries(folder)
         .into_iter()

@@ -1,4 +1,4 @@
-//! The materials that our own furniture shares: each drawn from a variant's random stream.
+//! The materials that our own furniture shares; each is drawn from a variant's random stream.
 
 use crate::{Material, rng::Rng};
 
@@ -22,7 +22,7 @@ pub(super) fn paint(rng: &mut Rng) -> Material {
     }
 }
 
-/// Wood or paint, as furniture is made.
+/// Wood or paint, the usual materials of furniture.
 pub(super) fn board(rng: &mut Rng) -> Material {
     if rng.chance(0.6) {
         wood(rng)

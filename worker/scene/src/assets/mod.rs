@@ -1,4 +1,4 @@
-//! Furniture: where models come from, what they are, and a cache that all threads share.
+//! Furniture: the sources of models, their properties, and a cache that all threads share.
 
 mod catalogue;
 mod category;
@@ -27,19 +27,19 @@ pub use install::install;
 
 /// Changes whenever a parametric model changes shape.
 const PARAMETRIC_VERSION: &str = "parametric-1";
-/// Changes whenever the files of a model are read as other materials or another shape.
+/// Changes whenever the import of a model's files gives other materials or another shape.
 const READING: &str = "models-2";
-/// Name of the library of a folder of glTF models.
+/// The name of the library of a folder of glTF models.
 const GLTF: &str = "gltf";
-/// Name of the library of Sweet Home 3D's furniture.
+/// The name of the library of Sweet Home 3D's furniture.
 const SWEETHOME3D: &str = "sweethome3d";
 
 const INSTALL: &str = "run `picofarm assets install`";
 
-/// Where a model comes from.
+/// The source of a model.
 #[derive(Debug, Clone)]
 enum Recipe {
-    /// Our own builder and the variant's seed.
+    /// One of our own builders and the variant's seed.
     Built(parametric::Build, u64),
     /// An entry of a furniture library.
     Stored(Arc<Archive>, Item),
@@ -47,7 +47,7 @@ enum Recipe {
     File(folder::Row),
 }
 
-/// A model ready for use, and what was changed to make it so.
+/// A model ready for use, and the changes made to it.
 #[derive(Debug)]
 struct Loaded {
     model: Arc<Model>,
@@ -58,15 +58,15 @@ struct Loaded {
 /// One piece of furniture of the library.
 #[derive(Debug)]
 pub(crate) struct Asset {
-    /// Name, for people.
+    /// The name, for people.
     pub(crate) name: String,
-    /// Category, a name of [`crate::LABELS`].
+    /// The category, a name of [`crate::LABELS`].
     pub(crate) label: &'static str,
-    /// Height of its bottom over the floor where it hangs on a wall or from the ceiling, metres.
+    /// The height of its bottom above the floor if it is fixed to a wall or the ceiling, metres.
     pub(crate) elevation: f32,
-    /// Creator and licence, where they must be named.
+    /// The creator and licence, if they must be named.
     pub(crate) attribution: Option<String>,
-    /// Width (x), height (y) and depth (z) in metres, where the catalogue states them.
+    /// The width (x), height (y) and depth (z) in metres, if the catalogue gives them.
     pub(crate) size: Option<[f32; 3]>,
     recipe: Recipe,
     loaded: OnceLock<Option<Loaded>>,
@@ -82,7 +82,7 @@ pub struct AssetLibrary {
 }
 
 impl AssetLibrary {
-    /// Our own furniture of boxes, cylinders and lathes: needs no files.
+    /// Returns our own furniture of boxes, cylinders and lathes, which needs no files.
     pub fn parametric() -> Self {
         let mut assets = Vec::new();
         for (label, variants, build) in parametric::catalogue() {
@@ -102,12 +102,12 @@ impl AssetLibrary {
         Self::new("parametric", PARAMETRIC_VERSION.to_owned(), assets)
     }
 
-    /// Sweet Home 3D's furniture: every `.sh3f` file of `dir`, of which the CC0 and CC BY items that fit
-    /// into rooms are used. Each model is read when first needed and then kept.
+    /// Opens Sweet Home 3D's furniture: the CC0 and CC BY items of every `.sh3f` file of `dir` that
+    /// fit into rooms. Each model is read on first use and then cached.
     ///
     /// # Errors
-    /// [`SceneError::Assets`] if the folder has none, [`SceneError::Read`] or [`SceneError::Format`] for a
-    /// file that cannot be read.
+    /// [`SceneError::Assets`] if the folder has none, [`SceneError::Read`] or
+    /// [`SceneError::Format`] for a file that cannot be read.
     pub fn sweethome3d(dir: &Path) -> Result<Self, SceneError> {
         let files = install::libraries_in(dir);
         if files.is_empty() {
@@ -139,17 +139,19 @@ impl AssetLibrary {
         Ok(Self::new(SWEETHOME3D, fingerprint, assets))
     }
 
-    /// A folder of `.glb` models and the list of them, `assets.csv`, with a line `path,label,up,front,scale` and
-    /// one for each model: its file in the folder, a name of [`crate::LABELS`], the axes that point up and to the
-    /// front (`x`, `-x`, … `-z`), and metres per unit. Columns `name`, `elevation` (metres over the floor, of what
-    /// hangs) and `attribution` may follow; any order of columns will do. Each model is read when first needed;
-    /// those that cannot be read or have more than 100,000 triangles are left out.
+    /// Opens a folder of `.glb` models with their list, `assets.csv`. The list has the header
+    /// `path,label,up,front,scale` and a line for each model: its file in the folder, a name of
+    /// [`crate::LABELS`], the axes that point up and to the front (`x`, `-x`, … `-z`), and metres
+    /// per unit. Columns `name`, `elevation` (metres above the floor, for objects fixed to a wall
+    /// or ceiling) and `attribution` are optional; columns may be in any order. Each model is read
+    /// on first use. Models that cannot be read or have more than 100,000 triangles are omitted.
     ///
-    /// The fingerprint covers the list, and of every model its length and its first and last 64 KiB.
+    /// The fingerprint covers the list, and the length and the first and last 64 KiB of every
+    /// model.
     ///
     /// # Errors
-    /// [`SceneError::Assets`] if the folder has no list, [`SceneError::Read`] for a file that cannot be read,
-    /// [`SceneError::Format`] naming file, line and column otherwise.
+    /// [`SceneError::Assets`] if the folder has no list, [`SceneError::Read`] for a file that
+    /// cannot be read, [`SceneError::Format`] naming file, line and column otherwise.
     pub fn gltf(dir: &Path) -> Result<Self, SceneError> {
         let list = folder::open(dir)?;
         let assets = list.rows.into_iter().map(|row| Asset {
@@ -165,16 +167,17 @@ impl AssetLibrary {
         Ok(Self::new(GLTF, fingerprint, assets.collect()))
     }
 
-    /// The libraries there are, by name.
+    /// The names of the libraries.
     pub const NAMES: [&str; 3] = ["sweethome3d", "parametric", "gltf"];
-    /// Those that `auto` chooses among, best first: a folder of somebody's own models is asked for by name.
+    /// The libraries among which `auto` chooses, best first. A folder of a user's own models must
+    /// be named explicitly.
     const AUTO: [&str; 2] = ["sweethome3d", "parametric"];
 
-    /// The library that a job's `assets` names: a name, a fingerprint, or `auto` for the best installed. Files are looked
-    /// for as by [`Self::find`].
+    /// Opens the library that a job's `assets` names: a name, a fingerprint, or `auto` for the best
+    /// installed one. Files are searched as by [`Self::find`].
     ///
     /// # Errors
-    /// As [`Self::find`].
+    /// As for [`Self::find`].
     pub fn named(name: &str, dirs: &[PathBuf]) -> Result<Self, SceneError> {
         if name == "auto" {
             for name in Self::AUTO {
@@ -195,12 +198,13 @@ impl AssetLibrary {
         Self::find(name, dirs)
     }
 
-    /// The library called `name` (`parametric`, `sweethome3d` or `gltf`). Files are looked for in each of `dirs`
-    /// and its subfolder of the library's name; those of Sweet Home 3D also where Debian installs them.
+    /// Opens the library called `name` (`parametric`, `sweethome3d` or `gltf`). Files are searched
+    /// in each of `dirs` and its subfolder of the library's name; those of Sweet Home 3D also in
+    /// Debian's installation folder.
     ///
     /// # Errors
-    /// [`SceneError::Assets`] if its files are in none of the folders, [`SceneError::Invalid`] for a
-    /// name that no library has; otherwise as [`AssetLibrary::sweethome3d`].
+    /// [`SceneError::Assets`] if its files are in none of the folders, [`SceneError::Invalid`] for
+    /// an unknown name; otherwise as for [`AssetLibrary::sweethome3d`].
     pub fn find(name: &str, dirs: &[PathBuf]) -> Result<Self, SceneError> {
         match name {
             "parametric" => Ok(Self::parametric()),
@@ -269,27 +273,28 @@ impl AssetLibrary {
         }
     }
 
-    /// Name by which jobs ask for this library.
+    /// Returns the name by which jobs request this library.
     pub fn name(&self) -> &str {
         self.name
     }
 
-    /// Names the exact set of assets; part of what decides a generated scene.
+    /// Returns a fingerprint of the exact set of assets, which is part of the input of a generated
+    /// scene.
     pub fn fingerprint(&self) -> &str {
         &self.fingerprint
     }
 
-    /// Number of models.
+    /// Returns the number of models.
     pub fn len(&self) -> usize {
         self.assets.len()
     }
 
-    /// True without any model.
+    /// Returns whether the library has no models.
     pub fn is_empty(&self) -> bool {
         self.assets.is_empty()
     }
 
-    /// The first model of a category of our own furniture, in its own frame.
+    /// Returns the first model of a category of our own furniture, in its own frame.
     pub(crate) fn first(&self, label: &str) -> Mesh {
         let asset = self.by_label.get(label).and_then(|of| of.first());
         let model = asset.and_then(|&k| self.assets[k].model());
@@ -297,8 +302,8 @@ impl AssetLibrary {
         (*model.mesh).clone()
     }
 
-    /// A random asset of a category that `fits` by its (width, height, depth) and elevation, with its
-    /// model; `None` if the category has none or a few draws do not fit.
+    /// Returns a random asset of a category with its model, if `fits` accepts its (width, height,
+    /// depth) and elevation. Returns `None` if the category is empty or a few draws do not fit.
     pub(crate) fn draw(
         &self,
         rng: &mut Rng,
@@ -308,7 +313,7 @@ impl AssetLibrary {
         let candidates = self.by_label.get(label)?;
         for _ in 0..12 {
             let asset = &self.assets[*rng.pick(candidates)];
-            // The catalogue's size saves loading models that do not fit anyway.
+            // The catalogue's size avoids loading models that do not fit.
             if asset.size.is_some_and(|size| !fits(size, asset.elevation)) {
                 continue;
             }
@@ -323,12 +328,13 @@ impl AssetLibrary {
 }
 
 impl Asset {
-    /// The model, loaded once; `None` if it cannot be used (unreadable, empty or too many triangles).
+    /// Returns the model, loaded once, or `None` if it cannot be used (unreadable, empty or too
+    /// many triangles).
     fn model(&self) -> Option<Arc<Model>> {
         self.loaded().map(|l| l.model.clone())
     }
 
-    /// What was changed to make the model usable, for the scene's notes.
+    /// Returns the changes that made the model usable, for the scene's notes.
     pub(crate) fn changes(&self) -> impl Iterator<Item = &'static str> {
         let (opaque, plain) = self
             .loaded()
@@ -362,7 +368,7 @@ impl Asset {
     }
 }
 
-/// The mesh moved so that its box stands on y = 0, centred on the vertical axis.
+/// Moves the mesh so that its bounding box is on y = 0, centred on the vertical axis.
 fn standing(mut mesh: Mesh) -> Mesh {
     if let Some((lo, hi)) = mesh.bounds() {
         let mut offset = (lo + hi) * 0.5;

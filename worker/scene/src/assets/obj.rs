@@ -1,5 +1,5 @@
-//! One OBJ model of a furniture library as a mesh of ours: upright, front towards +z, of the catalogue's
-//! size.
+//! Converts an OBJ model of a furniture library to a mesh: upright, with its front towards +z and
+//! the catalogue's size.
 
 use std::io::Cursor;
 
@@ -7,26 +7,26 @@ use crate::{Bsdf, Material, Mesh, Vec3, import::polygon::Triangulation};
 
 use super::catalogue::{Archive, Item};
 
-/// Larger models are left out: they cost more than they show.
+/// Models with more triangles are omitted: they cost more than they show.
 pub(super) const MAX_TRIANGLES: usize = 40_000;
-/// An OBJ file of [`MAX_TRIANGLES`] is never larger than this.
+/// The greatest size of an OBJ file with [`MAX_TRIANGLES`], bytes.
 pub(super) const MAX_BYTES: u64 = 8 << 20;
 /// Triangles of less than this (twice the area, m²) are degenerate.
 const MIN_DOUBLE_AREA: f32 = 1e-10;
-/// Albedo of surfaces without a stated colour.
+/// The albedo of surfaces without a colour.
 const GREY: f32 = 0.5;
 
 /// A loaded model.
 #[derive(Debug)]
 pub(super) struct Loaded {
     pub(super) mesh: Mesh,
-    /// A transparent material was made opaque.
+    /// Whether a transparent material was made opaque.
     pub(super) made_opaque: bool,
-    /// A texture was left out.
+    /// Whether a texture was omitted.
     pub(super) untextured: bool,
 }
 
-/// Reads, turns, stretches and cleans the model; `None` if it cannot be used.
+/// Reads, turns, stretches and cleans the model. Returns `None` if it cannot be used.
 pub(super) fn load(archive: &Archive, item: &Item) -> Option<Loaded> {
     let loaded = parse(archive, item);
     match &loaded {
@@ -57,7 +57,7 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
         tobj::load_mtl_buf(&mut Cursor::new(text))
     })
     .map_err(|e| e.to_string())?;
-    // Without a material file everything is grey.
+    // Without a material file, everything is grey.
     let materials = materials.unwrap_or_default();
     let mut loaded = Loaded {
         mesh: Mesh {
@@ -104,8 +104,8 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
     Ok(loaded)
 }
 
-/// The polygons of a part as triangles. A polygon whose edges cross becomes a fan, because models of
-/// a library are not corrected.
+/// Splits the polygons of a part into triangles. A polygon with crossing edges becomes a fan,
+/// because models of a library are not corrected.
 fn triangles(part: &tobj::Mesh) -> Vec<[u32; 3]> {
     if part.face_arities.is_empty() {
         return part.indices.as_chunks::<3>().0.to_vec();
@@ -137,7 +137,7 @@ fn turned(item: &Item, p: Vec3) -> Vec3 {
     })
 }
 
-/// Scales the mesh's box to width × height × depth.
+/// Scales the mesh's bounding box to width × height × depth.
 fn stretch(mesh: &mut Mesh, size: [f32; 3]) -> Result<(), String> {
     let (lo, hi) = mesh.bounds().ok_or("no vertices")?;
     let extent = hi - lo;
@@ -176,16 +176,18 @@ pub(super) fn drop_degenerate(mesh: &mut Mesh) {
         .retain(|_| *k.next().expect("one flag a triangle"));
 }
 
-/// What lets half of the light or more through. Most programs write an index of 1 where they know none.
+/// Returns glass for materials that transmit at least half of the light. Most programs write an
+/// index of 1 if they know none.
 fn glass(file: &tobj::Material) -> Option<Bsdf> {
     Material::by_opacity(file.dissolve?, file.optical_density, false)
 }
 
-/// Kd is a display colour: linear albedo by a 2.2 power, kept within what real surfaces have.
+/// Converts a material. Kd is a display colour; the linear albedo is its 2.2 power, limited to the
+/// range of real surfaces.
 fn material(file: &tobj::Material) -> Material {
     let linear = |v: f32| libm::powf(v.clamp(0.0, 1.0), 2.2).clamp(0.04, 0.9);
     let rgb = match file.diffuse {
-        // Black under a texture means that the texture has all the colour.
+        // With a texture, black means that the texture contains the whole colour.
         Some([0.0, 0.0, 0.0]) if file.diffuse_texture.is_some() => [GREY; 3],
         Some(kd) => kd.map(linear),
         None => [GREY; 3],
@@ -258,7 +260,7 @@ mod tests {
             1,
             "only the used material stays"
         );
-        // The apex pointed along z; turned upright it is the highest vertex.
+        // The apex pointed along z; after turning, it is the highest vertex.
         assert!(
             model
                 .mesh
@@ -266,7 +268,7 @@ mod tests {
                 .iter()
                 .any(|p| (p.y - 1.0).abs() < 1e-6)
         );
-        // A closed surface has two faces for each pane; an index of 1 is none.
+        // A closed surface has two faces for each pane; an index of 1 is ignored.
         let face = crate::Bsdf::ThinDielectric {
             ior: 1.5,
             transmittance: 0.75,

@@ -1,7 +1,7 @@
-//! Our own furniture: which builders there are.
+//! The list of builders of our own furniture.
 //!
-//! Every builder draws its dimensions from a variant's own random stream, so variant k of a category is
-//! the same piece for ever. Front is +z, units are metres, y is up.
+//! Every builder draws its dimensions from a variant's own random stream, so variant k of a
+//! category never changes. The front is +z, units are metres, and y is up.
 
 use crate::{Mesh, rng::Rng};
 
@@ -10,7 +10,8 @@ use super::{devices, small, storage, upholstery};
 /// A builder of one variant.
 pub(super) type Build = fn(&mut Rng) -> Mesh;
 
-/// (category, number of variants, builder), in the order that fixes the variants' seeds: append only.
+/// (category, number of variants, builder), in the order that fixes the variants' seeds: append
+/// only.
 pub(super) fn catalogue() -> Vec<(&'static str, u64, Build)> {
     vec![
         ("sofa", 8, upholstery::sofa),

@@ -1,4 +1,4 @@
-//! Small things that stand on tops and floors, and lamps, plants and rugs.
+//! Small objects for tops and floors, and lamps, plants and rugs.
 
 use std::f32::consts::TAU;
 
@@ -41,7 +41,7 @@ pub(super) fn floor_lamp(rng: &mut Rng) -> Mesh {
     shape.finish()
 }
 
-/// A shade with a wall of 3 mm, open above and below, round the top of a stand.
+/// Adds a shade with a wall of 3 mm, open above and below, around the top of a stand.
 fn shade_at(rng: &mut Rng, shape: &mut Shape, y: f32, radius: f32, material: u32) {
     let (top, height) = (radius * rng.range(0.5, 0.95), radius * rng.range(1.0, 1.4));
     let (y0, y1) = (y - height * 0.25, y + height * 0.75);
@@ -53,7 +53,7 @@ fn shade_at(rng: &mut Rng, shape: &mut Shape, y: f32, radius: f32, material: u32
         [radius - 0.003, y0],
     ];
     shape.lathe([0.0; 2], &wall, 28, material);
-    // The bar that holds it.
+    // The bar that supports the shade.
     shape.cuboid(
         [-top + 0.004, y, -0.003],
         [top - 0.004, y + 0.005, 0.003],
@@ -101,7 +101,7 @@ pub(super) fn plant(rng: &mut Rng) -> Mesh {
     shape.finish()
 }
 
-/// A leaf of unit length along y, pointed at both ends, as two folded halves with both sides.
+/// Adds a leaf of unit length along y, pointed at both ends, as two folded halves with both sides.
 fn blade(shape: &mut Shape, material: u32) {
     let spine = [[0.0, 0.02], [0.45, 0.1], [0.8, 0.06], [1.0, 0.0]];
     let width = [0.015, 0.13, 0.09, 0.004];
@@ -115,7 +115,7 @@ fn blade(shape: &mut Shape, material: u32) {
     }
 }
 
-/// Scale by `length`, tilt away from the vertical, turn about it, move.
+/// Scales by `length`, tilts away from the vertical, turns about it, and moves.
 fn leaf_frame(yaw: f32, tilt: f32, at: Vec3, length: f32) -> Affine {
     let (sy, cy, st, ct) = (
         libm::sinf(yaw),
@@ -173,7 +173,7 @@ pub(super) fn rug(rng: &mut Rng) -> Mesh {
     shape.finish()
 }
 
-/// One to four books, lying.
+/// Builds one to four books, lying flat.
 pub(super) fn books(rng: &mut Rng) -> Mesh {
     let mut shape = Shape::new("book");
     let paper = shape.material(linen(rng));

@@ -1,4 +1,4 @@
-//! Tables, shelves and cases: what has boards, drawers and doors.
+//! Furniture with boards, drawers and doors: tables, shelves and cases.
 
 use crate::{Mesh, rng::Rng, shape::Shape};
 
@@ -7,7 +7,7 @@ use super::{
     upholstery::legs,
 };
 
-/// A table of the given half extents: a rectangular or round top on legs.
+/// Builds a table of the given half extents: a rectangular or round top on legs.
 fn top_on_legs(rng: &mut Rng, name: &str, [x, z]: [f32; 2], height: f32, round: bool) -> Mesh {
     let mut shape = Shape::new(name);
     let top = shape.material(board(rng));
@@ -119,7 +119,7 @@ pub(super) fn desk(rng: &mut Rng) -> Mesh {
     shape.finish()
 }
 
-/// A closed case whose front (+z) carries `fronts` drawers, one above the other, with knobs.
+/// Adds a closed case with `fronts` drawers on its front (+z), one above the other, with knobs.
 fn case(shape: &mut Shape, lo: [f32; 3], hi: [f32; 3], body: u32, knob: u32, fronts: u32) {
     shape.cuboid(lo, [hi[0], hi[1], hi[2] - 0.018], body);
     let step = (hi[1] - lo[1] - 0.04) / fronts as f32;
@@ -139,7 +139,7 @@ fn case(shape: &mut Shape, lo: [f32; 3], hi: [f32; 3], body: u32, knob: u32, fro
     }
 }
 
-/// A case with doors side by side, from `lo` to `hi`.
+/// Adds a case with `count` doors in a row, from `lo` to `hi`.
 fn doors(shape: &mut Shape, lo: [f32; 3], hi: [f32; 3], [body, front, knob]: [u32; 3], count: u32) {
     shape.cuboid(lo, [hi[0], hi[1], hi[2] - 0.02], body);
     let step = (hi[0] - lo[0]) / count as f32;
@@ -247,7 +247,7 @@ pub(super) fn wardrobe(rng: &mut Rng) -> Mesh {
     shape.finish()
 }
 
-/// An open case of boards with `rows` compartments, filled with books and things.
+/// Builds an open case of boards with `rows` compartments, filled with books and other objects.
 fn open_case(rng: &mut Rng, name: &str, [x, z]: [f32; 2], height: f32, rows: u32) -> Mesh {
     let mut shape = Shape::new(name);
     let wood = shape.material(board(rng));

@@ -1,10 +1,10 @@
-//! Things to sit and lie on: sofas, armchairs, chairs, stools and beds.
+//! Furniture to sit and lie on: sofas, armchairs, chairs, stools and beds.
 
 use crate::{Affine, Mesh, Vec3, rng::Rng, shape::Shape};
 
 use super::materials::{board, cloth, linen, plastic, wood};
 
-/// Turn about x by `angle` (positive leans the top back, towards −z), then move.
+/// Turns about x by `angle` (positive leans the top back, towards −z), then moves.
 fn leaning(angle: f32, at: Vec3) -> Affine {
     let (s, c) = (libm::sinf(angle), libm::cosf(angle));
     Affine {
@@ -17,7 +17,7 @@ fn leaning(angle: f32, at: Vec3) -> Affine {
     }
 }
 
-/// Four legs of side `t` under the rectangle ±x, ±z, up to `height`.
+/// Adds four legs of side `t` under the rectangle ±x, ±z, up to `height`.
 pub(super) fn legs(
     shape: &mut Shape,
     [x, z]: [f32; 2],
@@ -37,7 +37,7 @@ pub(super) fn legs(
     }
 }
 
-/// A seat with arms, cushions and a leaning back; `seats` cushions wide.
+/// Builds a seat with arms, cushions and a leaning back; `seats` cushions wide.
 fn upholstered(rng: &mut Rng, name: &str, seats: u32, seat_width: f32) -> Mesh {
     let mut shape = Shape::new(name);
     let cover = shape.material(cloth(rng));
@@ -219,7 +219,7 @@ pub(super) fn bed(rng: &mut Rng) -> Mesh {
     shape.finish()
 }
 
-/// The unit ball stretched to a pillow of these half extents.
+/// Returns the map of the unit ball to a pillow of these half extents.
 fn pillow(at: Vec3, [x, y, z]: [f32; 3]) -> Affine {
     Affine {
         linear: [

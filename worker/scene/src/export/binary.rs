@@ -1,4 +1,5 @@
-//! The binary chunk of a glTF document while it grows: accessors over the meshes' numbers, images behind.
+//! The binary chunk of a glTF document during its construction: accessors over the meshes' numbers,
+//! followed by images.
 
 use serde::Serialize;
 
@@ -32,7 +33,7 @@ pub(super) struct BufferView {
     target: Option<u32>,
 }
 
-/// Accessors and the binary chunk while they grow.
+/// The accessors and the binary chunk during their construction.
 #[derive(Debug, Default)]
 pub(super) struct Binary {
     pub(super) bytes: Vec<u8>,
@@ -41,7 +42,7 @@ pub(super) struct Binary {
 }
 
 impl Binary {
-    /// Appends bytes as a view of their own, and pads to the next word.
+    /// Appends bytes as a separate view, and pads to the next word.
     pub(super) fn view(&mut self, bytes: impl Iterator<Item = u8>, target: Option<u32>) -> usize {
         let start = self.bytes.len();
         self.bytes.extend(bytes);
@@ -80,7 +81,7 @@ impl Binary {
         self.push(words.map(f32::to_le_bytes), TARGET_VERTICES, accessor)
     }
 
-    /// Unit normals, one a vertex.
+    /// Appends unit normals, one a vertex.
     pub(super) fn normals(&mut self, normals: &[Vec3]) -> usize {
         let accessor = Accessor {
             buffer_view: self.views.len(),
@@ -94,7 +95,7 @@ impl Binary {
         self.push(words.map(f32::to_le_bytes), TARGET_VERTICES, accessor)
     }
 
-    /// Texture coordinates; `None` for a mesh without.
+    /// Appends texture coordinates. Returns `None` for a mesh without them.
     pub(super) fn coordinates(&mut self, mesh: &Mesh) -> Option<usize> {
         let accessor = Accessor {
             buffer_view: self.views.len(),

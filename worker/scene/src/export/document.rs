@@ -15,7 +15,7 @@ use super::{
     textures::{ImageEntry, SamplerEntry, TextureEntry, TextureInfo, Textures},
 };
 
-/// glTF 2.0's top level, as far as we write it. Field order is the order on disk.
+/// The top level of glTF 2.0, as far as we write it. The field order is the order on disk.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Document {
@@ -119,7 +119,7 @@ struct MaterialEntry {
     extras: Keyed<MaterialExtras>,
 }
 
-/// What other programs draw glass by.
+/// The glass extensions that other programs render.
 #[derive(Debug, Serialize)]
 struct Glass {
     #[serde(rename = "KHR_materials_transmission")]
@@ -150,9 +150,9 @@ struct Volume {
     thickness_factor: f32,
 }
 
-/// Above 0: the mesh bounds the glass.
+/// A value above 0: the mesh encloses the glass.
 const THICKNESS_M: f32 = 0.005;
-/// The extensions that materials use.
+/// Returns the extensions that materials use.
 fn extensions(materials: &[MaterialEntry]) -> Vec<&'static str> {
     let glass = || materials.iter().filter_map(|m| m.extensions.as_ref());
     let mut names = vec![];
@@ -182,7 +182,7 @@ struct Buffer {
 }
 
 impl Document {
-    /// The document and its binary chunk; `mesh_of[i]` is the mesh of object i.
+    /// Returns the document and its binary chunk; `mesh_of[i]` is the mesh of object i.
     pub(super) fn new(
         scene: &Scene,
         meshes: &[Arc<Mesh>],
@@ -262,7 +262,7 @@ impl Document {
     }
 }
 
-/// One primitive a material that is used; all share the mesh's vertices.
+/// Returns one primitive for each material in use; all share the mesh's vertices.
 fn primitives(mesh: &Mesh, base: usize, normals: Normals, binary: &mut Binary) -> Vec<Primitive> {
     let position = binary.positions(mesh);
     let normal = normals.of(mesh).map(|normals| binary.normals(&normals));
@@ -335,7 +335,7 @@ fn glass(bsdf: Bsdf) -> Option<Glass> {
     })
 }
 
-/// Column-major 4×4 matrix of an affine map.
+/// Returns the column-major 4×4 matrix of an affine map.
 fn columns(a: &Affine) -> [f32; 16] {
     let mut m = [0.0; 16];
     for (row, r) in a.linear.iter().enumerate() {
@@ -346,7 +346,7 @@ fn columns(a: &Affine) -> [f32; 16] {
     m
 }
 
-/// glTF cameras look along −z with y up.
+/// Returns the node of a camera. glTF cameras look along −z with y up.
 fn camera_node(camera: &Camera) -> Node {
     let (x, y, z) = (camera.right, -camera.down, -camera.forward);
     let row = |k: usize| Vec3::new(x[k], y[k], z[k]);

@@ -1,5 +1,6 @@
-//! Writing scenes: as canonical `.glb` (one binary glTF 2.0 file that any viewer opens and that
-//! [`crate::import`] reads back exactly), for Mitsuba 3, or as one PLY mesh. The same scene gives the same bytes.
+//! Writes scenes: as canonical `.glb` (one binary glTF 2.0 file that any viewer opens and that
+//! [`crate::import`] reads back exactly), for Mitsuba 3, or as one PLY mesh. The same scene gives
+//! the same bytes.
 
 mod binary;
 mod document;
@@ -26,20 +27,20 @@ const GLB_VERSION: u32 = 2;
 const CHUNK_JSON: u32 = 0x4e4f_534a;
 const CHUNK_BIN: u32 = 0x004e_4942;
 
-/// The canonical `.glb` bytes of a scene. Meshes shared by several objects are stored once; triangles
-/// are grouped by material, in their order otherwise.
+/// Returns the canonical `.glb` bytes of a scene. Meshes shared by several objects are stored once.
+/// Triangles are grouped by material, otherwise in their order.
 ///
 /// # Errors
-/// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`] or would pass glTF's 4 GiB.
+/// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`] or would exceed glTF's 4 GiB.
 pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
     glb(scene, Normals::Flat)
 }
 
-/// The same with a normal at each vertex, so that viewers shade curved surfaces smoothly. [`crate::import`] does not read
-/// normals: it reads the same scene.
+/// Like [`glb_bytes`], with a normal at each vertex, so that viewers shade curved surfaces
+/// smoothly. [`crate::import`] does not read normals, so it reads the same scene.
 ///
 /// # Errors
-/// As [`glb_bytes`].
+/// As for [`glb_bytes`].
 pub fn glb_bytes_with_normals(scene: &Scene) -> Result<Vec<u8>, SceneError> {
     glb(scene, Normals::Smooth)
 }
@@ -99,20 +100,21 @@ fn glb(scene: &Scene, normals: Normals) -> Result<Vec<u8>, SceneError> {
     Ok(out)
 }
 
-/// Writes the canonical `.glb` to `path`: a temporary file beside it first, then a rename, so that a
-/// reader never sees half a scene.
+/// Writes the canonical `.glb` to `path`. It writes a temporary file in the same folder first and
+/// then renames it, so that a reader never sees an incomplete scene.
 ///
 /// # Errors
-/// As [`glb_bytes`], and [`SceneError::Write`] naming the file.
+/// As for [`glb_bytes`], and [`SceneError::Write`] naming the file.
 pub fn write_glb(scene: &Scene, path: &Path) -> Result<(), SceneError> {
     write_whole(path, &glb_bytes(scene)?)
 }
 
-/// Writes the whole scene as one PLY mesh in world space, for programs that look at shapes only: faces carry
-/// their sRGB colour and the index of their object (`instance`). Camera, laser, BSDFs and textures are left out.
+/// Writes the whole scene as one PLY mesh in world space, for programs that only use shapes: faces
+/// have their sRGB colour and the index of their object (`instance`). Camera, laser, BSDFs and
+/// textures are omitted.
 ///
 /// # Errors
-/// As [`write_glb`]; [`SceneError::Invalid`] also for more than 2³² vertices.
+/// As for [`write_glb`]; [`SceneError::Invalid`] also for more than 2³² vertices.
 pub fn write_ply(scene: &Scene, path: &Path) -> Result<(), SceneError> {
     scene.validate()?;
     let vertices: usize = scene.objects.iter().map(|o| o.mesh.positions.len()).sum();
@@ -126,7 +128,7 @@ pub fn write_ply(scene: &Scene, path: &Path) -> Result<(), SceneError> {
     write_whole(path, &ply::scene_bytes(scene))
 }
 
-/// Writes a file so that it appears whole or not at all.
+/// Writes a file so that it appears completely or not at all.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SceneError> {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(format!(".{}.partial", std::process::id()));
@@ -135,7 +137,7 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SceneError> {
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| std::fs::rename(&partial, path));
     written.map_err(|source| {
-        // The partial file is ours alone; the error that matters is the first.
+        // The partial file belongs to this function only; the first error is the one to report.
         let _ = std::fs::remove_file(&partial);
         SceneError::Write {
             path: path.to_path_buf(),
@@ -144,7 +146,7 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SceneError> {
     })
 }
 
-/// A texture as 8-bit RGB PNG.
+/// Encodes a texture as 8-bit RGB PNG.
 fn png(texture: &Texture) -> Vec<u8> {
     let texels = texture.texels().as_flattened();
     rgb_png(texture.width(), texture.height(), texels)

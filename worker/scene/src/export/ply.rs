@@ -1,10 +1,11 @@
-//! Writing PLY: one mesh, or a whole scene in world space with the colour and instance of each face.
+//! Writes PLY: one mesh, or a whole scene in world space with the colour and instance of each face.
 
 use std::fmt::Write as _;
 
 use crate::{Mesh, Scene, Vec3, texture::srgb_byte};
 
-/// A mesh as binary little-endian PLY, with texture coordinates `u`, `v` (v down) where it has them.
+/// Encodes a mesh as binary little-endian PLY, with texture coordinates `u`, `v` (v down) if it has
+/// them.
 pub(super) fn mesh_bytes(mesh: &Mesh) -> Vec<u8> {
     let uv = (!mesh.uv.is_empty()).then_some(mesh.uv.as_slice());
     let mut out = header(mesh.positions.len(), uv.is_some(), mesh.triangles.len(), "");
@@ -17,8 +18,9 @@ pub(super) fn mesh_bytes(mesh: &Mesh) -> Vec<u8> {
     out
 }
 
-/// A scene as one mesh in world space: each face has its material's sRGB colour (`red`, `green`, `blue`)
-/// and its object's index (`instance`). Camera, laser, BSDFs and textures have no place in PLY.
+/// Encodes a scene as one mesh in world space: each face has its material's sRGB colour (`red`,
+/// `green`, `blue`) and its object's index (`instance`). PLY cannot represent camera, laser, BSDFs
+/// and textures.
 pub(super) fn scene_bytes(scene: &Scene) -> Vec<u8> {
     let vertices = scene.objects.iter().map(|o| o.mesh.positions.len()).sum();
     let faces =

@@ -1,4 +1,4 @@
-//! Textures of a glTF document: each once, as PNG in the binary chunk.
+//! The textures of a glTF document: each is stored once, as PNG in the binary chunk.
 
 use std::sync::Arc;
 
@@ -42,7 +42,7 @@ pub(super) struct Textures {
 }
 
 impl Textures {
-    /// Reference to a texture, which is added if new.
+    /// Returns a reference to a texture, and adds the texture if it is new.
     pub(super) fn info(&mut self, texture: &Arc<Texture>) -> TextureInfo {
         let known = self
             .list
@@ -55,7 +55,8 @@ impl Textures {
         TextureInfo { index }
     }
 
-    /// The document's images, samplers and textures; the PNG bytes go to `binary`.
+    /// Returns the document's images, samplers and textures; the PNG bytes are appended to
+    /// `binary`.
     pub(super) fn entries(
         &self,
         binary: &mut Binary,

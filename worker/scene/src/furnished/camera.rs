@@ -1,4 +1,4 @@
-//! Choosing the camera: random places near the walls, rejected until the view is acceptable.
+//! Selects the camera: random positions near the walls, rejected until the view is acceptable.
 
 use crate::{
     Aim, Camera, Intrinsics, Laser, MAX_DEPTH_M, MIN_DEPTH_M, Vec3,
@@ -8,19 +8,20 @@ use crate::{
 
 use super::{FurnishedSettings, plan::Plan};
 
-/// Cameras tried for one room.
+/// The number of cameras to try for one room.
 const CAMERAS: u32 = 160;
-/// Pieces of furniture that the camera must see.
+/// The least number of pieces of furniture in view.
 const MIN_SEEN: usize = 5;
-/// Coarse pixels (of 576) that count as seeing something.
+/// The least number of coarse pixels (of 576) for an object to count as visible.
 const SEEN_PIXELS: u32 = 2;
-/// Coarse pixels that count as seeing a near-mirror.
+/// The least number of coarse pixels for a near-mirror to count as visible.
 const MIRROR_PIXELS: u32 = 5;
-/// Coarse pixels that one piece of furniture may fill: no view of nothing but a wardrobe.
+/// The greatest number of coarse pixels of one piece of furniture, so that a wardrobe does not fill
+/// the view.
 const FILL_PIXELS: u32 = 200;
-/// Bounds of z-depth, metres.
+/// The bounds of z-depth, metres.
 const DEPTH_M: [f32; 2] = [MIN_DEPTH_M, MAX_DEPTH_M];
-/// The camera keeps this distance from every box, metres.
+/// The least distance of the camera from every box, metres.
 const CLEARANCE: f32 = 0.12;
 
 /// An accepted camera with its laser.
@@ -28,11 +29,11 @@ const CLEARANCE: f32 = 0.12;
 pub(super) struct View {
     pub(super) camera: Camera,
     pub(super) laser: Laser,
-    /// Smallest and largest z-depth, metres.
+    /// The smallest and largest z-depth, metres.
     pub(super) depth: [f32; 2],
 }
 
-/// The first acceptable camera, if there is one among the first [`CAMERAS`].
+/// Returns the first acceptable camera among the first [`CAMERAS`], if there is one.
 pub(super) fn choose(
     rng: &mut Rng,
     settings: &FurnishedSettings,

@@ -1,4 +1,4 @@
-//! On the walls: a door, a window, pictures and mirrors, some of them near-mirrors.
+//! Objects on the walls: a door, a window, pictures and mirrors, some of them near-mirrors.
 
 use std::sync::Arc;
 
@@ -12,11 +12,11 @@ use crate::{
 
 use super::plan::{Plan, half_of};
 
-/// Roughness α of the near-mirrors.
+/// The roughness α of the near-mirrors.
 const MIRROR_ALPHA: f32 = 0.01;
-/// Distance of hung things from the wall, metres.
+/// The distance of hung objects from the wall, metres.
 const HANG_GAP: f32 = 0.001;
-/// Floor kept free in front of a door, metres.
+/// The free floor in front of a door, metres.
 const DOOR_CLEARANCE: f32 = 0.55;
 
 fn tone(rng: &mut Rng, name: &str, lo: f32, hi: f32) -> Material {
@@ -25,7 +25,7 @@ fn tone(rng: &mut Rng, name: &str, lo: f32, hi: f32) -> Material {
     Material::diffuse(name, rgb)
 }
 
-/// A flat frame of the given width round a thin panel, standing on y = 0.
+/// Builds a flat frame of the given width around a thin panel, standing on y = 0.
 fn framed(name: &str, [w, h, d]: [f32; 3], border: f32, frame: Material, panel: Material) -> Mesh {
     let mut shape = Shape::new(name);
     let (f, p) = (shape.material(frame), shape.material(panel));
@@ -42,7 +42,7 @@ fn framed(name: &str, [w, h, d]: [f32; 3], border: f32, frame: Material, panel: 
     shape.finish()
 }
 
-/// Hangs a model on a random wall with its bottom at `y`, where there is space.
+/// Hangs a model on a random wall with its bottom at `y`, if there is space.
 fn hang(rng: &mut Rng, plan: &mut Plan<'_>, label: &'static str, mesh: Mesh, y: f32) -> bool {
     let model = Arc::new(Model::new(mesh).expect("what hangs on walls has triangles"));
     (0..20).any(|_| {
@@ -54,7 +54,7 @@ fn hang(rng: &mut Rng, plan: &mut Plan<'_>, label: &'static str, mesh: Mesh, y: 
     })
 }
 
-/// A door with free floor before it, and mostly a window.
+/// Places a door with free floor in front of it, and usually a window.
 pub(super) fn openings(rng: &mut Rng, plan: &mut Plan<'_>) {
     let room: Room = plan.room;
     let size = [rng.range(0.8, 0.95), rng.range(1.98, 2.1), 0.05];
@@ -88,8 +88,9 @@ pub(super) fn openings(rng: &mut Rng, plan: &mut Plan<'_>) {
     }
 }
 
-/// Two to six flat things on the walls. Mirrors are near-mirrors, every other picture is one too (glossy
-/// glass); with `specular_at_least` there are always more near-mirrors than the camera must see.
+/// Hangs two to six flat objects on the walls. Mirrors are near-mirrors, and so are half of the
+/// pictures on average (glossy glass). With `specular_at_least`, more near-mirrors are hung than
+/// the camera must see, as far as there is space.
 pub(super) fn pictures_and_mirrors(rng: &mut Rng, plan: &mut Plan<'_>, specular_at_least: u32) {
     let wanted = if specular_at_least == 0 {
         0

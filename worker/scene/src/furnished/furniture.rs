@@ -1,4 +1,4 @@
-//! Furniture on the floor: anchors with their backs to the wall, tables with chairs, clutter.
+//! Furniture on the floor: anchors with their backs to the wall, tables with chairs, and clutter.
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
@@ -9,12 +9,12 @@ use super::{
     plan::{CONTACT_GAP, Plan, half_of},
 };
 
-/// Distance of anchors from the wall, metres.
+/// The distance of anchors from the wall, metres.
 const WALL_GAP: f32 = 0.01;
-/// Places tried for an anchor or a table before it is left out.
+/// The number of positions to try for an anchor or a table.
 const TRIES: u32 = 40;
 
-/// What stands along the walls, most important first.
+/// Returns the categories of furniture along the walls, most important first.
 fn anchors_of(kind: RoomType) -> &'static [&'static str] {
     match kind {
         RoomType::Living => &[
@@ -62,11 +62,11 @@ fn anchors_of(kind: RoomType) -> &'static [&'static str] {
     }
 }
 
-/// Puts the room type's furniture against the walls.
+/// Places the room type's furniture against the walls.
 pub(super) fn anchors(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
     let (room, assets) = (plan.room, plan.assets);
     for (rank, label) in anchors_of(kind).iter().enumerate() {
-        // The first two make the room what it is; any of the others may be missing.
+        // The first two define the room type; any of the others may be missing.
         if rank >= 2 && rng.chance(0.15) {
             continue;
         }
@@ -87,7 +87,7 @@ pub(super) fn anchors(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
     }
 }
 
-/// A rug, and tables in the room with seats that face them.
+/// Places a rug, and tables in the room with seats that face them.
 pub(super) fn groups(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
     let (room, assets) = (plan.room, plan.assets);
     let on_floor = |elevation: f32| elevation < 0.01;
@@ -137,7 +137,7 @@ pub(super) fn groups(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
     }
 }
 
-/// The same chair on up to four sides of a table, turned towards it.
+/// Places the same chair on up to four sides of a table, turned towards it.
 fn seats(
     rng: &mut Rng,
     plan: &mut Plan<'_>,
@@ -168,7 +168,7 @@ fn seats(
     }
 }
 
-/// A chair in front of a desk, its back to the room.
+/// Places a chair in front of a desk, its back to the room.
 fn desk_chair(rng: &mut Rng, plan: &mut Plan<'_>, desk: usize) {
     let (at, yaw, half) = {
         let d = &plan.placed[desk];
@@ -196,7 +196,7 @@ fn desk_chair(rng: &mut Rng, plan: &mut Plan<'_>, desk: usize) {
     }
 }
 
-/// Small things on the floor, anywhere, turned any way.
+/// Places small objects on the floor, at random positions and angles.
 pub(super) fn clutter(rng: &mut Rng, plan: &mut Plan<'_>) {
     const KINDS: [&str; 12] = [
         "box", "bag", "toy", "basket", "ball", "stool", "plant", "lamp", "exercise", "guitar",

@@ -1,4 +1,4 @@
-//! Furnished rooms: a room type, furniture that stands as people place it, small things on tops, pictures
+//! Furnished rooms: a room type, realistically placed furniture, small objects on tops, pictures
 //! and mirrors on the walls, and a camera that sees enough of it at bounded depth.
 
 mod camera;
@@ -23,26 +23,26 @@ use plan::Plan;
 /// Changes whenever the same seed and assets would give another scene.
 pub const GENERATOR_VERSION: &str = "furnished-2";
 
-/// Rooms tried for one seed before giving up.
+/// The number of rooms to try for one seed.
 const ATTEMPTS: u32 = 64;
 
-/// What a furnished room is made for.
+/// The settings of a furnished room.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FurnishedSettings {
-    /// Laser spots.
+    /// The laser spots.
     pub spots: Spots,
-    /// Where the laser stands in the camera's frame (x right, y down, z forward), metres.
+    /// The laser's position in the camera's frame (x right, y down, z forward), metres.
     pub laser_m: [f32; 3],
-    /// Image width in pixels.
+    /// The image width in pixels.
     pub width: u32,
-    /// Image height in pixels.
+    /// The image height in pixels.
     pub height: u32,
-    /// Horizontal field of view, degrees.
+    /// The horizontal field of view, degrees.
     pub fov_deg: f32,
-    /// Name of the furniture library ([`AssetLibrary::find`]).
+    /// The name of the furniture library ([`AssetLibrary::find`]).
     pub assets: String,
-    /// Specular objects that the camera must see, 0 to 4.
+    /// The least number of specular objects in view, 0 to 4.
     pub specular_at_least: u32,
 }
 
@@ -60,7 +60,7 @@ impl Default for FurnishedSettings {
     }
 }
 
-/// What kind of room it is: decides the furniture.
+/// The type of the room, which determines its furniture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RoomType {
     Living,
@@ -82,11 +82,13 @@ impl RoomType {
     }
 }
 
-/// The furnished room of `seed`: the same scene, bit for bit, on every machine with the same assets.
+/// Generates the furnished room of `seed`: the same scene, bit for bit, on every machine with the
+/// same assets.
 ///
 /// # Errors
 /// [`SceneError::Invalid`] for settings out of range, [`SceneError::Assets`] if `assets` is not the
-/// library that the settings name, [`SceneError::Exhausted`] if no sub-seed gives an acceptable view.
+/// library that the settings name, [`SceneError::Exhausted`] if no sub-seed gives an acceptable
+/// view.
 pub fn generate(
     seed: u64,
     settings: &FurnishedSettings,
@@ -171,7 +173,7 @@ fn furnish<'a>(
     (plan, kind)
 }
 
-/// Paint or boards of a random tone.
+/// Returns paint or boards of a random tone.
 fn surface(rng: &mut Rng, name: &str, lo: f32, hi: f32) -> Material {
     let level = rng.range(lo, hi);
     let rgb = [

@@ -1,4 +1,4 @@
-//! A room being furnished: what stands where, and whether there is space for more.
+//! A room being furnished: the placed objects, and tests for free space.
 
 use std::sync::Arc;
 
@@ -10,36 +10,37 @@ use crate::{
     trace::{Model, World},
 };
 
-/// Furniture stands this far above the floor or its support, so that no two surfaces coincide (metres).
+/// The gap between furniture and the floor or its support, so that no two surfaces coincide
+/// (metres).
 pub(super) const CONTACT_GAP: f32 = 5e-4;
 
-/// Something in the room.
+/// An object in the room.
 #[derive(Debug, Clone)]
 pub(super) struct Placed {
     pub(super) model: Arc<Model>,
     pub(super) label: &'static str,
     pub(super) name: String,
-    /// Bottom centre of the model's box.
+    /// The bottom centre of the model's box.
     pub(super) at: [f32; 3],
     pub(super) yaw: f32,
-    /// The box that nothing else may enter; `None` for the room itself and for rugs.
+    /// The box that no other object may enter; `None` for the room itself and for rugs.
     pub(super) foot: Option<Footprint>,
     pub(super) attribution: Option<String>,
-    /// What was changed in the model to use it.
+    /// The changes made to the model.
     pub(super) changes: Vec<&'static str>,
 }
 
-/// A room and everything in it so far.
+/// A room and the objects placed so far.
 #[derive(Debug)]
 pub(super) struct Plan<'a> {
     pub(super) room: Room,
     pub(super) assets: &'a AssetLibrary,
     pub(super) placed: Vec<Placed>,
-    /// Space kept free: in front of the door.
+    /// Reserved free space, in front of the door.
     pub(super) reserved: Vec<Footprint>,
 }
 
-/// Half of a model's extents on the plan.
+/// Returns half of a model's extents on the plan.
 pub(super) fn half_of(model: &Model) -> [f32; 2] {
     let [w, _, d] = model.size();
     [w * 0.5, d * 0.5]
@@ -70,7 +71,7 @@ impl<'a> Plan<'a> {
         });
     }
 
-    /// Adds `model` if its box is inside the room and free; `support` is what it stands on.
+    /// Adds `model` if its box is inside the room and free; `support` is the object under it.
     pub(super) fn try_place(
         &mut self,
         (name, model): (&str, &Arc<Model>),
@@ -96,7 +97,7 @@ impl<'a> Plan<'a> {
         true
     }
 
-    /// As [`Plan::try_place`], for an asset whose creator must be named.
+    /// Like [`Plan::try_place`], for an asset with a creator who must be named.
     pub(super) fn try_place_asset(
         &mut self,
         (asset, model): (&Asset, &Arc<Model>),
@@ -112,7 +113,7 @@ impl<'a> Plan<'a> {
         placed
     }
 
-    /// Adds something flat that furniture may stand on.
+    /// Adds a flat object on which furniture may be placed.
     pub(super) fn lay(&mut self, (asset, model): (&Asset, &Arc<Model>), at: [f32; 3], yaw: f32) {
         self.push(Placed {
             model: model.clone(),
@@ -130,7 +131,7 @@ impl<'a> Plan<'a> {
         self.placed.push(placed);
     }
 
-    /// True if the box is inside the room and meets nothing but what it stands on.
+    /// Returns whether the box is inside the room and overlaps no object except its support.
     pub(super) fn is_free(&self, foot: &Footprint, support: Option<usize>) -> bool {
         let taken = self.placed.iter().enumerate().any(|(k, p)| {
             Some(k) != support && p.foot.as_ref().is_some_and(|other| other.overlaps(foot))
@@ -138,7 +139,7 @@ impl<'a> Plan<'a> {
         self.room.holds(foot) && !taken && !self.reserved.iter().any(|r| r.overlaps(foot))
     }
 
-    /// Everything placed, ready for rays; indices are those of `placed`.
+    /// Returns all placed objects, ready for rays; indices are those of `placed`.
     pub(super) fn world(&self) -> World {
         let mut world = World::default();
         for p in &self.placed {
@@ -147,7 +148,7 @@ impl<'a> Plan<'a> {
         world
     }
 
-    /// Everything placed, as a scene holds it.
+    /// Returns all placed objects in the form of a scene.
     pub(super) fn objects(&self) -> Vec<Object> {
         self.placed
             .iter()

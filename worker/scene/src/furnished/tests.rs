@@ -1,4 +1,4 @@
-//! How a furnished room must stand: nothing runs into anything else, nothing floats.
+//! Tests of furnished rooms: objects do not overlap, and none floats.
 
 use super::{FurnishedSettings, furnish, plan::Plan, tops::TOPS};
 use crate::{AssetLibrary, Vec3, rng::Rng};
@@ -42,7 +42,7 @@ fn everything_rests_on_the_floor_on_something_or_hangs_on_a_wall() {
         let world = plan.world();
         for p in plan.placed.iter().filter(|p| p.foot.is_some()) {
             if matches!(p.label, "mirror" | "picture" | "window") {
-                // Its back is within a centimetre of a wall: look backwards from its middle.
+                // Its back is within a centimetre of a wall: a ray goes backwards from its middle.
                 let back = p.to_world().direction(Vec3::new(0.0, 0.0, -1.0));
                 let from =
                     p.to_world()

@@ -1,4 +1,4 @@
-//! Small things on tops: dropped where rays from above find flat, free support.
+//! Small objects on tops: they are placed where rays from above hit flat, free support.
 
 use std::f32::consts::TAU;
 
@@ -9,13 +9,13 @@ use super::{
     plan::{CONTACT_GAP, Plan, half_of},
 };
 
-/// Support heights under one object may differ by this, metres.
+/// The greatest difference of support heights under one object, metres.
 const FLATNESS_M: f32 = 0.01;
 
-/// Taller things stand on the floor, metres.
+/// Taller objects are placed on the floor, metres.
 const TALLEST_M: f32 = 0.75;
 
-/// What carries things.
+/// The categories that support small objects.
 pub(super) const TOPS: [&str; 12] = [
     "table",
     "coffee_table",
@@ -31,7 +31,7 @@ pub(super) const TOPS: [&str; 12] = [
     "kitchen_appliance",
 ];
 
-/// What people leave on the tops of a room.
+/// Returns the categories of objects on the tops of a room.
 fn things(kind: RoomType) -> &'static [&'static str] {
     match kind {
         RoomType::Living => &[
@@ -63,7 +63,7 @@ fn things(kind: RoomType) -> &'static [&'static str] {
     }
 }
 
-/// Puts things on tables and cases.
+/// Places objects on tables and cases.
 pub(super) fn drop_things(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
     for support in 0..plan.placed.len() {
         let label = plan.placed[support].label;
@@ -134,8 +134,8 @@ fn drop_one(rng: &mut Rng, plan: &mut Plan<'_>, support: usize, label: &str) {
     }
 }
 
-/// Height of the support under a rectangle, if nine rays from above (its middle, its corners, and half
-/// way) agree on it.
+/// Returns the height of the support under a rectangle, if nine rays from above (its middle, its
+/// corners, and half way) agree on it.
 fn flat_height(support: &Model, at: [f32; 2], corners: &[[f32; 2]; 4]) -> Option<f32> {
     let start = support.size()[1] + 0.5;
     let down = Vec3::new(0.0, -1.0, 0.0);
@@ -155,6 +155,6 @@ fn flat_height(support: &Model, at: [f32; 2], corners: &[[f32; 2]; 4]) -> Option
             }
         }
     }
-    // Standing on the highest point found: resting, never sunk in.
+    // The highest point is used, so that the object rests on the support and does not sink into it.
     (high - low <= FLATNESS_M && high > 0.2).then_some(high)
 }

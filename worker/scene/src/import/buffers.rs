@@ -1,4 +1,4 @@
-//! The binary buffers of a glTF file, checked against what the document claims before anyone reads them.
+//! The binary buffers of a glTF file, checked against the document's claims before they are read.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use crate::SceneError;
 
 use super::{Opener, format_error, of_file, read_file};
 
-/// Bytes of every buffer, by index.
+/// The bytes of every buffer, by index.
 #[derive(Debug)]
 pub(super) struct Buffers(Vec<Vec<u8>>);
 
@@ -53,12 +53,12 @@ impl Buffers {
             .map(Self)
     }
 
-    /// A buffer's bytes, for the readers of the `gltf` crate.
+    /// Returns a buffer's bytes, for the readers of the `gltf` crate.
     pub(super) fn get(&self, buffer: &gltf::Buffer<'_>) -> Option<&[u8]> {
         self.0.get(buffer.index()).map(Vec::as_slice)
     }
 
-    /// The bytes of a view.
+    /// Returns the bytes of a view.
     pub(super) fn view(&self, view: &gltf::buffer::View<'_>) -> Result<&[u8], String> {
         let buffer = self
             .0
@@ -74,8 +74,8 @@ impl Buffers {
         })
     }
 
-    /// Checks an accessor's type and that it lies inside its view and buffer; the readers of the `gltf`
-    /// crate rely on both.
+    /// Checks an accessor's type, and that it is inside its view and buffer; the readers of the
+    /// `gltf` crate rely on both.
     pub(super) fn check(
         &self,
         accessor: &Accessor<'_>,
@@ -133,10 +133,11 @@ fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8
     Ok(data)
 }
 
-/// The file that a buffer's URI names beside the glTF file `path`; `None` for data within the URI.
+/// Returns the file in the folder of the glTF file `path` that a buffer's URI names, or `None` for
+/// data within the URI.
 ///
 /// # Errors
-/// A name that is no plain path once it is decoded.
+/// A name that is not a plain path once it is decoded.
 pub(super) fn buffer_file(path: &Path, uri: &str) -> Result<Option<PathBuf>, SceneError> {
     let base = path.parent().unwrap_or(Path::new(""));
     if uri.starts_with("data:") {
@@ -146,7 +147,7 @@ pub(super) fn buffer_file(path: &Path, uri: &str) -> Result<Option<PathBuf>, Sce
     named.map(Some).map_err(of_file)
 }
 
-/// The bytes of a data URI.
+/// Returns the bytes of a data URI.
 pub(super) fn data_uri(uri: &str) -> Result<Vec<u8>, String> {
     let coded = uri
         .strip_prefix("data:")
@@ -155,7 +156,7 @@ pub(super) fn data_uri(uri: &str) -> Result<Vec<u8>, String> {
     STANDARD.decode(text).map_err(|e| e.to_string())
 }
 
-/// File names in glTF are URIs: `%20` stands for a space.
+/// Decodes file names in glTF, which are URIs: `%20` stands for a space.
 fn percent_decoded(uri: &str) -> String {
     let bytes = uri.as_bytes();
     let mut out = Vec::with_capacity(bytes.len());

@@ -1,16 +1,16 @@
-//! Coordinates far from the origin: files state them in double precision, scenes have them in
-//! single precision. A mesh or a scene is moved to the origin before it is rounded, wherever
-//! rounding would show.
+//! Coordinates far from the origin. Files contain them in double precision, scenes in single
+//! precision. If rounding would be visible, a mesh or a scene is moved to the origin before it is
+//! rounded.
 
 use crate::Vec3;
 
-/// Largest error of rounding to single precision, metres: a tenth of a picosecond of light.
+/// The largest error of rounding to single precision, metres: a tenth of a picosecond of light.
 const LOSS_M: f64 = 3e-5;
-/// The same as a share of the size of a mesh.
+/// The largest error as a share of the size of a mesh.
 const LOSS: f64 = 1e-5;
 
-/// Centre and diagonal of the box around points; `None` without any, and for points that are not
-/// finite.
+/// Returns the centre and diagonal of the bounding box of points, or `None` without any, and for
+/// non-finite points.
 pub(super) fn centre(points: &[[f64; 3]]) -> Option<([f64; 3], f64)> {
     let side = |k: usize| {
         let ends = (f64::INFINITY, f64::NEG_INFINITY);
@@ -24,20 +24,20 @@ pub(super) fn centre(points: &[[f64; 3]]) -> Option<([f64; 3], f64)> {
     (!points.is_empty() && finite && square.is_finite()).then(|| (centre, square.sqrt()))
 }
 
-/// True where a thing of this size at this place loses too much by rounding.
+/// Returns whether rounding loses too much for an object of this size at this position.
 pub(super) fn is_lossy(place: [f64; 3], size: f64) -> bool {
     let largest = place.iter().fold(0.0f64, |m, x| m.max(x.abs()));
     largest * f64::from(f32::EPSILON) * 0.5 > LOSS_M.min(LOSS * size)
 }
 
-/// Points relative to an origin, subtracted before they are rounded.
+/// Returns points relative to an origin, subtracted before they are rounded.
 pub(super) fn relative(points: &[[f64; 3]], origin: [f64; 3]) -> Vec<Vec3> {
     let place = |p: &[f64; 3]| Vec3::from(std::array::from_fn(|k| (p[k] - origin[k]) as f32));
     points.iter().map(place).collect()
 }
 
-/// Points in a frame around their centre, where rounding would show otherwise; and the origin of
-/// that frame.
+/// Returns points, and the origin of their frame. If rounding would be visible, the frame is
+/// centred on the points.
 pub(super) fn local(points: &[[f64; 3]]) -> (Vec<Vec3>, [f64; 3]) {
     let origin = match centre(points) {
         Some((centre, size)) if is_lossy(centre, size) => centre,
@@ -46,7 +46,7 @@ pub(super) fn local(points: &[[f64; 3]]) -> (Vec<Vec3>, [f64; 3]) {
     (relative(points, origin), origin)
 }
 
-/// A note on a scene that was moved.
+/// Returns a note on a scene that was moved.
 pub(super) fn note([x, y, z]: [f64; 3]) -> String {
     format!(
         "moved from [{x}, {y}, {z}] to [0, 0, 0], to keep the digits of coordinates far from it"

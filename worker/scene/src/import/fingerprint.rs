@@ -1,4 +1,5 @@
-//! What pins a scene file: its own bytes and those of the buffer files that it refers to.
+//! The fingerprint of a scene file, over its own bytes and those of the buffer files that it refers
+//! to.
 
 use std::path::Path;
 
@@ -7,11 +8,13 @@ use sha2::{Digest, Sha256};
 use super::{Bounds, buffers::buffer_file, gltf_file, is_xml, mitsuba, read_file};
 use crate::SceneError;
 
-/// SHA-256 of a scene's content, hexadecimal. For a file that stands alone (every `.glb` and reference scene of ours)
-/// it is the file's own SHA-256; each external buffer of a glTF file adds its URI, its length and its bytes.
+/// Returns the SHA-256 of a scene's content, hexadecimal. For a file without external buffers
+/// (every `.glb` and reference scene of ours) it is the file's own SHA-256. Each external buffer of
+/// a glTF file adds its URI, its length and its bytes.
 ///
 /// # Errors
-/// [`SceneError::Read`] for the file or a buffer that cannot be read, [`SceneError::Refused`] for one outside `bounds`.
+/// [`SceneError::Read`] for the file or a buffer that cannot be read, [`SceneError::Refused`] for
+/// one outside `bounds`.
 pub fn fingerprint(path: &Path, bounds: &Bounds) -> Result<String, SceneError> {
     let bytes = read_file(&bounds.files, path)?;
     let files = &bounds.of_scene(path);
@@ -24,7 +27,7 @@ pub fn fingerprint(path: &Path, bounds: &Bounds) -> Result<String, SceneError> {
             hash.update(&data);
         }
     }
-    // Other files, unreadable ones too, stand alone.
+    // Other files, including unreadable ones, are hashed on their own.
     if let Ok(file) = gltf_file::document::parse(&bytes) {
         let json = &file.root;
         let buffers = json.buffers.iter().filter_map(|b| b.uri.as_deref());

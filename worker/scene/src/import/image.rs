@@ -1,5 +1,5 @@
-//! Images of foreign files: PNG and JPEG as textures, decoded once and within limits that are checked
-//! before any texel is.
+//! Images in imported files: PNG and JPEG as textures. They are decoded once, and limits are
+//! checked before any texel is decoded.
 
 use std::{collections::BTreeMap, io::Cursor, sync::Arc};
 
@@ -12,10 +12,10 @@ use crate::{Texture, Wrap};
 
 use super::quoted;
 
-/// Most texels of all textures of one file (800 MB).
+/// The greatest number of texels of all textures of one file (800 MB).
 const MAX_TEXELS: u64 = 1 << 28;
 
-/// Textures of one file, by whatever names them there.
+/// The textures of one file, by the key that identifies them there.
 #[derive(Debug)]
 pub(super) struct Images<K> {
     known: BTreeMap<K, Arc<Texture>>,
@@ -32,7 +32,7 @@ impl<K> Default for Images<K> {
 }
 
 impl<K: Ord> Images<K> {
-    /// The texture called `key`, made by `decode` when first asked for.
+    /// Returns the texture called `key`, which `decode` makes on first use.
     pub(super) fn get(
         &mut self,
         key: K,
@@ -53,8 +53,8 @@ impl<K: Ord> Images<K> {
     }
 }
 
-/// A PNG or JPEG image as a texture; an alpha channel is dropped, grey is spread over the channels, and 16
-/// bits are rounded to 8.
+/// Decodes a PNG or JPEG image as a texture. An alpha channel is dropped, grey is copied to all
+/// channels, and 16 bits are rounded to 8.
 pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, String> {
     let decoded = if bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
         png(bytes)
@@ -75,7 +75,7 @@ pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, St
     Texture::new(name, size.0, size.1, texels, wrap)
 }
 
-/// The smallest alpha of an image; 255 for one without.
+/// Returns the smallest alpha of an image, or 255 if it has none.
 ///
 /// # Errors
 /// An image that cannot be read.
@@ -106,7 +106,7 @@ fn png(bytes: &[u8]) -> Result<Decoded, Refused> {
     Ok((size, texels(&samples, each)))
 }
 
-/// Width and height, 8-bit samples row by row, and how many samples a pixel has.
+/// Width and height, 8-bit samples row by row, and the number of samples of a pixel.
 type Samples = ((u32, u32), Vec<u8>, usize);
 
 fn png_samples(bytes: &[u8]) -> Result<Samples, Refused> {
@@ -148,7 +148,7 @@ fn jpeg(bytes: &[u8]) -> Result<Decoded, Refused> {
     Ok((size, texels(&samples, 3)))
 }
 
-/// Texels of pixels of 1 to 4 samples: grey, grey and alpha, RGB, RGB and alpha.
+/// Converts pixels of 1 to 4 samples to texels: grey, grey and alpha, RGB, RGB and alpha.
 fn texels(samples: &[u8], each: usize) -> Vec<[u8; 3]> {
     let pixels = samples.chunks_exact(each);
     match each {
@@ -213,7 +213,8 @@ mod tests {
         let mut png = written(&small, ImageFormat::Png);
         assert!(decode("a", &png, Wrap::Repeat).is_ok());
         png[16..24].copy_from_slice(&[0, 0, 0x40, 0, 0, 0, 0x40, 0]);
-        // The checksum no longer fits; whichever is found first, nothing large is allocated.
+        // The checksum is also wrong. Whichever fault is detected first, no large buffer is
+        // allocated.
         assert!(decode("a", &png, Wrap::Repeat).is_err());
         let error = decode("a", b"no image", Wrap::Repeat).unwrap_err();
         assert!(error.contains("neither a PNG nor a JPEG"), "{error}");
@@ -222,7 +223,7 @@ mod tests {
         jpeg[frame + 5..frame + 9].copy_from_slice(&[0xff; 4]);
         assert!(decode("a", &jpeg, Wrap::Repeat).is_err());
         for length in 0..jpeg.len() {
-            // A cut file is refused, or read as far as it goes.
+            // A truncated file is refused, or read up to its end.
             let _ = decode("a", &jpeg[..length], Wrap::Repeat);
         }
     }

@@ -1,5 +1,5 @@
-//! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`), Mitsuba 3 (XML, and its dictionary as JSON), PLY meshes and
-//! the reference scenes' JSON.
+//! Reads scenes from files: glTF 2.0 (`.glb`, `.gltf`), Mitsuba 3 (XML, and its dictionary as
+//! JSON), PLY meshes and the reference scenes' JSON.
 
 mod buffers;
 mod far;
@@ -24,28 +24,30 @@ use crate::{Aim, Camera, Scene, SceneError};
 pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
 
-/// What the caller states where a file does not, or wants otherwise.
+/// Settings for importing a scene, which complete or replace those of the file.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ImportOptions {
-    /// Use this camera in place of the file's.
+    /// The camera that replaces the file's.
     pub camera: Option<Camera>,
-    /// Beams aimed so over the camera's view, in place of the file's laser.
+    /// The aim of beams that replace the file's laser, over the camera's view.
     pub laser: Option<Aim>,
-    /// Put a camera in front of a lone mesh (PLY) where no camera is stated: 60°, on its +z side, seeing all of it.
+    /// Whether to place a camera in front of a lone mesh (PLY) if there is no camera: 60°, on its
+    /// +z side, seeing all of it.
     pub frame: bool,
 }
 
-/// Where a scene file may lie, and where the files that it names.
+/// The allowed locations of a scene file and of the files that it names.
 #[derive(Debug, Clone, Default)]
 pub struct Bounds {
-    /// Opens the scene file, and what it names.
+    /// Opens the scene file and the files that it names.
     pub files: Opener,
-    /// The folder that also holds everything the scene file names; `None` = the scene file's own folder.
+    /// The folder that contains all files named by the scene file; `None` = the scene file's own
+    /// folder.
     pub root: Option<PathBuf>,
 }
 
 impl Bounds {
-    /// What opens the files that the scene file at `path` names.
+    /// Returns the opener for the files that the scene file at `path` names.
     fn of_scene(&self, path: &Path) -> Opener {
         let own = path.parent().unwrap_or(Path::new(""));
         // The parent of a bare name is the current folder.
@@ -58,33 +60,39 @@ impl Bounds {
     }
 }
 
-/// Reads a scene with its own camera and laser, and files from its own folder only; see [`read_scene_with`].
+/// Reads a scene with its own camera and laser, and files from its own folder only; see
+/// [`read_scene_with`].
 ///
 /// # Errors
-/// As [`read_scene_with`].
+/// As for [`read_scene_with`].
 pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
     read_scene_with(path, &ImportOptions::default(), &Bounds::default())
 }
 
-/// Reads a scene by its content: `glTF` magic or a JSON object with `asset` is glTF, `ply` a lone mesh, XML or a
-/// JSON object with `"type": "scene"` a Mitsuba scene, and a JSON object with `meshes` and `spots` a reference scene.
+/// Reads a scene. The content determines the format: `glTF` magic or a JSON object with `asset` is
+/// glTF, `ply` a lone mesh, XML or a JSON object with `"type": "scene"` a Mitsuba scene, and a JSON
+/// object with `meshes` and `spots` a reference scene.
 ///
-/// Files written by [`crate::export`] come back exactly. Of other glTF files, metals become GGX conductors with
-/// α = roughness², metals in part a mix, everything else Lambertian with the base colour, all two-sided; base
-/// colour textures are read. The camera is the first camera node; its image gets 64 rows (see
-/// [`crate::Intrinsics::resized`]). The laser comes from `laser_spots` or `laser_directions` in a node's extras,
-/// or from `options`. A material's extras may state its `spectrum`.
+/// Files written by [`crate::export`] are restored exactly. In other glTF files, metals become GGX
+/// conductors with α = roughness², partial metals a mix, and all other materials Lambertian with
+/// the base colour, all two-sided; base colour textures are read. The camera is the first camera
+/// node; its image has 64 rows (see [`crate::Intrinsics::resized`]). The laser comes from
+/// `laser_spots` or `laser_directions` in a node's extras, or from `options`. A material's extras
+/// may define its `spectrum`.
 ///
-/// Of Mitsuba 3, this is understood: sensor `perspective`; shapes `ply`, `obj`, `rectangle`, `cube`, `disk` and
-/// `sphere`; BSDFs `diffuse`, `roughconductor`, `conductor`, `twosided`, and `blendbsdf` of all these, nested
-/// too; `dielectric` and `thindielectric`; `bitmap` textures, and spectra over wavelengths as reflectances. Beams are
-/// emitters `projector` of `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°) that start at one place; a shape's category is its id up to the
-/// first `.`. A PLY needs camera and laser from `options`. Whatever a format holds that our scenes do not is named in
-/// the provenance's notes, under keys that start with `import.`, or refused.
+/// For Mitsuba 3, the following is supported: sensor `perspective`; shapes `ply`, `obj`,
+/// `rectangle`, `cube`, `disk` and `sphere`; BSDFs `diffuse`, `roughconductor`, `conductor`,
+/// `twosided`, and `blendbsdf` of all these, nested too; `dielectric` and `thindielectric`;
+/// `bitmap` textures, and spectra over wavelengths as reflectances. Beams are emitters `projector`
+/// of `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°) that start at one point; a shape's category is
+/// its id up to the first `.`. A PLY needs camera and laser from `options`. Features of a format
+/// that our scenes cannot represent are listed in the provenance's notes, under keys that start
+/// with `import.`, or refused.
 ///
 /// # Errors
-/// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Refused`] for one outside
-/// `bounds`, [`SceneError::Format`] naming file and field otherwise. No error quotes a file that is none of these formats.
+/// [`SceneError::Read`] for a file (also a buffer file) that cannot be read,
+/// [`SceneError::Refused`] for one outside `bounds`, [`SceneError::Format`] naming file and field
+/// otherwise. If a file has none of these formats, no error quotes it.
 pub fn read_scene_with(
     path: &Path,
     options: &ImportOptions,
@@ -114,7 +122,8 @@ pub fn read_scene_with(
     validated(path, scene)
 }
 
-/// One glTF file as one mesh in its own frame, with the notes on what was dropped; its numbers are unchecked.
+/// Reads one glTF file as one mesh in its own frame, with the notes on dropped parts; its numbers
+/// are unchecked.
 pub(crate) fn read_model(
     path: &Path,
     files: &Opener,
@@ -128,7 +137,7 @@ enum Kind {
     Mitsuba,
 }
 
-/// True for text that starts like XML.
+/// Returns whether text starts like XML.
 fn is_xml(bytes: &[u8]) -> bool {
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     text.trim_ascii_start().first() == Some(&b'<')
@@ -160,10 +169,11 @@ fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
     }
 }
 
-/// Largest file read, bytes.
+/// The greatest size of a file, bytes.
 const MAX_FILE_BYTES: u64 = 8 << 30;
 
-/// A regular file's bytes: a path inside a scene file may name anything, devices too.
+/// Returns a regular file's bytes. The check is necessary because a path inside a scene file may
+/// name anything, devices too.
 fn read_file(files: &Opener, path: &Path) -> Result<Vec<u8>, SceneError> {
     files.read(path, MAX_FILE_BYTES).map_err(of_file)
 }
@@ -182,12 +192,12 @@ fn format_error(path: &Path, what: impl Into<String>) -> SceneError {
     }
 }
 
-/// Longest message on a file, and longest note, letters.
+/// The greatest length of a message on a file, and of a note, letters.
 const MAX_MESSAGE: usize = 1000;
-/// Letters of a file's own text that a message quotes.
+/// The number of letters of a file's own text that a message quotes.
 const MAX_QUOTE: usize = 80;
 
-/// A message, cut where it is too long to be read.
+/// Truncates a message of more than [`MAX_MESSAGE`] letters.
 fn shortened(mut message: String) -> String {
     if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE) {
         message.truncate(end);
@@ -196,11 +206,11 @@ fn shortened(mut message: String) -> String {
     message
 }
 
-/// Most notes on a file.
+/// The greatest number of notes on a file.
 const MAX_NOTES: usize = 256;
 
-/// Adds a note. Keys and texts may have names of the file in them, and a file may have any number
-/// of these.
+/// Adds a note. The length is limited, because keys and texts may contain names from the file. The
+/// number is limited, because a file may have any number of these.
 fn add_note(notes: &mut BTreeMap<String, String>, key: &str, what: String) {
     let key: String = key.chars().take(2 * MAX_QUOTE).collect();
     match notes.len() < MAX_NOTES || notes.contains_key(&key) {
@@ -209,7 +219,7 @@ fn add_note(notes: &mut BTreeMap<String, String>, key: &str, what: String) {
     };
 }
 
-/// Text of a file in quotes, cut where it is long.
+/// Returns text of a file in quotes, truncated if it is long.
 fn quoted(text: &str) -> String {
     match text.char_indices().nth(MAX_QUOTE) {
         None => format!("{text:?}"),
@@ -217,7 +227,7 @@ fn quoted(text: &str) -> String {
     }
 }
 
-/// The scene if the renderer can use it; otherwise an error that names the file too.
+/// Returns the scene if the renderer can use it, or else an error that also names the file.
 fn validated(path: &Path, scene: Scene) -> Result<Scene, SceneError> {
     match scene.validate() {
         Ok(()) => Ok(scene),

@@ -34,12 +34,12 @@ const FREE_FORM: [&[u8]; 8] = [
 /// The content of an OBJ file.
 #[derive(Debug, Default)]
 pub(super) struct Obj {
-    /// As the file states them.
+    /// The positions as in the file.
     pub(super) positions: Vec<[f64; 3]>,
-    /// One a vertex, v upwards, or none.
+    /// Texture coordinates, one a vertex, v upwards, or none.
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) triangles: Vec<[u32; 3]>,
-    /// Keys and texts of notes on what was changed or left out.
+    /// The notes on changes and omissions, by key.
     pub(super) notes: BTreeMap<String, String>,
 }
 
@@ -48,17 +48,17 @@ pub(super) struct Obj {
 struct Statements {
     positions: Vec<[f64; 3]>,
     uv: Vec<[f32; 2]>,
-    /// Indices of position and texture coordinates.
+    /// The indices of position and texture coordinates.
     corners: Vec<(usize, Option<usize>)>,
-    /// Line and number of corners of each face.
+    /// The line and the number of corners of each face.
     faces: Vec<(usize, usize)>,
     lines_and_points: usize,
-    /// Faces with fewer than three corners.
+    /// The number of faces with fewer than three corners.
     degenerate: usize,
 }
 
-/// Reads a whole file; the message names the line and quotes nothing: the file may be something
-/// else.
+/// Parses a whole file. The message names the line and quotes nothing, because the file may have
+/// another format.
 pub(super) fn parse(bytes: &[u8]) -> Result<Obj, String> {
     let mut all = Statements::default();
     let mut lines = Lines {
@@ -72,7 +72,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Obj, String> {
     all.finish()
 }
 
-/// Lines with any line ends, joined where one ends in a backslash.
+/// Lines with any line ending. A line that ends in a backslash is joined with the next.
 struct Lines<'a> {
     rest: &'a [u8],
     number: usize,
@@ -159,7 +159,7 @@ impl Statements {
         Ok(())
     }
 
-    /// `v`, `v/vt`, `v//vn` or `v/vt/vn`.
+    /// Parses `v`, `v/vt`, `v//vn` or `v/vt/vn`.
     fn corner(&self, word: &[u8]) -> Result<(usize, Option<usize>), String> {
         let mut parts = word.split(|b| *b == b'/');
         let index = |part: Option<&[u8]>, count: usize, what: &str| {
@@ -286,7 +286,7 @@ mod tests {
                     f 1/1/1 2/2/1 3/1/1\nf -4//1 -2//1 \\\n -1//1\nl 1 2\n";
         let obj = parse(text.as_bytes()).expect("reads");
         assert_eq!(obj.triangles.len(), 2);
-        // The first and third corners come with and without texture coordinates.
+        // The first and third corners occur with and without texture coordinates.
         assert_eq!(obj.positions.len(), 6);
         assert_eq!(obj.uv[1], [1.0, 1.0]);
         assert!(obj.notes.contains_key("dropped"));

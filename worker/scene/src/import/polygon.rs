@@ -1,32 +1,32 @@
-//! Polygons as triangles, in the polygon's own plane.
+//! Splits polygons into triangles, in the polygon's own plane.
 
 use earcut::Earcut;
 
-/// Most corners of a polygon that is not convex: looking for crossing edges takes their square at
-/// worst.
+/// The greatest number of corners of a non-convex polygon: the search for crossing edges takes
+/// their square in the worst case.
 const MAX_CONCAVE: usize = 1 << 14;
-/// A polygon whose corners leave its plane by more than this share of its size is not flat.
+/// A polygon with corners farther from its plane than this share of its size is not flat.
 const FLAT: f64 = 1e-3;
-/// Areas below this share of the square of a polygon's size are rounding.
+/// Areas below this share of the square of a polygon's size are rounding errors.
 const NO_AREA: f64 = 1e-12;
-/// Largest difference between the area of a polygon and the areas of its triangles.
+/// The largest difference between the area of a polygon and the areas of its triangles.
 const SAME_AREA: f64 = 1e-6;
 
-/// Splits polygons, and counts those that are not flat and those without an area.
+/// Splits polygons, and counts non-flat ones and those without an area.
 #[derive(Debug, Default)]
 pub(crate) struct Triangulation {
-    /// Polygons of more than three corners that do not lie in a plane.
+    /// The number of non-planar polygons with more than three corners.
     pub(crate) bent: usize,
-    /// Polygons of more than three corners without an area, which are left out.
+    /// The number of polygons of more than three corners without an area, which are omitted.
     pub(crate) empty: usize,
 }
 
 impl Triangulation {
-    /// Adds the triangles of a polygon, as indices of corners, to `out`. Convex polygons become fans
-    /// around their first corner; triangles stay as they are.
+    /// Adds the triangles of a polygon, as indices of corners, to `out`. Convex polygons become
+    /// fans around their first corner; triangles are unchanged.
     ///
     /// # Errors
-    /// A polygon whose edges cross, or a concave one with too many corners.
+    /// A polygon with crossing edges, or a concave one with too many corners.
     pub(crate) fn split(
         &mut self,
         corners: &[[f64; 3]],
@@ -78,7 +78,7 @@ impl Triangulation {
         if (covered - length).abs() > SAME_AREA * length {
             return Err(CROSSING.into());
         }
-        // The triangles face the way of the polygon, whatever order the crate prefers.
+        // The triangles have the orientation of the polygon, whatever order the crate returns.
         out.extend(
             ears.iter()
                 .map(|&[a, b, c]| match area(&flat, [a, b, c]) < 0.0 {
@@ -89,7 +89,7 @@ impl Triangulation {
         Ok(())
     }
 
-    /// What was changed or left out, for a note.
+    /// Returns the changes and omissions, for a note.
     pub(crate) fn note(&self) -> Option<String> {
         let bent = (self.bent > 0).then(|| {
             format!(
@@ -120,7 +120,7 @@ fn norm(v: [f64; 3]) -> f64 {
     dot(v, v).sqrt()
 }
 
-/// Length of the diagonal of the box around points.
+/// Returns the length of the diagonal of the bounding box of points.
 fn extent(points: &[[f64; 3]]) -> f64 {
     let side = |k: usize| {
         let all = points.iter().map(|p| p[k]);
@@ -132,7 +132,7 @@ fn extent(points: &[[f64; 3]]) -> f64 {
     norm([side(0), side(1), side(2)])
 }
 
-/// Twice the area of a polygon along each axis (Newell).
+/// Returns twice the area of a polygon along each axis (Newell).
 fn newell(points: &[[f64; 3]]) -> [f64; 3] {
     let mut sum = [0.0; 3];
     for (a, b) in edges(points) {
@@ -144,13 +144,13 @@ fn newell(points: &[[f64; 3]]) -> [f64; 3] {
     sum
 }
 
-/// The sides of a closed polygon.
+/// Returns the sides of a closed polygon.
 fn edges<T: Copy>(points: &[T]) -> impl Iterator<Item = (T, T)> + '_ {
     let next = points.iter().cycle().skip(1);
     points.iter().copied().zip(next.copied())
 }
 
-/// True for points on one line.
+/// Returns whether all points are on one line.
 fn is_a_line(local: &[[f64; 3]], size: f64) -> bool {
     let far = local
         .iter()
@@ -168,9 +168,9 @@ fn is_a_line(local: &[[f64; 3]], size: f64) -> bool {
     })
 }
 
-/// The polygon seen against its normal, counter-clockwise.
+/// Projects the polygon against its normal, counter-clockwise.
 fn projected(local: &[[f64; 3]], axis: [f64; 3]) -> Vec<[f64; 2]> {
-    // The smallest component of the normal gives the safest second axis.
+    // The smallest component of the normal gives the most stable second axis.
     let k = (0..3).fold(0, |m, k| if axis[k].abs() < axis[m].abs() { k } else { m });
     let mut helper = [0.0; 3];
     helper[k] = 1.0;
@@ -188,7 +188,7 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     ]
 }
 
-/// Twice the signed area of a triangle.
+/// Returns twice the signed area of a triangle.
 fn turn(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 }
@@ -197,8 +197,8 @@ fn area(flat: &[[f64; 2]], [a, b, c]: [u32; 3]) -> f64 {
     turn(flat[a as usize], flat[b as usize], flat[c as usize])
 }
 
-/// True where a fan around the first corner covers the polygon once: no corner turns back, and all
-/// corners lie within half a turn as seen from the first.
+/// Returns whether a fan around the first corner covers the polygon once: no corner turns back, and
+/// all corners are within half a turn as seen from the first.
 fn is_convex(flat: &[[f64; 2]]) -> bool {
     let n = flat.len();
     let size = flat.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
@@ -211,7 +211,7 @@ fn is_convex(flat: &[[f64; 2]]) -> bool {
     })
 }
 
-/// True where two edges that are no neighbours cross in a point inside both.
+/// Returns whether two edges that are not adjacent cross in a point inside both.
 fn edges_cross(flat: &[[f64; 2]]) -> bool {
     let mut sides: Vec<([f64; 2], [f64; 2])> = edges(flat).collect();
     let low = |s: &([f64; 2], [f64; 2])| s.0[0].min(s.1[0]);
@@ -237,7 +237,7 @@ mod tests {
 
     use super::*;
 
-    /// A corner list in a plane of any attitude, far from the origin.
+    /// Places corners in an inclined plane, far from the origin.
     fn placed(flat: &[[f64; 2]]) -> Vec<[f64; 3]> {
         let (u, v) = ([0.6, 0.0, 0.8], [0.0, 1.0, 0.0]);
         let at = |p: &[f64; 2]| std::array::from_fn(|k| 1e4 + p[0] * u[k] + p[1] * v[k]);
@@ -252,7 +252,7 @@ mod tests {
         triangles.iter().map(area).sum()
     }
 
-    /// Triangles and covered area, from every first corner and both ways round.
+    /// Checks triangles and covered area, from every first corner and in both orientations.
     fn every_start(flat: &[[f64; 2]], area: f64) {
         for start in 0..flat.len() {
             for back in [false, true] {
@@ -266,7 +266,7 @@ mod tests {
                 split.split(&corners, &mut out).expect("simple");
                 let found = covered(&corners, &out);
                 assert!((found - area).abs() < 1e-6 * area, "{turned:?}: {found}");
-                // All triangles face the way of the polygon.
+                // All triangles have the orientation of the polygon.
                 let whole = newell(
                     &corners
                         .iter()
@@ -291,8 +291,7 @@ mod tests {
         );
         every_start(&[[0., 0.], [2., 0.], [0.5, 0.5], [0., 2.]], 1.0);
         every_start(&[[0., 0.], [1., 0.], [1., 1.], [0., 1.]], 1.0);
-        // Corners on a side, and a slit that goes in and comes out again (a hole joined to the
-        // rim).
+        // Corners on a side, and a slit that goes in and out again (a hole joined to the rim).
         every_start(&[[0., 0.], [1., 0.], [2., 0.], [2., 2.], [0., 2.]], 4.0);
         let hole = [
             [0., 0.],
@@ -331,7 +330,7 @@ mod tests {
             [c, s]
         };
         refused(&std::array::from_fn::<_, 5, _>(turn));
-        // Twice around.
+        // A polygon that goes around twice.
         let spiral = |k: usize| {
             let (s, c) = libm::sincos(std::f64::consts::TAU * k as f64 / 5.5);
             [c * (1.0 + 0.1 * k as f64), s * (1.0 + 0.1 * k as f64)]
@@ -355,7 +354,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// Corners at rising angles around a point are a simple polygon, whatever their distances.
+        /// Corners at increasing angles around a point form a simple polygon, whatever their
+        /// distances.
         #[test]
         fn a_simple_polygons_triangles_cover_its_area(radii in proptest::collection::vec(0.05f64..1.0, 4..60)) {
             let n = radii.len();

@@ -1,4 +1,5 @@
-//! The reference scenes' JSON: exact meshes and BSDFs, a camera that looks along −z, spots stated.
+//! The reference scenes' JSON: exact meshes and BSDFs, a camera that looks along −z, and given
+//! spots.
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
@@ -11,7 +12,7 @@ use crate::{
 
 use super::{Opener, format_error, read_file, validated};
 
-/// Resolution given to a camera whose file states none; callers resize.
+/// The resolution of a camera if the file has none; callers resize it.
 const DEFAULT_PIXELS: u32 = 64;
 
 #[derive(Deserialize)]
@@ -64,8 +65,9 @@ struct FileBsdf {
     weight: Option<f32>,
 }
 
-/// Reads a reference scene. Its image has 64×64 pixels until resized; every mesh is an object and a
-/// category of its own; materials are one-sided, grey, and its stated spots become [`Beam::spot`].
+/// Reads a reference scene. Its image has 64×64 pixels until resized. Every mesh is an object with
+/// its own category. Materials are one-sided and grey, and the spots in the file become
+/// [`Beam::spot`].
 ///
 /// # Errors
 /// [`SceneError::Read`] or [`SceneError::Format`] naming file and field.
@@ -181,7 +183,7 @@ fn mesh(file: &FileMesh) -> Result<Mesh, String> {
     let mut positions = Vec::with_capacity(file.vertices.len() / 3);
     for (i, p) in file.vertices.chunks_exact(3).enumerate() {
         match p {
-            // JSON has no NaN: writers put null for it.
+            // JSON has no NaN: writers use null for it.
             &[Some(x), Some(y), Some(z)] => positions.push(Vec3::new(x, y, z)),
             _ => {
                 return Err(format!(
@@ -232,7 +234,7 @@ fn material(name: &str, file: &FileBsdf) -> Result<Material, String> {
             };
             (bsdf, fresnel)
         }
-        // A Lambertian, and beside it `weight` of a rough conductor.
+        // A Lambertian, blended with the share `weight` of a rough conductor.
         "mixed" => {
             let (reflectance, weight) =
                 (reflectance()?, file.weight.ok_or_else(|| needs("weight"))?);

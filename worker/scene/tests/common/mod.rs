@@ -1,4 +1,4 @@
-//! What several tests of files need.
+//! Helpers for several tests of files.
 
 use picofarm_scene::{
     Bsdf, Distribution, Scene, SpectrumPoint, Texture, Wrap,
@@ -6,7 +6,7 @@ use picofarm_scene::{
 };
 use std::sync::Arc;
 
-/// A base64 data URI.
+/// Returns a base64 data URI.
 pub fn data_uri(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::from("data:application/octet-stream;base64,");
@@ -22,7 +22,7 @@ pub fn data_uri(bytes: &[u8]) -> String {
     out
 }
 
-/// A small room in which the first three objects got a texture, a mix and both.
+/// Returns a small room in which the first three objects have a texture, a mix and both.
 pub fn textured_room() -> Scene {
     let settings = PrimitiveSettings {
         width: 96,
@@ -60,7 +60,7 @@ pub fn textured_room() -> Scene {
     scene
 }
 
-/// [`textured_room`] in which every material has a spectrum, mixes of both parts.
+/// Returns [`textured_room`] with a spectrum for every material; those of mixes are of both parts.
 pub fn spectral_room() -> Scene {
     let mut scene = textured_room();
     for (k, object) in scene.objects.iter_mut().enumerate() {

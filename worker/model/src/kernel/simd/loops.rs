@@ -7,8 +7,9 @@
 
 use super::{LANES, Lanes};
 
-/// `acc[m][v] += Σ_channel Σ_tap w[channel][tap][m] · x[channel][at[v] + tap]` for a K×K stencil, in this
-/// order. `x` has `channels` planes of `plane` values and rows of `row`; `w` is `[channels][K·K][8]`.
+/// Computes `acc[m][v] += Σ_channel Σ_tap w[channel][tap][m] · x[channel][at[v] + tap]` for a K×K
+/// stencil, in this order. `x` has `channels` planes of `plane` values and rows of `row`; `w` is
+/// `[channels][K·K][8]`.
 #[inline(always)]
 pub(in super::super) fn shifted<L: Lanes, const M: usize, const V: usize, const K: usize>(
     x: &[f32],
@@ -34,8 +35,8 @@ pub(in super::super) fn shifted<L: Lanes, const M: usize, const V: usize, const 
     for c in 0..channels {
         for ky in 0..K {
             for kx in 0..K {
-                // SAFETY: the largest offsets are those asserted above; pointers advance only while channels
-                // remain.
+                // SAFETY: the largest offsets are those asserted above; pointers advance only while
+                // channels remain.
                 unsafe {
                     let mut xs = [L::splat(0.0); V];
                     for v in 0..V {
@@ -63,8 +64,9 @@ pub(in super::super) fn shifted<L: Lanes, const M: usize, const V: usize, const 
     acc
 }
 
-/// The positions of [`outer`]: `rows × width`, whose scalars lie `row` and `step` apart and whose vectors lie
-/// `wide` apart, all rows in one run; the vectors of one position lie `apart`.
+/// The positions of [`outer`]: `rows × width`. The scalars of consecutive rows and columns are
+/// `row` and `step` apart. The vectors of consecutive positions are `wide` apart, over all rows in
+/// one run; the vectors of one position are `apart` apart.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Positions {
     pub rows: usize,
@@ -75,7 +77,8 @@ pub(in super::super) struct Positions {
     pub apart: usize,
 }
 
-/// `sum[r][c][v] = Σ_position x[at[r] + c + position] · g[position][v]`, from zero, in order of positions.
+/// Computes `sum[r][c][v] = Σ_position x[at[r] + c + position] · g[position][v]`, from zero, in
+/// order of positions.
 #[inline(always)]
 pub(in super::super) fn outer<L: Lanes, const V: usize, const R: usize, const C: usize>(
     x: &[f32],

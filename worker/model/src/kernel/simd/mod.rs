@@ -1,13 +1,15 @@
-//! Sixteen lanes by instruction set and the two inner loops of the convolutions: the only unsafe code here.
+//! Sixteen lanes for each instruction set, and the two inner loops of the convolutions: the only
+//! unsafe code here.
 //!
-//! Proof. The intrinsics need AVX-512 ([`native::Wide`]) or AVX2 with FMA ([`native::Pair`]). Values of these
-//! types are made only below [`Kernels::run`], which enters the function that enables the feature, and only
-//! where a [`Kernels`] says so; [`Kernels::with`] makes one only after the run-time check. [`Lanes::load`] and
-//! [`Lanes::store`] check the length of their slice. The two [`loops`] read through raw
-//! pointers; each asserts at entry that the largest offset it forms lies inside its slices.
+//! Proof. The intrinsics require AVX-512 ([`native::Wide`]) or AVX2 with FMA ([`native::Pair`]).
+//! Values of these types are created only within [`Kernels::run`], which calls the function that
+//! enables the feature, and only if a [`Kernels`] has that instruction set; [`Kernels::with`]
+//! creates one only after the run-time check. [`Lanes::load`] and [`Lanes::store`] check the length
+//! of their slice. The two [`loops`] read through raw pointers; each asserts at entry that the
+//! largest offset it forms is inside its slices.
 //!
-//! Nothing below [`Op::run`] may be a closure that is not inlined: closures do not inherit the enabled
-//! features, which costs speed (not correctness).
+//! No function called by [`Op::run`] may be a closure that is not inlined: closures do not inherit
+//! the enabled features, which costs speed (not correctness).
 #![expect(
     unsafe_code,
     reason = "vector intrinsics behind run-time detection, unchecked inner loops; proof above"
@@ -31,18 +33,18 @@ pub enum Isa {
     Avx512,
 }
 
-/// The kernels on one instruction set that this machine has.
+/// The kernels on an instruction set that this machine supports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Kernels(Isa);
 
 impl Kernels {
-    /// The kernels on the widest instruction set of this machine.
+    /// Returns the kernels on the widest instruction set of this machine.
     pub fn best() -> Self {
         let wide = Self::with(Isa::Avx512).or_else(|| Self::with(Isa::Avx2));
         wide.unwrap_or(Self(Isa::Portable))
     }
 
-    /// The kernels on one instruction set; none where this machine lacks it.
+    /// Returns the kernels on the given instruction set, or `None` if this machine lacks it.
     pub fn with(isa: Isa) -> Option<Self> {
         let there = match isa {
             Isa::Portable => true,
@@ -79,20 +81,21 @@ impl Kernels {
     }
 }
 
-/// A piece of work written once for all instruction sets. `run` must be `#[inline(always)]`.
+/// An operation written once for all instruction sets. `run` must be `#[inline(always)]`.
 pub(super) trait Op {
-    /// What it returns.
+    /// The operation's result.
     type Out;
-    /// Does it with one kind of lanes.
+    /// Runs the operation with one kind of lanes.
     fn run<L: Lanes>(self) -> Self::Out;
 }
 
 /// Sixteen `f32` lanes.
 pub(super) trait Lanes: Copy {
-    /// True with thirty-two registers of sixteen lanes: decides the register tile, never a result.
+    /// Whether there are thirty-two registers of sixteen lanes. It determines the register tile,
+    /// never a result.
     const WIDE: bool;
     fn splat(x: f32) -> Self;
-    /// The sixteen values at `p`.
+    /// Reads the sixteen values at `p`.
     ///
     /// # Safety
     /// Sixteen values at `p` may be read.
@@ -113,12 +116,12 @@ pub(super) trait Lanes: Copy {
     fn relu(self) -> Self;
     /// `self` where `gate > 0`, else +0.
     fn where_positive(self, gate: Self) -> Self;
-    /// `self > o ? self : o`: where either is NaN, `o`.
+    /// `self > o ? self : o`: if either is NaN, `o`.
     fn max(self, o: Self) -> Self;
-    /// 2 to the power of whole numbers from -126 to 127.
+    /// 2 to the power of each lane, which is a whole number from -126 to 127.
     fn power_of_two(self) -> Self;
 
-    /// The first sixteen values of a slice.
+    /// Loads the first sixteen values of a slice.
     #[inline(always)]
     fn load(a: &[f32]) -> Self {
         let a = &a[..LANES];
@@ -132,14 +135,14 @@ pub(super) trait Lanes: Copy {
         // SAFETY: the slice is that long.
         unsafe { self.write(a.as_mut_ptr()) };
     }
-    /// The lanes as an array.
+    /// Returns the lanes as an array.
     #[inline(always)]
     fn array(self) -> [f32; LANES] {
         let mut a = [0.0; LANES];
         self.store(&mut a);
         a
     }
-    /// Up to sixteen values of a slice, the missing ones filled with `pad`.
+    /// Loads up to sixteen values of a slice; missing ones are filled with `pad`.
     #[inline(always)]
     fn load_part(a: &[f32], pad: f32) -> Self {
         if a.len() >= LANES {
@@ -158,7 +161,7 @@ pub(super) trait Lanes: Copy {
         let n = a.len();
         a.copy_from_slice(&self.array()[..n]);
     }
-    /// The even and the odd values of two registers in a row.
+    /// Returns the even and the odd values of two consecutive registers.
     #[inline(always)]
     fn unzip(a: Self, b: Self) -> (Self, Self) {
         let (a, b) = (a.array(), b.array());
@@ -196,7 +199,7 @@ pub(super) trait Lanes: Copy {
         }
         to
     }
-    /// The sum by a fixed tree: halves onto each other.
+    /// Returns the sum by a fixed tree: the upper half is added to the lower one repeatedly.
     #[inline(always)]
     fn sum(self) -> f32 {
         let mut a = self.array();

@@ -24,7 +24,8 @@ pub(super) struct Wide(__m512);
 #[derive(Clone, Copy)]
 pub(super) struct Pair(__m256, __m256);
 
-// SAFETY of every block below: the instructions exist wherever a value of the type does (module proof).
+// SAFETY of every block below: wherever a value of the type exists, the machine has the
+// instructions (module proof).
 impl Lanes for Wide {
     const WIDE: bool = true;
     #[inline(always)]
@@ -137,7 +138,7 @@ fn transpose(r: [__m512; 16]) -> [__m512; 16] {
         q[4 * i + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(high, high2));
         q[4 * i + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(high, high2));
     }
-    // Now quarter k of q[4i + j] holds lanes 4i.. of column 4k + j.
+    // Quarter k of q[4i + j] now contains lanes 4i.. of column 4k + j.
     let mut t = r;
     for j in 0..4 {
         let [a, b, c, d] = [q[j], q[4 + j], q[8 + j], q[12 + j]];

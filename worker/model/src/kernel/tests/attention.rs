@@ -1,11 +1,12 @@
-//! Attention within windows against a loop over pairs of pixels in `f64`, and its gradient against that loop's slopes.
+//! Attention within windows compared with a loop over pairs of pixels in `f64`, and its gradient
+//! compared with that loop's slopes.
 
 use proptest::prelude::*;
 
 use super::*;
 
-/// Attention pixel by pixel: a window holds what lies within its rows and columns once they are turned back by the shift; from
-/// different ends of the image it is apart.
+/// Computes attention pixel by pixel. A window contains the pixels within its rows and columns
+/// after the shift is undone. Pixels from different ends of the image are masked.
 fn oracle(s: &AttentionShape, qkv: &[f64], bias: &[f64]) -> Vec<f64> {
     let (tokens, channels, w) = (s.tokens(), s.channels(), s.window);
     let mut out = vec![0.0; s.pixels() * channels];
@@ -130,7 +131,7 @@ proptest! {
     }
 }
 
-/// More windows than are summed in one go, and the size that networks have.
+/// There are more windows than are summed together, and the size is that of real networks.
 #[test]
 fn many_windows_have_the_same_bits_for_any_number_of_threads() {
     let s = AttentionShape {
@@ -149,7 +150,7 @@ fn many_windows_have_the_same_bits_for_any_number_of_threads() {
     let out = same_bits(|k| forward(k, &s, &qkv, &bias));
     let grads = same_bits(|k| backward(k, &s, &qkv, &bias, &dy));
     assert!(out.iter().chain(&grads).flatten().all(|x| x.is_finite()));
-    // A softmax does not change where all scores grow alike.
+    // A softmax does not change if all scores increase by the same amount.
     let zero: f64 = grads[1].iter().map(|x| f64::from(*x)).sum();
     assert!(zero.abs() < 1e-3, "{zero}");
 }

@@ -1,4 +1,5 @@
-//! Borders and leaky ReLU: the same bits everywhere (their values are compared with burn's operations in tests/operations.rs).
+//! Borders and leaky ReLU have the same bits everywhere (tests/operations.rs compares their values
+//! with burn's operations).
 
 use super::*;
 
@@ -22,7 +23,7 @@ fn borders_have_the_same_bits_and_what_is_cut_off_was_what_was_added() {
             k.surround_grad(&s, &dy, &mut dx);
             vec![y, dx]
         });
-        // Everything that comes out comes from somewhere, once.
+        // Every output value comes from exactly one input value.
         let sum = |x: &[f32]| x.iter().map(|x| f64::from(*x)).sum::<f64>();
         assert!((sum(&out[1]) - sum(&dy)).abs() < 1e-3);
         if !volume {

@@ -1,4 +1,4 @@
-//! Convolutions against the definition.
+//! Convolutions compared with the definition.
 
 use proptest::prelude::*;
 
@@ -67,7 +67,7 @@ fn check(s: ConvShape, k: usize, seed: u64) {
         dx[b] += f64::from(w[a]) * f64::from(dy[c]);
         dw[a] += f64::from(x[b]) * f64::from(dy[c]);
     });
-    // Relative to the sums' magnitudes, which are those of random walks.
+    // Tolerances are relative to the sums' magnitudes, which are those of random walks.
     let walks = [
         s.inputs * k * k,
         s.outputs * k * k,
@@ -116,7 +116,8 @@ fn odd_and_exact_sizes_agree() {
         shape(1, 2, 3, 70, 33),
         shape(2, 1, 40, 33, 48),
         shape(5, 70, 40, 2, 2),
-        // Winograd's form: odd planes, planes of several images, bands of one image, groups of channels.
+        // Winograd's form: odd planes, planes of several images, bands of one image, groups of
+        // channels.
         shape(3, 17, 19, 5, 7),
         shape(5, 33, 40, 4, 4),
         shape(1, 40, 16, 33, 64),
@@ -167,7 +168,7 @@ fn one_hot_convolution_equals_the_dense_one() {
         };
         let d = s.dense();
         let pixels = height * width;
-        // Some pixels have no bin, said in both ways.
+        // Some pixels have no bin, encoded in both ways.
         let hot: Vec<u16> = noise(images * pixels, 5)
             .iter()
             .map(|x| match ((x + 1.0) * 0.5 * (bins + 2) as f32) as usize {

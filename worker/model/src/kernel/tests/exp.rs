@@ -1,4 +1,4 @@
-//! GELU against the error function in `f64`, on all sizes of numbers.
+//! GELU compared with the error function in `f64`, for numbers of all magnitudes.
 
 use super::*;
 
@@ -9,7 +9,7 @@ fn inputs() -> Vec<f32> {
     x
 }
 
-/// Φ and its slope.
+/// Returns Φ and its slope.
 fn normal(x: f64) -> (f64, f64) {
     let below = 0.5 * libm::erfc(-x * std::f64::consts::FRAC_1_SQRT_2);
     let bell = (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();

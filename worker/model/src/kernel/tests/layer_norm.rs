@@ -1,4 +1,5 @@
-//! Layer norm against the definition in `f64`, and its gradient against the slopes of that.
+//! Layer norm compared with the definition in `f64`, and its gradient compared with the
+//! definition's slopes.
 
 use proptest::prelude::*;
 
@@ -17,7 +18,7 @@ fn oracle(x: &[f64], gamma: &[f64], beta: &[f64]) -> Vec<f64> {
     x.chunks_exact(wide).flat_map(row).collect()
 }
 
-/// What a row is divided by.
+/// Returns the divisor of a row.
 fn deviation(row: &[f64]) -> f64 {
     let n = row.len() as f64;
     let mean = row.iter().sum::<f64>() / n;
@@ -47,7 +48,7 @@ proptest! {
             vec![y, dx, dgamma, dbeta]
         });
         let (x, gamma, beta) = (wide(&x), wide(&gamma), wide(&beta));
-        // A row of almost equal values divides their rounding by its deviation.
+        // In a row of almost equal values, rounding errors are divided by its small deviation.
         let least = x.chunks_exact(columns).map(deviation).fold(f64::INFINITY, f64::min);
         let rounding = 1e-6 / least;
         close(&out[0], &oracle(&x, &gamma, &beta), rounding.max(1e-5));
@@ -62,7 +63,7 @@ proptest! {
         };
         for i in [0, x.len() / 2, x.len() - 1] {
             let at = |by: f64| loss(&moved(&x, i, by), &gamma, &beta);
-            // Two values in a row may be almost equal: slopes are steep there.
+            // Slopes are steep if two values in a row are almost equal.
             close(&out[1][i..=i], &[(at(step) - at(-step)) / (2.0 * step)], 2e-2);
         }
         for i in [0, columns - 1] {

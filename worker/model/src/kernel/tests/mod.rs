@@ -1,5 +1,5 @@
-//! Laws of the kernels: one set of bits on every instruction set and number of threads, and agreement with
-//! plain sums in `f64`.
+//! Laws of the kernels: one set of bits on every instruction set and number of threads, and
+//! agreement with plain sums in `f64`.
 
 use super::{simd::Isa, *};
 
@@ -25,8 +25,8 @@ fn noise(len: usize, seed: u64) -> Vec<f32> {
         .collect()
 }
 
-/// Runs on each instruction set of this machine with one, two and three threads, asserts that the bits are
-/// the same, and returns them.
+/// Runs on each instruction set of this machine with one, two and three threads, asserts that the
+/// bits are the same, and returns them.
 fn same_bits(run: impl Fn(Kernels) -> Vec<Vec<f32>> + Sync) -> Vec<Vec<f32>> {
     let bits = |r: &[Vec<f32>]| -> Vec<Vec<u32>> {
         r.iter()

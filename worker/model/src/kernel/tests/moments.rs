@@ -1,4 +1,4 @@
-//! What is done along time, against the definition.
+//! Operations along time, compared with the definition.
 
 use super::*;
 
@@ -38,7 +38,7 @@ fn of_two_moments_the_greater_is_kept_and_the_first_of_equals() {
         moments: 4,
         values: 37,
     };
-    // Many are equal.
+    // Many values are equal.
     let x: Vec<f32> = noise(s.len(), 1)
         .iter()
         .map(|x| (x * 3.0).round())

@@ -1,4 +1,4 @@
-//! Batch norm with ReLU against the definition and finite differences.
+//! Batch norm with ReLU, compared with the definition and finite differences.
 
 use proptest::prelude::*;
 

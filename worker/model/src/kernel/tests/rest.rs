@@ -1,4 +1,4 @@
-//! Pooling, upsampling and AdamW against the definitions.
+//! Pooling, upsampling and AdamW, compared with the definitions.
 
 use proptest::prelude::*;
 

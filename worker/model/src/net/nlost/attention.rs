@@ -1,4 +1,4 @@
-//! Attention of NLOST over images and over time, and what two scales ask of one another.
+//! The attention of NLOST over images and over time, and between its two scales.
 
 use burn::tensor::Tensor;
 
@@ -12,7 +12,7 @@ use crate::{
     parameters::{Begin, Declarations, Id},
 };
 
-/// (N·T, H, W, C) as a row of moments for each pixel: (N·H·W, T, C).
+/// Converts (N·T, H, W, C) to a row of moments for each pixel: (N·H·W, T, C).
 fn by_pixel(x: Tensor<4>, time: usize) -> Tensor<3> {
     let [images, h, w, c] = x.dims();
     let n = images / time;
@@ -21,7 +21,7 @@ fn by_pixel(x: Tensor<4>, time: usize) -> Tensor<3> {
         .reshape([n * h * w, time, c])
 }
 
-/// The inverse of [`by_pixel`] in images of (H, W).
+/// The inverse of [`by_pixel`] for images of (H, W).
 fn by_moment(x: Tensor<3>, [h, w]: [usize; 2]) -> Tensor<4> {
     let [rows, time, c] = x.dims();
     let n = rows / (h * w);
@@ -52,7 +52,7 @@ impl Perceptron {
 #[derive(Debug, Clone)]
 pub(super) struct Encoder {
     norms: [LayerNorm; 2],
-    /// Of pixels and moments; none in the global one.
+    /// The position biases of pixels and of moments; `None` in the global encoder.
     positions: Option<[Id; 2]>,
     qkv: [Dense; 2],
     project: [Dense; 2],
@@ -60,7 +60,8 @@ pub(super) struct Encoder {
 }
 
 impl Encoder {
-    /// With windows and biases of positions where `moments` says over how many; without either over all pixels.
+    /// Declares an encoder. If `moments` is set, it has windows and position biases for that number
+    /// of moments; otherwise it attends over all pixels and has neither.
     pub(super) fn declare(
         d: &mut Declarations,
         at: &str,
@@ -90,7 +91,7 @@ impl Encoder {
         }
     }
 
-    /// (N·T, H, W, C) to the same.
+    /// Maps (N·T, H, W, C) to the same shape.
     pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
         let [images, h, w, c] = x.dims();
         let device = x.device();
@@ -118,7 +119,8 @@ impl Encoder {
     }
 }
 
-/// Rows of a table (2T − 1, heads) for each pair of moments, by the second's distance from the first: (heads, T, T).
+/// Returns the rows of a table (2T − 1, heads) for each pair of moments, selected by the second's
+/// distance from the first: (heads, T, T).
 fn differences(table: Tensor<2>, time: usize) -> Tensor<3> {
     let table = table.transpose();
     let rows = (0..time).map(|at| table.clone().narrow(1, time - 1 - at, time));
@@ -128,7 +130,7 @@ fn differences(table: Tensor<2>, time: usize) -> Tensor<3> {
 /// x + sums over time(sums over the image(norms)), then x + perceptron(norm(x)).
 #[derive(Debug, Clone)]
 pub(super) struct Decoder {
-    /// Of what it works on, and of what asks.
+    /// The norms of the decoder's input and of the queries.
     norms: [LayerNorm; 2],
     over_image: Sums,
     over_time: Sums,
@@ -148,7 +150,7 @@ impl Decoder {
         }
     }
 
-    /// Both (N·T, H, W, C).
+    /// Applies the decoder. Both tensors are (N·T, H, W, C).
     pub(super) fn forward(
         &self,
         pass: &Pass,
@@ -175,13 +177,14 @@ impl Decoder {
     }
 }
 
-/// Compact generalised non-local attention (Yue et al., "Compact generalized non-local network", NeurIPS 2018) in groups of channels:
-/// θ·⟨φ, g⟩ with the product over all places and channels of a group, a layer, and group norm.
+/// Compact generalised non-local attention (Yue et al., "Compact generalized non-local network",
+/// NeurIPS 2018) in groups of channels: θ·⟨φ, g⟩ with the product over all places and channels of a
+/// group, followed by a layer and group norm.
 #[derive(Debug, Clone, Copy)]
 struct Sums {
-    /// θ, φ, g.
+    /// The projections θ, φ, g.
     projections: [Id; 3],
-    /// A layer for each group.
+    /// One layer for each group.
     out: Id,
     scale: Id,
     shift: Id,
@@ -207,7 +210,8 @@ impl Sums {
         }
     }
 
-    /// Rows of places (R, P, C) that ask, with keys and values; to the same shape.
+    /// Applies the attention to rows of places (R, P, C), the queries, with keys and values. The
+    /// result has the same shape.
     fn forward(
         &self,
         pass: &Pass,

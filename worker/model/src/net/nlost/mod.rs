@@ -1,15 +1,21 @@
-//! NLOST (Li et al., "NLOST: Non-line-of-sight imaging with transformer", CVPR 2023; released code): a volume of features, attention
-//! in it near and far, and the images that embeddings end with. Names of its parameters are the released code's.
+//! NLOST (Li et al., "NLOST: Non-line-of-sight imaging with transformer", CVPR 2023; released
+//! code): a volume of features, local and global attention in it, and the output images of learned
+//! feature embeddings. The names of its parameters are the released code's.
 //!
-//! As released, unless it says otherwise here:
-//! - The volume has half of the rows and columns, as in learned feature embeddings, so that at 256² it has the 128² that theirs has;
-//!   what comes out is doubled again. Between the two parts of the volume stands a transform of light in theirs, for confocal
-//!   scans of a wall; here it is the identity. Of their two outputs, intensity and depth, there is the one that is learnt.
-//! - Attention over time has a bias for each difference of moments. Theirs counts 16 moments as pixels of a 4×4 window.
-//! - Theirs brings features of one place to another where axes are exchanged (after attention over time in the global encoder,
-//!   after both sums of the decoders): here places stay.
-//! - The decoders' first norm begins with a scale of 1. Theirs begins with 0 as the second does, and then neither scale has ever a
-//!   gradient: what stands between the norms is not learnt.
+//! It differs from the released code as follows:
+//! - The volume has half of the input's rows and columns, as in learned feature embeddings. An
+//!   input of 256² therefore gives the 128² of the released code, and the output is doubled again.
+//!   The released code transforms light between the two parts of the volume, for confocal scans of
+//!   a wall; here this step is the identity. Of its two outputs, intensity and depth, only the
+//!   learned one exists.
+//! - Attention over time has a bias for each difference of moments. The released code treats 16
+//!   moments as pixels of a 4×4 window.
+//! - The released code moves features of one place to another when it exchanges axes (after
+//!   attention over time in the global encoder, and after both sums of the decoders). Here places
+//!   do not change.
+//! - The scale of the decoders' first norm is initially 1. In the released code it is initially 0,
+//!   like the second one. Neither scale then ever has a gradient, and the layers between the norms
+//!   are not learned.
 
 mod attention;
 
@@ -29,21 +35,23 @@ use crate::{
 };
 use attention::{Decoder, Encoder};
 
-/// Features of the first volume that convolutions make, besides the filtered ones.
+/// The number of features of the first volume that convolutions compute, in addition to the
+/// filtered ones.
 pub(super) const FIRST: usize = 3;
-/// Heads of attention.
+/// The number of attention heads.
 pub(super) const HEADS: usize = 4;
-/// Rows and columns of a window of the local encoder: what the released code comes to at 128².
+/// The number of rows and columns of a window of the local encoder: the released code's at 128².
 pub(super) const WINDOW: usize = 16;
-/// Channels between the two layers of a perceptron, over those of the features.
+/// The ratio of the channels between the two layers of a perceptron to those of the features.
 pub(super) const BETWEEN: usize = 4;
 
-/// Groups of features that are summed apart in the decoders.
+/// Returns the number of feature groups that the decoders sum separately.
 pub(super) fn groups(width: usize) -> usize {
     if width.is_multiple_of(8) { 8 } else { 4 }
 }
 
-/// Moments of the volume after each part that halves them, from that of the input.
+/// Returns the number of moments of the volume, first of the input and then after each part that
+/// halves it.
 pub(super) fn moments(bins: usize) -> [usize; 5] {
     let mut time = bins;
     [(); 5].map(|()| {
@@ -55,9 +63,9 @@ pub(super) fn moments(bins: usize) -> [usize; 5] {
 #[derive(Debug, Clone)]
 pub(super) struct Nlost {
     first: Downsample,
-    /// Stride 2, the same with gaps, 3×3×3 of that, with gaps of the first.
+    /// The kernels: stride 2, stride 2 with gaps, 3×3×3 of the latter, and with gaps of the first.
     scales: [Kernel; 4],
-    /// Third part that halves time: a filter, and convolutions beside it.
+    /// The third part that halves time: a filter, with convolutions in parallel.
     filter: Id,
     halved: Kernel,
     blocks: [Residual; 2],
@@ -74,7 +82,7 @@ pub(super) struct Nlost {
     depth: Rendering,
 }
 
-/// What a convolution has.
+/// The parameters of a convolution.
 #[derive(Debug, Clone, Copy)]
 struct Kernel {
     weight: Id,
@@ -82,7 +90,8 @@ struct Kernel {
 }
 
 impl Kernel {
-    /// Weights of a normal distribution that keeps deviations through ReLU (He et al., 2015), for that many taps; no bias yet.
+    /// Declares weights with a normal distribution that preserves deviations through ReLU (He et
+    /// al., 2015) for `taps` taps, without a bias.
     fn declare(d: &mut Declarations, at: &str, shape: [usize; 5], taps: usize) -> Self {
         let begin = Begin::Normal((2.0 / taps as f32).sqrt());
         Self::begun(d, at, shape, begin)
@@ -95,7 +104,7 @@ impl Kernel {
         }
     }
 
-    /// As PyTorch's convolutions begin, with a bias.
+    /// Declares weights and a bias with PyTorch's initialisation.
     fn usual(d: &mut Declarations, at: &str, shape: [usize; 5]) -> Self {
         let begin = Begin::FanIn(shape[1..].iter().product());
         let this = Self::begun(d, at, shape, begin);
@@ -113,7 +122,7 @@ impl Kernel {
         pass.get(self.weight)
     }
 
-    /// What the convolution gave, and the bias.
+    /// Adds the bias to a convolution's output.
     fn biased(&self, pass: &Pass, y: Tensor<4>) -> Tensor<4> {
         match self.bias {
             None => y,
@@ -126,7 +135,7 @@ impl Kernel {
     }
 }
 
-/// Taps of 3 moments, one after the other.
+/// Three consecutive moments.
 const fn three(stride: usize) -> Seen {
     Seen {
         taps: 3,
@@ -135,7 +144,7 @@ const fn three(stride: usize) -> Seen {
     }
 }
 
-/// Taps of 3 moments, every second one.
+/// Three moments, every second one.
 const fn gaps(stride: usize) -> Seen {
     Seen {
         taps: 3,
@@ -144,7 +153,7 @@ const fn gaps(stride: usize) -> Seen {
     }
 }
 
-/// Taps of 5 moments, for every second one.
+/// Five moments, with stride 2.
 const FIVE: Seen = Seen {
     taps: 5,
     apart: 1,
@@ -188,7 +197,7 @@ impl Nlost {
             c,
             zero,
         );
-        // Theirs is uniform with the same deviation.
+        // The released code uses a uniform distribution with the same deviation.
         let coarse = Kernel::declare(d, "spds.dsop.0", [c, c, 5, 5, 5], 125 * c).with_bias(
             d,
             "spds.dsop.0",
@@ -204,7 +213,7 @@ impl Nlost {
             d,
             "locglb_inte.upop_G.upop.0.0",
             [c, c, 3, 6, 6],
-            // Taps of the outputs, as PyTorch counts for transposed convolutions.
+            // The taps of the outputs, as PyTorch counts them for transposed convolutions.
             108 * c,
         );
         let decoders = ["locglb_inte.loc_decs.0", "locglb_inte.glb_decs.0"]
@@ -292,7 +301,7 @@ impl Nlost {
                     x = relu(x);
                 }
             }
-            // Halved moments were rounded up.
+            // The numbers of halved moments were rounded up.
             let c = x.dims()[1];
             x.reshape([n, moments, c * h * w])
                 .narrow(1, 0, second)
@@ -309,7 +318,7 @@ impl Nlost {
         self.depth.forward(pass, by_channel(x, second), h)
     }
 
-    /// Features of four scales, and how many moments there are.
+    /// Returns features of four scales, and the number of moments.
     fn scales(&self, pass: &Pass, x: Tensor<4>, time: usize) -> (Tensor<4>, usize) {
         let [straight, wide, of_wide, of_straight] = &self.scales;
         let of = |kernel: &Kernel, y| relu(kernel.biased(pass, y));
@@ -322,7 +331,7 @@ impl Nlost {
         (Tensor::cat(vec![a, b, c, d], 1), time)
     }
 
-    /// Half of the moments: filtered, and residual blocks.
+    /// Halves the number of moments with the filter and the residual blocks.
     fn halved(&self, pass: &Pass, x: Tensor<4>, time: usize) -> (Tensor<4>, usize) {
         let filtered = volume::conv(pass, x.clone(), time, pass.get(self.filter), three(2));
         let y = volume::conv_bordered_halved(pass, x, time, self.halved.weight(pass));
@@ -335,7 +344,7 @@ impl Nlost {
         (filtered + y, time)
     }
 
-    /// A quarter of the moments.
+    /// Reduces the number of moments to a quarter.
     fn embedded(&self, pass: &Pass, mut x: Tensor<4>, mut time: usize) -> (Tensor<4>, usize) {
         for kernel in &self.embedded {
             let y = volume::conv5(pass, x, time, kernel.weight(pass), FIVE);
@@ -354,12 +363,12 @@ impl Nlost {
     }
 }
 
-/// Images with their channels last.
+/// Converts images to the layout with channels last.
 fn tokens(x: Tensor<4>) -> Tensor<4> {
     x.permute([0, 2, 3, 1])
 }
 
-/// Tokens as images.
+/// Converts tokens to images.
 fn images_of(x: Tensor<4>) -> Tensor<4> {
     x.permute([0, 3, 1, 2])
 }

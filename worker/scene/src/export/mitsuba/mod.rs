@@ -1,7 +1,7 @@
-//! Writing a scene for Mitsuba 3: `scene.xml`, `meshes/*.ply` and `textures/*.png`, which
-//! `mitsuba.load_file` reads and [`crate::import`] too. What Mitsuba has no words for (labels, spots,
-//! provenance, exact BSDFs) stands in a comment of the XML. So do spectra, and there alone: the
-//! `<bsdf>` of a material has its colour.
+//! Writes a scene for Mitsuba 3: `scene.xml`, `meshes/*.ply` and `textures/*.png`, which both
+//! `mitsuba.load_file` and [`crate::import`] read. Data that Mitsuba cannot represent (labels,
+//! spots, provenance, exact BSDFs) is stored in a comment of the XML. Spectra are stored only
+//! there: the `<bsdf>` of a material has its colour.
 
 pub(crate) mod text;
 
@@ -18,14 +18,15 @@ use text::{
     sensor_text,
 };
 
-/// Writes the scene to `file` (an `.xml`) with its meshes and textures in folders beside it. Returns what
-/// Mitsuba's model cannot hold, a sentence each; often nothing.
+/// Writes the scene to `file` (an `.xml`), with its meshes and textures in folders next to it.
+/// Returns the features that Mitsuba's model cannot represent, a sentence each; often none.
 ///
 /// A mesh is written once per material that it uses. Colours are the materials' `rgb`, scaled so that their mean
 /// is the reflectance at the laser's wavelength. Every beam is a `projector` of 0.1°.
 ///
 /// # Errors
-/// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`], [`SceneError::Write`] naming the file.
+/// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`], [`SceneError::Write`] naming
+/// the file.
 pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneError> {
     scene.validate()?;
     let folder = file.parent().unwrap_or(Path::new(""));
@@ -90,8 +91,8 @@ pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneErr
     Ok(writer.notes)
 }
 
-/// JSON that any XML comment can hold: plain ASCII without two hyphens in a row. Whatever else there is stands in
-/// strings, where it can be escaped.
+/// Converts JSON to a form that any XML comment can contain: plain ASCII without two consecutive
+/// hyphens. All other characters are in strings, where they can be escaped.
 fn for_comment(json: &str) -> String {
     let mut out = String::with_capacity(json.len());
     for c in json.chars() {
@@ -106,7 +107,7 @@ fn for_comment(json: &str) -> String {
     out
 }
 
-/// (file, id of the material) of each part that a mesh is written as.
+/// The (file, id of the material) of each part as which a mesh is written.
 type Parts = Vec<(String, String)>;
 
 struct Writer<'a> {
@@ -120,9 +121,9 @@ struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    /// Writes every mesh; the text of all shapes.
+    /// Writes every mesh, and returns the text of all shapes.
     fn shapes(&mut self, scene: &Scene) -> Result<String, SceneError> {
-        // Meshes that are written, with the (file, material) of their parts.
+        // The written meshes, with the (file, material) of their parts.
         let mut written: Vec<(Arc<Mesh>, Parts)> = Vec::new();
         let mut out = String::new();
         for (k, object) in scene.objects.iter().enumerate() {
@@ -150,7 +151,7 @@ impl Writer<'_> {
         Ok(out)
     }
 
-    /// Writes one mesh, a file for each material that it uses.
+    /// Writes one mesh, with a file for each material that it uses.
     fn mesh(&mut self, index: usize, mesh: &Mesh) -> Result<Parts, SceneError> {
         let mut out = Vec::new();
         for (m, material) in mesh.materials.iter().enumerate() {
@@ -164,7 +165,7 @@ impl Writer<'_> {
         Ok(out)
     }
 
-    /// The id of a material, which is written if new.
+    /// Returns the id of a material, and writes the material if it is new.
     fn material(&mut self, material: &Material) -> Result<String, SceneError> {
         if let Some(k) = self.materials.iter().position(|m| m == material) {
             return Ok(format!("material{k}"));
@@ -215,7 +216,7 @@ impl Writer<'_> {
         Ok(id)
     }
 
-    /// The file of a texture, which is written if new.
+    /// Returns the file of a texture, and writes the texture if it is new.
     fn texture(&mut self, texture: &Arc<Texture>) -> Result<String, SceneError> {
         let known = self.textures.iter().position(|t| t == texture);
         let index = match known {
@@ -231,7 +232,8 @@ impl Writer<'_> {
     }
 }
 
-/// The facets of one material with the vertices that they use, in their order; `None` without facets.
+/// Returns the facets of one material with the vertices that they use, in their order, or `None`
+/// without facets.
 fn part(mesh: &Mesh, material: u32) -> Option<Mesh> {
     let facets = mesh.triangles.iter().zip(&mesh.triangle_material);
     let facets: Vec<[u32; 3]> = facets.filter(|f| *f.1 == material).map(|f| *f.0).collect();

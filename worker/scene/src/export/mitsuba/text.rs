@@ -1,5 +1,5 @@
-//! The elements of a Mitsuba scene as text, and the extras beside them. The importer compares its input with
-//! these texts to find out what was edited.
+//! The elements of a Mitsuba scene as text, and the extras stored with them. The importer compares
+//! its input with these texts to detect edits.
 
 use std::{collections::BTreeMap, fmt::Write as _, sync::Arc};
 
@@ -11,12 +11,12 @@ use crate::{
     texture::{linear, srgb_byte},
 };
 
-/// What Mitsuba has no words for.
+/// The data that Mitsuba cannot represent.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Extras {
     pub(crate) scene: SceneExtras,
     pub(crate) objects: Vec<ObjectExtras>,
-    /// By id of the BSDF.
+    /// The extras of materials, by id of the BSDF.
     pub(crate) materials: BTreeMap<String, MaterialExtras>,
 }
 
@@ -41,25 +41,26 @@ pub(crate) struct MaterialExtras {
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct TextureExtras {
-    /// Relative to the scene file.
+    /// The path, relative to the scene file.
     pub(crate) file: String,
     pub(crate) name: String,
     pub(crate) wrap: Wrap,
 }
 
-/// A BSDF's element, and the images that must be written for it.
+/// A BSDF's element, and the images required for it.
 pub(crate) struct BsdfText {
     pub(crate) text: String,
-    /// (file, texture with the material's colour on it).
+    /// The images: (file, texture multiplied by the material's colour).
     pub(crate) images: Vec<(String, Texture)>,
-    /// A colour would have to exceed 1.
+    /// Whether a colour would exceed 1 and was clamped.
     pub(crate) clamped: bool,
-    /// Glass whose thickness the mesh has: a surface of it is a whole pane in Mitsuba.
+    /// Whether the material is glass with a thickness given by the mesh. In Mitsuba, each of its
+    /// surfaces is a whole pane.
     pub(crate) whole: bool,
 }
 
-/// The `<bsdf>` of a material. Colours are `rgb`, scaled so that their mean is the laser's reflectance; with a
-/// texture, both are laid on a copy of it.
+/// Returns the `<bsdf>` of a material. Colours are `rgb`, scaled so that their mean is the laser's
+/// reflectance. If there is a texture, a copy of it is multiplied by them.
 pub(crate) fn bsdf_text(
     id: &str,
     material: &Material,
@@ -192,7 +193,8 @@ fn conductor(
     )
 }
 
-/// A colour parameter whose mean is `reflectance`; `image` names its file where it scales a texture.
+/// Writes a colour parameter with the mean `reflectance`. If it scales a texture, `image` is the
+/// name of its file.
 fn colour(
     out: &mut BsdfText,
     name: &str,
@@ -242,7 +244,7 @@ fn tinted(texture: &Arc<Texture>, tint: [f32; 3]) -> Texture {
         .expect("the size of a texture that exists")
 }
 
-/// The `<sensor>` of a camera.
+/// Returns the `<sensor>` of a camera.
 pub(crate) fn sensor_text(camera: &Camera) -> String {
     let i = &camera.intrinsics;
     let fov = 2.0 * libm::atan(f64::from(i.width) * 0.5 / f64::from(i.fx)).to_degrees();
@@ -273,10 +275,10 @@ pub(crate) fn sensor_text(camera: &Camera) -> String {
     )
 }
 
-/// The `<emitter>` of beam `k`.
+/// Returns the `<emitter>` of beam `k`.
 pub(crate) fn beam_text(k: usize, origin: Vec3, beam: &Beam) -> String {
     let d = beam.direction;
-    // Any frame around the beam will do (Duff et al., JCGT 2017).
+    // Any frame around the beam is valid (Duff et al., JCGT 2017).
     let sign = 1.0f32.copysign(d.z);
     let a = -1.0 / (sign + d.z);
     let b = d.x * d.y * a;
@@ -297,7 +299,7 @@ fn pose(x: Vec3, y: Vec3, z: Vec3, origin: Vec3) -> Affine {
     }
 }
 
-/// A map as Mitsuba's 16 numbers by rows.
+/// Returns a map as Mitsuba's 16 numbers by rows.
 pub(crate) fn matrix_text(a: &Affine) -> String {
     let mut out = String::new();
     for (r, row) in a.linear.iter().enumerate() {

@@ -1,5 +1,5 @@
-//! Meshes in their rest pose: morph targets at their default weights, skins with their joints where
-//! the nodes put them.
+//! Meshes in their rest pose: morph targets at their default weights, and skins with the joints at
+//! their nodes' positions.
 
 use gltf::{
     Accessor, Semantic,
@@ -13,22 +13,22 @@ use crate::{
 
 use super::{Walk, nodes::of_columns};
 
-/// How a node deforms its mesh.
+/// The deformation of a node's mesh.
 #[derive(Debug, Default)]
 pub(super) struct Deformation {
-    /// Weights of the morph targets.
+    /// The weights of the morph targets.
     weights: Vec<f32>,
-    /// World transforms of the joints after their inverse bind matrices; `None` without a skin.
+    /// The world transforms of the joints after their inverse bind matrices; `None` without a skin.
     joints: Option<Vec<Matrix>>,
 }
 
 impl Deformation {
-    /// True for a mesh that stays as it is.
+    /// Returns whether the mesh is not deformed.
     pub(super) fn is_none(&self) -> bool {
         self.joints.is_none() && self.weights.iter().all(|w| *w == 0.0)
     }
 
-    /// True where the vertices are in world space.
+    /// Returns whether the vertices are in world space.
     pub(super) fn is_skinned(&self) -> bool {
         self.joints.is_some()
     }
@@ -90,7 +90,7 @@ impl Walk<'_> {
             .collect()
     }
 
-    /// The deformed vertices of a primitive.
+    /// Deforms the vertices of a primitive.
     pub(super) fn deformed(
         &mut self,
         primitive: &gltf::Primitive<'_>,
@@ -140,7 +140,7 @@ impl Walk<'_> {
         joints: &[Matrix],
     ) -> Result<(), String> {
         let reader = primitive.reader(|b| self.buffers.get(&b));
-        // Of each vertex: its place times weights, and the sum of its weights.
+        // For each vertex: its position times weights, and the sum of its weights.
         let mut sums = vec![([0.0f64; 3], 0.0f64); positions.len()];
         for set in 0u32.. {
             let pair = primitive

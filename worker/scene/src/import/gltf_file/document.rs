@@ -1,5 +1,5 @@
-//! The JSON of a glTF file, with what is legal in glTF and refused by the `gltf` crate put right,
-//! and what is not read left out.
+//! The JSON of a glTF file. Legal constructs that the `gltf` crate refuses are converted, and data
+//! that is not used is removed.
 
 use std::collections::BTreeSet;
 
@@ -11,8 +11,8 @@ use serde::Deserialize;
 
 use crate::import::quoted;
 
-/// Extensions that a file may require: those that are read, and looks that are noted where they are
-/// not.
+/// The extensions that a file may require: those that are read, and those that only change the
+/// appearance and are noted.
 const REQUIRED: [&str; 5] = [
     "KHR_texture_transform",
     "KHR_lights_punctual",
@@ -27,27 +27,27 @@ pub(in crate::import) struct Parsed {
     pub(in crate::import) root: json::Root,
     /// The binary chunk.
     pub(super) blob: Option<Vec<u8>>,
-    /// Facts about the file that the document does not have.
+    /// Facts about the file that the document does not contain.
     pub(super) facts: Facts,
 }
 
-/// What was put right or left out.
+/// The corrections and omissions.
 #[derive(Debug, Default)]
 pub(super) struct Facts {
-    /// The file has animations, which are not read.
+    /// Whether the file has animations, which are not read.
     pub(super) animated: bool,
-    /// Textures without a source.
+    /// The textures without a source.
     pub(super) sourceless: BTreeSet<usize>,
-    /// Images that are neither a uri nor a view with a type.
+    /// The images that are neither a uri nor a view with a type.
     pub(super) damaged_images: BTreeSet<usize>,
-    /// Translations of nodes in double precision.
+    /// The translations of nodes in double precision.
     pub(super) translations: Vec<Option<[f64; 3]>>,
 }
 
-/// Parses `.glb` or `.gltf` bytes; nothing is checked yet.
+/// Parses `.glb` or `.gltf` bytes without validation.
 ///
 /// # Errors
-/// What the crate says.
+/// The crate's message.
 pub(in crate::import) fn parse(bytes: &[u8]) -> Result<Parsed, String> {
     let mut facts = Facts::default();
     let (root, blob) = match Gltf::from_slice_without_validation(bytes) {
@@ -60,8 +60,8 @@ pub(in crate::import) fn parse(bytes: &[u8]) -> Result<Parsed, String> {
     Ok(Parsed { root, blob, facts })
 }
 
-/// The file without animations, which may have parts that the crate does not know, and with a list
-/// of nodes in every scene.
+/// Returns the file without animations, which may contain parts unknown to the crate, and with a
+/// list of nodes in every scene.
 fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
     let glb = gltf::Glb::from_slice(bytes).ok();
     let text = glb.as_ref().map_or(bytes, |glb| &glb.json);
@@ -82,10 +82,10 @@ fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
 }
 
 impl Parsed {
-    /// The checked document.
+    /// Returns the validated document.
     ///
     /// # Errors
-    /// What is wrong with the file.
+    /// The fault in the file.
     pub(super) fn document(
         mut self,
         bytes: &[u8],
@@ -132,7 +132,7 @@ impl Parsed {
     }
 }
 
-/// The crate relies on the accessors of positions before it checks them.
+/// Checks the accessors of positions, on which the crate relies before it validates them.
 fn positions(root: &json::Root) -> Result<(), String> {
     let position = Checked::Valid(Semantic::Positions);
     for (m, mesh) in root.meshes.iter().enumerate() {
@@ -148,7 +148,7 @@ fn positions(root: &json::Root) -> Result<(), String> {
     Ok(())
 }
 
-/// The text of the JSON.
+/// Returns the text of the JSON.
 fn text(bytes: &[u8]) -> Vec<u8> {
     match gltf::Glb::from_slice(bytes) {
         Ok(glb) => glb.json.into_owned(),
@@ -165,8 +165,8 @@ fn has_animations(bytes: &[u8]) -> bool {
     serde_json::from_slice::<Root>(&text(bytes)).is_ok_and(|r| !r.animations.is_empty())
 }
 
-/// Where nodes lie in their parents, with all digits: the crate keeps single precision. Empty if a
-/// node has no such numbers.
+/// Returns the translations of nodes with all digits, because the crate stores single precision.
+/// Empty if a node has no such numbers.
 fn translations(bytes: &[u8]) -> Vec<Option<[f64; 3]>> {
     #[derive(Deserialize)]
     struct Root {

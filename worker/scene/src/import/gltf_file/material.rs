@@ -1,5 +1,5 @@
-//! Materials of a glTF file: what maps to Lambertian, conductor, mix and albedo texture, and a note on
-//! whatever does not.
+//! The materials of a glTF file: they become Lambertian, conductor, mix and albedo texture, with a
+//! note on every other feature.
 
 use std::{borrow::Cow, path::Path};
 
@@ -17,15 +17,16 @@ use crate::{
 
 use super::{Walk, keyed, under};
 
-/// Standard parameters closer than this to those we would write leave our extras in force.
+/// The tolerance within which standard parameters count as unchanged from our export, so that our
+/// extras apply.
 const SAME_FACTOR: f32 = 1e-3;
-/// Metalness closer than this to 0 or 1 is taken for it.
+/// Metalness within this distance of 0 or 1 counts as 0 or 1.
 const PURE: f32 = 0.01;
-/// Specular factors up to this are the coat of an ordinary dielectric.
+/// Specular factors up to this belong to the coat of an ordinary dielectric.
 const DIELECTRIC: f32 = 0.08;
-/// What a spectrum in extras looks like.
+/// The format of a spectrum in extras.
 const SPECTRUM: &str = r#"[{"nm": 905, "reflectance": 0.7}, …], by ascending nm"#;
-/// Extensions whose content is used, or noted by name below.
+/// Extensions that are used, or noted by name below.
 const KNOWN: [&str; 11] = [
     "KHR_node_visibility",
     "EXT_mesh_gpu_instancing",
@@ -40,13 +41,13 @@ const KNOWN: [&str; 11] = [
     "KHR_lights_punctual",
 ];
 
-/// Which texture coordinates a material uses, and what is done to them: (offset, rotation, scale).
+/// The texture coordinates that a material uses, and their transform: (offset, rotation, scale).
 pub(super) struct Coordinates {
     pub(super) set: u32,
     pub(super) transform: Option<([f32; 2], f32, [f32; 2])>,
 }
 
-/// What a material's parameters come to, whichever way they are stated.
+/// A material's parameters, independent of the form in which the file gives them.
 struct Standard<'a> {
     rgb: [f32; 3],
     bsdf: Bsdf,
@@ -58,7 +59,7 @@ impl Walk<'_> {
         add_note(&mut self.notes, key, what.into());
     }
 
-    /// Notes what a document has that no scene of ours does.
+    /// Adds notes on parts of a document that our scenes cannot represent.
     pub(super) fn dropped_parts(&mut self) {
         let document = self.document;
         if self.facts.animated {
@@ -76,7 +77,7 @@ impl Walk<'_> {
         }
     }
 
-    /// The texture coordinates that a material's albedo texture asks for.
+    /// Returns the texture coordinates that a material's albedo texture uses.
     pub(super) fn coordinates(&mut self, file: &gltf::Material<'_>) -> Coordinates {
         let Some(info) = albedo_texture(file) else {
             return Coordinates {
@@ -94,8 +95,8 @@ impl Walk<'_> {
         }
     }
 
-    /// A material as ours. `has_uv` is true if the mesh has the texture coordinates that the material
-    /// asks for; `tint` is the colour of its vertices.
+    /// Converts a material. `has_uv` is true if the mesh has the material's texture coordinates;
+    /// `tint` is the colour of its vertices.
     pub(super) fn material(
         &mut self,
         file: &gltf::Material<'_>,
@@ -151,13 +152,14 @@ impl Walk<'_> {
         Ok(material)
     }
 
-    /// True for a texture without any image. A texture with an image of an unread format has one.
+    /// Returns whether a texture has no image at all. A texture with an image in an unsupported
+    /// format has one.
     fn is_sourceless(&self, texture: &gltf::Texture<'_>) -> bool {
         self.facts.sourceless.contains(&texture.index())
             && texture.extensions().is_none_or(|all| all.is_empty())
     }
 
-    /// Refuses a mask that cuts holes: surfaces here are whole.
+    /// Refuses a mask that cuts holes, because our surfaces have none.
     fn check_mask(
         &mut self,
         file: &gltf::Material<'_>,
@@ -189,7 +191,7 @@ impl Walk<'_> {
         }
     }
 
-    /// The spectrum that anyone may state in a material's extras; unchecked.
+    /// Returns the spectrum that any program may define in a material's extras; unchecked.
     fn stated_spectrum(
         &self,
         file: &gltf::Material<'_>,
@@ -205,7 +207,8 @@ impl Walk<'_> {
         Ok(stated.map(|s| s.spectrum))
     }
 
-    /// What our own extras say of a material, where its standard factors are as we wrote them.
+    /// Returns the material in our own extras if its standard factors are unchanged from our
+    /// export.
     fn exact(
         &mut self,
         file: &gltf::Material<'_>,
@@ -220,7 +223,8 @@ impl Walk<'_> {
             file.extras().as_deref().map(|r| r.get()),
         )?;
         let Some(ours) = ours else { return Ok(None) };
-        // Someone who edits the file in another program changes the standard factors: they win then.
+        // If the file was edited in another program, the standard factors have changed and take
+        // precedence.
         let (metallic, roughness) = metallic_roughness(&Material {
             bsdf: ours.bsdf,
             ..standard.clone()
@@ -239,8 +243,8 @@ impl Walk<'_> {
         Ok(same.then_some(ours))
     }
 
-    /// What a material lets through, and its BSDF, where that is at least half of the light: by KHR_materials_transmission, or
-    /// by an opacity below one half.
+    /// Returns a material's transmitted light and its BSDF if at least half of the light passes: by
+    /// KHR_materials_transmission, or by an opacity below one half.
     fn glass(
         &mut self,
         file: &gltf::Material<'_>,
@@ -262,7 +266,7 @@ impl Walk<'_> {
             _ => None,
         };
         let (tint, bsdf) = if passes >= Material::LEAST_GLASS && !metal {
-            // What the way through the glass takes away.
+            // The absorption along the path through the glass.
             let absorbed = |k: usize| match &solid {
                 Some(v) if v.attenuation_distance().is_finite() => libm::powf(
                     unit(v.attenuation_color()[k]),
@@ -323,7 +327,7 @@ impl Walk<'_> {
                         "replaced by their means over the image",
                     );
                 }
-                // Of such a texture no more than its mean would be used.
+                // Only the mean of such a texture would be used.
                 Err(SceneError::Format { what, .. }) => self.note(
                     "metallic_roughness_textures.unread",
                     format!("left out, factors used: {what}"),
@@ -381,7 +385,7 @@ impl Walk<'_> {
         }
     }
 
-    /// Notes the features of a material that our model has no words for.
+    /// Adds notes on features of a material that our model cannot represent.
     fn dropped_features(&mut self, file: &gltf::Material<'_>) {
         if file.emissive_factor() != [0.0; 3] || file.emissive_strength().is_some() {
             self.note("emission", "ignored; only the laser shines");
@@ -433,7 +437,7 @@ impl Walk<'_> {
 }
 
 impl<'a> Walk<'a> {
-    /// The bytes of a texture's image, and its name.
+    /// Returns the bytes of a texture's image, and its name.
     fn image_bytes(
         &self,
         file: &gltf::Texture<'_>,
@@ -482,7 +486,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// A factor times the colour of vertices.
+/// Returns a factor times the colour of vertices.
 fn tinted([r, g, b, _]: [f32; 4], tint: [f32; 3]) -> [f32; 3] {
     [r * tint[0], g * tint[1], b * tint[2]]
 }
@@ -494,7 +498,7 @@ fn albedo_texture<'a>(file: &gltf::Material<'a>) -> Option<gltf::texture::Info<'
     }
 }
 
-/// A GGX mix, or what is left of it near either end.
+/// Returns a GGX mix, or a pure material near either end.
 fn mixed(weight: f32, alpha: f32, reflectance: f32, specular_reflectance: f32) -> Bsdf {
     let distribution = Distribution::Ggx;
     if weight < PURE {

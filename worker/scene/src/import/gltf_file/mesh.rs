@@ -1,4 +1,4 @@
-//! Meshes of a glTF file: their primitives over one vertex list, with texture coordinates.
+//! The meshes of a glTF file: their primitives over one vertex list, with texture coordinates.
 
 use std::collections::BTreeMap;
 
@@ -12,19 +12,20 @@ use crate::{Mesh, SceneError, Vec3, import::format_error};
 
 use super::{Walk, deform::Deformation, material::Coordinates};
 
-/// Most vertices and corners that one file may place in its meshes, rows of spectra included: accessors and materials can be
-/// used many times over.
+/// The greatest number of vertices and corners that one file may place in its meshes, including
+/// rows of spectra. The limit is necessary because accessors and materials can be used many times.
 pub(super) const MAX_CORNERS: usize = 1 << 28;
 
-/// Colours of vertices closer than this are the same.
+/// Colours of vertices with a smaller difference are the same.
 const SAME_COLOUR: f32 = 0.5 / 255.0;
 
-/// What decides whether primitives can share vertices: accessor of the positions, that of the texture
-/// coordinates, and what is done to these.
+/// The key by which primitives share vertices: accessor of the positions, that of the texture
+/// coordinates, and the transform of the latter.
 type VertexKey = (usize, Option<usize>, [u32; 5]);
 
 impl Walk<'_> {
-    /// A mesh's triangles over one vertex list; `None` (with a note) if it has only lines or points.
+    /// Returns a mesh's triangles over one vertex list, or `None` (with a note) if it has only
+    /// lines or points.
     pub(super) fn mesh(
         &mut self,
         file: &gltf::Mesh<'_>,
@@ -148,7 +149,7 @@ impl Walk<'_> {
         Ok((!mesh.triangles.is_empty()).then_some(mesh))
     }
 
-    /// The colour of all vertices of a primitive, by which its material's is multiplied.
+    /// Returns the common colour of a primitive's vertices, which multiplies its material's colour.
     fn vertex_colour(
         &mut self,
         primitive: &gltf::Primitive<'_>,
@@ -209,7 +210,7 @@ impl Walk<'_> {
 }
 
 impl Coordinates {
-    /// A point of texture space after KHR_texture_transform: scaled, turned, moved.
+    /// Applies KHR_texture_transform to a point of texture space: scaling, rotation, translation.
     fn placed(&self, [u, v]: [f32; 2]) -> [f32; 2] {
         let Some((offset, rotation, scale)) = self.transform else {
             return [u, v];
@@ -226,7 +227,7 @@ impl Coordinates {
     }
 }
 
-/// Corners as triangles: lists, strips (every second one turned) and fans.
+/// Converts corners to triangles: lists, strips (with every second one reversed) and fans.
 fn triangles(corners: &[u32], mode: Mode) -> Vec<[u32; 3]> {
     match mode {
         Mode::TriangleStrip => corners

@@ -1,4 +1,5 @@
-//! glTF 2.0 to scene: node transforms, labels and ids from extras, materials, camera and laser.
+//! Converts glTF 2.0 to scenes: node transforms, labels and ids from extras, materials, camera and
+//! laser.
 
 mod deform;
 pub(super) mod document;
@@ -23,9 +24,9 @@ use super::{
 use document::Facts;
 use parts::laser_of;
 
-/// Deepest nesting of nodes.
+/// The deepest nesting of nodes.
 const MAX_DEPTH: usize = 1000;
-/// Category of nodes without a `label`.
+/// The category of nodes without a `label`.
 const UNLABELLED: &str = "unlabelled";
 
 /// Reads `.glb` or `.gltf` bytes; the caller validates the result.
@@ -66,8 +67,8 @@ pub(super) fn read(
     walk.finish(&root, ours, options)
 }
 
-/// Reads `.glb` or `.gltf` bytes as one mesh in the file's own frame, with the notes on what was dropped. Cameras
-/// and lasers are not looked for; the caller checks the numbers.
+/// Reads `.glb` or `.gltf` bytes as one mesh in the file's own frame, with the notes on dropped
+/// parts. Cameras and lasers are ignored; the caller checks the numbers.
 pub(super) fn read_model(
     path: &Path,
     bytes: &[u8],
@@ -130,7 +131,8 @@ fn root<'a>(path: &Path, document: &'a gltf::Document) -> Result<gltf::Scene<'a>
         .ok_or_else(|| format_error(path, "scenes: the file has none; export at least one scene"))
 }
 
-/// Every node has one parent at most, and the scene's own nodes have none; otherwise a walk might not end.
+/// Checks that every node has at most one parent, and that the scene's own nodes have none;
+/// otherwise a walk might not end.
 fn is_a_forest(
     path: &Path,
     document: &gltf::Document,
@@ -155,7 +157,7 @@ fn is_a_forest(
     }
 }
 
-/// Parses `extras` that hold our key; `None` where they are absent or someone else's.
+/// Parses `extras` that contain our key. Returns `None` if they are absent or another program's.
 fn keyed<T: DeserializeOwned>(
     path: &Path,
     field: &str,
@@ -164,13 +166,14 @@ fn keyed<T: DeserializeOwned>(
     let Some(raw) = under(path, field, raw, "picofarm")? else {
         return Ok(None);
     };
-    // From the text again: a generic JSON value would round f32 numbers twice.
+    // Parsed from the text, because a generic JSON value would round f32 numbers twice.
     serde_json::from_str::<Keyed<T>>(raw)
         .map(|k| Some(k.picofarm))
         .map_err(|e| format_error(path, format!("{field}: {e}")))
 }
 
-/// The text of `extras` that hold a key; `None` where they are absent or hold others.
+/// Returns the text of `extras` that contain a key, or `None` if they are absent or contain other
+/// keys.
 fn under<'r>(
     path: &Path,
     field: &str,
@@ -185,7 +188,7 @@ fn under<'r>(
     Ok(value.get(key).is_some().then_some(raw))
 }
 
-/// Meshes by their index; those that a node deforms are that node's own.
+/// The key of a mesh: its index, and the node if the node deforms the mesh.
 type MeshKey = (usize, Option<usize>);
 
 struct Walk<'a> {
@@ -194,23 +197,24 @@ struct Walk<'a> {
     document: &'a gltf::Document,
     buffers: &'a Buffers,
     facts: &'a Facts,
-    /// World transforms by node, in the file's coordinates.
+    /// The world transforms by node, in the file's coordinates.
     worlds: Vec<Option<Matrix>>,
-    /// Place of the scene's origin in the file's coordinates.
+    /// The position of the scene's origin in the file's coordinates.
     origin: [f64; 3],
-    /// Refuses surfaces that would look otherwise; models of a library are taken with a note.
+    /// Whether to refuse surfaces that would change their appearance. For models of a library, a
+    /// note is added instead.
     strict: bool,
     images: Images<(usize, Wrap)>,
-    /// Vertices and corners read so far.
+    /// The number of vertices and corners read so far.
     corners: usize,
-    /// Vertices and corners of all objects.
+    /// The number of vertices and corners of all objects.
     placed: usize,
     meshes: BTreeMap<MeshKey, Option<Arc<Mesh>>>,
     objects: Vec<(Option<u32>, Object)>,
     labels: Vec<String>,
-    /// Indices of `labels`.
+    /// The indices of `labels`.
     known_labels: BTreeMap<String, usize>,
-    /// The first perspective camera; refused only if it is used.
+    /// The first perspective camera; an error is reported only if the camera is used.
     camera: Option<Result<Camera, SceneError>>,
     laser: Option<(Affine, NodeExtras)>,
     notes: BTreeMap<String, String>,
@@ -247,7 +251,7 @@ impl<'a> Walk<'a> {
         })
     }
 
-    /// Everything that the document's scene places.
+    /// Reads all objects of the document's scene.
     fn walk(&mut self, root: &gltf::Scene<'_>) -> Result<(), SceneError> {
         self.dropped_parts();
         for node in root.nodes() {
@@ -256,7 +260,7 @@ impl<'a> Walk<'a> {
         Ok(())
     }
 
-    /// A scene far from the origin of its file is moved to its camera.
+    /// Moves a scene far from the origin of its file to its camera.
     fn move_to_camera(&mut self, root: &gltf::Scene<'_>) {
         // In the order of the walk.
         let mut open: Vec<Node<'_>> = root.nodes().collect();
@@ -276,7 +280,7 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// A transform to the scene's coordinates.
+    /// Converts a transform to the scene's coordinates.
     fn placed(&self, world: &Matrix) -> Matrix {
         match self.origin == [0.0; 3] {
             true => *world,
@@ -284,7 +288,7 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// The index of a label.
+    /// Returns the index of a label.
     fn label(&mut self, label: &str) -> usize {
         if let Some(known) = self.known_labels.get(label) {
             return *known;
@@ -295,7 +299,7 @@ impl<'a> Walk<'a> {
         index
     }
 
-    /// `worlds` has bounded the depth.
+    /// Reads a node. `worlds` has already limited the depth.
     fn node(
         &mut self,
         node: &Node<'_>,
@@ -376,7 +380,8 @@ impl<'a> Walk<'a> {
                 );
                 return Err(format_error(self.path, what));
             }
-            // A skin puts vertices where its joints are, wherever the mesh's node is.
+            // A skin determines the vertices from its joints, whatever the transform of the mesh's
+            // node.
             let to_world = match deformation.is_skinned() {
                 true => Affine::IDENTITY,
                 false => to_world.after(&place).affine(),

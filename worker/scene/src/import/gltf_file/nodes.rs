@@ -1,4 +1,4 @@
-//! Where the nodes of a glTF file lie, and what their extras and extensions say.
+//! The transforms of the nodes of a glTF file, and their extras and extensions.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ use crate::{
 
 use super::{MAX_DEPTH, Walk, document::Facts};
 
-/// World transforms by node; `None` for nodes outside the scene.
+/// Returns the world transforms by node; `None` for nodes outside the scene.
 pub(super) fn worlds(
     path: &Path,
     document: &gltf::Document,
@@ -45,22 +45,22 @@ pub(super) fn worlds(
     Ok(worlds)
 }
 
-/// glTF's column-major matrix.
+/// Converts glTF's column-major matrix.
 pub(super) fn of_columns(m: [[f32; 4]; 4]) -> Matrix {
     Matrix(std::array::from_fn(|r| {
         std::array::from_fn(|c| f64::from(m[c][r]))
     }))
 }
 
-/// True for nodes that `KHR_node_visibility` hides, with all below them.
+/// Returns whether `KHR_node_visibility` hides a node and all its descendants.
 pub(super) fn is_hidden(node: &Node<'_>) -> bool {
     let extension = node.extension_value("KHR_node_visibility");
     extension.and_then(|e| e.get("visible")) == Some(&serde_json::Value::Bool(false))
 }
 
 impl Walk<'_> {
-    /// A node's extras. What is none of ours is ignored: labels and numbers of other programs have
-    /// other types.
+    /// Returns a node's extras. Entries of other programs are ignored: their labels and numbers
+    /// have other types.
     pub(super) fn extras(&mut self, node: &Node<'_>) -> Result<NodeExtras, SceneError> {
         #[derive(Deserialize)]
         struct Laser {
@@ -81,7 +81,7 @@ impl Walk<'_> {
         };
         let mut extras = NodeExtras::default();
         if fields.contains_key("laser_spots") || fields.contains_key("laser_directions") {
-            // From the text again: a generic JSON value would round numbers twice.
+            // Parsed from the text, because a generic JSON value would round numbers twice.
             let laser: Laser = serde_json::from_str(raw.get()).map_err(fail)?;
             (extras.laser_spots, extras.laser_directions) =
                 (laser.laser_spots, laser.laser_directions);
@@ -101,7 +101,8 @@ impl Walk<'_> {
         Ok(extras)
     }
 
-    /// Places of a node's mesh relative to the node: of `EXT_mesh_gpu_instancing`, or one.
+    /// Returns the transforms of a node's mesh instances relative to the node: those of
+    /// `EXT_mesh_gpu_instancing`, or a single one.
     pub(super) fn instances(&mut self, node: &Node<'_>) -> Result<Vec<Matrix>, SceneError> {
         let Some(extension) = node.extension_value("EXT_mesh_gpu_instancing") else {
             return Ok(vec![Matrix::IDENTITY]);

@@ -12,7 +12,7 @@ use crate::{
 
 use super::Walk;
 
-/// Rows given to a camera whose file states no resolution; callers resize.
+/// The number of rows of a camera if the file has no resolution; callers resize it.
 const DEFAULT_ROWS: u32 = 64;
 
 impl Walk<'_> {
@@ -64,7 +64,7 @@ impl Walk<'_> {
     }
 }
 
-/// The laser that a node's extras state.
+/// Returns the laser that a node's extras define.
 pub(super) fn laser_of(
     path: &Path,
     to_world: &Affine,
@@ -84,9 +84,9 @@ pub(super) fn laser_of(
             beams,
         });
     }
-    // The caller saw one of the two.
+    // The caller found one of the two.
     let spots = extras.laser_spots.clone().unwrap_or(Spots::Grid(0));
-    // A file has no seed: random places are the same in each.
+    // A file has no seed, so random positions are the same in every file.
     Aim::of(&spots, 0)
         .map(|aim| aim.laser(camera))
         .map_err(|what| format_error(path, format!("laser_spots: {what}")))

@@ -26,21 +26,22 @@ use super::{
     transform::Matrix,
 };
 
-/// Hues closer than this are the same.
+/// Hues with a smaller difference are the same.
 const SAME_HUE: f32 = 1e-3;
 /// Most different leaves of a blend.
 const MAX_LEAVES: usize = 64;
 
-/// What blends are made of.
+/// A leaf of a blend.
 #[derive(Debug, PartialEq)]
 pub(super) struct Leaf {
     pub(super) colour: Colour,
-    /// α and distribution of a conductor; a Lambertian has none.
+    /// α and distribution of a conductor; `None` for a Lambertian.
     pub(super) metal: Option<(f32, Distribution)>,
 }
 
 impl Leaf {
-    /// A Lambertian that reflects nothing, as the missing share of a material does.
+    /// Returns whether the leaf is a Lambertian that reflects nothing, like the missing share of a
+    /// material.
     fn is_black(&self) -> bool {
         let Colour {
             rgb,
@@ -72,14 +73,14 @@ type Share = (f64, Rc<Leaf>);
 /// Leaves with their shares.
 type Leaves = Vec<Share>;
 
-/// A BSDF as leaves side by side, no two alike; their shares sum to 1.
+/// A BSDF as a set of leaves without duplicates; their shares sum to 1.
 pub(super) struct Mix {
     leaves: Leaves,
     pub(super) two_sided: bool,
 }
 
 impl Mix {
-    /// One leaf, one-sided.
+    /// Returns a one-sided mix of one leaf.
     pub(super) fn of(leaf: Rc<Leaf>) -> Self {
         Self {
             leaves: vec![(1.0, leaf)],
@@ -87,7 +88,7 @@ impl Mix {
         }
     }
 
-    /// This and another side by side, which has the share `weight`.
+    /// Returns a mix of `self` and `other`, which has the share `weight`.
     fn beside(self, other: Self, weight: f64) -> Self {
         let two_sided = self.two_sided && other.two_sided;
         let first = self.leaves.into_iter().map(|l| (l.0 * (1.0 - weight), l.1));
@@ -134,7 +135,7 @@ impl Reader<'_> {
         }
     }
 
-    /// The material that a mix is.
+    /// Returns the material of a mix.
     pub(super) fn assemble(&mut self, node: &Node, mix: Mix) -> Result<Look, String> {
         let mut leaves = mix.leaves;
         if !is_simple(&leaves) {
@@ -175,12 +176,12 @@ impl Reader<'_> {
 
 type Assembled = (Bsdf, [f32; 3], Vec<SpectrumPoint>);
 
-/// False for what vanishes in a material's numbers.
+/// Returns whether a share is above zero in single precision.
 fn has_share((share, _): &Share) -> bool {
     *share as f32 > 0.0
 }
 
-/// One Lambertian and one conductor, in this order.
+/// Returns one Lambertian and one conductor, in this order.
 fn pair(leaves: &[Share]) -> Option<(&Share, &Share)> {
     match leaves {
         [a, b] if a.1.metal.is_none() && b.1.metal.is_some() => Some((a, b)),
@@ -189,12 +190,12 @@ fn pair(leaves: &[Share]) -> Option<(&Share, &Share)> {
     }
 }
 
-/// True for one leaf, and for one Lambertian and one conductor.
+/// Returns whether there is one leaf, or one Lambertian and one conductor.
 fn is_simple(leaves: &[Share]) -> bool {
     leaves.len() == 1 || pair(leaves).is_some()
 }
 
-/// The texture that scales all leaves.
+/// Returns the texture that scales all leaves.
 fn texture_of(leaves: &[Share]) -> Result<Option<(Arc<Texture>, Matrix)>, &'static str> {
     let mut all = leaves.iter().filter(|l| !l.1.is_black());
     let Some((_, first)) = all.next() else {
@@ -256,7 +257,7 @@ fn too_many(leaves: &[Share]) -> String {
     )
 }
 
-/// A Lambertian and a conductor with its share.
+/// Returns a mix of a Lambertian and a conductor with its share.
 fn mixed(d: &Colour, (share, metal): &Share) -> Assembled {
     let (s, w) = (&metal.colour, *share as f32);
     let (alpha, distribution) = metal.metal.unwrap_or((1.0, Distribution::Beckmann));

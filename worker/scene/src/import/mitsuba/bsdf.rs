@@ -1,4 +1,4 @@
-//! Mitsuba's BSDFs as materials.
+//! Converts Mitsuba's BSDFs to materials.
 
 use std::rc::Rc;
 
@@ -17,9 +17,9 @@ use super::{
     transform::Matrix,
 };
 
-/// Deepest nesting of BSDFs, references included.
+/// The deepest nesting of BSDFs, references included.
 const MAX_DEPTH: usize = 8;
-/// Normal-incidence reflectance (linear RGB) of the metals that scenes name most.
+/// The normal-incidence reflectance (linear RGB) of the most common metals.
 const METALS: [(&str, [f32; 3]); 5] = [
     ("Ag", [0.972, 0.960, 0.915]),
     ("Al", [0.913, 0.922, 0.924]),
@@ -29,7 +29,7 @@ const METALS: [(&str, [f32; 3]); 5] = [
 ];
 const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these, or dielectric or thindielectric by \
                       itself";
-/// What exports of thin glass stated when its reflections were not rendered.
+/// The text in exports of thin glass from the time when its reflections were not rendered.
 const UNREFLECTED: &str = r#"<rgb name="specular_reflectance" value="0 0 0"/>"#;
 
 /// Mitsuba's names of media, with their indices of refraction.
@@ -41,7 +41,7 @@ const MEDIA: [(&str, f64); 5] = [
     ("bk7", 1.5046),
 ];
 
-/// A material, and what its textures do to texture coordinates.
+/// A material, and the transform that its textures apply to texture coordinates.
 #[derive(Debug, Clone)]
 pub(super) struct Look {
     pub(super) material: Material,
@@ -49,7 +49,8 @@ pub(super) struct Look {
 }
 
 impl Reader<'_> {
-    /// The material of a BSDF; ours, exactly, where its text is as we wrote it.
+    /// Returns the material of a BSDF. If its text is unchanged from our export, the exact material
+    /// is returned.
     pub(super) fn look(&mut self, node: &Rc<Node>) -> Result<Look, String> {
         let key = Rc::as_ptr(node).addr();
         if let Some(known) = self.looks.get(&key) {
@@ -120,7 +121,7 @@ impl Reader<'_> {
         Ok(None)
     }
 
-    /// What a BSDF is made of.
+    /// Returns the parts of a BSDF.
     pub(super) fn mix(&mut self, node: &Rc<Node>, depth: usize) -> Result<Mix, String> {
         if depth > MAX_DEPTH {
             return Err(node.fail(format!("nested deeper than {MAX_DEPTH}")));
@@ -145,7 +146,7 @@ impl Reader<'_> {
         }
     }
 
-    /// A Lambertian or a conductor, read once however often blends refer to it.
+    /// Returns a Lambertian or a conductor, which is read once even if several blends refer to it.
     fn leaf(&mut self, node: &Rc<Node>) -> Result<Rc<Leaf>, String> {
         let key = Rc::as_ptr(node).addr();
         if let Some(known) = self.leaves.get(&key) {
@@ -169,7 +170,7 @@ impl Reader<'_> {
         Ok(leaf)
     }
 
-    /// Glass, thin or a body.
+    /// Returns a material of glass, thin or solid.
     fn glass(&mut self, node: &Node) -> Result<Material, String> {
         self.only(node, &properties::GLASS)?;
         let ior = index(node, "int_ior", "bk7")? / index(node, "ext_ior", "air")?;
@@ -289,7 +290,7 @@ impl Reader<'_> {
     }
 }
 
-/// What a material is called.
+/// Returns the name of a material.
 pub(super) fn named(node: &Node) -> String {
     match node.id.is_empty() {
         true => node.kind.clone(),
@@ -297,7 +298,7 @@ pub(super) fn named(node: &Node) -> String {
     }
 }
 
-/// An index of refraction: a number, or one of Mitsuba's names.
+/// Parses an index of refraction: a number, or one of Mitsuba's names.
 fn index(node: &Node, name: &str, default: &str) -> Result<f64, String> {
     if let Ok(Some(number)) = node.number(name) {
         return match number.is_finite() && number > 0.0 {

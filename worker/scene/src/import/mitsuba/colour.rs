@@ -1,12 +1,13 @@
 //! Mitsuba's colour parameters: numbers, spectra over wavelengths, bitmaps.
 //!
-//! A spectrum becomes a material's [`Material::spectrum`](crate::Material::spectrum) as it stands. Beyond its ends it keeps its last
-//! values (in Mitsuba it is zero there).
-//! The material's `rgb` is what the spectrum has at the three primaries (611, 549 and 464 nm), by the same rule: one that
-//! lies outside the visible is grey. Its reflectance is the mean of these three, as of every other colour in Mitsuba's files.
-//! So renders without a wavelength treat it as they treat the `<rgb>` that looks like it.
+//! A spectrum becomes a material's [`Material::spectrum`](crate::Material::spectrum) unchanged.
+//! Beyond its ends, its last values continue (in Mitsuba, it is zero there). The material's `rgb`
+//! is the spectrum at the three primaries (611, 549 and 464 nm), by the same rule, so a spectrum
+//! outside the visible range is grey. The reflectance is the mean of these three values, as for
+//! every other colour in Mitsuba's files. Renders without a wavelength therefore treat a spectrum
+//! like the `<rgb>` of the same appearance.
 //!
-//! Of a blend of which some parts have spectra, the others reflect their means at every wavelength.
+//! If only some parts of a blend have spectra, the others reflect their means at every wavelength.
 
 use std::{path::Path, sync::Arc};
 
@@ -24,11 +25,11 @@ use super::{
     transform::Matrix,
 };
 
-/// A colour, by wavelength if stated so; or white with a texture.
+/// A colour, by wavelength if the file gives a spectrum; or white with a texture.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Colour {
     pub(super) rgb: [f32; 3],
-    /// Empty where the file states numbers alone.
+    /// The spectrum; empty if the file contains only numbers.
     pub(super) spectrum: Vec<SpectrumPoint>,
     pub(super) texture: Option<(Arc<Texture>, Matrix)>,
 }
@@ -46,7 +47,7 @@ impl Colour {
         (self.rgb[0] + self.rgb[1] + self.rgb[2]) / 3.0
     }
 
-    /// A spectrum, with the colour that it has.
+    /// Returns a spectrum with its colour.
     fn by_wavelength(spectrum: Vec<SpectrumPoint>) -> Self {
         let [blue, green, red] = PRIMARIES_NM.map(|nm| reflectance(&spectrum, nm).unwrap_or(0.0));
         Self {
@@ -56,7 +57,7 @@ impl Colour {
         }
     }
 
-    /// What it reflects at a wavelength: its mean, where the file states numbers alone.
+    /// Returns the reflectance at a wavelength; without a spectrum, the mean.
     fn at(&self, nm: f32) -> f32 {
         reflectance(&self.spectrum, nm).unwrap_or(self.mean())
     }
@@ -66,7 +67,8 @@ fn reflectance(spectrum: &[SpectrumPoint], nm: f32) -> Option<f32> {
     interpolated(spectrum, nm, |p| [p.reflectance]).map(|[r]| r)
 }
 
-/// The mean of colours without textures by their shares, at the wavelengths of all.
+/// Returns the mean of colours without textures weighted by their shares, at the wavelengths of
+/// all.
 pub(super) fn mean_of(all: &[(f64, &Colour)]) -> Colour {
     let sum: f64 = all.iter().map(|(share, _)| share).sum();
     let mean = |of: &dyn Fn(&Colour) -> f32| {
@@ -86,7 +88,7 @@ pub(super) fn mean_of(all: &[(f64, &Colour)]) -> Colour {
     }
 }
 
-/// Those at which any of the colours states what it reflects, ascending.
+/// Returns the wavelengths of all colours' spectra, ascending.
 fn wavelengths<'a>(colours: impl Iterator<Item = &'a Colour>) -> Vec<f32> {
     let mut all: Vec<f32> = colours.flat_map(|c| &c.spectrum).map(|p| p.nm).collect();
     all.sort_by(f32::total_cmp);
@@ -94,7 +96,8 @@ fn wavelengths<'a>(colours: impl Iterator<Item = &'a Colour>) -> Vec<f32> {
     all
 }
 
-/// The spectrum of a material by those of its parts; of a mix, at the wavelengths of both.
+/// Returns the spectrum of a material from those of its parts; for a mix, at the wavelengths of
+/// both.
 pub(super) fn spectrum_of(
     diffuse: Option<&Colour>,
     conductor: Option<&Colour>,
@@ -116,7 +119,7 @@ pub(super) fn spectrum_of(
 }
 
 impl Reader<'_> {
-    /// A colour parameter: numbers, a spectrum, or a bitmap.
+    /// Reads a colour parameter: numbers, a spectrum, or a bitmap.
     pub(super) fn colour(&mut self, node: &Node, name: &str) -> Result<Option<Colour>, String> {
         let rgb = match node.parameters.get(name) {
             Some(Value::Colour(rgb)) => Some(*rgb),
@@ -203,7 +206,7 @@ impl Reader<'_> {
             if !raw {
                 return Ok(texture);
             }
-            // `raw` texels are linear already; ours are sRGB-encoded.
+            // `raw` texels are already linear; ours are sRGB-encoded.
             let encoded = |t: &[u8; 3]| t.map(|c| srgb_byte(f32::from(c) / 255.0));
             let texels = texture.texels().iter().map(encoded).collect();
             Texture::new(name, texture.width(), texture.height(), texels, wrap)

@@ -1,4 +1,4 @@
-//! Mitsuba's Python dictionary, written as JSON: `type` keys, `to_world` as rows of numbers.
+//! Mitsuba's Python dictionary, written as JSON: `type` keys, and `to_world` as rows of numbers.
 
 use std::{collections::BTreeSet, fmt, rc::Rc};
 
@@ -11,7 +11,7 @@ use super::{
     transform::Matrix,
 };
 
-/// Plugins by what they are; a dictionary does not say.
+/// Plugins by their tag, which a dictionary does not contain.
 const TAGS: [(&str, &[&str]); 6] = [
     (
         "shape",
@@ -55,7 +55,7 @@ const TAGS: [(&str, &[&str]); 6] = [
         ],
     ),
 ];
-/// What says how to render, which is the job's business.
+/// Plugins with settings for rendering, which belong to the job.
 const SKIPPED: [&str; 25] = [
     "path",
     "direct",
@@ -84,10 +84,11 @@ const SKIPPED: [&str; 25] = [
     "gaussian",
 ];
 
-/// Letters of a place in the file that errors quote.
+/// The greatest number of letters of a position in the file that errors quote.
 const MAX_PLACE: usize = 200;
 
-/// JSON whose keys keep their order: it decides which BSDF of a blend is the first.
+/// JSON objects that preserve the order of their keys, because the order determines the first BSDF
+/// of a blend.
 enum Json {
     Null,
     Switch(bool),
@@ -125,7 +126,7 @@ impl<'de> Deserialize<'de> for Json {
             }
 
             fn visit_f64<E: serde::de::Error>(self, value: f64) -> Result<Json, E> {
-                // Everything is single precision in the end.
+                // All values are finally stored in single precision.
                 if (value as f32).is_finite() {
                     Ok(Json::Number(value))
                 } else {
@@ -175,7 +176,7 @@ fn field<'a>(fields: &'a [(String, Json)], key: &str) -> Option<&'a Json> {
     fields.iter().find(|(k, _)| k == key).map(|(_, v)| v)
 }
 
-/// The scene's node of a dictionary.
+/// Returns the scene's node of a dictionary.
 pub(super) fn parse(bytes: &[u8]) -> Result<Node, String> {
     let json = serde_json::from_slice(bytes).map_err(|e| e.to_string())?;
     let Json::Fields(root) = json else {
@@ -184,7 +185,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Node, String> {
     node(&root, "scene", "scene")?.ok_or_else(|| "the scene is empty".into())
 }
 
-/// A plugin; `None` for those that are none of our business.
+/// Returns a plugin, or `None` for irrelevant ones.
 fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, String> {
     let Some(kind) = field(json, "type").and_then(Json::text) else {
         return Err(format!("{at}: needs the key \"type\" (text)"));
@@ -251,7 +252,7 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
     Ok(Some(out))
 }
 
-/// The path of keys to a value, which a hostile file can make long.
+/// Shortens the path of keys to a value, which a hostile file can make long.
 fn shortened(at: &str) -> String {
     match at.char_indices().rev().nth(MAX_PLACE) {
         None => at.to_owned(),
@@ -259,7 +260,7 @@ fn shortened(at: &str) -> String {
     }
 }
 
-/// Rows of numbers, or numbers, as one list.
+/// Returns rows of numbers, or numbers, as one list.
 fn flat(json: &Json) -> Result<Vec<f64>, String> {
     const EXPECTED: &str = "expected numbers";
     match json {
@@ -275,7 +276,7 @@ fn flat(json: &Json) -> Result<Vec<f64>, String> {
     }
 }
 
-/// True for a spectrum whose value starts with a pair.
+/// Returns whether a spectrum's value starts with a pair.
 fn by_wavelength(fields: &[(String, Json)]) -> bool {
     let Some(Json::List(items)) = field(fields, "value") else {
         return false;
@@ -283,7 +284,7 @@ fn by_wavelength(fields: &[(String, Json)]) -> bool {
     matches!(items.first(), Some(Json::List(pair)) if pair.len() == 2)
 }
 
-/// A list of [wavelength, value].
+/// Parses a list of [wavelength, value].
 fn pairs(json: &Json) -> Result<Vec<SpectrumPoint>, String> {
     let Json::List(items) = json else {
         return Err("expected pairs [wavelength, value]".into());

@@ -1,27 +1,31 @@
 //! Mitsuba 3 scenes, as XML or as the Python dictionary written as JSON.
 //!
-//! Understood: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size); shapes `ply`,
-//! `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs `diffuse`,
-//! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
-//! all these, nested too; `dielectric` on closed shapes and `thindielectric`, by themselves; `bitmap` textures;
-//! `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a reflectance; references, `<default>` parameters, and
-//! every transform. A shape without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
-//! Integrators, samplers and media are skipped with a note; any other plugin is an error that names
-//! it. As in Mitsuba, every property of a plugin must be used: any other is an error, unless it
-//! changes neither geometry nor light. Files of versions before 2 may have the names of their time
-//! (`toWorld`, `fovAxis`). As in Mitsuba, `rotate` takes its axis as it is: one of another length
-//! than 1 shears.
+//! Supported: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size);
+//! shapes `ply`, `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs
+//! `diffuse`, `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001),
+//! `twosided` and `blendbsdf` of all these, nested too; `dielectric` on closed shapes and
+//! `thindielectric`, on their own; `bitmap` textures; `spectrum` with values by wavelength
+//! (`450:0.2, 905:0.7`) as a reflectance; references, `<default>` parameters, and every transform.
+//! A shape without BSDF has Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex
+//! normals are not used. Integrators, samplers and media are skipped with a note; any other plugin
+//! is an error that names it. As in Mitsuba, every property of a plugin must be used: any other is
+//! an error, unless it changes neither geometry nor light. Files of versions before 2 may have the
+//! names of their time (`toWorld`, `fovAxis`). As in Mitsuba, `rotate` does not normalise its axis:
+//! if its length is not 1, the map shears.
 //!
-//! **The laser.** Mitsuba has no collimated emitter. As mitransient's users do, a beam is an emitter `projector`
-//! with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`; several make a grid, and all
-//! start at one place. Its power is not read: every beam is of unit energy. Other emitters are left out with a
-//! note. Without beams, a grid must be stated on import.
+//! **The laser.** Mitsuba has no collimated emitter. As in mitransient scenes, a beam is an emitter
+//! `projector` with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`.
+//! Several beams form a grid, and all must start at one point. The power is not read: every beam
+//! has unit energy. Other emitters are omitted with a note. Without beams, a grid must be given on
+//! import.
 //!
-//! **Labels.** A shape's category is its id up to the first `.` (`chair.2` is a `chair`), else `unlabelled`.
+//! **Labels.** A shape's category is its id up to the first `.` (`chair.2` is a `chair`), else
+//! `unlabelled`.
 //!
-//! Files of [`crate::export`] carry what Mitsuba has no words for in a comment of the scene that starts with
-//! `picofarm`: exact materials, labels, spots and provenance. Each is used only while the element that it
-//! belongs to still has the text that was written; edited elements count as they stand.
+//! In files of [`crate::export`], a comment of the scene that starts with `picofarm` contains the
+//! data that Mitsuba cannot represent: exact materials, labels, spots and provenance. Each entry is
+//! used only if its element still has the exported text; edited elements are read like those of any
+//! other file.
 
 mod blend;
 mod bsdf;
@@ -54,9 +58,10 @@ use node::{Child, Node};
 use shape::Geometry;
 pub(super) use transform::Matrix;
 
-/// Category of shapes whose id names none.
+/// The category of shapes with an id that names none.
 const UNLABELLED: &str = "unlabelled";
-/// Most vertices, triangles and rows of spectra of a scene, instances counted each.
+/// The greatest number of vertices, triangles and rows of spectra of a scene, counting each
+/// instance.
 const MAX_SIZE: usize = 1 << 28;
 
 /// Reads a scene in XML; the caller validates the result.
@@ -92,10 +97,10 @@ pub(super) fn read_dictionary(
         .map_err(|refusal| refusal.of_file(path))
 }
 
-/// The files that a scene in XML or JSON refers to, in order of their names.
+/// Returns the files that a scene in XML or JSON refers to, in order of their names.
 ///
 /// # Errors
-/// A name that is no plain path.
+/// A name that is not a plain path.
 pub(super) fn files(path: &Path, bytes: &[u8]) -> Result<Vec<PathBuf>, SceneError> {
     let root = match std::str::from_utf8(bytes) {
         Ok(text) if text.trim_start().starts_with('{') => dictionary::parse(bytes).ok(),
@@ -125,9 +130,9 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
-/// Why a scene is not read.
+/// The reason why a scene is not read.
 enum Refusal {
-    /// It has no beam, and none was stated.
+    /// It has no beam, and none was given.
     NoLaser,
     Format(String),
 }
@@ -158,13 +163,13 @@ struct Reader<'a> {
     ids: BTreeMap<String, Rc<Node>>,
     extras: Option<Extras>,
     images: Images<(PathBuf, Wrap, bool)>,
-    /// Materials by the address of their node, which lives as long as `root`.
+    /// Materials by the address of their node, which exists as long as `root`.
     looks: BTreeMap<usize, Look>,
-    /// What blends are made of, likewise.
+    /// The parts of blends, likewise.
     leaves: BTreeMap<usize, Rc<Leaf>>,
     geometries: BTreeMap<PathBuf, Geometry>,
     notes: BTreeMap<String, String>,
-    /// Place of the scene's origin in the file's coordinates.
+    /// The position of the scene's origin in the file's coordinates.
     origin: [f64; 3],
 }
 
@@ -198,7 +203,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// The file that an element names.
+    /// Returns the file that an element names.
     fn named(&self, node: &Node, name: &str) -> Result<PathBuf, String> {
         Opener::named(folder(self.path), name).map_err(|e| node.fail(e))
     }
@@ -207,7 +212,7 @@ impl<'a> Reader<'a> {
         add_note(&mut self.notes, key, what.into());
     }
 
-    /// A transform to the scene's coordinates.
+    /// Converts a transform to the scene's coordinates.
     fn placed(&self, place: &Matrix) -> Matrix {
         match self.origin == [0.0; 3] {
             true => *place,
@@ -215,7 +220,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A scene far from the origin of its file is moved to its camera.
+    /// Moves a scene far from the origin of its file to its camera.
     fn move_to_camera(&mut self, sensor: Option<&Rc<Node>>) -> Result<(), String> {
         if self.extras.is_some() {
             return Ok(());
@@ -242,7 +247,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Children of one tag, references resolved.
+    /// Returns the children of one tag, with references resolved.
     fn children(&self, node: &Node, tag: &str) -> Result<Vec<Rc<Node>>, String> {
         let mut found = Vec::new();
         for (_, child) in &node.children {
@@ -265,7 +270,7 @@ impl<'a> Reader<'a> {
             .collect()
     }
 
-    /// Notes what was skipped while the file was parsed.
+    /// Adds notes on the elements that the parser skipped.
     fn note_skipped(&mut self) {
         let mut open = vec![self.root.clone()];
         while let Some(node) = open.pop() {
@@ -275,7 +280,7 @@ impl<'a> Reader<'a> {
                         "media",
                         "left out: light travels through empty space and through glass only",
                     ),
-                    // Files of ours have such elements for other programs.
+                    // Our own files contain such elements for other programs.
                     _ if self.extras.is_none() => self.note(
                         "skipped",
                         "integrators, samplers and filters: the job or the options of a render decide these",
@@ -391,7 +396,7 @@ impl<'a> Reader<'a> {
                     "more than {MAX_SIZE} vertices, triangles and rows of spectra in all"
                 )));
             }
-            // Equal shapes of our own files share their mesh as they did.
+            // Equal shapes of our own files share their mesh, as in the original scene.
             let mesh = match ours {
                 Some(_) => {
                     let key = parts.iter().map(|p| self.identity(p)).collect();
@@ -409,7 +414,7 @@ impl<'a> Reader<'a> {
         Ok((objects, labels))
     }
 
-    /// What makes two shapes of our own files the same mesh: file and material.
+    /// Returns the key by which shapes of our own files have the same mesh: file and material.
     fn identity(&self, node: &Node) -> String {
         let file = node.text("filename").ok().flatten().unwrap_or_default();
         let material = node.children.iter().find_map(|(_, c)| match c {
@@ -419,7 +424,7 @@ impl<'a> Reader<'a> {
         format!("{file}\n{}", material.unwrap_or_default())
     }
 
-    /// Index into our extras of a shape `object<k>` or `object<k>.<part>`.
+    /// Returns the index into our extras of a shape `object<k>` or `object<k>.<part>`.
     fn our_object(&self, node: &Node) -> Option<usize> {
         let objects = &self.extras.as_ref()?.objects;
         let number = node.id.strip_prefix("object")?.split('.').next()?;
@@ -431,7 +436,7 @@ impl<'a> Reader<'a> {
         same && a.transform("to_world").ok() == b.transform("to_world").ok()
     }
 
-    /// One mesh of a shape, or of the parts that an object of ours was written as.
+    /// Returns one mesh of a shape, or of the parts as which an object of ours was written.
     fn mesh(
         &mut self,
         parts: &[Rc<Node>],

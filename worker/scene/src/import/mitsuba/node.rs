@@ -1,4 +1,4 @@
-//! The tree that XML and the dictionary have in common: plugins with parameters and children.
+//! The tree to which both XML and the dictionary are parsed: plugins with parameters and children.
 
 use std::{collections::BTreeMap, rc::Rc};
 
@@ -33,23 +33,23 @@ pub(super) struct Node {
     pub(super) tag: String,
     /// The plugin's name.
     pub(super) kind: String,
-    /// Empty without one.
+    /// The id; empty without one.
     pub(super) id: String,
-    /// Where it stands, for errors.
+    /// The position in the file, for errors.
     pub(super) at: String,
-    /// Its own XML text; empty from a dictionary.
+    /// The XML text; empty from a dictionary.
     pub(super) text: String,
     pub(super) parameters: BTreeMap<String, Value>,
-    /// Where each parameter stands, for errors.
+    /// The position of each parameter, for errors.
     pub(super) places: BTreeMap<String, String>,
-    /// Tags of the elements in it that are skipped.
+    /// The tags of its skipped elements.
     pub(super) skipped: Vec<String>,
-    /// (parameter name or empty, child), in order.
+    /// The children in order: (parameter name or empty, child).
     pub(super) children: Vec<(String, Child)>,
 }
 
 impl Node {
-    /// A message that says where.
+    /// Returns a message with the position.
     pub(super) fn fail(&self, what: impl std::fmt::Display) -> String {
         format!("{}: {what}", self.at)
     }
@@ -101,7 +101,7 @@ impl Node {
     /// Sets a parameter.
     ///
     /// # Errors
-    /// A name that was set before.
+    /// A name that is already set.
     pub(super) fn set(&mut self, name: String, value: Value, place: String) -> Result<(), String> {
         if self.parameters.contains_key(&name) {
             return Err(format!(
@@ -115,12 +115,12 @@ impl Node {
     }
 }
 
-/// Numbers separated by commas or white space.
+/// Parses numbers separated by commas or white space.
 pub(super) fn numbers(text: &str) -> Result<Vec<f64>, String> {
     text.split(|c: char| c == ',' || c.is_ascii_whitespace())
         .filter(|w| !w.is_empty())
         .map(|w| match w.parse::<f64>() {
-            // Everything is single precision in the end.
+            // All values are finally stored in single precision.
             Ok(x) if (x as f32).is_finite() => Ok(x),
             _ => Err(format!("expected a finite number, found {}", quoted(w))),
         })
@@ -134,7 +134,7 @@ fn finite(word: &str) -> Result<f32, String> {
     }
 }
 
-/// `wavelength:value` pairs, separated as [`numbers`].
+/// Parses `wavelength:value` pairs, separated as in [`numbers`].
 pub(super) fn pairs(text: &str) -> Result<Vec<SpectrumPoint>, String> {
     text.split(|c: char| c == ',' || c.is_ascii_whitespace())
         .filter(|w| !w.is_empty())
@@ -145,7 +145,7 @@ pub(super) fn pairs(text: &str) -> Result<Vec<SpectrumPoint>, String> {
         .collect()
 }
 
-/// What is reflected at one wavelength.
+/// Returns the reflectance at one wavelength.
 pub(super) fn point(nm: f32, reflectance: f32) -> SpectrumPoint {
     SpectrumPoint {
         nm,
@@ -154,7 +154,7 @@ pub(super) fn point(nm: f32, reflectance: f32) -> SpectrumPoint {
     }
 }
 
-/// One number for all three, or three.
+/// Returns three numbers, or one number three times.
 pub(super) fn triple(n: &[f64]) -> Result<[f64; 3], String> {
     match *n {
         [x] => Ok([x; 3]),

@@ -1,5 +1,4 @@
-//! Files of Mitsuba before version 2, with the names of today: what Mitsuba itself does when it
-//! reads them.
+//! Converts files of Mitsuba before version 2 to the current names, as Mitsuba itself does.
 
 use crate::import::quoted;
 
@@ -8,10 +7,10 @@ use super::{
     transform::Matrix,
 };
 
-/// True for versions before 2. A file without a version is one of today.
+/// Returns whether a version is before 2. A file without a version is current.
 ///
 /// # Errors
-/// A version that is none.
+/// An invalid version.
 pub(super) fn is_old(version: Option<&str>) -> Result<bool, String> {
     let Some(version) = version else {
         return Ok(false);
@@ -26,7 +25,8 @@ pub(super) fn is_old(version: Option<&str>) -> Result<bool, String> {
     }
 }
 
-/// A name in camelCase as words with underscores: `toWorld` is `to_world`, `intIOR` is `int_ior`.
+/// Converts a name in camelCase to words with underscores: `toWorld` to `to_world`, `intIOR` to
+/// `int_ior`.
 pub(super) fn name(camel: &str) -> String {
     let mut out = String::with_capacity(camel.len() + 4);
     let mut lower = false;
@@ -36,7 +36,7 @@ pub(super) fn name(camel: &str) -> String {
                 out.push('_');
                 out.push(c.to_ascii_lowercase());
             }
-            // A run of capitals is one word.
+            // Consecutive capitals form one word.
             (true, false) if !out.is_empty() => out.push(c.to_ascii_lowercase()),
             _ => out.push(c),
         }
@@ -45,10 +45,10 @@ pub(super) fn name(camel: &str) -> String {
     out
 }
 
-/// Parameters that were renamed, and the four that became a transform.
+/// Renames old parameters, and converts the four that became a transform.
 ///
 /// # Errors
-/// A parameter stated in both ways.
+/// A parameter given in both forms.
 pub(super) fn upgrade(node: &mut Node) -> Result<(), String> {
     if node.kind == "diffuse" {
         rename(node, "diffuse_reflectance", "reflectance")?;

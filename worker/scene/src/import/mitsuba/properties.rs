@@ -1,5 +1,5 @@
-//! Which properties each plugin has. As in Mitsuba, a property that nothing uses is an error: what
-//! a file states must not get lost in silence.
+//! The properties of each plugin. As in Mitsuba, an unused property is an error, so that no
+//! statement of a file is lost unnoticed.
 
 use super::{
     Reader,
@@ -7,19 +7,19 @@ use super::{
 };
 use crate::import::quoted;
 
-/// Names that differ by at most this many letters are taken for one another in hints.
+/// The greatest difference in letters for suggesting a name in hints.
 const NEAR: usize = 3;
-/// Longer names are none of ours.
+/// The greatest length of a compared name.
 const MAX_COMPARED: usize = 64;
 
 /// The properties of a plugin.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Properties {
-    /// Those that are read.
+    /// The properties that are read.
     pub(super) used: &'static [&'static str],
-    /// Those that change neither geometry nor light, which are accepted with a note.
+    /// The properties that change neither geometry nor light, which are accepted with a note.
     pub(super) harmless: &'static [&'static str],
-    /// Tags of the plugins that may stand in it.
+    /// The tags of the allowed child plugins.
     pub(super) children: &'static [&'static str],
 }
 
@@ -84,7 +84,7 @@ pub(super) const ROUGH_CONDUCTOR: Properties = with(
         "distribution",
         "material",
         "specular_reflectance",
-        // How light paths are drawn.
+        // The sampling of light paths.
         "sample_visible",
     ],
     &[],
@@ -104,7 +104,7 @@ pub(super) const PERSPECTIVE: Properties = with(
         "fov_axis",
         "principal_point_offset_x",
         "principal_point_offset_y",
-        // Of a pinhole they change nothing.
+        // For a pinhole, these have no effect.
         "near_clip",
         "far_clip",
         "focus_distance",
@@ -112,7 +112,7 @@ pub(super) const PERSPECTIVE: Properties = with(
     &["shutter_open", "shutter_close"],
     &["film"],
 );
-/// Crop windows are refused by the reader.
+/// The properties of a film. The reader refuses crop windows.
 pub(super) const FILM: Properties = with(
     &[
         "width",
@@ -162,7 +162,7 @@ pub(super) const SPOT: Properties = with(
 );
 
 impl Reader<'_> {
-    /// Refuses what a plugin states and nothing uses.
+    /// Refuses unused properties of a plugin.
     pub(super) fn only(&mut self, node: &Node, known: &Properties) -> Result<(), String> {
         for name in node.parameters.keys() {
             if known.used.contains(&name.as_str()) {
@@ -205,7 +205,7 @@ impl Reader<'_> {
 fn unused(node: &Node, name: &str, known: &Properties) -> String {
     let place = node.places.get(name).map(|p| format!(" ({p})"));
     let words = super::old::name(name);
-    // Comparing takes the product of both lengths.
+    // The time of a comparison is the product of both lengths.
     let short = words.len() <= MAX_COMPARED;
     let all = known.used.iter().chain(known.harmless).filter(|_| short);
     let near = all

@@ -1,4 +1,4 @@
-//! Mitsuba's shapes as meshes in their own frame.
+//! Converts Mitsuba's shapes to meshes in their own frame.
 
 use std::collections::BTreeMap;
 
@@ -9,9 +9,9 @@ use crate::{
 
 use super::{Reader, node::Node, properties as p, transform::Matrix};
 
-/// Facets of a tessellated sphere from pole to pole, and half of those around.
+/// The number of facets of a tessellated sphere from pole to pole, and half of those around it.
 const SPHERE_ROWS: u32 = 48;
-/// Facets of a tessellated disk.
+/// The number of facets of a tessellated disk.
 const DISK_SECTORS: u32 = 96;
 
 /// Geometry without materials.
@@ -23,12 +23,12 @@ pub(super) struct Geometry {
     /// The origin of `positions` in the file's coordinates. A mesh far from its origin is moved
     /// before it is rounded.
     pub(super) origin: [f64; 3],
-    /// Keys and texts of notes.
+    /// The notes, by key.
     notes: BTreeMap<String, String>,
 }
 
 impl Geometry {
-    /// Vertices in the file's coordinates.
+    /// Moves vertices back to the file's coordinates.
     pub(super) fn restore(&mut self) {
         if self.origin != [0.0; 3] {
             let origin = Vec3::from(self.origin.map(|x| x as f32));
@@ -51,7 +51,7 @@ impl Geometry {
         self
     }
 
-    /// Appends this geometry to a mesh, its facets with material `slot`.
+    /// Appends this geometry to a mesh; its facets have material `slot`.
     pub(super) fn append_to(&self, mesh: &mut Mesh, slot: u32, to_uv: &Matrix) {
         let base = mesh.positions.len();
         mesh.positions.extend(&self.positions);
@@ -76,13 +76,13 @@ fn placed(to_uv: &Matrix, [u, v]: [f32; 2]) -> [f32; 2] {
     let (u, v) = (f64::from(u), f64::from(v));
     [0, 1].map(|r| {
         let m = to_uv.0[r];
-        // Mitsuba takes the third column of a 3×3 as the shift, the fourth of a 4×4.
+        // Mitsuba uses the third column of a 3×3 as the shift, and the fourth of a 4×4.
         (m[0] * u + m[1] * v + m[2] + m[3]) as f32
     })
 }
 
 impl Reader<'_> {
-    /// A shape's geometry, and what its own parameters add to `to_world`.
+    /// Returns a shape's geometry, and the transform that its own parameters add to `to_world`.
     pub(super) fn geometry(&mut self, node: &Node) -> Result<(Geometry, Matrix), String> {
         let mut place = Matrix::IDENTITY;
         let geometry = match node.kind.as_str() {
@@ -134,7 +134,7 @@ impl Reader<'_> {
             .text("filename")?
             .ok_or_else(|| node.fail("needs a filename"))?;
         let path = self.named(node, filename)?;
-        // OBJ counts v upwards, PLY as we do.
+        // In OBJ, v points upwards; in PLY, as in our meshes, downwards.
         let obj = node.kind == "obj";
         let flip = node.switch("flip_tex_coords")?.unwrap_or(obj);
         let mut geometry = match self.geometries.get(&path) {
@@ -181,7 +181,7 @@ fn read_ply(bytes: &[u8]) -> Result<Geometry, String> {
 }
 
 fn read_obj(bytes: &[u8]) -> Result<Geometry, String> {
-    // Mitsuba takes the material from the shape, never from the OBJ.
+    // Mitsuba uses the shape's material, never the OBJ's.
     let obj = obj::parse(bytes).map_err(|e| format!("is not readable OBJ: {e}"))?;
     let (positions, origin) = far::local(&obj.positions);
     Ok(Geometry {
@@ -202,7 +202,7 @@ fn rectangle() -> Geometry {
     g
 }
 
-/// The cube from −1 to 1, each face with the whole image.
+/// Returns the cube from −1 to 1, each face with the whole image.
 fn cube() -> Geometry {
     const FACES: [[[f32; 3]; 4]; 6] = [
         [
@@ -242,7 +242,7 @@ fn cube() -> Geometry {
     g
 }
 
-/// The unit disk that faces +z; u is the radius, v the angle.
+/// Returns the unit disk that faces +z; u is the radius, v the angle.
 fn disk() -> Geometry {
     let mut g = Geometry::default();
     for k in 0..=DISK_SECTORS {
@@ -257,8 +257,8 @@ fn disk() -> Geometry {
     g
 }
 
-/// The unit sphere with its poles on z; u is the azimuth, v the polar angle. It is closed: each pole is one place, and where u is
-/// 1 the places are those where it is 0.
+/// Returns the unit sphere with its poles on z; u is the azimuth, v the polar angle. It is closed:
+/// each pole is a single position, and the positions at u = 1 are those at u = 0.
 fn sphere() -> Geometry {
     let (rows, columns) = (SPHERE_ROWS, 2 * SPHERE_ROWS);
     let mut g = Geometry::default();

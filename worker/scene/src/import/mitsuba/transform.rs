@@ -1,4 +1,4 @@
-//! Mitsuba's 4×4 transforms, in f64 until they place something.
+//! Mitsuba's 4×4 transforms, in f64 until an object is placed.
 
 use crate::{Affine, Vec3};
 
@@ -14,7 +14,7 @@ impl Matrix {
         [0.0, 0.0, 0.0, 1.0],
     ]);
 
-    /// `self` after `inner`.
+    /// Returns the map that applies `inner`, and then `self`.
     pub(in crate::import) fn after(&self, inner: &Matrix) -> Matrix {
         if *inner == Self::IDENTITY {
             return *self;
@@ -36,8 +36,8 @@ impl Matrix {
         m
     }
 
-    /// Rotation by `degrees` about an axis (Rodrigues). As in Mitsuba, an axis of another length than 1 is not
-    /// normalised: it shears.
+    /// Returns a rotation by `degrees` about an axis (Rodrigues). As in Mitsuba, the axis is not
+    /// normalised: if its length is not 1, the map shears.
     pub(in crate::import) fn rotation([x, y, z]: [f64; 3], degrees: f64) -> Result<Matrix, String> {
         if [x, y, z] == [0.0; 3] {
             return Err("rotate: the axis has no direction; set x, y or z".into());
@@ -52,7 +52,7 @@ impl Matrix {
         ]))
     }
 
-    /// Places +z along target − origin, with +y towards `up`.
+    /// Returns the pose with +z along target − origin, and +y towards `up`.
     pub(in crate::import) fn look_at(
         origin: [f64; 3],
         target: [f64; 3],
@@ -69,7 +69,7 @@ impl Matrix {
         Ok(m)
     }
 
-    /// 16 numbers by rows, or the 9 of the linear part.
+    /// Parses 16 numbers by rows, or the 9 of the linear part.
     pub(in crate::import) fn from_numbers(n: &[f64]) -> Result<Matrix, String> {
         let mut m = Self::IDENTITY;
         match n.len() {
@@ -91,7 +91,7 @@ impl Matrix {
         Ok(m)
     }
 
-    /// The place of the origin.
+    /// Returns the position of the origin.
     pub(in crate::import) fn origin(&self) -> [f64; 3] {
         [0, 1, 2].map(|r| self.0[r][3])
     }
@@ -107,7 +107,7 @@ impl Matrix {
         }
     }
 
-    /// Column `k` of the linear part, of unit length.
+    /// Returns column `k` of the linear part, of unit length.
     pub(in crate::import) fn axis(&self, k: usize) -> Option<Vec3> {
         unit([self.0[0][k], self.0[1][k], self.0[2][k]]).map(|v| Vec3::from(v.map(|x| x as f32)))
     }

@@ -1,4 +1,4 @@
-//! Mitsuba's sensor as the camera, and its narrow emitters as the laser's beams.
+//! Converts Mitsuba's sensor to the camera, and its narrow emitters to the laser's beams.
 
 use crate::{
     Beam, Camera, Intrinsics, Laser, Vec3,
@@ -8,9 +8,9 @@ use crate::{
 
 use super::{Reader, node::Node, properties};
 
-/// Widest full angle of an emitter that counts as a beam, degrees.
+/// The widest full angle of an emitter that counts as a beam, degrees.
 const BEAM_DEG: f64 = 2.0;
-/// Mitsuba's film where none is stated.
+/// Mitsuba's default film size.
 const FILM: [f64; 2] = [768.0, 576.0];
 
 impl Reader<'_> {
@@ -89,7 +89,7 @@ impl Reader<'_> {
         })
     }
 
-    /// Checks a film's properties, and notes a gate that it states: gates belong to renders.
+    /// Checks a film's properties. Adds a note for a gate, because gates belong to renders.
     fn film(&mut self, node: &Node) -> Result<(), String> {
         if node.kind == "specfilm" {
             self.note("film", "its bands are not used: renders state wavelengths");
@@ -101,7 +101,7 @@ impl Reader<'_> {
         if !stated && !node.kind.starts_with("transient") && !node.kind.starts_with("phasor") {
             return Ok(());
         }
-        // Values that are not stated are mitransient's.
+        // The default values are mitransient's.
         let bins = node.number(gated[0])?.unwrap_or(2048.0);
         let width = node.number(gated[1])?.unwrap_or(0.003);
         let start = node.number(gated[2])?.unwrap_or(0.0);
@@ -122,7 +122,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// The laser of the emitters that are beams; `None` without any.
+    /// Returns the laser from the emitters that are beams, or `None` without any.
     pub(super) fn laser(
         &mut self,
         emitters: &[std::rc::Rc<Node>],

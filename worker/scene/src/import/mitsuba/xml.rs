@@ -1,4 +1,4 @@
-//! Mitsuba's XML as a tree: defaults, ids and transforms resolved.
+//! Parses Mitsuba's XML to a tree, and resolves defaults, ids and transforms.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -15,19 +15,19 @@ use super::{
     transform::Matrix,
 };
 
-/// Deepest nesting of elements.
+/// The deepest nesting of elements.
 const MAX_DEPTH: usize = 32;
-/// Most elements of a file.
+/// The greatest number of elements of a file.
 const MAX_NODES: u32 = 4_000_000;
-/// Longest attribute with its parameters replaced, bytes.
+/// The greatest length of an attribute with its parameters replaced, bytes.
 const MAX_VALUE: usize = 1 << 16;
-/// Most `<default>` parameters of a file.
+/// The greatest number of `<default>` parameters of a file.
 const MAX_DEFAULTS: usize = 1024;
-/// Elements that are plugins.
+/// The elements that are plugins.
 const PLUGINS: [&str; 7] = [
     "scene", "shape", "bsdf", "sensor", "emitter", "texture", "film",
 ];
-/// Plugins that say how to render, which is the job's business.
+/// Plugins with settings for rendering, which belong to the job.
 const SKIPPED: [&str; 6] = [
     "integrator",
     "sampler",
@@ -37,7 +37,7 @@ const SKIPPED: [&str; 6] = [
     "phase",
 ];
 
-/// The scene's node, and the texts of its comments that start with `picofarm`.
+/// Returns the scene's node, and the text of its comment that starts with `picofarm`.
 pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
     let options = ParsingOptions {
         allow_dtd: false,
@@ -45,7 +45,7 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
         ..ParsingOptions::default()
     };
     let document = Document::parse_with_options(text, options)
-        // What the parser says quotes the file.
+        // The parser's message would quote the file.
         .map_err(|e| {
             format!(
                 "is not readable XML: line {}, column {}",
@@ -76,10 +76,10 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
 struct Parser<'a> {
     text: &'a str,
     line_ends: Vec<usize>,
-    /// The file is of a version before 2, with names in camelCase.
+    /// Whether the file's version is before 2, with names in camelCase.
     old: bool,
     ids: BTreeSet<String>,
-    /// Longest name first when replaced.
+    /// The parameters; longer names are replaced first.
     defaults: BTreeMap<String, String>,
 }
 
@@ -96,7 +96,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// Refuses attributes that are not among `known`.
+    /// Refuses attributes outside `known`.
     fn only(&self, e: Element<'a>, known: &[&str]) -> Result<(), String> {
         let other = e.attributes().find(|a| !known.contains(&a.name()));
         match other {
@@ -110,7 +110,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// An attribute with `$name` replaced.
+    /// Returns an attribute with `$name` replaced.
     fn attribute(&self, e: Element<'a>, name: &str) -> Result<Option<String>, String> {
         let Some(raw) = e.attribute(name) else {
             return Ok(None);
@@ -242,7 +242,7 @@ impl<'a> Parser<'a> {
             );
         }
         match tag {
-            // 0.6 had an intent of colours.
+            // Version 0.6 had an intent of colours.
             "rgb" | "spectrum" if self.old => self.only(e, &["name", "value", "intent"])?,
             _ => self.only(e, &["name", "value"])?,
         }
@@ -263,7 +263,7 @@ impl<'a> Parser<'a> {
         })
     }
 
-    /// `value` with 1 or 3 numbers, or any of `x`, `y`, `z`.
+    /// Parses `value` with 1 or 3 numbers, or any of `x`, `y`, `z`.
     fn vector(&self, e: Element<'a>, missing: f64) -> Result<[f64; 3], String> {
         if let Some(value) = self.attribute(e, "value")? {
             return triple(&numbers(&value)?);
@@ -317,7 +317,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// Attributes of a step of a transform.
+/// Returns the attributes of a step of a transform.
 fn attributes_of(step: &str) -> &'static [&'static str] {
     match step {
         "rotate" => &["value", "x", "y", "z", "angle"],
@@ -327,7 +327,7 @@ fn attributes_of(step: &str) -> &'static [&'static str] {
     }
 }
 
-/// One or three numbers, or #rrggbb (sRGB).
+/// Parses one or three numbers, or #rrggbb (sRGB).
 fn colour(text: &str) -> Result<[f32; 3], String> {
     if let Some(hex) = text.trim().strip_prefix('#') {
         let byte = |k: usize| {

@@ -2,7 +2,7 @@
 
 use super::header::{Element, Encoding, Number};
 
-/// The numbers of one row, and where each property's start.
+/// The numbers of one row, and the start of each property.
 #[derive(Default)]
 pub(super) struct Row {
     numbers: Vec<f64>,
@@ -19,7 +19,7 @@ impl Row {
     }
 }
 
-/// What is left of the file after the header, or after the elements that are read.
+/// The rest of the file after the header, or after the elements read so far.
 pub(super) struct Body<'a> {
     encoding: Encoding,
     rest: &'a [u8],
@@ -54,7 +54,7 @@ impl<'a> Body<'a> {
         Ok(())
     }
 
-    /// Bytes after the last row that are no white space.
+    /// Returns the number of bytes after the last row, excluding white space.
     pub(super) fn left_over(&self) -> Result<usize, String> {
         let left = self.rest.trim_ascii().len();
         if left > 0 && self.encoding == Encoding::Ascii {
@@ -66,7 +66,7 @@ impl<'a> Body<'a> {
         Ok(left)
     }
 
-    /// A row in text: a line with exactly the numbers that the header states.
+    /// Reads a row in text: a line with exactly the numbers that the header declares.
     fn line(&mut self, element: &Element, row: &mut Row) -> Result<(), String> {
         let line = loop {
             if self.rest.is_empty() {
@@ -97,7 +97,7 @@ impl<'a> Body<'a> {
                 None => 1.0,
                 Some(length) => next(length)?,
             };
-            // Each number of a list takes up a byte and a space at least.
+            // Each number of a list takes at least a byte and a space.
             if !(0.0..=line.len() as f64).contains(&count) {
                 return Err(format!("list {name} of {count} does not fit its line"));
             }
@@ -138,7 +138,7 @@ impl<'a> Body<'a> {
         Ok(())
     }
 
-    /// Fewest bytes that a number takes up.
+    /// Returns the least number of bytes that a number takes.
     fn least(&self, number: Number) -> usize {
         match self.encoding {
             Encoding::Ascii => 1,
@@ -146,7 +146,7 @@ impl<'a> Body<'a> {
         }
     }
 
-    /// Refuses counts that the rest of the file cannot hold, before anything is allocated for them.
+    /// Refuses counts that exceed the rest of the file, before memory is allocated for them.
     fn fits(&self, element: &Element) -> Result<(), String> {
         let one: usize = element
             .properties
@@ -189,7 +189,8 @@ impl<'a> Body<'a> {
 
 const SHORT: &str = "the file is cut short";
 
-/// A value of a number's type: whole numbers have no fraction and lie in the type's range.
+/// Checks that a value has a number's type: whole numbers have no fraction and are in the type's
+/// range.
 fn in_range(value: f64, number: Number) -> Result<f64, String> {
     match number.range() {
         Some((lo, hi)) if value.fract() != 0.0 || !(lo..=hi).contains(&value) => Err(format!(

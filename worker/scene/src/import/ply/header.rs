@@ -1,9 +1,9 @@
-//! The header of a PLY file: its format, and what each element consists of.
+//! The header of a PLY file: its format, and the properties of each element.
 
-/// Longest header read, bytes.
+/// The greatest length of a header, bytes.
 const MAX_HEADER: usize = 1 << 16;
 
-/// How numbers are written after the header.
+/// The encoding of numbers after the header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Encoding {
     Ascii,
@@ -11,7 +11,7 @@ pub(super) enum Encoding {
     Big,
 }
 
-/// Type of a number.
+/// The type of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Number {
     I8,
@@ -34,7 +34,7 @@ impl Number {
         }
     }
 
-    /// Least and largest value of a whole-number type; `None` for the others.
+    /// Returns the least and largest value of a whole-number type, or `None` for the others.
     pub(super) fn range(self) -> Option<(f64, f64)> {
         Some(match self {
             Self::I8 => (f64::from(i8::MIN), f64::from(i8::MAX)),
@@ -78,7 +78,7 @@ pub(super) struct Element {
 }
 
 impl Element {
-    /// Index of the property with one of these names.
+    /// Returns the index of the property with one of these names.
     pub(super) fn find(&self, names: &[&str]) -> Option<usize> {
         self.properties
             .iter()
@@ -86,10 +86,10 @@ impl Element {
     }
 }
 
-/// Format, elements, and the offset at which the body starts.
+/// Parses format, elements, and the offset at which the body starts.
 pub(super) fn parse(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize), String> {
     let (mut at, mut encoding, mut elements) = (0, None, Vec::<Element>::new());
-    // The first line shows how lines end: files of old Macs have a carriage return alone.
+    // The first line shows the line ending: files of old Macs have a carriage return alone.
     let cr = bytes.starts_with(b"ply\r") && bytes.get(4) != Some(&b'\n');
     let ending = if cr { b'\r' } else { b'\n' };
     for number in 1.. {

@@ -1,5 +1,5 @@
-//! PLY meshes: ascii and binary of either byte order, faces of any number of corners, texture
-//! coordinates; colours as their mean.
+//! PLY meshes: ascii and binary in either byte order, faces with any number of corners, texture
+//! coordinates, and colours as their mean.
 
 mod body;
 mod header;
@@ -14,45 +14,47 @@ use super::{ImportOptions, far, format_error, polygon::Triangulation};
 use body::{Body, Row};
 use header::{Element, Number};
 
-/// Linear albedo of a mesh without colours.
+/// The linear albedo of a mesh without colours.
 const GREY: f32 = 0.5;
-/// Image size and field of view of a camera that frames a mesh.
+/// The image size and field of view of a camera that frames a mesh.
 const FRAME_PIXELS: u32 = 256;
 const FRAME_FOV_DEG: f32 = 60.0;
 
-/// A mesh that shows less than this share of its area to a camera is edge-on.
+/// The share of its area below which a mesh is edge-on to a camera.
 const EDGE_ON: f64 = 1e-3;
-/// Elements with geometry that is not read, which a mesh must not lose in silence.
+/// Elements with geometry that cannot be read. They are refused, so that no geometry is lost
+/// unnoticed.
 const UNREAD_SURFACES: [&str; 2] = ["tristrips", "range_grid"];
 
 /// The content of a PLY file.
 #[derive(Debug, Default)]
 pub(super) struct Ply {
-    /// As the file states them.
+    /// The positions as in the file.
     pub(super) positions: Vec<[f64; 3]>,
-    /// One a vertex, or none.
+    /// Texture coordinates, one a vertex, or none.
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) triangles: Vec<[u32; 3]>,
-    /// Mean linear colour of the vertices, or else of the faces.
+    /// The mean linear colour of the vertices, or else of the faces.
     pub(super) colour: Option<[f32; 3]>,
-    /// Keys and texts of notes on what was changed or left out.
+    /// The notes on changes and omissions, by key.
     pub(super) notes: BTreeMap<String, String>,
 }
 
-/// Faces as the file states them.
+/// The faces as in the file.
 #[derive(Default)]
 struct Polygons {
     corners: Vec<u32>,
-    /// Number of corners of each.
+    /// The number of corners of each face.
     lengths: Vec<usize>,
 }
 
-/// True for the first bytes of a PLY file.
+/// Returns whether a file starts like PLY.
 pub(super) fn is_ply(bytes: &[u8]) -> bool {
     bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
 }
 
-/// A PLY file as a scene of one object: it has no camera and no laser, so `options` must help.
+/// Reads a PLY file as a scene of one object. It has no camera and no laser, so `options` must
+/// define them.
 pub(super) fn read(
     path: &Path,
     bytes: &[u8],
@@ -124,7 +126,7 @@ pub(super) fn read(
     })
 }
 
-/// True for a mesh that a camera on its +z side sees as a line.
+/// Returns whether a camera on the mesh's +z side sees it as a line.
 fn is_edge_on(mesh: &Mesh) -> bool {
     let (mut seen, mut whole) = (0.0, 0.0);
     for t in &mesh.triangles {
@@ -136,7 +138,7 @@ fn is_edge_on(mesh: &Mesh) -> bool {
     seen <= EDGE_ON * whole
 }
 
-/// A camera in front (towards +z) of a mesh that sees all of it.
+/// Returns a camera in front (towards +z) of a mesh that sees all of it.
 fn frame(mesh: &Mesh) -> Option<Camera> {
     let (lo, hi) = mesh.bounds()?;
     let (centre, radius) = ((lo + hi) * 0.5, (hi - lo).length() * 0.5);
@@ -153,8 +155,8 @@ fn frame(mesh: &Mesh) -> Option<Camera> {
     Some(camera)
 }
 
-/// Reads a whole file; the message names the element and quotes nothing: the file may be something
-/// else.
+/// Parses a whole file. The message names the element and quotes nothing, because the file may have
+/// another format.
 pub(super) fn parse(bytes: &[u8]) -> Result<Ply, String> {
     if !is_ply(bytes) {
         return Err("is not PLY: its first line is not `ply`".into());
@@ -250,8 +252,8 @@ impl Ply {
         Ok(())
     }
 
-    /// Vertices that no face has are no part of the surface, and must not decide where a camera
-    /// stands.
+    /// Removes vertices without a face, which are not part of the surface and must not influence
+    /// the position of a camera.
     fn drop_stray_vertices(&mut self) {
         let mut places = vec![u32::MAX; self.positions.len()];
         for v in self.triangles.iter().flatten() {
@@ -341,7 +343,7 @@ fn read_faces(
     })
 }
 
-/// Where an element keeps its colour: bytes are sRGB, floats linear.
+/// The properties of an element that contain its colour: bytes are sRGB, floats linear.
 struct Channels(Option<([usize; 3], bool)>);
 
 impl Channels {
