@@ -2,7 +2,7 @@
 //! processes, and even if some arrive, leave or die. Here each process is a thread with its own
 //! connections; the tests of the whole farm kill real processes.
 
-#[path = "../../model/tests/common/mod.rs"]
+#[path = "../../model/tests/it/common/mod.rs"]
 #[expect(dead_code, reason = "other tests need more of it")]
 mod common;
 

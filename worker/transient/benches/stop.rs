@@ -7,7 +7,7 @@
 //! to an error, and prints what they cost. Without arguments: 20 rooms at 256×256 with Sweet Home 3D's
 //! furniture to 0.1.
 
-#[path = "../tests/common/mod.rs"]
+#[path = "../tests/it/common/mod.rs"]
 #[allow(unused, reason = "a bench uses its own part")]
 mod common;
 #[path = "stop/reference.rs"]

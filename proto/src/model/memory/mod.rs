@@ -2,7 +2,7 @@
 //! arithmetic is plain. The coordinator places tasks by the estimate, plans show it, and workers
 //! refuse tasks by it before they allocate anything.
 //!
-//! The constants are measured. `tests/tests/memory.rs` compares the estimates with the largest
+//! The constants are measured. `tests/tests/it/memory.rs` compares the estimates with the largest
 //! memory of processes that run each kind of task. An estimate is at most a factor of two above,
 //! and at most a quarter below.
 

@@ -1,0 +1,5 @@
+//! Tests of one flash taken apart, in one executable because each one links the whole crate.
+
+mod bad_input;
+mod common;
+mod laws;

@@ -1,0 +1,12 @@
+//! Tests of networks and training, in one executable because each one links the whole crate.
+
+mod answers;
+mod architectures;
+mod common;
+mod gpu;
+mod operations;
+mod optimiser;
+mod precision;
+mod report;
+mod segments;
+mod training;
