@@ -116,7 +116,7 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
             .unwrap_err()
             .words()
             .to_owned();
-        assert!(why.words().contains("reprocess"), "{why}");
+        assert!(why.contains("reprocess"), "{why}");
         able(&mut world, true);
         world.end().await;
     });
