@@ -1,5 +1,5 @@
-//! Scattering: Lambertian, rough conductor (Beckmann or GGX; Walter et al., EGSR 2007) and the mix of
-//! both, for two directions on the same side of a facet.
+//! Scattering for two directions on the same side of a facet: Lambertian, rough conductor (Beckmann
+//! or GGX; Walter et al., EGSR 2007) and a mix of both.
 
 mod beckmann;
 
@@ -12,18 +12,19 @@ use crate::{
     rng::Rng,
 };
 
-/// How a surface scatters: the kinds that the renderer knows. A new kind is a variant here, its density, pdf and draw in this
-/// file, and a variant of [`Bsdf`]; the rest of the renderer asks a [`Surface`] what it can do and knows no kind.
+/// The scattering models of the renderer. A new model is a variant here, its density, pdf and
+/// sampling in this file, and a variant of [`Bsdf`]. The rest of the renderer queries the
+/// properties of a [`Surface`] and does not match on models.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     /// ρ/π.
     Lambertian,
     /// A rough conductor.
     Conductor,
-    /// A Lambertian beside a rough conductor.
+    /// A weighted sum of a Lambertian and a rough conductor.
     Mixed,
-    /// Any number of both, which the world knows. Nothing scatters by it before it is settled on one of them: on a conductor, or on
-    /// a mix of one with all Lambertians.
+    /// Any number of both, stored in the world. It never scatters itself: a path first chooses one
+    /// part, which is a conductor or a mix of a conductor with all Lambertians.
     Several,
 }
 
@@ -32,8 +33,9 @@ const TWO_SIDED: u8 = 1;
 const SPECULAR: u8 = 2;
 const GGX: u8 = 4;
 
-/// Roughness from which pixels share a conductor's vertices. There its lobe is wide enough to be weighed pixel by pixel for
-/// light that was found for one of them; beneath, that costs more than it brings (measured at 0.12 and 0.2).
+/// Roughness from which pixels share a conductor's vertices. From there on, its lobe is wide enough
+/// to evaluate light sampled for one pixel at the others; below it, sharing costs more than it
+/// gains (measured at 0.12 and 0.2).
 const SHARED_ALPHA: f32 = 0.15;
 
 /// A material's scattering, ready for use. Sixteen bytes: every hit carries one.
@@ -41,15 +43,17 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Which ratios it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = ones. Of several
-    /// parts: which they are.
+    /// Row of its spectral ratios: the Lambertian part's, or a pure conductor's. The ratios of a
+    /// mix's conductor are in the next row. 0 = all ratios are 1. For several parts: the index of
+    /// the list of parts.
     spectrum_row: u16,
-    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. Several parts: the factor of all. 0 = black.
+    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share.
+    /// Several parts: a factor on all of them. 0 = black.
     strength: f32,
-    /// Roughness of a conductor; of others 0. Of several parts that of the roughest near-mirror, or else of the smoothest conductor,
-    /// or else 1.
+    /// Roughness of a conductor; 0 for Lambertians. For several parts it is that of the roughest
+    /// near-mirror; without a near-mirror, that of the smoothest conductor; without a conductor, 1.
     alpha: f32,
-    /// Lambertian part ρ/π of a mix times its share; of others 0.
+    /// Lambertian part ρ/π of a mix times its share; 0 for other surfaces.
     base: f32,
 }
 
@@ -94,7 +98,7 @@ impl Surface {
             } => {
                 let strength = weight * specular_reflectance;
                 let base = (1.0 - weight) * reflectance / PI;
-                // A mix has two parts that scatter; with one it is pure.
+                // A mix has two parts that scatter; with one such part the surface is pure.
                 if base == 0.0 {
                     of(Kind::Conductor, strength, alpha, 0.0)
                 } else if strength == 0.0 {
@@ -103,16 +107,18 @@ impl Surface {
                     of(Kind::Mixed, strength, alpha, base)
                 }
             }
-            // Made of its parts by `several`.
+            // `several` builds it from its parts.
             Bsdf::Several { .. } => of(Kind::Several, 0.0, 1.0, 0.0),
-            // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see `by_glass`).
+            // Thin glass is not a surface (see `glass`), and bodies of glass do not scatter (see
+            // `by_glass`).
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
                 of(Kind::Lambertian, 0.0, 0.0, 0.0)
             }
         }
     }
 
-    /// A material of several parts, given as surfaces times their shares, which are found by `index`.
+    /// Returns the surface of a material of several parts, given as surfaces times their shares.
+    /// `index` is the index of the list of parts.
     pub fn several(m: &Material, parts: &[Surface], index: u16) -> Self {
         let lit = || parts.iter().filter(|p| !p.is_black() && !p.diffuse());
         let mirrors = lit().filter(|p| !p.is_rough()).map(Surface::alpha);
@@ -128,7 +134,8 @@ impl Surface {
         }
     }
 
-    /// A mix of this conductor and a Lambertian `base` (ρ/π times its share), with the ratios of a row and of the one behind it.
+    /// Returns a mix of this conductor and a Lambertian `base` (ρ/π times its share), with the
+    /// ratios of a row and of the row after it.
     pub fn mixed_with(self, base: f32, spectrum_row: u16) -> Self {
         Self {
             kind: Kind::Mixed,
@@ -138,8 +145,8 @@ impl Surface {
         }
     }
 
-    /// A mix to draw directions by at a vertex that pixels share: as this surface scatters, half of it or more Lambertian, of
-    /// albedo 1.
+    /// Returns a mix for sampling directions at a vertex that pixels share: it scatters like this
+    /// surface, but at least half of it is Lambertian and its albedo is 1.
     pub fn guide(self) -> Self {
         let base = self.base.max(0.5 * self.albedo() / PI);
         let all = 1.0 / (self.strength + base * PI);
@@ -152,13 +159,14 @@ impl Surface {
         }
     }
 
-    /// True for several parts; which of them and times what.
+    /// Returns the index of the list of parts and the factor on them, if the surface has several
+    /// parts.
     #[inline(always)]
     pub fn parts_of_several(&self) -> Option<(usize, f32)> {
         (self.kind == Kind::Several).then_some((usize::from(self.spectrum_row), self.strength))
     }
 
-    /// Share of light that it sends on, as far as masking lets it.
+    /// Returns the share of light that the surface scatters, before masking.
     #[inline]
     pub fn albedo(&self) -> f32 {
         match self.kind {
@@ -167,7 +175,8 @@ impl Surface {
         }
     }
 
-    /// The same surface with the ratios of a row and the one behind it: the Lambertian part's, and the conductor's.
+    /// Returns the same surface with the ratios of two rows: the Lambertian part's in `row` and the
+    /// conductor's in the next one.
     pub fn with_spectrum(self, row: u16) -> Self {
         let spectrum_row = match self.kind {
             Kind::Conductor => row + 1,
@@ -179,36 +188,36 @@ impl Surface {
         }
     }
 
-    /// Which ratios it has; 0 = ones.
+    /// Returns the row of its ratios; 0 = all ratios are 1.
     #[inline(always)]
     pub fn spectrum_row(&self) -> u16 {
         self.spectrum_row
     }
 
-    /// Which ratios the conductor of a mix has.
+    /// Returns the row of the ratios of a mix's conductor.
     #[inline(always)]
     fn gloss_spectrum(&self) -> u16 {
         self.spectrum_row + u16::from(self.spectrum_row != 0)
     }
 
-    /// Scatters from both sides.
+    /// Returns whether the surface scatters from both sides.
     #[inline(always)]
     pub fn two_sided(&self) -> bool {
         self.flags & TWO_SIDED != 0
     }
 
-    /// Counts as a mirror (specular mask).
+    /// Returns whether the surface counts as a mirror (specular mask).
     #[inline(always)]
     pub fn specular(&self) -> bool {
         self.flags & SPECULAR != 0
     }
 
-    /// The same surface, scattering nothing.
+    /// Returns the same surface without any scattering.
     pub fn black(self) -> Self {
         self.scaled(0.0)
     }
 
-    /// The same surface, scattering `factor` times as much.
+    /// Returns the same surface with its scattering multiplied by `factor`.
     #[inline(always)]
     pub fn scaled(self, factor: f32) -> Self {
         let scaled = Self {
@@ -223,13 +232,14 @@ impl Surface {
         }
     }
 
-    /// Pixels may share its vertices: a Lambertian, or a conductor that is rough enough.
+    /// Returns whether pixels may share its vertices: for a Lambertian, or a conductor that is
+    /// rough enough.
     #[inline(always)]
     pub fn is_shared(&self) -> bool {
         self.diffuse() || self.alpha >= SHARED_ALPHA
     }
 
-    /// A Lambertian of albedo 1 in its place.
+    /// Returns a Lambertian of albedo 1 with the same sides.
     #[inline]
     pub fn white(self) -> Self {
         Self {
@@ -242,26 +252,27 @@ impl Surface {
         }
     }
 
-    /// Scatters nothing.
+    /// Returns whether the surface scatters nothing.
     #[inline(always)]
     pub fn is_black(&self) -> bool {
         self.strength == 0.0
     }
 
-    /// True for Lambertian surfaces.
+    /// Returns whether the surface is Lambertian.
     #[inline(always)]
     pub fn diffuse(&self) -> bool {
         matches!(self.kind, Kind::Lambertian)
     }
 
-    /// True for a mix of two parts, of which [`Surface::lobe`] chooses.
+    /// Returns whether the surface is a mix of two parts; [`Surface::lobe`] chooses one of them.
     #[inline(always)]
     pub fn is_mixed(&self) -> bool {
         matches!(self.kind, Kind::Mixed)
     }
 
-    /// True for a mix and for several parts of which a path must settle on one: all but a mix whose vertices pixels share. Its
-    /// lobes are both wide, so that a vertex can scatter by both.
+    /// Returns whether a path must choose one of the surface's parts. This is true for several
+    /// parts, and for a mix unless pixels share its vertices: the lobes of a shared mix are both
+    /// wide, so a vertex can scatter by both.
     #[inline(always)]
     pub fn is_open(&self) -> bool {
         match self.kind {
@@ -271,38 +282,40 @@ impl Surface {
         }
     }
 
-    /// BRDF of a Lambertian surface, ρ/π.
+    /// Returns the BRDF of a Lambertian surface, ρ/π.
     #[inline(always)]
     pub fn lambertian(&self) -> f32 {
         self.strength
     }
 
-    /// Roughness α of its conductor, 0 without one.
+    /// Returns the roughness α of its conductor, 0 without one.
     #[inline(always)]
     pub fn alpha(&self) -> f32 {
         self.alpha
     }
 
-    /// Its conductor, if it has one, is GGX.
+    /// Returns whether its conductor, if it has one, is GGX.
     #[inline(always)]
     pub fn ggx(&self) -> bool {
         self.flags & GGX != 0
     }
 
-    /// Has a conductor that is smooth enough for a mirror, alone or in a mix.
+    /// Returns whether the surface has a conductor, alone or in a mix, that is smooth enough for a
+    /// mirror.
     #[inline(always)]
     pub fn has_mirror(&self) -> bool {
         !self.diffuse() && !self.is_rough() && !self.is_black()
     }
 
-    /// Has a conductor that is too rough for a mirror.
+    /// Returns whether the surface has a conductor that is too rough for a mirror.
     #[inline(always)]
     pub fn is_rough(&self) -> bool {
         self.alpha > Material::SPECULAR_ALPHA
     }
 
-    /// One part of a mix, chosen by `u` in [0, 1) in proportion to the parts' albedos and divided by the
-    /// chance of that choice, with `specular` as for the part alone. Pure surfaces are their own part.
+    /// Returns one part of a mix, chosen by `u` in [0, 1) in proportion to the parts' albedos and
+    /// divided by the probability of that choice, with `specular` as for the part alone. A pure
+    /// surface returns itself.
     #[inline]
     pub fn lobe(&self, u: f32) -> Surface {
         if !self.is_mixed() {
@@ -330,7 +343,7 @@ impl Surface {
         }
     }
 
-    /// The conductor alone, as it is in a mix. Pure surfaces stay what they are.
+    /// Returns the conductor of a mix, with its share. A pure surface returns itself.
     #[inline(always)]
     pub fn gloss(self) -> Self {
         match self.kind {
@@ -344,13 +357,13 @@ impl Surface {
         }
     }
 
-    /// Chance with which [`Surface::sample`] draws from the conductor of a mix.
+    /// Returns the probability that [`Surface::sample`] draws from the conductor of a mix.
     #[inline(always)]
     fn share(&self) -> f32 {
         self.strength / (self.strength + self.base * PI)
     }
 
-    /// f · cos(n, o) for unit directions `i` and `o`, both leaving the surface.
+    /// Returns f · cos(n, o) for unit directions `i` and `o`, both leaving the surface.
     #[inline(always)]
     pub fn scatter(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
         let (ci, co) = (n.dot(i), n.dot(o));
@@ -363,7 +376,8 @@ impl Surface {
         self.scatter_rough(n, i, o, (ci, co))
     }
 
-    /// The same of what is not Lambertian, with the cosines of both.
+    /// Like [`Surface::scatter`], for surfaces that are not Lambertian, given the cosines of both
+    /// directions.
     #[inline]
     fn scatter_rough(&self, n: Vec3, i: Vec3, o: Vec3, (ci, co): (f32, f32)) -> f32 {
         let d = self.density(n, i + o);
@@ -373,7 +387,8 @@ impl Surface {
         self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci) + self.base * co
     }
 
-    /// How it scatters light from a direction with cosine `c`, for many directions side by side; nothing from beneath.
+    /// Returns the lobe for light from a direction with cosine `c`, for evaluation in many
+    /// directions at once; black for directions below the surface.
     #[inline]
     pub fn lobe_from(&self, c: f32) -> Lobe {
         let lit = c > 0.0 && !self.is_black();
@@ -405,14 +420,15 @@ impl Surface {
         }
     }
 
-    /// The BRDF of a surface that is not Lambertian, from a direction with cosine `c` to another, is the first number here plus the
-    /// second times [`Surface::leaving`] and [`Surface::lobe_ggx`] or [`Surface::lobe_beckmann`] of the other.
+    /// Returns two numbers (a, b) for the BRDF of a non-Lambertian surface, from a
+    /// direction with cosine `c` to another. The BRDF is a + b times [`Surface::leaving`] and
+    /// [`Surface::lobe_ggx`] or [`Surface::lobe_beckmann`] of the other direction.
     pub fn arriving(&self, c: f32) -> (f32, f32) {
         let a2 = self.alpha * self.alpha;
         (self.base, self.strength * self.leaving(c) / (4.0 * PI * a2))
     }
 
-    /// G₁ over the cosine `c`, above the surface; see [`Surface::arriving`].
+    /// Returns G₁ over the cosine `c`, above the surface; see [`Surface::arriving`].
     pub fn leaving(&self, c: f32) -> f32 {
         let leaving = match self.ggx() {
             true => 2.0 / self.edge(c),
@@ -421,8 +437,8 @@ impl Surface {
         if leaving.is_finite() { leaving } else { 0.0 }
     }
 
-    /// G₁ over the cosine `c` by which facets are drawn that a direction sees: Smith's of either distribution, to the last digits, as
-    /// draws follow it.
+    /// Returns G₁ over the cosine `c` for the sampling of visible facets. It is Smith's for both
+    /// distributions, to the last digits, because the samples follow it.
     #[inline]
     fn seen(&self, c: f32) -> f32 {
         match self.ggx() {
@@ -431,8 +447,9 @@ impl Surface {
         }
     }
 
-    /// See [`Surface::arriving`]: D·π·α² of GGX by the squares of the sum of both directions and of its part along the normal. For
-    /// lobes wide enough that their difference does not cancel.
+    /// Returns D·π·α² of GGX from the square of the sum of both directions and the square of its
+    /// part along the normal; see [`Surface::arriving`]. It is valid for lobes wide enough that
+    /// their difference does not cancel.
     #[inline(always)]
     pub fn lobe_ggx(&self, square: f32, along2: f32) -> f32 {
         let (across2, a2) = ((square - along2).max(0.0), self.alpha * self.alpha);
@@ -440,7 +457,7 @@ impl Surface {
         t * t
     }
 
-    /// The same of Beckmann.
+    /// Like [`Surface::lobe_ggx`], for Beckmann.
     #[inline(always)]
     pub fn lobe_beckmann(&self, square: f32, along2: f32) -> f32 {
         let across2 = (square - along2).max(0.0);
@@ -450,7 +467,7 @@ impl Surface {
         if lobe > 0.0 { lobe } else { 0.0 }
     }
 
-    /// [`Surface::scatter`] of a mix by its parts: the Lambertian one's, and the conductor's.
+    /// Returns [`Surface::scatter`] of a mix by parts: the Lambertian's, and the conductor's.
     #[inline]
     pub fn parts(&self, n: Vec3, i: Vec3, o: Vec3) -> (f32, f32) {
         let co = n.dot(o);
@@ -460,7 +477,8 @@ impl Surface {
         (self.base * co, self.gloss().scatter(n, i, o))
     }
 
-    /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none leaves.
+    /// Draws a direction for `i`. Returns (direction, f·cos/pdf, pdf per steradian), or `None` if the
+    /// drawn direction does not leave the surface.
     #[inline]
     pub fn sample(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         if self.diffuse() {
@@ -483,7 +501,7 @@ impl Surface {
     fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         let (t, b) = frame(n);
         let ci = n.dot(i);
-        // Of a direction beneath the surface no facet is seen: to draw one would take without end.
+        // From below the surface no facet is visible, and drawing one would never end.
         if ci <= 0.0 || ci.is_nan() {
             return None;
         }
@@ -503,7 +521,7 @@ impl Surface {
             return None;
         }
         let seen = self.seen(ci);
-        // 1 but for what Walter's approximation is off.
+        // 1 except for the error of Walter's approximation.
         let approximated = match self.ggx() {
             true => 1.0,
             false => self.leaving(ci) / seen,
@@ -512,7 +530,7 @@ impl Surface {
         Some((o, weight, 0.25 * seen * self.density(n, i + o)))
     }
 
-    /// Density per steradian with which [`Surface::sample`] draws `o`.
+    /// Returns the density per steradian with which [`Surface::sample`] draws `o`.
     #[inline]
     pub fn pdf(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
         let (ci, co) = (n.dot(i), n.dot(o));
@@ -530,7 +548,8 @@ impl Surface {
         share * conductor + (1.0 - share) * co / PI
     }
 
-    /// D(h) for h along `sum` = i + o. The slope comes from n × h: 1 − cos² would cancel at small α.
+    /// Returns D(h) for h along `sum` = i + o. The slope is computed from n × h, because 1 − cos²
+    /// would cancel at small α.
     #[inline]
     fn density(&self, n: Vec3, sum: Vec3) -> f32 {
         let (c, s) = (n.dot(sum), n.cross(sum));
@@ -554,7 +573,7 @@ impl Surface {
         e / (PI * a2 * cos2 * cos2)
     }
 
-    /// G1: Smith's for GGX, Walter's rational approximation for Beckmann.
+    /// Returns G₁: Smith's for GGX, Walter's rational approximation for Beckmann.
     #[inline]
     fn masking(&self, c: f32) -> f32 {
         if self.ggx() {
@@ -564,7 +583,7 @@ impl Surface {
         beckmann_masking(1.0 / (self.alpha * tan))
     }
 
-    /// 2cos / G1 of GGX.
+    /// Returns 2cos / G₁ of GGX.
     #[inline(always)]
     fn edge(&self, c: f32) -> f32 {
         let c2 = c * c;
@@ -572,7 +591,7 @@ impl Surface {
     }
 }
 
-/// A cosine-distributed direction around `n`, and its cosine.
+/// Returns a cosine-distributed direction around `n`, and its cosine.
 #[inline]
 fn cosine(n: Vec3, rng: &mut Rng) -> Option<(Vec3, f32)> {
     let (t, b) = frame(n);
@@ -583,8 +602,8 @@ fn cosine(n: Vec3, rng: &mut Rng) -> Option<(Vec3, f32)> {
     (c > 0.0).then_some((o, c))
 }
 
-/// A half vector of GGX among those that `i` sees, in the surface's frame and of any length (Heitz, JCGT
-/// 2018): its weights never exceed 1, however rough or grazing.
+/// Returns a half vector of GGX among those visible from `i`, in the surface's frame and of any
+/// length (Heitz, JCGT 2018). Its weights never exceed 1, however rough or grazing.
 #[inline]
 fn visible_ggx(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
     let v = Vec3::new(alpha * i[0], alpha * i[1], i[2]).normalized();
@@ -602,7 +621,7 @@ fn visible_ggx(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
     [alpha * h.x, alpha * h.y, h.z.max(0.0)]
 }
 
-/// Two unit vectors that complete `n` to a right-handed frame (Duff et al., JCGT 2017).
+/// Returns two unit vectors that complete `n` to a right-handed frame (Duff et al., JCGT 2017).
 #[inline(always)]
 pub(crate) fn frame(n: Vec3) -> (Vec3, Vec3) {
     let sign = 1.0f32.copysign(n.z);
