@@ -23,7 +23,8 @@ const SAME_PLACE: f32 = 1e-3;
 /// the beam is taken as it is; otherwise the beam is followed, through mirrors
 /// (`Material::is_specular`) by exact reflection, to the first other surface.
 ///
-/// # Errors [`RenderError::Scene`] if the scene is invalid.
+/// # Errors
+/// [`RenderError::Scene`] if the scene is invalid.
 pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
     scene.validate()?;
     let world = World::new(scene, f64::INFINITY, Stop(&Unstopped))?;

@@ -125,7 +125,8 @@ impl Buffers {
 impl ByGlass {
     /// Returns the glass of a scene that turns light; `None` if there is none.
     ///
-    /// # Errors [`RenderError::Stopped`] if the render was stopped.
+    /// # Errors
+    /// [`RenderError::Stopped`] if the render was stopped.
     pub fn find(
         (walk, film): (&Walk, &Film),
         centres: &Centres,

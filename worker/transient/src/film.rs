@@ -1,4 +1,4 @@
-//! The gate as an array of slots, and what pixels collect in it.
+//! The gate as an array of slots, and the histograms that pixels accumulate in it.
 
 use crate::{
     api::{Gate, Overflow},
@@ -6,31 +6,32 @@ use crate::{
     spectra::Light,
 };
 
-/// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
-/// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
-/// what comes before the gate and one behind for what comes after. Where several wavelengths are asked for, all channels of the
-/// first come before all of the next.
+/// The layout of histograms while they are filled. A *channel* is one histogram: channel 0 is for
+/// all spots, each further one for a group of spots. A channel has one *slot* per bin, one before
+/// them for paths shorter than the gate and one after them for longer paths. With several
+/// wavelengths, all channels of one come before all channels of the next.
 #[derive(Debug)]
 pub(crate) struct Film {
     pub gate: Gate,
-    /// Slots of a channel.
+    /// Slots per channel.
     pub slots: usize,
-    /// Channels of a pixel.
+    /// Channels per pixel.
     pub channels: usize,
-    /// Wavelengths that have channels of their own, 1 or more.
+    /// Number of wavelengths with channels of their own, at least 1.
     pub wavelengths: usize,
-    /// There are several wavelengths in the scene.
+    /// Whether the scene has several wavelengths.
     pub spectral: bool,
-    /// Channels beyond 0 that a spot counts in, by emitter.
+    /// By emitter: the channels beyond 0 that its light is added to.
     pub of_spot: Vec<Vec<u16>>,
-    /// Channels beyond 0 are classes of paths in place of groups of spots.
+    /// Whether channels beyond 0 are path classes instead of groups of spots.
     by_class: bool,
 }
 
 impl Film {
-    /// A film for a gate, so many groups and wavelengths (none stands for one), and the groups that each emitter belongs to.
+    /// Creates a film for a gate, numbers of groups and wavelengths (0 wavelengths count as one),
+    /// and the groups of each emitter.
     pub fn new(gate: &Gate, (groups, wavelengths): (usize, usize), of_spot: Vec<Vec<u16>>) -> Self {
-        // One has the reflectances of the paths themselves.
+        // A single wavelength uses the reflectances of the paths themselves.
         let spectral = wavelengths > 1;
         let wavelengths = wavelengths.max(1);
         Self {
@@ -44,7 +45,7 @@ impl Film {
         }
     }
 
-    /// A film that has a channel for each class of paths, at the first wavelength.
+    /// Creates a film with a channel for each path class, at the first wavelength.
     pub fn by_class(gate: &Gate, spectral: bool) -> Self {
         let of_class = (0..CLASSES).map(|c| vec![1 + c as u16]).collect();
         Self {
@@ -54,7 +55,7 @@ impl Film {
         }
     }
 
-    /// What a contribution is filed under: its spot, or its class.
+    /// Returns the index that a contribution is filed under: its spot, or its class.
     #[inline]
     pub fn tag(&self, spot: usize, place: Place, way: Way) -> usize {
         match self.by_class {
@@ -63,12 +64,12 @@ impl Film {
         }
     }
 
-    /// Slots of one pixel.
+    /// Returns the number of slots of one pixel.
     pub fn pixel(&self) -> usize {
         self.slots * self.channels
     }
 
-    /// The slot of a path of a length.
+    /// Returns the slot of a path length.
     #[inline]
     pub fn slot(&self, path_m: f64) -> usize {
         let b = (path_m - self.gate.start_m) / self.gate.bin_width_m;
@@ -94,7 +95,7 @@ impl Film {
         }
     }
 
-    /// Adds light to the channels of groups alone.
+    /// Adds light to the channels of groups only.
     #[inline]
     pub fn add_to_groups(&self, pixel: &mut [f32], slot: usize, light: &Light, spot: usize) {
         if self.channels == self.wavelengths {
@@ -108,13 +109,13 @@ impl Film {
         }
     }
 
-    /// The channel of all spots at a wavelength.
+    /// Returns the channel of all spots at a wavelength.
     #[inline(always)]
     pub fn first_channel(&self, wavelength: usize) -> usize {
         wavelength * (self.channels / self.wavelengths)
     }
 
-    /// The channels of the groups that a spot counts in, at a wavelength.
+    /// Returns the channels of a spot's groups at a wavelength.
     #[inline(always)]
     pub fn groups_of(&self, wavelength: usize, spot: usize) -> impl Iterator<Item = usize> {
         let first = self.first_channel(wavelength);
@@ -124,25 +125,27 @@ impl Film {
     }
 }
 
-/// Two-bounce contributions of one pixel: sums, and squared contrasts. A block of 2×2 strata has one stratum, chosen at
-/// random, sampled twice; the difference of its two samples is the block's contrast, scaled so that its square estimates
-/// the block's variance without bias, whatever edges cross it.
+/// Two-bounce contributions of one pixel: sums, and squared contrasts. In each block of 2×2 strata,
+/// one stratum, chosen at random, is sampled twice. The difference of its two samples is the
+/// block's contrast, scaled so that its square is an unbiased estimate of the block's variance,
+/// regardless of edges within the block.
 #[derive(Debug)]
 pub(crate) struct Blocks {
-    /// Σ of contributions, as [`Film::pixel`] slots.
+    /// Σ of contributions, in the slots of [`Film::pixel`].
     pub sum: Vec<f32>,
     /// Σ over blocks of (contrast by slot of channel 0)².
     pub square: Vec<f32>,
-    /// Σ over blocks of (contrast of the whole)².
+    /// Σ over blocks of (contrast of the total)².
     pub total_square: f64,
-    /// Σ over blocks of ± contrast by slot of channel 0: what its slots have in common stays.
+    /// Σ over blocks of ± contrast by slot of channel 0; it preserves the correlation between
+    /// slots.
     pub noise: Vec<f32>,
     contrast: Vec<f32>,
     touched: Vec<u32>,
 }
 
-/// √(7/4). Of four strata of variance v each, three have one sample and one has the mean of two: their sum has variance
-/// 3.5 v, and the squared difference of the two samples is 2 v on average.
+/// √(7/4). Of four strata of variance v each, three have one sample and one has the mean of two:
+/// their sum has variance 3.5 v, and the mean squared difference of the two samples is 2 v.
 const CONTRAST: f32 = 1.322_875_7;
 
 impl Blocks {
@@ -164,13 +167,13 @@ impl Blocks {
         self.total_square = 0.0;
     }
 
-    /// Adds the contribution of a sample that is its stratum's only one.
+    /// Adds a contribution from the only sample of its stratum.
     #[inline]
     pub fn add(&mut self, film: &Film, slot: usize, light: Light, spot: usize) {
         film.add(&mut self.sum, slot, light, spot);
     }
 
-    /// Adds that of one of a stratum's two samples; `sign` tells which.
+    /// Adds a contribution from one of a stratum's two samples; `sign` distinguishes them.
     #[inline]
     pub fn add_half(&mut self, film: &Film, slot: usize, light: Light, sign: f32, spot: usize) {
         let half = Light {
@@ -184,7 +187,7 @@ impl Blocks {
         self.contrast[slot] += sign * CONTRAST * (light.value * light.ratios[0]);
     }
 
-    /// Ends a block; `sign` is the one that its contrast counts with in `noise`.
+    /// Ends a block; `sign` is the sign of its contrast in `noise`.
     pub fn finish(&mut self, sign: f32) {
         let mut total = 0.0f64;
         for b in self.touched.drain(..) {
@@ -198,7 +201,7 @@ impl Blocks {
 }
 
 impl Overflow {
-    /// Adds what a pixel collected outside the gate.
+    /// Adds the light of a pixel outside the gate.
     pub(crate) fn take(&mut self, film: &Film, pixel: &[f32], factor: f64) {
         let outside = f64::from(pixel[0]) + f64::from(pixel[film.slots - 1]);
         self.energy += outside * factor;

@@ -2,10 +2,10 @@
 
 use crate::{api::Gate, bvh::Stack, emitter::Emitters, spectra::Light, world::World};
 
-/// One spot seen directly.
+/// One spot that the camera sees directly.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peak {
-    /// Emitter.
+    /// Emitter index.
     pub spot: usize,
     /// Row-major pixel.
     pub pixel: usize,
@@ -15,8 +15,9 @@ pub(crate) struct Peak {
     pub light: Light,
 }
 
-/// The peaks of all spots that the camera sees. A spot of intensity I at distance d and angle θ from the
-/// optical axis gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance.
+/// Returns the peaks of all spots that the camera sees. A spot of intensity I at distance d and
+/// angle θ from the optical axis gives I/(d² cos³θ) over the pixel's sensitive area on the film at
+/// unit distance.
 pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Vec<Peak> {
     let c = &world.camera;
     let i = &c.intrinsics;
@@ -52,7 +53,7 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
     peaks
 }
 
-/// Adds a peak to a histogram of one wavelength; returns false where it lies outside the gate.
+/// Adds a peak to a histogram of one wavelength. Returns false if the peak is outside the gate.
 pub(crate) fn add(p: &Peak, wavelength: usize, gate: &Gate, transient: &mut [f32]) -> bool {
     let bin = gate.bin(p.path_m);
     if let Some(b) = bin {

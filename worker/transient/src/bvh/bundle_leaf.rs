@@ -108,7 +108,7 @@ impl Rays {
         hit
     }
 
-    /// Returns whether ray `k` hits the needle in a lane whose edges it passes inside.
+    /// Returns whether ray `k` hits the needle in a lane, if it passes inside the needle's edges.
     #[inline(always)]
     fn meets_needle(&self, pack: &Pack, lane: usize, k: usize) -> bool {
         let d = Vec3::new(self.d[0][k], self.d[1][k], self.d[2][k]);
