@@ -35,7 +35,7 @@ pub struct Settings {
     /// are always those of the beams' centres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beam: Option<BeamWidth>,
-    /// Share of each pixel's area that is sensitive, 10⁻⁶ to 1: a square in the pixel's middle.
+    /// Sensitive share of each pixel's area, 10⁻⁶ to 1: a square in the pixel's middle.
     /// Histograms are means over this square; the ground truth is always taken at the pixels'
     /// middles.
     #[serde(default = "whole", skip_serializing_if = "is_whole")]
@@ -121,14 +121,14 @@ pub struct Rendered {
     pub plan: Plan,
     /// Rays traced.
     pub rays: u64,
-    /// The reason why the image contains no light, if it contains none. It is also in `warnings`.
+    /// The reason for an image without light, if it has none. It is also in `warnings`.
     pub dark: Option<String>,
     /// Warnings for the user: beams that hit nothing, an image without light. They are not stored,
     /// because they can be derived from the stored data.
     pub warnings: Vec<String>,
 }
 
-/// The histograms of a wavelength that is not the main one.
+/// The histograms of a wavelength other than the main one.
 #[derive(Debug, Clone)]
 pub struct AtWavelength {
     /// The wavelength, nanometres.
@@ -175,7 +175,7 @@ pub struct GroundTruth {
     pub instance: Vec<u32>,
     /// Label index + 1; 0 = nothing.
     pub label: Vec<u16>,
-    /// 1 where the first surface is a mirror (see `Material::is_specular`).
+    /// 1 if the first surface is a mirror (see `Material::is_specular`).
     pub specular: Vec<u8>,
     /// `[spot][row][col]`: 1 = lit: the segment from the spot to the surface point is free and both
     /// face it.
@@ -190,7 +190,7 @@ pub struct GroundTruth {
 pub struct Overflow {
     /// Energy dropped.
     pub energy: f64,
-    /// Share of all energy that was sampled.
+    /// The dropped energy as a share of all sampled energy.
     pub share: f64,
 }
 
@@ -217,7 +217,7 @@ pub struct ErrorEstimate {
     pub samples: u32,
 }
 
-/// What the renderer decided for this scene.
+/// The renderer's decisions for this scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Strategies used, e.g. `two-bounce deterministic 4x4`, `mirror images: 2 planar mirrors`.

@@ -477,8 +477,8 @@ impl Surface {
         (self.base * co, self.gloss().scatter(n, i, o))
     }
 
-    /// Draws a direction for `i`. Returns (direction, f·cos/pdf, pdf per steradian), or `None` if the
-    /// drawn direction does not leave the surface.
+    /// Draws a direction for `i`. Returns (direction, f·cos/pdf, pdf per steradian), or `None` if
+    /// the drawn direction does not leave the surface.
     #[inline]
     pub fn sample(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         if self.diffuse() {

@@ -1,7 +1,7 @@
 //! Light that glass turns: reflected by panes, or reflected and refracted by bodies of glass.
 //!
 //! Surfaces scatter, but glass turns a ray without a choice of direction, so no connection between
-//! two points finds such a path. Light over glass therefore has paths of its own, drawn into the
+//! two points finds such a path. Light via glass therefore has paths of its own, drawn into the
 //! image in addition to all other techniques, for which thin glass only transmits and bodies are
 //! black. Call the path between two surface points a *leg*, including the camera's first and the
 //! spot's last. A leg is *turned* if glass reflects or refracts light on it. Paths without a turned
@@ -18,7 +18,7 @@
 //! If no leg is straight, light paths with only turned legs and camera paths with a turned first
 //! leg join on a surface: see [`photons`]. This technique is the only approximation: it blurs its
 //! result over about a pixel. It includes the spots themselves if the camera sees them in bodies of
-//! glass or over several panes; a spot that a single planar pane shows is a point of light
+//! glass or via several panes; a spot that a single planar pane shows is a point of light
 //! ([`images`]). Each class is sampled by one technique, so nothing is weighted and nothing is
 //! counted twice. A reflection counts as a bounce, and refraction does not; a spot that the camera
 //! sees by refraction alone, with one bounce, is left out.
@@ -142,7 +142,7 @@ impl ByGlass {
         for (k, (corners, normal)) in world.panes.iter().flat_map(|p| p.triangles()).enumerate() {
             let panes = world.panes.as_ref().expect("there is a pane");
             let share = panes.reflectance(k);
-            // Such panes are targets only for light that is turned again after the pane.
+            // Such panes are targets only for light with further turns after the pane.
             let rest = if images.has(k as u32) { IMAGED } else { 1.0 };
             of_pane.push(NONE);
             glass += share * area(corners);

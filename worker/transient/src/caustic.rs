@@ -1,4 +1,4 @@
-//! Light paths for light that arrives over near-mirrors.
+//! Light paths for light that arrives via near-mirrors.
 //!
 //! A camera path hits a spot in a curved near-mirror only by chance, and likewise a spot behind two
 //! mirrors. Light paths reach these points directly. So that no path is counted twice, paths are
@@ -11,17 +11,17 @@
 //! 2. it is not the case that j = 1, s₁ is on a planar mirror known to [`crate::mirror_images`] and
 //!    the spot is Lambertian, because such paths aim at mirror images;
 //! 3. the camera directly sees z or a later point off near-mirrors; or the event before that point
-//!    (read from the camera) is not specular; or the camera sees it over near-mirrors alone, and the
+//!    (read from the camera) is not specular; or the camera sees it via near-mirrors alone, and the
 //!    last of them is not much smoother than s₁ ([`pays_below`]).
 //!
 //! Light paths cover that class and nothing else. Let z be the first point that satisfies 3. It is
 //! drawn into the image if the camera sees it, and it is a light vertex ([`crate::light_vertices`])
 //! for every other point. A light path continues from z by the surface's own scattering, and ends
-//! unless it hits a near-mirror, so a caustic that diffuse surfaces see over a near-mirror is
+//! unless it hits a near-mirror, so a caustic that diffuse surfaces see via a near-mirror is
 //! covered as well. [`crate::walk`] leaves out exactly these paths: [`crate::vertex::Vertex::open`]
 //! carries condition 3 along a camera path. A near-mirror that the camera sees connects to z by its
 //! own narrow lobe: many camera paths test many light vertices, so that some of these are within
-//! the lobe. Two kinds of light are left to chance: light that reaches the camera over near-mirrors
+//! the lobe. Two kinds of light are left to chance: light that reaches the camera via near-mirrors
 //! alone, and caustics seen in much smoother near-mirrors.
 //!
 //! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the
@@ -50,7 +50,7 @@ const SURE: u32 = 3;
 /// smoother the first near-mirror is, and connections less often the smoother the other one is. But
 /// connections test thousands of pairs.
 const SMOOTHER: f32 = 16.0;
-/// Number of paths of the probe, and the share of the spots' power over near-mirrors from which
+/// Number of paths of the probe, and the share of the spots' power via near-mirrors from which
 /// light paths pay. In a furnished room with a share of 8·10⁻⁴ to 1.6·10⁻³ (the upper edge of a
 /// mirror on the wall, 2 mm deep), chance found a path that carried 0.7 % of the image's light to
 /// one pixel; light paths cost 2 % of the time there at 64×64 and 10 % at 24×24. With a share of
@@ -220,7 +220,7 @@ impl Caustics {
                 continue;
             }
             // Light that left by another lobe and hits no near-mirror is sampled from the camera's
-            // side, and light over a single planar mirror by mirror images.
+            // side, and light via a single planar mirror by mirror images.
             if !before || (bounces == 3 && aimed_at) {
                 return;
             }
@@ -306,7 +306,7 @@ impl Caustics {
         })
     }
 
-    /// Returns whether the spots send enough of their power over near-mirrors for light paths to
+    /// Returns whether the spots send enough of their power via near-mirrors for light paths to
     /// pay.
     pub fn pay(&self, within: &Surroundings<'_>, seed: u64) -> bool {
         let mut stack = within.world.bvh.stack();

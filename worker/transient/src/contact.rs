@@ -163,7 +163,8 @@ impl Contacts {
         self.zones.iter().any(inside) && self.plain(world, h)
     }
 
-    /// Clears the weights of spots if the vertex is near and within the inner radius of their own zone.
+    /// Clears the weights of spots if the vertex is near and within the inner radius of their own
+    /// zone.
     #[inline]
     pub fn leave_out(&self, world: &World, h: &Hit, weights: &mut [f32]) {
         for z in &self.zones {

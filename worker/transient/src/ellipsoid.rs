@@ -23,7 +23,7 @@ use crate::{
 
 /// Number of gather points that represent a tile for its shells.
 const STANDINS: usize = 8;
-/// Largest difference between a path over a patch and the path over its centre, in radii of the
+/// Largest difference between a path via a patch and the path via its centre, in radii of the
 /// patch. It is at most 2, and less if the patch is seen at an angle.
 const SWELL: f32 = 1.2;
 /// Margin for rounding when paths are left out, as a share of the gate's end.
@@ -133,7 +133,7 @@ impl Shells {
         }
     }
 
-    /// Computes the path length from every patch over the gather points to the camera, and the flux
+    /// Computes the path length from every patch via the gather points to the camera, and the flux
     /// that the gather points receive from it.
     fn reach(&mut self, patches: &Patches, gathers: &[(Vertex, usize)]) {
         let count = patches.len();
@@ -215,7 +215,7 @@ impl Shells {
         patch.map_or(0.0, |k| self.density[k])
     }
 
-    /// Returns the window of paths up to `y` that can fall into the gate over a gather point,
+    /// Returns the window of paths up to `y` that can fall into the gate via a gather point,
     /// computed as if every path continued for `nearest` metres.
     pub fn window(&self, world: &World, gate: &Window, y: Vec3, nearest: f64) -> Window {
         let (mut near, mut far) = (f32::MAX, 0.0f32);

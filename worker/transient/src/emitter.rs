@@ -440,7 +440,7 @@ impl Emitters {
         f * e.intensity(-w) / d2
     }
 
-    /// Returns the shortest optical path from the laser over a spot to `x`, metres.
+    /// Returns the shortest optical path from the laser via a spot to `x`, metres.
     pub fn shortest_m(&self, world: &World, x: Vec3) -> f64 {
         let each = self.list.iter();
         each.fold(f64::INFINITY, |a, e| {

@@ -57,7 +57,7 @@ impl Column {
 
     pub fn push(&mut self, x: f32) {
         let at = self.len / SIDE;
-        // The last number may be the first of a group that is read.
+        // The last number may be the first of a group to read.
         self.groups.resize(at + 2, [0.0; SIDE]);
         self.groups[at][self.len % SIDE] = x;
         self.len += 1;

@@ -35,7 +35,7 @@ pub(crate) struct LightVertex {
     pub spot: usize,
     /// Bounces up to and including this vertex, counted from the spot as the first.
     pub bounces: u32,
-    /// Roughness of the first near-mirror whose lobe reflected the light; 0 if there was none.
+    /// Roughness of the first near-mirror on the light's path; 0 if there was none.
     pub alpha: f32,
 }
 

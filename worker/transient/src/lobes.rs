@@ -17,7 +17,7 @@ use crate::{
 /// The scattering of a surface point for a fixed direction.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Lobe {
-    /// f · cos / (D·π·α²·G₁) of the conductor, with the G₁ of the other direction.
+    /// f · cos / (D·π·α²·G₁) of the conductor, for the G₁ of the other direction.
     pub conductor: f32,
     /// ρ/π of the Lambertian part.
     pub lambertian: f32,

@@ -158,7 +158,7 @@ impl Mirrors {
         self.list.len() * self.spots
     }
 
-    /// Writes the unshadowed contribution at `x` of every spot over every mirror. Returns their
+    /// Writes the unshadowed contribution at `x` of every spot via every mirror. Returns their
     /// sum.
     pub fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> f32 {
         widest(Weights {

@@ -1,7 +1,7 @@
 //! Bundles: segments from one point to many, traced together.
 //!
-//! A single ray's result is defined as "some leaf whose box the ray hits contains a triangle that
-//! the ray hits". Rounding is monotonic, so a ray that hits a box hits every box around it, and the
+//! A single ray's result is defined as "the ray hits the box of some leaf, and a triangle in that
+//! leaf". Rounding is monotonic, so a ray that hits a box hits every box around it, and the
 //! tree above the leaves does not affect the result. A bundle may therefore reach the leaves in any
 //! order that misses none, as long as each pair of ray and leaf, and of ray and triangle, is tested
 //! by the single ray's operations. Here a [`Pyramid`] around all rays culls the nodes, eight

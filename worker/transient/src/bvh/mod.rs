@@ -184,8 +184,8 @@ impl Bvh {
 
     /// Tests the segments from one point to many: `blocked[i]` becomes
     /// `occluded(stack, from, to[i] - from, 1.0)`, bit for bit, independently of the rest of the
-    /// bundle. The origin of every ray is `from`; the same segments traced from their other ends may
-    /// differ in grazing cases. Bundles are fast if the targets are close together as seen from
+    /// bundle. The origin of every ray is `from`; the same segments traced from their other ends
+    /// may differ in grazing cases. Bundles are fast if the targets are close together as seen from
     /// there, best on one surface: up to five times as fast as single rays for 64 targets (the
     /// natural number; any is allowed), twice for 8, no gain below 6.
     ///

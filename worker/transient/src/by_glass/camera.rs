@@ -1,4 +1,4 @@
-//! Camera paths over glass.
+//! Camera paths via glass.
 
 use picofarm_scene::Vec3;
 
@@ -185,7 +185,7 @@ fn straight(
         bounce: point.path.bounces,
         sight: Sight::ELSEWHERE,
     };
-    // Zones leave light near a spot to light paths, which do not cover paths over glass.
+    // Zones leave light near a spot to light paths, which do not cover paths via glass.
     let near = walk.contacts.is_some_and(|c| c.near(walk.world, &hit));
     let walk = Walk {
         contacts: walk.contacts.filter(|_| !near),

@@ -312,7 +312,7 @@ impl Images {
         buffers.lights = weights;
     }
 
-    /// Returns the path from a point, lifted off its surface, in a medium of some index over a pane
+    /// Returns the path from a point, lifted off its surface, in a medium of some index via a pane
     /// of a plane to another point, if it is free.
     fn way(
         &self,
@@ -363,7 +363,7 @@ impl Images {
     }
 }
 
-/// A free path over a pane.
+/// A free path via a pane.
 struct Way {
     /// Transmitted and reflected share of the light, relative to the reflectance that weights
     /// assume.
@@ -420,7 +420,7 @@ impl Plane {
         (within(0, self.u) && within(1, self.v)).then_some(q)
     }
 
-    /// Returns the unblocked contribution from another point to a point over the plane: f · cos,
+    /// Returns the unblocked contribution from another point to a point via the plane: f · cos,
     /// times the pane's reflectance, times the light that the other point `sends` in a direction,
     /// over the squared distance.
     fn weight(

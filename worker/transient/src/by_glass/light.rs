@@ -1,4 +1,4 @@
-//! Light paths over glass.
+//! Light paths via glass.
 
 use super::{
     Buffers, ByGlass,

@@ -1,11 +1,11 @@
 //! Points that scatter light on its way to a pane, with all the light that they scatter: the light
 //! from every spot, and the light that a walk from them samples. Their mirror images are connected
-//! to camera paths, so that a single path over a pane carries many arrivals, and no arrival is
+//! to camera paths, so that a single path via a pane carries many arrivals, and no arrival is
 //! rare.
 //!
 //! The points are on Lambertian surfaces. Half of them are drawn by the scattering of the spots,
 //! half uniformly over all surfaces, combined by the balance heuristic. No other technique samples
-//! paths over an image of such a point that continue by straight legs alone to a spot.
+//! paths via an image of such a point that continue by straight legs alone to a spot.
 
 use picofarm_scene::Vec3;
 

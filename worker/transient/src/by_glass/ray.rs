@@ -1,4 +1,4 @@
-//! Rays over glass, and the paths whose legs they are.
+//! Rays via glass: the legs of paths.
 
 use picofarm_scene::Vec3;
 
@@ -177,7 +177,7 @@ pub(super) fn pick(crossings: &[Crossing], mut left: f32) -> Option<u32> {
     last
 }
 
-/// Follows a ray over glass to the next surface that is not glass. Before the first turn,
+/// Follows a ray via glass to the next surface that is not glass. Before the first turn,
 /// reflections by panes are chosen with a probability of at least `seek`.
 fn follow(
     world: &World,

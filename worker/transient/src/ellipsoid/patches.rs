@@ -1,5 +1,5 @@
 //! The scene's Lambertian surfaces, cut and gathered into patches of similar size, each with its
-//! path to every spot. A patch is the unit that is tested against a narrow gate.
+//! path to every spot. Narrow gates are tested against whole patches.
 
 use picofarm_scene::Vec3;
 
