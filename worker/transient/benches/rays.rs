@@ -1,9 +1,11 @@
-//! Rays per second of CPU time, one thread, in a furnished room and two finer tessellations of it.
+//! Measures rays per second of CPU time on one thread, in a furnished room and two finer
+//! tessellations of it.
 //!
 //! `cargo bench -p picofarm-transient --bench rays -- [--export DIR] [--rounds N] [--only RAYS]
 //! [--kernel avx2|portable]`
-//! prints a table: mesh, set of rays, millions of rays a CPU-second (best round). `--export` also writes
-//! the meshes and rays as raw little-endian files, for other ray tracers (`tests/peers/embree_rays.py`).
+//! prints a table: mesh, set of rays, millions of rays per CPU second (best round). `--export` also
+//! writes the meshes and rays as raw little-endian files, for other ray tracers
+//! (`tests/peers/embree_rays.py`).
 
 use std::{
     fs::{self, File},
@@ -15,7 +17,7 @@ use std::{
 use picofarm_scene::{AssetLibrary, Scene, Vec3, furnished};
 use picofarm_transient::{Bvh, Kernel};
 
-/// Image width and height: one primary ray a pixel, in tiles of 8×8 pixels.
+/// Image width and height: one primary ray per pixel, in tiles of 8×8 pixels.
 const SIDE: u32 = 256;
 const TILE: usize = 64;
 

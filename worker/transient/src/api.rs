@@ -18,7 +18,7 @@ pub struct Settings {
     pub budget: Budget,
     /// Longest path in bounces; `None` = until the gate ends. 2 renders no random walk.
     pub max_bounces: Option<u32>,
-    /// Add the analytic one-bounce peaks to the histogram.
+    /// Adds the analytic one-bounce peaks to the histogram.
     pub one_bounce: bool,
     /// Seed of all random numbers.
     pub seed: u64,
@@ -226,7 +226,7 @@ pub struct Plan {
     pub approximations: Vec<String>,
 }
 
-/// Why a render stopped.
+/// The reason why a render stopped.
 #[derive(Debug, thiserror::Error)]
 pub enum RenderError {
     /// The scene or a setting is unusable.

@@ -232,8 +232,8 @@ impl Surface {
         }
     }
 
-    /// Returns whether pixels may share its vertices: for a Lambertian, or a conductor that is
-    /// rough enough.
+    /// Returns whether pixels may share its vertices: for a Lambertian, or a sufficiently rough
+    /// conductor.
     #[inline(always)]
     pub fn is_shared(&self) -> bool {
         self.diffuse() || self.alpha >= SHARED_ALPHA
@@ -300,14 +300,13 @@ impl Surface {
         self.flags & GGX != 0
     }
 
-    /// Returns whether the surface has a conductor, alone or in a mix, that is smooth enough for a
-    /// mirror.
+    /// Returns whether the surface has a conductor, alone or in a mix, smooth enough for a mirror.
     #[inline(always)]
     pub fn has_mirror(&self) -> bool {
         !self.diffuse() && !self.is_rough() && !self.is_black()
     }
 
-    /// Returns whether the surface has a conductor that is too rough for a mirror.
+    /// Returns whether the surface has a conductor too rough for a mirror.
     #[inline(always)]
     pub fn is_rough(&self) -> bool {
         self.alpha > Material::SPECULAR_ALPHA

@@ -10,11 +10,12 @@
 //!    z;
 //! 2. it is not the case that j = 1, s₁ is on a planar mirror known to [`crate::mirror_images`] and
 //!    the spot is Lambertian, because such paths aim at mirror images;
-//! 3. the camera directly sees z or a later point off near-mirrors; or the event before that point
-//!    (read from the camera) is not specular; or the camera sees it via near-mirrors alone, and the
-//!    last of them is not much smoother than s₁ ([`pays_below`]).
+//! 3. there is a point p, either z or a later point off near-mirrors, with one of these properties:
+//!    the camera sees p directly; or the event before p (read from the camera) is not specular; or
+//!    the camera sees p via near-mirrors alone, and the last of them is not much smoother than s₁
+//!    ([`pays_below`]).
 //!
-//! Light paths cover that class and nothing else. Let z be the first point that satisfies 3. It is
+//! Light paths cover that class and nothing else. Let z be the first such p. It is
 //! drawn into the image if the camera sees it, and it is a light vertex ([`crate::light_vertices`])
 //! for every other point. A light path continues from z by the surface's own scattering, and ends
 //! unless it hits a near-mirror, so a caustic that diffuse surfaces see via a near-mirror is

@@ -1,4 +1,4 @@
-//! Illumination spots as light sources: how they scatter light into the scene.
+//! Illumination spots as light sources that scatter the laser's light into the scene.
 
 use std::ops::Range;
 

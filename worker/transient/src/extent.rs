@@ -24,14 +24,14 @@ const BOUNCES: u32 = 3;
 /// Largest extent of a wall that counts, as a multiple of the distance at which it was hit.
 const BEYOND: f64 = 2.0;
 
-/// Distance of the first cut, render units: twice the extent of a scene that is reached over its
-/// whole width. Beyond it, there is a cut at every further factor.
+/// Distance of the first cut, render units: twice the extent of a fully reached scene. Beyond it,
+/// there is a cut at every further factor.
 const FIRST_CUT: f64 = 16.0;
 const FACTOR: f64 = 8.0;
 
 /// Returns the largest distance from the camera, along an axis, of the surfaces that contribute
-/// light. This is `widest`, unless that is much farther than the probes' hits. No surface farther
-/// than `horizon` counts.
+/// light: `widest`, unless the probes' hits are much nearer. No surface farther than `horizon`
+/// counts.
 ///
 /// # Errors
 /// [`RenderError::Stopped`] if the render was stopped.

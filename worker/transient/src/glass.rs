@@ -152,8 +152,7 @@ impl Panes {
         }))
     }
 
-    /// Returns the share of the laser's light that is transmitted on the straight segment from `a`
-    /// to `b`.
+    /// Returns the transmitted share of the laser's light on the straight segment from `a` to `b`.
     pub fn through(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> f32 {
         self.shares(stack, a, b)[0]
     }

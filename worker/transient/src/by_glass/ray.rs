@@ -177,7 +177,7 @@ pub(super) fn pick(crossings: &[Crossing], mut left: f32) -> Option<u32> {
     last
 }
 
-/// Follows a ray via glass to the next surface that is not glass. Before the first turn,
+/// Follows a ray via glass to the next surface of another material. Before the first turn,
 /// reflections by panes are chosen with a probability of at least `seek`.
 fn follow(
     world: &World,
