@@ -1,7 +1,7 @@
 //! Light that glass turns: reflected by panes, or reflected and refracted by bodies of glass.
 //!
 //! Surfaces scatter, but glass turns a ray without a choice of direction, so no connection between
-//! two points finds such a path. Light via glass therefore has paths of its own, drawn into the
+//! two points finds such a path. Such light therefore has paths of its own, drawn into the
 //! image in addition to all other techniques, for which thin glass only transmits and bodies are
 //! black. Call the path between two surface points a *leg*, including the camera's first and the
 //! spot's last. A leg is *turned* if glass reflects or refracts light on it. Paths without a turned

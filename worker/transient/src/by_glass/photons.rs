@@ -1,7 +1,7 @@
-//! Photons: light of spots that reaches points via glass and that the camera sees via glass
-//! alone, so that no two points of such a path can be connected. Light paths leave *photons* at
-//! their vertices, and a camera path gathers those within a disc around its own end to estimate the
-//! density of their flux there (Jensen 1996). A disc is about as wide as the pixel at that
+//! Photons: the light of spots at points that it reaches via glass and that the camera sees via
+//! glass alone, so that no two points of such a path can be connected. Light paths leave *photons*
+//! at their vertices, and a camera path gathers those within a disc around its own end to estimate
+//! the density of their flux there (Jensen 1996). A disc is about as wide as the pixel at that
 //! distance, and so is the blur.
 
 use std::f32::consts::PI;
