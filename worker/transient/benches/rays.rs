@@ -1,9 +1,11 @@
-//! Rays per second of CPU time, one thread, in a furnished room and two finer tessellations of it.
+//! Measures rays per second of CPU time on one thread, in a furnished room and two finer
+//! tessellations of it.
 //!
 //! `cargo bench -p picofarm-transient --bench rays -- [--export DIR] [--rounds N] [--only RAYS]
 //! [--kernel avx2|portable]`
-//! prints a table: mesh, set of rays, millions of rays a CPU-second (best round). `--export` also writes
-//! the meshes and rays as raw little-endian files, for other ray tracers (`tests/peers/embree_rays.py`).
+//! prints a table: mesh, set of rays, millions of rays per CPU second (best round). `--export` also
+//! writes the meshes and rays as raw little-endian files, for other ray tracers
+//! (`tests/peers/embree_rays.py`).
 
 use std::{
     fs::{self, File},
@@ -15,17 +17,17 @@ use std::{
 use picofarm_scene::{AssetLibrary, Scene, Vec3, furnished};
 use picofarm_transient::{Bvh, Kernel};
 
-/// Image width and height: one primary ray a pixel, in tiles of 8×8 pixels.
+/// Image width and height: one primary ray per pixel, in tiles of 8×8 pixels.
 const SIDE: u32 = 256;
 const TILE: usize = 64;
 
-/// Rays of one kind in the order in which they are traced.
+/// Rays of one kind in tracing order.
 enum Rays {
     /// Origin and direction; the nearest hit.
     Closest(Vec<(Vec3, Vec3)>),
     /// From, to; any hit between.
     Single(Vec<(Vec3, Vec3)>),
-    /// One point and the range of `points` that it is tested against.
+    /// One point and the range of `points` that it is tested against, per bundle.
     Bundles {
         from: Vec<(Vec3, std::ops::Range<usize>)>,
         points: Vec<Vec3>,
@@ -103,11 +105,11 @@ fn row(mesh: &str, name: &str, count: usize, seconds: f64) {
     println!("{mesh:<10} {name:<12} {count:>9} {rate:>8.2}");
 }
 
-/// Rays traced in a pass and the CPU seconds of the fastest pass.
+/// Returns the number of rays of a pass and the CPU seconds of the fastest pass.
 fn best(bvh: &Bvh, rays: &Rays, rounds: usize, split: bool) -> (usize, f64) {
     let (mut count, mut seconds) = (0, f64::INFINITY);
     for _ in 0..rounds {
-        // At least 150 ms a round: the clock ticks every few milliseconds.
+        // Run at least 150 ms per round, because the clock ticks every few milliseconds.
         let (start, begun, mut passes) = (cpu_seconds(), Instant::now(), 0u32);
         while begun.elapsed().as_millis() < 150 {
             count = pass(bvh, rays, split);
@@ -152,7 +154,7 @@ fn pass(bvh: &Bvh, rays: &Rays, split: bool) -> usize {
     stack.rays as usize
 }
 
-/// CPU time of this thread.
+/// Returns the CPU time of this thread.
 fn cpu_seconds() -> f64 {
     let text = fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
     let nanoseconds = text.split(' ').next().and_then(|t| t.parse::<f64>().ok());
@@ -169,7 +171,7 @@ fn soup(scene: &Scene) -> Vec<[Vec3; 3]> {
         .collect()
 }
 
-/// One triangle cut into n² of the same shape.
+/// Cuts a triangle into n² of the same shape.
 fn cut(t: &[Vec3; 3], n: u32) -> Vec<[Vec3; 3]> {
     let at = |i: u32, j: u32| {
         t[0] + (t[1] - t[0]) * (i as f32 / n as f32) + (t[2] - t[0]) * (j as f32 / n as f32)
@@ -186,7 +188,7 @@ fn cut(t: &[Vec3; 3], n: u32) -> Vec<[Vec3; 3]> {
     parts
 }
 
-/// Numbers in [0, 1).
+/// Returns a generator of numbers in [0, 1).
 fn noise(seed: u32) -> impl FnMut() -> f32 {
     let mut s = u64::from(seed).wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     move || {
@@ -197,7 +199,7 @@ fn noise(seed: u32) -> impl FnMut() -> f32 {
     }
 }
 
-/// A cosine-distributed direction about `n`.
+/// Returns a cosine-distributed direction about `n`.
 fn scatter(n: Vec3, r: &mut dyn FnMut() -> f32) -> Vec3 {
     loop {
         let s = Vec3::new(r(), r(), r()) * 2.0 - Vec3::splat(1.0);
@@ -251,8 +253,8 @@ fn rays(scene: &Scene, triangles: &[[Vec3; 3]], bvh: &Bvh) -> Vec<(&'static str,
         .iter()
         .map(|h| (h.p, spots[one_of(spots.len(), &mut r)]))
         .collect();
-    // Bundles: each tile's points from every spot; from vertices of paths that start in the tile; and
-    // a quarter of a tile (a pixel's samples, say) from a spot or such a vertex.
+    // Bundles to each tile's points from every spot and from vertices of paths that start in the
+    // tile, and to a quarter of a tile (such as a pixel's samples) from such a vertex.
     let (mut points, mut starts) = (vec![], vec![0]);
     for tile in first.chunks(TILE) {
         points.extend(tile.iter().flatten().map(|h| h.p));
@@ -268,7 +270,7 @@ fn rays(scene: &Scene, triangles: &[[Vec3; 3]], bvh: &Bvh) -> Vec<(&'static str,
     for t in tiles {
         lit.extend(spots.iter().map(|&s| (s, t.clone())));
         for _ in 0..16 {
-            // `second` runs along the points that exist.
+            // `second` is indexed like the existing points.
             let k = t.start + one_of(t.len(), &mut r);
             let Some(y) = second[k] else { continue };
             reused.push((y.p, t.clone()));
@@ -291,8 +293,8 @@ fn rays(scene: &Scene, triangles: &[[Vec3; 3]], bvh: &Bvh) -> Vec<(&'static str,
     ]
 }
 
-/// Writes `MESH.triangles` (nine f32 each) and, for each set, `MESH.NAME.closest` or `.any`: origin,
-/// direction and limit of each ray, seven f32.
+/// Writes `MESH.triangles` (nine f32 each) and, for each set, `MESH.NAME.closest` or `.any`:
+/// origin, direction and limit of each ray, seven f32.
 fn write(
     folder: &Path,
     mesh: &str,

@@ -1,10 +1,12 @@
-//! Speed of the sensor model on one thread, a scene of 256×256×637: `cargo bench -p picofarm-transient --bench sensor`.
+//! Measures the speed of the sensor model on one thread, for a scene of 256×256×637:
+//! `cargo bench -p picofarm-transient --bench sensor`.
 
 use picofarm_transient::sensor::{
     DeadTime, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values, sense,
 };
 
-/// Something like a furnished room: a dark start, a two-bounce peak, and a tail of many bounces.
+/// Returns histograms similar to those of a furnished room: a dark start, a two-bounce peak, and a
+/// tail of many bounces.
 fn room(pixels: usize, bins: usize) -> (Vec<f32>, Vec<f32>) {
     let mut two = vec![0f32; pixels * bins];
     let mut all = vec![0f32; pixels * bins];
@@ -25,7 +27,8 @@ fn room(pixels: usize, bins: usize) -> (Vec<f32>, Vec<f32>) {
     (all, two)
 }
 
-/// CPU seconds of this process so far (Linux), so that other work on the machine does not count.
+/// Returns the CPU seconds of this process so far (Linux), so that other work on the machine does
+/// not count.
 fn cpu_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").expect("the bench runs on Linux");
     let after_name = stat.rsplit(')').next().unwrap_or_default();

@@ -1,11 +1,16 @@
-//! Whether the error that a render states, and stops by, is its true one, on scenes that are hard to sample:
-//! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
-//! SCENE is a scene's name, or a part of several scenes' names. ERROR 0 renders numbers of passes instead: error by pixel and of the whole image, CPU seconds, slope and merit. With a
-//! negative ERROR it prints which class of paths carries the variance; `wavelengths` in its place compares three wavelengths in one
-//! pass with each alone, and `json` prints the scene for tests/peers. With a folder in `STOP_TRUTHS`, truths are kept there and used again, so that two versions are compared with the same one.
-//! `rooms [ROOMS [PIXELS [ERROR [LIBRARY [FOLDER]]]]]` renders furnished rooms of fresh seeds with 25 spots
-//! to an error, and prints what they cost. Without arguments: 20 rooms at 256×256 with Sweet Home 3D's
-//! furniture to 0.1.
+//! Compares the error estimate by which a render stops with its true error, on scenes that are hard
+//! to sample: `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
+//! SCENE is a scene's name, or a part of several scenes' names.
+//!
+//! ERROR 0 renders fixed numbers of passes and prints the error by pixel and of the whole image,
+//! CPU seconds, slope and merit. A negative ERROR prints the share of each path class in the
+//! variance. `wavelengths` instead of a number compares three wavelengths in one pass with each
+//! alone, and `json` prints the scene for tests/peers. If `STOP_TRUTHS` is a folder, truths are
+//! stored there and reused, so that two versions are compared with the same truth.
+//!
+//! `rooms [ROOMS [PIXELS [ERROR [LIBRARY [FOLDER]]]]]` renders furnished rooms of fresh seeds with
+//! 25 spots to an error, and prints their cost. Without further arguments: 20 rooms at 256×256 with
+//! Sweet Home 3D's furniture to 0.1.
 
 #[path = "../tests/it/common/mod.rs"]
 #[allow(unused, reason = "a bench uses its own part")]
@@ -23,7 +28,8 @@ use picofarm_transient::{Budget, Rendered, Settings, plan, render, variance};
 
 const BINS: usize = 637;
 
-/// CPU seconds of this process so far (Linux), so that other work on the machine does not count.
+/// Returns the CPU seconds of this process so far (Linux), so that other work on the machine does
+/// not count.
 fn cpu_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").expect("the bench runs on Linux");
     let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split(' ').collect();
@@ -62,7 +68,8 @@ fn truth(scene: &Scene, passes: u32) -> Truth {
     Truth { mean, noise }
 }
 
-/// Median and 95th percentile over pixels of ‖h − r‖ / ‖r‖, the truth's own noise taken off.
+/// Returns the median and the 95th percentile over pixels of ‖h − r‖ / ‖r‖, without the truth's own
+/// noise.
 fn deviation(h: &[f32], t: &Truth) -> [f64; 2] {
     let mut all: Vec<f64> = h
         .chunks(BINS)
@@ -193,7 +200,7 @@ fn classes(scene: &Scene) {
     }
 }
 
-/// A truth from its file, or made and kept there.
+/// Reads a truth from its file, or creates and stores it.
 fn kept(name: &str, make: impl Fn() -> Truth) -> Truth {
     let Ok(folder) = std::env::var("STOP_TRUTHS") else {
         return make();
@@ -211,13 +218,15 @@ fn kept(name: &str, make: impl Fn() -> Truth) -> Truth {
     truth
 }
 
-/// What renders of so many passes came to: CPU seconds, and the median error of a pixel.
+/// The mean result of renders with a fixed number of passes: CPU seconds, and the median error of a
+/// pixel.
 struct Rung {
     cpu_s: f64,
     error: f64,
 }
 
-/// Renders of so many passes: what they say and what is true, per pixel and of the whole image.
+/// Renders with a fixed number of passes, and prints the estimated and the true error, per pixel
+/// and of the whole image.
 fn fixed(scene: &Scene, (passes, seeds): (u32, u32), truth: &Truth) -> Rung {
     let (mut says, mut is, mut p95, mut total, mut cpu_s) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let mut says_p95 = 0.0;
@@ -254,7 +263,7 @@ fn fixed(scene: &Scene, (passes, seeds): (u32, u32), truth: &Truth) -> Rung {
     Rung { cpu_s, error: is }
 }
 
-/// Slope of error over time between the last rungs, and CPU seconds to 10 and to 5 %.
+/// Prints the slope of error over time between the last rungs, and CPU seconds to 10 % and to 5 %.
 fn merit(rungs: &[Rung]) {
     let [.., a, b] = rungs else { return };
     let slope = (b.error / a.error).ln() / (b.cpu_s / a.cpu_s).ln();
@@ -277,7 +286,7 @@ fn merit(rungs: &[Rung]) {
     );
 }
 
-/// Renders that stop by the error asked for.
+/// Renders until the requested error, and prints the true one.
 fn stopped(scene: &Scene, asked: f64, seeds: u32, truth: &Truth) {
     let mut found = vec![];
     for seed in 0..seeds {

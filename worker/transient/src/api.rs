@@ -1,11 +1,12 @@
-//! What goes into a render and what comes out of it. Images are row-major `[row][column]`; histograms
-//! are `[row][column][bin]`; per-spot images are `[spot][row][column]`.
+//! The input and the output of a render. Images are row-major `[row][column]`; histograms are
+//! `[row][column][bin]`; per-spot images are `[spot][row][column]`.
 
 use picofarm_scene::Spot;
 pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelength};
 use serde::{Deserialize, Serialize};
 
-/// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
+/// Version of the rendered values. It is part of every task key, so change it whenever any output
+/// bit may change.
 pub const RENDERER_VERSION: &str = "transient-21";
 
 /// Settings of one render.
@@ -17,24 +18,26 @@ pub struct Settings {
     pub budget: Budget,
     /// Longest path in bounces; `None` = until the gate ends. 2 renders no random walk.
     pub max_bounces: Option<u32>,
-    /// Add the analytic one-bounce peaks to the histogram.
+    /// Adds the analytic one-bounce peaks to the histogram.
     pub one_bounce: bool,
     /// Seed of all random numbers.
     pub seed: u64,
-    /// Keep the two-bounce and 3+ parts with their standard errors.
+    /// Keeps the two-bounce and 3+ parts with their standard errors.
     pub split: bool,
-    /// Groups of beams, by index, of which histograms of their own are wanted from the same pass: subsets
-    /// of a grid, or each beam alone.
+    /// Groups of beams, by index, that get histograms of their own from the same pass: subsets of a
+    /// grid, or each beam alone.
     #[serde(default)]
     pub groups: Vec<Vec<u32>>,
-    /// Ways of finding light.
+    /// The techniques to render with.
     #[serde(default)]
     pub strategy: Strategy,
-    /// The width of the laser's beams; without it they have none. Spots and ground truth are those of the beams' middles.
+    /// The width of the laser's beams; `None` renders beams without a width. Spots and ground truth
+    /// are always those of the beams' centres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beam: Option<BeamWidth>,
-    /// Share of each pixel's area that is sensitive, 10⁻⁶ to 1: a square in its middle. Histograms are means over it; the
-    /// ground truth is that of pixels' middles all the same.
+    /// Sensitive share of each pixel's area, 10⁻⁶ to 1: a square in the pixel's middle.
+    /// Histograms are means over this square; the ground truth is always taken at the pixels'
+    /// middles.
     #[serde(default = "whole", skip_serializing_if = "is_whole")]
     pub fill_factor: f64,
     /// Wavelength of the laser. Without one, materials reflect what their [`picofarm_scene::Bsdf`] says.
@@ -51,13 +54,14 @@ fn is_whole(share: &f64) -> bool {
     *share == 1.0
 }
 
-/// Called with the progress of a render; may end it.
+/// Receives the progress of a render and may end it.
 pub trait Progress: Sync {
-    /// Share done in [0, 1], from any thread, not necessarily increasing. Return `false` to stop the render.
+    /// Receives the share done in [0, 1], from any thread and not necessarily increasing. Returns
+    /// `false` to stop the render.
     fn at(&self, done: f32) -> bool;
 }
 
-/// Nobody stops it.
+/// A [`Progress`] that never stops the render.
 pub(crate) struct Unstopped;
 
 impl Progress for Unstopped {
@@ -66,18 +70,18 @@ impl Progress for Unstopped {
     }
 }
 
-/// Asks between steps, and within long ones, whether to stop. What is cut short by it is thrown away: whoever uses it
-/// ends with [`Stop::check`].
+/// A stop request, polled between steps and within long ones. A step that was cut short returns an
+/// unusable result, so the caller discards it and ends with [`Stop::check`].
 #[derive(Clone, Copy)]
 pub(crate) struct Stop<'a>(pub &'a dyn Progress);
 
 impl Stop<'_> {
-    /// Whether to stop.
+    /// Returns whether the render should stop.
     pub fn asked(self) -> bool {
         !self.0.at(0.0)
     }
 
-    /// The same as an error.
+    /// Returns [`RenderError::Stopped`] if the render should stop.
     pub fn check(self) -> Result<(), RenderError> {
         match self.asked() {
             true => Err(RenderError::Stopped),
@@ -97,26 +101,26 @@ pub struct Rendered {
     pub gate: Gate,
     /// h(p, b), multiplexed over the spots: `[row][col][bin]`, radiance per pulse energy (1/(m² sr)).
     pub transient: Vec<f32>,
-    /// The parts, where asked for.
+    /// The parts, if [`Settings::split`] is set.
     pub split: Option<Split>,
-    /// The histograms of [`Settings::groups`], each as `transient`.
+    /// The histograms of [`Settings::groups`], each in the layout of `transient`.
     pub groups: Vec<Vec<f32>>,
     /// Ground truth from the same rays.
     pub truth: GroundTruth,
-    /// The spots, world space, in the order of the scene's beams; `None` where a beam meets nothing.
+    /// The spots, world space, in the order of the scene's beams; `None` if a beam hits nothing.
     pub spots: Vec<Option<Spot>>,
-    /// What fell outside the gate.
+    /// The energy outside the gate.
     pub overflow: Overflow,
-    /// How noisy it is.
+    /// The estimated noise.
     pub error: ErrorEstimate,
-    /// What was done and why.
+    /// The decisions of the renderer and the reasons for them.
     pub plan: Plan,
     /// Rays traced.
     pub rays: u64,
-    /// Why no light is in the image, where there is none: one of `warnings`.
+    /// The reason for an image without light, if it has none. It is also in `warnings`.
     pub dark: Option<String>,
-    /// What somebody should know before trusting it: beams that meet nothing, an image without light. No part of what is
-    /// stored: it says nothing that the stored data do not.
+    /// Warnings for the user: beams that hit nothing, an image without light. They are not stored,
+    /// because they can be derived from the stored data.
     pub warnings: Vec<String>,
 }
 
@@ -127,25 +131,28 @@ pub struct Split {
     pub two: Vec<f32>,
     /// Its standard error.
     pub two_se: Vec<f32>,
-    /// A draw of its error: the square of any weighted sum of it estimates the variance of that sum of `two`. What a
-    /// path brings falls into one bin or the next, so that sums over bins err far less than `two_se` alone says.
+    /// A draw of its error: the square of any weighted sum of it estimates the variance of that sum
+    /// of `two`. A path's contribution falls into one bin or the next, so sums over bins have a far
+    /// smaller error than `two_se` alone suggests.
     pub two_noise: Vec<f32>,
     /// Three bounces and more.
     pub multi: Vec<f32>,
     /// Its standard error.
     pub multi_se: Vec<f32>,
-    /// A draw of its error, with what pixels and bins have in common: the square of any weighted sum of
-    /// it estimates the variance of that sum of `multi`, where `multi_se` alone cannot. Both parts are independent: for sums
-    /// of `two` and `multi` together the two squares add up.
+    /// A draw of its error, including correlations between pixels and bins: the square of any
+    /// weighted sum of it estimates the variance of that sum of `multi`, which `multi_se` alone
+    /// cannot. Both parts are independent: for sums of `two` and `multi` together the two squares
+    /// add up.
     pub multi_noise: Vec<f32>,
 }
 
-/// Ground truth. Depth and its kin are those of the ray through the pixel's centre.
+/// Ground truth. Depth, range, normal, indices and masks are for the ray through the pixel's
+/// centre.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GroundTruth {
-    /// z-depth, metres; 0 where the ray leaves the scene.
+    /// z-depth, metres; 0 if the ray leaves the scene.
     pub depth: Vec<f32>,
-    /// Distance along the ray, metres; 0 likewise.
+    /// Distance along the ray, metres; 0 if the ray leaves the scene.
     pub range: Vec<f32>,
     /// Unit normals facing the camera, camera frame, `[row][col][3]`.
     pub normal: Vec<f32>,
@@ -153,77 +160,80 @@ pub struct GroundTruth {
     pub instance: Vec<u32>,
     /// Label index + 1; 0 = nothing.
     pub label: Vec<u16>,
-    /// 1 where the first surface is a mirror (see `Material::is_specular`).
+    /// 1 if the first surface is a mirror (see `Material::is_specular`).
     pub specular: Vec<u8>,
-    /// `[spot][row][col]`: 1 = lit, the segment from spot to surface point is free and both face it.
+    /// `[spot][row][col]`: 1 = lit: the segment from the spot to the surface point is free and both
+    /// face it.
     pub visibility: Vec<u8>,
     /// Companion image, linear RGB in [0, 1], `[row][col][3]`.
     pub rgb: Vec<f32>,
 }
 
-/// Energy outside the gate, same units as the histogram summed over pixels and bins. A lower bound where
-/// the plan says that the gate is narrow ([`Strategy::ellipsoidal`]).
+/// Energy outside the gate, in the units of the histogram summed over pixels and bins. It is a
+/// lower bound if the plan reports a narrow gate ([`Strategy::ellipsoidal`]).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Overflow {
     /// Energy dropped.
     pub energy: f64,
-    /// Share of all energy found.
+    /// The dropped energy as a share of all sampled energy.
     pub share: f64,
 }
 
-/// How noisy a render is, estimated from the variance between passes.
+/// The noise of a render, estimated from the variance between passes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ErrorEstimate {
-    /// Median over pixels of ‖error‖₂ / ‖h‖₂ over the bins (one bounce left out). Where bins of a pixel err together, most
-    /// pixels err by less than ‖standard error‖₂ and few by much more, so the standard errors' median is corrected by draws of
-    /// the errors of one pixel in nine. Pixels of a neighbourhood share vertices: their errors are alike, and sums over
-    /// them err more than by chance.
+    /// Median over pixels of ‖error‖₂ / ‖h‖₂ over the bins, without one-bounce light. If the errors
+    /// of a pixel's bins are correlated, most pixels have an error below ‖standard error‖₂ and a
+    /// few have a much larger one. The median of the standard errors is therefore corrected by
+    /// draws of the errors of one pixel in nine. Neighbouring pixels share vertices, so their
+    /// errors are correlated, and sums over them have larger errors than independent pixels would.
     pub median_relative: f32,
     /// The same, 95th percentile.
     pub p95_relative: f32,
-    /// Standard error of the total energy / total energy, with what pixels have in common.
+    /// Standard error of the total energy / total energy, including correlations between pixels.
     pub total_relative: f32,
-    /// How far `total_relative` itself can be trusted: the relative standard error of its square, from the fourth moment
-    /// of the passes, as far as it exceeds that of normal ones. Near 0 where passes scatter normally, near 1 where a single
-    /// bright path holds the variance.
+    /// The uncertainty of `total_relative`: the relative standard error of its square, from the
+    /// fourth moment of the passes, as far as it exceeds that of normally distributed passes. It is
+    /// near 0 if passes scatter normally, and near 1 if a single bright path dominates the
+    /// variance.
     #[serde(default)]
     pub total_uncertainty: f32,
-    /// Camera paths of each pixel.
+    /// Camera paths per pixel.
     pub samples: u32,
 }
 
-/// What the renderer decided for this scene.
+/// The renderer's decisions for this scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Strategies used, e.g. `two-bounce deterministic 4x4`, `mirror images: 2 planar mirrors`.
     pub strategies: Vec<String>,
-    /// What is approximated or noisy here, in words; empty if nothing.
+    /// The approximations and noise sources in this scene, in words; empty if there are none.
     pub approximations: Vec<String>,
 }
 
-/// Why a render stopped.
+/// The reason why a render stopped.
 #[derive(Debug, thiserror::Error)]
 pub enum RenderError {
     /// The scene or a setting is unusable.
     #[error("{field}: {what}")]
     Invalid {
-        /// Field, e.g. `gate.bin_width_m`.
+        /// The field, e.g. `gate.bin_width_m`.
         field: String,
-        /// What was expected and how to correct it.
+        /// The expected value and how to correct the field.
         what: String,
     },
     /// The scene is unusable.
     #[error(transparent)]
     Scene(#[from] picofarm_scene::SceneError),
-    /// The histograms find no room in memory.
+    /// There is not enough memory for the histograms.
     #[error("{what} take {gib:.1} GiB of memory, which this process does not get")]
     Memory {
-        /// What they are.
+        /// The buffers in question.
         what: String,
-        /// How much they take.
+        /// Their size, GiB.
         gib: f64,
     },
-    /// [`Progress::at`] asked to stop.
+    /// [`Progress::at`] requested a stop.
     #[error("render stopped on request")]
     Stopped,
 }

@@ -1,5 +1,6 @@
-//! The laser's beams on their way to their spots: straight through thin glass, refracted by bodies of glass, folded by near-mirrors. What
-//! glass reflects of a beam makes spots of its own.
+//! Traces the laser's beams to their spots: straight through thin glass, refracted by bodies of
+//! glass, and reflected by near-mirrors. The part of a beam that glass reflects makes spots of its
+//! own.
 
 use picofarm_scene::{Beam, Scene, Spot, Vec3};
 
@@ -11,19 +12,19 @@ use crate::{
     world::{World, lift},
 };
 
-/// Mirrors a beam may meet before it is given up.
+/// Largest number of turns of a beam before it is dropped.
 const MAX_REFLECTIONS: u32 = 64;
-/// Least share of a beam's light that is followed where glass turns it aside.
+/// Least share of a beam's light for which a reflection by glass is followed.
 const LEAST_BRANCH: f32 = 1.0 / 256.0;
-/// How far a stated spot may lie from where its beam ends, render units.
+/// Largest distance between a stated spot and the end of its beam, render units.
 const SAME_PLACE: f32 = 1e-3;
 
-/// The spots of a scene's beams in their order; `None` where a beam meets nothing. A spot stated by the
-/// beam is taken as it is; otherwise the beam is followed, through mirrors (`Material::is_specular`) by
-/// exact reflection, to the first other surface.
+/// Returns the spots of a scene's beams in order; `None` if a beam hits nothing. A spot stated by
+/// the beam is taken as it is; otherwise the beam is followed, through mirrors
+/// (`Material::is_specular`) by exact reflection, to the first other surface.
 ///
 /// # Errors
-/// [`RenderError::Scene`] where the scene is invalid.
+/// [`RenderError::Scene`] if the scene is invalid.
 pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
     scene.validate()?;
     let world = World::new(scene, f64::INFINITY, Stop(&Unstopped))?;
@@ -36,7 +37,8 @@ pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
     beams.iter().map(|b| b.spot.or_else(|| end(b))).collect()
 }
 
-/// Where a ray of the laser that starts at `origin` ends, and the share of its light that glass lets through to there.
+/// Returns the end of a laser ray that starts at `origin`, and the share of its light that glass
+/// transmits to there.
 pub(crate) fn follow(
     world: &World,
     stack: &mut Stack,
@@ -47,8 +49,8 @@ pub(crate) fn follow(
     ray.follow(world, stack, &mut vec![], |_| {})
 }
 
-/// Where what glass turns aside of a ray of the laser ends, and the shares of its light: as far as they are
-/// [`LEAST_BRANCH`] or more.
+/// Returns the ends of the rays that glass reflects off a laser ray, with their shares of its
+/// light. Only shares of [`LEAST_BRANCH`] or more are followed.
 pub(crate) fn branches(
     world: &World,
     stack: &mut Stack,
@@ -68,10 +70,10 @@ pub(crate) fn branches(
     ends
 }
 
-/// A ray of the laser on its way.
+/// A laser ray in flight.
 #[derive(Debug, Clone, Copy)]
 struct BeamRay {
-    /// Where it is, and the same lifted off the surface there.
+    /// Its position, and the same position lifted off the surface there.
     from: Vec3,
     start: Vec3,
     direction: Vec3,
@@ -79,9 +81,9 @@ struct BeamRay {
     path: f64,
     /// Share of the beam's light.
     share: f32,
-    /// Index of refraction around it.
+    /// Index of refraction of the medium around it.
     medium: f32,
-    /// How often it was reflected or refracted.
+    /// Number of reflections and refractions so far.
     turns: u32,
 }
 
@@ -98,7 +100,8 @@ impl BeamRay {
         }
     }
 
-    /// Reflected at a place on glass, whose unit normal faces it, with a share of its light.
+    /// Returns the ray reflected at a point on glass with the unit normal that faces it, carrying
+    /// `share` of its light.
     fn reflected(&self, world: &World, (p, n): (Vec3, Vec3), share: f32) -> Self {
         let w = self.direction;
         Self {
@@ -112,8 +115,9 @@ impl BeamRay {
         }
     }
 
-    /// Follows it straight through thin glass, refracted by bodies of glass and folded by near-mirrors, to where it ends, with its
-    /// share of the light; what glass reflects of it goes to `aside`.
+    /// Follows the ray straight through thin glass, refracted by bodies of glass and reflected by
+    /// near-mirrors. Returns its end and its share of the light. The rays that glass reflects off
+    /// it go to `aside`.
     fn follow(
         &mut self,
         world: &World,
@@ -139,7 +143,7 @@ impl BeamRay {
             }
             let mut hit = hit?;
             self.share *= passes;
-            // Where the beam meets that facet without the lift off the mirror before it.
+            // The beam's intersection with that facet without the lift off the previous mirror.
             hit.p = world.point(hit.triangle, self.from, self.direction);
             let (p, n) = (hit.p, hit.n);
             if let Some(body) = world.body(hit.triangle) {
@@ -185,8 +189,8 @@ impl BeamRay {
     }
 }
 
-/// The share of a beam's light that glass lets through to its spot: along the beam, or in a straight line where the spot is
-/// stated elsewhere.
+/// Returns the share of a beam's light that glass transmits to its spot: along the beam, or in a
+/// straight line if the stated spot is elsewhere.
 pub(crate) fn through(world: &World, stack: &mut Stack, direction: Vec3, spot: &Spot) -> f32 {
     if !world.has_glass() && !world.has_bodies() {
         return 1.0;
@@ -198,7 +202,7 @@ pub(crate) fn through(world: &World, stack: &mut Stack, direction: Vec3, spot: &
     }
 }
 
-/// The share of a beam's light that glass lets through, if the beam ends at `spot`.
+/// Returns the share of a beam's light that glass transmits, if the beam ends at `spot`.
 pub(crate) fn ends_at(
     world: &World,
     stack: &mut Stack,

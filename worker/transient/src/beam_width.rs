@@ -1,27 +1,29 @@
-//! Beams with a width: rays that stand for a Gaussian beam.
+//! Beams with a width: rays that represent a Gaussian beam.
 //!
-//! The rays of a Gaussian beam are straight lines on hyperboloids around its axis: one that leaves the laser beside the axis
-//! by `s` times the standard deviation there is tilted by `s` times that of the angle, at a right angle to where it stands. So at a distance z
-//! it is √(σ₀² + σ_θ²z²)·s from the axis, which is how wide such a beam is there.
+//! The rays of a Gaussian beam are straight lines on hyperboloids around its axis. A ray that
+//! leaves the laser at `s` standard deviations from the axis is tilted by `s` standard deviations
+//! of the angle, at a right angle to its offset. So at a distance z the ray is √(σ₀² + σ_θ²z²)·s
+//! from the axis, which is the width of a Gaussian beam there.
 //!
-//! Each of a fixed number of rays carries an equal share of the light and ends in a point source of its own: a spot is as a small group
-//! of spots, on whatever surfaces the rays meet, and everything that holds of spots holds of it (mirrors, glass, subsets). The
-//! rays are the same in every render. What is smaller than the distance between two of them is not resolved.
+//! Each of a fixed number of rays carries an equal share of the light and ends in a point source of
+//! its own. A spot is therefore a small group of point spots, on whatever surfaces the rays hit,
+//! and is treated like any other spots (mirrors, glass, subsets). The rays are the same in every
+//! render. Details smaller than the distance between two rays are not resolved.
 
 use picofarm_scene::Vec3;
 
 use crate::{api::BeamWidth, bsdf::frame};
 
-/// A ray of a beam that has a width.
+/// A ray of a beam with a width.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
-    /// Where it leaves the laser, from the laser's place, metres.
+    /// Its offset from the laser's position where it leaves the laser, metres.
     pub beside_m: Vec3,
     /// Unit direction.
     pub direction: Vec3,
 }
 
-/// The ray of a beam along `direction` that stands for a place of the normal distribution.
+/// Returns the ray of a beam along `direction` for a point of the normal distribution.
 pub(crate) fn ray(width: &BeamWidth, [a, b]: [f32; 2], direction: Vec3) -> Ray {
     let (u, v) = frame(direction);
     // A diameter to 1/e² is four standard deviations.
@@ -35,8 +37,9 @@ pub(crate) fn ray(width: &BeamWidth, [a, b]: [f32; 2], direction: Vec3) -> Ray {
     }
 }
 
-/// Places of a normal distribution in the plane: a spiral by the golden angle, at the distances of equal shares, moved and scaled so
-/// that their mean is 0 and the mean square of each coordinate is 1 on average over both.
+/// Returns points of a normal distribution in the plane: a golden-angle spiral at the radii of
+/// equal shares, shifted and scaled so that their mean is 0 and the mean square of each coordinate
+/// is 1 on average over both.
 pub(crate) fn places(count: u32) -> Vec<[f32; 2]> {
     let n = f64::from(count);
     let mut all: Vec<[f64; 2]> = (0..count)
@@ -73,7 +76,7 @@ mod tests {
             let (xx, yy) = (mean(&|p| p[0] * p[0]), mean(&|p| p[1] * p[1]));
             let xy = mean(&|p| p[0] * p[1]);
             assert!((xx + yy - 2.0).abs() < 1e-5, "{count}: {xx} {yy}");
-            // The longer of few has no partner on the other side.
+            // With few places, the outermost one has no partner on the other side.
             let round = 2.0 / n.sqrt();
             assert!(
                 (xx - yy).abs() < round && xy.abs() < round,
@@ -99,7 +102,7 @@ mod tests {
                 let off = at - axis * at.dot(axis);
                 square += f64::from(off.dot(off)) / 64.0;
             }
-            // Two coordinates, each of a quarter of the diameter.
+            // Two coordinates, each with a standard deviation of a quarter of the diameter.
             let diameter = 4.0 * (square / 2.0).sqrt() * 1e3;
             let expected = libm::hypot(4.0, 2.0 * f64::from(z));
             assert!(

@@ -1,5 +1,5 @@
-//! Scattering: Lambertian, rough conductor (Beckmann or GGX; Walter et al., EGSR 2007) and the mix of
-//! both, for two directions on the same side of a facet.
+//! Scattering for two directions on the same side of a facet: Lambertian, rough conductor (Beckmann
+//! or GGX; Walter et al., EGSR 2007) and a mix of both.
 
 mod beckmann;
 
@@ -12,15 +12,16 @@ use crate::{
     rng::Rng,
 };
 
-/// How a surface scatters: the kinds that the renderer knows. A new kind is a variant here, its density, pdf and draw in this
-/// file, and a variant of [`Bsdf`]; the rest of the renderer asks a [`Surface`] what it can do and knows no kind.
+/// The scattering models of the renderer. A new model is a variant here, its density, pdf and
+/// sampling in this file, and a variant of [`Bsdf`]. The rest of the renderer queries the
+/// properties of a [`Surface`] and does not match on models.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     /// ρ/π.
     Lambertian,
     /// A rough conductor.
     Conductor,
-    /// A Lambertian beside a rough conductor.
+    /// A weighted sum of a Lambertian and a rough conductor.
     Mixed,
 }
 
@@ -29,8 +30,9 @@ const TWO_SIDED: u8 = 1;
 const SPECULAR: u8 = 2;
 const GGX: u8 = 4;
 
-/// Roughness from which pixels share a conductor's vertices. There its lobe is wide enough to be weighed pixel by pixel for
-/// light that was found for one of them; beneath, that costs more than it brings (measured at 0.12 and 0.2).
+/// Roughness from which pixels share a conductor's vertices. From there on, its lobe is wide enough
+/// to evaluate light sampled for one pixel at the others; below it, sharing costs more than it
+/// gains (measured at 0.12 and 0.2).
 const SHARED_ALPHA: f32 = 0.15;
 
 /// A material's scattering, ready for use. Sixteen bytes: every hit carries one.
@@ -42,7 +44,7 @@ pub(crate) struct Surface {
     strength: f32,
     /// Roughness of a conductor; of others 0.
     alpha: f32,
-    /// Lambertian part ρ/π of a mix times its share; of others 0.
+    /// Lambertian part ρ/π of a mix times its share; 0 for other surfaces.
     base: f32,
 }
 
@@ -83,7 +85,7 @@ impl Surface {
             } => {
                 let strength = weight * specular_reflectance;
                 let base = (1.0 - weight) * reflectance / PI;
-                // A mix has two parts that scatter; with one it is pure.
+                // A mix has two parts that scatter; with one such part the surface is pure.
                 if base == 0.0 {
                     of(Kind::Conductor, strength, alpha, 0.0)
                 } else if strength == 0.0 {
@@ -127,18 +129,18 @@ impl Surface {
         self.flags & TWO_SIDED != 0
     }
 
-    /// Counts as a mirror (specular mask).
+    /// Returns whether the surface counts as a mirror (specular mask).
     #[inline(always)]
     pub fn specular(&self) -> bool {
         self.flags & SPECULAR != 0
     }
 
-    /// The same surface, scattering nothing.
+    /// Returns the same surface without any scattering.
     pub fn black(self) -> Self {
         self.scaled(0.0)
     }
 
-    /// The same surface, scattering `factor` times as much.
+    /// Returns the same surface with its scattering multiplied by `factor`.
     #[inline(always)]
     pub fn scaled(self, factor: f32) -> Self {
         let scaled = Self {
@@ -153,13 +155,14 @@ impl Surface {
         }
     }
 
-    /// Pixels may share its vertices: a Lambertian, or a conductor that is rough enough.
+    /// Returns whether pixels may share its vertices: for a Lambertian, or a sufficiently rough
+    /// conductor.
     #[inline(always)]
     pub fn is_shared(&self) -> bool {
         self.diffuse() || self.alpha >= SHARED_ALPHA
     }
 
-    /// A Lambertian of albedo 1 in its place.
+    /// Returns a Lambertian of albedo 1 with the same sides.
     #[inline]
     pub fn white(self) -> Self {
         Self {
@@ -171,19 +174,19 @@ impl Surface {
         }
     }
 
-    /// Scatters nothing.
+    /// Returns whether the surface scatters nothing.
     #[inline(always)]
     pub fn is_black(&self) -> bool {
         self.strength == 0.0
     }
 
-    /// True for Lambertian surfaces.
+    /// Returns whether the surface is Lambertian.
     #[inline(always)]
     pub fn diffuse(&self) -> bool {
         matches!(self.kind, Kind::Lambertian)
     }
 
-    /// True for a mix of two parts, of which [`Surface::lobe`] chooses.
+    /// Returns whether the surface is a mix of two parts; [`Surface::lobe`] chooses one of them.
     #[inline(always)]
     pub fn is_mixed(&self) -> bool {
         matches!(self.kind, Kind::Mixed)
@@ -199,38 +202,39 @@ impl Surface {
         }
     }
 
-    /// BRDF of a Lambertian surface, ρ/π.
+    /// Returns the BRDF of a Lambertian surface, ρ/π.
     #[inline(always)]
     pub fn lambertian(&self) -> f32 {
         self.strength
     }
 
-    /// Roughness α of its conductor, 0 without one.
+    /// Returns the roughness α of its conductor, 0 without one.
     #[inline(always)]
     pub fn alpha(&self) -> f32 {
         self.alpha
     }
 
-    /// Its conductor, if it has one, is GGX.
+    /// Returns whether its conductor, if it has one, is GGX.
     #[inline(always)]
     pub fn ggx(&self) -> bool {
         self.flags & GGX != 0
     }
 
-    /// Has a conductor that is smooth enough for a mirror, alone or in a mix.
+    /// Returns whether the surface has a conductor, alone or in a mix, smooth enough for a mirror.
     #[inline(always)]
     pub fn has_mirror(&self) -> bool {
         !self.diffuse() && !self.is_rough() && !self.is_black()
     }
 
-    /// Has a conductor that is too rough for a mirror.
+    /// Returns whether the surface has a conductor too rough for a mirror.
     #[inline(always)]
     pub fn is_rough(&self) -> bool {
         self.alpha > Material::SPECULAR_ALPHA
     }
 
-    /// One part of a mix, chosen by `u` in [0, 1) in proportion to the parts' albedos and divided by the
-    /// chance of that choice, with `specular` as for the part alone. Pure surfaces are their own part.
+    /// Returns one part of a mix, chosen by `u` in [0, 1) in proportion to the parts' albedos and
+    /// divided by the probability of that choice, with `specular` as for the part alone. A pure
+    /// surface returns itself.
     #[inline]
     pub fn lobe(&self, u: f32) -> Surface {
         if !self.is_mixed() {
@@ -256,7 +260,7 @@ impl Surface {
         }
     }
 
-    /// The conductor alone, as it is in a mix. Pure surfaces stay what they are.
+    /// Returns the conductor of a mix, with its share. A pure surface returns itself.
     #[inline(always)]
     pub fn gloss(self) -> Self {
         match self.kind {
@@ -269,13 +273,13 @@ impl Surface {
         }
     }
 
-    /// Chance with which [`Surface::sample`] draws from the conductor of a mix.
+    /// Returns the probability that [`Surface::sample`] draws from the conductor of a mix.
     #[inline(always)]
     fn share(&self) -> f32 {
         self.strength / (self.strength + self.base * PI)
     }
 
-    /// f · cos(n, o) for unit directions `i` and `o`, both leaving the surface.
+    /// Returns f · cos(n, o) for unit directions `i` and `o`, both leaving the surface.
     #[inline(always)]
     pub fn scatter(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
         let (ci, co) = (n.dot(i), n.dot(o));
@@ -288,7 +292,8 @@ impl Surface {
         self.scatter_rough(n, i, o, (ci, co))
     }
 
-    /// The same of what is not Lambertian, with the cosines of both.
+    /// Like [`Surface::scatter`], for surfaces that are not Lambertian, given the cosines of both
+    /// directions.
     #[inline]
     fn scatter_rough(&self, n: Vec3, i: Vec3, o: Vec3, (ci, co): (f32, f32)) -> f32 {
         let d = self.density(n, i + o);
@@ -298,7 +303,8 @@ impl Surface {
         self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci) + self.base * co
     }
 
-    /// How it scatters light from a direction with cosine `c`, for many directions side by side; nothing from beneath.
+    /// Returns the lobe for light from a direction with cosine `c`, for evaluation in many
+    /// directions at once; black for directions below the surface.
     #[inline]
     pub fn lobe_from(&self, c: f32) -> Lobe {
         let lit = c > 0.0 && !self.is_black();
@@ -329,14 +335,15 @@ impl Surface {
         }
     }
 
-    /// The BRDF of a surface that is not Lambertian, from a direction with cosine `c` to another, is the first number here plus the
-    /// second times [`Surface::leaving`] and [`Surface::lobe_ggx`] or [`Surface::lobe_beckmann`] of the other.
+    /// Returns two numbers (a, b) for the BRDF of a non-Lambertian surface, from a
+    /// direction with cosine `c` to another. The BRDF is a + b times [`Surface::leaving`] and
+    /// [`Surface::lobe_ggx`] or [`Surface::lobe_beckmann`] of the other direction.
     pub fn arriving(&self, c: f32) -> (f32, f32) {
         let a2 = self.alpha * self.alpha;
         (self.base, self.strength * self.leaving(c) / (4.0 * PI * a2))
     }
 
-    /// G₁ over the cosine `c`, above the surface; see [`Surface::arriving`].
+    /// Returns G₁ over the cosine `c`, above the surface; see [`Surface::arriving`].
     pub fn leaving(&self, c: f32) -> f32 {
         let leaving = match self.ggx() {
             true => 2.0 / self.edge(c),
@@ -345,8 +352,8 @@ impl Surface {
         if leaving.is_finite() { leaving } else { 0.0 }
     }
 
-    /// G₁ over the cosine `c` by which facets are drawn that a direction sees: Smith's of either distribution, to the last digits, as
-    /// draws follow it.
+    /// Returns G₁ over the cosine `c` for the sampling of visible facets. It is Smith's for both
+    /// distributions, to the last digits, because the samples follow it.
     #[inline]
     fn seen(&self, c: f32) -> f32 {
         match self.ggx() {
@@ -355,8 +362,9 @@ impl Surface {
         }
     }
 
-    /// See [`Surface::arriving`]: D·π·α² of GGX by the squares of the sum of both directions and of its part along the normal. For
-    /// lobes wide enough that their difference does not cancel.
+    /// Returns D·π·α² of GGX from the square of the sum of both directions and the square of its
+    /// part along the normal; see [`Surface::arriving`]. It is valid for lobes wide enough that
+    /// their difference does not cancel.
     #[inline(always)]
     pub fn lobe_ggx(&self, square: f32, along2: f32) -> f32 {
         let (across2, a2) = ((square - along2).max(0.0), self.alpha * self.alpha);
@@ -364,7 +372,7 @@ impl Surface {
         t * t
     }
 
-    /// The same of Beckmann.
+    /// Like [`Surface::lobe_ggx`], for Beckmann.
     #[inline(always)]
     pub fn lobe_beckmann(&self, square: f32, along2: f32) -> f32 {
         let across2 = (square - along2).max(0.0);
@@ -397,7 +405,7 @@ impl Surface {
     fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         let (t, b) = frame(n);
         let ci = n.dot(i);
-        // Of a direction beneath the surface no facet is seen: to draw one would take without end.
+        // From below the surface no facet is visible, and drawing one would never end.
         if ci <= 0.0 || ci.is_nan() {
             return None;
         }
@@ -417,7 +425,7 @@ impl Surface {
             return None;
         }
         let seen = self.seen(ci);
-        // 1 but for what Walter's approximation is off.
+        // 1 except for the error of Walter's approximation.
         let approximated = match self.ggx() {
             true => 1.0,
             false => self.leaving(ci) / seen,
@@ -426,7 +434,7 @@ impl Surface {
         Some((o, weight, 0.25 * seen * self.density(n, i + o)))
     }
 
-    /// Density per steradian with which [`Surface::sample`] draws `o`.
+    /// Returns the density per steradian with which [`Surface::sample`] draws `o`.
     #[inline]
     pub fn pdf(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
         let (ci, co) = (n.dot(i), n.dot(o));
@@ -444,7 +452,8 @@ impl Surface {
         share * conductor + (1.0 - share) * co / PI
     }
 
-    /// D(h) for h along `sum` = i + o. The slope comes from n × h: 1 − cos² would cancel at small α.
+    /// Returns D(h) for h along `sum` = i + o. The slope is computed from n × h, because 1 − cos²
+    /// would cancel at small α.
     #[inline]
     fn density(&self, n: Vec3, sum: Vec3) -> f32 {
         let (c, s) = (n.dot(sum), n.cross(sum));
@@ -468,7 +477,7 @@ impl Surface {
         e / (PI * a2 * cos2 * cos2)
     }
 
-    /// G1: Smith's for GGX, Walter's rational approximation for Beckmann.
+    /// Returns G₁: Smith's for GGX, Walter's rational approximation for Beckmann.
     #[inline]
     fn masking(&self, c: f32) -> f32 {
         if self.ggx() {
@@ -478,7 +487,7 @@ impl Surface {
         beckmann_masking(1.0 / (self.alpha * tan))
     }
 
-    /// 2cos / G1 of GGX.
+    /// Returns 2cos / G₁ of GGX.
     #[inline(always)]
     fn edge(&self, c: f32) -> f32 {
         let c2 = c * c;
@@ -486,7 +495,7 @@ impl Surface {
     }
 }
 
-/// A cosine-distributed direction around `n`, and its cosine.
+/// Returns a cosine-distributed direction around `n`, and its cosine.
 #[inline]
 fn cosine(n: Vec3, rng: &mut Rng) -> Option<(Vec3, f32)> {
     let (t, b) = frame(n);
@@ -497,8 +506,8 @@ fn cosine(n: Vec3, rng: &mut Rng) -> Option<(Vec3, f32)> {
     (c > 0.0).then_some((o, c))
 }
 
-/// A half vector of GGX among those that `i` sees, in the surface's frame and of any length (Heitz, JCGT
-/// 2018): its weights never exceed 1, however rough or grazing.
+/// Returns a half vector of GGX among those visible from `i`, in the surface's frame and of any
+/// length (Heitz, JCGT 2018). Its weights never exceed 1, however rough or grazing.
 #[inline]
 fn visible_ggx(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
     let v = Vec3::new(alpha * i[0], alpha * i[1], i[2]).normalized();
@@ -516,7 +525,7 @@ fn visible_ggx(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
     [alpha * h.x, alpha * h.y, h.z.max(0.0)]
 }
 
-/// Two unit vectors that complete `n` to a right-handed frame (Duff et al., JCGT 2017).
+/// Returns two unit vectors that complete `n` to a right-handed frame (Duff et al., JCGT 2017).
 #[inline(always)]
 pub(crate) fn frame(n: Vec3) -> (Vec3, Vec3) {
     let sign = 1.0f32.copysign(n.z);

@@ -1,26 +1,33 @@
-//! Light that glass turns: what panes reflect, and what bodies of glass reflect and refract.
+//! Light that glass turns: reflected by panes, or reflected and refracted by bodies of glass.
 //!
-//! Surfaces scatter, glass turns a ray without a choice of direction: no connection between two points finds such a way. So light
-//! by way of glass has paths of its own, drawn into the image, beside all other techniques, for which thin glass is only passed and
-//! bodies are black. Call the way between two surface points a *leg*, the camera's first and the spot's last, and say that it is
-//! *turned* where glass reflects or refracts light on it. Paths without a turned leg are the other techniques'; of the rest
+//! Surfaces scatter, but glass turns a ray without a choice of direction, so no connection between
+//! two points finds such a path. Such light therefore has paths of its own, drawn into the
+//! image in addition to all other techniques, for which thin glass only transmits and bodies are
+//! black. Call the path between two surface points a *leg*, including the camera's first and the
+//! spot's last. A leg is *turned* if glass reflects or refracts light on it. Paths without a turned
+//! leg belong to the other techniques. The rest are divided as follows:
 //!
-//! 1. those whose last leg is straight, or turned by the reflection of one planar pane alone, are camera paths, connected to the spots
-//!    and to their [`images`]; where straight legs alone lead from a spot to a Lambertian point and a pane's reflection from there to the
-//!    next, that point's image is what is connected ([`lit`]);
-//! 2. the others are light paths. Read from the camera, the first straight leg joins the two: where it is the camera's own, the
-//!    light path is drawn into the image; else camera paths whose legs are all turned are connected to the light path's vertices.
+//! 1. Paths whose last leg is straight, or turned by the reflection of one planar pane alone, are
+//!    camera paths. They are connected to the spots and to their [`images`]. If straight legs alone
+//!    lead from a spot to a Lambertian point, and a pane's reflection leads from there to the next
+//!    point, the path is connected to that point's image instead ([`lit`]).
+//! 2. The others are light paths. Read from the camera, the first straight leg joins the two: if it
+//!    is the camera's own leg, the light path is drawn into the image; otherwise camera paths with
+//!    only turned legs are connected to the light path's vertices.
 //!
-//! Where no leg is straight, light paths whose legs are all turned and camera paths whose first leg is meet on a surface: see
-//! [`photons`]. That alone is an approximation: it blurs what it finds over about a pixel. The spots are among what is found so,
-//! where the camera sees them in bodies of glass or by several panes; one that a planar pane alone shows is a point of light
-//! ([`images`]). Each class is found in one way, so nothing is weighed and nothing counted twice. A reflection
-//! counts as a bounce, and refraction does not; a spot that the camera sees by refraction alone, one bounce, is left out.
+//! If no leg is straight, light paths with only turned legs and camera paths with a turned first
+//! leg join on a surface: see [`photons`]. This technique is the only approximation: it blurs its
+//! result over about a pixel. It includes the spots themselves if the camera sees them in bodies of
+//! glass or via several panes; a spot that a single planar pane shows is a point of light
+//! ([`images`]). Each class is sampled by one technique, so nothing is weighted and nothing is
+//! counted twice. A reflection counts as a bounce, and refraction does not; a spot that the camera
+//! sees by refraction alone, with one bounce, is left out.
 //!
-//! Camera paths that scatter aim at glass with half of their directions: see [`aim`].
+//! Camera paths that scatter aim half of their directions at glass: see [`aim`].
 //!
-//! On a leg every pane in the way may reflect, and what passes goes on. Where nothing was turned yet a reflection is chosen more often
-//! than light does, since only such paths bring anything.
+//! On a leg every pane in the way may reflect, and the transmitted light goes on. Until the first
+//! turn, a reflection is chosen more often than its share of the light, because only such paths
+//! contribute.
 
 mod aim;
 mod camera;
@@ -51,31 +58,33 @@ use crate::{
     world::World,
 };
 
-/// Chances of a camera path in a pixel that sees no glass, at least, and by the share that what glass sends on has in all surfaces'
-/// area: where there is little glass it brings little.
+/// Probability of a camera path in a pixel that sees no glass: its least value, and the factor on
+/// the share of glass, weighted by reflectance, in the area of all surfaces. A small area of glass
+/// contributes little.
 const ELSEWHERE: f32 = 0.125;
 const BY_AREA: f32 = 100.0;
 
-/// How often light paths aim at panes in which spots have images, as a share of what they send on.
+/// Weight of panes in which spots have images as targets of light paths, as a share of the weight
+/// of other panes.
 const IMAGED: f32 = 0.1;
 
 /// Glass as a target of light paths.
 #[derive(Debug)]
 pub(crate) struct ByGlass {
     targets: Targets,
-    /// Index among the targets by pane, and by triangle; [`NONE`] for what is none.
+    /// Index among the targets by pane, and by triangle; [`NONE`] if it is not a target.
     of_pane: Vec<u32>,
     of_triangle: Vec<u32>,
     images: Images,
-    /// What each pass draws of the spots that the camera sees in planar panes.
+    /// The splats that each pass draws of the spots that the camera sees in planar panes.
     seen: Vec<Splat>,
-    /// What camera paths aim at.
+    /// The glass that camera paths aim at.
     aim: Aim,
-    /// Where points of [`Lit`] lie.
+    /// Surface areas, for sampling the points of [`Lit`].
     areas: Areas,
-    /// Row-major: the pixel or one of its neighbours sees glass.
+    /// By row-major pixel: whether the pixel or one of its neighbours sees glass.
     sees: Vec<bool>,
-    /// Chance of a camera path in other pixels.
+    /// Probability of a camera path in other pixels.
     elsewhere: f32,
     /// Index of refraction around the camera.
     around: f32,
@@ -107,17 +116,17 @@ impl Buffers {
         }
     }
 
-    /// What is traced with.
+    /// Returns the stack for traversals.
     pub fn stack(&mut self) -> &mut Stack {
         &mut self.scratch.stack
     }
 }
 
 impl ByGlass {
-    /// The glass of a scene that turns light; `None` where there is none.
+    /// Returns the glass of a scene that turns light; `None` if there is none.
     ///
     /// # Errors
-    /// [`RenderError::Stopped`].
+    /// [`RenderError::Stopped`] if the render was stopped.
     pub fn find(
         (walk, film): (&Walk, &Film),
         centres: &Centres,
@@ -133,7 +142,7 @@ impl ByGlass {
         for (k, (corners, normal)) in world.panes.iter().flat_map(|p| p.triangles()).enumerate() {
             let panes = world.panes.as_ref().expect("there is a pane");
             let share = panes.reflectance(k);
-            // Light paths bring what else is turned on the way from there.
+            // Such panes are targets only for light with further turns after the pane.
             let rest = if images.has(k as u32) { IMAGED } else { 1.0 };
             of_pane.push(NONE);
             glass += share * area(corners);
@@ -194,17 +203,18 @@ impl ByGlass {
         }))
     }
 
-    /// Whether spots that planar panes show are points of light: where the camera is in no body of glass.
+    /// Returns whether spots that planar panes show are points of light: true unless the camera is
+    /// in a body of glass.
     fn points_of_light(&self) -> bool {
         self.around == AIR
     }
 
-    /// What each pass draws of the spots that the camera sees in planar panes.
+    /// Returns the splats that each pass draws of the spots that the camera sees in planar panes.
     pub fn seen(&self) -> &[Splat] {
         &self.seen
     }
 
-    /// How likely a pixel gets a camera path in a pass.
+    /// Returns the probability that a pixel gets a camera path in a pass.
     fn chance(&self, pixel: u32) -> f32 {
         match self.sees[pixel as usize] {
             true => 1.0,
@@ -213,7 +223,7 @@ impl ByGlass {
     }
 }
 
-/// Which pixels see glass, or have a neighbour that does: in their middles.
+/// Returns, by pixel, whether the centre of the pixel or of a neighbour sees glass.
 fn sees(world: &World, centres: &Centres, stack: &mut Stack) -> Vec<bool> {
     let i = &world.camera.intrinsics;
     let (width, height) = (i.width as usize, i.height as usize);

@@ -1,27 +1,32 @@
-//! Light that comes by way of near-mirrors, found from the spots' side.
+//! Light paths for light that arrives via near-mirrors.
 //!
-//! A camera path finds a spot in a curved near-mirror only by chance, and likewise a spot behind two
-//! mirrors. Light paths go there by themselves. So that no path is counted twice, paths are parted in
-//! two *classes*, by geometry alone. Call an event *specular* where the light leaves by a near-mirror's
-//! lobe (a mix of two lobes counts as the lobe that scattered). A path belongs to light paths where
+//! A camera path hits a spot in a curved near-mirror only by chance, and likewise a spot behind two
+//! mirrors. Light paths reach these points directly. So that no path is counted twice, paths are
+//! divided into two *classes*, by geometry alone. Call an event *specular* if the light leaves by a
+//! near-mirror's lobe (a mix of two lobes counts as the lobe that scattered). A path belongs to
+//! light paths if
 //!
-//! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point z;
-//! 2. it is not the case that j = 1, s₁ lies on a planar mirror that [`crate::mirror_images`] knows and the spot is
-//!    Lambertian: those have images to aim at;
-//! 3. z, or a later point that is no near-mirror's, is what the camera sees directly; or the event before it (read from
-//!    the camera) is not specular; or the camera sees it by way of near-mirrors alone, of which the last is not much smoother than s₁
+//! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point
+//!    z;
+//! 2. it is not the case that j = 1, s₁ is on a planar mirror known to [`crate::mirror_images`] and
+//!    the spot is Lambertian, because such paths aim at mirror images;
+//! 3. there is a point p, either z or a later point off near-mirrors, with one of these properties:
+//!    the camera sees p directly; or the event before p (read from the camera) is not specular; or
+//!    the camera sees p via near-mirrors alone, and the last of them is not much smoother than s₁
 //!    ([`pays_below`]).
 //!
-//! Light paths cover that class and nothing else. Let z be the first point of which 3 holds: it is drawn into the image
-//! where the camera sees it, and is a light vertex ([`crate::light_vertices`]) for every other point. A light path goes on
-//! from z by the surface's own scattering, and ends unless it meets a near-mirror: a caustic that diffuse surfaces see by
-//! way of a near-mirror is covered as well. [`crate::walk`] leaves out just these: [`crate::vertex::Vertex::open`] carries
-//! condition 3 along a camera path. A near-mirror that the camera sees connects to z by its own narrow lobe: many light vertices are
-//! looked at from many camera paths, so that some lie within it. What is left to chance is light that comes to the camera by near-mirrors
-//! alone, and caustics that it sees in much smoother ones.
+//! Light paths cover that class and nothing else. Let z be the first such p. It is
+//! drawn into the image if the camera sees it, and it is a light vertex ([`crate::light_vertices`])
+//! for every other point. A light path continues from z by the surface's own scattering, and ends
+//! unless it hits a near-mirror, so a caustic that diffuse surfaces see via a near-mirror is
+//! covered as well. [`crate::walk`] leaves out exactly these paths: [`crate::vertex::Vertex::open`]
+//! carries condition 3 along a camera path. A near-mirror that the camera sees connects to z by its
+//! own narrow lobe: many camera paths test many light vertices, so that some of these are within
+//! the lobe. Two kinds of light are left to chance: light that reaches the camera via near-mirrors
+//! alone, and caustics seen in much smoother near-mirrors.
 //!
-//! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the spot's own
-//! scattering, joined by the balance heuristic.
+//! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the
+//! spot's own scattering, combined by the balance heuristic.
 
 use picofarm_scene::Vec3;
 
@@ -38,19 +43,22 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// Events before Russian roulette sets in.
+/// Number of events before Russian roulette starts.
 const SURE: u32 = 3;
-/// How much smoother than the first near-mirror of a light path the one may be in which the camera sees its end. Chance finds such
-/// light, from the camera, more seldom the smoother the first one is; connecting, the smoother the other one. But thousands
-/// of pairs are looked at there.
+/// Largest ratio by which the near-mirror in which the camera sees a light path's end may be
+/// smoother than the path's first near-mirror. Camera paths sample such light less often the
+/// smoother the first near-mirror is, and connections less often the smoother the other one is. But
+/// connections test thousands of pairs.
 const SMOOTHER: f32 = 16.0;
-/// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay. In a furnished room where it is
-/// 8·10⁻⁴ to 1.6·10⁻³ (the upper edge of a mirror on the wall, 2 mm deep) chance found a path that brought 0.7 % of the image's
-/// light to one pixel; light paths cost 2 % of the time there at 64×64 and 10 % at 24×24. With 1.4·10⁻⁴ no such path was met.
+/// Number of paths of the probe, and the share of the spots' power via near-mirrors from which
+/// light paths pay. In a furnished room with a share of 8·10⁻⁴ to 1.6·10⁻³ (the upper edge of a
+/// mirror on the wall, 2 mm deep), chance found a path that carried 0.7 % of the image's light to
+/// one pixel; light paths cost 2 % of the time there at 64×64 and 10 % at 24×24. With a share of
+/// 1.4·10⁻⁴ no such path was seen.
 const PROBE: u32 = 4096;
 const PAYS: f64 = 3e-4;
 
-/// What light paths are traced in.
+/// The context in which light paths are traced.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Surroundings<'a> {
     pub world: &'a World,
@@ -66,9 +74,9 @@ pub(crate) struct Surroundings<'a> {
 pub(crate) struct Caustics {
     /// Triangles with a near-mirror's lobe.
     triangles: Vec<u32>,
-    /// Place in `triangles` by triangle, [`NONE`] for most.
+    /// By triangle: its index in `triangles`, [`NONE`] for most.
     place: Vec<u32>,
-    /// How to aim at them.
+    /// The sampler that aims at them.
     targets: Targets,
 }
 
@@ -81,7 +89,7 @@ pub(crate) struct Splat {
     pub pixel: u32,
     /// Slot of the film.
     pub slot: u32,
-    /// Emitter.
+    /// Emitter index.
     pub spot: u16,
     /// Radiance averaged over the pixel, render units.
     pub value: f32,
@@ -90,14 +98,15 @@ pub(crate) struct Splat {
     pub technique: Technique,
 }
 
-/// How many of a batch of light paths begin which way.
+/// The numbers of light paths of a batch by the way they start.
 #[derive(Debug, Clone, Copy)]
 struct Shares {
     aimed: u32,
     plain: u32,
 }
 
-/// The first leg: spot, point on the near-mirror, unit direction back, flux there, path from the laser.
+/// The first leg: spot, point on the near-mirror, unit direction back, flux there, and path length
+/// from the laser.
 struct Start {
     spot: usize,
     hit: Hit,
@@ -106,15 +115,15 @@ struct Start {
     path_m: f64,
 }
 
-/// Roughness that the first near-mirror of light paths must be below for them to pay where the camera sees their end in a
-/// near-mirror of roughness `alpha`.
+/// Returns the roughness that the first near-mirror of light paths must be below for them to pay,
+/// if the camera sees their end in a near-mirror of roughness `alpha`.
 #[inline]
 pub(crate) fn pays_below(alpha: f32) -> f32 {
     SMOOTHER * alpha
 }
 
 impl Caustics {
-    /// The near-mirrors of a scene; `None` where there are none.
+    /// Returns the near-mirrors of a scene; `None` if there are none.
     pub fn find(world: &World, emitters: &Emitters, stop: Stop) -> Option<Self> {
         let narrow = |t: usize| {
             let surface = &world.surfaces[world.surface[t] as usize];
@@ -152,8 +161,8 @@ impl Caustics {
         }
     }
 
-    /// Light path `l` of a batch of `count`: calls `each` with every surface point z that it may end on. The sum over the
-    /// batch is an estimate.
+    /// Traces light path `l` of a batch of `count`. Calls `each` with every surface point z that
+    /// the path may end on. The sum over the batch is an estimate.
     pub fn trace(
         &self,
         within: &Surroundings<'_>,
@@ -176,7 +185,7 @@ impl Caustics {
         let images = within.emitters.columns.strength[spot] > 0.0;
         let alpha = hit.surface.alpha();
         let aimed_at = images && within.mirrors.of(hit.triangle).is_some();
-        // The spot and the first event.
+        // Counts the spot and the first event.
         let (mut bounces, mut ended) = (2, false);
         while bounces < within.max_bounces && path_m < within.gate.end_m() {
             let Some((w, mut weight, _)) = hit.surface.sample(hit.n, wo, rng) else {
@@ -205,8 +214,8 @@ impl Caustics {
             if hit.surface.specular() {
                 continue;
             }
-            // What is left by another lobe and meets no near-mirror is found from the camera's side, and a single planar
-            // mirror by its images.
+            // Light that left by another lobe and hits no near-mirror is sampled from the camera's
+            // side, and light via a single planar mirror by mirror images.
             if !before || (bounces == 3 && aimed_at) {
                 return;
             }
@@ -238,7 +247,7 @@ impl Caustics {
         }
     }
 
-    /// The leg from a spot to a near-mirror.
+    /// Draws the leg from a spot to a near-mirror.
     fn start(
         &self,
         within: &Surroundings<'_>,
@@ -290,7 +299,8 @@ impl Caustics {
         })
     }
 
-    /// True where the spots send a share of their power by near-mirrors that makes light paths pay.
+    /// Returns whether the spots send enough of their power via near-mirrors for light paths to
+    /// pay.
     pub fn pay(&self, within: &Surroundings<'_>, seed: u64) -> bool {
         let mut stack = within.world.bvh.stack();
         let mut rng = Rng::new(seed, Stream::Caustic, 0, u64::MAX);

@@ -1,22 +1,27 @@
-//! Spots beside another surface: light that a spot throws on a surface close to it.
+//! Zones around spots near another surface: the light of a spot on a surface close to it.
 //!
-//! A spot at a small distance d from a wall sends up to half of its light to a strip of that wall some d wide, from which
-//! it goes on. No camera path finds the strip, and as d falls the variance grows without bound, although the energy stays finite.
-//! So around such a spot two balls are set, its *zone*, and paths are parted in two classes, by geometry alone. Call a vertex
-//! *near* where it lies within a zone's outer radius, on a material without a near-mirror. A path belongs to the zones where the first vertex
-//! after its spot is near and within the inner radius of that spot's own zone. Let v be the last vertex of the run of near ones that begins there.
+//! A spot at a small distance d from a wall sends up to half of its light to a strip of that wall
+//! about d wide, and the light goes on from there. No camera path finds the strip, and as d falls
+//! the variance grows without bound, although the energy stays finite. So two balls are set around
+//! such a spot, its *zone*, and paths are divided into two classes by geometry alone. Call a vertex
+//! *near* if it is within a zone's outer radius and its material has no near-mirror. A path belongs
+//! to the zones if the first vertex after its spot is near and within the inner radius of that
+//! spot's own zone. Let v be the last vertex of the run of near vertices that begins there.
 //!
-//! Light paths from the spots cover that class. They walk within the zones, and each of their vertices may be v: it is
-//! drawn into the image where the camera sees it, and is a light vertex ([`crate::light_vertices`]) for camera vertices that
-//! are not near. Where the run ends on a near-mirror, they go on as [`crate::caustic`] says, to a point z behind it that is
-//! drawn or connected likewise; what such paths do not cover (no point as in condition 3 there, so that
-//! [`crate::vertex::Vertex::open`] is not above the near-mirror's roughness) is found by connecting v to the near-mirror itself. [`crate::walk`] leaves
-//! out the light that comes from a spot to its own zone, and so do the strata of two bounces where the other surface is very close
-//! ([`CLOSE`]); elsewhere they find it better than light paths do. Energy is carried from vertex to vertex
-//! and never divided by a distance within a zone: it is kept at any d.
+//! Light paths from the spots cover that class. They walk within the zones, and each of their
+//! vertices may be v: it is drawn into the image if the camera sees it, and it is a light vertex
+//! ([`crate::light_vertices`]) for camera vertices that are not near. If the run ends on a
+//! near-mirror, the light paths continue as in [`crate::caustic`], to a point z behind it that is
+//! drawn or connected likewise. They do not cover paths without a point as in condition 3 there,
+//! for which [`crate::vertex::Vertex::open`] is not above the near-mirror's roughness. Those are
+//! sampled by connecting v to the near-mirror itself. [`crate::walk`] leaves out the light from a
+//! spot to its own zone, and so do the strata of two bounces if the other surface is very close
+//! ([`CLOSE`]); at larger distances the strata are better than light paths. Energy is carried from
+//! vertex to vertex and never divided by a distance within a zone, so it is conserved at any d.
 //!
-//! Where a beam meets an edge exactly, rounding decides on which side of the other wall the spot lies. Such a spot is moved
-//! along its own surface ([`clear`]) until it is [`CLEARANCE`] away from the other one.
+//! If a beam hits an edge exactly, rounding decides on which side of the other wall the spot is.
+//! Such a spot is moved along its own surface ([`clear`]) until it is [`CLEARANCE`] away from the
+//! other one.
 
 use std::collections::HashSet;
 
@@ -33,47 +38,52 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// Least distance of a spot from other surfaces, render units: a lift at the far end of a scene, which is 4 to 8 units wide
-/// (about 0.03 mm in a room).
+/// Least distance of a spot from other surfaces, render units: the lift off a surface at the far
+/// end of a scene, which is 4 to 8 units wide (about 0.03 mm in a room).
 const CLEARANCE: f32 = 1.0 / 32768.0;
-/// How much of a beam must be free before a spot, in units of the distance that it is moved by.
+/// Length of a beam that must be free before a spot, in units of the distance by which the spot is
+/// moved.
 const BEAM: f32 = 64.0;
-/// How often the distance is doubled to get clear.
+/// Number of times that the distance is doubled to get clear.
 const DOUBLINGS: u32 = 8;
-/// Directions along the surface in which neighbours are looked for, and directions above it.
+/// Number of probe directions along the surface, and above it.
 const ROUND: u32 = 24;
 const ABOVE: u32 = 128;
-/// Share of a spot's light that must stay in its zone.
+/// Share of a spot's light that must stay in its zone for the zone to be used.
 const MUCH: f32 = 1.0 / 32.0;
-/// A spot has a zone where a surface is nearer than at most this share of its distance from the camera. Without one, walks find light that
-/// the spot throws there by coming close to it, and by chance where a near-mirror comes before: most of the variance of rooms with
-/// a spot 10 cm from a box.
+/// A spot gets a zone if a surface is nearer than at most this share of its distance from the
+/// camera. Without a zone, the light of the spot on that surface is sampled by walks that come
+/// close to it, and only by chance if a near-mirror comes before. In rooms with a spot 10 cm from a
+/// box, this was most of the variance.
 const NEAR: f32 = 1.0 / 12.0;
-/// Of more spots than this each has so small a share in the light that fewer zones are better (25 spots in furnished rooms: with
-/// as many zones as for 5 error² × CPU time is 1.05 to 1.3 of what it is without those). Spots are counted by their places.
+/// Number of spots above which fewer zones are better, because each spot has a small share of the
+/// light. For 25 spots in furnished rooms with as many zones as for 5 spots, error² × CPU time is
+/// 1.05 to 1.3 of its value without those zones. Spots are counted by their places.
 const FEW: f32 = 5.0;
-/// The same for zones in which light of two bounces is left to light paths too.
+/// Like [`NEAR`], for zones in which light paths also sample light of two bounces.
 const CLOSE: f32 = 1.0 / 64.0;
-/// A zone's inner radius in units of the distance to the other surface; the least and the greatest in units of the distance from
-/// the camera, and the least one, render units. Error² × CPU time is within a tenth for greatest radii of 1/12 to 1/8.
+/// A zone's inner radius in units of the distance to the other surface; its least and greatest
+/// value in units of the distance from the camera; and its least value in render units. Error² ×
+/// CPU time varies by less than a tenth for greatest radii of 1/12 to 1/8.
 const RADIUS: f32 = 8.0;
 const RANGE: (f32, f32) = (1.0 / 64.0, 1.0 / 10.0);
 const LEAST: f32 = 1.0 / 256.0;
-/// Outer radius in units of the inner one: connections from vertices near the middle to others have at least some length.
+/// Outer radius in units of the inner one, so that connections from vertices near the middle to
+/// others have a minimum length.
 const OUTER: f32 = 1.8;
-/// Vertices of a light path before Russian roulette sets in.
+/// Number of vertices of a light path before Russian roulette starts.
 const SURE: u32 = 4;
 
 /// A spot with a zone.
 #[derive(Debug, Clone, Copy)]
 struct Zone {
-    /// Emitter.
+    /// Emitter index.
     spot: usize,
     centre: Vec3,
-    /// Squares of its inner and outer radius.
+    /// Squares of the inner and the outer radius.
     inner2: f32,
     outer2: f32,
-    /// Square of the radius within which light of two bounces is found by light paths as well.
+    /// Square of the radius within which light paths also sample light of two bounces.
     two2: f32,
 }
 
@@ -89,12 +99,13 @@ impl Zone {
 #[derive(Debug)]
 pub(crate) struct Contacts {
     zones: Vec<Zone>,
-    /// By surface index: has no near-mirror.
+    /// By surface index: whether the surface has no near-mirror.
     plain: Vec<bool>,
 }
 
 impl Contacts {
-    /// The zones of a scene's spots; `None` where no spot is near another surface. Spots on near-mirrors have none.
+    /// Returns the zones of a scene's spots; `None` if no spot is near another surface. Spots on
+    /// near-mirrors have no zone.
     pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
         let mut stack = world.bvh.stack();
         let mut zones = vec![];
@@ -121,7 +132,7 @@ impl Contacts {
         })
     }
 
-    /// How many zones there are: one for each source that has one.
+    /// Returns the number of zones: one for each source that has one.
     pub fn count(&self) -> u32 {
         self.zones.len() as u32
     }
@@ -135,22 +146,23 @@ impl Contacts {
         self.plain[world.surface[h.triangle as usize] as usize]
     }
 
-    /// True for near vertices.
+    /// Returns whether a vertex is near.
     #[inline]
     pub fn near(&self, world: &World, h: &Hit) -> bool {
         let inside = |z: &Zone| z.distance2(h.p) < z.outer2;
         self.zones.iter().any(inside) && self.plain(world, h)
     }
 
-    /// True for near vertices within the inner radius of a spot's own zone: where they are lit by it, the path belongs to
-    /// the zones.
+    /// Returns whether a vertex is near and within the inner radius of a spot's own zone. If that
+    /// spot lights it, the path belongs to the zones.
     #[inline]
     pub fn own(&self, world: &World, spot: usize, h: &Hit) -> bool {
         let inside = |z: &Zone| z.spot == spot && z.distance2(h.p) < z.inner2;
         self.zones.iter().any(inside) && self.plain(world, h)
     }
 
-    /// Drops the weights of spots whose own zone has a near vertex within its inner radius.
+    /// Clears the weights of spots if the vertex is near and within the inner radius of their own
+    /// zone.
     #[inline]
     pub fn leave_out(&self, world: &World, h: &Hit, weights: &mut [f32]) {
         for z in &self.zones {
@@ -160,7 +172,8 @@ impl Contacts {
         }
     }
 
-    /// Drops the weights of spots whose light at what the camera sees is drawn into the image by the zones' light paths.
+    /// Clears the weights of spots if the zones' light paths draw their light at this camera hit
+    /// into the image.
     #[inline]
     pub fn leave_out_of_two(&self, world: &World, h: &Hit, weights: &mut [f32]) {
         for z in &self.zones {
@@ -170,13 +183,15 @@ impl Contacts {
         }
     }
 
-    /// Whether a light path's near vertex is drawn into the image: of two bounces where nothing else finds that light.
+    /// Returns whether a light path's near vertex is drawn into the image. For two bounces it is
+    /// drawn only if no other technique samples that light.
     pub fn draws(&self, y: &LightVertex) -> bool {
         let own = |z: &&Zone| z.spot == y.spot;
         y.bounces > 2 || (self.zones.iter().filter(own)).any(|z| z.distance2(y.hit.p) < z.two2)
     }
 
-    /// Light path `l` of as many as `turns` has, in a zone: calls `each` with every vertex that it may end on.
+    /// Traces light path `l` of the `turns.count()` paths in a zone. Calls `each` with every vertex
+    /// that the path may end on.
     pub fn trace(
         &self,
         within: &Surroundings<'_>,
@@ -193,9 +208,9 @@ impl Contacts {
         };
         flux /= turns.count();
         let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
-        // Within the zones, and what the vertex before was.
+        // Whether the path is still within the zones, and whether the vertex before was specular.
         let (mut inside, mut specular) = (true, false);
-        // Roughness of the first near-mirror that it went by.
+        // Roughness of the first near-mirror on the path.
         let mut alpha = 0.0;
         for bounces in 2..=within.max_bounces {
             let Some(mut hit) = world.closest(stack, at, w) else {
@@ -214,7 +229,7 @@ impl Contacts {
             let end = match near {
                 true => Some(End::Near),
                 false if hit.surface.specular() => None,
-                // Behind a near-mirror, or found from the camera's side.
+                // Behind a near-mirror; other vertices are sampled from the camera's side.
                 false if specular => Some(End::Beyond),
                 false => return,
             };
@@ -251,7 +266,8 @@ impl Contacts {
         }
     }
 
-    /// Draws light vertices anew, from `count` light paths for every zone: near ones, and adds those beyond near-mirrors.
+    /// Redraws the near light vertices from `count` light paths per zone, and adds those beyond
+    /// near-mirrors to `beyond`.
     pub fn fill(
         &self,
         (near, beyond): (&mut LightVertices, &mut LightVertices),
@@ -273,7 +289,7 @@ impl Contacts {
     }
 }
 
-/// Whether there are so many spots that each has a small share in the light.
+/// Returns whether there are more than [`FEW`] spots, so that each has a small share of the light.
 pub(crate) fn many(emitters: &Emitters) -> bool {
     places(emitters.list.iter().map(|e| e.p)) as f32 > FEW
 }
@@ -284,16 +300,16 @@ fn places(sources: impl Iterator<Item = Vec3>) -> usize {
     sources.map(bits).collect::<HashSet<_>>().len()
 }
 
-/// Where a light path from a zone may end.
+/// The kinds of vertices that a zone's light path may end on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum End {
-    /// On a near vertex.
+    /// A near vertex.
     Near,
-    /// On the first surface behind near-mirrors.
+    /// A vertex on the first surface behind near-mirrors.
     Beyond,
 }
 
-/// Unit directions around and above a surface with normal `n`.
+/// Returns unit directions around and above a surface with normal `n`.
 fn looks(n: Vec3) -> impl Iterator<Item = Vec3> {
     let (t, b) = frame(n);
     let round = (0..ROUND).map(move |k| {
@@ -309,7 +325,8 @@ fn looks(n: Vec3) -> impl Iterator<Item = Vec3> {
     round.chain(above)
 }
 
-/// Distances to what a surface point sees in directions around it and above it, up to `reach`.
+/// Returns the distances from a surface point to the hits in directions around it and above it, up
+/// to `reach`.
 fn distances(
     world: &World,
     stack: &mut Stack,
@@ -321,8 +338,9 @@ fn distances(
     looks(n).map(closest).collect()
 }
 
-/// Radius of the zone of a spot, if it needs one: if other surfaces nearer than `near` of its distance from the camera receive much of its light; and whether one is
-/// so close that the strata of two bounces miss the strip that it lights.
+/// Returns the radius of a spot's zone, if it needs one: if surfaces nearer than `near` of its
+/// distance from the camera receive much of its light. Also returns whether one is so close that
+/// the strata of two bounces miss the strip that the spot lights.
 fn radius(world: &World, stack: &mut Stack, place: (Vec3, Vec3), near: f32) -> Option<(f32, bool)> {
     let range = place.0.length();
     let (least, most) = (RANGE.0 * range, RANGE.1 * range);
@@ -337,11 +355,13 @@ fn radius(world: &World, stack: &mut Stack, place: (Vec3, Vec3), near: f32) -> O
     (inside as f32 >= MUCH * ABOVE as f32).then_some((radius, nearest < CLOSE * range))
 }
 
-/// The place of a spot, moved along its surface where it lies on an edge: where another surface comes within
-/// [`CLEARANCE`], or cuts the spot off by rounding. It stays where light from `back` reaches it. Spots that are clear stay
-/// where they are, to the bit; one that finds no clear place stays as well.
+/// Returns the place of a spot, moved along its surface if the spot is on an edge: if another
+/// surface comes within [`CLEARANCE`], or cuts the spot off by rounding. The new place is still lit
+/// from `back`. A spot that is already clear keeps its exact place, and so does a spot for which no
+/// clear place exists.
 pub(crate) fn clear(world: &World, stack: &mut Stack, p: Vec3, n: Vec3, back: Vec3) -> Vec3 {
-    // A wall through the spot itself is met from either side of it.
+    // The test starts on the other side of the spot, so that it hits a wall through the spot
+    // itself.
     let crossed = |stack: &mut Stack, w: Vec3| {
         let (a, b) = (
             lift(p - w * (0.5 * CLEARANCE), n),
@@ -350,7 +370,7 @@ pub(crate) fn clear(world: &World, stack: &mut Stack, p: Vec3, n: Vec3, back: Ve
         world.bvh.occluded(stack, a, b - a, 1.0)
     };
     let round: Vec<Vec3> = looks(n).take(ROUND as usize).collect();
-    // Beneath a wall that leans over the spot, the place that rays start from may be behind it.
+    // Under a wall that leans over the spot, the start of the rays may be behind the wall.
     let lit = |stack: &mut Stack, q: Vec3, far: f32| {
         let start = lift(q, n);
         !world.bvh.occluded(stack, start, back * far, 1.0)

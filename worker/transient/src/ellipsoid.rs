@@ -1,12 +1,13 @@
 //! Narrow gates: ellipsoidal connections (Pediredla, Veeraraghavan and Gkioulekas, SIGGRAPH Asia 2019).
 //!
-//! A path laser → spot → y → x → camera falls into the gate where y lies between two ellipsoids with foci
-//! at the spot and at x. Shared vertices are drawn there, on patches of the surfaces in proportion to what
-//! of them lies in the shells of all spots and the tile's gather points. The density of any point so
-//! drawn is a table's entry, so that this way joins the others in the balance heuristic; what it misses
-//! (the shells are those of patches, not of points), the others find.
+//! A path laser → spot → y → x → camera falls into the gate if y is between two ellipsoids with
+//! foci at the spot and at x. Shared vertices are drawn there, on patches of the surfaces, in
+//! proportion to the part of each patch within the shells of all spots and the tile's gather
+//! points. The density of any such point is a table entry, so that this technique is combined with
+//! the others by the balance heuristic. The other techniques cover what it misses, because the
+//! shells are those of patches, not of points.
 //!
-//! What cannot fall into the gate is neither lit nor connected nor counted.
+//! Paths that cannot fall into the gate are neither lit nor connected nor counted.
 
 mod patches;
 
@@ -20,19 +21,20 @@ use crate::{
     world::{Hit, World},
 };
 
-/// Gather points that stand for a tile where its shells are laid out.
+/// Number of gather points that represent a tile for its shells.
 const STANDINS: usize = 8;
-/// How far a path over a patch may differ from that over its centre, in radii of the patch: 2 at most, less
-/// where the patch is seen at an angle.
+/// Largest difference between a path via a patch and the path via its centre, in radii of the
+/// patch. It is at most 2, and less if the patch is seen at an angle.
 const SWELL: f32 = 1.2;
-/// Room for rounding in what is left out, as a share of the gate's end.
+/// Margin for rounding when paths are left out, as a share of the gate's end.
 const ROUNDING: f64 = 1e-5;
 
-/// Scene diagonals in a gate at most for ellipsoidal connections to pay, by error² × CPU time on furnished
-/// rooms with 1 and 25 spots: gains of 0.8 to 2.6 at 1/200 to 1/50, of 0.9 to 1.1 at 1/12 and losses beyond.
+/// Largest length of a gate, in scene diagonals, for ellipsoidal connections to pay, by error² ×
+/// CPU time on furnished rooms with 1 and 25 spots: gains of 0.8 to 2.6 at 1/200 to 1/50, of 0.9 to
+/// 1.1 at 1/12 and losses beyond.
 const NARROW: f64 = 1.0 / 40.0;
 
-/// True where ellipsoidal connections pay.
+/// Returns whether ellipsoidal connections pay.
 pub(crate) fn pays(gate: &Gate, world: &World) -> bool {
     let length = gate.bin_width_m * f64::from(gate.bins);
     length < NARROW * world.metres(world.diagonal)
@@ -46,7 +48,7 @@ pub(crate) struct Window {
 }
 
 impl Window {
-    /// The gate, and a little more for rounding.
+    /// Returns the gate's range, with a margin for rounding.
     pub fn new(gate: &Gate) -> Self {
         let more = ROUNDING * gate.end_m() + 0.01 * gate.bin_width_m;
         Self {
@@ -61,27 +63,28 @@ impl Window {
     }
 }
 
-/// One tile's shells.
+/// The shells of one tile.
 #[derive(Debug, Default)]
 pub(crate) struct Shells {
-    /// The gather points: place, and optical path to the camera, render units.
+    /// The gather points: position, and optical path to the camera, render units.
     points: Vec<(Vec3, f32)>,
-    /// Towards which vertices are drawn: their sides face it.
+    /// The point that the drawn sides of surfaces face.
     towards: Vec3,
     /// By patch: shortest and longest path beyond it.
     near: Vec<f32>,
     far: Vec<f32>,
-    /// By patch: rough part of its flux that reaches the gather points, negative on its back.
+    /// By patch: approximate share of its flux that reaches the gather points, negative on its
+    /// back.
     seen: Vec<f32>,
-    /// By patch: share of the paths that fall in the gate, weighed by flux; then the expected number of
-    /// vertices per area.
+    /// By patch: share of the paths that fall into the gate, weighted by flux; later the expected
+    /// number of vertices per area.
     density: Vec<f32>,
-    /// Patches in the shells with the sum of weights up to and with each.
+    /// Patches in the shells, with the sum of weights up to and including each.
     chosen: Vec<(u32, f64)>,
 }
 
 impl Shells {
-    /// Lays out the shells for a tile's gather points.
+    /// Computes the shells for a tile's gather points.
     pub fn lay(
         &mut self,
         (world, patches, gate): (&World, &Patches, &Gate),
@@ -130,7 +133,8 @@ impl Shells {
         }
     }
 
-    /// Finds how far every patch is from the camera by way of the gather points, and how they see it.
+    /// Computes the path length from every patch via the gather points to the camera, and the flux
+    /// that the gather points receive from it.
     fn reach(&mut self, patches: &Patches, gathers: &[(Vertex, usize)]) {
         let count = patches.len();
         for column in [&mut self.near, &mut self.far, &mut self.seen] {
@@ -178,8 +182,8 @@ impl Shells {
         }
     }
 
-    /// Draws a vertex; `at` in [0, 1) says which patch. `None` where no patch is in the shells, or its
-    /// surface scatters nothing there.
+    /// Draws a vertex. `at` in [0, 1) selects the patch. Returns `None` if no patch is in the
+    /// shells, or if the surface scatters nothing there.
     pub fn draw(
         &self,
         (world, patches): (&World, &Patches),
@@ -201,7 +205,7 @@ impl Shells {
         (!hit.surface.is_black()).then_some(hit)
     }
 
-    /// Expected number of vertices drawn per area at a point.
+    /// Returns the expected number of vertices drawn per area at a point.
     #[inline]
     pub fn density(&self, (world, patches): (&World, &Patches), h: &Hit) -> f32 {
         if h.n.dot(self.towards - h.p) <= 0.0 {
@@ -211,8 +215,8 @@ impl Shells {
         patch.map_or(0.0, |k| self.density[k])
     }
 
-    /// What of paths that come to `y` can fall in the gate by way of a gather point, counted as if they
-    /// went on for `nearest` metres.
+    /// Returns the window of paths up to `y` that can fall into the gate via a gather point,
+    /// computed as if every path continued for `nearest` metres.
     pub fn window(&self, world: &World, gate: &Window, y: Vec3, nearest: f64) -> Window {
         let (mut near, mut far) = (f32::MAX, 0.0f32);
         for &(x, length) in &self.points {

@@ -1,4 +1,4 @@
-//! Illumination spots as light sources: how they scatter light into the scene.
+//! Illumination spots as light sources that scatter the laser's light into the scene.
 
 use std::ops::Range;
 
@@ -16,7 +16,7 @@ use crate::{
     world::{World, lift},
 };
 
-/// A spot as a point source: unit power arrives along the beam and leaves by the BRDF.
+/// A spot as a point source: unit power arrives along the beam and is scattered by the BRDF.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Emitter {
     /// Index of the beam.
@@ -29,9 +29,11 @@ pub(crate) struct Emitter {
     pub back: Vec3,
     /// Optical path from the laser, metres.
     pub path_m: f64,
-    /// Scattering on the lit side (black behind a one-sided surface), times the source's share of the beam: what glass lets through.
+    /// Scattering on the lit side (black behind a one-sided surface), times the source's share of
+    /// the beam after transmission by glass.
     pub surface: Surface,
-    /// It is not the beam's own spot: glass turned that light aside.
+    /// Whether glass reflected this light off the beam, so that the source is not the beam's own
+    /// spot.
     pub aside: bool,
 }
 
@@ -46,9 +48,10 @@ impl Emitter {
         let surface = world.surfaces[material as usize];
         let p = world.inward(spot.point);
         let p = contact::clear(world, stack, p, spot.normal, -spot.arriving);
-        // The spot does not say whether its side is the facet's front: look at the facet beneath it.
+        // The spot does not store whether its side is the facet's front, so look at the facet
+        // beneath it.
         let beneath = world.closest(stack, lift(p, spot.normal), -spot.normal);
-        // It also knows the texture there.
+        // The facet also provides the texture there.
         let beneath = beneath.filter(|h| (h.p - p).length() < 1e-3);
         let surface = match beneath {
             Some(h) if !surface.two_sided() && h.surface.is_black() => surface.black(),
@@ -70,14 +73,14 @@ impl Emitter {
         }
     }
 
-    /// Radiant intensity per unit power towards the unit direction `w`: f·cos.
+    /// Returns the radiant intensity per unit power towards the unit direction `w`: f·cos.
     #[inline]
     pub fn intensity(&self, w: Vec3) -> f32 {
         self.surface.scatter(self.n, self.back, w)
     }
 }
 
-/// Point sources side by side, for loops over all of them.
+/// Point sources in columns, for loops over all of them.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Columns {
     pub px: Column,
@@ -86,7 +89,7 @@ pub(crate) struct Columns {
     pub nx: Column,
     pub ny: Column,
     pub nz: Column,
-    /// Lambertian strength ρ/π; 0 where the source is not Lambertian.
+    /// Lambertian strength ρ/π; 0 if the source is not Lambertian.
     pub strength: Column,
 }
 
@@ -122,7 +125,7 @@ impl Columns {
         self.irradiance_from(0, x, n, out);
     }
 
-    /// The same of as many sources as `out` holds, from the `first` on.
+    /// Like [`Columns::irradiance`], for `out.len()` sources from the `first` on.
     #[inline]
     pub fn irradiance_from(&self, first: usize, x: Vec3, n: Vec3, out: &mut [f32]) {
         widest(Irradiance {
@@ -135,7 +138,7 @@ impl Columns {
     }
 }
 
-/// [`Columns::irradiance_from`].
+/// The loop of [`Columns::irradiance_from`].
 pub(crate) struct Irradiance<'a> {
     pub columns: &'a Columns,
     pub first: usize,
@@ -185,22 +188,23 @@ impl<'a> Wide for Irradiance<'a> {
 pub(crate) struct Emitters {
     /// The sources.
     pub list: Vec<Emitter>,
-    /// Their places, lifted off the surface, for shadow rays.
+    /// Their positions, lifted off the surface, for shadow rays.
     pub lifted: Vec<Vec3>,
-    /// The Lambertian ones in columns.
+    /// All sources in columns; the strength of those that are not Lambertian is 0.
     pub columns: Columns,
-    /// Indices of the others.
+    /// Indices of the sources that are not Lambertian.
     pub glossy: Vec<usize>,
-    /// How each shines.
+    /// The lobe of each source.
     lobes: Lobes,
-    /// Indices of those on mirrors.
+    /// Indices of the sources on mirrors.
     pub on_mirror: Vec<usize>,
-    /// Those of each ray of the beams: one range for all where beams have no width.
+    /// The range of sources of each ray of the beams; a single range for all if beams have no
+    /// width.
     pub rays: Vec<Range<usize>>,
 }
 
 impl Emitters {
-    /// No source.
+    /// Returns an empty set of sources.
     pub fn none() -> Self {
         Self {
             rays: std::iter::once(0..0).collect(),
@@ -261,11 +265,12 @@ impl Emitters {
         Ok(all)
     }
 
-    /// The sources of beams that have a width: as many for each beam as `width` has points, with equal shares of its light.
-    /// What of a beam meets nothing is lost.
+    /// Returns the sources of beams with a width: one for each of the `width.points` rays of a
+    /// beam, with equal shares of its light. Rays that hit nothing are lost.
     ///
     /// # Errors
-    /// [`RenderError::Invalid`] where the width cannot be used, or a beam does not end at the spot that the scene states for it.
+    /// [`RenderError::Invalid`] if the width is unusable, or if a beam does not end at the
+    /// spot that the scene states for it.
     pub fn widened(scene: &Scene, world: &World, width: &BeamWidth) -> Result<Self, RenderError> {
         let invalid = |field: String, what: String| Err(RenderError::Invalid { field, what });
         if let Err((field, what)) = width.check() {
@@ -302,7 +307,8 @@ impl Emitters {
         Ok(all)
     }
 
-    /// Adds the sources of what glass turns aside of a ray of a beam that has a share of its light.
+    /// Adds the sources of the light that glass reflects off a ray of a beam; the ray carries a
+    /// share of the beam's light.
     fn push_branches(
         &mut self,
         world: &World,
@@ -329,7 +335,7 @@ impl Emitters {
         } else {
             0.0
         };
-        // A beam that arrives from behind its own normal lights nothing.
+        // A beam that arrives from behind the spot's normal lights nothing.
         let strength = if e.n.dot(e.back) > 0.0 { strength } else { 0.0 };
         self.columns.push(e.p, e.n, strength);
         let place = Seen {
@@ -355,7 +361,8 @@ impl Emitters {
         self.weights_of(0..self.list.len(), of, buffer, out);
     }
 
-    /// The same for the sources of a range; what `out` holds of others stays.
+    /// Like [`Emitters::weights`], for the sources of a range; the other entries of `out` do not
+    /// change.
     #[inline]
     pub fn weights_of(
         &self,
@@ -377,7 +384,7 @@ impl Emitters {
         self.lobes.between(range, (&place, surface), own, buffer);
     }
 
-    /// The same for one source.
+    /// Like [`Emitters::weights`], for one source.
     #[inline]
     pub fn weight(&self, i: usize, x: Vec3, n: Vec3, wo: Vec3, surface: &Surface) -> f32 {
         let e = &self.list[i];
@@ -395,7 +402,7 @@ impl Emitters {
         f * e.intensity(-w) / d2
     }
 
-    /// Shortest optical path from the laser by way of a spot to `x`, metres.
+    /// Returns the shortest optical path from the laser via a spot to `x`, metres.
     pub fn shortest_m(&self, world: &World, x: Vec3) -> f64 {
         let each = self.list.iter();
         each.fold(f64::INFINITY, |a, e| {

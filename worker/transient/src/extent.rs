@@ -1,5 +1,6 @@
-//! How far camera and light reach, and triangles cut to what f32 can hold of them. A scene's scale must not
-//! depend on what stands far outside of its rooms, nor on how far a wall goes on behind them.
+//! Estimates the extent of a scene that camera and light reach, and cuts triangles to sizes that
+//! f32 can represent. A scene's scale must not depend on objects far outside its rooms, nor on how
+//! far a wall extends behind them.
 
 use picofarm_scene::{Scene, Vec3};
 
@@ -11,26 +12,29 @@ use crate::{
 /// A point in metres from the camera.
 pub(crate) type Point = [f64; 3];
 
-/// How many times wider than what is reached a scene is before its scale goes by what is reached.
+/// Ratio of a scene's width to its reached width above which the scale depends on the reached
+/// width.
 const SLACK: f64 = 4.0;
-/// Probes: to all sides, along each side of the image, and along beams at most; bounces of each.
+/// Number of probes in all directions, along each side of the image, and the largest number along
+/// beams; and the bounces of each probe.
 const ROUND: u32 = 64;
 const ACROSS: u32 = 8;
 const BEAMS: usize = 32;
 const BOUNCES: u32 = 3;
-/// A wall counts up to so many times as far as it was met.
+/// Largest extent of a wall that counts, as a multiple of the distance at which it was hit.
 const BEYOND: f64 = 2.0;
 
-/// Where triangles are cut first, in render units: twice as far as a scene goes whose whole width is reached.
-/// Beyond it a cut comes at every further factor.
+/// Distance of the first cut, render units: twice the extent of a fully reached scene. Beyond it,
+/// there is a cut at every further factor.
 const FIRST_CUT: f64 = 16.0;
 const FACTOR: f64 = 8.0;
 
-/// How far from the camera, along an axis, the surfaces lie that light can count by: `widest`, unless that is much
-/// farther than what probes find. No surface farther than `horizon` counts.
+/// Returns the largest distance from the camera, along an axis, of the surfaces that contribute
+/// light: `widest`, unless the probes' hits are much nearer. No surface farther than `horizon`
+/// counts.
 ///
 /// # Errors
-/// [`RenderError::Stopped`].
+/// [`RenderError::Stopped`] if the render was stopped.
 pub(crate) fn reach(
     scene: &Scene,
     triangles: &[[Point; 3]],
@@ -61,7 +65,7 @@ pub(crate) fn reach(
         starts.push(([0.0; 3], d));
     }
     for (from, direction) in starts {
-        // Each looks at all triangles.
+        // Each walk tests all triangles.
         stop.check()?;
         if probe.walk(from, direction) {
             return Ok(widest);
@@ -75,7 +79,7 @@ pub(crate) fn reach(
 
 struct Probe<'a> {
     triangles: &'a [[Point; 3]],
-    /// How far surfaces were found.
+    /// Largest distance of a surface so far.
     found: f64,
     enough: f64,
     horizon: f64,
@@ -83,7 +87,7 @@ struct Probe<'a> {
 }
 
 impl Probe<'_> {
-    /// Follows light from a place; true where what was found is all that there is to find.
+    /// Follows light from a point. Returns true if the distance reached is enough.
     fn walk(&mut self, mut from: Point, mut direction: Point) -> bool {
         for _ in 0..=BOUNCES {
             let Some((k, at)) = self.first(from, direction) else {
@@ -106,7 +110,7 @@ impl Probe<'_> {
                 true => d.map(|x| -x),
                 false => d,
             };
-            // Off the surface by what f64 rounds away, and more.
+            // Moves off the surface by more than the rounding of f64.
             let off = 1e-9 * largest(at).max(largest(from)) / dot(n, n).sqrt();
             let off = if side > 0.0 { -off } else { off };
             from = std::array::from_fn(|a| at[a] + off * n[a]);
@@ -114,7 +118,8 @@ impl Probe<'_> {
         false
     }
 
-    /// Uniform over all directions, by rejection: the same bits everywhere.
+    /// Returns a direction, uniform over the sphere, by rejection, so that the bits are the same
+    /// everywhere.
     fn direction(&mut self) -> Point {
         loop {
             let d = std::array::from_fn(|_| 2.0 * f64::from(self.rng.uniform()) - 1.0);
@@ -125,7 +130,8 @@ impl Probe<'_> {
         }
     }
 
-    /// The first surface from a place along a direction: triangle and point (Möller and Trumbore 1997).
+    /// Returns the first surface from a point along a direction: triangle and point (Möller and
+    /// Trumbore 1997).
     fn first(&self, from: Point, d: Point) -> Option<(usize, Point)> {
         let mut best = (f64::INFINITY, usize::MAX);
         for (k, [a, b, c]) in self.triangles.iter().enumerate() {
@@ -152,12 +158,13 @@ impl Probe<'_> {
     }
 }
 
-/// A corner: a point, and its texture coordinates.
+/// A corner: a point and its texture coordinates.
 pub(crate) type Corner = (Point, [f64; 2]);
 
-/// Cuts a triangle where it leaves the nearest box around the camera and each larger one, so that every
-/// piece's corners are about as far away as the piece; `scale` is render units per metre. `None` where nothing
-/// is to be cut. Triangles that have an edge in common are cut in the same points of it: no gap opens.
+/// Cuts a triangle at the nearest box around the camera and at each larger one, so that every
+/// piece's corners are about as far away as the piece. `scale` is render units per metre. Returns
+/// `None` if no cut is needed. Triangles with a common edge are cut at the same points of it, so no
+/// gap opens.
 pub(crate) fn cut(triangle: [Corner; 3], scale: f64) -> Option<Vec<[Corner; 3]>> {
     let far = triangle.iter().fold(0.0f64, |a, c| a.max(largest(c.0)));
     let first = FIRST_CUT / scale;
@@ -183,7 +190,7 @@ pub(crate) fn cut(triangle: [Corner; 3], scale: f64) -> Option<Vec<[Corner; 3]>>
     Some(pieces.into_iter().flat_map(fan).collect())
 }
 
-/// What of a convex polygon lies below a plane across an axis, and what above.
+/// Returns the parts of a convex polygon below and above a plane across an axis.
 fn halves(polygon: &[Corner], axis: usize, plane: f64) -> Vec<Vec<Corner>> {
     let at = |c: &Corner| c.0[axis];
     let above = polygon.iter().any(|c| at(c) > plane);
@@ -209,7 +216,7 @@ fn halves(polygon: &[Corner], axis: usize, plane: f64) -> Vec<Vec<Corner>> {
     vec![low, high]
 }
 
-/// Where an edge meets a plane: the same point from either end.
+/// Returns the intersection of an edge and a plane: the same point from either end.
 fn meet(a: &Corner, b: &Corner, axis: usize, plane: f64) -> Corner {
     let (a, b) = if a.0[axis] < b.0[axis] {
         (a, b)
@@ -223,7 +230,7 @@ fn meet(a: &Corner, b: &Corner, axis: usize, plane: f64) -> Corner {
     (p, std::array::from_fn(|k| mix(a.1[k], b.1[k])))
 }
 
-/// Unit normal; `None` for a triangle without area.
+/// Returns the unit normal; `None` for a triangle without area.
 pub(crate) fn normal(t: &[Point; 3]) -> Option<Vec3> {
     let n = cross(sub(t[1], t[0]), sub(t[2], t[0]));
     let length = dot(n, n).sqrt();
@@ -285,7 +292,7 @@ mod tests {
                     .all(|c| (c.0[0] - c.1[0]).abs() < 1e-6)
             );
         }
-        // Along the common edge both have the same corners.
+        // Both have the same corners along the common edge.
         let along = |pieces: &[[Corner; 3]]| {
             let e = sub(c.0, b.0);
             let on = |p: Point| {

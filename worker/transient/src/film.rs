@@ -1,4 +1,4 @@
-//! The gate as an array of slots, and what pixels collect in it.
+//! The gate as an array of slots, and the histograms that pixels accumulate in it.
 
 use crate::{
     api::{Gate, Overflow},
@@ -11,13 +11,13 @@ use crate::{
 #[derive(Debug)]
 pub(crate) struct Film {
     pub gate: Gate,
-    /// Slots of a channel.
+    /// Slots per channel.
     pub slots: usize,
-    /// Channels of a pixel.
+    /// Channels per pixel.
     pub channels: usize,
     /// Channels beyond 0 that a spot counts in, by emitter.
     pub of_spot: Vec<Vec<u16>>,
-    /// Channels beyond 0 are classes of paths in place of groups of spots.
+    /// Whether channels beyond 0 are path classes instead of groups of spots.
     by_class: bool,
 }
 
@@ -42,7 +42,7 @@ impl Film {
         }
     }
 
-    /// What a contribution is filed under: its spot, or its class.
+    /// Returns the index that a contribution is filed under: its spot, or its class.
     #[inline]
     pub fn tag(&self, spot: usize, place: Place, way: Way) -> usize {
         match self.by_class {
@@ -51,12 +51,12 @@ impl Film {
         }
     }
 
-    /// Slots of one pixel.
+    /// Returns the number of slots of one pixel.
     pub fn pixel(&self) -> usize {
         self.slots * self.channels
     }
 
-    /// The slot of a path of a length.
+    /// Returns the slot of a path length.
     #[inline]
     pub fn slot(&self, path_m: f64) -> usize {
         let b = (path_m - self.gate.start_m) / self.gate.bin_width_m;
@@ -78,7 +78,7 @@ impl Film {
         }
     }
 
-    /// Adds light to the channels of groups alone.
+    /// Adds light to the channels of groups only.
     #[inline]
     pub fn add_to_groups(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
         if self.channels == 1 {
@@ -90,25 +90,27 @@ impl Film {
     }
 }
 
-/// Two-bounce contributions of one pixel: sums, and squared contrasts. A block of 2×2 strata has one stratum, chosen at
-/// random, sampled twice; the difference of its two samples is the block's contrast, scaled so that its square estimates
-/// the block's variance without bias, whatever edges cross it.
+/// Two-bounce contributions of one pixel: sums, and squared contrasts. In each block of 2×2 strata,
+/// one stratum, chosen at random, is sampled twice. The difference of its two samples is the
+/// block's contrast, scaled so that its square is an unbiased estimate of the block's variance,
+/// regardless of edges within the block.
 #[derive(Debug)]
 pub(crate) struct Blocks {
-    /// Σ of contributions, as [`Film::pixel`] slots.
+    /// Σ of contributions, in the slots of [`Film::pixel`].
     pub sum: Vec<f32>,
     /// Σ over blocks of (contrast by slot of channel 0)².
     pub square: Vec<f32>,
-    /// Σ over blocks of (contrast of the whole)².
+    /// Σ over blocks of (contrast of the total)².
     pub total_square: f64,
-    /// Σ over blocks of ± contrast by slot of channel 0: what its slots have in common stays.
+    /// Σ over blocks of ± contrast by slot of channel 0; it preserves the correlation between
+    /// slots.
     pub noise: Vec<f32>,
     contrast: Vec<f32>,
     touched: Vec<u32>,
 }
 
-/// √(7/4). Of four strata of variance v each, three have one sample and one has the mean of two: their sum has variance
-/// 3.5 v, and the squared difference of the two samples is 2 v on average.
+/// √(7/4). Of four strata of variance v each, three have one sample and one has the mean of two:
+/// their sum has variance 3.5 v, and the mean squared difference of the two samples is 2 v.
 const CONTRAST: f32 = 1.322_875_7;
 
 impl Blocks {
@@ -130,13 +132,13 @@ impl Blocks {
         self.total_square = 0.0;
     }
 
-    /// Adds the contribution of a sample that is its stratum's only one.
+    /// Adds a contribution from the only sample of its stratum.
     #[inline]
     pub fn add(&mut self, film: &Film, slot: usize, value: f32, spot: usize) {
         film.add(&mut self.sum, slot, value, spot);
     }
 
-    /// Adds that of one of a stratum's two samples; `sign` tells which.
+    /// Adds a contribution from one of a stratum's two samples; `sign` distinguishes them.
     #[inline]
     pub fn add_half(&mut self, film: &Film, slot: usize, value: f32, sign: f32, spot: usize) {
         film.add(&mut self.sum, slot, 0.5 * value, spot);
@@ -146,7 +148,7 @@ impl Blocks {
         self.contrast[slot] += sign * CONTRAST * value;
     }
 
-    /// Ends a block; `sign` is the one that its contrast counts with in `noise`.
+    /// Ends a block; `sign` is the sign of its contrast in `noise`.
     pub fn finish(&mut self, sign: f32) {
         let mut total = 0.0f64;
         for b in self.touched.drain(..) {
@@ -160,7 +162,7 @@ impl Blocks {
 }
 
 impl Overflow {
-    /// Adds what a pixel collected outside the gate.
+    /// Adds the light of a pixel outside the gate.
     pub(crate) fn take(&mut self, film: &Film, pixel: &[f32], factor: f64) {
         let outside = f64::from(pixel[0]) + f64::from(pixel[film.slots - 1]);
         self.energy += outside * factor;

@@ -5,25 +5,25 @@ use picofarm_scene::{Bsdf, Material, Vec3};
 /// A body of glass behind a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Body {
-    /// Index of refraction against what is around it.
+    /// Index of refraction relative to the surroundings.
     pub ior: f32,
-    /// Share of what is refracted that passes the surface.
+    /// Share of the refracted light that passes the surface.
     pub transmittance: f32,
 }
 
-/// What a surface does with a ray.
+/// The reflection and refraction of a ray at a surface.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Split {
-    /// Share that is reflected; 1 where all of it is.
+    /// Reflected share; 1 for total reflection.
     pub reflects: f32,
-    /// Unit direction of what is reflected.
+    /// Unit direction of the reflected ray.
     pub reflected: Vec3,
-    /// Unit direction of what is refracted, of no meaning where all is reflected.
+    /// Unit direction of the refracted ray; meaningless for total reflection.
     pub refracted: Vec3,
 }
 
 impl Body {
-    /// `None` for what is no body of glass.
+    /// Returns `None` if the material is not a body of glass.
     pub fn new(material: &Material) -> Option<Self> {
         match material.bsdf {
             Bsdf::Dielectric { ior, transmittance } => Some(Self { ior, transmittance }),
@@ -32,13 +32,14 @@ impl Body {
     }
 }
 
-/// Splits a ray along the unit direction `w` at a surface whose unit normal `n` faces it, from the index of refraction `from` to
-/// `to` (Snell, Fresnel).
+/// Splits a ray along the unit direction `w` at a surface with the unit normal `n` facing the ray,
+/// from the index of refraction `from` to `to` (Snell, Fresnel).
 pub(crate) fn split(w: Vec3, n: Vec3, (from, to): (f32, f32)) -> Split {
     let cos = (-n.dot(w)).clamp(0.0, 1.0);
     let reflected = (w + n * (2.0 * cos)).normalized();
     let ratio = from / to;
-    // Cosine behind the surface, squared: written without 1 − sin², so that equal indices change nothing.
+    // Square of the cosine behind the surface, written without 1 − sin², so that equal indices
+    // change nothing.
     let square = 1.0 - ratio * ratio + ratio * ratio * (cos * cos);
     if square <= 0.0 {
         return Split {
@@ -86,7 +87,7 @@ mod tests {
 
         #[test]
         fn flat_rays_from_within_are_reflected_whole(angle in 0.0f32..1.0, ior in 1.1f32..4.0) {
-            // Beyond the critical angle.
+            // The angle is beyond the critical angle.
             let sine = 1.0 / ior + angle * (1.0 - 1.0 / ior);
             let w = Vec3::new(sine, 0.0, -(1.0 - sine * sine).max(0.0).sqrt()).normalized();
             prop_assume!(sine > 1.0 / ior * (1.0 + 1e-5));
@@ -100,7 +101,7 @@ mod tests {
         let same = split(w, Vec3::new(0.0, 0.0, 1.0), (1.0, 1.0));
         assert_eq!(same.reflects, 0.0);
         assert!((same.refracted - w).length() < 1e-6);
-        // At a right angle (n − 1)²/(n + 1)².
+        // At normal incidence the reflectance is (n − 1)²/(n + 1)².
         let straight = split(
             Vec3::new(0.0, 0.0, -1.0),
             Vec3::new(0.0, 0.0, 1.0),

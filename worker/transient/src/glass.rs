@@ -1,8 +1,10 @@
-//! Thin glass. It is no surface: light goes straight on through it, and a straight way between two points carries the share of
-//! light that the panes across it let through. So every technique of the renderer stays what it is, with that share in the place
-//! of "free", and the densities of drawing do not change. Light that glass reflects comes by ways of its own: [`crate::by_glass`].
+//! Thin glass. It is not a surface: light passes straight through it, and a straight segment
+//! between two points carries the share of light that the panes on it transmit. So every technique
+//! of the renderer stays the same, with that share as the visibility, and the sampling densities do
+//! not change. Light that glass reflects has techniques of its own: [`crate::by_glass`].
 //!
-//! The panes have a hierarchy of their own beside that of the surfaces: scenes without glass do not pay for it.
+//! The panes have a hierarchy of their own, separate from that of the surfaces, so that scenes
+//! without glass have no extra cost.
 
 use picofarm_scene::{Bsdf, Material, Vec3};
 
@@ -12,22 +14,23 @@ use crate::{
     world::point,
 };
 
-/// Triangles of glass that a ray meets within this length are one, render units: two that share the edge which it meets, and
-/// sheets that are there twice.
+/// Length within which hits of glass on a ray count as one, render units: hits of two triangles at
+/// a common edge, and of duplicate sheets.
 const SAME: f32 = 1.0 / 65536.0;
 
-/// What of a material's glass counts.
+/// The properties of a material's glass.
 #[derive(Debug, Clone, Copy)]
 struct Glass {
     ior: f32,
-    /// What a pane lets through beside its reflection: at the laser's wavelength, and of red, green and blue.
+    /// Transmittance of a pane apart from reflection: at the laser's wavelength, and for red, green
+    /// and blue.
     passes: [f32; 4],
-    /// One of two faces.
+    /// Whether it is one of a pane's two faces.
     face: bool,
 }
 
 impl Glass {
-    /// `None` for what is no glass.
+    /// Returns `None` if the material is not thin glass.
     fn new(material: &Material) -> Option<Self> {
         let Bsdf::ThinDielectric {
             ior,
@@ -45,7 +48,7 @@ impl Glass {
         })
     }
 
-    /// Shares of the light that pass at an angle with this cosine.
+    /// Returns the transmitted shares of the light at an angle with this cosine.
     fn through(&self, cos: f32) -> [f32; 4] {
         let clear = clear(self.ior, cos);
         self.passes.map(|passes| match self.face {
@@ -54,8 +57,8 @@ impl Glass {
         })
     }
 
-    /// Share of the laser's light that is reflected at an angle with this cosine; of a pane with two faces the front of each, the
-    /// side of its normal, reflects for both.
+    /// Returns the reflected share of the laser's light at an angle with this cosine. If a pane has
+    /// two faces, the front of each, on the side of its normal, reflects for both.
     fn reflects(&self, cos: f32, front: bool) -> f32 {
         match self.face && !front {
             true => 0.0,
@@ -64,26 +67,29 @@ impl Glass {
     }
 }
 
-/// Share of unpolarised light that passes a pane which absorbs nothing: with r the reflectance of a face for one polarisation
-/// (Fresnel), 1 − r passes the first, and of the sum over all reflections to and fro (1 − r)/(1 + r) the pane.
+/// Returns the transmitted share of unpolarised light for a pane without absorption. Let r be the
+/// reflectance of a face for one polarisation (Fresnel). The first face transmits 1 − r, and with
+/// the sum over all internal reflections the pane transmits (1 − r)/(1 + r).
 fn clear(ior: f32, cos: f32) -> f32 {
     let cos = cos.clamp(0.0, 1.0);
-    // Snell, times the index: without the cancellation of 1 − sin², so that an index of 1 takes nothing at any angle.
+    // Snell's law times the index, without the cancellation of 1 − sin², so that an index of 1
+    // removes nothing at any angle.
     let inside = (ior * ior - 1.0 + cos * cos).sqrt();
     let share = |a: f32, b: f32| {
         let root = (a - b) / (a + b);
         let r = root * root;
         (1.0 - r) / (1.0 + r)
     };
-    // An index of 1, along the pane: it is not crossed.
+    // With an index of 1, a ray along the pane does not cross it.
     if inside + cos <= 0.0 {
         return 0.0;
     }
     0.5 * (share(cos, inside) + share(ior * ior * cos, inside))
 }
 
-/// Share of unpolarised light that a pane reflects: a face of reflectance r for one polarisation (Fresnel) reflects it, and of
-/// what comes from the other face 1 − r passes, (1 − r)/(1 + r) with all reflections to and fro, tinted twice.
+/// Returns the reflected share of unpolarised light for a pane. A face of reflectance r for one
+/// polarisation (Fresnel) reflects r. Of the light from the other face, 1 − r passes, or
+/// (1 − r)/(1 + r) with all internal reflections, tinted twice.
 fn reflected(ior: f32, tint: f32, cos: f32) -> f32 {
     let cos = cos.clamp(0.0, 1.0);
     let inside = (ior * ior - 1.0 + cos * cos).sqrt();
@@ -98,14 +104,14 @@ fn reflected(ior: f32, tint: f32, cos: f32) -> f32 {
     0.5 * (share(cos, inside) + share(ior * ior * cos, inside))
 }
 
-/// Where a straight way goes through a pane.
+/// The crossing of a straight segment and a pane.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Crossing {
-    /// Triangle of glass.
+    /// Index of the triangle of glass.
     pub pane: u32,
-    /// Share of the laser's light that goes straight on.
+    /// Transmitted share of the laser's light.
     pub passes: f32,
-    /// Share that is reflected.
+    /// Reflected share.
     pub reflects: f32,
 }
 
@@ -115,17 +121,18 @@ pub(crate) struct Panes {
     bvh: Bvh,
     /// Corners, render units.
     triangles: Vec<[Vec3; 3]>,
-    /// Unit normals, one a triangle.
+    /// Unit normals, one per triangle.
     normals: Vec<Vec3>,
     /// Glass of each triangle.
     glass: Vec<Glass>,
 }
 
 impl Panes {
-    /// The panes of these triangles (render units) of these materials; `None` where there are none.
+    /// Creates the panes of these triangles (render units) of these materials; `None` if there are
+    /// none.
     ///
     /// # Errors
-    /// [`RenderError::Stopped`].
+    /// [`RenderError::Stopped`] if the render was stopped.
     pub fn new(
         triangles: &[[Vec3; 3]],
         materials: &[&Material],
@@ -145,12 +152,13 @@ impl Panes {
         }))
     }
 
-    /// Share of the laser's light that passes on the straight way from `a` to `b`.
+    /// Returns the transmitted share of the laser's light on the straight segment from `a` to `b`.
     pub fn through(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> f32 {
         self.shares(stack, a, b)[0]
     }
 
-    /// [`Panes::through`] from one point to many: calls `each` with the index of every way that glass crosses, and its share.
+    /// Like [`Panes::through`], from one point to many: calls `each` with the index of every
+    /// segment that glass crosses, and its share.
     pub fn through_bundle(
         &self,
         stack: &mut Stack,
@@ -172,41 +180,43 @@ impl Panes {
         stack.crossed = crossed;
     }
 
-    /// Shares of red, green and blue light that pass on the straight way from `a` to `b`.
+    /// Returns the shares of red, green and blue light that are transmitted on the straight segment
+    /// from `a` to `b`.
     pub fn tint(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> [f32; 3] {
         let [_, r, g, b] = self.shares(stack, a, b);
         [r, g, b]
     }
 
-    /// Corners and unit normal of each triangle.
+    /// Returns the corners and the unit normal of each triangle.
     pub fn triangles(&self) -> impl Iterator<Item = ([Vec3; 3], Vec3)> {
         let corners = self.triangles.iter().copied();
         corners.zip(self.normals.iter().copied())
     }
 
-    /// Share of light at a right angle that a triangle reflects.
+    /// Returns the share of light that a triangle reflects at normal incidence.
     pub fn reflectance(&self, pane: usize) -> f32 {
         self.glass[pane].reflects(1.0, true)
     }
 
-    /// What a triangle's front reflects at an angle with this cosine, never nothing.
+    /// Returns the share that a triangle's front reflects at an angle with this cosine, never 0.
     pub fn weight(&self, pane: usize, cos: f32) -> f32 {
         self.glass[pane].reflects(cos, true).max(1e-3)
     }
 
-    /// Whether a triangle's back reflects as its front does.
+    /// Returns whether a triangle's back reflects like its front.
     pub fn two_sided(&self, pane: usize) -> bool {
         !self.glass[pane].face
     }
 
-    /// Where the line from `origin` along `direction` meets a triangle's plane, and its unit normal towards the origin.
+    /// Returns the intersection of a triangle's plane and the line from `origin` along `direction`,
+    /// and the unit normal facing the origin.
     pub fn point(&self, pane: u32, origin: Vec3, direction: Vec3) -> (Vec3, Vec3) {
         let n = self.normals[pane as usize];
         let p = point(&self.triangles[pane as usize], origin, direction);
         (p, if n.dot(direction) <= 0.0 { n } else { -n })
     }
 
-    /// Writes the panes across the straight way from `a` to `b` in their order.
+    /// Writes the panes on the straight segment from `a` to `b` in order.
     pub fn crossings(&self, stack: &mut Stack, a: Vec3, b: Vec3, out: &mut Vec<Crossing>) {
         out.clear();
         let way = b - a;
@@ -231,7 +241,8 @@ impl Panes {
         all
     }
 
-    /// Calls `each` for every pane across a way, with its triangle and the way's direction along its normal.
+    /// Calls `each` for every pane on a segment, with its triangle and the component of the
+    /// segment's direction along its normal.
     fn each(&self, stack: &mut Stack, a: Vec3, way: Vec3, each: impl FnMut(&Glass, u32, f32)) {
         self.bvh.deepen(stack);
         if self.bvh.occluded(stack, a, way, 1.0) {
@@ -239,7 +250,7 @@ impl Panes {
         }
     }
 
-    /// The same of a way that glass is known to cross.
+    /// Like [`Panes::each`], for a segment that glass is known to cross.
     fn across(
         &self,
         stack: &mut Stack,

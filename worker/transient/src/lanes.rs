@@ -1,19 +1,22 @@
-//! Loops over many things side by side, with the longest registers that the machine has. Products and sums stay apart, so that
-//! the bits are the same with any: those of AVX-512, of AVX2, or what every machine of its kind has.
+//! Loops over many elements with the widest registers of the machine. Products and sums are not
+//! fused, so that the bits are the same with AVX-512, with AVX2, and with the baseline of the
+//! architecture.
 //!
-//! Many loops are over five spots or twenty light vertices. A compiler does what is left of a loop after its last full register one
-//! by one, which took most of their time. So columns are kept in whole groups ([`Column`]), and loops work on those.
+//! Many loops are over five spots or twenty light vertices. A compiler runs the elements after the
+//! last full register one by one, which took most of their time. So columns are stored in whole
+//! groups ([`Column`]), and loops work on those.
 
 use std::ops::Deref;
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// A loop to be run so. `run` must be `#[inline(always)]`, as must be what it calls: only what is inlined has these registers.
+/// A loop for [`widest`]. `run` must be `#[inline(always)]`, and so must the functions that it
+/// calls, because only inlined code uses the wide registers.
 pub(crate) trait Wide {
-    /// What the loop finds.
+    /// The result of the loop.
     type Output;
 
-    /// The loop.
+    /// Runs the loop.
     fn run(self) -> Self::Output;
 }
 
@@ -28,16 +31,18 @@ impl<T: Wide> WithSimd for With<T> {
     }
 }
 
-/// Runs a loop with the longest registers.
+/// Runs a loop with the widest registers.
 #[inline]
 pub(crate) fn widest<T: Wide>(this: T) -> T::Output {
     Arch::new().dispatch(With(this))
 }
 
-/// How many numbers a sum is made of side by side: the same on every machine, since the order is part of the bits.
+/// Number of partial sums of a sum. It is the same on every machine, because the order determines
+/// the bits.
 pub(crate) const SIDE: usize = 8;
 
-/// Numbers in groups of [`SIDE`], with zeros behind them, so that a loop may begin at any of them and read whole groups.
+/// Numbers in groups of [`SIDE`], followed by zeros, so that a loop may begin at any of them and
+/// read whole groups.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Column {
     groups: Vec<[f32; SIDE]>,
@@ -52,13 +57,13 @@ impl Column {
 
     pub fn push(&mut self, x: f32) {
         let at = self.len / SIDE;
-        // The last one may be the first of a group that is read.
+        // The last number may be the first of a group to read.
         self.groups.resize(at + 2, [0.0; SIDE]);
         self.groups[at][self.len % SIDE] = x;
         self.len += 1;
     }
 
-    /// `count` numbers from the `first` on, in whole groups.
+    /// Returns `count` numbers from the `first` on, in whole groups.
     #[inline(always)]
     pub fn groups(&self, first: usize, count: usize) -> &[[f32; SIDE]] {
         let all = self.groups.as_flattened();
@@ -76,13 +81,13 @@ impl Deref for Column {
     }
 }
 
-/// Writes a group to where it belongs: all of it, or as much as there is room for.
+/// Writes a group at its place: all of it, or as much as fits.
 #[inline(always)]
 pub(crate) fn put(out: &mut [f32], group: usize, found: &[f32; SIDE]) {
     let out = &mut out[group * SIDE..];
     match out.first_chunk_mut::<SIDE>() {
         Some(whole) => *whole = *found,
-        // Without a call for a few numbers.
+        // Avoids a call for a few numbers.
         None => {
             let (room, mut at) = (out.len(), 0);
             for part in [4, 2, 1] {
@@ -95,7 +100,7 @@ pub(crate) fn put(out: &mut [f32], group: usize, found: &[f32; SIDE]) {
     }
 }
 
-/// The sum of many numbers, eight partial sums first.
+/// Returns the sum of many numbers, by eight partial sums.
 #[inline(always)]
 pub(crate) fn sum(all: &[f32]) -> f32 {
     let (many, few) = all.as_chunks::<SIDE>();
@@ -131,7 +136,7 @@ mod tests {
             let mut column = Column::default();
             for round in 0..2 {
                 column.clear();
-                // The second time there are fewer, over what was there.
+                // The second time there are fewer numbers, over the earlier ones.
                 let all = &all[..all.len() / (round + 1)];
                 all.iter().for_each(|&x| column.push(x));
                 prop_assert_eq!(&*column, all);

@@ -1,5 +1,5 @@
-//! The transient renderer: a scene in, time-resolved histograms and ground truth out. Knows nothing of
-//! jobs, stores or files.
+//! The transient renderer: turns a scene into time-resolved histograms and ground truth. It does
+//! not depend on jobs, stores or files.
 
 mod api;
 mod beam;

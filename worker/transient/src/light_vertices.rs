@@ -1,7 +1,7 @@
-//! Light vertices: surface points that spots light directly, drawn along the spots' own scattering and
-//! kept for a batch of camera paths. A camera vertex sees them as points of light. Together with plain
-//! connections, weighed by MIS, they bound both 1/d² singularities of paths of three bounces and more:
-//! the one at the spot and the one at the camera vertex.
+//! Light vertices: surface points that spots light directly, drawn along the spots' own scattering
+//! and stored for a batch of camera paths. A camera vertex sees them as points of light. Combined
+//! with plain connections by MIS, they bound both 1/d² singularities of paths of three bounces and
+//! more: the one at the spot and the one at the camera vertex.
 
 use std::f32::consts::PI;
 
@@ -22,21 +22,21 @@ pub(crate) struct LightVertex {
     pub hit: Hit,
     /// Unit direction back towards the spot.
     pub back: Vec3,
-    /// Flux that arrives, divided by the number of vertices drawn.
+    /// Arriving flux, divided by the number of vertices drawn.
     pub flux: f32,
     /// Density per area of drawing it, times the weight of this technique in MIS.
     pub density: f32,
     /// Optical path from the laser, metres.
     pub path_m: f64,
-    /// Emitter.
+    /// Emitter index.
     pub spot: usize,
-    /// Bounces up to and with this vertex, counted from the spot as the first.
+    /// Bounces up to and including this vertex, counted from the spot as the first.
     pub bounces: u32,
-    /// Roughness of the first near-mirror by whose lobe the light came; 0 where it came by none.
+    /// Roughness of the first near-mirror on the light's path; 0 if there was none.
     pub alpha: f32,
 }
 
-/// Density of a light vertex that nothing else finds: its share in MIS is 1 to the last bit.
+/// Density of a light vertex that no other technique samples: its MIS weight is 1 to the last bit.
 pub(crate) const ALONE: f32 = 1e30;
 
 /// The light vertices of one batch.
@@ -44,15 +44,16 @@ pub(crate) const ALONE: f32 = 1e30;
 pub(crate) struct LightVertices {
     pub list: Vec<LightVertex>,
     columns: Columns,
-    /// Indices of those that are not Lambertian.
+    /// Indices of the vertices that are not Lambertian.
     glossy: Vec<usize>,
-    /// How each scatters what arrives.
+    /// The lobe of each vertex for the arriving light.
     lobes: Lobes,
 }
 
 impl LightVertices {
-    /// Draws `count` vertices anew, spread evenly over the spots. Vertices on mirrors are left out: a
-    /// camera vertex meets their lobe with no chance to speak of (aimed paths reach them); so are those in a spot's own zone.
+    /// Redraws `count` vertices, spread evenly over the spots. Vertices on mirrors are left out,
+    /// because a camera vertex is almost never within their lobe (aimed paths reach them); so are
+    /// those in a spot's own zone.
     pub fn fill(
         &mut self,
         (world, emitters, contacts): (&World, &Emitters, Option<&Contacts>),
@@ -101,7 +102,7 @@ impl LightVertices {
         }
     }
 
-    /// Forgets all.
+    /// Removes all vertices.
     pub fn clear(&mut self) {
         self.list.clear();
         self.glossy.clear();
@@ -109,7 +110,7 @@ impl LightVertices {
         self.lobes.clear();
     }
 
-    /// Adds one.
+    /// Adds a vertex.
     pub fn push(&mut self, y: LightVertex) {
         let lambert = if y.hit.surface.diffuse() {
             y.hit.surface.lambertian()
@@ -122,7 +123,8 @@ impl LightVertices {
         self.list.push(y);
     }
 
-    /// Writes the unshadowed contribution of every vertex to a surface point, MIS weight included.
+    /// Writes the unshadowed contribution of every vertex to a surface point, including the MIS
+    /// weight.
     pub fn weights(&self, x: &Hit, wo: Vec3, (out, plain): (&mut Vec<f32>, &mut Vec<f32>)) {
         out.clear();
         out.resize(self.list.len(), 0.0);
@@ -148,13 +150,14 @@ impl LightVertices {
         }
     }
 
-    /// True where [`LightVertices::glossy_weights`] has something to give.
+    /// Returns whether [`LightVertices::glossy_weights`] can be nonzero.
     pub fn has_gloss(&self) -> bool {
         let gloss = |&i: &usize| !self.list[i].hit.surface.is_shared();
         self.glossy.iter().any(gloss)
     }
 
-    /// As [`LightVertices::weights`], of conductors alone whose vertices a tile does not share.
+    /// Like [`LightVertices::weights`], only for conductors with vertices that a tile does not
+    /// share.
     pub fn glossy_weights(&self, x: &Hit, wo: Vec3, out: &mut Vec<f32>) {
         out.clear();
         out.resize(self.list.len(), 0.0);
@@ -180,8 +183,8 @@ impl LightVertices {
     }
 }
 
-/// Density per steradian at a spot, times this technique's weight in MIS. Both sides of the balance
-/// must use it.
+/// Returns the density per steradian at a spot, times the MIS weight of this technique. Both sides
+/// of the balance heuristic must use it.
 #[inline(always)]
 pub(crate) fn share(emitters: &Emitters, pdf: f32) -> f32 {
     LIGHT_WEIGHT * pdf / emitters.list.len() as f32

@@ -1,6 +1,8 @@
-//! Scattering of many surface points side by side: each with a direction of its own that stays, towards or from one point.
+//! Scattering at many surface points at once. Each point has a fixed direction of its own and
+//! scatters towards or from one common point.
 //!
-//! GGX and Beckmann conductors, Lambertians and mixes of both. Where none is Beckmann, nothing of it is worked out.
+//! Supports GGX and Beckmann conductors, Lambertians and mixes of both. If no surface is Beckmann,
+//! its terms are not computed.
 
 use std::ops::Range;
 
@@ -12,25 +14,25 @@ use crate::{
     world::Hit,
 };
 
-/// How a surface point scatters light from a direction that stays.
+/// The scattering of a surface point for a fixed direction.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Lobe {
-    /// f · cos / (D·π·α²·G₁) of the conductor; D and the other direction's G₁ are missing.
+    /// f · cos / (D·π·α²·G₁) of the conductor, for the G₁ of the other direction.
     pub conductor: f32,
     /// ρ/π of the Lambertian part.
     pub lambertian: f32,
     /// α².
     pub alpha2: f32,
-    /// Density of a draw from the conductor / (D·π·α²).
+    /// Sampling density of the conductor / (D·π·α²).
     pub conductor_pdf: f32,
-    /// Density of a draw from the Lambertian part, without the cosine.
+    /// Sampling density of the Lambertian part, without the cosine.
     pub lambertian_pdf: f32,
-    /// 1 of a Beckmann conductor, 0 of all else.
+    /// 1 for a Beckmann conductor, otherwise 0.
     pub beckmann: f32,
 }
 
 impl Lobe {
-    /// Of a surface that scatters nothing.
+    /// The lobe of a surface that scatters nothing.
     pub const BLACK: Self = Self {
         conductor: 0.0,
         lambertian: 0.0,
@@ -40,22 +42,24 @@ impl Lobe {
         beckmann: 0.0,
     };
 
-    /// f·cos of the direction `w`, and the density per steradian of drawing it. `n` is the normal, `i` the direction that stays.
-    /// `BECKMANN`: it may be a Beckmann conductor.
+    /// Returns f·cos for the direction `w`, and its sampling density per steradian. `n` is the
+    /// normal, `i` the fixed direction. `BECKMANN` states whether the surface may be a Beckmann
+    /// conductor.
     #[inline(always)]
     fn scatter<const BECKMANN: bool>(&self, n: [f32; 3], i: [f32; 3], w: [f32; 3]) -> (f32, f32) {
         let co = dot(n, w);
         let s = [i[0] + w[0], i[1] + w[1], i[2] + w[2]];
         let c = dot(n, s);
-        // The slope comes from n × s: 1 − cos² would cancel at small α.
+        // The slope is computed from n × s, because 1 − cos² would cancel at small α.
         let x = [
             n[1] * s[2] - n[2] * s[1],
             n[2] * s[0] - n[0] * s[2],
             n[0] * s[1] - n[1] * s[0],
         ];
         let (along2, across2) = (c * c, dot(x, x));
-        // Both times α²: GGX's D·π·α² is (part / whole)², and its G₁ is 2cos / (cos + root). One division for both. Opposite
-        // directions have no sum, and divide by no 0.
+        // Both are multiplied by α². GGX's D·π·α² is (part / whole)², and its G₁ is 2cos / (cos +
+        // root); one division computes both. The sum of opposite directions is 0, so a small number
+        // avoids a division by 0.
         let part = (along2 + across2) * self.alpha2;
         let whole = along2 * self.alpha2 + across2 + 1e-16;
         let edge = co + (co * co + self.alpha2 * (1.0 - co * co).max(0.0)).sqrt();
@@ -76,20 +80,20 @@ impl Lobe {
     }
 }
 
-/// Walter's rational approximation of G₁ by 1/(α·tan θ).
+/// Returns Walter's rational approximation of G₁ for `a` = 1/(α·tan θ).
 #[inline(always)]
 pub(crate) fn beckmann_masking(a: f32) -> f32 {
     let rational = (3.535 * a + 2.181 * a * a) / (1.0 + 2.276 * a + 2.577 * a * a);
     if a < 1.6 { rational } else { 1.0 }
 }
 
-/// e⁻ˣ for x ≥ 0, to 10⁻⁷ of it; 0 from 80 on, beneath everything that f32 can add to anything, and where x is no number. Without
-/// branches, and the same bits on any machine.
+/// Returns e⁻ˣ for x ≥ 0, with a relative error of 10⁻⁷. Returns 0 for x ≥ 80, below the resolution
+/// of any f32 sum, and for NaN. It has no branches and gives the same bits on any machine.
 #[inline(always)]
 pub(crate) fn exp_minus(x: f32) -> f32 {
     // Adding 1.5·2²³ leaves the nearest integer in the low bits.
     const ROUND: f32 = 12_582_912.0;
-    // ln 2 in two parts, the first with few bits.
+    // ln 2 in two parts; the first has few bits.
     const LN_2: (f32, f32) = (0.693_359_4, -2.121_944_4e-4);
     let near = x < 80.0;
     let y = if near { -x } else { 0.0 };
@@ -123,7 +127,7 @@ fn array(v: Vec3) -> [f32; 3] {
     [v.x, v.y, v.z]
 }
 
-/// A surface point, its normal and the direction that stays.
+/// A surface point, its normal and its fixed direction.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Seen {
     pub p: Vec3,
@@ -132,14 +136,14 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
-    /// A hit, seen in the direction `i`.
+    /// Creates the point of a hit with the fixed direction `i`.
     #[inline]
     pub fn of(h: &Hit, i: Vec3) -> Self {
         Self { p: h.p, n: h.n, i }
     }
 }
 
-/// Many of them.
+/// The lobes of many surface points, in columns.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Lobes {
     p: [Column; 3],
@@ -151,7 +155,7 @@ pub(crate) struct Lobes {
     conductor_pdf: Column,
     lambertian_pdf: Column,
     beckmann: Column,
-    /// One has a Beckmann conductor.
+    /// Whether any of them has a Beckmann conductor.
     any_beckmann: bool,
 }
 
@@ -192,7 +196,8 @@ impl Lobes {
         self.lambertian_pdf.push(lobe.lambertian_pdf);
     }
 
-    /// What each scatters towards the point `q` with normal `nq`, and the density of drawing it, both per area there.
+    /// Writes f·cos of each point towards the point `q` with normal `nq`, and its sampling density,
+    /// both per area at `q`.
     pub fn toward(&self, (q, nq): (Vec3, Vec3), value: &mut [f32], pdf: &mut [f32]) {
         widest(Toward {
             lobes: self,
@@ -203,8 +208,8 @@ impl Lobes {
         });
     }
 
-    /// What a point sends on of what those of a range send to it, f_x cos_x f_y cos_y / d², and the density per area at
-    /// each of them with which the point draws it.
+    /// Writes the light that a point scatters from each point of a range, f_x cos_x f_y cos_y / d²,
+    /// and the density per area there with which the point samples it.
     pub fn between(
         &self,
         range: Range<usize>,
@@ -224,7 +229,7 @@ impl Lobes {
     }
 }
 
-/// One group of [`SIDE`] of them.
+/// One group of [`SIDE`] lobes.
 struct Group<'a> {
     p: [&'a [f32; SIDE]; 3],
     n: [&'a [f32; SIDE]; 3],
@@ -237,7 +242,7 @@ struct Group<'a> {
     beckmann: &'a [f32; SIDE],
 }
 
-/// Groups of a range, of each column as many.
+/// The groups of a range, the same number for each column.
 struct Groups<'a> {
     p: [&'a [[f32; SIDE]]; 3],
     n: [&'a [[f32; SIDE]]; 3],
@@ -306,7 +311,7 @@ fn at(columns: &[&[f32; SIDE]; 3], k: usize) -> [f32; 3] {
     [columns[0][k], columns[1][k], columns[2][k]]
 }
 
-/// [`Lobes::toward`].
+/// The loop of [`Lobes::toward`].
 struct Toward<'a> {
     lobes: &'a Lobes,
     q: Vec3,
@@ -344,7 +349,7 @@ impl Toward<'_> {
                 let w = [to[0] * scale, to[1] * scale, to[2] * scale];
                 let (f, density) = c.lobe(k).scatter::<BECKMANN>(at(&c.n, k), at(&c.i, k), w);
                 let turn = dot(nq, w).abs() * (scale * scale);
-                // In one place with it there is no direction.
+                // Points at the same position have no direction between them.
                 value[k] = if f > 0.0 { f * turn } else { 0.0 };
                 pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
             }
@@ -354,7 +359,7 @@ impl Toward<'_> {
     }
 }
 
-/// [`Lobes::between`].
+/// The loop of [`Lobes::between`].
 struct Between<'a> {
     lobes: &'a Lobes,
     range: Range<usize>,
@@ -399,7 +404,7 @@ impl Between<'_> {
                 let (there, _) = c.lobe(k).scatter::<BECKMANN>(ny, at(&c.i, k), back);
                 let less = scale * scale;
                 let (f, turn) = (here * there, dot(ny, w).abs() * less);
-                // In one place with it there is no direction.
+                // Points at the same position have no direction between them.
                 value[k] = if f > 0.0 { f * less } else { 0.0 };
                 pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
             }

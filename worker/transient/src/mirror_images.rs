@@ -1,10 +1,11 @@
-//! Planar near-mirrors: which there are, and aiming at the narrow lobes around the spots' mirror images.
+//! Planar near-mirrors: finds them, and aims at the narrow lobes around the spots' mirror images.
 //!
-//! A surface point x sees a spot s through a mirror of roughness α around one point m₀, where the image
-//! of s lies behind it. Over the mirror's plane, the half vector's slope grows linearly around m₀, so a
-//! Gaussian in slope (for GGX its own heavy-tailed distribution), carried to the plane by that linear
-//! map, is close to the lobe's own shape. Where it is not (grazing, spots at the mirror's foot), MIS with
-//! BSDF sampling keeps the estimate unbiased and its variance bounded.
+//! A surface point x sees a spot s in a mirror of roughness α around one point m₀, in front of the
+//! image of s. Over the mirror's plane, the half vector's slope grows linearly around m₀, so a
+//! Gaussian in slope (for GGX its own heavy-tailed distribution), mapped to the plane by that
+//! linear map, approximates the lobe's own shape. If the approximation is poor (grazing angles,
+//! spots at the mirror's foot), MIS with BSDF sampling keeps the estimate unbiased and its variance
+//! bounded.
 
 use std::f32::consts::PI;
 
@@ -19,13 +20,14 @@ use crate::{
     world::World,
 };
 
-/// Most planes kept; scenes with more facets are curved mirrors for our purposes.
+/// Largest number of planes; a scene with more facets counts as having curved mirrors.
 const MAX_MIRRORS: usize = 8;
 /// Planes below this share of the whole mirror area are left to plain sampling.
 const MIN_SHARE: f64 = 0.02;
-/// The lobe is sampled a little wider than it is, so that its tail stays in reach.
+/// Factor by which the sampled lobe is wider than the real one, so that the tail is sampled too.
 const WIDEN: f32 = 1.2;
-/// Reach beyond the mirror's rectangle in which images still count, in units of the lobe's width.
+/// Margin around the mirror's rectangle within which images still count, in units of the lobe's
+/// width.
 const MARGIN: f32 = 3.0;
 
 /// One planar mirror and the spots' images behind it.
@@ -51,7 +53,7 @@ pub(crate) struct Mirror {
 #[derive(Debug, Default)]
 pub(crate) struct Mirrors {
     pub list: Vec<Mirror>,
-    /// Mirror of each triangle, `NONE` for most; empty where there are no mirrors.
+    /// Mirror of each triangle, `NONE` for most; empty if there are no mirrors.
     of_triangle: Vec<u8>,
     /// Share of the specular area that no plane covers (curved near-mirrors).
     pub curved_share: f64,
@@ -60,14 +62,14 @@ pub(crate) struct Mirrors {
 
 const NONE: u8 = u8::MAX;
 
-/// A draw: where to aim, for which spot by which mirror, and the chance of that choice.
+/// A sample: the target, the spot and the mirror, and the probability of that choice.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Aim {
     /// Point on the mirror's plane.
     pub target: Vec3,
-    /// Mirror.
+    /// Mirror index.
     pub mirror: usize,
-    /// Emitter.
+    /// Emitter index.
     pub spot: usize,
     /// Probability of having chosen this mirror and spot.
     pub chance: f32,
@@ -144,19 +146,20 @@ impl Mirrors {
         }
     }
 
-    /// The planar mirror a triangle belongs to.
+    /// Returns the planar mirror of a triangle.
     #[inline]
     pub fn of(&self, triangle: u32) -> Option<usize> {
         let k = *self.of_triangle.get(triangle as usize)?;
         (k != NONE).then_some(usize::from(k))
     }
 
-    /// Room needed for [`Mirrors::aim`]'s weights.
+    /// Returns the number of weights for [`Mirrors::aim`].
     pub fn choices(&self) -> usize {
         self.list.len() * self.spots
     }
 
-    /// Writes the unshadowed contribution at `x` of every spot by every mirror; returns their sum.
+    /// Writes the unshadowed contribution at `x` of every spot via every mirror. Returns their
+    /// sum.
     pub fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> f32 {
         widest(Weights {
             mirrors: self,
@@ -166,8 +169,8 @@ impl Mirrors {
         })
     }
 
-    /// Chooses a spot and mirror by unshadowed contribution at `x` and a point to aim at; `None` with no
-    /// image in reach. `weights` has room for all choices.
+    /// Chooses a spot and a mirror by unshadowed contribution at `x`, and a point to aim at; `None`
+    /// if no image is in reach. `weights` has room for all choices.
     pub fn aim(&self, x: Vec3, n: Vec3, rng: &mut Rng, weights: &mut [f32]) -> Option<Aim> {
         let total = self.weights(x, n, weights);
         if total <= 0.0 {
@@ -192,12 +195,12 @@ impl Mirrors {
         })
     }
 
-    /// Weight of one spot and mirror at `x`, as in [`Mirrors::aim`].
+    /// Returns the weight of one spot and mirror at `x`, as in [`Mirrors::aim`].
     pub fn weight(&self, mirror: usize, spot: usize, x: Vec3, n: Vec3) -> f32 {
         self.list[mirror].weight(spot, x, n)
     }
 
-    /// Density per steradian at `x` of aiming at `m`, given mirror and spot.
+    /// Returns the density per steradian at `x` of aiming at `m`, given mirror and spot.
     pub fn pdf(&self, mirror: usize, spot: usize, x: Vec3, m: Vec3) -> f32 {
         let mirror = &self.list[mirror];
         let Some(shape) = mirror.shape(x, spot) else {
@@ -221,7 +224,7 @@ impl Mirrors {
     }
 }
 
-/// [`Mirrors::weights`].
+/// The loop of [`Mirrors::weights`].
 struct Weights<'a> {
     mirrors: &'a Mirrors,
     x: Vec3,
@@ -245,7 +248,8 @@ impl Wide for Weights<'_> {
     }
 }
 
-/// The entry in which the running sum passes `at`, and its weight; never one of weight 0.
+/// Returns the entry at which the running sum exceeds `at`, and its weight; never an entry of
+/// weight 0.
 #[inline]
 fn pick(weights: &[f32], at: f32) -> Option<(usize, f32)> {
     let mut sum = 0.0;
@@ -306,11 +310,12 @@ impl Mirror {
         }
     }
 
-    /// Writes the weights of all spots at `x`; returns whether `x` is on a side that reflects (else all are 0).
+    /// Writes the weights of all spots at `x`. Returns whether `x` is on a reflecting side;
+    /// otherwise all weights are 0.
     #[inline(always)]
     fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> bool {
         let hx = self.normal.dot(x) - self.offset;
-        // `reflects` without branches, for all spots side by side.
+        // `reflects` without branches, for all spots at once.
         let (im, count) = (&self.images, out.len());
         let (px, py, pz) = (&im.px[..count], &im.py[..count], &im.pz[..count]);
         let height = &self.height[..count];
@@ -362,7 +367,8 @@ impl Mirror {
         im.strength[spot] * cx * cs / (d2 * d2)
     }
 
-    /// True where x and the spot are on the same, reflecting side and the image lies within the frame.
+    /// Returns whether `x` and the spot are on the same, reflecting side and the image is within
+    /// the frame.
     fn reflects(&self, spot: usize, x: Vec3, hx: f32) -> bool {
         let hs = self.height[spot];
         let front = hx > 1e-4 && hs > 1e-4;

@@ -2,10 +2,10 @@
 
 use crate::{api::Gate, bvh::Stack, emitter::Emitters, world::World};
 
-/// One spot seen directly.
+/// One spot that the camera sees directly.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peak {
-    /// Emitter.
+    /// Emitter index.
     pub spot: usize,
     /// Row-major pixel.
     pub pixel: usize,
@@ -15,8 +15,9 @@ pub(crate) struct Peak {
     pub value: f32,
 }
 
-/// The peaks of all spots that the camera sees. A spot of intensity I at distance d and angle θ from the
-/// optical axis gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance.
+/// Returns the peaks of all spots that the camera sees. A spot of intensity I at distance d and
+/// angle θ from the optical axis gives I/(d² cos³θ) over the pixel's sensitive area on the film at
+/// unit distance.
 pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Vec<Peak> {
     let c = &world.camera;
     let i = &c.intrinsics;

@@ -1,13 +1,15 @@
-//! A scene as the reference scenes' JSON (`picofarm_scene::read_reference_json`), which tests/peers renders with others.
+//! Converts a scene to the reference scenes' JSON (`picofarm_scene::read_reference_json`), which
+//! tests/peers renders with other renderers.
 
 use picofarm_scene::{Bsdf, Distribution, Material, Mesh, Scene, Vec3};
 use picofarm_transient::Rendered;
 use serde_json::{Value, json};
 
-/// The scene in that format; `rendered` says where its beams end. Every material counts on one side.
+/// Returns the scene in that format; `rendered` provides the ends of its beams. Every material is
+/// one-sided.
 ///
 /// # Errors
-/// The material that the format has no word for.
+/// A description of the material that the format cannot represent.
 pub fn json(name: &str, scene: &Scene, rendered: &Rendered) -> Result<Value, String> {
     let c = &scene.camera;
     let [origin, right, up, forward] = [c.origin, c.right, -c.down, c.forward].map(array);
@@ -51,7 +53,7 @@ fn array(v: Vec3) -> [f32; 3] {
     [v.x, v.y, v.z]
 }
 
-/// That of a mesh, which may have one alone.
+/// Returns the material of a mesh, which must have exactly one.
 fn material(mesh: &Mesh) -> Result<Value, String> {
     match &mesh.materials[..] {
         [

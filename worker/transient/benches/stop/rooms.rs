@@ -1,5 +1,5 @@
-//! What rooms of a data set cost: furnished rooms of seeds that nothing was tuned by, rendered to an
-//! error on one thread.
+//! Measures the cost of a data set's rooms: furnished rooms of seeds that were not used for tuning,
+//! rendered to an error on one thread.
 
 use std::path::PathBuf;
 
@@ -13,11 +13,12 @@ use picofarm_transient::Budget;
 /// The first seed.
 const FIRST: u64 = 98_001;
 const SPOTS: u32 = 25;
-/// Scenes of the data set that the mean is scaled to.
+/// Number of scenes in the data set that the mean is scaled to.
 const DATA_SET: f64 = 97_432.0;
 
-/// Renders `count` rooms with a library's furniture, and prints what each cost, with mean and spread over
-/// all. `folder` holds the library's files, unless they are where they are installed.
+/// Renders `count` rooms with a library's furniture, and prints the cost of each, with mean and
+/// spread over all. `folder` contains the library's files, unless they are in their installed
+/// place.
 pub fn run(library: &str, folder: Option<&String>, (count, pixels): (u32, u32), error: f64) {
     let folders: Vec<PathBuf> = folder.map(PathBuf::from).into_iter().collect();
     let library = AssetLibrary::find(library, &folders).unwrap_or_else(|e| {

@@ -52,7 +52,7 @@ fn squared(wall: &Object, size: f32) -> Object {
     }
 }
 
-/// A box's six sides, seen from outside.
+/// Returns the six sides of a box, seen from outside.
 fn block(low: Vec3, high: Vec3, m: &Material) -> Vec<Object> {
     room(low, high, m)
 }
@@ -61,7 +61,7 @@ fn walls() -> Vec<Object> {
     room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6))
 }
 
-/// How many rooms of [`far`] there are.
+/// Number of rooms of [`far`].
 const FAR: u64 = 16;
 
 const BEAMS: [Vec3; 5] = [
@@ -72,7 +72,7 @@ const BEAMS: [Vec3; 5] = [
     Vec3::new(0.45, -0.1, -1.0),
 ];
 
-/// Every class of scene by name.
+/// Returns every class of scene by name.
 pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     let mut everything = walls();
     everything.push(sphere(
@@ -172,7 +172,7 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         specular_at_least: 0,
         ..FurnishedSettings::default()
     };
-    // Panes that reflect, and bodies that refract; and the same rooms without them.
+    // Panes that reflect and bodies that refract, and the same rooms without them.
     let mut clear = walls();
     clear.push(sphere(v(0.9, -1.0, -2.9), 0.4, 3, grey(0.5)));
     let mut windows = clear.clone();
@@ -218,7 +218,7 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         let foot = v(-2.0, -1.5 + 0.075 * k as f32, -2.6);
         quad(foot, v(4.0, 0.0, 0.0), v(0.0, 0.03, 0.05), grey(0.6))
     }));
-    // The laser stands in the other room.
+    // The laser is in the other room.
     let lit_by_door = |width: f32, spots: &[Vec3]| {
         let mut objects = walls();
         objects.extend([partition(-2.0, -width), partition(width, 2.0)]);
@@ -261,7 +261,7 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         (format!("{name}-lambertian"), lambertian(rough))
     });
     all.extend(twins);
-    // Mitsuba's default distribution in place of GGX.
+    // Mitsuba's default distribution instead of GGX.
     let sharp = ["coated", "glossy"].map(|name| {
         let (_, ggx) = all.iter().find(|(of, _)| of == name).expect("it is one");
         (format!("beckmann-{name}"), beckmann(ggx))
@@ -281,7 +281,8 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     all
 }
 
-/// A scene with a Lambertian of the same albedo in place of each rough or mixed material; near-mirrors stay.
+/// Returns a scene with each rough or mixed material replaced by a Lambertian of the same albedo;
+/// near-mirrors stay.
 fn lambertian(scene: &Scene) -> Scene {
     let mut scene = scene.clone();
     let materials = scene.objects.iter_mut().flat_map(|o| {
@@ -294,7 +295,7 @@ fn lambertian(scene: &Scene) -> Scene {
     scene
 }
 
-/// A scene with Beckmann's distribution for every conductor and mix.
+/// Returns a scene with Beckmann's distribution for every conductor and mix.
 fn beckmann(scene: &Scene) -> Scene {
     let mut scene = scene.clone();
     let materials = scene.objects.iter_mut().flat_map(|o| {
@@ -312,7 +313,7 @@ fn beckmann(scene: &Scene) -> Scene {
     scene
 }
 
-/// Share of light that a material sends on, masking aside.
+/// Returns the share of light that a material scatters, without masking.
 fn albedo(bsdf: &Bsdf) -> f32 {
     match bsdf {
         Bsdf::Diffuse { reflectance } | Bsdf::RoughConductor { reflectance, .. } => *reflectance,
@@ -326,7 +327,7 @@ fn albedo(bsdf: &Bsdf) -> f32 {
     }
 }
 
-/// The side of a standing cylinder.
+/// Returns the side of a standing cylinder.
 fn cylinder(foot: Vec3, radius: f32, height: f32, m: Material) -> Object {
     let sides = 48;
     let (mut positions, mut triangles) = (vec![], vec![]);
@@ -340,8 +341,9 @@ fn cylinder(foot: Vec3, radius: f32, height: f32, m: Material) -> Object {
     object("cylinder", positions, triangles, m)
 }
 
-/// A deep room with five spots far from the camera, and with near-mirrors, glossy and mixed things at random places: what
-/// the renderer's constants were not chosen for. `walls` in place of grey or mixed ones.
+/// Returns a deep room with five spots far from the camera, and with near-mirrors, glossy and mixed
+/// objects at random places. The renderer's constants were not tuned on these rooms. `walls`
+/// replaces the grey or mixed walls.
 fn far(seed: u64, walls: Option<&Material>, pixels: u32) -> Scene {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let mut uniform = move |low: f32, high: f32| {
@@ -393,7 +395,7 @@ fn far(seed: u64, walls: Option<&Material>, pixels: u32) -> Scene {
         uniform(0.8, 2.0),
         pick(uniform(0.0, 8.0)),
     ));
-    // Panes on three walls: one of them always a near-mirror.
+    // Panes on three walls; one of them is always a near-mirror.
     let pane = |u: f32| Material::mirror("pane", if u < 0.5 { 0.01 } else { 0.05 });
     things.push(quad(
         v(-half + 0.02, uniform(-tall, 0.0), uniform(back, -3.0)),

@@ -1,23 +1,27 @@
-//! Facets of Beckmann's distribution that a direction sees (Heitz and d'Eon, EGSR 2014), drawn without inverting anything.
+//! Samples the visible facets of Beckmann's distribution (Heitz and d'Eon, EGSR 2014) without
+//! inverting a distribution function.
 //!
-//! Seen under the angle θ, a facet of slope (x, y)·α, x towards the direction, counts (a + x)·e^(−x²−y²) where a + x > 0, with
-//! a = 1/(α·tan θ). So y is normal. For x, ±r count 2a·e^(−r²) together where r < a, and +r alone (a + r)·e^(−r²) beyond.
+//! Seen under the angle θ, a facet of slope (x, y)·α, with x towards the direction, has the weight
+//! (a + x)·e^(−x²−y²) if a + x > 0, with a = 1/(α·tan θ). So y is normally distributed. For x, the
+//! pair ±r has the total weight 2a·e^(−r²) if r < a; beyond a only +r counts, with the weight (a +
+//! r)·e^(−r²).
 
 use crate::{lobes::exp_minus, rng::Rng};
 
 /// √π.
 const ROOT: f32 = 1.772_453_9;
-/// Beyond it directions are normal to the surface.
+/// Value of a above which directions count as normal to the surface.
 const NORMAL: f32 = 1e15;
 
-/// a of a direction with the cosine `c`.
+/// Returns a of a direction with the cosine `c`.
 #[inline]
 fn ratio(alpha: f32, c: f32) -> f32 {
     let sin = (1.0 - c * c).max(0.0).sqrt();
     (c / (alpha * sin)).min(NORMAL)
 }
 
-/// What all facets count that a direction sees, less that of the normal y: those with |x| < a, and those beyond.
+/// Returns the total weights of the visible facets, without the factor of the normally distributed
+/// y: of those with |x| < a, and of those beyond.
 #[inline]
 fn counts(a: f32) -> (f32, f32) {
     let e = exp_minus(a * a);
@@ -26,7 +30,8 @@ fn counts(a: f32) -> (f32, f32) {
     (within, 0.5 * (a * ROOT * beyond + e))
 }
 
-/// The complementary error function over e^(−a²), to 1.5·10⁻⁷ of 1 once that is multiplied in (Abramowitz and Stegun, 7.1.26).
+/// Returns the complementary error function over e^(−a²), with an error of 1.5·10⁻⁷ relative to 1
+/// after multiplication by e^(−a²) (Abramowitz and Stegun, 7.1.26).
 #[inline]
 fn erfc_over(a: f32) -> f32 {
     let t = 1.0 / (1.0 + 0.327_591_1 * a);
@@ -38,7 +43,7 @@ fn erfc_over(a: f32) -> f32 {
     p * t
 }
 
-/// Smith's G₁ over the cosine `c` of the direction.
+/// Returns Smith's G₁ over the cosine `c` of the direction.
 #[inline]
 pub(super) fn seen(alpha: f32, c: f32) -> f32 {
     let a = ratio(alpha, c);
@@ -47,7 +52,7 @@ pub(super) fn seen(alpha: f32, c: f32) -> f32 {
     if seen.is_finite() { seen } else { 0.0 }
 }
 
-/// A half vector among those that `i` sees, in the surface's frame and of any length.
+/// Returns a half vector among those visible from `i`, in the surface's frame and of any length.
 #[inline]
 pub(super) fn visible(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
     let flat = (i[0] * i[0] + i[1] * i[1]).sqrt();
@@ -65,19 +70,20 @@ pub(super) fn visible(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
     ]
 }
 
-/// A number of density e^(−t).
+/// Draws a number of density e^(−t).
 #[inline]
 fn exponential(rng: &mut Rng) -> f32 {
     -libm::logf(1.0 - rng.uniform())
 }
 
-/// x by what it counts.
+/// Draws x in proportion to its weight.
 #[inline]
 fn slope(a: f32, rng: &mut Rng) -> f32 {
     let (within, beyond) = counts(a);
     if rng.uniform() * (within + beyond) < within {
         let r = loop {
-            // Of numbers with density e^(−r²), those below a; of few such numbers evenly spread ones.
+            // Draws a number below a with density e^(−r²) by rejection. For small a, the proposals
+            // are uniform below a, because few normally distributed ones would be below it.
             if a < 0.5 {
                 let r = a * rng.uniform();
                 if rng.uniform() < exp_minus(r * r) {
@@ -98,7 +104,8 @@ fn slope(a: f32, rng: &mut Rng) -> f32 {
         };
     }
     loop {
-        // Density 2r·e^(a²−r²), of which (a + r)/2r is kept: half or more.
+        // Proposals have the density 2r·e^(a²−r²); a share (a + r)/2r of them, at least half, is
+        // accepted.
         let r = (a * a + exponential(rng)).sqrt();
         if rng.uniform() * 2.0 * r < a + r {
             return r;
@@ -139,7 +146,7 @@ mod tests {
         }
     }
 
-    /// Sum over slopes of f times what they count.
+    /// Returns the weighted sum of f over slopes.
     fn moments(a: f64, f: impl Fn(f64) -> f64) -> f64 {
         let (low, high, steps) = ((-a).max(-9.0), 9.0, 200_000);
         let step = (high - low) / f64::from(steps);

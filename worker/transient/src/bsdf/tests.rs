@@ -1,4 +1,4 @@
-//! Laws of scattering: energy, reciprocity, densities, and limits that hold in f32.
+//! Tests the laws of scattering: energy, reciprocity, densities, and limits in f32.
 
 use super::*;
 use crate::rng::Stream;
@@ -36,7 +36,7 @@ fn mix(alpha: f32, distribution: Distribution, weight: f32) -> Surface {
     })
 }
 
-/// Every kind of surface, lossless.
+/// Returns every kind of surface, lossless.
 fn all() -> Vec<Surface> {
     let mut surfaces = vec![lambert(1.0)];
     for alpha in ALPHAS {
@@ -55,7 +55,7 @@ fn normal_and_incident(angle: f32) -> (Vec3, Vec3) {
     (n, i.normalized())
 }
 
-/// Mean weight over draws: the albedo.
+/// Returns the mean weight over samples, which is the albedo.
 fn albedo(s: &Surface, angle: f32, count: u32) -> f64 {
     let (n, i) = normal_and_incident(angle);
     let mut rng = Rng::new(1, Stream::Paths, 0, 0);
@@ -123,7 +123,7 @@ fn the_albedo_by_sampling_is_that_by_quadrature() {
     }
 }
 
-/// Integrals of two functions over directions around `n`.
+/// Returns the integrals of two functions over directions around `n`.
 fn over_hemisphere(n: Vec3, f: impl Fn(Vec3) -> [f32; 2]) -> (f64, f64) {
     let (t, b) = frame(n);
     let (rows, columns) = (300, 600);

@@ -1,6 +1,7 @@
-//! Boxes that are all but alike, many at a time. A builder that joins what makes the least surface has nothing to
-//! go by among them: every union is as large as the next, it joins one pair a round, and the tree becomes a chain,
-//! made in quadratic time. Such boxes are built as one; below it they are halved.
+//! Handles large numbers of nearly identical boxes. A builder that joins the pair with the smallest
+//! surface cannot distinguish them: every union has the same size, each round joins one pair, and
+//! the tree becomes a chain, built in quadratic time. Such boxes are therefore built as one box,
+//! and the subtree below it is built by halving.
 
 use std::collections::HashMap;
 
@@ -9,22 +10,23 @@ use obvhs::{
     bvh2::{Bvh2, node::Bvh2Node},
 };
 
-/// So many boxes may be alike without harm: they fit in one leaf.
+/// Number of identical boxes that does no harm, because they fit in one leaf.
 const FEW: usize = 8;
-/// Two boxes are alike that agree within this share of their size: well above what f32 keeps of a surface.
+/// Relative tolerance of two identical boxes: well above the f32 precision of a surface.
 const SHARE: f32 = 1.0 / 65536.0;
-/// Smaller boxes count as of this size (render units).
+/// Smaller boxes count as boxes of this size, render units.
 const LEAST: f32 = 1e-12;
 
-/// A box, or several that are alike.
+/// A box, or several nearly identical boxes.
 #[derive(Debug)]
 pub(super) struct Group {
     pub bounds: Aabb,
-    /// Which boxes.
+    /// The indices of the boxes.
     pub of: Vec<u32>,
 }
 
-/// Groups of boxes in the order of their first members; `None` where there are never many alike.
+/// Returns groups of boxes in the order of their first members; `None` if no more than [`FEW`]
+/// boxes are identical anywhere.
 pub(super) fn groups(boxes: &[Aabb]) -> Option<Vec<Group>> {
     let mut by_key = HashMap::with_capacity(boxes.len());
     let (mut group_of, mut count) = (Vec::with_capacity(boxes.len()), vec![]);
@@ -57,11 +59,11 @@ pub(super) fn groups(boxes: &[Aabb]) -> Option<Vec<Group>> {
     Some(groups)
 }
 
-/// What boxes have in common that are alike.
+/// Returns a key that nearly identical boxes share.
 fn key(b: &Aabb) -> [i64; 7] {
     let (low, high) = (b.min.to_array(), b.max.to_array());
     let size = (0..3).fold(LEAST, |a, k| a.max(high[k] - low[k]));
-    // A power of two: its bits are an exponent alone.
+    // Rounds to a power of two by clearing all bits except the exponent.
     let size = f32::from_bits(size.to_bits() & 0x7f80_0000);
     let step = f64::from(size * SHARE);
     let cell = |x: f32| (f64::from(x) / step).round() as i64;
@@ -70,7 +72,7 @@ fn key(b: &Aabb) -> [i64; 7] {
     [x, y, z, u, v, w, i64::from(size.to_bits())]
 }
 
-/// A tree over groups becomes one over their members.
+/// Turns a tree over groups into one over their members.
 pub(super) fn expand(tree: &mut Bvh2, groups: &[Group], boxes: &[Aabb]) {
     let held = std::mem::take(&mut tree.primitive_indices);
     for n in 0..tree.nodes.len() {
@@ -83,7 +85,8 @@ pub(super) fn expand(tree: &mut Bvh2, groups: &[Group], boxes: &[Aabb]) {
     }
 }
 
-/// Puts a subtree over `members` in the place of node `n`: halves along the longest way between their centres.
+/// Replaces node `n` by a subtree over `members`, halved along the axis with the largest spread of
+/// their centres.
 fn halve(tree: &mut Bvh2, n: usize, members: &[u32], boxes: &[Aabb]) {
     let mut members = members.to_vec();
     let centre = |k: u32, axis: usize| {

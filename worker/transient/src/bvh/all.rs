@@ -1,4 +1,4 @@
-//! All triangles that a segment meets, for glass: scalar code, since few rays need it.
+//! Finds all triangles on a segment, for glass. This is scalar code, because few rays need it.
 
 use picofarm_scene::Vec3;
 
@@ -9,8 +9,9 @@ use super::{
 };
 
 impl Bvh {
-    /// Writes every triangle that `origin + t · direction` meets with 0 < t ≤ `limit` as (t, index), nearest first and among
-    /// those at equal t the lowest index first. None for rays that are not finite. By the same arithmetic as the nearest hit.
+    /// Writes every triangle that `origin + t · direction` hits with 0 < t ≤ `limit` as (t, index),
+    /// nearest first and at equal t the lowest index first. Writes none for rays that are not
+    /// finite. The arithmetic is the same as for the nearest hit.
     pub(crate) fn all(
         &self,
         stack: &mut Stack,
@@ -64,7 +65,7 @@ impl Bvh {
                     let u = c[0] * b[1] - c[1] * b[0];
                     let v = a[0] * c[1] - a[1] * c[0];
                     let w = b[0] * a[1] - b[1] * a[0];
-                    // Lanes without a triangle are NaN and inside of nothing.
+                    // Lanes without a triangle are NaN, so they are never inside.
                     let inside = u.min(v).min(w) >= 0.0 || u.max(v).max(w) <= 0.0;
                     let det = u + v + w;
                     let t = match inside && pack.is_needle(lane) {

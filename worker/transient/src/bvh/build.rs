@@ -1,4 +1,5 @@
-//! Building: a binary tree from `obvhs`, collapsed to eight children a node as [`Plan`] says.
+//! Builds the hierarchy: a binary tree from `obvhs`, collapsed to eight children per node according
+//! to [`Plan`].
 
 use std::{
     sync::mpsc::{self, RecvTimeoutError},
@@ -29,9 +30,10 @@ const NO_NODE: Node = Node {
     child: [EMPTY; 8],
 };
 
-/// Triangles from which the binary tree is built on a thread of its own, which can be left to itself.
+/// Number of triangles from which the binary tree is built on a thread of its own, which can be
+/// abandoned.
 const MANY: usize = 1 << 17;
-/// How often it is asked meanwhile whether to stop.
+/// Interval between two polls of the stop request meanwhile.
 const LOOK: Duration = Duration::from_millis(50);
 
 pub(super) fn build_unless(triangles: &[[Vec3; 3]], stop: Stop) -> Result<Bvh, RenderError> {
@@ -44,7 +46,7 @@ pub(super) fn build_unless(triangles: &[[Vec3; 3]], stop: Stop) -> Result<Bvh, R
             .find(|&k| simd::available(k))
             .unwrap_or(Kernel::Portable),
     };
-    // A triangle without area cannot be hit; near-degenerate ones stay.
+    // A triangle without area cannot be hit and is dropped; near-degenerate ones stay.
     let used: Vec<u32> = (0..triangles.len() as u32)
         .filter(|&i| normal(&triangles[i as usize]).is_some())
         .collect();
@@ -121,12 +123,12 @@ fn joined<T: Boundable>(input: &[T]) -> Bvh2 {
     build_bvh2(input, params, &mut Duration::default())
 }
 
-/// The same tree, built on a thread of its own: the library's builder cannot be stopped, but it can be left alone. It then
-/// ends by itself, and its tree is dropped.
+/// Builds the same tree on a thread of its own. The library's builder cannot be stopped, but it can
+/// be abandoned: it then finishes by itself, and its tree is dropped.
 fn apart(input: Vec<Triangle>, stop: Stop) -> Result<Bvh2, RenderError> {
     let (done, tree) = mpsc::channel();
     let builder = move || {
-        // Nobody waits for it any more where the render was stopped.
+        // If the render was stopped, the receiver no longer exists.
         let _ = done.send(binary(&input));
     };
     let named = std::thread::Builder::new().name("bvh".into());
@@ -147,7 +149,7 @@ fn array(p: Vec3) -> [f32; 3] {
     p.into()
 }
 
-/// Unit normal (v1−v0)×(v2−v0), computed in f64; `None` for a triangle without area.
+/// Returns the unit normal (v1−v0)×(v2−v0), computed in f64; `None` for a triangle without area.
 pub(crate) fn normal(t: &[Vec3; 3]) -> Option<Vec3> {
     let wide = |v: Vec3| [f64::from(v.x), f64::from(v.y), f64::from(v.z)];
     let [a, b, c] = t.map(wide);
@@ -172,7 +174,7 @@ pub(crate) fn normal(t: &[Vec3; 3]) -> Option<Vec3> {
 }
 
 impl Bvh {
-    /// Stores a leaf; returns its code as a child.
+    /// Stores a leaf and returns its code as a child.
     fn pack(&mut self, triangles: &[[Vec3; 3]], held: &[u32]) -> u32 {
         let start = self.packs.len() as u32;
         for chunk in held.chunks(8) {

@@ -1,12 +1,13 @@
 //! Bundles: segments from one point to many, traced together.
 //!
-//! What a single ray finds is "some leaf whose box it meets holds a triangle that it meets": rounding is
-//! monotonic, so a ray that meets a box meets every box around it, and the tree above the leaves decides
-//! nothing. A bundle may therefore reach the leaves in any way that misses none, as long as each pair of
-//! ray and leaf, and of ray and triangle, is judged by the single ray's operations. Here the nodes are
-//! culled by a [`Pyramid`] around all rays, eight children at a time, and what it leaves by the rays
-//! themselves: each entry on the stack knows which rays meet it. A pyramid alone holds more nodes the
-//! finer a mesh is; the rays in it meet few of them.
+//! A single ray's result is defined as "the ray hits the box of some leaf, and a triangle in that
+//! leaf". Rounding is monotonic, so a ray that hits a box hits every box around it, and the
+//! tree above the leaves does not affect the result. A bundle may therefore reach the leaves in any
+//! order that misses none, as long as each pair of ray and leaf, and of ray and triangle, is tested
+//! by the single ray's operations. Here a [`Pyramid`] around all rays culls the nodes, eight
+//! children at a time, and the rays themselves cull the remaining ones: each entry on the stack
+//! stores a mask of the rays that hit it. The finer a mesh is, the more nodes intersect a pyramid
+//! alone, while the rays within it hit few of them.
 
 use picofarm_scene::Vec3;
 
@@ -18,15 +19,15 @@ use super::{
     traverse::{inverse, traverse},
 };
 
-/// Fewer rays go singly.
+/// Least number of rays in a bundle; fewer rays are traced singly.
 pub(super) const FEWEST: usize = 6;
-/// No more rays than this that are left at a node go on singly.
+/// If at most this many rays are left at a node, they are traced singly from there.
 const LAST: u32 = 2;
 
 /// Working memory for bundles.
 #[derive(Debug, Clone)]
 pub(super) struct Scratch {
-    /// Directions of all rays of a call, whatever their class.
+    /// Directions of all rays of a call, in all classes.
     all: [Column; 3],
     rays: Rays,
 }
@@ -49,7 +50,7 @@ impl Scratch {
     }
 }
 
-/// Answers `occluded` for every segment from `o`; the tree has nodes. `E` has eight lanes.
+/// Computes `occluded` for every segment from `o`. The tree has nodes, and `E` has eight lanes.
 #[inline(always)]
 pub(super) fn bundle<E: Lanes, W: Lanes>(
     bvh: &Bvh,
@@ -100,7 +101,7 @@ pub(super) fn bundle<E: Lanes, W: Lanes>(
     }
 }
 
-/// Bit k of `bits` goes to the k-th set bit of `mask`.
+/// Moves bit k of `bits` to the k-th set bit of `mask`.
 #[inline(always)]
 fn spread(mut bits: u64, mut mask: u64) -> u64 {
     if mask & mask.wrapping_add(1) == 0 {
@@ -116,8 +117,8 @@ fn spread(mut bits: u64, mut mask: u64) -> u64 {
     out
 }
 
-/// Which rays are usable (the single ray's rule), and which have their largest component on +x, −x, +y,
-/// −y, +z, −z. Bits from `count` on are arbitrary.
+/// Returns masks of the rays that are usable (by the single ray's rule), and of those with their
+/// largest component on +x, −x, +y, −y, +z, −z. Bits from `count` on are arbitrary.
 #[inline(always)]
 fn classes<W: Lanes>(o: Vec3, d: &[Column; 3], count: usize) -> (u64, [u64; 6]) {
     let zero = W::splat(0.0);
@@ -152,7 +153,7 @@ fn classes<W: Lanes>(o: Vec3, d: &[Column; 3], count: usize) -> (u64, [u64; 6]) 
 }
 
 impl Rays {
-    /// Takes the rays of `mask`, all of one class.
+    /// Copies the rays of `mask`, all of one class.
     #[inline(always)]
     fn take(&mut self, o: Vec3, all: &[Column; 3], mask: u64, class: usize) {
         let kz = class / 2;
@@ -179,8 +180,8 @@ impl Rays {
         }
     }
 
-    /// Works out slopes and shears, and the pyramid: `None` where the numbers are so large or small that
-    /// its margins would not hold.
+    /// Computes slopes and shears, and the pyramid. Returns `None` if the numbers are so large or
+    /// small that the pyramid's margins are not valid.
     #[inline(always)]
     fn prepare<W: Lanes>(&mut self) -> Option<Pyramid> {
         let padded = self.count.next_multiple_of(W::N);
@@ -208,7 +209,7 @@ impl Rays {
     }
 }
 
-/// The rays that nothing blocks, as a mask.
+/// Returns a mask of the unblocked rays.
 #[inline(always)]
 fn trace<E: Lanes, W: Lanes>(
     rays: &Rays,
@@ -227,7 +228,7 @@ fn trace<E: Lanes, W: Lanes>(
             mask &= mask - 1;
             let child = node.child[i];
             let inner = child & LEAF == 0;
-            // The root's children are too large to be missed by all rays often.
+            // The root's children are so large that all rays rarely miss one.
             let met = if inner && current == 0 {
                 live
             } else {

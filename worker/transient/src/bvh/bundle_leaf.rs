@@ -1,4 +1,4 @@
-//! Bundles at a leaf: which rays meet its box, and which a triangle of it.
+//! Bundles at a leaf: tests the rays against its box and its triangles.
 
 use picofarm_scene::Vec3;
 
@@ -10,7 +10,8 @@ use super::{
 };
 
 impl Rays {
-    /// Which of the rays `of` meet box `i` of a node: the single ray's slab test, a lane for each ray.
+    /// Returns a mask of the rays in `of` that hit box `i` of a node, by the single ray's slab test
+    /// with a lane per ray.
     #[inline(always)]
     pub(super) fn meet<W: Lanes>(&self, bounds: &[[f32; 8]; 6], i: usize, of: u64) -> u64 {
         let (ox, oy, oz) = (self.o.x, self.o.y, self.o.z);
@@ -41,8 +42,8 @@ impl Rays {
         met
     }
 
-    /// Where rays `k..` enter and leave a slab. Which plane is nearer depends on the sign; as min and max
-    /// they are the same numbers.
+    /// Returns the entry and exit distances of rays `k..` in a slab. The sign decides which plane
+    /// is nearer; min and max give the same numbers.
     #[inline(always)]
     fn planes<W: Lanes>(&self, low: W, high: W, axis: usize, k: usize) -> (W, W) {
         let inverse = W::load(&self.inverse[axis][k..]);
@@ -50,7 +51,7 @@ impl Rays {
         (p.min(q), p.max(q))
     }
 
-    /// Which of the rays `of` meet a triangle of a leaf.
+    /// Returns a mask of the rays in `of` that hit a triangle of a leaf.
     #[inline(always)]
     pub(super) fn leaf<E: Lanes, W: Lanes>(&self, bvh: &Bvh, leaf: u32, of: u64) -> u64 {
         let range = packs(leaf);
@@ -60,7 +61,8 @@ impl Rays {
             let pack = &bvh.packs[p];
             let fill = if p == last { last_fill(leaf) } else { 8 };
             let left = of & !hit;
-            // A register of triangles for each ray, or one of rays for each triangle?
+            // Choose the cheaper order: a register of triangles per ray, or a register of rays per
+            // triangle.
             if left.count_ones() as usize <= fill * self.count.div_ceil(W::N) {
                 hit |= self.by_ray::<E>(pack, left);
             } else {
@@ -106,7 +108,7 @@ impl Rays {
         hit
     }
 
-    /// Whether ray `k` meets the needle in a lane that it crosses.
+    /// Returns whether ray `k` hits the needle in a lane, if it passes inside the needle's edges.
     #[inline(always)]
     fn meets_needle(&self, pack: &Pack, lane: usize, k: usize) -> bool {
         let d = Vec3::new(self.d[0][k], self.d[1][k], self.d[2][k]);
@@ -151,8 +153,9 @@ impl Rays {
     }
 }
 
-/// The triangle test of the single ray with limit 1: vertices relative to the origin, axes in the order
-/// of the shear. Which lanes are met, and which are crossed anywhere along the ray's line.
+/// Performs the single ray's triangle test with limit 1, for vertices relative to the origin and
+/// axes in the order of the shear. Returns masks of the lanes that are hit, and of those that are
+/// crossed anywhere along the ray's line.
 #[inline(always)]
 fn meets<L: Lanes>(v: &[[L; 3]; 3], [sx, sy, sz]: &[L; 3]) -> (u32, u32) {
     let [[ax, ay, az], [bx, by, bz], [cx, cy, cz]] = *v;

@@ -1,17 +1,17 @@
-//! Floats side by side: what the traversal needs of them, and the portable version.
+//! SIMD lanes of floats: the operations that the traversal needs, and the portable version.
 
-/// `N` f32 lanes. Comparisons give a bit mask, lane 0 lowest. `min` and `max` follow the machine's
-/// rule: the second operand where either is NaN.
+/// `N` f32 lanes. Comparisons return a bit mask with lane 0 in the lowest bit. `min` and `max`
+/// follow the machine's rule: they return the second operand if either is NaN.
 pub(super) trait Lanes: Copy {
-    /// How many lanes: 8 or 16.
+    /// Number of lanes: 8 or 16.
     const N: usize;
-    /// Asks for `x` to be brought near; a hint.
+    /// Prefetches `x` into the cache; a hint.
     #[inline(always)]
     fn prefetch<T>(_x: &T) {}
     fn splat(x: f32) -> Self;
-    /// The first `N` of `a`.
+    /// Loads the first `N` numbers of `a`.
     fn load(a: &[f32]) -> Self;
-    /// Into the first `N` of `a`.
+    /// Stores into the first `N` numbers of `a`.
     fn store(self, a: &mut [f32]);
     fn add(self, o: Self) -> Self;
     fn sub(self, o: Self) -> Self;
@@ -19,13 +19,13 @@ pub(super) trait Lanes: Copy {
     fn div(self, o: Self) -> Self;
     fn min(self, o: Self) -> Self;
     fn max(self, o: Self) -> Self;
-    /// The least of all lanes, none of which is NaN.
+    /// Returns the least of all lanes, none of which is NaN.
     fn least(self) -> f32;
-    /// The greatest of all lanes, none of which is NaN.
+    /// Returns the greatest of all lanes, none of which is NaN.
     fn greatest(self) -> f32;
     fn le(self, o: Self) -> u32;
     fn gt(self, o: Self) -> u32;
-    /// Not equal and neither NaN.
+    /// Returns a mask of the lanes that differ, neither operand being NaN.
     fn differs(self, o: Self) -> u32;
 }
 

@@ -1,9 +1,10 @@
 //! An 8-wide bounding volume hierarchy over triangles with a watertight triangle test.
 //!
-//! `obvhs` builds a binary tree (PLOC with reinsertion), which is collapsed to eight children a node.
-//! Rays meet triangles by the test of Woop, Benthin and Wald (JCGT 2013), edges included and without
-//! fused multiply-add, so that no ray slips between two triangles that share an edge or a vertex.
-//! The kernels (AVX-512, AVX2, portable) run the same operations in the same order: same bits.
+//! `obvhs` builds a binary tree (PLOC with reinsertion), which is collapsed to eight children per
+//! node. Triangles are intersected by the test of Woop, Benthin and Wald (JCGT 2013), including
+//! their edges and without fused multiply-add, so that no ray slips between two triangles that
+//! share an edge or a vertex. The kernels (AVX-512, AVX2, portable) run the same operations in the
+//! same order and give the same bits.
 
 mod alike;
 mod all;
@@ -25,7 +26,7 @@ pub(crate) use needle::is_needle;
 
 use crate::api::{RenderError, Stop, Unstopped};
 
-/// Bounds of eight children (min xyz, max xyz), and what they are.
+/// Bounds of eight children (min xyz, max xyz), and their codes.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
 struct Node {
@@ -33,8 +34,8 @@ struct Node {
     child: [u32; 8],
 }
 
-/// Eight triangles: vertex components a.xyz, b.xyz, c.xyz; NaN in unused lanes, which never hit. The highest bit of an index marks
-/// a needle ([`needle`]).
+/// Eight triangles: vertex components a.xyz, b.xyz, c.xyz. Unused lanes are NaN, so they are never
+/// hit. The highest bit of an index marks a needle ([`needle`]).
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
 struct Pack {
@@ -42,26 +43,26 @@ struct Pack {
     id: [u32; 8],
 }
 
-/// A child that is a leaf: count of packs in bits 27..31, triangles in the last pack less one in bits
-/// 24..27, first pack below.
+/// Marks a child as a leaf: bits 27..31 are the number of packs, bits 24..27 the number of
+/// triangles in the last pack less one, and the lower bits the first pack.
 const LEAF: u32 = 0x8000_0000;
-/// A child that does not exist; its bounds are never met.
+/// Marks a child that does not exist; its bounds are never hit.
 const EMPTY: u32 = u32::MAX;
 
-/// The packs of a leaf.
+/// Returns the packs of a leaf.
 #[inline(always)]
 fn packs(leaf: u32) -> std::ops::Range<usize> {
     let first = (leaf & 0x00ff_ffff) as usize;
     first..first + ((leaf >> 27) & 15) as usize
 }
 
-/// Triangles in the last pack of a leaf.
+/// Returns the number of triangles in the last pack of a leaf.
 #[inline(always)]
 fn last_fill(leaf: u32) -> usize {
     ((leaf >> 24) & 7) as usize + 1
 }
 
-/// Which code traverses the tree.
+/// The code that traverses the tree.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kernel {
     /// Eight lanes in AVX2 registers, sixteen in AVX-512 registers for bundles.
@@ -72,7 +73,7 @@ pub enum Kernel {
     Portable,
 }
 
-/// The hierarchy. Triangles are known by their index in the slice it was built from.
+/// The hierarchy. Triangles are identified by their index in the slice that it was built from.
 #[derive(Debug)]
 pub struct Bvh {
     nodes: Vec<Node>,
@@ -81,33 +82,34 @@ pub struct Bvh {
     kernel: Kernel,
 }
 
-/// Scratch memory of one thread's traversals; counts the rays.
+/// Scratch memory of one thread's traversals. It also counts the rays.
 #[derive(Debug)]
 pub struct Stack {
     entries: Vec<(u32, f32)>,
-    /// Bundles: which rays an entry is for.
+    /// For bundles: the mask of the rays of each entry.
     masks: Vec<u64>,
     bundle: Box<bundle::Scratch>,
-    /// What a segment meets of glass.
+    /// The hits of a segment with glass.
     pub(crate) met: Vec<(f32, u32)>,
-    /// Which of a bundle's segments glass crosses.
+    /// By segment of a bundle: whether glass crosses it.
     pub(crate) crossed: Vec<bool>,
     /// Rays traced with this stack.
     pub rays: u64,
 }
 
 impl Bvh {
-    /// Builds the hierarchy; triangles without area or with vertices that are not finite are left out.
+    /// Builds the hierarchy. Triangles without area or with vertices that are not finite are left
+    /// out.
     pub fn build(triangles: &[[Vec3; 3]]) -> Self {
         build::build_unless(triangles, Stop(&Unstopped)).expect("nobody stops it")
     }
 
-    /// The same, unless it is asked to stop.
+    /// Like [`Bvh::build`], but returns an error if a stop is requested.
     pub(crate) fn build_unless(triangles: &[[Vec3; 3]], stop: Stop) -> Result<Self, RenderError> {
         build::build_unless(triangles, stop)
     }
 
-    /// The same tree traversed by another kernel; `None` where this machine lacks it.
+    /// Returns the same tree with another kernel; `None` if this machine lacks it.
     pub fn with_kernel(mut self, kernel: Kernel) -> Option<Self> {
         if !simd::available(kernel) {
             return None;
@@ -116,7 +118,8 @@ impl Bvh {
         Some(self)
     }
 
-    /// A bundle's entries, and above them those of a single ray that it sends on.
+    /// Returns the required stack size: a bundle's entries, and above them those of a single ray
+    /// that the bundle continues with.
     fn deepest(&self) -> usize {
         2 * 8 * (self.depth + 2)
     }
@@ -129,7 +132,7 @@ impl Bvh {
         }
     }
 
-    /// A stack deep enough for this tree.
+    /// Returns a stack deep enough for this tree.
     pub fn stack(&self) -> Stack {
         let deepest = self.deepest();
         Stack {
@@ -142,8 +145,9 @@ impl Bvh {
         }
     }
 
-    /// The nearest triangle that `origin + t · direction` meets with 0 < t ≤ `limit`, as (t, index);
-    /// among triangles at equal t the lowest index. `None` for rays that are not finite.
+    /// Returns the nearest triangle that `origin + t · direction` hits with 0 < t ≤ `limit`, as (t,
+    /// index); among triangles at equal t the lowest index. Returns `None` for rays that are not
+    /// finite.
     #[inline]
     pub fn closest(
         &self,
@@ -164,7 +168,8 @@ impl Bvh {
         (id != EMPTY).then_some((t, id))
     }
 
-    /// True where a triangle is met with 0 < t ≤ `limit`. Rays that are not finite count as blocked.
+    /// Returns whether a triangle is hit with 0 < t ≤ `limit`. Rays that are not finite count as
+    /// blocked.
     #[inline]
     pub fn occluded(&self, stack: &mut Stack, origin: Vec3, direction: Vec3, limit: f32) -> bool {
         stack.rays += 1;
@@ -177,12 +182,15 @@ impl Bvh {
         self.any(stack, origin, direction, limit)
     }
 
-    /// Which of the segments from ONE point to many are blocked: `blocked[i]` becomes
-    /// `occluded(stack, from, to[i] - from, 1.0)`, bit for bit, whatever else is in the bundle. The origin
-    /// of every ray is `from`: the same segments from their other ends may differ in grazing cases. Fast
-    /// where the targets lie close together as seen from there, best on one surface: up to five times
-    /// single rays for 64 (the natural number; any is right), twice for 8, no gain below 6. Panics where
-    /// the lengths differ.
+    /// Tests the segments from one point to many: `blocked[i]` becomes
+    /// `occluded(stack, from, to[i] - from, 1.0)`, bit for bit, independently of the rest of the
+    /// bundle. The origin of every ray is `from`; the same segments traced from their other ends
+    /// may differ in grazing cases. Bundles are fast if the targets are close together as seen from
+    /// there, best on one surface: up to five times as fast as single rays for 64 targets (the
+    /// natural number; any is allowed), twice for 8, no gain below 6.
+    ///
+    /// # Panics
+    /// If the lengths of `to` and `blocked` differ.
     pub fn occluded_bundle(
         &self,
         stack: &mut Stack,
@@ -199,7 +207,7 @@ impl Bvh {
         }
         stack.rays += to.len() as u64;
         match self.kernel {
-            // Two registers of eight are quicker than one of sixteen (measured).
+            // Two registers of eight are faster than one of sixteen (measured).
             Kernel::Avx512 if to.len() <= 16 => simd::bundle_avx2(self, stack, from, to, blocked),
             Kernel::Avx512 => simd::bundle_avx512(self, stack, from, to, blocked),
             Kernel::Avx2 => simd::bundle_avx2(self, stack, from, to, blocked),
@@ -207,7 +215,7 @@ impl Bvh {
         }
     }
 
-    /// Brings a child's node or first pack near.
+    /// Prefetches a child's node or first pack.
     #[inline(always)]
     fn prefetch<L: lanes::Lanes>(&self, child: u32) {
         if child & LEAF == 0 {
@@ -217,7 +225,7 @@ impl Bvh {
         }
     }
 
-    /// Some hit in (0, `limit`] for a usable ray in a tree with nodes.
+    /// Returns whether there is any hit in (0, `limit`] for a usable ray in a tree with nodes.
     #[inline(always)]
     fn any(&self, stack: &mut Stack, origin: Vec3, direction: Vec3, limit: f32) -> bool {
         match self.kernel {
@@ -228,7 +236,8 @@ impl Bvh {
     }
 }
 
-/// NaN and infinite rays would select every lane, empty ones included: they are refused up front.
+/// Returns whether a ray is usable. NaN and infinite rays would select every lane, including empty
+/// ones, so they are rejected up front.
 #[inline(always)]
 fn usable(o: Vec3, d: Vec3, limit: f32) -> bool {
     (o.x + o.y + o.z + d.x + d.y + d.z).is_finite() && limit > 0.0 && d.dot(d) > 0.0

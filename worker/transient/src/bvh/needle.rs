@@ -1,10 +1,12 @@
-//! Needles: triangles so long and thin that f32 does not say where along a ray they are.
+//! Needles: triangles so long and thin that f32 cannot resolve their distance along a ray.
 //!
-//! The barycentric coordinates of a hit are quotients of differences of products. Their relative error grows with how many times
-//! longer than wide a triangle is, and the error of t with it: of a strip of 1 mm × 3 m it is some tenths of a millimetre, many times
-//! what [`crate::world::lift`] moves a point off its surface. A ray that starts or ends on a needle would meet that needle, or the one
-//! beside it in the same plane. So t of needles is computed in f64, from the same vertices. Whether the ray passes inside of the
-//! edges is judged as for all triangles, so that none slips between two that share an edge.
+//! The barycentric coordinates of a hit are quotients of differences of products. Their relative
+//! error grows with the ratio of a triangle's length to its width, and so does the error of t. For
+//! a strip of 1 mm × 3 m the error is some tenths of a millimetre, many times the distance by which
+//! [`crate::world::lift`] moves a point off its surface. A ray that starts or ends on a needle
+//! would hit that needle, or its neighbour in the same plane. So t of needles is computed in f64,
+//! from the same vertices. The test whether the ray passes inside the edges is the same as for all
+//! triangles, so that no ray slips between two that share an edge.
 
 use picofarm_scene::Vec3;
 
@@ -12,10 +14,11 @@ use super::Pack;
 
 /// Marks the index of a needle in a pack.
 const NEEDLE: u32 = 1 << 31;
-/// Length over width from which a triangle is a needle: below it the error of t is less than what points are lifted.
+/// Ratio of length to width from which a triangle is a needle; below it the error of t is smaller
+/// than the lift of points.
 const SLENDER: f64 = 16.0;
 
-/// The mark of a triangle in its pack: 0 where it is none.
+/// Returns the mark of a triangle in its pack; 0 if it is not a needle.
 pub(super) fn mark(t: &[Vec3; 3]) -> u32 {
     match is_needle(t) {
         true => NEEDLE,
@@ -23,7 +26,7 @@ pub(super) fn mark(t: &[Vec3; 3]) -> u32 {
     }
 }
 
-/// Whether a triangle is longer than [`SLENDER`] times its width.
+/// Returns whether a triangle is longer than [`SLENDER`] times its width.
 pub(crate) fn is_needle(t: &[Vec3; 3]) -> bool {
     let [a, b, c] = t.map(wide);
     let (e, f, g) = (minus(b, a), minus(c, a), minus(c, b));
@@ -50,13 +53,13 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 impl Pack {
-    /// The index of the triangle in a lane.
+    /// Returns the index of the triangle in a lane.
     #[inline(always)]
     pub(super) fn triangle(&self, lane: usize) -> u32 {
         self.id[lane] & !NEEDLE
     }
 
-    /// Which of some lanes hold needles.
+    /// Returns a mask of the given lanes that contain needles.
     #[inline(always)]
     pub(super) fn needles(&self, mut lanes: u32) -> u32 {
         let mut needles = 0;
@@ -68,14 +71,15 @@ impl Pack {
         needles
     }
 
-    /// Whether a lane holds a needle.
+    /// Returns whether a lane contains a needle.
     #[inline(always)]
     pub(super) fn is_needle(&self, lane: usize) -> bool {
         self.id[lane] & NEEDLE != 0
     }
 
-    /// How far along a ray the triangle in a lane is, in units of the direction; the ray passes inside of its edges. NaN where the
-    /// ray lies in its plane.
+    /// Returns the distance along a ray to the triangle in a lane, in units of the direction. The
+    /// ray must pass inside the triangle's edges. Returns NaN if the ray is in the triangle's
+    /// plane.
     #[cold]
     pub(super) fn exactly(&self, lane: usize, o: Vec3, d: Vec3) -> f32 {
         let at = |v: usize| {
@@ -86,7 +90,7 @@ impl Pack {
     }
 }
 
-/// [`Pack::exactly`] of a triangle.
+/// Computes [`Pack::exactly`] for a triangle.
 pub(super) fn along(t: &[Vec3; 3], o: Vec3, d: Vec3) -> f32 {
     let (o, d) = (wide(o), wide(d));
     let [a, b, c] = t.map(|v| minus(wide(v), o));
@@ -97,7 +101,8 @@ pub(super) fn along(t: &[Vec3; 3], o: Vec3, d: Vec3) -> f32 {
         e[0] * f[1] - e[1] * f[0],
     ];
     let plane = dot(normal, a) / dot(normal, d);
-    // Seen all but edge on, the plane is met far from where the ray passes the triangle.
+    // If the plane is seen nearly edge-on, its intersection may be far from where the ray passes
+    // the triangle.
     let square = dot(d, d);
     let ends = [a, b, c].map(|v| dot(v, d) / square);
     let first = ends[0].min(ends[1]).min(ends[2]);

@@ -1,28 +1,28 @@
-//! How a binary tree becomes one of eight children a node at the least expected cost.
+//! Collapses a binary tree to one with eight children per node at the least expected cost.
 //!
-//! The dynamic programme of Ylitie, Karras and Laine (HPG 2017, section 3.2), with the cost of this
-//! traversal: a node and a leaf cost the same for however many children or triangles, up to eight. It
-//! fills nodes and leaves better than opening the widest child does.
+//! This is the dynamic programme of Ylitie, Karras and Laine (HPG 2017, section 3.2), with the cost
+//! of this traversal: a node and a leaf cost the same for any number of children or triangles, up
+//! to eight. It fills nodes and leaves better than opening the widest child does.
 
 use obvhs::bvh2::Bvh2;
 
-/// Triangles in a leaf: one pack.
+/// Number of triangles in a leaf: one pack.
 const LEAF_SIZE: u32 = 8;
 /// Cost of visiting a leaf, in visits of a node.
 const LEAF_COST: f32 = 1.0;
 
-/// What is best for one subtree.
+/// The optimal choices for one subtree.
 #[derive(Debug, Clone, Copy, Default)]
 struct Choice {
     /// Least cost of the subtree as at most 1, 2, … 8 roots.
     cost: [f32; 8],
-    /// For 2, … 8 roots: how many of them the left child makes; 0: one root fewer is as good.
+    /// For 2, … 8 roots: the number of roots in the left child; 0 if one root fewer costs no more.
     left: [u8; 8],
     /// The same for the children of this subtree's own node.
     split: u8,
-    /// As one root it is a leaf.
+    /// Whether the subtree as one root is a leaf.
     leaf: bool,
-    /// Triangles below.
+    /// Number of triangles below.
     count: u32,
 }
 
@@ -33,7 +33,7 @@ pub(super) struct Plan(Vec<Choice>);
 impl Plan {
     pub(super) fn new(tree: &Bvh2) -> Self {
         let mut plan = Self(vec![Choice::default(); tree.nodes.len()]);
-        // Parents before children, then backwards.
+        // List parents before children, then visit the list backwards.
         let mut order = vec![0usize];
         let mut i = 0;
         while i < order.len() {
@@ -64,7 +64,7 @@ impl Plan {
         }
         let first = node.first_index as usize;
         let (a, b) = (&self.0[first], &self.0[first + 1]);
-        // The best way to share out `roots` ≥ 2 between the children.
+        // Returns the best division of `roots` ≥ 2 between the children.
         let share = |roots: usize| {
             let cost = |k: usize| a.cost[k - 1] + b.cost[roots - k - 1];
             (1..roots).fold((f32::INFINITY, 1), |best, k| {
@@ -95,13 +95,13 @@ impl Plan {
         choice
     }
 
-    /// True where the subtree is a leaf when it is one root.
+    /// Returns whether the subtree as one root is a leaf.
     pub(super) fn is_leaf(&self, n: usize) -> bool {
         self.0[n].leaf
     }
 
-    /// The children of the wide node that stands for subtree `n`, at most eight; of a tree that is one
-    /// leaf, that leaf.
+    /// Writes the children of the wide node for subtree `n`, at most eight. If the tree is one
+    /// leaf, writes that leaf.
     pub(super) fn children(&self, tree: &Bvh2, n: usize, children: &mut Vec<usize>) {
         children.clear();
         if self.0[n].leaf {
@@ -127,7 +127,7 @@ impl Plan {
         }
     }
 
-    /// The triangles below `n`.
+    /// Writes the triangles below `n`.
     pub(super) fn triangles(&self, tree: &Bvh2, n: usize, held: &mut Vec<u32>) {
         held.clear();
         let mut open = vec![n];

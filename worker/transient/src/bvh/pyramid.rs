@@ -1,10 +1,11 @@
-//! The pyramid around a bundle: a volume that holds every segment, and a box test against it.
+//! The pyramid around a bundle: a volume that contains every segment, and a box test against it.
 //!
 //! It is bounded by the slopes of the rays on both sides of their main axis, by the box around all
-//! segments, and by a plane through the targets, which usually lie on one surface: the leaves of that
-//! surface are beyond it. The test must pass every box that the slab test of some ray passes. That test
-//! errs by less than 9 units of 2⁻²³ in relation to each coordinate of the point where the ray meets the
-//! box; the margins here are about twice that, and the test itself adds less than 4 units.
+//! segments, and by a plane through the targets. The targets are usually on one surface, so the
+//! plane excludes the leaves of that surface. The test must pass every box that passes the slab
+//! test of some ray. The error of that test is less than 9 units of 2⁻²³ relative to each
+//! coordinate of the point where the ray hits the box. The margins here are about twice as large,
+//! and the test itself adds less than 4 units.
 
 use super::{Node, lanes::Lanes, rays::Rays};
 
@@ -12,10 +13,11 @@ use super::{Node, lanes::Lanes, rays::Rays};
 const MARGIN: f32 = 2e-6;
 /// Absolute margin for numbers that underflow.
 const TINY: f32 = 1e-30;
-/// The slab test takes smaller components of a direction for half of this.
+/// Twice the value by which the slab test replaces smaller components of a direction.
 const LEAST: f32 = 2e-18;
 
-/// All relative to the rays' origin. z is the main axis and its sign is turned so that rays go to +z.
+/// All values are relative to the rays' origin. z is the main axis; its sign is flipped so that
+/// rays go to +z.
 #[derive(Debug)]
 pub(super) struct Pyramid {
     axes: [usize; 3],
@@ -23,7 +25,7 @@ pub(super) struct Pyramid {
     negative: bool,
     /// Least and greatest x/z and y/z.
     slope: [(f32, f32); 2],
-    /// The box: x, y; and the greatest z.
+    /// The box: its extent in x and y, and the greatest z.
     sides: [(f32, f32); 2],
     depth: f32,
     /// A plane n·p ≤ bound.
@@ -39,7 +41,7 @@ fn wider((low, high): (f32, f32), least: f32) -> (f32, f32) {
     )
 }
 
-/// Least and greatest of the first `padded` numbers, a multiple of the lanes.
+/// Returns the least and the greatest of the first `padded` numbers, a multiple of the lanes.
 #[inline(always)]
 fn range<W: Lanes>(a: &[f32], padded: usize) -> (f32, f32) {
     let (mut low, mut high) = (W::load(a), W::load(a));
@@ -53,7 +55,7 @@ fn range<W: Lanes>(a: &[f32], padded: usize) -> (f32, f32) {
 }
 
 impl Pyramid {
-    /// `None` where the numbers are so large or small that the margins would not hold.
+    /// Returns `None` if the numbers are so large or small that the margins are not valid.
     #[inline(always)]
     pub(super) fn around<W: Lanes>(rays: &Rays, padded: usize) -> Option<Self> {
         let [kx, ky, kz] = rays.axes;
@@ -120,7 +122,7 @@ impl Pyramid {
         })
     }
 
-    /// Which of a node's children may be met, as a mask. `E` has eight lanes.
+    /// Returns a mask of a node's children that the rays may hit. `E` has eight lanes.
     #[inline(always)]
     pub(super) fn children<E: Lanes>(&self, node: &Node) -> u32 {
         let [kx, ky, kz] = self.axes;

@@ -1,22 +1,22 @@
-//! The rays of a bundle, side by side.
+//! The rays of a bundle in columns.
 
 use picofarm_scene::Vec3;
 
-/// Rays in a bundle: bits of a mask.
+/// Number of rays in a bundle: the bits of a mask.
 pub(super) const MOST: usize = 64;
 
-/// One number for each ray.
+/// One number per ray.
 pub(super) type Column = [f32; MOST];
 
-/// Rays from one point whose largest components lie on the same axis with the same sign, ray by ray;
-/// lanes beyond the last ray repeat the first.
+/// Rays from one point with their largest component on the same axis with the same sign. Lanes
+/// beyond the last ray repeat the first.
 #[derive(Debug, Clone)]
 pub(super) struct Rays {
     pub o: Vec3,
     pub count: usize,
     /// x and y of the shear, and the axis of the largest component.
     pub axes: [usize; 3],
-    /// The largest component is negative.
+    /// Whether the largest component is negative.
     pub negative: bool,
     /// Direction: to − from.
     pub d: [Column; 3],

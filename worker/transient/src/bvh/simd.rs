@@ -1,12 +1,13 @@
 //! The kernels by instruction set: the only unsafe code of this crate.
 //!
-//! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch
-//! no memory except unaligned loads and stores of one whole register, from and to slices that are checked
-//! to be that long; a prefetch may name any address. The functions `*_avx2` are reached only through a
-//! [`Bvh`](super::Bvh) whose kernel is AVX2 or AVX-512, those `*_avx512` only through one whose kernel is
-//! AVX-512; `build` and `with_kernel` set these only where [`available`] says so. Features are enabled
-//! for these functions alone; everything below is inlined into them. Nothing below may be a closure that
-//! is not inlined: closures do not inherit features, which costs much speed (not correctness).
+//! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and
+//! touch no memory except by unaligned loads and stores of one whole register, from and to slices
+//! that are checked to be that long; a prefetch may name any address. The functions `*_avx2` are
+//! called only through a [`Bvh`](super::Bvh) with the kernel AVX2 or AVX-512, those `*_avx512` only
+//! through one with the kernel AVX-512; `build` and `with_kernel` set these only if [`available`]
+//! returns true. Features are enabled for these functions alone; everything below is inlined into
+//! them. Nothing below may be a closure that is not inlined: closures do not inherit features,
+//! which costs much speed (not correctness).
 #![cfg_attr(
     target_arch = "x86_64",
     expect(
@@ -19,7 +20,7 @@ use picofarm_scene::Vec3;
 
 use super::{Bvh, EMPTY, Kernel, Stack, bundle::bundle, traverse::traverse};
 
-/// True where this machine can run a kernel.
+/// Returns whether this machine can run a kernel.
 pub(super) fn available(kernel: Kernel) -> bool {
     match kernel {
         Kernel::Portable => true,
@@ -79,7 +80,8 @@ mod native {
                 fn run(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> (f32, u32) {
                     traverse::<Eight, false>(b, &mut s.entries, 0, o, d, t)
                 }
-                // SAFETY: the tree's kernel says that the machine has the feature (module proof).
+                // SAFETY: the tree's kernel guarantees that the machine has the feature (module
+                // proof).
                 unsafe { run(b, s, o, d, t) }
             }
 
@@ -118,11 +120,11 @@ mod native {
         bundle_avx512
     );
 
-    /// Eight lanes in one register; made only inside the functions above.
+    /// Eight lanes in one register; created only inside the functions above.
     #[derive(Clone, Copy)]
     pub(in crate::bvh) struct Eight(__m256);
 
-    /// Sixteen lanes in one register; made only inside the AVX-512 functions above.
+    /// Sixteen lanes in one register; created only inside the AVX-512 functions above.
     #[derive(Clone, Copy)]
     pub(in crate::bvh) struct Sixteen(__m512);
 
@@ -130,7 +132,7 @@ mod native {
     macro_rules! lanes {
         ($t:ident, $n:literal, $splat:ident, $load:ident, $store:ident, $add:ident, $sub:ident,
          $mul:ident, $div:ident, $min:ident, $max:ident, $least:ident, $greatest:ident, $compare:ident) => {
-            // SAFETY of every block: the instructions exist wherever a value of this type does (module
+            // SAFETY of every block: a value of this type exists only if the instructions do (module
             // proof), and the slices are as long as a register.
             impl Lanes for $t {
                 const N: usize = $n;

@@ -4,7 +4,7 @@ use picofarm_scene::Vec3;
 
 use super::{Bvh, EMPTY, LEAF, lanes::Lanes, packs};
 
-/// 1/x. 1/0 would make 0·∞ = NaN in the slab test; a huge finite slope does the same work.
+/// Returns 1/x. 1/0 would give 0·∞ = NaN in the slab test, so a huge finite slope replaces it.
 #[inline(always)]
 pub(super) fn inverse(x: f32) -> f32 {
     1.0 / if x.abs() < 1e-18 {
@@ -14,7 +14,7 @@ pub(super) fn inverse(x: f32) -> f32 {
     }
 }
 
-/// The axis of the largest component.
+/// Returns the axis of the largest component.
 #[inline(always)]
 pub(super) fn largest(d: Vec3) -> usize {
     let (ax, ay, az) = (d.x.abs(), d.y.abs(), d.z.abs());
@@ -27,8 +27,9 @@ pub(super) fn largest(d: Vec3) -> usize {
     }
 }
 
-/// Nearest hit (`ANY` = false) or some hit (`ANY` = true) with 0 < t ≤ `limit` below node `root` (0: in the
-/// whole tree): (t, triangle), triangle [`EMPTY`] for a miss. The caller has checked that ray and tree are usable and `stack` deep enough.
+/// Returns the nearest hit (`ANY` = false) or some hit (`ANY` = true) with 0 < t ≤ `limit` below
+/// node `root` (0: in the whole tree) as (t, triangle); triangle is [`EMPTY`] for a miss. The
+/// caller has checked that ray and tree are usable and `stack` is deep enough.
 #[inline(always)]
 pub(super) fn traverse<L: Lanes, const ANY: bool>(
     bvh: &Bvh,
@@ -51,7 +52,7 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
     // A few ulp of slack on the far plane make the slab test watertight (Ize, JCGT 2013).
     let slack = L::splat(1.0 + 4.0 * f32::EPSILON);
 
-    // Shear of Woop et al.: the ray's largest axis becomes z.
+    // Shear of Woop et al.: z is the ray's largest axis.
     let kz = largest(d);
     let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
     if d[kz] < 0.0 {

@@ -1,6 +1,7 @@
-//! Where glass lies, seen from a point. A camera path that scatters finds glass by chance alone, and only what glass turns counts; so
-//! half of its directions are drawn within cones around spheres that hold the glass, joined with the surface's own scattering by the
-//! balance heuristic.
+//! Directions from a point to the glass. A camera path that scatters hits glass only by chance, and
+//! only light that glass turns counts. So half of its directions are drawn within cones around
+//! bounding spheres of the glass, combined with the surface's own scattering by the balance
+//! heuristic.
 
 use std::f32::consts::PI;
 
@@ -8,17 +9,18 @@ use picofarm_scene::Vec3;
 
 use crate::{bsdf::frame, rng::Rng, world::Hit};
 
-/// Spheres at most, what two boxes together must at most have of the squared diagonal of the one that they divide, and slices of a box
-/// that they are made of.
+/// The largest number of spheres; the largest sum of the squared diagonals of two boxes, relative
+/// to that of the box that they divide; and the number of slices of a box that the cuts are chosen
+/// from.
 const MOST: usize = 16;
 const PAYS: f32 = 0.7;
 const SLICES: usize = 16;
-/// Share of the directions that are drawn within cones.
+/// Share of directions drawn within cones.
 const SHARE: f32 = 0.5;
-/// Least square of a cone's sine, so that directions on its edge are told apart.
+/// Least square of a cone's sine, so that directions on its edge are distinguishable.
 const NARROW: f32 = 1e-4;
 
-/// Spheres that hold all glass but panes in which spots and lit points have images.
+/// Bounding spheres of all glass except panes in which spots and lit points have images.
 #[derive(Debug, Default)]
 pub(super) struct Aim(Vec<Sphere>);
 
@@ -28,11 +30,11 @@ struct Sphere {
     radius: f32,
 }
 
-/// Directions to a sphere.
+/// The directions to a sphere.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cone {
     axis: Vec3,
-    /// 1 − cos of its half angle: its solid angle over 2π.
+    /// 1 − cos of the half angle: the solid angle over 2π.
     size: f32,
 }
 
@@ -41,7 +43,7 @@ struct Cone {
 pub(super) struct Cones {
     list: [Cone; MOST],
     count: usize,
-    /// Sum of their sizes.
+    /// Sum of the cones' sizes.
     total: f32,
 }
 
@@ -68,14 +70,14 @@ impl Bounds {
         ])
     }
 
-    /// Square of the diagonal; infinite for an empty box, which no division is made with.
+    /// Returns the square of the diagonal; infinite for an empty box, so that no division uses it.
     fn square(self) -> f32 {
         let d = self.0[1] - self.0[0];
         d.dot(d)
     }
 }
 
-/// The sphere of some triangles, in the middle of their box.
+/// Returns the bounding sphere of some triangles around the middle of their box.
 fn around(all: &[[Vec3; 3]]) -> Sphere {
     let [low, high] = Bounds::of(all.iter().flatten()).0;
     let centre = (low + high) * 0.5;
@@ -87,8 +89,8 @@ fn around(all: &[[Vec3; 3]]) -> Sphere {
     }
 }
 
-/// Divides triangles in two where the squared diagonals of both boxes have the least sum, among a few planes across each axis; `None`
-/// where that does not pay.
+/// Divides triangles in two by the cut with the least sum of the squared diagonals of both boxes,
+/// among a few planes across each axis. Returns the triangles undivided as an error if no cut pays.
 fn divided(all: Vec<[Vec3; 3]>) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
     let coordinate = |p: Vec3, axis: usize| [p.x, p.y, p.z][axis];
     let middle = |t: &[Vec3; 3]| (t[0] + t[1] + t[2]) / 3.0;
@@ -97,7 +99,7 @@ fn divided(all: Vec<[Vec3; 3]>) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
     let slice = |p: Vec3, axis: usize| {
         let (from, to) = (coordinate(low, axis), coordinate(high, axis));
         let at = (coordinate(p, axis) - from) / (to - from) * SLICES as f32;
-        // Casting saturates, and takes what is no number as 0.
+        // The cast saturates, and maps NaN to 0.
         (at as usize).min(SLICES - 1)
     };
     let mut best = (PAYS * Bounds::of(all.iter().flatten()).square(), 0, 0);
@@ -127,7 +129,7 @@ fn divided(all: Vec<[Vec3; 3]>) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
 }
 
 impl Aim {
-    /// At some triangles.
+    /// Builds the spheres of some triangles.
     pub fn at(all: Vec<[Vec3; 3]>) -> Self {
         if all.is_empty() {
             return Self::default();
@@ -144,7 +146,8 @@ impl Aim {
         Self(done)
     }
 
-    /// Directions at it from a surface point; `None` where there are none to draw, or where the surface scatters into few.
+    /// Returns the cones from a surface point; `None` if there are none, or if the surface scatters
+    /// into a narrow lobe.
     pub fn from(&self, h: &Hit) -> Option<Cones> {
         let mut cones = Cones {
             list: [Cone::default(); MOST],
@@ -155,7 +158,8 @@ impl Aim {
             let to = s.centre - h.p;
             let d2 = to.dot(to);
             let square = (s.radius * s.radius / d2).max(NARROW);
-            // Within it there is no cone; below the surface nothing arrives.
+            // A point within a sphere has no cone to it, and no light arrives from below the
+            // surface.
             if square >= 1.0 || h.n.dot(to) <= -s.radius {
                 continue;
             }
@@ -172,8 +176,8 @@ impl Aim {
 }
 
 impl Cones {
-    /// Draws a direction for light that leaves a surface toward `back`: direction, f·cos over the density of both ways, and f·cos
-    /// over that of the surface's own scattering.
+    /// Draws a direction for light that leaves a surface toward `back`. Returns the direction,
+    /// f·cos over the combined density, and f·cos over the density of the surface's own scattering.
     pub fn sample(&self, h: &Hit, back: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         let w = match rng.uniform() < SHARE {
             true => self.within(rng),
@@ -201,7 +205,7 @@ impl Cones {
         (cone.axis * (1.0 - below) + t * (sin * x) + b * (sin * y)).normalized()
     }
 
-    /// Density per steradian.
+    /// Returns the density per steradian.
     fn density(&self, w: Vec3) -> f32 {
         let cones = self.list[..self.count].iter();
         let holds = |c: &&Cone| c.axis.dot(w) >= 1.0 - c.size;
@@ -218,7 +222,7 @@ mod tests {
     use super::{Aim, Cones};
     use crate::rng::{Rng, Stream};
 
-    /// A tetrahedron of a size at a place.
+    /// Returns a tetrahedron of a size at a place.
     fn solid(at: Vec3, size: f32) -> Vec<[Vec3; 3]> {
         let corner = |x, y, z| at + Vec3::new(x, y, z) * size;
         let all = [
@@ -259,7 +263,8 @@ mod tests {
         );
         let cones = cones(&aim);
         let mut rng = Rng::new(1, Stream::ByGlass, 0, 0);
-        // The mean of 1/density is the solid angle of what is covered, and of each half of it.
+        // The mean of 1/density is the solid angle of the covered directions; this also applies to
+        // each half of it.
         let (mut all, mut left) = (0.0, 0.0);
         let count = 100_000;
         for _ in 0..count {

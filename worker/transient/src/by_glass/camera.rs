@@ -1,4 +1,4 @@
-//! Camera paths by way of glass.
+//! Camera paths via glass.
 
 use picofarm_scene::Vec3;
 
@@ -18,19 +18,20 @@ use crate::{
     walk::{ALL, Walk, draw},
 };
 
-/// How often at least a pane's reflection is chosen where nothing was turned yet.
+/// Least probability of choosing a pane's reflection before the first turn.
 const SEEK: f32 = 0.5;
-/// Images that the first point is connected to at most, and that any other is.
+/// Largest number of images that the first point, and any other point, is connected to.
 const IMAGES: (u32, u32) = (4, 1);
-/// The same of points that spots light.
+/// The same for points lit by spots.
 const LIT: (u32, u32) = (2, 1);
-/// Spots that a vertex after the first is connected to at most, and light vertices that any is.
+/// Largest number of spots that a vertex after the first is connected to, and of light vertices
+/// that any vertex is connected to.
 const SPOTS: u32 = 6;
 const LIGHTS: u32 = 1;
 
 impl ByGlass {
-    /// A camera path through a point of the film: what it finds by connecting to the spots, their images and the light vertices that
-    /// were laid, and among the photons.
+    /// Traces a camera path through a point of the film. Adds the light from connections to the
+    /// spots, their images and the current light vertices, and from the photons.
     pub fn look(
         &self,
         (walk, film, photons): (&Walk, &Film, &Photons),
@@ -51,7 +52,7 @@ impl ByGlass {
             length_m: 0.0,
             bounces: 0,
         };
-        // Whether any leg was turned, and whether all were.
+        // Whether any leg was turned, and whether all legs were.
         let (mut turned, mut all) = (false, true);
         loop {
             let seek = if turned { 0.0 } else { SEEK };
@@ -66,7 +67,7 @@ impl ByGlass {
                 return;
             }
             if first && turned {
-                // The spots themselves are seen as points of light where they can be.
+                // The spots themselves are points of light if possible.
                 let spots = !(point.shows && self.points_of_light());
                 let limits = (walk.max_bounces, world, spots);
                 photons.around(limits, &point, |found| add(film, (pixel, found), out));
@@ -77,7 +78,8 @@ impl ByGlass {
             {
                 return;
             }
-            // Straight legs alone from here to a spot; those from a point that a pane's reflection led to are found by its image.
+            // From here, straight legs alone lead to a spot. If a pane's reflection led here from
+            // another point, the image of this point covers these paths.
             let by_image = !first && point.imaged && Lit::may_hold(walk, &point.hit);
             if point.turns > 0 && !by_image {
                 straight((walk, film), (&point, pixel), first, rng, buffers, out);
@@ -109,25 +111,26 @@ impl ByGlass {
     }
 }
 
-/// What a camera path found.
+/// A contribution of a camera path.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Found {
     /// Radiance.
     pub value: f32,
     /// Optical path, metres.
     pub path_m: f64,
-    /// Emitter.
+    /// Emitter index.
     pub spot: usize,
     pub bounces: u32,
     pub technique: Technique,
 }
 
-/// Where the splats of a walk go. Straight legs stay in one medium: those of the walk are all as much longer as its index says.
+/// The sink for a walk's splats. Straight legs stay in one medium, so the index of that medium
+/// scales the length of the walk's legs.
 struct Splats<'a> {
     film: &'a Film,
     emitters: &'a Emitters,
     pixel: u32,
-    /// Optical path up to the walk, metres, and index of refraction around it.
+    /// Optical path before the walk, metres, and the index of refraction around it.
     before_m: f64,
     medium: f64,
     out: &'a mut Vec<Splat>,
@@ -149,7 +152,8 @@ impl Sink for Splats<'_> {
     fn at(&mut self, _: Place) {}
 }
 
-/// Connects a point of a camera path to the spots and walks on from it, by straight legs alone.
+/// Connects a point of a camera path to the spots and continues the walk from it, with straight
+/// legs alone.
 fn straight(
     (walk, film): (&Walk, &Film),
     (point, pixel): (&Point, u32),
@@ -176,11 +180,11 @@ fn straight(
         bounce: point.path.bounces,
         sight: Sight::ELSEWHERE,
     };
-    // Zones leave what is close beside a spot to light paths, which do not come here.
+    // Zones leave light near a spot to light paths, which do not cover paths via glass.
     let near = walk.contacts.is_some_and(|c| c.near(walk.world, &hit));
     let walk = Walk {
         contacts: walk.contacts.filter(|_| !near),
-        // The window is that of whole paths.
+        // The window applies to whole paths.
         window: None,
         ..*walk
     };

@@ -1,6 +1,8 @@
-//! Mirror images of the spots in planar panes: light that a pane reflects once on its way from a spot comes straight from the image
-//! behind it. So a camera path's points connect to images as they do to spots, as far as the pane reaches and nothing stands between.
-//! The camera itself does so too: a spot that it sees in a planar pane is a point of light, in one pixel and one bin.
+//! Mirror images of the spots in planar panes. Light that a pane reflects once on its way from a
+//! spot comes straight from the image behind the pane. So a camera path's points connect to images
+//! as they do to spots, within the extent of the pane and if nothing blocks the path. The camera
+//! itself does so too: a spot that it sees in a planar pane is a point of light, in one pixel and
+//! one bin.
 
 use picofarm_scene::Vec3;
 
@@ -17,19 +19,22 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// Most planes that are kept, those of the largest area, and least share of the whole area that one has: what others reflect is
-/// found by light paths.
+/// Largest number of planes, by area, that points are connected by, and the least share of the
+/// whole area for such a plane. Light reflected by other planes is left to light paths.
 const MOST: usize = 8;
 const LEAST: f32 = 0.02;
-/// Planes that panes are compared with at most: curved glass has one for each facet.
+/// Largest number of planes that panes are compared with, because curved glass has one for each
+/// facet.
 const MOST_KNOWN: usize = 4096;
-/// How far a pane may lie off its plane, render units, and how far its normal may turn, cosine.
+/// Largest distance of a pane from its plane, render units, and least cosine between the normals of
+/// both.
 const FLAT: f32 = 1e-5;
 const ALIKE: f32 = 0.999_999;
-/// How far off a plane a point must be to be on one of its sides, render units.
+/// Least distance from a plane for a point to be on one of its sides, render units.
 const OFF: f32 = 1e-4;
 
-/// Points that light scatters at which are looked at for one connection, in all planes together, and of one plane at least and at most.
+/// Number of lit points that are considered for one connection, in all planes together, and its
+/// least and greatest value for one plane.
 const LOOKED_AT: usize = 64;
 const OF_ONE: (usize, usize) = (4, 32);
 
@@ -39,38 +44,38 @@ struct Plane {
     normal: Vec3,
     /// Distance from the origin along `normal`.
     offset: f32,
-    /// Two directions within it, and bounds along them.
+    /// Two directions within the plane, and the bounds along them.
     u: Vec3,
     v: Vec3,
     low: [f32; 2],
     high: [f32; 2],
     area: f32,
-    /// Of its first pane, by which all are weighed.
+    /// The first pane of the plane; its weight represents all of them.
     pane: usize,
 }
 
 /// The planes of a scene's panes.
 #[derive(Debug, Default)]
 pub(super) struct Images {
-    /// The largest first.
+    /// The planes, largest first.
     planes: Vec<Plane>,
-    /// How many of them points of camera paths are connected by.
+    /// The number of planes by which points of camera paths are connected.
     kept: usize,
-    /// Plane of each pane, [`NONE`] for those of none.
+    /// Plane of each pane; [`NONE`] if it has none.
     of_pane: Vec<u32>,
 }
 
 const NONE: u32 = u32::MAX;
 
 impl Images {
-    /// The planes of all panes. Whoever stops it gets what must not be used.
+    /// Returns the planes of all panes. The result is unusable after a stop.
     pub fn find(world: &World, stop: Stop) -> Self {
         let Some(panes) = &world.panes else {
             return Self::default();
         };
         let mut planes: Vec<(Plane, Vec<usize>)> = vec![];
         for (pane, (corners, normal)) in panes.triangles().enumerate() {
-            // Each is compared with all planes so far.
+            // Each pane is compared with all planes so far.
             if pane % 256 == 0 && stop.asked() {
                 break;
             }
@@ -113,23 +118,24 @@ impl Images {
         }
     }
 
-    /// Whether there are any.
+    /// Returns whether points of camera paths are connected to any images.
     pub fn any(&self) -> bool {
         self.kept > 0
     }
 
-    /// Whether points of camera paths are connected to the spots' images in a pane.
+    /// Returns whether points of camera paths are connected to the spots' images in a pane.
     pub fn has(&self, pane: u32) -> bool {
         (self.of_pane[pane as usize] as usize) < self.kept
     }
 
-    /// Whether the spots that the camera sees in a pane are among [`Images::seen`].
+    /// Returns whether [`Images::seen`] includes the spots that the camera sees in a pane.
     pub fn shows(&self, pane: u32) -> bool {
         self.of_pane[pane as usize] != NONE
     }
 
-    /// The spots that the camera sees in planar panes, each a point of light: what each pass draws of them into the image. As a spot
-    /// seen without glass ([`crate::one_bounce`]), from where its image is. Whoever stops it gets what must not be used.
+    /// Returns the splats that each pass draws of the spots that the camera sees in planar panes.
+    /// Each is a point of light at the place of its image, computed like a spot seen without glass
+    /// ([`crate::one_bounce`]). The result is unusable after a stop.
     pub fn seen(
         &self,
         (walk, film): (&Walk, &Film),
@@ -173,7 +179,8 @@ impl Images {
         seen
     }
 
-    /// Connects a point of a camera path to `count` images, drawn by what they would bring if nothing stood between.
+    /// Connects a point of a camera path to `count` images, drawn in proportion to their unblocked
+    /// contributions.
     pub fn connect(
         &self,
         walk: &Walk,
@@ -195,7 +202,7 @@ impl Images {
         }
         draw(&weights, count, rng.uniform(), |k, value| {
             let (plane, spot) = (k / spots, k % spots);
-            // `value` is this image's weight over its chance.
+            // `value` is this image's weight over its probability.
             let of = self.light((walk, panes), (plane, spot), point, buffers);
             if let Some((share, found)) = of {
                 let value = point.path.weight * value * share;
@@ -205,7 +212,8 @@ impl Images {
         buffers.lights = weights;
     }
 
-    /// What comes from a spot's image: as a share of its weight, and how.
+    /// Returns the light from a spot's image as a share of its weight, with the path and the
+    /// ratios.
     fn light(
         &self,
         (walk, panes): (&Walk, &Panes),
@@ -227,8 +235,9 @@ impl Images {
         Some((way.share, found))
     }
 
-    /// Connects a point of a camera path to images of the points of `lit`, at most `count` of them: a few are looked at, and of
-    /// those some are drawn by what they would bring.
+    /// Connects a point of a camera path to images of the points of `lit`, at most `count` of them.
+    /// A few points are considered, and some of these are drawn in proportion to their unblocked
+    /// contributions.
     pub fn connect_lit(
         &self,
         (walk, lit): (&Walk, &Lit),
@@ -284,7 +293,8 @@ impl Images {
         buffers.lights = weights;
     }
 
-    /// The way from a point, lifted off its surface, in a medium of some index to another point by a pane of a plane, where it is free.
+    /// Returns the path from a point, lifted off its surface, in a medium of some index via a pane
+    /// of a plane to another point, if it is free.
     fn way(
         &self,
         (world, panes): (&World, &Panes),
@@ -294,14 +304,14 @@ impl Images {
         buffers: &mut Buffers,
     ) -> Option<Way> {
         let plane = &self.planes[k];
-        // From where the ray starts: it meets the pane there.
+        // Computed from the start of the ray, because the ray hits the pane there.
         let q = plane.between(from, p)?;
         let to = q - from;
         let stack = &mut buffers.scratch.stack;
         if world.bvh.occluded(stack, from, to, 1.0) {
             return None;
         }
-        // A little further than the pane.
+        // A point a little beyond the pane.
         let beyond = from + to * (1.0 + 1.0 / 16384.0);
         panes.crossings(stack, from, beyond, &mut buffers.crossings);
         let mut passes = 1.0;
@@ -333,11 +343,12 @@ impl Images {
     }
 }
 
-/// A free way by a pane.
+/// A free path via a pane.
 struct Way {
-    /// What passes and is reflected, as a share of what weights count with.
+    /// Transmitted and reflected share of the light, relative to the reflectance that weights
+    /// assume.
     share: f32,
-    /// The same of all light.
+    /// The same share, relative to all light.
     free: f32,
     /// Unit direction from the far end.
     back: Vec3,
@@ -369,7 +380,8 @@ impl Plane {
         }
     }
 
-    /// Where light from a spot to a point is reflected, if both are on one side and that lies within the bounds.
+    /// Returns the point of reflection for light from a spot to a point, if both are on one side
+    /// and the reflection is within the bounds.
     fn between(&self, x: Vec3, spot: Vec3) -> Option<Vec3> {
         let (a, b) = (
             self.normal.dot(x) - self.offset,
@@ -387,8 +399,9 @@ impl Plane {
         (within(0, self.u) && within(1, self.v)).then_some(q)
     }
 
-    /// What a point would get from another by the plane if nothing stood between: f · cos, what the pane reflects, what the other
-    /// `sends` in a direction, over the squared distance.
+    /// Returns the unblocked contribution from another point to a point via the plane: f · cos,
+    /// times the pane's reflectance, times the light that the other point `sends` in a direction,
+    /// over the squared distance.
     fn weight(
         &self,
         panes: &Panes,

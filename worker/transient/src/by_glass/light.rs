@@ -1,4 +1,4 @@
-//! Light paths by way of glass.
+//! Light paths via glass.
 
 use super::{
     Buffers, ByGlass,
@@ -12,11 +12,12 @@ use crate::{
     world::Hit,
 };
 
-/// Vertices of a path before Russian roulette sets in.
+/// Number of vertices of a path before Russian roulette starts.
 const SURE: u32 = 3;
 
 impl ByGlass {
-    /// Makes the light vertices and points that camera paths are connected to; the vertices from `count` light paths.
+    /// Draws the light vertices and lit points that camera paths are connected to. The light
+    /// vertices come from `count` light paths.
     pub fn lay(&self, walk: &Walk, count: u32, rng: &mut Rng, buffers: &mut Buffers) {
         let mut vertices = std::mem::take(&mut buffers.vertices);
         vertices.clear();
@@ -31,8 +32,8 @@ impl ByGlass {
         }
     }
 
-    /// Light path `l` of a batch of `count`: calls `each` with every surface point that it comes to, and whether glass turned all
-    /// its legs up to there. The sum over the batch is an estimate.
+    /// Traces light path `l` of a batch of `count`. Calls `each` with every surface point on the
+    /// path, and whether glass turned all legs up to there. The sum over the batch is an estimate.
     pub fn trace(
         &self,
         walk: &Walk,
@@ -52,7 +53,7 @@ impl ByGlass {
             let Some(point) = arrive((world, &self.images), &path, (ray, 0.0), rng, tools) else {
                 return;
             };
-            // Camera paths find it by the image.
+            // Camera paths cover this path by the image.
             if vertex == 0 && imaged && point.turns == 1 {
                 return;
             }
@@ -86,8 +87,8 @@ impl ByGlass {
         }
     }
 
-    /// The first leg of a light path up to its first turn: emitter, whether it has an image in the pane that turned it, flux, and the ray
-    /// there.
+    /// Draws the first leg of a light path up to its first turn. Returns the emitter, whether it
+    /// has an image in the pane that turned the leg, the flux, and the ray there.
     fn start(
         &self,
         walk: &Walk,
@@ -119,7 +120,8 @@ impl ByGlass {
         let from = emitters.lifted[spot];
         let hit = world.ahead(stack, from, w, &mut buffers.crossings);
         let body = hit.as_ref().and_then(|h| world.body(h.triangle));
-        // What is turned on this way: by each pane, and by a body beyond them.
+        // Shares of the light that are turned in this direction: by each pane, and by a body behind
+        // the panes.
         let shares = Shares::of(&buffers.crossings, hit.as_ref());
         let straight = if body.is_some() { shares.straight } else { 0.0 };
         let total = shares.reflected + straight;
@@ -144,7 +146,7 @@ impl ByGlass {
                 pane
             }
         };
-        // Its share of the light, its place among the targets, and where it is.
+        // The share of the light, the target index, and the point and normal of the turn.
         let (share, target, p, n) = match pane {
             None => {
                 let h = hit.as_ref()?;
@@ -167,7 +169,7 @@ impl ByGlass {
         };
         let to = p - e.p;
         let turn = n.dot(w).abs() / to.dot(to);
-        // Per area: of aiming there, and of coming there by the spot's own scattering.
+        // Densities per area: of aiming there, and of arriving there by the spot's own scattering.
         let aims = aimed as f32 * self.targets.density(spot, target as usize);
         let comes =
             plain as f32 / spots as f32 * e.surface.pdf(e.n, e.back, w) * turn * (share / total);

@@ -1,8 +1,11 @@
-//! Points at which light scatters on its way to a pane, with all that they bring: their light from every spot, and what a walk from them
-//! finds. Their mirror images are connected to camera paths, so that a single way by a pane brings many arrivals, and none that is rare.
+//! Points that scatter light on its way to a pane, with all the light that they scatter: the light
+//! from every spot, and the light that a walk from them samples. Their mirror images are connected
+//! to camera paths, so that a single path via a pane carries many arrivals, and no arrival is
+//! rare.
 //!
-//! They lie on Lambertians, half of them drawn by the scattering of the spots, half evenly over all surfaces; both ways are joined by the
-//! balance heuristic. Paths that come by an image of such a point, and by straight legs alone from there to a spot, are found in no other way.
+//! The points are on Lambertian surfaces. Half of them are drawn by the scattering of the spots,
+//! half uniformly over all surfaces, combined by the balance heuristic. No other technique samples
+//! paths via an image of such a point that continue by straight legs alone to a spot.
 
 use picofarm_scene::Vec3;
 
@@ -18,11 +21,11 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// How many there are at most, and light vertices that their walks are connected to.
+/// Largest number of points, and the number of light vertices that their walks are connected to.
 const POINTS: u32 = 128;
 const LIGHT_VERTICES: u32 = 64;
 
-/// Light that arrives and is scattered.
+/// Light that arrives at a point and is scattered there.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Arrival {
     /// Optical path from the laser, metres.
@@ -31,26 +34,26 @@ pub(super) struct Arrival {
     pub value: f32,
     /// Emitter.
     pub spot: usize,
-    /// Bounces up to and with the point.
+    /// Number of bounces up to and including the point.
     pub bounces: u32,
 }
 
-/// A point.
+/// A surface point lit by spots.
 #[derive(Debug)]
 pub(super) struct LitPoint {
     pub hit: Hit,
     pub arrivals: Vec<Arrival>,
-    /// Sum of their light.
+    /// Sum of the arrivals' light.
     pub sum: f32,
 }
 
-/// The points of one stream.
+/// The lit points of one stream.
 #[derive(Debug, Default)]
 pub(super) struct Lit {
     pub list: Vec<LitPoint>,
 }
 
-/// All surfaces by area, as running sums; of triangles without light to scatter none.
+/// Running sums of the area of all surfaces; triangles that scatter no light do not count.
 #[derive(Debug, Default)]
 pub(super) struct Areas(Vec<f64>);
 
@@ -69,12 +72,12 @@ impl Areas {
         Self(each.collect())
     }
 
-    /// Of all, render units squared.
+    /// Returns the total area, render units squared.
     pub fn whole(&self) -> f64 {
         self.0.last().copied().unwrap_or(0.0)
     }
 
-    /// A point of a surface, on one of its sides.
+    /// Draws a point of a surface, on one of its sides.
     fn draw(&self, world: &World, at: f64, rng: &mut Rng) -> Option<Hit> {
         let at = at * self.whole();
         let k = self.0.partition_point(|&s| s <= at);
@@ -87,7 +90,7 @@ impl Areas {
     }
 }
 
-/// What a walk finds beyond a point.
+/// The sink for the light that a walk samples beyond a point.
 struct Arrivals<'a>(&'a mut Vec<Arrival>);
 
 impl Sink for Arrivals<'_> {
@@ -104,13 +107,14 @@ impl Sink for Arrivals<'_> {
 }
 
 impl Lit {
-    /// Whether a point would be among them: on a Lambertian, and not close beside a spot that has a zone.
+    /// Returns whether a point may be a lit point: it is on a Lambertian surface, and not near a
+    /// spot with a zone.
     pub fn may_hold(walk: &Walk, hit: &Hit) -> bool {
         let near = walk.contacts.is_some_and(|c| c.near(walk.world, hit));
         hit.surface.diffuse() && !hit.surface.is_black() && !near
     }
 
-    /// Draws what walks are connected to.
+    /// Draws the light vertices that walks are connected to.
     pub fn prepare(walk: &Walk, rng: &mut Rng, scratch: &mut Scratch) {
         Sharing::draw_lights(walk, POINTS, rng, scratch);
         if walk.lights {
@@ -122,7 +126,7 @@ impl Lit {
         }
     }
 
-    /// Draws the points anew.
+    /// Redraws the points.
     pub fn lay(&mut self, (walk, areas): (&Walk, &Areas), rng: &mut Rng, scratch: &mut Scratch) {
         let (world, emitters) = (walk.world, walk.emitters);
         let spots = emitters.list.len();
@@ -154,7 +158,8 @@ impl Lit {
 }
 
 impl LitPoint {
-    /// A point that was drawn with a density per area: `by_spot` times each one's own, and evenly.
+    /// Creates a point that was drawn with the sum of two densities per area: `by_spot` times each
+    /// spot's own, and `even`.
     fn new(
         walk: &Walk,
         hit: Hit,

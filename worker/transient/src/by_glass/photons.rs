@@ -1,6 +1,8 @@
-//! Light of spots that comes by glass to points which the camera sees by glass alone: no two points can be connected on such a path.
-//! Light paths leave *photons* where they end, and a camera path takes those within a disc around its own end: the density of their
-//! flux there (Jensen 1996). A disc is about as wide as the pixel is at that distance, and so is what it blurs.
+//! Photons: the light of spots at points that it reaches via glass and that the camera sees via
+//! glass alone, so that no two points of such a path can be connected. Light paths leave *photons*
+//! at their vertices, and a camera path gathers those within a disc around its own end to estimate
+//! the density of their flux there (Jensen 1996). A disc is about as wide as the pixel at that
+//! distance, and so is the blur.
 
 use std::f32::consts::PI;
 
@@ -14,29 +16,29 @@ use crate::{
     world::{Hit, World},
 };
 
-/// Photons further than this share of the radius off the point's plane, or whose normal has less than this cosine with its own, lie
-/// on another surface.
+/// Photons on another surface are skipped: those further than this share of the radius off the
+/// point's plane, or with less than this cosine between both normals.
 const FLAT: f32 = 0.25;
 const ALIKE: f32 = 0.7;
-/// Least cosine of a direction that a surface is seen in.
+/// Least cosine of the viewing direction on a surface.
 const GRAZING: f32 = 1e-3;
 
-/// The photons of a pass, by cells of space.
+/// The photons of a pass, sorted by cells of space.
 #[derive(Debug)]
 pub(crate) struct Photons {
-    /// By cell, those of a cell in the order in which they were found.
+    /// The photons by cell; within a cell, in the order of their paths.
     all: Vec<([i32; 3], LightVertex)>,
-    /// Width of a cell, and widest radius, render units.
+    /// Width of a cell and largest radius, render units.
     cell: f32,
-    /// Radius for a length of the camera's path of 1.
+    /// Radius for a camera path of length 1.
     spread: f32,
 }
 
 impl Photons {
-    /// The spots, and `found` by light paths.
+    /// Creates the photons of the spots, and those in `found` from light paths.
     pub fn new(world: &World, emitters: &Emitters, found: Vec<LightVertex>) -> Self {
         let i = &world.camera.intrinsics;
-        // A disc as large as a pixel at unit distance.
+        // The disc has the area of a pixel at unit distance.
         let spread = (world.sensitive * world.sensitive / (PI * i.fx * i.fy)).sqrt();
         let cell = spread * world.diagonal;
         let each = emitters.list.iter().enumerate();
@@ -63,13 +65,13 @@ impl Photons {
         };
         let all = spots.chain(found).map(|z| (photons.cell_of(z.hit.p), z));
         photons.all = all.collect();
-        // Stable: sums are made in the order of the paths.
+        // The sort is stable, so that sums are computed in the order of the paths.
         photons.all.sort_by_key(|(cell, _)| *cell);
         photons
     }
 
     fn cell_of(&self, p: Vec3) -> [i32; 3] {
-        // Casting saturates.
+        // The cast saturates.
         [p.x, p.y, p.z].map(|x| (x / self.cell).floor() as i32)
     }
 
@@ -92,7 +94,7 @@ impl Photons {
         }
         for x in low[0]..=high[0] {
             for y in low[1]..=high[1] {
-                // Cells of a column follow one another.
+                // Cells of a column are contiguous.
                 let first = self.all.partition_point(|(c, _)| *c < [x, y, low[2]]);
                 let near = self.all[first..].iter();
                 for (_, z) in near.take_while(|(c, _)| *c <= [x, y, high[2]]) {

@@ -1,4 +1,4 @@
-//! Rays by way of glass, and the paths that they are legs of.
+//! Rays via glass: the legs of paths.
 
 use picofarm_scene::Vec3;
 
@@ -11,30 +11,33 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// How often at least a body's reflection is chosen, where there is any.
+/// Least probability of choosing a body's reflection, if it reflects at all.
 const REFLECT: f32 = 0.1;
-/// Turns of one leg before Russian roulette sets in where light got lost, and at most. Roulette must not end what is reflected whole
-/// again and again: few such rays would be left, of many times the weight.
+/// Number of turns of one leg before Russian roulette starts for rays that lost light, and the
+/// largest number of turns. Roulette must not end rays under repeated total reflection, because the
+/// few survivors would have a large weight.
 const SURE_TURNS: u32 = 4;
 const MOST_TURNS: u32 = 400;
 
-/// Chance of a camera path to go on, by what it carries, and at most.
+/// Factor from a path's weight to the probability that a camera path continues, and the largest
+/// probability.
 const STAY: f32 = 1.5;
 const MOST_STAY: f32 = 0.95;
 
 /// A ray on a leg.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ray {
-    /// Where it is, and the same lifted off the surface there.
+    /// Position, and the same position lifted off the surface there.
     at: Vec3,
     from: Vec3,
     /// Unit direction.
     w: Vec3,
-    /// Index of refraction around it.
+    /// Index of refraction of the medium around it.
     pub medium: f32,
-    /// It carries radiance, from the camera, and not flux.
+    /// Whether it carries radiance, from the camera, rather than flux.
     radiance: bool,
-    /// Of this leg: what is left, optical path in metres, reflections, turns.
+    /// On this leg: the remaining share, the optical path in metres, the numbers of reflections and
+    /// turns.
     weight: f32,
     length_m: f64,
     reflections: u32,
@@ -106,7 +109,7 @@ impl Ray {
     }
 }
 
-/// What a path has come to.
+/// The state of a path.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Carried {
     /// What is left of radiance or flux.
@@ -122,21 +125,22 @@ pub(super) struct Point {
     pub hit: Hit,
     /// Unit direction back along the path.
     pub back: Vec3,
-    /// Up to here, the bounce here among it.
+    /// The path up to here, including the bounce here.
     pub path: Carried,
-    /// Index of refraction around it.
+    /// Index of refraction of the medium around the point.
     pub medium: f32,
-    /// How often glass turned light on the leg that led here.
+    /// Number of turns by glass on the leg that led here.
     pub turns: u32,
-    /// It was a single time, at a pane in which points have images; at one in which spots are seen as points of light.
+    /// Whether that leg was turned once, by a pane in which points have images; and by one in which
+    /// spots are points of light.
     pub imaged: bool,
     pub shows: bool,
 }
 
-/// Shares of light that go one way or another on a straight way.
+/// Shares of the light along a straight segment.
 pub(super) struct Shares {
     pub reflected: f32,
-    /// Beyond all panes, where there is a surface.
+    /// Share that passes all panes, if there is a surface behind them.
     pub straight: f32,
 }
 
@@ -154,7 +158,7 @@ impl Shares {
     }
 }
 
-/// The pane whose share of what is reflected `left` falls into.
+/// Returns the pane that `left` selects in proportion to the reflected shares.
 pub(super) fn pick(crossings: &[Crossing], mut left: f32) -> Option<u32> {
     let (mut reach, mut last) = (1.0, None);
     for c in crossings {
@@ -171,8 +175,8 @@ pub(super) fn pick(crossings: &[Crossing], mut left: f32) -> Option<u32> {
     last
 }
 
-/// Follows a ray by way of glass to the next surface that is none. Reflections by panes are chosen with the chance `seek` at
-/// least where nothing was turned yet.
+/// Follows a ray via glass to the next surface of another material. Before the first turn,
+/// reflections by panes are chosen with a probability of at least `seek`.
 fn follow(
     world: &World,
     mut ray: Ray,

@@ -1,25 +1,25 @@
-//! The scene's Lambertian surfaces cut and gathered into patches of about one size, each with its way
-//! to every spot. A patch is what a narrow gate can be held against at once.
+//! The scene's Lambertian surfaces, cut and gathered into patches of similar size, each with its
+//! path to every spot. Narrow gates are tested against whole patches.
 
 use picofarm_scene::Vec3;
 
 use crate::{emitter::Emitters, world::World};
 
-/// Patches aimed for; a scene of many small separate parts has more.
+/// Target number of patches; a scene of many small separate parts has more.
 const COUNT: f32 = 3000.0;
-/// A triangle is halved at most this often.
+/// Largest number of successive halvings of a triangle.
 const HALVINGS: u32 = 24;
-/// Pieces from which triangles stay whole: long needles would make millions. Larger pieces are only drawn
-/// less well.
+/// Number of pieces from which triangles stay whole, because long needles would produce millions.
+/// Larger pieces only make sampling less efficient.
 const MOST: usize = 1 << 17;
-/// Cosine above which triangles of a patch count as lying in one plane.
+/// Cosine above which triangles of a patch count as coplanar.
 const FLAT: f32 = 0.98;
 
 /// Marks a link to a piece or patch instead of a halving.
 const LEAF: u32 = 1 << 31;
 const NONE: u32 = u32::MAX;
 
-/// A halving of a triangle from the middle of edge `edge` (between its vertices `edge` and `edge` + 1) to
+/// Splits a triangle from the middle of edge `edge` (between its vertices `edge` and `edge` + 1) to
 /// the opposite vertex.
 #[derive(Debug, Clone, Copy)]
 struct Halving {
@@ -33,7 +33,7 @@ struct Halving {
 pub(super) struct Piece {
     pub triangle: u32,
     pub corners: [Vec3; 3],
-    /// Sum of areas of the patch's pieces up to and with this one.
+    /// Sum of areas of the patch's pieces up to and including this one.
     pub upto: f32,
 }
 
@@ -44,19 +44,20 @@ pub(crate) struct Patches {
     of_triangle: Vec<u32>,
     halvings: Vec<Halving>,
     pub(super) pieces: Vec<Piece>,
-    /// A patch' pieces: from here to the next one's.
+    /// Index of each patch's first piece; its pieces end at the next patch's first.
     pub(super) first: Vec<u32>,
     pub(super) centre: [Vec<f32>; 3],
-    /// Its normal where it is flat, otherwise zero.
+    /// The normal of a flat patch, otherwise zero.
     pub(super) normal: [Vec<f32>; 3],
-    /// It scatters from its front alone.
+    /// Whether the patch scatters from its front only.
     pub(super) one_sided: Vec<bool>,
     /// Half the diagonal of its box, render units.
     pub(super) radius: Vec<f32>,
     pub(super) area: Vec<f32>,
     /// `[spot][patch]`: optical path from the laser, render units.
     pub(super) path: Vec<f32>,
-    /// `[spot][patch]`: rough flux there per unit power, negative on the back of a flat patch.
+    /// `[spot][patch]`: approximate flux there per unit power, negative on the back of a flat
+    /// patch.
     pub(super) flux: Vec<f32>,
 }
 
@@ -100,12 +101,12 @@ impl Patches {
         all
     }
 
-    /// Patches there are.
+    /// Returns the number of patches.
     pub fn len(&self) -> usize {
         self.area.len()
     }
 
-    /// Halves a triangle until its edges are no longer than `size`; returns the link to it.
+    /// Halves a triangle until its edges are no longer than `size`. Returns the link to it.
     fn halve(
         &mut self,
         triangle: u32,
@@ -140,7 +141,8 @@ impl Patches {
         at as u32
     }
 
-    /// Makes a patch of the pieces in `order` where they are close together, otherwise of either half.
+    /// Makes a patch of the pieces in `order` if they are close together, otherwise recurses into
+    /// both halves.
     fn gather(
         &mut self,
         world: &World,
@@ -194,7 +196,7 @@ impl Patches {
         self.area.push(area);
     }
 
-    /// Finds the way from every spot to every patch.
+    /// Computes the path and the flux from every spot to every patch.
     fn measure(&mut self, world: &World, emitters: &Emitters) {
         for e in &emitters.list {
             let start = (e.path_m * f64::from(world.scale)) as f32;
@@ -204,7 +206,7 @@ impl Patches {
                 let d = to.length();
                 let r = self.radius[k];
                 let out = if e.surface.diffuse() {
-                    // The patch reaches up to where its centre does not.
+                    // Parts of the patch may be lit even if its centre is not.
                     ((e.n.dot(to) + r) / (d + r)).clamp(0.0, 1.0)
                 } else {
                     0.5
@@ -232,8 +234,8 @@ impl Patches {
         Vec3::new(x[patch], y[patch], z[patch])
     }
 
-    /// The patch that holds the point of a triangle with these barycentric coordinates; `None` where the
-    /// triangle is in none.
+    /// Returns the patch at the point of a triangle with these barycentric coordinates; `None` if
+    /// the triangle is in no patch.
     #[inline]
     pub(super) fn at(&self, triangle: u32, mut coordinates: [f32; 3]) -> Option<usize> {
         let mut link = self.of_triangle[triangle as usize];

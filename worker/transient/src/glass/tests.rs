@@ -17,7 +17,8 @@ fn pane(ior: f32, transmittance: f32, face: bool) -> Material {
 
 #[test]
 fn a_pane_lets_through_what_fresnel_says() {
-    // Window glass: 4 % of each face at a right angle. At Brewster's angle one polarisation passes whole.
+    // Window glass reflects 4 % at each face at normal incidence. At Brewster's angle one
+    // polarisation is fully transmitted.
     assert!((clear(1.5, 1.0) - 0.96 / 1.04).abs() < 1e-6);
     let brewster = libm::atanf(1.5);
     let r = ((1.0f32 - 1.5 * 1.5) / (1.0 + 1.5 * 1.5)).powi(2);
@@ -53,7 +54,7 @@ fn corner() -> impl Strategy<Value = Vec3> {
 }
 
 proptest! {
-    /// Against a test of every triangle by itself in f64.
+    /// Compares with an independent test of every triangle in f64.
     #[test]
     fn a_way_meets_every_pane_across_it(
         triangles in prop::collection::vec([corner(), corner(), corner()], 1..40),
@@ -126,7 +127,7 @@ fn an_edge_between_two_triangles_is_met_once() {
     let glass = pane(1.0, 0.5, false);
     let panes = built(&square, &[glass.clone(), glass]);
     let mut stack = panes.bvh.stack();
-    // Along the diagonal, and through corners that the square is drawn from.
+    // Along the diagonal, including the corners of the square.
     for k in -8i16..=8 {
         let x = 0.125 * f32::from(k);
         let through = panes.through(&mut stack, Vec3::ZERO, at(x, x) * 2.0);

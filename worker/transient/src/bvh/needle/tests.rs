@@ -32,7 +32,7 @@ fn needles_are_told_by_length_over_width_at_any_scale() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(2_000))]
 
-    /// The two needles of a strip, by every kernel.
+    /// Tests the two needles of a strip with every kernel.
     #[test]
     fn rays_from_and_to_a_point_of_a_strip_do_not_meet_it(
         middle in place(-3.0..3.0),
@@ -48,7 +48,7 @@ proptest! {
         let corner = |a: f32, b: f32| middle + l * a + w * b;
         let [a, b, c, d] = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)].map(|(a, b)| corner(a, b));
         let strip = [[a, b, c], [a, c, d]];
-        // From the camera, in the origin.
+        // The camera is at the origin.
         let goal = corner(share, beside);
         prop_assume!(goal.length() > 0.2);
         let triangles: Vec<_> = strip.to_vec();
@@ -86,7 +86,7 @@ proptest! {
         t in [place(-4.0..4.0), place(-4.0..4.0), place(-4.0..4.0)],
         (o, d) in (place(-4.0..4.0), place(-1.0..1.0)),
     ) {
-        // Any triangle: most are met where f32 says.
+        // Any triangle except needles: f32 is accurate for most of them.
         prop_assume!(normal(&t).is_some() && d.length() > 0.1);
         let mut stack = Bvh::build(&[t]).stack();
         if let Some((f32_says, _)) = Bvh::build(&[t]).closest(&mut stack, o, d, f32::INFINITY) {
