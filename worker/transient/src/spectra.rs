@@ -1,11 +1,14 @@
 //! Several wavelengths in one pass.
 //!
-//! Where light goes does not depend on its wavelength, only how much of it goes on. So paths are drawn once, by the greatest
-//! reflectance that each lobe has among the wavelengths, and carry *ratios*: for each wavelength the product over the
-//! path's vertices of the reflectance there over that greatest one. A ratio is never above 1, so that no wavelength gets rarer and
-//! brighter paths than the brightest one has. A contribution of value v counts v times its ratio in each wavelength's histogram.
+//! The path of light does not depend on its wavelength; only its attenuation does. So paths are
+//! drawn once, by the greatest reflectance that each lobe has among the wavelengths, and carry
+//! *ratios*: for each wavelength the product over the path's vertices of the reflectance there over
+//! that greatest one. A ratio is never above 1, so that no wavelength has rarer and brighter paths
+//! than the brightest wavelength. A contribution of value v counts v times its ratio in each
+//! wavelength's histogram.
 //!
-//! The first wavelength is the main one, whose errors are stated. With one or none all ratios are 1 and nobody multiplies by them.
+//! The first wavelength is the main one, and the errors are stated for it. With one wavelength or
+//! none all ratios are 1, and nothing is multiplied by them.
 
 use std::collections::HashMap;
 
@@ -14,26 +17,27 @@ use picofarm_settings::MAX_WAVELENGTHS;
 
 use crate::{api::RenderError, bsdf::Surface};
 
-/// By wavelength; those beyond the render's own are 1.
+/// Ratios by wavelength; those beyond the render's wavelengths are 1.
 pub(crate) type Ratios = [f32; MAX_WAVELENGTHS];
 
-/// Every wavelength alike.
+/// Equal ratios for all wavelengths.
 pub(crate) const ONES: Ratios = [1.0; MAX_WAVELENGTHS];
 
-/// Light of all wavelengths: of each `value` times its ratio.
+/// Light of all wavelengths: `value` times the ratio of each.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Light {
     pub value: f32,
     pub ratios: Ratios,
 }
 
-/// The ratios of a path of two parts.
+/// Returns the ratios of a path of two parts.
 #[inline(always)]
 pub(crate) fn times(a: Ratios, b: Ratios) -> Ratios {
     std::array::from_fn(|k| a[k] * b[k])
 }
 
-/// The ratios of light of which the Lambertian part and the conductor of a mix send so much.
+/// Returns the ratios of light of which the Lambertian part and the conductor of a mix scatter the
+/// given amounts.
 #[inline(always)]
 pub(crate) fn mix((lambertian, conductor): (f32, f32), of: &[Ratios; 2]) -> Ratios {
     let whole = lambertian + conductor;
@@ -43,28 +47,28 @@ pub(crate) fn mix((lambertian, conductor): (f32, f32), of: &[Ratios; 2]) -> Rati
     std::array::from_fn(|k| (lambertian * of[0][k] + conductor * of[1][k]) / whole)
 }
 
-/// By what surfaces multiply ratios.
+/// The ratio factors of the surfaces.
 #[derive(Debug)]
 pub(crate) struct Spectra {
-    /// By [`Surface::spectrum_row`]; the first holds ones.
+    /// Ratios by [`Surface::spectrum_row`]; the first row is all ones.
     rows: Vec<Ratios>,
-    /// What texels do, by surface index; `None` without a texture.
+    /// Texel factors by surface index; `None` without a texture.
     texels: Vec<Option<Texels>>,
-    /// How many wavelengths there are.
+    /// The number of wavelengths.
     count: usize,
 }
 
-/// What a texel does to a surface's reflectances.
+/// The effect of a texel on a surface's reflectances.
 #[derive(Debug, Clone, Copy)]
 struct Texels {
     /// Shares of the texel's red, green and blue, by wavelength.
     shares: [[f32; 3]; MAX_WAVELENGTHS],
-    /// Most that it may multiply by: no surface gives more than it gets.
+    /// The largest allowed factor: no surface reflects more than it receives.
     most: f32,
 }
 
 impl Texels {
-    /// Factors by wavelength, and the greatest.
+    /// Returns the factors by wavelength, and the greatest of them.
     fn factors(&self, texel: [f32; 3], count: usize) -> (Ratios, f32) {
         let mut factors = ONES;
         let mut greatest = 0.0f32;
@@ -77,7 +81,7 @@ impl Texels {
     }
 }
 
-/// Collects what [`Spectra`] holds while surfaces are made.
+/// Collects the contents of a [`Spectra`] while surfaces are created.
 pub(crate) struct Builder<'a> {
     wavelengths_nm: &'a [f64],
     rows: Vec<Ratios>,
@@ -95,10 +99,11 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// The next surface. Parts of a material of several are added to `several`.
+    /// Adds the next surface. If a material has several parts, they are added to `several`.
     ///
     /// # Errors
-    /// [`RenderError::Invalid`] where materials have more spectra, or more materials several parts, than can be told apart.
+    /// Returns [`RenderError::Invalid`] if materials have more spectra, or more materials have
+    /// several parts, than indices can represent.
     pub fn surface(
         &mut self,
         m: &Material,
@@ -129,8 +134,8 @@ impl<'a> Builder<'a> {
         Ok(surface)
     }
 
-    /// Parts of which few remain to choose from: the Lambertians are one, and beside each conductor whose vertices pixels share, in
-    /// proportion to what it reflects.
+    /// Joins parts so that few remain to choose from. The Lambertian parts become one, combined
+    /// with each conductor that pixels can share vertices of, in proportion to its reflectance.
     fn joined(&mut self, parts: Vec<Surface>) -> Result<Vec<Surface>, RenderError> {
         let (lambertians, conductors): (Vec<Surface>, Vec<Surface>) = parts
             .into_iter()
@@ -165,7 +170,7 @@ impl<'a> Builder<'a> {
         Ok(all)
     }
 
-    /// A material of one part, or a mix; and what a texel does to it.
+    /// Returns a material of one part, or a mix, and its texel factors.
     fn part(&mut self, m: &Material) -> Result<(Surface, Option<Texels>), RenderError> {
         if self.wavelengths_nm.is_empty() {
             return Ok((Surface::new(m), None));
@@ -193,7 +198,8 @@ impl<'a> Builder<'a> {
         Ok((Surface::new(&brightest).with_spectrum(row), texels))
     }
 
-    /// Where the ratios of two lobes lie; with the ones where no wavelengths are asked for.
+    /// Returns the row of the ratios of two lobes. If no wavelengths are requested, it is the row
+    /// of ones.
     fn row(&mut self, lambertian: Ratios, conductor: Ratios) -> Result<u16, RenderError> {
         if self.wavelengths_nm.is_empty() {
             return Ok(0);
@@ -214,7 +220,7 @@ impl<'a> Builder<'a> {
         Ok(row)
     }
 
-    /// `None` where no wavelengths are asked for.
+    /// Returns the collected spectra, or `None` if no wavelengths are requested.
     pub fn done(self) -> Option<Spectra> {
         let count = self.wavelengths_nm.len();
         (count > 0).then_some(Spectra {
@@ -225,7 +231,7 @@ impl<'a> Builder<'a> {
     }
 }
 
-/// The greatest of the reflectances, and each as a share of it.
+/// Returns the greatest of the reflectances, and each reflectance as a fraction of it.
 fn greatest(all: impl Iterator<Item = f32> + Clone) -> (f32, Ratios) {
     let most = all.clone().fold(0.0f32, f32::max);
     let mut ratios = ONES;
@@ -237,7 +243,7 @@ fn greatest(all: impl Iterator<Item = f32> + Clone) -> (f32, Ratios) {
     (most, ratios)
 }
 
-/// The same kind of surface with other reflectances.
+/// Returns the same kind of surface with other reflectances.
 fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
     match bsdf {
         Bsdf::Diffuse { .. } => Bsdf::Diffuse {
@@ -271,13 +277,14 @@ fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
 }
 
 impl Spectra {
-    /// Whether ratios differ from 1: with one wavelength all light is of that.
+    /// Returns whether ratios can differ from 1. With one wavelength, all light is of that
+    /// wavelength.
     #[inline(always)]
     pub fn is_spectral(&self) -> bool {
         self.count > 1
     }
 
-    /// The ratios with which a surface scatters from `i` to `o`, without its texture.
+    /// Returns the ratios with which a surface scatters from `i` to `o`, without its texture.
     #[inline]
     pub fn scattered(&self, s: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Ratios {
         let row = usize::from(s.spectrum_row());
@@ -287,14 +294,15 @@ impl Spectra {
         mix(s.parts(n, i, o), &[self.rows[row], self.rows[row + 1]])
     }
 
-    /// The ratios of the Lambertian part and of the conductor of a mix; of other surfaces twice their own.
+    /// Returns the ratios of the Lambertian part and of the conductor of a mix. Other surfaces
+    /// return their own ratios twice.
     pub fn lobes(&self, s: &Surface) -> [Ratios; 2] {
         let row = usize::from(s.spectrum_row());
         let second = row + usize::from(s.is_mixed() && row != 0);
         [self.rows[row], self.rows[second]]
     }
 
-    /// The factor of the brightest wavelength's reflectances at a texel of a surface.
+    /// Returns the factor of the brightest wavelength's reflectances at a texel of a surface.
     #[inline]
     pub fn brightest(&self, surface: usize, texel: [f32; 3]) -> f32 {
         match &self.texels[surface] {
@@ -303,7 +311,7 @@ impl Spectra {
         }
     }
 
-    /// The ratios of a texel of a surface.
+    /// Returns the ratios of a texel of a surface.
     #[inline]
     pub fn texel(&self, surface: usize, texel: [f32; 3]) -> Ratios {
         match &self.texels[surface] {

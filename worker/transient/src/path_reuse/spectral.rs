@@ -1,5 +1,6 @@
-//! Carrying light of several wavelengths to the pixels: as [`super::arrivals`] does it of one, in the same order, so that a main
-//! wavelength that is the brightest everywhere has the bits that it has alone.
+//! Carries light of several wavelengths to the pixels, as [`super::arrivals`] does for one
+//! wavelength. The order is the same, so that a main wavelength that is the brightest everywhere
+//! gives the same bits as it does alone.
 
 use picofarm_scene::Vec3;
 
@@ -16,7 +17,7 @@ use crate::{
     world::Hit,
 };
 
-/// [`Sharing::spread_spectral`].
+/// Arguments of [`Sharing::spread_spectral`].
 struct SpreadSpectral<'a> {
     sharing: &'a Sharing,
     walk: &'a Walk<'a>,
@@ -34,14 +35,15 @@ impl Wide for SpreadSpectral<'_> {
     }
 }
 
-/// Sums of one pixel, all wavelengths of a slot side by side. Every second arrival is summed in `second`.
+/// Sums of one pixel, with all wavelengths of a slot adjacent. Every second arrival is summed in
+/// `second`.
 struct Sums {
     first: Vec<Ratios>,
     second: Vec<Ratios>,
 }
 
 impl Sums {
-    /// What a pixel has already.
+    /// Loads a pixel's previous values.
     fn take(&mut self, film: &Film, pixel: &[f32]) {
         for wavelength in 0..film.wavelengths {
             let from = film.first_channel(wavelength) * film.slots;
@@ -52,7 +54,7 @@ impl Sums {
         }
     }
 
-    /// Gives it back with what came.
+    /// Stores the pixel's values with the additions.
     fn give(&mut self, film: &Film, pixel: &mut [f32]) {
         for wavelength in 0..film.wavelengths {
             let from = film.first_channel(wavelength) * film.slots;
@@ -73,7 +75,7 @@ fn add(to: &mut Ratios, x: Ratios) {
 }
 
 impl Sharing {
-    /// Carries the arrivals to the pixels, where there are several wavelengths.
+    /// Carries the arrivals to the pixels if there are several wavelengths.
     pub(super) fn spread_spectral(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
         widest(SpreadSpectral {
             sharing: self,
@@ -153,7 +155,7 @@ impl Sharing {
     }
 }
 
-/// The ratios of a rough vertex by its lobes; its arrivals are those of a white one.
+/// Returns the ratios of a rough vertex by lobe. Its arrivals are those of a white one.
 fn own(walk: &Walk, y: &Shared) -> [Ratios; 2] {
     match y.rough {
         None => [ONES; 2],
@@ -161,7 +163,8 @@ fn own(walk: &Walk, y: &Shared) -> [Ratios; 2] {
     }
 }
 
-/// The ratios with which a surface with normal `n` scatters from `i` to `o`, from those of its Lambertian part and its conductor.
+/// Returns the ratios with which a surface with normal `n` scatters from `i` to `o`, computed from
+/// those of its Lambertian part and its conductor.
 #[inline(always)]
 fn joined(surface: &Surface, of: &[Ratios; 2], (n, i, o): (Vec3, Vec3, Vec3)) -> Ratios {
     match surface.is_mixed() {
