@@ -17,8 +17,8 @@ const SIDE: u32 = 3;
 /// The maximum number of mirror reflections that are followed.
 const REFLECTIONS: u32 = 2;
 
-/// The minimum distance from the camera that is used to place the lamp, render units, because
-/// squares of much smaller lengths underflow.
+/// The minimum distance from the camera used to place the lamp, render units, because squares of
+/// much smaller lengths underflow.
 const NEAREST: f32 = 1e-9;
 
 /// A disc of light below the ceiling and parallel to it, so that no part of it extends above the

@@ -13,7 +13,7 @@ pub(crate) enum Place {
     Walk,
     /// At a gather point.
     Gather,
-    /// At a vertex after a gather point that is not shared but traced for one pixel alone.
+    /// At a vertex after a gather point, not shared but traced for one pixel alone.
     Alone,
     /// On a walk from a vertex of one pixel.
     AloneWalk,
@@ -68,7 +68,7 @@ pub(crate) fn class_name(class: usize) -> String {
     format!("{place}, {way}")
 }
 
-/// The technique of a contribution that is drawn into the image outside the tiles.
+/// The technique of a contribution drawn into the image outside the tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Technique {
     /// By light paths via near-mirrors.

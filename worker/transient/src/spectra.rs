@@ -36,8 +36,8 @@ pub(crate) fn times(a: Ratios, b: Ratios) -> Ratios {
     std::array::from_fn(|k| a[k] * b[k])
 }
 
-/// Returns the ratios of light of which the Lambertian part and the conductor of a mix scatter the
-/// given amounts.
+/// Returns the ratios of light with the given amounts from the Lambertian part and the conductor of
+/// a mix.
 #[inline(always)]
 pub(crate) fn mix((lambertian, conductor): (f32, f32), of: &[Ratios; 2]) -> Ratios {
     let whole = lambertian + conductor;

@@ -20,7 +20,7 @@ pub(crate) struct Target {
     pub two_sided: bool,
     /// Whether it is near enough to count.
     pub counts: bool,
-    /// Fraction of the arriving light that is scattered on.
+    /// Fraction of the arriving light scattered on.
     pub share: f32,
 }
 

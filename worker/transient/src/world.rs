@@ -469,8 +469,8 @@ impl World {
         self.camera.ray(col + inward(x), row + inward(y))
     }
 
-    /// Returns the row-major index of the pixel whose sensitive square sees a direction in the
-    /// camera's frame.
+    /// Returns the row-major index of the pixel with a sensitive square that sees a direction in
+    /// the camera's frame.
     pub fn pixel(&self, q: Vec3) -> Option<usize> {
         if q.z <= 0.0 {
             return None;

@@ -1,5 +1,5 @@
-//! Rough conductors and mixes, whose vertices pixels share, and near-mirrors between: energies against an independent tracer
-//! of light paths in f64.
+//! Rough conductors and mixes, which have vertices that pixels share, and near-mirrors in between:
+//! energies against an independent tracer of light paths in f64.
 
 mod common;
 
@@ -37,7 +37,8 @@ fn mixed(alpha: f32) -> Material {
     }
 }
 
-/// Paint with a coat and flakes: a Lambertian and conductors of two kinds, with a black rest.
+/// Returns paint with a coat and flakes: a Lambertian and conductors of two kinds, with a black
+/// rest.
 fn flaked() -> Material {
     let part = |weight, lobe| Part { weight, lobe };
     let metal = |alpha, distribution| Lobe::RoughConductor {
@@ -59,7 +60,7 @@ fn flaked() -> Material {
     }
 }
 
-/// A room with two beams' spots far from its edges.
+/// Returns a room with the spots of two beams, far from its edges.
 fn with_spot(objects: Vec<Object>) -> (Scene, Start) {
     let mut s = scene(objects, 24, &[]);
     let p = v(0.5, 0.3, -4.0);
@@ -76,8 +77,8 @@ fn walls(m: &Material) -> Vec<Object> {
     room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), m)
 }
 
-/// Energy of three bounces and more, against the tracer's: within 0.3 % and four standard errors of both, and of exactly
-/// two bounces likewise.
+/// Compares the energy of three bounces and more with the tracer's, within 0.3 % and four standard
+/// errors of both, and likewise that of exactly two bounces.
 #[track_caller]
 fn agrees(what: &str, objects: Vec<Object>, (passes, paths): (u32, usize)) {
     let (s, start) = with_spot(objects);

@@ -1,4 +1,5 @@
-//! Materials of several parts: the sum of their parts, however light is found.
+//! Materials of several parts: they equal the sum of their parts, whatever technique finds the
+//! light.
 
 mod common;
 #[path = "../benches/stop/scenes.rs"]
@@ -29,7 +30,7 @@ fn metal(alpha: f32, reflectance: f32) -> Lobe {
     }
 }
 
-/// The same surface, said as one of several parts: each part in two halves.
+/// Returns the same surface, stated as one of several parts: each part in two halves.
 fn said_otherwise(bsdf: Bsdf) -> Bsdf {
     let halves = |share: f32, lobe| [(0.5 * share, lobe), (0.5 * share, lobe)];
     match bsdf {
@@ -72,8 +73,9 @@ fn each_material(scene: &mut Scene, mut change: impl FnMut(&mut Material)) {
     }
 }
 
-/// Mean energy of renders in which a scene shall be the same, and its standard error: the stated one, or that of their scatter where
-/// it is larger. Highlights in narrow lobes are rare and bright, so that one render states too little now and then.
+/// Returns the mean energy of renders that must agree, and its standard error: the stated one, or
+/// that of their spread if it is larger. Highlights in narrow lobes are rare and bright, so one
+/// render occasionally states too small an error.
 fn mean(all: &[Rendered], of: impl Fn(&[f32]) -> f64) -> (f64, f64) {
     let n = all.len() as f64;
     let each: Vec<f64> = all.iter().map(|r| of(&r.transient)).collect();
@@ -84,7 +86,7 @@ fn mean(all: &[Rendered], of: impl Fn(&[f32]) -> f64) -> (f64, f64) {
     (mean, stated.max(scatter).sqrt())
 }
 
-/// Energies of renders, of the whole image and of its thirds, in which a scene shall be the same.
+/// Checks that the energies of renders agree, of the whole image and of its thirds.
 fn same(what: &str, (a, b): (&[Rendered], &[Rendered])) {
     let ((_, of_a), (e, of_b)) = (mean(a, energy), mean(b, energy));
     let se = of_a.hypot(of_b) / e;
@@ -123,7 +125,7 @@ fn a_material_said_in_more_parts_is_the_same_material() {
                 max_bounces,
                 ..settings(Budget::Samples(passes))
             };
-            // Two bounces alone take little time, and are sure of their error after several renders.
+            // Two bounces alone take little time, and several renders give a reliable error.
             let renders = if max_bounces.is_some() { 4 } else { 1 };
             let of = |scene: &Scene, first: u64| -> Vec<Rendered> {
                 let seeds = first..first + renders;
@@ -216,11 +218,11 @@ fn two_near_mirrors_in_one_surface_reflect_as_each_does_by_its_share() {
         (energy(&r.transient), f64::from(r.error.total_relative))
     };
     let (all, a, b) = (of(both, 1), of(smooth, 2), of(rough, 3));
-    // Light that meets the pane twice is not linear in it; it is little.
+    // Light that hits the pane twice is not linear in it, but there is little of it.
     let expected = (a.0 + 2.0 * b.0) / 3.0;
     let se = (all.1.powi(2) + (0.34 * a.1).powi(2) + (0.67 * b.1).powi(2)).sqrt();
     near("both", all.0, expected, 0.002, se * expected);
-    // Aimed at or not, it is the same.
+    // The result is the same with and without aiming.
     let unaimed = Settings {
         strategy: Strategy {
             mirror_images: Some(false),
@@ -292,7 +294,7 @@ fn what_is_black_of_several_parts_brings_nothing_and_harms_nothing() {
         "half black",
         (&[of(half, true, &set)], &[of(grey, true, &set)]),
     );
-    // From behind a one-sided surface nothing comes back.
+    // A one-sided surface reflects nothing from behind.
     let mut behind = scene(
         vec![quad(
             v(-2.0, -1.5, -3.0),
@@ -333,6 +335,7 @@ fn spots_on_walls_of_several_parts_count_once() {
     };
     let expected = "light paths: 5 spots close beside other surfaces";
     assert_eq!(beside("parts-lambertian"), expected);
-    // Each of the same spots is two sources there. Counted apart the zones would reach half as far, and three spots have one.
+    // Each of the same spots is two sources there. If these were counted separately, the zones
+    // would reach half as far, and three spots have one.
     assert_eq!(beside("parts"), expected);
 }

@@ -1,4 +1,5 @@
-//! Several wavelengths in one pass: every one of them is the render of a scene that reflects as it does there.
+//! Several wavelengths in one pass: each of them equals the render of a scene with the reflectances
+//! of that wavelength.
 
 mod common;
 #[path = "../benches/stop/scenes.rs"]
@@ -24,7 +25,7 @@ fn row(nm: f64, reflectance: f32, specular: Option<f32>) -> SpectrumPoint {
     }
 }
 
-/// Changes every material of a scene; `number` counts them.
+/// Changes every material of a scene. `number` counts the materials.
 fn each_material(scene: &mut Scene, mut change: impl FnMut(usize, &mut Material)) {
     let mut number = 0;
     for object in &mut scene.objects {
@@ -35,7 +36,7 @@ fn each_material(scene: &mut Scene, mut change: impl FnMut(usize, &mut Material)
     }
 }
 
-/// Reflectances that differ from material to material and from wavelength to wavelength.
+/// Returns reflectances that differ from material to material and from wavelength to wavelength.
 fn spectrum(number: usize, m: &Material) -> Vec<SpectrumPoint> {
     let mixed = matches!(m.bsdf, Bsdf::Mixed { .. });
     let share = |k: usize| 0.15 + 0.8 * ((number * 7 + k * 5) % 11) as f32 / 10.0;
@@ -43,7 +44,7 @@ fn spectrum(number: usize, m: &Material) -> Vec<SpectrumPoint> {
     vec![at(2), at(1), at(0)]
 }
 
-/// A scene by its name in the benches, with a spectrum for every material.
+/// Returns a scene by its name in the benches, with a spectrum for every material.
 fn coloured(name: &str, pixels: u32) -> Scene {
     let (_, mut scene) = scenes::all(pixels)
         .into_iter()
@@ -53,7 +54,7 @@ fn coloured(name: &str, pixels: u32) -> Scene {
     scene
 }
 
-/// The scene as it is at one wavelength, without spectra.
+/// Returns the scene at one wavelength, without spectra.
 fn alone(scene: &Scene, nm: f64) -> Scene {
     let mut scene = scene.clone();
     each_material(&mut scene, |_, m| {
@@ -84,7 +85,7 @@ fn bits(h: &[f32]) -> Vec<u32> {
     h.iter().map(|x| x.to_bits()).collect()
 }
 
-/// Everything that has a value of its own at the main wavelength.
+/// Returns all values of the main wavelength.
 fn main_bits(r: &Rendered) -> Vec<Vec<u32>> {
     let s = r.split.as_ref().unwrap();
     let all = [
@@ -149,7 +150,8 @@ fn one_wavelength_is_a_scene_of_its_reflectances_to_the_bit() {
     }
 }
 
-/// Gives every material what it reflects anyway at the first wavelength, and `share(number, wavelength)` of it at the others.
+/// Gives every material its existing reflectance at the first wavelength, and `share(number,
+/// wavelength)` of it at the others.
 fn darken(scene: &mut Scene, share: impl Fn(usize, usize) -> f32) {
     each_material(scene, |number, m| {
         let (lambertian, conductor) = match m.bsdf {
@@ -237,12 +239,13 @@ fn darker_wavelengths_change_no_bit_of_the_main_one() {
     }
 }
 
-/// `PICOFARM_EFFORT`: as many times as many passes.
+/// Returns `PICOFARM_EFFORT`, the factor by which passes are multiplied.
 fn effort() -> u32 {
     std::env::var("PICOFARM_EFFORT").map_or(1, |n| n.parse().expect("PICOFARM_EFFORT is a number"))
 }
 
-/// What each wavelength brings, beside a render of the scene that reflects so and has another seed.
+/// Compares the light of each wavelength with a render of the scene that has those reflectances and
+/// another seed.
 fn compare(what: &str, s: &Scene, passes: u32, set: &Settings) {
     let set = Settings {
         budget: Budget::Samples(passes * effort()),
@@ -259,7 +262,8 @@ fn compare(what: &str, s: &Scene, passes: u32, set: &Settings) {
             0 => (&all.transient, &alone.transient),
             _ => (&all.others[k - 1].transient, &alone.transient),
         };
-        // Paths are those of the brightest reflectances: no wavelength has rarer ones, but their weights spread more.
+        // Paths are drawn by the brightest reflectances: no wavelength has rarer ones, but their
+        // weights vary more.
         let se = f64::from(all.error.total_relative).hypot(f64::from(alone.error.total_relative));
         near(
             &format!("{what}, {nm} nm"),
@@ -309,7 +313,7 @@ fn each_wavelength_is_the_render_of_a_scene_that_reflects_so() {
 fn wide_beams_and_spots_beside_walls_have_their_wavelengths() {
     let s = {
         let mut s = coloured("everything", 18);
-        // A spot that all but touches the corner of the room.
+        // A spot that almost touches the corner of the room.
         s.laser.beams[0].direction = v(1.999, 1.2, -3.995).normalized();
         s
     };
@@ -326,14 +330,14 @@ fn wide_beams_and_spots_beside_walls_have_their_wavelengths() {
     compare("beside a wall", &s, 192, &settings(Budget::Samples(1)));
 }
 
-/// A grey room, with a wall of one or several materials.
+/// Returns a grey room with a wall of one or several materials.
 fn with_wall(wall: Vec<Object>) -> Scene {
     let mut all = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.5));
     all.extend(wall);
     scene(all, 18, &[v(0.4, 0.2, -1.0), v(-0.5, 0.3, -1.0)])
 }
 
-/// An upright strip of the wall between two shares of its width.
+/// Returns an upright strip of the wall between two fractions of its width.
 fn strip((from, to): (f32, f32), m: Material) -> Object {
     let (left, right) = (4.0 * from - 2.0, 4.0 * (to - from));
     quad(v(left, -1.5, -3.0), v(right, 0.0, 0.0), v(0.0, 3.0, 0.0), m)
@@ -352,7 +356,7 @@ fn a_texture_colours_each_wavelength_by_its_own_channels() {
     let set = settings(Budget::Samples(128));
     let all = ok(&with_wall(vec![wall]), &at(&nm, set.clone()));
     for (k, nm) in nm.into_iter().enumerate() {
-        // Red, blue, and the mean of the three channels, laid out in strips that each are of one reflectance.
+        // Red, blue, and the mean of the three channels, as strips of one reflectance each.
         let reflectance = |u: f32| {
             let texel = texture.at([u, 0.5]);
             let mean = |c: [f32; 3]| (c[0] + c[1] + c[2]) / 3.0;
@@ -454,7 +458,8 @@ fn a_black_wavelength_is_black_and_harms_no_other() {
     let without = ok(&s, &at(&[905.0], set.clone()));
     assert_eq!(energy(&with.others[0].transient), 0.0);
     assert!(main_bits(&with) == main_bits(&without));
-    // As the main one it has no light to be found by: what its paths carry is the other's.
+    // As the main wavelength, it has no light that paths can be drawn by: its paths carry the light
+    // of the other wavelength.
     let first = ok(&s, &at(&[300.0, 905.0], set));
     assert_eq!(energy(&first.transient), 0.0);
     let (a, b) = (

@@ -17,9 +17,9 @@ use crate::{
 /// The minimum and maximum number of walks from a shared vertex, on average.
 const WALKS: (f32, f32) = (0.2, 6.0);
 
-/// Selects the spots of which a vertex carries the light on. A rough vertex weighs each arrival for
-/// each pixel, so if there are many spots, some are drawn by contribution (systematic sampling),
-/// each with its share of the sum.
+/// Selects the spots that a vertex carries light from. A rough vertex weighs each arrival for each
+/// pixel, so if there are many spots, some are drawn by contribution (systematic sampling), each
+/// with its share of the sum.
 struct Carry {
     /// Weight between two draws; 0 if all spots are carried unchanged.
     step: f32,

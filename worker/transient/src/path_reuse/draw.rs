@@ -64,8 +64,8 @@ impl Sharing {
         }
     }
 
-    /// Connects every gather point that is not near to every light vertex in a zone: one narrow
-    /// bundle of rays each.
+    /// Connects every gather point outside the zones' surroundings to every light vertex in a zone:
+    /// one narrow bundle of rays each.
     fn connect_near(
         &mut self,
         (walk, film, contacts): (&Walk, &Film, &Contacts),

@@ -12,7 +12,7 @@ use crate::api::ErrorEstimate;
 /// part is pooled.
 pub(super) const MULTI_REACH: usize = 3;
 pub(super) const TWO_REACH: usize = 1;
-/// Fraction of a pixel's mean variance that is added to every bin.
+/// Fraction of a pixel's mean variance added to every bin.
 const FLOOR: f32 = 0.003;
 /// Weight of a bin's own sample variance, because edges and peaks differ from their neighbours.
 /// Without it the brightest bins deviate by 1.25 to 1.4 of the stored error.

@@ -61,7 +61,7 @@ struct Sparse<V> {
     values: Vec<V>,
 }
 
-/// A contribution that is not in the sums yet.
+/// A contribution that has not been added to the sums.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Waiting {
     /// Pixel within the block.

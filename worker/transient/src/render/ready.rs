@@ -37,7 +37,7 @@ const MOST_SPOTS: usize = 1 << 16;
 /// The number of rows from which the rays of the ground truth are forecast.
 const ROWS: usize = 128;
 
-/// A scene that is ready to be traced.
+/// A scene prepared for tracing.
 pub(super) struct Ready<'a> {
     pub scene: &'a Scene,
     pub settings: &'a Settings,
@@ -141,7 +141,7 @@ pub(super) fn prepare<R>(
     stop.check()?;
     walk.caustics = caustics.as_ref();
     // Few spots light few bins, so the error of the light that pixels share is as large there as
-    // that of the light each finds alone. The same holds in a narrow gate.
+    // that of the light each finds alone. A narrow gate is similar.
     let many = contact::many(emitters) && !narrow;
     let reflectors = many.then(|| Reflectors::find(&world)).flatten();
     walk.reflectors = reflectors.as_ref();

@@ -79,8 +79,7 @@ pub(super) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
     }
 }
 
-/// Returns the reason why a gate sees no light, if that is certain beforehand because all light
-/// arrives after its end.
+/// Returns the reason why a gate sees no light, if all light arrives after its end.
 pub(super) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<String> {
     let end = end(gate);
     let first = arrivals?.first;

@@ -1,4 +1,5 @@
-//! Sums over adjacent bins, cuts along the time axis, and the time-integrated image. Arrays are `[pixel][bin]`.
+//! Sums over adjacent bins, cuts along the time axis, and the time-integrated image. Arrays are
+//! `[pixel][bin]`.
 
 use std::ops::Range;
 
