@@ -87,7 +87,7 @@ struct Shared {
     /// The range of its arrivals.
     first: usize,
     end: usize,
-    /// The scattering of a surface that is not Lambertian. Its arrivals are those of a white
+    /// The scattering of a surface other than Lambertian. Its arrivals are those of a white
     /// Lambertian surface at the same place.
     rough: Option<Surface>,
 }

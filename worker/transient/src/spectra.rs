@@ -135,7 +135,8 @@ impl<'a> Builder<'a> {
     }
 
     /// Joins parts so that few remain to choose from. The Lambertian parts become one, combined
-    /// with each conductor that pixels can share vertices of, in proportion to its reflectance.
+    /// with each conductor that is wide enough for shared vertices, in proportion to its
+    /// reflectance.
     fn joined(&mut self, parts: Vec<Surface>) -> Result<Vec<Surface>, RenderError> {
         let (lambertians, conductors): (Vec<Surface>, Vec<Surface>) = parts
             .into_iter()

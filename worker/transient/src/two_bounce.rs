@@ -36,7 +36,7 @@ fn strata(pixel: f32) -> f32 {
 /// The sampling density of pixels.
 #[derive(Debug, Clone)]
 pub(crate) struct Sampling {
-    /// Strata per side in an ordinary pixel that go with 64 camera paths, before rounding.
+    /// Strata per side in an ordinary pixel that go with 16 camera paths, before rounding.
     base: f32,
     /// Row-major: the pixel or one of its neighbours shows a mirror or is in a mirror spot's beam.
     /// Decided from the centres alone, hence independent of the samples: no bias.

@@ -52,9 +52,9 @@ impl Vertex {
     /// Returns the roughness threshold for light paths to this vertex: those with a smoother first
     /// near-mirror end on a vertex up to here.
     ///
-    /// All of them end on a vertex that the camera sees directly, and on one with a predecessor
-    /// that is not a near-mirror. On a vertex that the camera sees only in near-mirrors, the light
-    /// paths end that pay off there.
+    /// All of them end on a vertex that the camera sees directly, and on one that follows another
+    /// vertex outside near-mirrors. On a vertex that the camera sees only in near-mirrors, the
+    /// light paths end that pay off there.
     #[inline]
     pub fn open(&self) -> f32 {
         let Sight {

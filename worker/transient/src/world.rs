@@ -24,8 +24,8 @@ use crate::{
 const WIDEST_M: f64 = 1e9;
 const NARROWEST_M: f64 = 1e-6;
 
-/// The largest number of pieces that cutting may add to the one piece per triangle. A piece takes
-/// some hundred bytes.
+/// The maximum number of pieces that cutting may add, beyond one per triangle. A piece takes some
+/// hundred bytes.
 const MOST_PIECES: usize = 1 << 22;
 
 /// Geometry, materials and camera in render units.

@@ -85,8 +85,8 @@ fn glass_that_takes_nothing_changes_no_bit() {
 
 #[test]
 fn glass_around_the_laser_takes_the_same_of_all_light() {
-    // The laser and the camera are at different places: the camera looks out of the closed glass
-    // box, and the laser is outside it.
+    // The laser is not at the camera here: a closed glass box surrounds the laser, and the camera
+    // is outside it.
     let half = glass(1.0, 0.5);
     let mut clear = furnished(vec![]);
     clear.laser.origin = v(0.5, 0.2, 0.1);
@@ -101,8 +101,8 @@ fn glass_around_the_laser_takes_the_same_of_all_light() {
         ..settings(Budget::Samples(4))
     };
     let (a, b) = (ok(&clear, &set), ok(&dim, &set));
-    // The box hides part of the room's light from other parts as well, so one and two bounces are
-    // compared separately.
+    // The box also dims light between other parts of the room, but most light of one and two
+    // bounces passes by it.
     let two = |r: &picofarm_transient::Rendered| r.split.as_ref().unwrap().two.clone();
     let (a2, b2) = (two(&a), two(&b));
     let mut halves = 0;
@@ -163,8 +163,8 @@ fn black_glass_hides_light_and_no_surface() {
     let (a, b) = (ok(&clear, &set), ok(&dark, &set));
     assert!(a.truth.depth == b.truth.depth);
     assert!(energy(&b.transient) < energy(&a.transient));
-    // Pixels that see only the far wall, and whose neighbours do too. Others see the edge of the
-    // ball, which is partly in front.
+    // Pixels that see only the far wall, like their neighbours. Others see the edge of the ball,
+    // which is partly in front.
     let far = |row: usize, col: usize| {
         let around = |k: usize| k.saturating_sub(1)..=(k + 1).min(15);
         around(row).all(|r| around(col).all(|c| b.truth.depth[16 * r + c] > 3.6))

@@ -533,8 +533,8 @@ fn copies_of_one_triangle_without_number_are_served_in_time() {
     assert!(one.transient == all.transient);
 }
 
-/// A closed box of a millimetre around the camera, and sheets of millions of kilometres behind it,
-/// each of which would be cut into hundreds of pieces.
+/// A closed box of a millimetre around the camera, and sheets of millions of kilometres behind it.
+/// Each sheet would be cut into hundreds of pieces.
 #[test]
 fn more_pieces_of_huge_triangles_than_fit_are_refused_by_name() {
     let mut objects = common::room(

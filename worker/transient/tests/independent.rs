@@ -136,7 +136,7 @@ fn mirrored(beams: &[Vec3]) -> Scene {
 /// Glass that reflects nothing, because near-mirrors together with reflections at glass need the
 /// machinery of both sides at once.
 ///
-/// The room has a slanted partition across it, a show-case with front faces of its own and a curved
+/// The room has a slanted partition across it, a show-case of single pane faces with a curved
 /// near-mirror in it, a window in front of the mirror, and one between the laser and a spot. A spot
 /// in a corner behind the partition has a zone. `independent_glass.rs` tests reflecting glass.
 #[test]

@@ -7,8 +7,8 @@ use common::{energy, grey, near, object, ok, room, scene, settings, two_only, v}
 use picofarm_scene::{Material, Mesh, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Rendered, Settings};
 
-/// Longest side of a triangle that is never cut, whatever its width: the tip of a spike stays a
-/// needle at any size.
+/// Longest side of a triangle that is not cut at any width: the tip of a spike stays a needle at
+/// any size.
 const SHORT: f32 = 0.005;
 
 /// Returns the object with every triangle halved along its longest side until none is longer than

@@ -60,7 +60,7 @@ fn flaked() -> Material {
     }
 }
 
-/// Returns a room with the spots of two beams, far from its edges.
+/// Returns a room with a beam's spot far from its edges, and the start of its light.
 fn with_spot(objects: Vec<Object>) -> (Scene, Start) {
     let mut s = scene(objects, 24, &[]);
     let p = v(0.5, 0.3, -4.0);

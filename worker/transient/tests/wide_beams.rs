@@ -1,6 +1,6 @@
 //! Beams with a width: the width of their spots, their light at edges, via mirrors and through
-//! glass, and the light that is scattered from the spots, compared with beams without a width drawn
-//! at random from the same Gaussian.
+//! glass, and the light scattered from the spots, compared with beams without a width drawn at
+//! random from the same Gaussian.
 
 mod common;
 

@@ -63,7 +63,7 @@ impl Sharing {
     /// The number of walks is proportional to the part of their light that the gather points
     /// receive: the square root of the sum of the squared weights, normalised so that 1 is a vertex
     /// that sends its light equally to all of them. Light for a rough vertex is drawn by its
-    /// scattering to a gather point that is drawn by the same weights.
+    /// scattering to a gather point drawn by the same weights.
     pub(super) fn light_up(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),

@@ -64,7 +64,7 @@ impl Sharing {
         }
     }
 
-    /// Connects every gather point outside the zones' surroundings to every light vertex in a zone:
+    /// Connects every gather point that is not near a zone to every light vertex in a zone, with
     /// one narrow bundle of rays each.
     fn connect_near(
         &mut self,
@@ -124,8 +124,9 @@ impl Sharing {
         }
     }
 
-    /// Draws vertices by the scattering of gather points in turn: `count` vertices, of which those
-    /// that can be shared become candidates, and `extra` times more for those that cannot.
+    /// Draws vertices by the scattering of gather points in turn: `count` vertices, which become
+    /// candidates for shared vertices if they can be shared, and `extra` more for surfaces that
+    /// cannot.
     ///
     /// Vertices that cannot be shared are walked on for their own pixel. They have most of the
     /// variance and cost little compared to the shared work. They are walked on for one in `times`

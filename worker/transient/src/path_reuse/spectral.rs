@@ -1,6 +1,6 @@
 //! Carries light of several wavelengths to the pixels, as [`super::arrivals`] does for one
-//! wavelength. The order is the same, so that a main wavelength that is the brightest everywhere
-//! gives the same bits as it does alone.
+//! wavelength. The order is the same, so if the main wavelength is the brightest everywhere, it has
+//! the same bits as it does alone.
 
 use picofarm_scene::Vec3;
 

@@ -25,8 +25,8 @@ use crate::{
 
 /// Rows of pixels per block of sums.
 const ROWS: u32 = 16;
-/// A block is merged once at least this many contributions wait in it, and at least this fraction
-/// (1/`SHARE`) of the number of its sums.
+/// A block is merged when its waiting contributions reach `LEAST` plus 1/`SHARE` of the number of
+/// its sums.
 const LEAST: usize = 4096;
 const SHARE: usize = 4;
 
@@ -82,7 +82,8 @@ pub(super) struct Found<'a> {
     /// Σ over the gate of the variance before pooling, and draws of the error if the pixel is
     /// watched; both in metres².
     own: (f64, Option<Draw>),
-    /// Factors from the sums to the mean and to a draw of its error, and from render units to metres.
+    /// Factors from the sums to the mean and to a draw of its error, and from render units to
+    /// metres.
     mean: (f64, f64),
     noise: f64,
     unit: f64,

@@ -167,7 +167,7 @@ pub fn render_part(
 /// Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render`], and [`RenderError::Invalid`] naming the part that is
+/// Returns the errors of [`crate::render`], and [`RenderError::Invalid`] naming a part that is
 /// missing, duplicated, or from another scene or other settings.
 pub fn join_parts(
     scene: &Scene,

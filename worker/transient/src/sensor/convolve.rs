@@ -55,7 +55,7 @@ impl Convolver {
         };
         let end = h.iter().rposition(|h| *h != 0.0).map_or(0, |i| i + 1);
         self.padded.fill(0.0);
-        // Bin b is at b + lead, if that is within the buffer.
+        // Bin b is at b + lead, if the buffer includes it.
         let skipped = (start as i64 + self.lead).min(0).unsigned_abs() as usize;
         let at = (start as i64 + self.lead).max(0) as usize;
         let seen = h[start..end].iter().skip(skipped);

@@ -183,10 +183,10 @@ fn stirling_rest(k: f64) -> f64 {
     (1.0 / 12.0 - (1.0 / 360.0 - (1.0 / 1260.0 - r / 1680.0) * r) * r) / k
 }
 
-/// Returns a binomial count of `n` trials, each of which succeeds with probability 1 −
-/// exp(−`rate`); exact for n up to 2⁴⁰. It uses inversion below 10 expected counts, and from there
-/// Hörmann's BTRS ("The generation of binomial random variates", Journal of Statistical Computation
-/// and Simulation 46, 1993). Returns 0 if the rate is not above 0.
+/// Returns a binomial count of `n` trials with success probability 1 − exp(−`rate`); exact for n up
+/// to 2⁴⁰. It uses inversion below 10 expected counts, and from there Hörmann's BTRS ("The
+/// generation of binomial random variates", Journal of Statistical Computation and Simulation 46,
+/// 1993). Returns 0 if the rate is not above 0.
 pub fn binomial(n: u64, rate: f64, draws: &mut Draws) -> u64 {
     if n == 0 || rate.is_nan() || rate <= 0.0 {
         return 0;

@@ -68,11 +68,11 @@ pub struct Sensed {
     pub peak_photons: Option<f64>,
     /// Bins by which the pulse was shifted (`sb3d_compat` jitter; otherwise 0).
     pub shift_bins: i64,
-    /// Expected photons that are not in the image.
+    /// Expected photons missing from the image.
     pub dropped: Dropped,
 }
 
-/// Expected photons that are not in the image, of all pixels.
+/// Expected photons missing from the image, of all pixels.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Dropped {
     /// Photons moved out of the gate by pulse and jitter.
@@ -107,9 +107,9 @@ enum Fault {
 /// rayon's current pool.
 ///
 /// # Errors
-/// Returns [`SensorError::Invalid`] for an unusable setting, shapes that do not agree, a value of h
-/// that is negative or not finite, a transient with light but no peak to scale by, or a bin of more
-/// than 10⁹ photons (2³² after rebinning).
+/// Returns [`SensorError::Invalid`] for an unusable setting, shapes that do not agree, a negative
+/// or non-finite value of h, a transient with light but no peak to scale by, or a bin of more than
+/// 10⁹ photons (2³² after rebinning).
 pub fn sense(
     sensor: &Sensor,
     h: &Histograms<'_>,

@@ -165,8 +165,8 @@ impl Brute {
         (f(x.bsdf, x.n, wo, w) * cx * intensity / (d * d), path + d)
     }
 
-    /// Averages over a pixel a function of the seen points, by `n`×`n` midpoints. Points without a
-    /// surface count 0.
+    /// Calls `value` with the surface point seen at each of `n`×`n` midpoints of a pixel, and the
+    /// direction back. Midpoints without a surface are skipped.
     pub fn pixel(&self, col: usize, row: usize, n: usize, mut value: impl FnMut(&Point, P)) {
         for k in 0..n * n {
             let at = |i: usize| (i as f64 + 0.5) / n as f64;

@@ -122,7 +122,7 @@ impl Draw {
     }
 }
 
-/// A leg of a path, up to the next surface that is not glass.
+/// A leg of a path, up to the next surface other than glass.
 #[derive(Debug, Clone, Copy)]
 pub struct Leg {
     pub end: Vertex,

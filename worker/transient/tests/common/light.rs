@@ -1,11 +1,11 @@
 //! An independent tracer in f64.
 //!
-//! Light paths start at a spot and scatter as the surfaces do, and each vertex that is not on a
-//! near-mirror is connected to the camera. Light that the camera sees in near-mirrors is traced
-//! from the camera's side: the glint of a spot by points drawn around its mirror image, all other
-//! light by camera paths (both in [`super::seen`]). Glass is in [`super::glass`], and light that
-//! the camera sees by its reflection and refraction in [`super::bent`]. The tracer shares no code
-//! with the renderer.
+//! Light paths start at a spot and scatter as the surfaces do, and each vertex outside near-mirrors
+//! is connected to the camera. Light that the camera sees in near-mirrors is traced from the
+//! camera's side: the glint of a spot by points drawn around its mirror image, all other light by
+//! camera paths (both in [`super::seen`]). Glass is in [`super::glass`], and light that the camera
+//! sees by its reflection and refraction in [`super::bent`]. The tracer shares no code with the
+//! renderer.
 
 use std::f64::consts::PI;
 

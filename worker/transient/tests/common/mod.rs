@@ -204,8 +204,8 @@ pub fn beam_to(point: Vec3, normal: Vec3, object: u32) -> Beam {
     }
 }
 
-/// Returns a camera at `origin` with an image that is exactly the parallelogram that `corner`,
-/// `right` and `down` span (at right angles to each other, seen at a right angle).
+/// Returns a camera at `origin`. Its image is exactly the parallelogram that `corner`, `right` and
+/// `down` span (at right angles to each other, seen at a right angle).
 pub fn framed(origin: Vec3, corner: Vec3, right: Vec3, down: Vec3, (w, h): (u32, u32)) -> Camera {
     let (r, d) = (right.normalized(), down.normalized());
     let forward = r.cross(d);
