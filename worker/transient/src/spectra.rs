@@ -135,7 +135,7 @@ impl<'a> Builder<'a> {
     }
 
     /// Joins parts so that few remain to choose from. The Lambertian parts become one, combined
-    /// with each conductor that is wide enough for shared vertices, in proportion to its
+    /// with each conductor wide enough for shared vertices, in proportion to its
     /// reflectance.
     fn joined(&mut self, parts: Vec<Surface>) -> Result<Vec<Surface>, RenderError> {
         let (lambertians, conductors): (Vec<Surface>, Vec<Surface>) = parts

@@ -252,6 +252,6 @@ fn glints_of_curved_and_angled_mirrors_have_the_energy_of_an_independent_tracer(
         v(-0.3, 0.35, -1.0),
         v(0.05, -0.1, -1.0),
     ];
-    // Three bounces and more are found by chance alone here, on both sides.
+    // Some light of three bounces and more is found by chance alone here, on both sides.
     agrees("angled", &scene(objects, PIXELS, &beams), 1);
 }
