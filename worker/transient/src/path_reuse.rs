@@ -1,16 +1,17 @@
 //! Path reuse: three bounces and more for a tile of neighbouring pixels at once.
 //!
-//! Every pixel of a tile brings one *gather point*: the first surface point along a camera path that is
-//! not a near-mirror. *Shared vertices* are drawn from the gather points' scattering and from the spots',
-//! and every gather point is connected to every shared vertex (Bekaert, Sbert and Halton, EGWR 2002;
-//! vertices from the light side as in Segovia et al., EGSR 2006). They are chosen among several times as
-//! many candidates, by the direct light that each is likely to bring. A shared vertex sends out its direct
-//! light from all spots, found exactly, and what random walks bring, more of them where the gather points
-//! take more of it: one shadow ray carries a whole list of arrivals to a pixel. All ways of drawing a
-//! shared vertex are joined by the balance heuristic with visibility in the densities, so both 1/d²
+//! Every pixel of a tile has one *gather point*: the first surface point along a camera path that
+//! is not a near-mirror. *Shared vertices* are drawn from the scattering of the gather points and
+//! of the spots, and every gather point is connected to every shared vertex (Bekaert, Sbert and
+//! Halton, EGWR 2002; vertices from the light side as in Segovia et al., EGSR 2006). They are
+//! chosen among several times as many candidates, by the direct light that each is likely to bring.
+//! A shared vertex sends out its direct light from all spots, computed exactly, and the light that
+//! random walks bring. It starts more walks if the gather points receive more of its light. One
+//! shadow ray carries a whole list of arrivals to a pixel. All techniques that draw a shared vertex
+//! are combined by the balance heuristic with visibility in the densities, so both 1/d²
 //! singularities, at the gather point and at the spot, stay bounded.
 //!
-//! What only one pixel can see, namely light by way of a near-mirror or a glossy surface, is walked for
+//! Light that only one pixel can see, namely via a near-mirror or a glossy surface, is walked for
 //! that pixel alone.
 
 mod arrivals;
@@ -51,51 +52,57 @@ use crate::{
     world::Hit,
 };
 
-/// Camera paths of a pass by way of near-mirrors alone, where a pixel sees one: few of them meet a narrow lobe that a spot
-/// lights, and a single one in a pass made that light a rare event of many times the image's error.
+/// Camera paths per pass through near-mirrors alone, for pixels that see one. Few of them hit a
+/// narrow lobe that a spot lights, and with a single path per pass that light was a rare event of
+/// many times the image's error.
 const MIRROR_PATHS: u32 = 16;
-/// Light vertices beyond near-mirrors that a gather point is connected to at most.
+/// The maximum number of light vertices beyond near-mirrors that a gather point is connected to.
 const BEYOND: u32 = 2;
-/// The same of a near-mirror that the camera sees, and how many of a pixel's camera paths there are to one that is connected.
+/// Like `BEYOND`, for a near-mirror that the camera sees. One in `SHOWING` of a pixel's camera
+/// paths is connected.
 const SHOWN: u32 = 2;
 const SHOWING: u32 = 4;
-/// Light paths of a pass in all zones beside spots, and at least and at most in one.
+/// Light paths per pass in all zones near spots, and the minimum and maximum in one zone.
 const ALL_ZONES: u32 = 64;
 const ZONE_PATHS: (u32, u32) = (4, 16);
-/// Light vertices in zones that a near-mirror is connected to at most.
+/// The maximum number of light vertices in zones that a near-mirror is connected to.
 const BESIDE: u32 = 2;
-/// Light vertices on conductors that are not shared that a gather point is connected to at most.
+/// The maximum number of light vertices on unshared conductors that a gather point is connected to.
 const GLOSSY: u32 = 2;
-/// Spots whose light at a rough vertex is carried to the pixels, at most: drawn by contribution.
+/// The maximum number of spots for which the light at a rough vertex is carried to the pixels. They
+/// are drawn by contribution.
 const ROUGH_SPOTS: usize = 32;
 
 /// A vertex that all gather points of a tile share.
 #[derive(Debug, Clone, Copy)]
 struct Shared {
     hit: Hit,
-    /// For how many candidates it counts.
+    /// The number of candidates that it represents.
     counts: f32,
-    /// Expected number of such candidates per area, from the spots' side and in a narrow gate's shells.
+    /// The expected number of such candidates per area, from the spots' side and in a narrow gate's
+    /// shells.
     light: f32,
-    /// Its arrivals.
+    /// The range of its arrivals.
     first: usize,
     end: usize,
-    /// How a surface that is not Lambertian scatters; its arrivals are those of a white Lambertian in its place.
+    /// The scattering of a surface other than Lambertian. Its arrivals are those of a white
+    /// Lambertian surface at the same place.
     rough: Option<Surface>,
 }
 
-/// By what light is drawn at a rough vertex: by how it scatters towards one of the gather points, half of it or more
-/// as a Lambertian does, so that none is rare. What is found is carried as for a white Lambertian.
+/// Guides the drawing of light at a rough vertex: by its scattering towards one of the gather
+/// points, at least half of it as a Lambertian surface scatters, so that no direction is rare. The
+/// contributions are carried as for a white Lambertian surface.
 #[derive(Debug, Clone, Copy)]
 struct Guide {
     surface: Surface,
     n: Vec3,
-    /// Unit direction to that gather point.
+    /// Unit direction to the gather point.
     to: Vec3,
 }
 
 impl Guide {
-    /// White Lambertian's light over the guide's, from direction `w`.
+    /// Returns the ratio of a white Lambertian surface's light to the guide's, from direction `w`.
     #[inline]
     fn share(&self, w: Vec3) -> f32 {
         let guided = self.surface.scatter(self.n, self.to, w);
@@ -108,7 +115,7 @@ impl Guide {
 }
 
 impl Shared {
-    /// A vertex, if it can be shared.
+    /// Returns a shared vertex, or `None` if the hit cannot be shared.
     fn new(mut hit: Hit) -> Option<Self> {
         if !hit.surface.is_shared() || hit.surface.is_black() {
             return None;
@@ -128,17 +135,19 @@ impl Shared {
     }
 }
 
-/// What arrives at shared vertices and goes on, per unit solid angle, to every side. Those of a vertex begin with a group of [`SIDE`],
-/// and behind its last one lies nothing up to the end of a group.
+/// The light that arrives at shared vertices and is scattered on, per unit solid angle, to every
+/// side.
+///
+/// The arrivals of a vertex begin at a group of [`SIDE`], and its last group is padded with zeros.
 #[derive(Debug, Default)]
 struct Arrivals {
-    /// Optical path from the laser, in bins.
+    /// Optical path length from the laser, in bins.
     bins: Vec<f32>,
     value: Vec<f32>,
     spot: Vec<u16>,
-    /// Bounces of the whole path where the gather point is the first.
+    /// Bounces of the whole path if the gather point is the first.
     bounces: Vec<u8>,
-    /// Unit direction from which it arrives at a rough vertex; of others anything.
+    /// Unit direction of arrival at a rough vertex; unspecified at other vertices.
     from: Vec<Vec3>,
 }
 
@@ -151,7 +160,7 @@ impl Arrivals {
         self.from.clear();
     }
 
-    /// Fills the last group up; returns how many there are.
+    /// Pads the last group and returns the number of arrivals.
     fn fill_up(&mut self) -> usize {
         let whole = self.bins.len().next_multiple_of(SIDE);
         self.bins.resize(whole, 0.0);
@@ -163,7 +172,7 @@ impl Arrivals {
     }
 }
 
-/// Adds arrivals; lengths counted from `base_m`.
+/// Adds arrivals, with path lengths relative to `base_m`.
 struct ArrivalSink<'a> {
     list: &'a mut Arrivals,
     base_m: f64,
@@ -171,12 +180,12 @@ struct ArrivalSink<'a> {
     factor: f32,
     film: &'a Film,
     place: Place,
-    /// By what it was drawn at a rough vertex.
+    /// The guide by which it was drawn at a rough vertex.
     guide: Option<Guide>,
-    /// Value for the vertex of what is worth 1 as it was drawn.
+    /// The factor from the value as drawn to the value for the vertex.
     share: f32,
     from: Vec3,
-    /// `from` is that of a walk's first step and stays.
+    /// True if `from` is the direction of a walk's first step and no longer changes.
     left: bool,
 }
 
@@ -213,7 +222,8 @@ impl Sink for ArrivalSink<'_> {
     }
 }
 
-/// Where a pass stands: the tile's first pixel and its columns, the image's width, and the pass' number.
+/// The position of a pass: the tile's first pixel and its columns, the image's width, and the pass
+/// number.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Tile<'a> {
     pub row: u32,
@@ -222,7 +232,8 @@ pub(crate) struct Tile<'a> {
     pub width: u32,
     pub seed: u64,
     pub pass: u64,
-    /// Row-major, of the whole image: pixels that may see a near-mirror. Chosen without any sample.
+    /// Pixels that may see a near-mirror, row-major, of the whole image. They are chosen without
+    /// any sample.
     pub mirrors: &'a [bool],
 }
 
@@ -231,9 +242,10 @@ pub(crate) struct Tile<'a> {
 pub(crate) struct Sharing {
     gathers: Vec<(Vertex, usize)>,
     columns: Columns,
-    /// Optical path to the nearest of them, metres: where arrivals' lengths are counted from.
+    /// Optical path length to the nearest gather point, metres. Arrivals' lengths are relative to
+    /// it.
     nearest_m: f64,
-    /// Fewest bounces up to one of them.
+    /// The fewest bounces up to a gather point.
     lowest: u32,
     /// Indices of gather points that are not Lambertian.
     glossy: Vec<usize>,
@@ -242,10 +254,11 @@ pub(crate) struct Sharing {
     aiming: Aiming,
     arrivals: Arrivals,
     gloss: Gloss,
-    /// Those of one shared vertex.
+    /// Segments of one shared vertex.
     segments: Segments,
     lengths: Lengths,
-    /// How the gather points of `glossy` scatter to the camera, and what of one shared vertex.
+    /// How the gather points of `glossy` scatter to the camera, and how much they scatter from one
+    /// shared vertex.
     lobes: Lobes,
     scattered: Vec<f32>,
     drawn: Vec<f32>,
@@ -258,8 +271,8 @@ pub(crate) struct Sharing {
 }
 
 impl Sharing {
-    /// One pass over a tile. `pixels` holds its pixels' slots row by row, as [`Film::pixel`] each, and is
-    /// added to.
+    /// Makes one pass over a tile. `pixels` contains the slots of its pixels row by row, each as
+    /// [`Film::pixel`], and the pass adds to them.
     pub fn pass(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),
@@ -292,7 +305,8 @@ impl Sharing {
                 false => 1,
             };
             let begin = |j: u32| {
-                // Each pass takes every part of the pixel, and its first path another one in each.
+                // Each pass samples every part of the pixel, and its first path samples a different
+                // part in each pass.
                 let (j, paths) = (u64::from(j), u64::from(paths));
                 let path = tile.pass * paths + (j + tile.pass) % paths;
                 let place = place(tile.seed, Stream::Place, index, path);
@@ -349,8 +363,8 @@ impl Sharing {
         self.spread((walk, film), pixels);
     }
 
-    /// Weighs the near-mirrors that this tile's `pixels` gather points aim at; returns how often they do, beside `alone` directions
-    /// drawn by their scattering.
+    /// Weighs the near-mirrors that this tile's `pixels` gather points aim at. Returns the number
+    /// of aims, in addition to `alone` directions drawn by scattering.
     fn aim(&mut self, (walk, effort): (&Walk, &Effort), alone: u32, pixels: f32) -> u32 {
         self.aiming.clear();
         let Some(all) = walk.reflectors else { return 0 };
@@ -362,7 +376,7 @@ impl Sharing {
         }
     }
 
-    /// Lays the gather points out in columns.
+    /// Arranges the gather points in columns.
     fn index(&mut self) {
         self.columns.clear();
         self.glossy.clear();

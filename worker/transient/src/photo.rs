@@ -1,5 +1,5 @@
-//! The companion image: what a colour camera would see under a soft ceiling light. Not radiometry, but
-//! the right shapes, colours, shadows and reflections, from few rays.
+//! The companion image: the view of a colour camera under a soft ceiling light. It is not
+//! radiometric, but shows the right shapes, colours, shadows and reflections, from few rays.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -12,25 +12,27 @@ use crate::{
     world::{World, lift},
 };
 
-/// Sub-pixel samples a side.
+/// Sub-pixel samples per side.
 const SIDE: u32 = 3;
-/// Mirrors followed.
+/// The maximum number of mirror reflections that are followed.
 const REFLECTIONS: u32 = 2;
 
-/// What is nearer to the camera counts as this far for the lamp, render units: squares of much smaller lengths are no numbers.
+/// The minimum distance from the camera used to place the lamp, render units, because squares of
+/// much smaller lengths underflow.
 const NEAREST: f32 = 1e-9;
 
-/// A disc of light beneath the ceiling and parallel to it, so that no part of it sticks out above.
+/// A disc of light below the ceiling and parallel to it, so that no part of it extends above the
+/// ceiling.
 struct Lamp {
     centre: Vec3,
     /// Unit vectors that span the disc's plane.
     plane: (Vec3, Vec3),
     radius: f32,
-    /// Distance at which a surface facing the lamp gets full light.
+    /// Distance at which a surface facing the lamp receives full light.
     reach: f32,
 }
 
-/// Linear RGB in [0, 1], `[row][col][3]`, and the rays traced.
+/// Returns linear RGB in [0, 1], `[row][col][3]`, and the number of rays traced.
 pub(crate) fn photo(world: &World, seed: u64, stop: Stop) -> Result<(Vec<f32>, u64), RenderError> {
     let i = world.camera.intrinsics;
     let (width, height) = (i.width as usize, i.height as usize);
@@ -48,7 +50,7 @@ pub(crate) fn photo(world: &World, seed: u64, stop: Stop) -> Result<(Vec<f32>, u
     Ok((rgb, rays))
 }
 
-/// About how many rays it takes: from every `step`-th row.
+/// Returns the approximate number of rays of the image, from every `step`-th row.
 pub(crate) fn rays(world: &World, seed: u64, step: usize) -> u64 {
     let i = world.camera.intrinsics;
     let lamp = lamp(world);
@@ -67,7 +69,7 @@ pub(crate) fn rays(world: &World, seed: u64, step: usize) -> u64 {
     some * step as u64
 }
 
-/// Draws a row; returns the rays.
+/// Draws a row and returns the number of rays traced.
 fn draw(world: &World, lamp: &Lamp, (row, seed): (usize, u64), out: &mut [f32]) -> u64 {
     let mut stack = world.bvh.stack();
     let width = out.len() / 3;
@@ -91,7 +93,7 @@ fn draw(world: &World, lamp: &Lamp, (row, seed): (usize, u64), out: &mut [f32]) 
     stack.rays
 }
 
-/// Places the lamp over the space in front of the camera, below whatever is above it.
+/// Places the lamp over the space in front of the camera, below any surface above that space.
 fn lamp(world: &World) -> Lamp {
     let mut stack = world.bvh.stack();
     let up = -world.camera.down;
@@ -113,10 +115,11 @@ fn lamp(world: &World) -> Lamp {
 }
 
 impl Lamp {
-    /// A point of the disc for sub-pixel sample `s`: stratified in angle and radius over the samples of a pixel.
+    /// Returns a point of the disc for sub-pixel sample `s`, stratified in angle and radius over
+    /// the samples of a pixel.
     fn point(&self, rng: &mut Rng, s: u32) -> Vec3 {
         let strata = (SIDE * SIDE) as f32;
-        // Golden-angle spiral, turned and shifted at random for each pixel's sample.
+        // A golden-angle spiral, rotated and shifted at random for each pixel's sample.
         let turn = (s as f32 * 0.618_034 + rng.uniform() / strata) * std::f32::consts::TAU;
         let r = self.radius * ((s as f32 + rng.uniform()) / strata).sqrt();
         let (t, b) = self.plane;

@@ -1,4 +1,4 @@
-//! What the renderer decides to do in a scene, in words, for the scene's metadata.
+//! The renderer's decisions for a scene, in words, for the scene's metadata.
 
 use std::collections::BTreeSet;
 
@@ -10,7 +10,7 @@ use crate::{
     walk::Walk,
 };
 
-/// The plan that `render` follows.
+/// Returns the plan that `render` follows.
 pub(crate) fn plan(
     scene: &Scene,
     settings: &Settings,
@@ -124,7 +124,8 @@ pub(crate) fn plan(
     }
 }
 
-/// How many of a scene's materials, by name, state no spectrum, and how many there are, glass left out.
+/// Returns the number of a scene's materials, by name, without a spectrum, and the number of all
+/// its materials. Glass is excluded.
 fn colours(scene: &Scene) -> (usize, usize) {
     let each = scene.objects.iter().flat_map(|o| &o.mesh.materials);
     let all: BTreeSet<(bool, &str)> = each

@@ -1,10 +1,15 @@
 //! Near-mirrors as targets of gather points.
 //!
-//! What a surface sees in a near-mirror is found by chance where a direction drawn by its scattering meets one, and one pixel alone has
-//! it. With many spots, whose light is found surely elsewhere, such rare paths are most of a pixel's error in furnished rooms with mirrors: 0.7 to 2.4 % of the
-//! light of three bounces and more, and a third of the variance (25 spots, 256×256). So gather points aim at near-mirrors as well: at
-//! triangles by their area as seen from some of the tile's gather points, evenly over each. Both ways are joined by the balance heuristic,
-//! so triangles that are hidden or that the table does not know cost nothing but rays.
+//! Light that a surface receives via a near-mirror is found by chance, when a direction drawn by
+//! the surface's scattering hits the near-mirror, and counts for one pixel alone. With many spots,
+//! the other light is found reliably, and such rare paths are most of a pixel's error in furnished
+//! rooms with mirrors: 0.7 to 2.4 % of the light of three bounces and more, and a third of the
+//! variance (25 spots, 256×256).
+//!
+//! So gather points also aim at near-mirrors: at triangles in proportion to their area as seen from
+//! some of the tile's gather points, and evenly over each triangle. Both techniques are combined by
+//! the balance heuristic, so triangles that are hidden or missing from the table cost nothing but
+//! rays.
 
 use picofarm_scene::Vec3;
 
@@ -13,23 +18,24 @@ use crate::{
     world::{Hit, World},
 };
 
-/// Most triangles; a tile's table of more would cost more than it brings.
+/// The maximum number of triangles. The table of a tile with more would cost more than it gains.
 const MOST: usize = 4096;
-/// Gather points of a tile by which triangles are weighed. With 1 and 16 error² × CPU time is within 3 %.
+/// The number of a tile's gather points that triangles are weighed from. With 1 and 16, error² ×
+/// CPU time is within 3 %.
 const SEEN_FROM: usize = 4;
-/// Bound of a density, which shares are taken of: they must not be quotients of infinities.
+/// Upper bound of a density. Shares of densities must not be quotients of infinities.
 const MOST_DENSE: f32 = 1e30;
 const NONE: u32 = u32::MAX;
 
 /// A near-mirror's triangle.
 #[derive(Debug)]
 struct Reflector {
-    /// Of the scene.
+    /// Triangle index in the scene.
     triangle: u32,
     corners: [Vec3; 3],
     middle: Vec3,
     normal: Vec3,
-    /// Square render units.
+    /// Area in square render units.
     area: f32,
     two_sided: bool,
 }
@@ -38,12 +44,12 @@ struct Reflector {
 #[derive(Debug)]
 pub(crate) struct Reflectors {
     list: Vec<Reflector>,
-    /// Place in `list` by triangle, [`NONE`] for most.
+    /// Index into `list` by triangle, or [`NONE`].
     place: Vec<u32>,
 }
 
 impl Reflectors {
-    /// The near-mirrors of a scene; `None` where there are none or too many.
+    /// Returns the near-mirrors of a scene, or `None` if there are none or too many.
     pub fn find(world: &World) -> Option<Self> {
         let mut place = vec![NONE; world.triangles.len()];
         let mut list = vec![];
@@ -56,7 +62,7 @@ impl Reflectors {
                 return None;
             }
             let found = Reflector::new(t as u32, corners, world.normals[t], surface.two_sided());
-            // So small that squares vanish: nothing would be said of its density.
+            // The triangle is so small that squares underflow, so its density would be undefined.
             if !found.area.is_normal() {
                 continue;
             }
@@ -80,7 +86,7 @@ impl Reflector {
         }
     }
 
-    /// About the cosine-weighted solid angle at a point with normal `n`.
+    /// Returns the approximate cosine-weighted solid angle at a point with normal `n`.
     fn size(&self, p: Vec3, n: Vec3) -> f32 {
         let to = self.middle - p;
         let cos = -self.normal.dot(to);
@@ -89,7 +95,7 @@ impl Reflector {
         } else {
             cos.max(0.0)
         };
-        // A tenth of it may stand above a horizon that its middle is beneath.
+        // A tenth of the triangle may be above a horizon that hides its middle.
         let up = n.dot(to).max(0.0) + 0.1 * self.area.sqrt();
         let d2 = to.dot(to) + self.area;
         cos * up * self.area / (d2 * d2)
@@ -101,19 +107,20 @@ impl Reflector {
 pub(crate) struct Aiming {
     /// Running sums of the triangles' weights.
     sums: Vec<f32>,
-    /// Aims at a unit of area of each for one direction drawn by scattering.
+    /// Aims per unit of area of each triangle, for one direction drawn by scattering.
     density: Vec<f32>,
 }
 
 impl Aiming {
-    /// Nothing is aimed at.
+    /// Removes all targets.
     pub fn clear(&mut self) {
         self.sums.clear();
         self.density.clear();
     }
 
-    /// Weighs the near-mirrors for a tile whose gather points lie at `points`, with normals: for each direction that one of them draws by
-    /// its scattering it aims `often` times. Returns whether there is anything to aim at.
+    /// Weighs the near-mirrors for a tile with gather points at `points`, given with normals. A
+    /// gather point aims `often` times for each direction that it draws by scattering. Returns
+    /// whether there is anything to aim at.
     pub fn weigh(
         &mut self,
         all: &Reflectors,
@@ -134,7 +141,7 @@ impl Aiming {
             self.sums.push(sum);
             self.density.push(often * weight / r.area);
         }
-        // Beneath the least normal number quotients could be anything.
+        // Below the smallest normal number, quotients could be anything.
         if !(sum > 1e-30 && sum.is_finite()) {
             self.clear();
             return false;
@@ -143,7 +150,7 @@ impl Aiming {
         true
     }
 
-    /// Draws a triangle of the scene and a point of it.
+    /// Draws a triangle of the scene and a point on it.
     pub fn draw(&self, all: &Reflectors, rng: &mut Rng) -> Option<(u32, Vec3)> {
         let at = rng.uniform() * self.sums.last()?;
         let k = self.sums.partition_point(|&s| s <= at);
@@ -156,8 +163,8 @@ impl Aiming {
         ))
     }
 
-    /// Aims per steradian from the point `x` in the direction of `m`, for one direction drawn by scattering; 0 where `m` lies on nothing
-    /// that is aimed at.
+    /// Returns the aims per steradian from the point `x` towards `m`, for one direction drawn by
+    /// scattering; 0 if `m` is not on a target.
     pub fn density(&self, all: &Reflectors, x: Vec3, m: &Hit) -> f32 {
         let place = all.place[m.triangle as usize] as usize;
         let Some(&density) = self.density.get(place) else {
@@ -227,7 +234,8 @@ mod tests {
             let mut aiming = Aiming::default();
             prop_assume!(aiming.weigh(&all, often, points.into_iter()));
             let mut rng = Rng::new(seed, Stream::Paths, 0, 0);
-            // Seen from a point above each triangle's middle, what is said per steradian is what is said of its area.
+            // Seen from a point above each triangle's middle, the density per steradian agrees with
+            // the density per area.
             let mut said = vec![];
             for r in &all.list {
                 let m = hit(r.triangle, r.middle, r.normal);
@@ -267,9 +275,9 @@ mod tests {
         let (there, elsewhere) = (hit(0, Vec3::ZERO, up), hit(1, Vec3::ZERO, up));
         assert!(aiming.density(&all, up, &there) > 0.0);
         assert_eq!(aiming.density(&all, up, &elsewhere), 0.0);
-        // Along its plane there is no solid angle.
+        // In the plane of the triangle, the solid angle vanishes.
         assert_eq!(aiming.density(&all, Vec3::new(3.0, 0.0, 0.0), &there), 0.0);
-        // In its plane nothing is seen of it.
+        // Nothing of the triangle is visible from its plane.
         let beside = [(Vec3::new(PI, 0.0, 0.0), up)];
         assert!(!aiming.weigh(&all, 1.0, beside.into_iter()));
         assert_eq!(aiming.density(&all, up, &there), 0.0);

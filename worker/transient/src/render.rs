@@ -1,4 +1,4 @@
-//! The driver: a whole render with its stopping rule, and the forecast of one.
+//! The driver: a whole render with its stopping rule, and the forecast of a render.
 
 mod dark;
 mod draws;
@@ -32,24 +32,25 @@ use crate::{
     two_bounce::Sampling,
 };
 
-/// Most passes that [`Budget::Error`] spends.
+/// The maximum number of passes of [`Budget::Error`].
 const MAX_PASSES: u32 = 1 << 16;
-/// Passes of its first round, the fewest that tell how far they scatter: with 4 large images of many spots
-/// came to 6.8 to 8.6 % where 10 % were asked for.
+/// Passes of the first round of [`Budget::Error`], the fewest that give an error estimate. With 4
+/// passes, large images of many spots ended at 6.8 to 8.6 % with a target of 10 %.
 const FIRST_PASSES: u32 = 2;
-/// Share of the progress that the first round counts for.
+/// Fraction of the progress that the first round counts for.
 const FIRST_SHARE: f32 = 0.3;
-/// How much longer than all before it a round of a render that is bound in time may be: each tells how long the next will take.
+/// The maximum length of a round of a time-bound render, in multiples of all rounds before it,
+/// because each round predicts the time of the next.
 const GROWTH: u32 = 3;
-/// Share of the time left that a round is made for.
+/// Fraction of the remaining time that a round is planned for.
 const TIMED: f64 = 0.85;
 
-/// Renders a scene. Runs on the caller's rayon pool; the result is bit-identical for any number of
+/// Renders a scene. Runs on the caller's rayon pool. The result is bit-identical for any number of
 /// threads, and on any machine.
 ///
 /// # Errors
-/// [`RenderError::Scene`] or [`RenderError::Invalid`] name what is unusable; [`RenderError::Stopped`]
-/// where `progress` asked to stop.
+/// Returns [`RenderError::Scene`] or [`RenderError::Invalid`] naming the invalid input, and
+/// [`RenderError::Stopped`] if `progress` requests a stop.
 pub fn render(
     scene: &Scene,
     settings: &Settings,
@@ -60,13 +61,17 @@ pub fn render(
     })
 }
 
-/// Renders as many passes as time allows: `left` says how many seconds are left, and is asked between rounds. The budget of
-/// `settings` bounds it as well: it ends where the error is reached, or after so many samples. It makes 2 passes even
-/// where time is too short for them. How many passes there are depends on the machine and its load, so the same call gives
-/// other bytes each time; [`render`] with the samples that [`crate::ErrorEstimate::samples`] states comes near to it.
+/// Renders as many passes as time allows.
+///
+/// `left` returns the remaining seconds and is called between rounds. The budget of `settings`
+/// applies as well: the render ends once the error is reached, or after the given number of
+/// samples. It makes 2 passes even if there is not enough time for them. The number of passes
+/// depends on the machine and its load, so the same call returns different bytes each time.
+/// [`render`] with the number of samples in [`crate::ErrorEstimate::samples`] gives a similar
+/// result.
 ///
 /// # Errors
-/// Those of [`render`].
+/// Returns the errors of [`render`].
 pub fn render_within(
     scene: &Scene,
     settings: &Settings,
@@ -78,11 +83,11 @@ pub fn render_within(
     })
 }
 
-/// What [`render`] would do, from a few small tiles of the image instead of all of it. Runs on the
+/// Forecasts a [`render`] from a few small tiles of the image instead of all of it. Runs on the
 /// caller's rayon pool.
 ///
 /// # Errors
-/// Those of [`render`].
+/// Returns the errors of [`render`].
 pub fn plan(scene: &Scene, settings: &Settings) -> Result<Forecast, RenderError> {
     prepare(scene, settings, Stop(&Unstopped), |ready| {
         let plan = ready.plan(ready.first_passes());
@@ -101,7 +106,7 @@ fn whole(
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
     let (frame, stop) = (&ready.frame, Stop(progress));
-    // Before anything that takes long: where there is no room, it is known at once.
+    // Allocated before anything that takes long, so that a lack of memory is reported at once.
     let mut image = Image::new(frame)?;
     let mut splats = Sources::of(frame).map(|sources| (sources, Splats::new(frame)));
     let seen = ready.seen(stop)?;
@@ -175,16 +180,19 @@ fn whole(
     ready.finish((image, splats), seen, (error, rays), (plan, stop))
 }
 
-/// Passes that fit into the time left, where `round` of them took it from `began` to `left`.
+/// Returns the passes that fit into the remaining time, if `round` passes took it from `began` to
+/// `left`.
 fn in_time((began, left): (f64, f64), round: u32) -> u32 {
     let each = (began - left).max(1e-6) / f64::from(round.max(1));
-    // Casting saturates.
+    // The cast saturates.
     (TIMED * left / each) as u32
 }
 
-/// What more the median error of the image needs to reach `target`: passes, and two bounces sampled again where
-/// that takes fewer rays. All tiles get as many passes: to give those with larger errors more, up to twice as
-/// many, took up to a half more time to the same median, and as long to the same 95th percentile.
+/// Returns the round that the median error of the image needs to reach `target`: passes, and a new
+/// sampling of two bounces if that takes fewer rays.
+///
+/// All tiles get the same number of passes. With up to twice as many passes for tiles with larger
+/// errors, the same median took up to a half more time, and the same 95th percentile took as long.
 fn further(
     errors: &Errors,
     (sampling, strata_cost): (&Sampling, &dyn Fn(u32) -> u32),
@@ -195,7 +203,7 @@ fn further(
     let target = target / errors.likely(0.5) as f32;
     let passes = |two: bool| {
         let unit = |n: u32| match stop.asked() {
-            // Whatever comes out of it is not used.
+            // The value is not used.
             true => 0.0,
             false if n == spent || !two => errors.two_unit,
             false => sampling.joined(errors.two_unit, n - spent),

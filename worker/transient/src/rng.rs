@@ -1,5 +1,5 @@
-//! Random numbers: PCG-XSH-RR 64/32 (O'Neill 2014), seeded by SplitMix64 from (seed, stream, index), so
-//! that a number depends on what it is drawn for and never on who draws it.
+//! Random numbers: PCG-XSH-RR 64/32 (O'Neill 2014), seeded by SplitMix64 from (seed, stream,
+//! index), so that a number depends on its purpose and never on the thread that draws it.
 
 /// A small, fast generator of one stream.
 #[derive(Debug, Clone)]
@@ -8,28 +8,28 @@ pub(crate) struct Rng {
     increment: u64,
 }
 
-/// What a stream is for; keeps the parts of a render independent of each other.
+/// The purpose of a stream. Separate streams make the parts of a render independent of each other.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Stream {
     /// Sub-pixel samples of the two-bounce part.
     Two = 1,
-    /// Camera paths and what they share.
+    /// Camera paths, and the vertices that they share.
     Paths = 2,
     /// The companion image.
     Photo = 3,
-    /// Where tiles that share vertices begin.
+    /// Offsets of the grid of tiles that share vertices.
     Grid = 4,
-    /// Light paths by way of near-mirrors.
+    /// Light paths via near-mirrors.
     Caustic = 5,
-    /// Light paths in the zones of spots beside other surfaces.
+    /// Light paths in the zones of spots close to other surfaces.
     Contact = 7,
-    /// Light paths by way of glass, and camera paths.
+    /// Light paths via glass, and camera paths via glass.
     Glass = 8,
     ByGlass = 9,
-    /// Where in a pixel its camera paths begin, and those by glass.
+    /// Positions in a pixel at which its camera paths begin, and those via glass.
     Place = 10,
     GlassPlace = 11,
-    /// How far camera and light reach.
+    /// The extent that the camera and the light reach.
     Extent = 6,
 }
 
@@ -41,7 +41,7 @@ fn splitmix(mut z: u64) -> u64 {
 }
 
 impl Rng {
-    /// The generator of pixel `pixel` in pass `pass` of `stream`.
+    /// Returns the generator of pixel `pixel` in pass `pass` of `stream`.
     pub fn new(seed: u64, stream: Stream, pixel: u64, pass: u64) -> Self {
         let key = [stream as u64, pixel, pass]
             .into_iter()
@@ -66,14 +66,14 @@ impl Rng {
         x.rotate_right((s >> 59) as u32)
     }
 
-    /// Uniform in [0, 1), 24 bits.
+    /// Returns a uniform number in [0, 1), 24 bits.
     #[inline(always)]
     pub fn uniform(&mut self) -> f32 {
         (self.next_u32() >> 8) as f32 * (1.0 / 16_777_216.0)
     }
 
-    /// Uniform in the unit disc, by rejection: no trigonometry, so the same bits everywhere. Returns the
-    /// point and its squared radius.
+    /// Returns a uniform point in the unit disc and its squared radius. Drawn by rejection: no
+    /// trigonometry, so the same bits everywhere.
     #[inline(always)]
     pub fn disc(&mut self) -> (f32, f32, f32) {
         loop {
@@ -85,7 +85,7 @@ impl Rng {
         }
     }
 
-    /// A direction on the unit circle.
+    /// Returns a uniform direction on the unit circle.
     #[inline(always)]
     pub fn circle(&mut self) -> (f32, f32) {
         loop {

@@ -4,14 +4,14 @@ use picofarm_scene::Vec3;
 
 use crate::{bvh::Stack, world::World};
 
-/// Segments from one point: where they end, of what they are, and what light takes each.
+/// Segments from one point: their ends, their indices, and the light that passes along each.
 #[derive(Debug, Default)]
 pub(crate) struct Segments {
     ends: Vec<Vec3>,
     of: Vec<usize>,
     blocked: Vec<bool>,
     through: Vec<Option<f32>>,
-    /// Which are free of surfaces, where there is glass, and their ends.
+    /// The segments that no surface occludes and their ends, if there is glass.
     free: (Vec<usize>, Vec<Vec3>),
 }
 
@@ -21,14 +21,14 @@ impl Segments {
         self.of.clear();
     }
 
-    /// Adds one that ends at `end`, of what `of` stands for.
+    /// Adds a segment that ends at `end`. `of` is the caller's index for it.
     pub fn push(&mut self, of: usize, end: Vec3) {
         self.ends.push(end);
         self.of.push(of);
     }
 
-    /// Looks from `from`, with one bundle of rays, whether a surface is in the way of each, and with another one whether glass
-    /// is in the way of those that are free.
+    /// Tests with one bundle of rays from `from` whether a surface occludes each segment, and with
+    /// another bundle whether glass crosses the free ones.
     pub fn trace(&mut self, world: &World, stack: &mut Stack, from: Vec3) {
         self.blocked.resize(self.ends.len(), false);
         let blocked = &mut self.blocked;
@@ -53,7 +53,8 @@ impl Segments {
         }
     }
 
-    /// Of what each is, and the share of light that goes through: `None` where a surface is in the way.
+    /// Returns the caller's index of each segment and the fraction of light that passes, or `None`
+    /// if a surface occludes it.
     pub fn found(&self) -> impl Iterator<Item = (usize, Option<f32>)> {
         self.of.iter().copied().zip(self.through.iter().copied())
     }

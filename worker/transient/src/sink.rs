@@ -1,42 +1,42 @@
-//! Where goes what walks find, and of which class it is.
+//! Receives the contributions that walks find, by path class.
 
 use picofarm_scene::Vec3;
 
 use crate::film::Film;
 
-/// Where on its path from the camera a contribution was found.
+/// The place on the path from the camera at which a contribution was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Place {
-    /// On a vertex that a tile's pixels share.
+    /// At a vertex that a tile's pixels share.
     Shared,
-    /// On a walk from such a vertex.
+    /// On a walk from a shared vertex.
     Walk,
-    /// On a gather point.
+    /// At a gather point.
     Gather,
-    /// On a vertex after a gather point that is not shared but followed for one pixel alone.
+    /// At a vertex after a gather point, not shared but traced for one pixel alone.
     Alone,
-    /// On a walk from such a vertex.
+    /// On a walk from a vertex of one pixel.
     AloneWalk,
-    /// On the way by near-mirrors to a gather point.
+    /// Between the camera and a gather point, on the near-mirrors.
     Mirror,
 }
 
-/// How a contribution was found.
+/// The technique that found a contribution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Way {
     /// By connecting to a spot.
     Spot,
     /// By aiming at the image of a spot.
     Image,
-    /// By connecting to a surface point that a spot lights.
+    /// By connecting to a surface point lit by a spot.
     Lit,
-    /// By connecting to one beyond near-mirrors.
+    /// By connecting to a lit surface point beyond near-mirrors.
     Beyond,
-    /// By connecting to one in the zone of a spot.
+    /// By connecting to a lit surface point in the zone of a spot.
     Zone,
 }
 
-/// What is found at each place, in each way: the name of a class.
+/// The names of places and techniques. A pair of them names a class.
 const PLACES: [&str; 6] = [
     "shared vertex",
     "walk from a shared vertex",
@@ -53,46 +53,46 @@ const WAYS: [&str; 5] = [
     "point in a zone",
 ];
 
-/// How many classes there are.
+/// The number of classes.
 pub(crate) const CLASSES: usize = PLACES.len() * WAYS.len();
 
-/// Index of a class.
+/// Returns the index of a class.
 #[inline]
 pub(crate) fn class(place: Place, way: Way) -> usize {
     place as usize * WAYS.len() + way as usize
 }
 
-/// Name of a class by its index.
+/// Returns the name of a class by its index.
 pub(crate) fn class_name(class: usize) -> String {
     let (place, way) = (PLACES[class / WAYS.len()], WAYS[class % WAYS.len()]);
     format!("{place}, {way}")
 }
 
-/// How what is drawn into the image beside the tiles was found.
+/// The technique of a contribution drawn into the image outside the tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Technique {
-    /// By light paths by way of near-mirrors.
+    /// By light paths via near-mirrors.
     Mirrors,
     /// By light paths in the zone of a spot.
     Zone,
-    /// By light paths by way of glass.
+    /// By light paths via glass.
     Glass,
-    /// By camera paths by way of glass and straight legs to the spots, walks from them among those.
+    /// By camera paths via glass and straight segments to the spots, including walks from them.
     Straight,
     /// By connecting camera paths to images of spots in panes.
     Image,
-    /// By connecting them to images of lit points in panes.
+    /// By connecting camera paths to images of lit points in panes.
     LitImage,
-    /// By connecting them to the vertices of light paths by way of glass.
+    /// By connecting camera paths to the vertices of light paths via glass.
     Vertex,
-    /// By the photons of such paths.
+    /// By the photons of light paths via glass.
     Photon,
     /// A spot that a planar pane shows to the camera.
     SeenSpot,
 }
 
 impl Technique {
-    /// Whether more light paths alone lessen its variance.
+    /// Returns whether only more light paths reduce the variance.
     pub fn is_of_light_paths(self) -> bool {
         matches!(
             self,
@@ -101,7 +101,7 @@ impl Technique {
     }
 }
 
-/// Their names.
+/// Names of the techniques.
 pub(crate) const TECHNIQUES: [&str; 9] = [
     "light path by near-mirrors",
     "light path in a zone",
@@ -118,13 +118,14 @@ pub(crate) const TECHNIQUES: [&str; 9] = [
 pub(crate) trait Sink {
     fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way);
 
-    /// Where contributions are found from now on.
+    /// Sets the place of the following contributions.
     fn at(&mut self, place: Place);
 
-    /// From where light arrives at a walk's first vertex by what is added from now on.
+    /// Sets the direction from which the light of the following contributions arrives at a walk's
+    /// first vertex.
     fn toward(&mut self, _: Vec3) {}
 
-    /// The same, for the rest of the walk.
+    /// Like `toward`, for the rest of the walk.
     fn leave(&mut self, _: Vec3) {}
 }
 

@@ -4,7 +4,7 @@ use picofarm_scene::{Bsdf, Material};
 
 use crate::bsdf::Surface;
 
-/// What a texel does to a surface's reflectances.
+/// The effect of a texel on a surface's reflectances.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Texels {
     /// Shares of the texel's red, green and blue.
@@ -37,7 +37,7 @@ pub(crate) fn at(m: &Material, nm: f64) -> (Surface, Option<Texels>) {
     (Surface::new(&there), texels)
 }
 
-/// The same kind of surface with other reflectances.
+/// Returns the same kind of surface with other reflectances.
 fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
     match bsdf {
         Bsdf::Diffuse { .. } => Bsdf::Diffuse {

@@ -1,33 +1,35 @@
-//! Triangles that light paths aim at from the spots, by what the spots send to them.
+//! Triangles that light paths aim at from the spots, weighted by the light that the spots send to
+//! them.
 
 use picofarm_scene::Vec3;
 
 use crate::{api::Stop, emitter::Emitters};
 
-/// Entries of the table of triangles by spot; beyond that all spots share one row.
+/// The maximum number of entries of the table of triangles by spot. With more, all spots share one
+/// row.
 const TABLE: usize = 1 << 22;
 
 /// A triangle to aim at.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Target {
-    /// Render units.
+    /// Corners, render units.
     pub corners: [Vec3; 3],
     /// Unit normal.
     pub normal: Vec3,
-    /// Both sides count.
+    /// Whether both sides count.
     pub two_sided: bool,
-    /// Near enough to count.
+    /// Whether it is near enough to count.
     pub counts: bool,
-    /// Share of the light that arrives there which goes on.
+    /// Fraction of the arriving light scattered on.
     pub share: f32,
 }
 
-/// Chances of spots and triangles, as running sums.
+/// Probabilities of spots and triangles, as running sums.
 #[derive(Debug)]
 pub(crate) struct Targets {
     /// Corners and areas, render units.
     triangles: Vec<([Vec3; 3], f32)>,
-    /// Running sums of the triangles' weights, one row a spot, or one row for all.
+    /// Running sums of the triangles' weights, one row per spot, or one row for all.
     rows: Vec<f64>,
     /// Running sums of the spots' weights.
     spots: Vec<f64>,
@@ -36,16 +38,16 @@ pub(crate) struct Targets {
 /// A point that was drawn.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Drawn {
-    /// Emitter.
+    /// Emitter index.
     pub spot: usize,
     /// Index among the triangles.
     pub target: usize,
-    /// On the triangle, uniform.
+    /// Point on the triangle, uniformly distributed.
     pub p: Vec3,
 }
 
-/// Index of the entry of running sums in which `at` in [0, 1) of their total falls, and the rest of `at`
-/// within it in [0, 1).
+/// Returns the index of the entry of running sums that contains `at` in [0, 1) of their total, and
+/// the position of `at` within it in [0, 1).
 fn pick(sums: &[f64], at: f64) -> Option<(usize, f64)> {
     let total = *sums.last()?;
     if !(total > 0.0 && total.is_finite()) {
@@ -59,7 +61,7 @@ fn pick(sums: &[f64], at: f64) -> Option<(usize, f64)> {
 }
 
 impl Targets {
-    /// The chances of these triangles; `None` where the render shall stop.
+    /// Returns the probabilities of these triangles, or `None` if the render must stop.
     pub fn new(all: &[Target], emitters: &Emitters, stop: Stop) -> Option<Self> {
         let area = |[a, b, c]: [Vec3; 3]| 0.5 * (b - a).cross(c - a).length();
         let each = all.iter();
@@ -72,7 +74,7 @@ impl Targets {
         Some(table)
     }
 
-    /// Fills the running sums; `None` where the render shall stop.
+    /// Fills the running sums. Returns `None` if the render must stop.
     fn weigh(&mut self, all: &[Target], emitters: &Emitters, stop: Stop) -> Option<()> {
         let apart = all.len() * emitters.list.len() <= TABLE;
         let mut spots = 0.0;
@@ -80,7 +82,7 @@ impl Targets {
             if stop.asked() {
                 return None;
             }
-            // A narrow lobe is not to be judged by the middle of a triangle.
+            // The middle of a triangle does not represent a narrow lobe.
             let wide = e.surface.diffuse() || e.surface.is_rough();
             let mut sum = 0.0;
             for (t, &([a, b, c], area)) in all.iter().zip(&self.triangles) {
@@ -89,7 +91,7 @@ impl Targets {
                 let w = to.normalized();
                 let cos = -t.normal.dot(w);
                 let cos = if t.two_sided { cos.abs() } else { cos.max(0.0) };
-                // What is too far away to count is left to chance.
+                // Targets that are too far away to count are left to chance.
                 if wide && t.counts {
                     sum += f64::from(area * cos / d2 * e.intensity(w) * t.share);
                 }
@@ -112,19 +114,20 @@ impl Targets {
         Some(())
     }
 
-    /// Whether there is anything to aim at.
+    /// Returns whether there is anything to aim at.
     pub fn any(&self) -> bool {
         self.spots.last().is_some_and(|&s| s > 0.0)
     }
 
-    /// A spot's row of running sums.
+    /// Returns a spot's row of running sums.
     fn row(&self, spot: usize) -> &[f64] {
         let n = self.triangles.len();
         let at = if self.rows.len() > n { spot * n } else { 0 };
         &self.rows[at..at + n]
     }
 
-    /// Draws a spot and a triangle by `at` in [0, 1), and a point of it by two more numbers.
+    /// Draws a spot and a triangle by `at` in [0, 1), and a point on the triangle by two more
+    /// numbers.
     pub fn draw(&self, at: f64, mut uniform: impl FnMut() -> f32) -> Option<Drawn> {
         let (spot, rest) = pick(&self.spots, at)?;
         let (target, _) = pick(self.row(spot), rest)?;
@@ -137,7 +140,7 @@ impl Targets {
         })
     }
 
-    /// Density per area of aiming from `spot` at a point of a triangle.
+    /// Returns the density per area of aiming from `spot` at a point of a triangle.
     pub fn density(&self, spot: usize, target: usize) -> f32 {
         let chance = |sums: &[f64], k: usize| {
             let before = if k == 0 { 0.0 } else { sums[k - 1] };

@@ -9,7 +9,7 @@ use crate::{
     world::{Hit, World},
 };
 
-/// What a pixel's centre sees.
+/// The surfaces seen by the pixels' centres.
 #[derive(Debug)]
 pub(crate) struct Centres {
     /// First surfaces, row-major.
@@ -18,7 +18,7 @@ pub(crate) struct Centres {
     pub rays: u64,
 }
 
-/// Traces the centres.
+/// Traces the rays through the centres.
 pub(crate) fn centres(world: &World, stop: Stop) -> Result<Centres, RenderError> {
     let i = world.camera.intrinsics;
     let rows: Vec<(Vec<Option<Hit>>, u64)> = (0..i.height)
@@ -45,8 +45,8 @@ pub(crate) fn centres(world: &World, stop: Stop) -> Result<Centres, RenderError>
     })
 }
 
-/// Everything but the companion image, and the rays it took. Visibility is per beam; a beam without a spot
-/// lights nothing.
+/// Returns everything except the companion image, and the number of rays traced. Visibility is per
+/// beam; a beam without a spot lights nothing.
 pub(crate) fn ground_truth(
     scene: &Scene,
     (world, emitters): (&World, &Emitters),
@@ -69,7 +69,7 @@ pub(crate) fn ground_truth(
     for (k, hit) in centres.hits.iter().enumerate() {
         let Some(h) = hit else { continue };
         let q = world.camera.direction_to_camera(h.p);
-        // Rays at right angles to the axis round to either side of it.
+        // Rays at right angles to the axis are rounded to either side of it.
         truth.depth[k] = world.metres(q.z).max(0.0) as f32;
         truth.range[k] = world.metres(h.p.length()) as f32;
         let n = world.camera.direction_to_camera(h.n);
@@ -96,21 +96,21 @@ pub(crate) fn ground_truth(
     Ok((truth, rays))
 }
 
-/// One source for each spot: those of its parts are in the same place, one behind the other. Spots of light that glass turned
-/// aside are none of the ground truth's.
+/// Returns one source per spot. The sources of a spot's parts are at the same position and
+/// consecutive. Spots of light that glass deflected are not in the ground truth.
 fn places(emitters: &Emitters) -> impl Iterator<Item = &Emitter> {
     let runs = emitters.list.chunk_by(|a, b| a.beam == b.beam);
     runs.filter_map(|run| run.iter().find(|e| !e.aside))
 }
 
-/// Which pixels of a row a spot lights; returns the rays.
+/// Writes which pixels of a row a spot lights. Returns the number of rays traced.
 fn lit(world: &World, e: &Emitter, row: usize, hits: &[Option<Hit>], out: &mut [u8]) -> u64 {
     let mut stack = world.bvh.stack();
     let first = row * out.len();
     for (lit, hit) in out.iter_mut().zip(&hits[first..]) {
         let Some(h) = hit else { continue };
         let to = e.p - h.p;
-        // Points on the spot's own wall see it at a right angle, give or take rounding.
+        // Points on the spot's own wall see the spot at a right angle, up to rounding.
         let slack = 1e-3 * to.length();
         let facing = h.n.dot(to) > -slack && e.n.dot(to) < slack;
         *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n) > 0.0);
@@ -118,7 +118,8 @@ fn lit(world: &World, e: &Emitter, row: usize, hits: &[Option<Hit>], out: &mut [
     stack.rays
 }
 
-/// About how many rays the truth takes beside the centres': from every `step`-th row.
+/// Returns the approximate number of rays of the truth in addition to the centres', from every
+/// `step`-th row.
 pub(crate) fn rays(world: &World, emitters: &Emitters, centres: &Centres, step: usize) -> u64 {
     let width = world.camera.intrinsics.width as usize;
     let rows = (0..world.camera.intrinsics.height as usize).step_by(step);

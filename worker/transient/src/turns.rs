@@ -9,15 +9,17 @@ use crate::{
     rng::{Rng, Stream},
 };
 
-/// Evenly spread draws: choices in strict turn, directions by the R₂ sequence (Roberts 2018), both from
-/// a random start. What neighbours have in common then varies less from pass to pass.
+/// Evenly spread draws: choices in strict turn, directions by the R₂ sequence (Roberts 2018), both
+/// from a random start. The contribution shared by neighbouring pixels then varies less from pass
+/// to pass.
 pub(crate) struct Turns {
     count: f32,
     start: f32,
     at: (u32, u32),
 }
 
-/// Point `k` of the R₂ sequence (Roberts 2018) in the unit square, from a start in units of 2⁻³².
+/// Returns point `k` of the R₂ sequence (Roberts 2018) in the unit square, from a start in units of
+/// 2⁻³².
 #[inline]
 fn r2(start: (u32, u32), k: u64) -> (f32, f32) {
     // 1/g and 1/g² in units of 2⁻⁶⁴, g³ = g + 1.
@@ -29,24 +31,26 @@ fn r2(start: (u32, u32), k: u64) -> (f32, f32) {
     (turn(start.0, STEPS.0), turn(start.1, STEPS.1))
 }
 
-/// Quarters within quarters that paths of a pixel take in turn; within the smallest, places are random. With
-/// eight, what is seen in two mirrors erred by 0.83 of what the spread of passes states.
+/// Levels of nested quarters that the paths of a pixel visit in turn. Within the smallest quarter,
+/// positions are random. With eight levels, light seen via two mirrors had an error of 0.83 of the
+/// one stated by the spread of passes.
 const QUARTERS: u32 = 3;
 
-/// Where in a pixel path `k` of those that `stream` is for begins, over all passes: spread evenly, because
-/// much of the light in a bin depends on it.
+/// Returns the position in a pixel at which path `k` of `stream` begins, over all passes. Positions
+/// are spread evenly, because much of the light in a bin depends on them.
 ///
-/// Four paths in a row take the quarters of the pixel in random order, sixteen the quarters of those, and
-/// 64 once more: nested scrambling of the van der Corput sequence in base 4 (Owen 1995), laid along a Z and
-/// begun anew every 64 paths. Passes are never more alike than random ones would be, whatever is seen, so
-/// that their spread states no less than the error of their mean. Sequences with a step, such as R₂, agree
-/// from pass to pass where what a pixel sees repeats itself at that step.
+/// Four consecutive paths take the quarters of the pixel in random order, sixteen the quarters of
+/// those, and 64 once more: nested scrambling of the van der Corput sequence in base 4 (Owen 1995),
+/// arranged along a Z curve and restarted every 64 paths. For any image, passes are never more
+/// alike than random ones would be, so their spread states no less than the error of their mean.
+/// Sequences with a step, such as R₂, agree from pass to pass if the image within a pixel repeats
+/// at that step.
 #[inline]
 pub(crate) fn place(seed: u64, stream: Stream, pixel: u64, k: u64) -> (f32, f32) {
     let mut rng = Rng::new(seed, stream, pixel, k);
     let random = |rng: &mut Rng| rng.next_u32() >> (8 + QUARTERS);
     let (mut x, mut y) = (random(&mut rng), random(&mut rng));
-    // Which 64 paths, a one, and the digits of `k` in base 4 from the last one on.
+    // The group of 64 paths, a one, and the digits of `k` in base 4 from the last one on.
     let mut path = (k >> (2 * QUARTERS)) << 8 | 1;
     for level in 0..QUARTERS {
         let digit = (k >> (2 * level)) & 3;
@@ -60,10 +64,10 @@ pub(crate) fn place(seed: u64, stream: Stream, pixel: u64, k: u64) -> (f32, f32)
     (unit(x), unit(y))
 }
 
-/// What one of the 24 permutations of 0 to 3, chosen by `turn`, makes of `digit`.
+/// Returns the image of `digit` under one of the 24 permutations of 0 to 3, chosen by `turn`.
 #[inline]
 fn permuted(turn: u32, digit: u32) -> u32 {
-    // All of them are affine over two bits: two different images of the bits, and a shift.
+    // All permutations are affine over two bits: two different images of the bits, and a shift.
     let first = turn % 3;
     let second = (first + 1 + turn / 3 % 2) % 3;
     let shift = turn / 6 % 4;
@@ -80,18 +84,18 @@ impl Turns {
         }
     }
 
-    /// How many draws there are.
+    /// Returns the number of draws.
     pub fn count(&self) -> f32 {
         self.count
     }
 
-    /// Which of `among` draw `j` is for.
+    /// Returns which of `among` choices draw `j` takes.
     pub fn choice(&self, j: u32, among: usize) -> usize {
         let at = j as f32 / self.count + self.start;
         (((at - at.floor()) * among as f32) as usize).min(among - 1)
     }
 
-    /// The direction of draw `j`, as [`Surface::sample`] gives it.
+    /// Returns the direction of draw `j`, in the form of [`Surface::sample`].
     pub fn direction(
         &self,
         j: u32,
@@ -160,8 +164,8 @@ mod tests {
         }
     }
 
-    /// Variance of the mean over passes of what pixels see, over what the spread of those passes states.
-    /// Half of each pixel is white.
+    /// Returns the variance of the mean over passes of the pixels' values, divided by the variance
+    /// stated by the spread of those passes. Half of each pixel is white.
     fn true_over_stated(passes: u64, sees: impl Fn((f32, f32), (f32, f32)) -> f32) -> f64 {
         const PIXELS: u64 = 8000;
         let (mut found, mut stated) = (0.0, 0.0);
@@ -191,7 +195,8 @@ mod tests {
                     let (x, y) = (at.0 * times + phase.0, at.1 * times + phase.1);
                     f32::from(odd(x) != odd(y))
                 });
-                // Random places have 1. With R₂, stripes seven times along a pixel had 40.
+                // Random positions give 1. With R₂, stripes that repeat seven times per pixel gave
+                // 40.
                 let most = stripes.max(squares);
                 assert!(
                     most < 1.15,

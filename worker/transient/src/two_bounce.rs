@@ -1,5 +1,6 @@
-//! Exactly two bounces: stratified sub-pixel samples, each connected to every spot, a whole
-//! pixel's samples at once. No random walk. Of beams with a width each sample takes one ray, in turn, for all of them.
+//! Exactly two bounces: stratified sub-pixel samples, each connected to every spot, a whole pixel's
+//! samples at once. No random walk. If beams have a width, each sample takes one ray, in turn, for
+//! all beams.
 
 use picofarm_scene::Vec3;
 
@@ -15,13 +16,15 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// How strata a side grow with the width of pixels where that is small. 6×6 for 4×4 at 256×256 (8 to 24 passes): error² × CPU time
-/// 0.70 to 0.92 in furnished rooms of 1 to 25 spots, 1.05 with 100.
+/// Exponent of the strata per side in the pixel width, for narrow pixels. 6×6 strata, versus 4×4,
+/// at 256×256 (8 to 24 passes): error² × CPU time 0.70 to 0.92 in furnished rooms of 1 to 25 spots,
+/// 1.05 with 100.
 const NARROW_PIXELS: f32 = 0.1;
 
-/// Strata a side beside 16 camera paths in pixels so wide at unit distance: eight where that is 1/32 (64 pixels over 90°). Wider pixels
-/// straddle more bins: more strata, as the root of the width. In narrower ones a spot's light is in a bin or two, which is no
-/// easier: nearly as many.
+/// Returns the strata per side that go with 16 camera paths, for pixels of this width at unit
+/// distance: eight for a width of 1/32 (64 pixels over 90°). Wider pixels straddle more bins and
+/// get more strata, growing with the square root of the width. In narrower pixels a spot's light
+/// falls into one or two bins, which is no easier to sample, so they get nearly as many strata.
 fn strata(pixel: f32) -> f32 {
     match pixel * 128.0 {
         wide if wide >= 4.0 => 4.0 * wide.sqrt(),
@@ -29,12 +32,12 @@ fn strata(pixel: f32) -> f32 {
     }
 }
 
-/// How finely pixels are sampled.
+/// The sampling density of pixels.
 #[derive(Debug, Clone)]
 pub(crate) struct Sampling {
-    /// Strata a side in an ordinary pixel beside 64 camera paths, before rounding.
+    /// Strata per side in an ordinary pixel that go with 16 camera paths, before rounding.
     base: f32,
-    /// Row-major: the pixel or one of its neighbours shows a mirror or stands in a mirror spot's beam.
+    /// Row-major: the pixel or one of its neighbours shows a mirror or is in a mirror spot's beam.
     /// Decided from the centres alone, hence independent of the samples: no bias.
     pub refined: Vec<bool>,
 }
@@ -73,9 +76,12 @@ impl Sampling {
         Self { base, refined }
     }
 
-    /// Strata a side (even) in ordinary pixels and where a narrow lobe may be seen. They grow with the
-    /// passes so that neither part of the histogram is much noisier than the other, and are those of eight where there are fewer:
-    /// they cost little beside them. `passes` = 0 is a render of two bounces only.
+    /// Returns the strata per side (even) in ordinary pixels and in those that may see a narrow
+    /// lobe.
+    ///
+    /// They grow with the passes so that neither part of the histogram is much noisier than the
+    /// other. Below eight passes they are those of eight, because they cost little in comparison.
+    /// `passes` = 0 is a render of two bounces only.
     pub fn sides(&self, passes: u32) -> (u32, u32) {
         let passes = if passes == 0 { 64 } else { passes.max(8) };
         let side = self.base * libm::powf(passes as f32 / 16.0, 0.4);
@@ -83,15 +89,15 @@ impl Sampling {
         (side, (4 * side).min(64))
     }
 
-    /// How the two-bounce variance falls with the passes: as n^(−3/2) for n strata, since half of it
-    /// lies on edges between bins.
+    /// Returns the relative two-bounce variance after `passes`. It falls as n^(−3/2) for n strata,
+    /// because half of it is on edges between bins.
     pub fn variance(&self, passes: u32) -> f64 {
         let side = f64::from(self.sides(passes).0);
         1.0 / (side * side * side)
     }
 
-    /// The weight of strata of `wave` passes beside earlier ones, whose variance is `before`, 0 where there
-    /// are none: the less they scatter, the more they weigh.
+    /// Returns the weight of the strata of `wave` passes when combined with earlier ones of
+    /// variance `before`, which is 0 if there are none. Strata with less variance have more weight.
     pub fn weight(&self, before: f64, wave: u32) -> f64 {
         match before > 0.0 {
             true => before / (before + self.variance(wave)),
@@ -99,7 +105,7 @@ impl Sampling {
         }
     }
 
-    /// The variance of both together.
+    /// Returns the variance of the combination.
     pub fn joined(&self, before: f64, wave: u32) -> f64 {
         self.weight(before, wave) * self.variance(wave)
     }
@@ -109,20 +115,21 @@ impl Sampling {
 #[derive(Debug, Default)]
 pub(crate) struct Strata {
     hits: Vec<Option<Hit>>,
-    /// Places of the hits, lifted off the surface.
+    /// Positions of the hits, lifted off the surface.
     lifted: Vec<Vec3>,
     range_m: Vec<f64>,
-    /// `[sample][spot]`, spots of the sample's ray.
+    /// `[sample][spot]`, for the spots of the sample's ray.
     weights: Vec<f32>,
-    /// Which of its strata each block samples twice; those samples come after all others.
+    /// Index of the stratum that each block samples twice. The extra samples come after all others.
     twice: Vec<u32>,
     segments: Segments,
-    /// `[sample][spot]`: slot, and value where the spot is seen.
+    /// `[sample][spot]`: slot, and value if the spot is visible.
     found: Vec<(u32, f32)>,
 }
 
 impl Strata {
-    /// Adds one pixel's two-bounce samples to `blocks`; returns how many strata there were. `side` is even.
+    /// Adds one pixel's two-bounce samples to `blocks` and returns the number of strata. `side` is
+    /// even.
     pub fn sample_pixel(
         &mut self,
         walk: &Walk,
@@ -136,7 +143,7 @@ impl Strata {
         let rays = emitters.rays.len();
         let spots = emitters.rays.iter().map(ExactSizeIterator::len).max();
         let (count, spots) = ((side * side) as usize, spots.unwrap_or(0));
-        // Which ray the first sample takes.
+        // The ray of the first sample.
         let first = match rays {
             1 => 0,
             _ => (rng.uniform() * rays as f32) as usize,
@@ -158,7 +165,7 @@ impl Strata {
                 None => sample,
                 Some(block) => 4 * block + self.twice[block] as usize,
             };
-            // Four in a row are a block: two above, two below.
+            // Four consecutive strata form a block: two above, two below.
             let (block, corner) = (stratum as u32 / 4, stratum as u32 % 4);
             let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
             let b = (2 * (block / (side / 2)) + corner / 2) as f32 + rng.uniform();
@@ -169,7 +176,7 @@ impl Strata {
                 let range = h.p.length();
                 let all = &mut scratch.weights;
                 let own = ray(sample).clone();
-                // Of the other rays nothing counts here.
+                // Light of the other rays does not count here.
                 all.fill(0.0);
                 let seen = (Seen::of(&h, -h.p / range), &h.surface);
                 emitters.weights_of(own.clone(), seen, &mut scratch.plain, all);
@@ -244,7 +251,7 @@ mod tests {
     fn wide_pixels_have_more_strata_and_narrow_ones_nearly_as_many() {
         let of = |pixels: f32| strata(2.0 / pixels);
         assert_eq!((of(16.0), of(64.0)), (16.0, 8.0));
-        // No step between the two laws.
+        // The two laws join without a step.
         assert!((of(64.1) / 8.0 - 1.0).abs() < 1e-3);
         let base = of(256.0);
         let sides = |n| {
@@ -268,7 +275,7 @@ mod tests {
         assert_eq!(one, sampling.variance(64));
         let two = sampling.joined(one, 64);
         assert!((two / one - 0.5).abs() < 1e-12, "{two} {one}");
-        // Few passes bring few strata, which weigh less.
+        // Few passes have few strata, which weigh less.
         let more = sampling.joined(one, 4);
         assert!(more < one && more > 0.7 * one, "{more} {one}");
         assert_eq!(sampling.sides(1), sampling.sides(8));

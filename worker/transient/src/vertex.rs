@@ -14,30 +14,31 @@ pub(crate) struct Vertex {
     pub beta: f32,
     /// Optical path from where the walk is counted, metres.
     pub length_m: f64,
-    /// Bounces up to and with this vertex.
+    /// Bounces up to and including this vertex.
     pub bounce: u32,
     /// How the camera sees it.
     pub sight: Sight,
 }
 
-/// How the camera sees a vertex of its path, as far as light paths ([`crate::caustic`]) are concerned.
+/// How the camera sees a vertex of its path, as far as light paths ([`crate::caustic`]) are
+/// concerned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Sight {
-    /// Roughness of the near-mirror before it; infinite where none is.
+    /// Roughness of the near-mirror before it; infinite if there is none.
     before: f32,
-    /// Only near-mirrors lie between the camera and it.
+    /// Whether only near-mirrors are between the camera and the vertex.
     by_mirrors: bool,
-    /// [`Vertex::open`] of the vertex before it.
+    /// [`Vertex::open`] of the previous vertex.
     open_before: f32,
 }
 
 impl Sight {
-    /// What the camera sees.
+    /// The sight of the first vertex.
     pub const FIRST: Self = Self {
         by_mirrors: true,
         ..Self::ELSEWHERE
     };
-    /// Where a walk begins that the camera does not see.
+    /// The sight of the start of a walk that the camera does not see.
     pub const ELSEWHERE: Self = Self {
         before: f32::INFINITY,
         by_mirrors: false,
@@ -46,9 +47,12 @@ impl Sight {
 }
 
 impl Vertex {
-    /// Light paths whose first near-mirror is smoother than this end on a vertex up to here: all of them on one that the camera sees
-    /// directly or before which another one comes that is no near-mirror's, and on one that the camera sees in near-mirrors those
-    /// that pay there.
+    /// Returns the roughness threshold for light paths to this vertex: those with a smoother first
+    /// near-mirror end on a vertex up to here.
+    ///
+    /// All of them end on a vertex that the camera sees directly, and on one that follows another
+    /// vertex outside near-mirrors. On a vertex that the camera sees only in near-mirrors, the
+    /// light paths end that pay off there.
     #[inline]
     pub fn open(&self) -> f32 {
         let Sight {
@@ -67,7 +71,7 @@ impl Vertex {
         }
     }
 
-    /// How it sees what follows.
+    /// Returns how the camera sees the next vertex.
     #[inline]
     pub fn next(&self) -> Sight {
         let specular = self.hit.surface.specular();

@@ -1,6 +1,8 @@
-//! Walks: random paths onward from a vertex, whose vertices connect to the spots and to light vertices
-//! and, where the scene has planar near-mirrors, aim at the spots' images in them. All are weighed by
-//! multiple importance sampling (balance heuristic, Veach and Guibas 1995).
+//! Walks: random paths onward from a vertex.
+//!
+//! The vertices of a walk connect to the spots and to light vertices and, if the scene has planar
+//! near-mirrors, aim at the spots' images in them. All techniques are weighted by multiple
+//! importance sampling (balance heuristic, Veach and Guibas 1995).
 
 mod connect;
 
@@ -25,7 +27,7 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// What paths are traced in.
+/// The scene and the settings in which paths are traced.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Walk<'a> {
     pub world: &'a World,
@@ -34,21 +36,21 @@ pub(crate) struct Walk<'a> {
     pub gate: &'a Gate,
     /// Longest path in bounces.
     pub max_bounces: u32,
-    /// Walks connect to light vertices.
+    /// Whether walks connect to light vertices.
     pub lights: bool,
-    /// Light paths by way of near-mirrors, where they pay.
+    /// Light paths via near-mirrors, if they pay off.
     pub caustics: Option<&'a Caustics>,
-    /// Near-mirrors that gather points aim at, where it pays.
+    /// Near-mirrors that gather points aim at, if aiming pays off.
     pub reflectors: Option<&'a Reflectors>,
-    /// Glass that turns light, where there is any.
+    /// Glass that refracts light, if there is any.
     pub glass: Option<&'a ByGlass>,
-    /// Zones around spots beside other surfaces, where there are any.
+    /// Zones around spots close to other surfaces, if there are any.
     pub contacts: Option<&'a Contacts>,
-    /// Shortest path from the laser to a spot, metres.
+    /// Length of the shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
-    /// With a narrow gate: the path lengths that count; whatever else is found is not looked at.
+    /// The path lengths that count with a narrow gate. Other contributions are discarded.
     pub window: Option<Window>,
-    /// With a narrow gate: where shared vertices are drawn for it.
+    /// The patches on which shared vertices are drawn for a narrow gate.
     pub patches: Option<&'a Patches>,
 }
 
@@ -57,7 +59,7 @@ pub(crate) struct Walk<'a> {
 pub(crate) struct Step {
     p: Vec3,
     n: Vec3,
-    /// Density per steradian of the direction taken, by all ways of drawing it.
+    /// Density per steradian of the direction taken, summed over all techniques that can draw it.
     pub pdf: f32,
     /// Expected number of aims at `p`.
     aims: f32,
@@ -66,13 +68,14 @@ pub(crate) struct Step {
 /// Kinds of light vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Lights {
-    /// All that spots light directly.
+    /// All vertices that spots light directly.
     All,
-    /// Those among them on conductors that are not shared, for vertices that a tile's shared vertices serve as well.
+    /// Directly lit vertices on unshared conductors, for vertices that a tile's shared vertices
+    /// serve as well.
     Glossy,
-    /// Those beyond near-mirrors.
+    /// Vertices beyond near-mirrors.
     Beyond,
-    /// Those in the zones of spots beside other surfaces.
+    /// Vertices in the zones of spots close to other surfaces.
     Contact,
 }
 
@@ -82,17 +85,17 @@ pub(crate) struct Scratch {
     pub stack: Stack,
     /// Weights of spots.
     pub weights: Vec<f32>,
-    /// Weights of spots in mirrors.
+    /// Weights of the spots' images in mirrors.
     images: Vec<f32>,
     /// Weights of light vertices.
     lights: Vec<f32>,
-    /// Densities that go with them, or with weights of spots.
+    /// Densities for `lights` or for weights of spots.
     pub plain: Vec<f32>,
     /// Light vertices that walks connect to.
     pub vertices: LightVertices,
     /// Light vertices beyond near-mirrors.
     pub caustics: LightVertices,
-    /// Light vertices in the zones of spots beside other surfaces.
+    /// Light vertices in the zones of spots close to other surfaces.
     pub contacts: LightVertices,
 }
 
@@ -111,22 +114,24 @@ impl Scratch {
     }
 }
 
-/// Spots that a camera vertex is connected to at most. This and the numbers below were chosen by
-/// error² × CPU time on the reference rooms, where the optimum is flat (2, 4 and 12 spots: 7.2, 5.7 and
-/// 6.0 on room-diffuse). More connections from one vertex also tie neighbouring bins of a pixel together,
-/// so that errors of sums over bins exceed what the bins' own errors say.
+/// The maximum number of spots that a camera vertex is connected to. This number and those below
+/// were chosen by error² × CPU time on the reference rooms, where the optimum is flat (2, 4 and 12
+/// spots: 7.2, 5.7 and 6.0 on room-diffuse). More connections from one vertex also correlate
+/// neighbouring bins of a pixel, so that errors of sums over bins exceed the estimate from the
+/// bins' own errors.
 pub(crate) const SPOTS: u32 = 4;
-/// Connect to every spot.
+/// Connects to every spot.
 pub(crate) const ALL: u32 = u32::MAX;
-/// Light vertices that a camera vertex is connected to at most.
+/// The maximum number of light vertices that a camera vertex is connected to.
 const LIGHTS: u32 = 2;
-/// How often a vertex of a walk aims at images: it matters less than a gather point, and costs as much.
+/// Aims at images per vertex of a walk. Such a vertex matters less than a gather point and costs as
+/// much.
 const AIMS: f32 = 0.25;
-/// Russian roulette keeps a path with this multiple of its throughput as probability.
+/// Russian roulette continues a path with a probability of this multiple of its throughput.
 const SURVIVAL: f32 = 1.5;
 
 impl Walk<'_> {
-    /// What light paths are traced in.
+    /// Returns the part of this walk's state that light paths are traced in.
     #[inline]
     pub fn surroundings(&self) -> Surroundings<'_> {
         Surroundings {
@@ -138,7 +143,7 @@ impl Walk<'_> {
         }
     }
 
-    /// True where a path with one more vertex and a spot can still count.
+    /// Returns true if a path with one more vertex and a spot can still count.
     #[inline]
     pub fn goes_on(&self, v: &Vertex) -> bool {
         !v.hit.surface.is_black()
@@ -147,15 +152,15 @@ impl Walk<'_> {
             && self.in_time(v.hit.p, v.length_m)
     }
 
-    /// False where a narrow gate ends before the shortest path by way of `p`.
+    /// Returns false if a narrow gate ends before the shortest path via `p`.
     #[inline]
     pub fn in_time(&self, p: Vec3, length_m: f64) -> bool {
         self.window
             .is_none_or(|w| length_m + self.emitters.shortest_m(self.world, p) < w.end_m)
     }
 
-    /// Drops the weights of spots whose path by way of a surface point misses a narrow gate. Returns
-    /// whether any is left.
+    /// Zeroes the weights of spots if their path via a surface point misses a narrow gate. Returns
+    /// whether any weight is left.
     pub fn keep_in_window(&self, p: Vec3, length_m: f64, weights: &mut [f32]) -> bool {
         if self.window.is_none() {
             return true;
@@ -171,7 +176,7 @@ impl Walk<'_> {
         any
     }
 
-    /// Whether a path from one of the spots with a weight by way of a surface point can count.
+    /// Returns whether a path from a spot with a weight via a surface point can count.
     pub fn any_in_window(&self, p: Vec3, length_m: f64, weights: &[f32]) -> bool {
         let mut lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
         self.window.is_none() || lit.any(|(spot, _)| self.in_window(p, length_m, spot))
@@ -184,13 +189,13 @@ impl Walk<'_> {
         self.window.is_none_or(|w| w.holds(path))
     }
 
-    /// Whether a vertex that a spot lights belongs to its zone.
+    /// Returns whether a vertex lit by a spot belongs to the spot's zone.
     #[inline]
     pub fn is_own(&self, spot: usize, h: &Hit) -> bool {
         self.contacts.is_some_and(|c| c.own(self.world, spot, h))
     }
 
-    /// Drops the weights of spots whose light at `h` is the zones'.
+    /// Zeroes the weights of spots if the zones account for their light at `h`.
     #[inline]
     pub fn leave_to_zones(&self, h: &Hit, weights: &mut [f32]) {
         if let Some(contacts) = self.contacts {
@@ -198,8 +203,9 @@ impl Walk<'_> {
         }
     }
 
-    /// Walks on from a vertex: everything beyond it except its own connection to the spots. The next vertex is connected to `spots` of
-    /// them at most, later ones to [`SPOTS`].
+    /// Walks on from a vertex and finds everything beyond it except its own connection to the
+    /// spots. The next vertex is connected to at most `spots` of them, later ones to at most
+    /// [`SPOTS`].
     pub fn run(
         &self,
         rng: &mut Rng,
@@ -227,7 +233,7 @@ impl Walk<'_> {
         }
     }
 
-    /// One step by the surface's own scattering, with Russian roulette where asked for.
+    /// Takes one step by the surface's own scattering, with Russian roulette if requested.
     pub fn step(
         &self,
         rng: &mut Rng,
@@ -250,7 +256,7 @@ impl Walk<'_> {
         Some((step, next))
     }
 
-    /// One step in a given direction: (direction, f·cos/pdf, pdf per steradian).
+    /// Takes one step in a given direction: (direction, f·cos/pdf, pdf per steradian).
     pub fn follow(
         &self,
         v: &Vertex,

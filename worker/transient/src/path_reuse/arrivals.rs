@@ -1,4 +1,4 @@
-//! What arrives at the shared vertices.
+//! The light that arrives at the shared vertices.
 
 use std::f32::consts::PI;
 
@@ -13,20 +13,21 @@ use crate::{
     world::{Hit, lift},
 };
 
-/// Walks from a shared vertex at least and at most, on average.
+/// The minimum and maximum number of walks from a shared vertex, on average.
 const WALKS: (f32, f32) = (0.2, 6.0);
 
-/// Which spots' light is carried on from a vertex. A rough one weighs each arrival for each pixel, so that of many spots
-/// some are drawn by contribution (systematic sampling), each with its share of the sum.
+/// Selects the spots that a vertex carries light from. A rough vertex weighs each arrival for each
+/// pixel, so if there are many spots, some are drawn by contribution (systematic sampling), each
+/// with its share of the sum.
 struct Carry {
-    /// Weight between two draws; 0 where all are carried as they are.
+    /// Weight between two draws; 0 if all spots are carried unchanged.
     step: f32,
     sum: f32,
     next: f32,
 }
 
 impl Carry {
-    /// `lit` are the spots that are seen, with the share of their light that glass lets through.
+    /// `lit` are the visible spots, with the fraction of their light that glass transmits.
     fn new(rough: bool, lit: &[(usize, f32)], weights: &[f32], rng: &mut Rng) -> Self {
         let total: f32 = lit.iter().map(|&(spot, _)| weights[spot]).sum();
         let step = total / ROUGH_SPOTS as f32;
@@ -38,7 +39,7 @@ impl Carry {
         }
     }
 
-    /// What is carried of the next spot, whose weight is `w`.
+    /// Returns the carried weight of the next spot, which has weight `w`.
     fn share(&mut self, w: f32) -> f32 {
         if self.step == 0.0 {
             return w;
@@ -54,12 +55,14 @@ impl Carry {
 }
 
 impl Sharing {
-    /// Finds what arrives at a shared vertex: from all spots directly, from beyond by walks. `drawn` are the candidates drawn from
-    /// spots, `density` that of drawing this one from gather points, where they are weighed.
+    /// Finds the light that arrives at a shared vertex: from all spots directly, from beyond by
+    /// walks. `drawn` is the number of candidates drawn from spots, `density` the density of
+    /// drawing this one from gather points, if they have been weighed.
     ///
-    /// There are as many walks as the gather points take of what they bring: the root of the sum of squares of the weights, of
-    /// which 1 is that of a vertex whose light all of them take alike. Light for a rough vertex is drawn by how it scatters to a
-    /// gather point that is drawn by the same weights.
+    /// The number of walks is proportional to the part of their light that the gather points
+    /// receive: the square root of the sum of the squared weights, normalised so that 1 is a vertex
+    /// that sends its light equally to all of them. Light for a rough vertex is drawn by its
+    /// scattering to a gather point drawn by the same weights.
     pub(super) fn light_up(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),
@@ -152,7 +155,7 @@ impl Sharing {
         let lit = lit.filter_map(|(spot, through)| Some((spot, through?)));
         let lit: Vec<(usize, f32)> = lit.collect();
         let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
-        // The densities are of what is drawn: with glass in the way as without.
+        // The densities do not depend on glass in between.
         for (spot, through) in lit {
             let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
             let to = h.p - e.p;

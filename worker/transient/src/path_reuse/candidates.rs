@@ -1,10 +1,11 @@
 //! Choosing shared vertices among candidates.
 //!
-//! A candidate costs a ray. A shared vertex costs a bundle of rays to the spots, one to the gather points, and walks: tens of
-//! times as much. So several candidates are drawn for each, and kept in proportion to what they are likely to bring (Talbot,
-//! Cline and Egbert, EGSR 2005, with systematic sampling). The estimate of that is cheap: no shadow rays, some gather points,
-//! and the spots' direct light. It decides how much the sums vary and not what they are, since a vertex that is kept counts
-//! for those that are not.
+//! A candidate costs a ray. A shared vertex costs a bundle of rays to the spots, one to the gather
+//! points, and walks: tens of times as much. So several candidates are drawn for each shared
+//! vertex, and selected in proportion to their expected contribution (Talbot, Cline and Egbert,
+//! EGSR 2005, with systematic sampling). The estimate of the contribution is cheap: no shadow rays,
+//! some gather points, and the spots' direct light. It affects the variance of the sums but not
+//! their expectation, because a selected vertex counts for the rejected ones as well.
 
 use std::f32::consts::PI;
 
@@ -18,33 +19,36 @@ use crate::{
     walk::{Scratch, Walk, draw},
 };
 
-/// Gather points that estimates look at, at most. All of them foresee the direct light of vertices close to one of them better:
-/// what vertices send directly has 0.4 of the variance that it has without candidates, summed over all pixels, in place of 0.7.
+/// The maximum number of gather points that estimates use. An estimate over all of them would
+/// predict the direct light of vertices close to one of them better: the variance of direct light
+/// from vertices, summed over all pixels, would be 0.4 of that without candidates, instead of 0.7.
 /// Medians and times are the same.
 const POINTS: usize = 64;
-/// Gather points that light at a rough vertex is estimated for.
+/// The number of gather points that light at a rough vertex is estimated for.
 const LOOKS: u32 = 2;
-/// What a candidate counts beside its direct light, in means of that over all: what walks bring is not foreseen. 0.3 and 2
-/// give the same medians.
+/// The constant added to the direct light of a candidate, in means of that light over all
+/// candidates, because the light of walks is not predicted. 0.3 and 2 give the same medians.
 const REST: f32 = 1.0;
 
-/// Buffers, and the gather points that are looked at.
+/// Buffers, and the gather points that estimates use.
 #[derive(Debug, Default)]
 pub(super) struct Candidates {
     columns: Columns,
-    /// Albedo/π times the weight of the camera path; of surfaces that are not Lambertian anything.
+    /// Albedo/π times the weight of the camera path; unspecified for surfaces that are not
+    /// Lambertian.
     factor: Vec<f32>,
-    /// Indices of those that are not Lambertian, and how they scatter to the camera.
+    /// Indices of the gather points that are not Lambertian, and how they scatter to the camera.
     glossy: Vec<usize>,
     lobes: Lobes,
-    /// Which of the gather points they are.
+    /// Index of each among all gather points.
     of: Vec<usize>,
     weight: Vec<f32>,
     scattered: Vec<f32>,
     drawn: Vec<f32>,
     /// Light from the spots.
     lit: Vec<f32>,
-    /// By candidate: what it is likely to bring, and how much it counts if it is kept.
+    /// By candidate: its expected contribution, and the number of candidates it counts for if it is
+    /// selected.
     worth: Vec<f32>,
     counts: Vec<f32>,
 }
@@ -75,8 +79,8 @@ impl Candidates {
         self.drawn.resize(self.glossy.len(), 0.0);
     }
 
-    /// Writes what each of the gather points takes of light that a vertex sends to it, unshadowed, and returns the density of
-    /// drawing the vertex from one of them on average.
+    /// Writes the weight of each gather point for light that a vertex sends to it, unshadowed.
+    /// Returns the average density of drawing the vertex from one of them.
     fn weigh(&mut self, y: &Shared, gathers: &[(Vertex, usize)]) -> f32 {
         let h = &y.hit;
         self.columns.irradiance(h.p, h.n, &mut self.weight);
@@ -98,8 +102,8 @@ impl Candidates {
         density / self.of.len() as f32
     }
 
-    /// Sum over the spots of the squares of what a vertex sends to direction `to` of their light, unshadowed: each has a bin
-    /// of its own.
+    /// Returns the sum over the spots of the squared light that a vertex sends in direction `to`,
+    /// unshadowed: the light of each spot falls into a bin of its own.
     fn square(
         &mut self,
         walk: &Walk,
@@ -112,8 +116,9 @@ impl Candidates {
         self.lit.iter().map(|w| w * w).sum()
     }
 
-    /// What a candidate is likely to bring: the root of the sum of squares of its direct light in all pixels. `drawn` are those
-    /// drawn from the gather points and from the spots.
+    /// Returns the expected contribution of a candidate: the square root of the sum of squares of
+    /// its direct light in all pixels. `drawn` are the numbers of candidates drawn from the gather
+    /// points and from the spots.
     fn direct(
         &mut self,
         walk: &Walk,
@@ -132,7 +137,7 @@ impl Candidates {
         let white = h.surface.white();
         let of = (Seen::of(h, h.n), &white);
         emitters.weights(of, &mut scratch.plain, &mut self.lit);
-        // A spot sends out its albedo times the density of drawing a direction.
+        // A spot scatters its albedo times the density of drawing a direction.
         let from_spots = self.lit.iter().zip(&emitters.list);
         let from_spots = from_spots.filter(|(w, _)| **w > 0.0);
         density += from_spots
@@ -159,7 +164,8 @@ impl Candidates {
 }
 
 impl Sharing {
-    /// Keeps `kept` of the candidates. `drawn` are those drawn from the gather points and from the spots.
+    /// Selects `kept` of the candidates. `drawn` are the numbers of candidates drawn from the
+    /// gather points and from the spots.
     pub(super) fn choose(
         &mut self,
         walk: &Walk,
@@ -192,8 +198,9 @@ impl Sharing {
     }
 }
 
-/// Keeps `kept` candidates in proportion to their worth and writes for how many each counts, 0 for those that are dropped. All are
-/// kept where the worths have no sum to speak of: nothing may be dropped that is not made up for.
+/// Selects `kept` candidates in proportion to their worth, and writes the number of candidates that
+/// each counts for, 0 for rejected ones. If the worths have no usable sum, all are selected,
+/// because a rejected candidate must be compensated for.
 fn count(worth: &[f32], (kept, u): (u32, f32), counts: &mut Vec<f32>) {
     counts.clear();
     counts.resize(worth.len(), 0.0);
@@ -227,7 +234,8 @@ mod tests {
                     *sum += f64::from(*c) / STEPS as f64;
                 }
             }
-            // A count is a step of the sum over the candidate's own part of it, and one of STEPS is known no better.
+            // A count is a step of the sum over the candidate's own part of it. The average over
+            // STEPS is no more precise than that.
             let step = worth.iter().sum::<f32>() / kept as f32;
             for (sum, w) in sums.iter().zip(&worth) {
                 let grain = 2.0 * f64::from(step / w) / STEPS as f64 + 1e-3;

@@ -1,4 +1,4 @@
-//! Drawing: gather points, and the vertices that they share.
+//! Drawing gather points and the vertices that they share.
 
 use picofarm_scene::Vec3;
 
@@ -16,8 +16,8 @@ use crate::{
 };
 
 impl Sharing {
-    /// Draws light vertices for this pass, those beyond near-mirrors by `count` paths, and those in the zones of spots beside other
-    /// surfaces.
+    /// Draws the light vertices of this pass: those beyond near-mirrors by `count` paths, and those
+    /// in the zones of spots close to other surfaces.
     pub(crate) fn draw_lights(walk: &Walk, count: u32, rng: &mut Rng, scratch: &mut Scratch) {
         let Scratch {
             caustics: beyond,
@@ -38,7 +38,7 @@ impl Sharing {
         }
     }
 
-    /// Connects the gather points to those light vertices.
+    /// Connects the gather points to the light vertices of [`draw_lights`].
     pub(super) fn connect_lights(
         &mut self,
         (walk, film): (&Walk, &Film),
@@ -63,7 +63,8 @@ impl Sharing {
         }
     }
 
-    /// Connects every gather point that is not near to every light vertex in a zone: one narrow bundle of rays each.
+    /// Connects every gather point that is not near a zone to every light vertex in a zone, with
+    /// one narrow bundle of rays each.
     fn connect_near(
         &mut self,
         (walk, film, contacts): (&Walk, &Film, &Contacts),
@@ -110,10 +111,13 @@ impl Sharing {
         }
     }
 
-    /// Draws vertices by the scattering of gather points in turn: `count` of which those that can be shared are, and `extra`
-    /// more for those that cannot. They are walked on for their own pixel, which is where most of the variance is, and
-    /// costs little beside what is shared. That is done for one of `times` of the `count`; the others are candidates for shared
-    /// vertices and nothing else.
+    /// Draws vertices by the scattering of gather points in turn: `count` vertices, which become
+    /// candidates for shared vertices if they can be shared, and `extra` more for surfaces that
+    /// cannot.
+    ///
+    /// Vertices that cannot be shared are walked on for their own pixel. They have most of the
+    /// variance and cost little compared to the shared work. They are walked on for one in `times`
+    /// of the `count`; the others are only candidates for shared vertices.
     pub(super) fn draw_from_camera(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),
@@ -177,8 +181,8 @@ impl Sharing {
         }
     }
 
-    /// Aims at near-mirrors from gather points in turn, `count` times, beside `alone` directions drawn by their scattering. What is met is walked on for
-    /// its own pixel.
+    /// Aims at near-mirrors from gather points in turn, `count` times, in addition to `alone`
+    /// directions drawn by their scattering. Each vertex found is walked on for its own pixel.
     pub(super) fn draw_from_mirrors(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),
@@ -193,7 +197,7 @@ impl Sharing {
         let size = film.pixel();
         let points = self.gathers.len();
         let turns = Turns::new(count, rng);
-        // As gather points aim at images.
+        // Gather points aim at images in the same way.
         let images = if walk.mirrors.list.is_empty() {
             0.0
         } else {
@@ -216,7 +220,8 @@ impl Sharing {
             if !(value > 0.0 && plain > 0.0) {
                 continue;
             }
-            // The vertex as if it had been drawn by scattering: by that weight walks live or die.
+            // The vertex as if it had been drawn by scattering. Russian roulette of its walk uses
+            // this weight.
             let drawn = (w, value / plain, plain);
             let Some((mut step, mut next)) =
                 walk.follow(&vertex, drawn, images, &mut scratch.stack)
@@ -262,7 +267,7 @@ impl Sharing {
                 .closest(&mut scratch.stack, lift(e.p, e.n), w)
                 .filter(|_| weight > 0.0);
             let Some(mut hit) = hit else { continue };
-            // Its light is the zones', and no density of it is counted there.
+            // The zones account for its light, and their densities do not include this technique.
             if walk.is_own(spot, &hit) {
                 continue;
             }
@@ -293,16 +298,16 @@ impl Sharing {
     }
 }
 
-/// What share one of a pixel's camera paths has in what near-mirrors bring.
+/// The fraction of the light of near-mirrors that one of a pixel's camera paths accounts for.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
-    /// In light from the spots and their zones.
+    /// The fraction of light from the spots and their zones.
     pub spots: f32,
-    /// In light from points beyond other near-mirrors; 0 where it is not looked for.
+    /// The fraction of light from points beyond other near-mirrors; 0 if it is not sampled.
     pub beyond: f32,
 }
 
-/// Connects what one pixel sees to the spots, and walks on from it.
+/// Connects a vertex seen by one pixel to the spots, and walks on from it.
 fn go_on_alone(
     (walk, effort): (&Walk, &Effort),
     (step, vertex): (Step, Vertex),
@@ -316,7 +321,7 @@ fn go_on_alone(
     walk.run(rng, (vertex, effort.spots.1), scratch, sink);
 }
 
-/// Connects a near-mirror to light vertices beyond others.
+/// Connects a near-mirror to light vertices beyond other near-mirrors.
 fn show(
     walk: &Walk,
     rng: &mut Rng,
@@ -332,8 +337,9 @@ fn show(
     }
 }
 
-/// Follows a camera ray through near-mirrors to the first other surface. What the spots send to vertices
-/// past the first goes to `sink`; to near-mirrors this path finds `share` of it.
+/// Follows a camera ray through near-mirrors to the first other surface. Light from the spots at
+/// vertices past the first goes to `sink`. Of the light at near-mirrors, this path adds the
+/// fraction `share`.
 pub(super) fn gather_point(
     walk: &Walk,
     rng: &mut Rng,
@@ -367,8 +373,8 @@ pub(super) fn gather_point(
     }
 }
 
-/// Follows a camera ray as [`gather_point`] does, for what the spots send to near-mirrors past the first vertex: `share` of
-/// that goes to `sink`.
+/// Follows a camera ray as [`gather_point`] does, for the light from the spots at near-mirrors past
+/// the first vertex. The fraction `share` of it goes to `sink`.
 pub(super) fn only_mirrors(
     walk: &Walk,
     rng: &mut Rng,
@@ -402,7 +408,7 @@ pub(super) fn only_mirrors(
     }
 }
 
-/// What a camera ray meets.
+/// Returns the first vertex along a camera ray.
 fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
     let world = walk.world;
     let hit = world.closest(&mut scratch.stack, Vec3::ZERO, ray)?;

@@ -1,4 +1,5 @@
-//! What arrives at rough vertices, laid out so that each pair of vertex and pixel weighs all of it side by side.
+//! The arrivals at rough vertices, laid out so that each pair of vertex and pixel weighs all of
+//! them with SIMD.
 
 use std::f32::consts::PI;
 
@@ -7,22 +8,23 @@ use picofarm_scene::Vec3;
 use super::{Arrivals, Shared};
 use crate::bsdf::Surface;
 
-/// How many arrivals are weighed in one go: those behind the last one of a vertex are not looked at. A loop of so many is long enough for
-/// the compiler to work on several at once, and has no rest that it would do one by one.
+/// The number of arrivals weighed together; results past the last arrival of a vertex are ignored.
+/// A loop of this length is long enough for the compiler to vectorise, and has no scalar remainder.
 const GROUP: usize = 16;
 
-/// By arrival, as in [`Arrivals`]; of vertices that are not rough anything, and empty where there are none.
+/// Values by arrival, as in [`Arrivals`]. They are unspecified for vertices that are not rough, and
+/// empty if no vertex is rough.
 #[derive(Debug, Default)]
 pub(super) struct Gloss {
-    /// Unit direction from which it arrives.
+    /// Unit direction of arrival.
     x: Vec<f32>,
     y: Vec<f32>,
     z: Vec<f32>,
-    /// Its cosine.
+    /// Cosine of that direction.
     cos: Vec<f32>,
-    /// What the conductor sends on, less what the other direction has to do with it.
+    /// Light scattered by the conductor, without the factors that depend on the outgoing direction.
     conductor: Vec<f32>,
-    /// What the Lambertian part sends on.
+    /// Light scattered by the Lambertian part.
     lambertian: Vec<f32>,
 }
 
@@ -50,7 +52,7 @@ impl Gloss {
                 (self.x[k], self.y[k], self.z[k]) = (from.x, from.y, from.z);
                 self.cos[k] = cos;
                 if cos > 0.0 {
-                    // In place of the white Lambertian's 1/π.
+                    // Replaces the white Lambertian's 1/π.
                     let value = PI * arrivals.value[k];
                     let (lambertian, conductor) = surface.arriving(cos);
                     self.lambertian[k] = value * lambertian;
@@ -60,7 +62,8 @@ impl Gloss {
         }
     }
 
-    /// Writes what a rough vertex sends on in the unit direction `to` of each of its arrivals, and more up to a whole group.
+    /// Writes the light that a rough vertex scatters in the unit direction `to` from each of its
+    /// arrivals, padded to a whole group.
     #[inline(always)]
     pub fn send<'a>(&'a self, y: &Shared, surface: &Surface, to: Vec3, out: &mut Vec<f32>) {
         let count = (y.end - y.first).next_multiple_of(GROUP);
@@ -77,7 +80,7 @@ impl Gloss {
         let lambertian = of(&self.lambertian);
         let leaving = surface.leaving(cos);
         let (out, _) = out.as_chunks_mut::<GROUP>();
-        // What the conductor does with light of each arrival; a loop for each of its kinds.
+        // The conductor's scattering of each arrival; one loop per kind of conductor.
         macro_rules! send {
             ($lobe:ident) => {
                 for (g, out) in out.iter_mut().enumerate() {
@@ -85,7 +88,8 @@ impl Gloss {
                     let (lambertian, conductor) = (&lambertian[g], &conductor[g]);
                     for k in 0..GROUP {
                         let along = to.x * x[k] + to.y * y[k] + to.z * z[k];
-                        // Of the sum of both directions: its square, and its part along the normal.
+                        // The squared length of the sum of both directions, and its component along
+                        // the normal.
                         let (square, c) = (2.0 + 2.0 * along, cos + cosines[k]);
                         let lobe = surface.$lobe(square, c * c);
                         out[k] = lambertian[k] + leaving * conductor[k] * lobe;

@@ -1,4 +1,4 @@
-//! Carrying what arrives at the shared vertices to the pixels.
+//! Carries the arrivals at the shared vertices to the pixels.
 
 use picofarm_scene::Vec3;
 
@@ -28,8 +28,8 @@ impl Sharing {
         let last = film.slots as f32 - 1.0;
         let lowest = self.lowest;
         let bounded = walk.max_bounces < u32::MAX;
-        // Every second arrival is summed here: a sum that waits for the one just before it in the same slot takes several
-        // times as long.
+        // Every second arrival is summed here. An addition that waits for the previous one in the
+        // same slot takes several times as long.
         let mut second = vec![0.0f32; film.slots];
         let mut sent = vec![];
         for (i, (v, k)) in self.gathers.iter().enumerate() {
@@ -46,7 +46,7 @@ impl Sharing {
                 }
                 let range = y.first..y.end;
                 let a = &self.arrivals;
-                // In whole groups; behind the last arrival nothing comes.
+                // Whole groups; the padding past the last arrival is zero.
                 let groups = y.first..y.end.next_multiple_of(SIDE);
                 let values = match &y.rough {
                     None => &a.value[groups.clone()],
@@ -60,7 +60,7 @@ impl Sharing {
                     let (bins, _) = a.bins[groups].as_chunks::<SIDE>();
                     let (values, _) = values.as_chunks::<SIDE>();
                     let mut left = range.len();
-                    // Slots and values side by side.
+                    // Slots and values are computed with SIMD.
                     for (bins, values) in bins.iter().zip(values) {
                         let (mut slots, mut found) = ([0u32; SIDE], [0.0f32; SIDE]);
                         for (slot, b) in slots.iter_mut().zip(bins) {
@@ -86,7 +86,7 @@ impl Sharing {
                 }
                 let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
                 let each = a.bins[y.first..y.end].iter().zip(values).zip(rest);
-                // In the same order as above: groups of spots change no bit.
+                // The order is the same as above, so groups of spots do not change a bit.
                 for (k, ((&b, &value), (&spot, &bounces))) in each.enumerate() {
                     if u32::from(bounces) + deeper > walk.max_bounces {
                         continue;
@@ -109,7 +109,7 @@ impl Sharing {
     }
 }
 
-/// [`Sharing::spread`].
+/// Arguments of [`Sharing::spread`].
 struct Spread<'a> {
     sharing: &'a Sharing,
     walk: &'a Walk<'a>,
@@ -134,8 +134,9 @@ fn toward(y: &Shared, v: &Vertex) -> Vec3 {
     to * (1.0 / to.length())
 }
 
-/// ⌊x⌋ within 0..=last, for last < 2²². Half an ulp of 2²³ is ½: adding it leaves the integer in the low
-/// bits, without the checks of a cast. (An x within rounding of an integer may fall to either side.)
+/// Returns ⌊x⌋ clamped to 0..=last, for last < 2²². Half an ulp of 2²³ is ½, so adding 2²³ leaves
+/// the integer in the low bits, without the checks of a cast. (An x within rounding of an integer
+/// may fall to either side.)
 #[inline(always)]
 fn floor(x: f32, last: f32) -> u32 {
     let half = x.max(0.5).min(last + 0.5) - 0.5;

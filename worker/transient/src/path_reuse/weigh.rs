@@ -1,4 +1,4 @@
-//! What the gather points take of light from each shared vertex.
+//! The weights of the gather points for light from each shared vertex.
 
 use std::f32::consts::PI;
 
@@ -16,11 +16,12 @@ use crate::{
 };
 
 impl Sharing {
-    /// Weighs every pair of shared vertex and gather point, and finds what arrives at the vertices. `drawn` are the candidates drawn
-    /// from gather points and from spots.
+    /// Weighs every pair of shared vertex and gather point, and finds the arrivals at the vertices.
+    /// `drawn` are the numbers of candidates drawn from gather points and from spots.
     ///
-    /// What arrives is looked for in proportion to what the gather points take of it. Not so with a narrow gate: there few
-    /// vertices have arrivals in its window, and only those are weighed.
+    /// The effort for arrivals is proportional to the light that the gather points receive. A
+    /// narrow gate is different: few vertices have arrivals in its window, and only those are
+    /// weighed.
     pub(super) fn connect(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),
@@ -68,8 +69,8 @@ impl Sharing {
         self.arrivals.fill_up();
     }
 
-    /// Writes what each gather point takes of light that a shared vertex sends to it. Returns the density of drawing the vertex
-    /// from one of them.
+    /// Writes the weight of each gather point for light that a shared vertex sends to it. Returns
+    /// the density of drawing the vertex from one of them.
     fn weigh(&mut self, walk: &Walk, at: usize, scratch: &mut Scratch) -> f32 {
         let count = self.gathers.len();
         let y = &self.shared[at];
@@ -124,14 +125,15 @@ impl Sharing {
     }
 }
 
-/// What the gather points do with light of a direction, side by side.
+/// How the gather points weigh light from a direction, as columns.
 #[derive(Debug, Default)]
 pub(super) struct Lengths {
-    /// Albedo/π times the weight of the camera path; of surfaces that are not Lambertian anything.
+    /// Albedo/π times the weight of the camera path; unspecified for surfaces that are not
+    /// Lambertian.
     factor: Vec<f32>,
-    /// Optical path from the camera less the gate's start, in bins.
+    /// Optical path length from the camera, minus the gate's start, in bins.
     bins: Vec<f64>,
-    /// Bins in a render unit.
+    /// Bins per render unit.
     per_unit: f64,
 }
 
@@ -147,9 +149,10 @@ impl Lengths {
         }
     }
 
-    /// Turns the irradiances that a shared vertex in `y` casts on Lambertian gather points into what they send to the
-    /// camera, and finds the optical paths by way of it, in bins. Returns the density of drawing the vertex from them. No
-    /// branches, and sums side by side: the compiler works on several at once.
+    /// Converts the irradiances that a shared vertex at `y` casts on Lambertian gather points into
+    /// the light that they send to the camera, and computes the optical path lengths via `y`, in
+    /// bins. Returns the density of drawing the vertex from them. The loop has no branches, and its
+    /// sums are independent, so the compiler can vectorise it.
     pub fn weigh(&self, columns: &Columns, y: Vec3, weight: &mut [f32], offset: &mut [f32]) -> f32 {
         widest(Weigh {
             lengths: self,
@@ -187,7 +190,7 @@ impl Lengths {
     }
 }
 
-/// [`Lengths::weigh`].
+/// Arguments of [`Lengths::weigh`].
 struct Weigh<'a> {
     lengths: &'a Lengths,
     columns: &'a Columns,

@@ -1,16 +1,18 @@
-//! Gates that no light reaches: known from lengths alone, before any ray is traced.
+//! Gates that no light reaches, determined from lengths alone before any ray is traced.
 
 use picofarm_scene::Vec3;
 
 use crate::{api::Gate, emitter::Emitters, world::World};
 
-/// What sums of lengths in f32 may be off, as a share of them.
+/// Relative rounding error of sums of lengths in f32.
 const ROUNDING: f64 = 1e-5;
 
-/// Whether all light comes after the gate's end, or before its start. Every path is at least as long as the
-/// straight ways to its spot and from there to the camera. One of `max_bounces` is at most as long as the
-/// way to its spot and as many times the way across the scene. What comes late by ever more bounces never
-/// ends, so that without a bound no gate is too late.
+/// Returns whether all light arrives after the gate's end or before its start.
+///
+/// Every path is at least as long as the straight segments from the laser to its spot and from
+/// there to the camera. A path of `max_bounces` bounces is at most as long as the segment to its
+/// spot plus `max_bounces` diagonals of the scene. Without a bound on the bounces, paths can be
+/// arbitrarily long, so no gate is too late.
 pub(super) fn is_dark(world: &World, emitters: &Emitters, gate: &Gate, max_bounces: u32) -> bool {
     let each = || emitters.list.iter();
     let first = each().map(|e| e.path_m + world.metres(e.p.length()));
@@ -18,7 +20,7 @@ pub(super) fn is_dark(world: &World, emitters: &Emitters, gate: &Gate, max_bounc
     if first * (1.0 - ROUNDING) > gate.end_m() {
         return true;
     }
-    // Within glass light may go to and fro for long.
+    // Light may travel back and forth within glass for long.
     if max_bounces == u32::MAX || world.has_glass() || world.has_bodies() {
         return false;
     }

@@ -1,18 +1,20 @@
-//! How large a pixel's error is likely to be, beside its standard error.
+//! The likely size of a pixel's error, which its standard error alone does not tell.
 //!
-//! The standard error is a quadratic mean. Where one path brings light to many bins at once, a pixel errs by a few chances
-//! alone: most pixels err by less than their standard error, and few by much more. So some pixels are *watched*: they keep
-//! the sum over every eighth pass, of what the tiles find and of what light paths draw into the image. Differences of these
-//! sums are draws of the pixel's error, with all that its bins have in common, and the median over pixels is taken of them.
+//! The standard error is a quadratic mean. If one path brings light to many bins at once, a few
+//! random events determine the pixel's error: most pixels err by less than their standard error,
+//! and few by much more. So some pixels are *watched*: they store the sum over every eighth pass,
+//! both of the tiles' contributions and of those that light paths draw into the image. Differences
+//! of these sums are draws of the pixel's error, with all correlations between its bins, and the
+//! median over pixels is taken of them.
 
 use super::{error::Stat, region::Region};
 
-/// Sums over every eighth pass, and their seven independent differences.
+/// The number of sums, each over every eighth pass, and of their independent differences.
 const PHASES: usize = 8;
 const DRAWS: usize = PHASES - 1;
-/// One pixel in so many rows and columns is watched.
+/// One pixel in this many rows and columns is watched.
 const APART: u32 = 3;
-/// Watched pixels that a statement is made from at least.
+/// The minimum number of watched pixels for an estimate.
 const LEAST: usize = 16;
 
 /// ‖draw of a pixel's error‖² over the bins, for each draw.
@@ -21,35 +23,35 @@ pub(super) type Draw = [f64; DRAWS];
 /// Sums over every eighth pass.
 pub(super) type Sums = [f32; PHASES];
 
-/// From sums over every eighth pass to draws of the error of the mean over all passes.
+/// Converts sums over every eighth pass to draws of the error of the mean over all passes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Phases {
-    /// Of each phase's sum in a draw.
+    /// Weight of each phase's sum in a draw.
     weights: [f64; PHASES],
 }
 
 impl Phases {
-    /// Those of so many passes; `None` where a phase has none.
+    /// Returns the weights for this number of passes, or `None` if a phase has no pass.
     pub fn of(passes: u32) -> Option<Self> {
         if !are_drawn(passes) {
             return None;
         }
-        // Means over the passes of each phase. Of n passes, a phase has n/8 or one more.
+        // Means over the passes of each phase. A phase has n/8 of the n passes, or one more.
         let n = |phase: usize| (passes as usize + PHASES - 1 - phase) / PHASES;
         let spread: f64 = (0..PHASES).map(|phase| 1.0 / n(phase) as f64).sum();
-        // A mean of all passes has 1/passes of a pass' variance.
+        // The mean of all passes has 1/passes of the variance of a pass.
         let factor = (1.0 / (f64::from(passes) * spread)).sqrt();
         Some(Self {
             weights: std::array::from_fn(|phase| factor / n(phase) as f64),
         })
     }
 
-    /// The phase of a pass.
+    /// Returns the phase of a pass.
     pub fn phase(pass: u32) -> usize {
         pass as usize % PHASES
     }
 
-    /// Adds a bin with such sums to a pixel's draws.
+    /// Adds a bin with these sums to a pixel's draws.
     pub fn add(&self, sums: Sums, draw: &mut Draw) {
         let mean = |phase: usize| f64::from(sums[phase]) * self.weights[phase];
         let means: [f64; PHASES] = std::array::from_fn(mean);
@@ -60,27 +62,28 @@ impl Phases {
     }
 }
 
-/// A draw of the error of two parts that err independently: on average their squares add up.
+/// Returns a draw of the error of two parts that err independently: on average their squares add
+/// up.
 pub(super) fn joined(draw: Draw, other: f64) -> Draw {
     draw.map(|square| square + other)
 }
 
-/// Whether so many passes have draws of their own.
+/// Returns whether there are enough passes for draws of their own.
 pub(super) fn are_drawn(passes: u32) -> bool {
     passes as usize >= PHASES
 }
 
-/// A draw from a pixel's variance alone.
+/// Returns a draw from a pixel's variance alone.
 pub(super) fn of_variance(variance: f64) -> Draw {
     [variance; DRAWS]
 }
 
-/// What the watched pixels of a tile keep.
+/// The sums of the watched pixels of a tile.
 #[derive(Debug, Default)]
 pub(super) struct Watched {
-    /// By pixel of the tile.
+    /// Index of the watched pixel, by pixel of the tile.
     places: Vec<Option<u32>>,
-    /// Which pixels are watched.
+    /// The watched pixels.
     pixels: Vec<usize>,
     slots: usize,
     /// `[watched][phase][slot]`: Σ over passes of the 3+ part.
@@ -89,24 +92,25 @@ pub(super) struct Watched {
     two: Vec<f32>,
 }
 
-/// Whether pixel `k` of a region is watched.
+/// Returns whether pixel `k` of a region is watched.
 pub(super) fn is_watched(region: &Region, k: usize) -> bool {
     let chosen = |i: u32| i % APART == APART / 2;
     let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
     chosen(region.row + row) && chosen(region.col + col)
 }
 
-/// The watched pixels of a region.
+/// Returns the watched pixels of a region.
 pub(super) fn watched(region: &Region) -> impl Iterator<Item = usize> + '_ {
     (0..region.pixels()).filter(|&k| is_watched(region, k))
 }
 
-/// How many pixels of a region are watched.
+/// Returns the number of watched pixels of a region.
 pub(super) fn count(region: &Region) -> usize {
     watched(region).count()
 }
 
-/// The sign of a phase in a draw: rows of a Hadamard matrix, so that draws are independent of the mean and of each other.
+/// Returns the sign of a phase in a draw. The signs are rows of a Hadamard matrix, so draws are
+/// independent of the mean and of each other.
 fn sign(draw: usize, phase: usize) -> f64 {
     match ((draw + 1) & phase).count_ones() % 2 {
         0 => 1.0,
@@ -115,7 +119,7 @@ fn sign(draw: usize, phase: usize) -> f64 {
 }
 
 impl Watched {
-    /// Empties it for a region.
+    /// Clears the sums and prepares them for a region.
     pub fn reset(&mut self, region: &Region, slots: usize) {
         self.slots = slots;
         self.pixels.clear();
@@ -131,12 +135,12 @@ impl Watched {
         }
     }
 
-    /// Which pixels of the region are watched, ascending.
+    /// Returns the watched pixels of the region, ascending.
     pub fn pixels(&self) -> &[usize] {
         &self.pixels
     }
 
-    /// Adds a pass over pixel `k`, if that is watched.
+    /// Adds a pass over pixel `k`, if the pixel is watched.
     #[inline]
     pub fn add(&mut self, k: usize, pass: u32, values: &[f32]) {
         let Some(place) = self.places[k] else { return };
@@ -147,7 +151,8 @@ impl Watched {
         }
     }
 
-    /// Keeps a draw of the error of pixel `k`'s two-bounce part, if that is watched: `factor` times `noise`.
+    /// Stores a draw of the error of pixel `k`'s two-bounce part, `factor` times `noise`, if the
+    /// pixel is watched.
     pub fn two(&mut self, k: usize, noise: &[f32], factor: f32) {
         let Some(place) = self.places[k] else { return };
         let two = &mut self.two[place as usize * self.slots..][..self.slots];
@@ -156,8 +161,9 @@ impl Watched {
         }
     }
 
-    /// Draws of the errors of the watched pixels' 3+ part after so many passes. With fewer than eight of
-    /// them its variance, which `multi_variance` says by pixel of the region, stands in their place.
+    /// Returns draws of the errors of the watched pixels' 3+ part after this number of passes. With
+    /// fewer than eight passes, each draw is the variance `multi_variance` of the pixel of the
+    /// region.
     pub fn draws(&self, passes: u32, multi_variance: impl Fn(usize) -> f64) -> Vec<Draw> {
         let phases = Phases::of(passes);
         let pixels = self.pixels.iter().enumerate();
@@ -175,7 +181,7 @@ impl Watched {
         each.collect()
     }
 
-    /// ‖draw of the two-bounce part's error‖² of the watched pixels.
+    /// Returns ‖draw of the two-bounce part's error‖² of the watched pixels.
     pub fn two_draws(&self) -> Vec<f64> {
         let slots = self.slots.max(1);
         let each = self.two.chunks(slots).map(|two| {
@@ -186,8 +192,8 @@ impl Watched {
     }
 }
 
-/// By how much the `q`-quantile over pixels of the errors differs from that of the standard errors: a factor. `draws` are
-/// those of some pixels of `stats`. 1 where too few pixels are watched.
+/// Returns the ratio of the `q`-quantile of the errors over pixels to that of the standard errors.
+/// `draws` are those of some pixels of `stats`. Returns 1 if too few pixels are watched.
 pub(super) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
     let (mut stated, mut drawn) = (vec![], vec![]);
     for (pixel, draw) in draws {
@@ -231,7 +237,7 @@ mod tests {
         }
     }
 
-    /// Draws and variances of pixels whose passes are as `value` says, after so many.
+    /// Returns draws and variances of pixels after `passes` passes with the values from `value`.
     fn drawn(passes: u32, mut value: impl FnMut(&mut Rng) -> Vec<f32>) -> (Vec<Draw>, Vec<f64>) {
         let mut watched = Watched::default();
         watched.reset(&region(), SLOTS);
@@ -264,13 +270,13 @@ mod tests {
 
     #[test]
     fn draws_have_the_variance_of_the_mean() {
-        // Of eight passes, to rounding: the draws hold all that there is but the mean.
+        // With eight passes, the draws contain everything except the mean, up to rounding.
         let (draws, variances) = drawn(8, apart);
         for (draw, variance) in draws.iter().zip(&variances) {
             let mean = draw.iter().sum::<f64>() / draw.len() as f64;
             assert!((mean / variance - 1.0).abs() < 1e-5, "{mean} {variance}");
         }
-        // Of other numbers, on average.
+        // With other numbers of passes, they do so on average.
         for passes in [9, 13, 64, 101] {
             let (draws, variances) = drawn(passes, apart);
             let all: f64 = draws.iter().flatten().sum();

@@ -1,4 +1,4 @@
-//! From variances to error estimates, and from those to a number of passes.
+//! Computes error estimates from variances, and the number of passes from error estimates.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,21 +8,23 @@ use super::{
 };
 use crate::api::ErrorEstimate;
 
-/// Bins on either side over which the variance of the 3+ part and of the two-bounce part is pooled.
+/// The number of bins on either side over which the variance of the 3+ part and of the two-bounce
+/// part is pooled.
 pub(super) const MULTI_REACH: usize = 3;
 pub(super) const TWO_REACH: usize = 1;
-/// Share of a pixel's mean variance that every bin gets on top.
+/// Fraction of a pixel's mean variance added to every bin.
 const FLOOR: f32 = 0.003;
-/// Share of a bin's own sample variance: edges and peaks stand out from their neighbours by it. Without it
-/// the brightest bins deviate by 1.25 to 1.4 of what is stored for them.
+/// Weight of a bin's own sample variance, because edges and peaks differ from their neighbours.
+/// Without it the brightest bins deviate by 1.25 to 1.4 of the stored error.
 const OWN: f32 = 0.5;
 
-/// Pools variances in place, half of each, over 3×3 pixels and a few bins, within a region's `[row][col][slot]`.
+/// Pools variances in place, half of each, over 3×3 pixels and a few bins, within a region's
+/// `[row][col][slot]`.
 ///
-/// A bin that few paths reach has a sample variance that is mostly luck, and often nearly nothing; its
-/// neighbours have nearly the same true variance, and together they know it. The floor stands for paths
-/// that might come and did not. Over many seeds the rms of (h − mean) / error is then 1 within a few
-/// percent, where single sample variances give any number.
+/// The sample variance of a bin that few paths reach is mostly chance, and often nearly zero. Its
+/// neighbours have nearly the same true variance, so their mean is a better estimate. The floor
+/// accounts for paths that might have arrived and did not. Over many seeds the rms of (h − mean) /
+/// error is then 1 within a few percent, whereas with single sample variances it is arbitrary.
 pub(super) fn pool(
     variance: &mut [f32],
     region: &Region,
@@ -37,7 +39,8 @@ pub(super) fn pool(
     for row in smooth.iter_mut() {
         row.resize(size, 0.0);
     }
-    // Rows of pixels in turn, of which three are kept: a large region would not stay in the cache.
+    // Pixel rows are processed in turn and three are buffered, because a large region would not
+    // stay in the cache.
     let mut done = 0;
     for row in 0..height {
         while done < height && done <= row + 1 {
@@ -61,14 +64,15 @@ pub(super) fn pool(
     }
 }
 
-/// Room that [`pool`] works in: a row of pixels after the mean over bins, and the latest three after that over columns.
+/// Work buffers of [`pool`]: a row of pixels after the mean over bins, and the latest three rows
+/// after the mean over columns.
 #[derive(Debug, Default)]
 pub(super) struct Pool {
     bins: Vec<f32>,
     smooth: [Vec<f32>; 3],
 }
 
-/// Means of a pixel's bins and their neighbours, with the floor.
+/// Writes the means of a pixel's bins and their neighbours, with the floor.
 fn along_bins(out: &mut [f32], v: &[f32], reach: usize) {
     let slots = v.len();
     let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
@@ -78,7 +82,7 @@ fn along_bins(out: &mut [f32], v: &[f32], reach: usize) {
         let near = &v[k.saturating_sub(reach)..(k + reach + 1).min(slots)];
         out[k] = near.iter().sum::<f32>() / near.len() as f32 + floor;
     }
-    // All others side by side.
+    // All other bins, with SIMD.
     if slots > 2 * reach {
         let inner = &mut out[reach..slots - reach];
         inner.copy_from_slice(&v[..inner.len()]);
@@ -93,7 +97,7 @@ fn along_bins(out: &mut [f32], v: &[f32], reach: usize) {
     }
 }
 
-/// The mean of one to three items.
+/// Writes the mean of one to three items.
 fn mean<'a>(out: &mut [f32], mut items: impl ExactSizeIterator<Item = &'a [f32]>) {
     let share = 1.0 / items.len() as f32;
     if let Some(first) = items.next() {
@@ -109,8 +113,8 @@ fn mean<'a>(out: &mut [f32], mut items: impl ExactSizeIterator<Item = &'a [f32]>
     }
 }
 
-/// Keeps what lies outside the gate out of the pool: the slots before and after the gate take the
-/// value of the bin next to them.
+/// Excludes light outside the gate from the pool: the slots before and after the gate take the
+/// value of the adjacent bin.
 pub(super) fn shut_out(variance: &mut [f32], slots: usize) {
     for v in variance.chunks_mut(slots) {
         v[0] = v[1];
@@ -118,9 +122,11 @@ pub(super) fn shut_out(variance: &mut [f32], slots: usize) {
     }
 }
 
-/// The power of the passes that error² × passes of the 3+ part rises with in the median over pixels, stated or true: after few passes most
-/// pixels have not met what is rare and bright. From 4 to 64 passes it was 0.08 to 0.16 in rooms of 1 to 100 spots. It is counted
-/// on for so many times the passes: for 4 times, one class of rooms ended at 8.5 % where 10 were asked for, without a bound at 7.4.
+/// The exponent with which error² × passes of the 3+ part rises with the passes in the median over
+/// pixels, stated or true. After few passes, most pixels have not yet received rare bright paths.
+/// From 4 to 64 passes the exponent was 0.08 to 0.16 in rooms of 1 to 100 spots. The rise is
+/// extrapolated up to `RISES` times the passes: with 4 times, one class of rooms ended at 8.5 %
+/// with a target of 10 %; without a bound, at 7.4 %.
 const RISE: f64 = 0.13;
 const RISES: f64 = 2.0;
 
@@ -138,14 +144,14 @@ pub(super) struct Stat {
 }
 
 impl Stat {
-    /// ‖standard error‖ / ‖h‖; `None` for a pixel without light.
+    /// Returns ‖standard error‖ / ‖h‖, or `None` for a pixel without light.
     pub fn error(&self) -> Option<f64> {
         relative(self.norm2, self.two_variance + self.multi_variance)
     }
 }
 
-/// ‖standard error‖ / ‖h‖ of a pixel; `None` for a pixel without light. The measured ‖h‖² contains the
-/// variance; it is taken off, down to a tenth.
+/// Returns ‖standard error‖ / ‖h‖ of a pixel, or `None` for a pixel without light. The measured
+/// ‖h‖² contains the variance, so the variance is subtracted, down to a tenth.
 fn relative(norm2: f64, variance: f64) -> Option<f64> {
     let clean = (norm2 - variance).max(0.1 * norm2);
     (norm2 > 0.0).then(|| (variance / clean).sqrt())
@@ -164,13 +170,13 @@ fn sorted(stats: impl Iterator<Item = Stat>) -> Vec<f64> {
     all
 }
 
-/// Median of the pixels' relative standard errors.
+/// Returns the median of the pixels' relative standard errors.
 pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
     quantile(&sorted(stats), 0.5)
 }
 
-/// Variance of an energy's mean over passes, and the variance of that variance beyond what it is where passes scatter
-/// normally (2/n of its square).
+/// Variance of an energy's mean over passes, and the variance of that variance in excess of its
+/// value for normally distributed passes (2/n of its square).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Spread {
     pub variance: f64,
@@ -178,7 +184,7 @@ pub(super) struct Spread {
 }
 
 impl Spread {
-    /// That of the mean of `passes`; of a single one, its square.
+    /// Returns the spread of the mean of `passes`. The variance of a single pass is its square.
     pub fn of(passes: &[f64]) -> Self {
         let n = passes.len() as f64;
         if passes.len() < 2 {
@@ -201,7 +207,7 @@ impl Spread {
         }
     }
 
-    /// That of the energy times `factor`.
+    /// Returns the spread of the energy times `factor`.
     pub fn scaled(self, factor: f64) -> Self {
         let square = factor * factor;
         Self {
@@ -210,7 +216,7 @@ impl Spread {
         }
     }
 
-    /// That of a sum of two independent energies.
+    /// Returns the spread of a sum of two independent energies.
     pub fn plus(self, other: Self) -> Self {
         Self {
             variance: self.variance + other.variance,
@@ -218,14 +224,15 @@ impl Spread {
         }
     }
 
-    /// That of the mean over `n` passes, which it is of, and over `m` more, which `other` is of. The means
-    /// over both tell how far they scatter as well as the passes of each do.
+    /// Returns the spread of the mean over `n` passes, which `self` describes, and over `m` more,
+    /// which `other` describes. The difference of the means contributes to the estimate as well as
+    /// the passes of each.
     pub fn joined(self, (n, mean): (f64, f64), other: Self, (m, other_mean): (f64, f64)) -> Self {
         if n == 0.0 || m == 0.0 {
             return if n == 0.0 { other } else { self };
         }
         let difference2 = (mean - other_mean).powi(2);
-        // A single pass has no scatter of its own.
+        // A single pass has no variance of its own.
         let of = |s: Self, n: f64| if n > 1.0 { s.of_variance } else { 0.0 };
         let part = |s: Self, k: f64| of(s, k) * (k / (n + m)).powi(4);
         Self {
@@ -234,7 +241,7 @@ impl Spread {
         }
     }
 
-    /// Relative standard error of the variance.
+    /// Returns the relative standard error of the variance.
     fn uncertainty(self) -> f64 {
         match self.variance > 0.0 {
             true => self.of_variance.sqrt() / self.variance,
@@ -243,8 +250,9 @@ impl Spread {
     }
 }
 
-/// Variance of the mean of `n` and `m` passes together: `variances` of the mean of each, and the squared
-/// difference of these means (Chan, Golub and LeVeque 1979). A single pass has no variance of its own.
+/// Returns the variance of the mean of `n` and `m` passes together, from the `variances` of the
+/// mean of each and the squared difference of these means (Chan, Golub and LeVeque 1979). A single
+/// pass has no variance of its own.
 pub(super) fn joined_variance((n, m): (f64, f64), variances: (f64, f64), difference2: f64) -> f64 {
     if n == 0.0 || m == 0.0 {
         return if n == 0.0 { variances.1 } else { variances.0 };
@@ -258,25 +266,26 @@ pub(super) fn joined_variance((n, m): (f64, f64), variances: (f64, f64), differe
 /// The errors of a whole image.
 #[derive(Debug, Clone)]
 pub(super) struct Errors {
-    /// By pixel.
+    /// Sums by pixel.
     pub stats: Vec<Stat>,
     /// The watched pixels, and draws of their errors.
     pub draws: Vec<(usize, Draw)>,
-    /// Of the whole energy.
+    /// Spread of the whole energy.
     pub spread: Spread,
-    /// Passes.
+    /// The number of passes.
     pub samples: u32,
-    /// What the two-bounce variance is in proportion to.
+    /// The value that the two-bounce variance is proportional to.
     pub two_unit: f64,
 }
 
 impl Errors {
-    /// By how much the `q`-quantile over pixels of the errors differs from that of the standard errors: a factor.
+    /// Returns the ratio of the `q`-quantile of the errors over pixels to that of the standard
+    /// errors.
     pub fn likely(&self, q: f64) -> f64 {
         likely(&self.stats, &self.draws, q)
     }
 
-    /// What they come to.
+    /// Returns the error estimate of the image.
     pub fn estimate(&self) -> ErrorEstimate {
         let all = sorted(self.stats.iter().copied());
         let total: f64 = self.stats.iter().map(|s| s.total).sum();
@@ -295,12 +304,13 @@ impl Errors {
     }
 }
 
-/// The median standard error after `n` passes of pixels that stand as `stats` says after `passes`.
+/// Returns the median standard error after `n` passes, for pixels with sums `stats` after `passes`.
 pub(super) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u32) -> f64) -> f64 {
     let more = f64::from(n) / f64::from(passes);
     let scale = libm::pow(more.min(RISES), RISE) / more;
     let then = stats.iter().map(|s| {
-        // As `sorted` would find it after n passes: the measured norm loses the variance of now.
+        // The result of `sorted` after n passes: the present variance is subtracted from the
+        // measured norm.
         let now = s.two_variance + s.multi_variance;
         let clean = (s.norm2 - now).max(0.1 * s.norm2);
         let two_variance = s.two_variance * two(n) / two(passes);
@@ -315,8 +325,9 @@ pub(super) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u3
     relative_median(then)
 }
 
-/// The fewest passes, from `least` to `most`, with which pixels that stand as `stats` says after
-/// `passes` come down to a median standard error of `target`. `two` says how the two-bounce variance falls.
+/// Returns the fewest passes, from `least` to `most`, that reduce the median standard error to
+/// `target`, for pixels with sums `stats` after `passes`. `two` returns the relative two-bounce
+/// variance after a number of passes.
 pub(super) fn passes_for(
     stats: &[Stat],
     passes: u32,
@@ -346,7 +357,7 @@ mod tests {
 
     use super::{FLOOR, OWN, Pool, Region, Stat, median_after, passes_for, pool};
 
-    /// The definition, a bin at a time.
+    /// The definition, one bin at a time.
     fn plain(v: &[f32], (rows, cols, slots): (usize, usize, usize), reach: usize) -> Vec<f32> {
         let near =
             |k: usize, n: usize, reach: usize| k.saturating_sub(reach)..(k + reach + 1).min(n);

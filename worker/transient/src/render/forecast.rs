@@ -1,4 +1,4 @@
-//! What a render would take, from a few tiles of it.
+//! Forecasts the cost and error of a render from a few of its tiles.
 
 use std::collections::HashMap;
 
@@ -22,30 +22,30 @@ use crate::{
     film::Film,
 };
 
-/// Number of the tiles looked at along each side of the image, and their passes.
+/// The number of sampled tiles along each side of the image, and their passes.
 const TILES: u32 = 3;
 const PASSES: u32 = 8;
 
-/// What a render would do.
+/// The forecast of a render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
-    /// What the renderer decides for the scene.
+    /// The renderer's decisions for the scene.
     pub plan: Plan,
-    /// Passes (camera paths of each pixel); 0 where no walk is needed.
+    /// Passes (camera paths per pixel); 0 if no walk is needed.
     pub passes: u32,
-    /// Median per-pixel relative error that they come to; see [`crate::ErrorEstimate`].
+    /// Median per-pixel relative error after these passes; see [`crate::ErrorEstimate`].
     pub error: f32,
     /// Rays of the whole render.
     pub rays: u64,
-    /// What is wrong with scene or gate, as far as it is certain beforehand; empty if nothing.
+    /// Warnings about the scene or gate that are certain beforehand; empty if there are none.
     pub warnings: Vec<String>,
 }
 
-/// Renders a few tiles with a few passes, and light paths as far as they tell what those tiles get, and scales up; `rays` are
-/// those of the ground truth.
+/// Renders a few tiles with a few passes, and enough light paths to estimate their contribution to
+/// those tiles, and scales up. `rays` is the number of rays of the ground truth.
 ///
 /// # Errors
-/// [`RenderError::Memory`].
+/// Returns [`RenderError::Memory`] if an allocation fails.
 pub(super) fn forecast(
     frame: &Frame,
     budget: &Budget,
@@ -85,7 +85,8 @@ pub(super) fn forecast(
             (n, median_after(&stats, PASSES, n, &two))
         }
     };
-    // Rays of a pixel: two bounces take side² times something, and each pass takes the same.
+    // Rays of a pixel: two bounces take a constant times side², and all passes take the same
+    // number.
     let (s1, s8) = (side(1).powi(2), side(PASSES).powi(2));
     let eight = f64::from(PASSES);
     let of_two = ((eight * one.rays - found.rays) / (eight * s1 - s8)).clamp(0.0, found.rays / s8);
@@ -101,7 +102,7 @@ pub(super) fn forecast(
     })
 }
 
-/// What was found in the tiles looked at.
+/// The results of the sampled tiles.
 struct Found {
     regions: Vec<Region>,
     tiles: Vec<Looked>,
@@ -109,12 +110,12 @@ struct Found {
     rays: f64,
 }
 
-/// One of them.
+/// The result of one tile.
 struct Looked {
     /// h by pixel and bin.
     light: Vec<f32>,
     stats: Vec<Stat>,
-    /// By pixel of the tile.
+    /// Draws by pixel of the tile.
     draws: Vec<(usize, Draw)>,
     rays: u64,
 }
@@ -124,7 +125,7 @@ impl Found {
         self.tiles.iter().flat_map(|t| &t.stats).copied().collect()
     }
 
-    /// Draws of the errors of some pixels, by their place in all tiles together.
+    /// Returns draws of the errors of some pixels, by their index in all tiles together.
     fn draws(&self) -> Vec<(usize, Draw)> {
         let (mut draws, mut before) = (vec![], 0);
         for tile in &self.tiles {
@@ -135,9 +136,10 @@ impl Found {
     }
 }
 
-/// The tiles looked at.
+/// Returns the sampled tiles.
 pub(super) fn regions(frame: &Frame) -> Vec<Region> {
-    // As wide as the image's own: the more pixels share vertices, the smaller is their error.
+    // The regions are as wide as the image's own tiles, because the error decreases with the number
+    // of pixels that share vertices.
     let widest = tile_side(frame);
     let starts = |length: u32| -> Vec<u32> {
         let side = widest.min(length);
@@ -164,7 +166,8 @@ pub(super) fn regions(frame: &Frame) -> Vec<Region> {
 fn look(frame: &Frame, passes: u32) -> Found {
     let regions = regions(frame);
     let pixels: usize = regions.iter().map(Region::pixels).sum();
-    // Passes from the far end of the range: the render's own would be no forecast.
+    // Passes from the far end of the range, because with the render's own passes the result would
+    // not be a forecast.
     let order = Order {
         first: u32::MAX - PASSES,
         count: passes,
@@ -208,8 +211,9 @@ fn look(frame: &Frame, passes: u32) -> Found {
     }
 }
 
-/// Adds what is drawn into the image, as it is after so many passes; returns the rays of one of them. Light paths cross tiles, so
-/// that those looked at get as little of them as all others: fewer are made than a pass has, and their variance is scaled.
+/// Adds the light drawn into the image, scaled to its state after `after` passes. Returns the rays
+/// of one pass. Light paths cross tiles, so the sampled tiles receive as little of them as all
+/// others. Therefore fewer light paths are traced than in a pass, and their variance is scaled.
 fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderError> {
     let Some(sources) = Sources::of(frame) else {
         return Ok(0);
@@ -222,7 +226,7 @@ fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderErro
         regions,
     };
     let watch = Watch::new(&Unstopped, 0.0, 1.0);
-    // What camera paths find alone, and what fewer light paths bring.
+    // The contributions of camera paths alone, and those of fewer light paths.
     let mut layers = [Layer::new(frame), Layer::new(frame)];
     let mut rays = 0;
     for pass in 0..PASSES {
@@ -238,7 +242,7 @@ fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderErro
     let places = places(frame, regions);
     let (bins, unit) = (frame.film.slots - 2, unit(frame));
     for (layer, of) in layers.iter_mut().zip([1, thin.of]) {
-        // The variance after so many passes, by that of these.
+        // Scales the variance of these passes to that after `after` passes.
         let less = f64::from(PASSES) / f64::from(of) / f64::from(after);
         layer.settle(frame)?;
         layer.each(frame, PASSES, Stop(&Unstopped), |pixel, of| {
@@ -268,7 +272,7 @@ fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderErro
     Ok(rays * u64::from(thin.of) / u64::from(PASSES))
 }
 
-/// Tile and pixel of the tile by pixel of the image.
+/// Returns the tile and the pixel of the tile, by pixel of the image.
 pub(super) fn places(frame: &Frame, regions: &[Region]) -> HashMap<usize, (usize, usize)> {
     let each = regions.iter().enumerate().flat_map(|(tile, r)| {
         (0..r.pixels()).map(move |k| {
@@ -279,7 +283,7 @@ pub(super) fn places(frame: &Frame, regions: &[Region]) -> HashMap<usize, (usize
     each.collect()
 }
 
-/// A pixel's sums, in render units: only their ratios count.
+/// Returns a pixel's sums in render units, because only their ratios count.
 fn stat(done: &Done, film: &Film, k: usize) -> Stat {
     let mut stat = Stat::default();
     for slot in 1..film.slots - 1 {

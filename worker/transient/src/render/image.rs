@@ -1,4 +1,5 @@
-//! The whole image: rounds over its tiles, joined to what earlier rounds found, and the pilot.
+//! The whole image: rounds over its tiles, joined with the results of earlier rounds, and the
+//! pilot.
 
 use std::{
     ops::Range,
@@ -22,11 +23,13 @@ use crate::{
     two_bounce::Sampling,
 };
 
-/// Side of a tile in pixels: of a large image, and of a small one or one with many histograms a pixel.
-/// A larger tile cuts fewer of the squares that share vertices at its edges, and takes more memory.
+/// Side of a tile in pixels: in a large image, and in a small one or one with many histograms per
+/// pixel. A larger tile cuts fewer of the squares that share vertices at its edges, and takes more
+/// memory.
 const LARGE_TILE: u32 = 32;
 const SMALL_TILE: u32 = 16;
-/// Pixels from which an image is large, channels from which a pixel has many histograms.
+/// The number of pixels from which an image is large, and of channels from which a pixel has many
+/// histograms.
 const LARGE: usize = 1 << 16;
 const MANY: usize = 5;
 /// The parts with their standard errors.
@@ -40,7 +43,7 @@ pub(super) struct Parts {
     pub multi_noise: Vec<f32>,
 }
 
-/// What rounds fill.
+/// The image that rounds accumulate.
 #[derive(Debug)]
 pub(super) struct Image {
     pub transient: Vec<f32>,
@@ -54,13 +57,15 @@ pub(super) struct Image {
     tiles: Vec<Region>,
     /// Passes over every tile so far.
     pub passes: u32,
-    /// What the two-bounce variance is in proportion to after them, see [`crate::two_bounce::Sampling::variance`].
+    /// The value that the two-bounce variance is proportional to after these passes, see
+    /// [`crate::two_bounce::Sampling::variance`].
     two_unit: f64,
     of_tiles: Vec<OfTile>,
-    /// The two-bounce part of each tile where later rounds need it: place among the slots of all channels
-    /// of its pixels, and value.
+    /// The two-bounce part of each tile, if later rounds need it: index among the slots of all
+    /// channels of its pixels, and value.
     tile_two: Vec<Vec<(u32, f32)>>,
-    /// Rays of the last strata of two bounces, the passes that these were made for, and rays of all passes.
+    /// Rays of the last strata of two bounces, the passes that these strata were made for, and rays
+    /// of all passes.
     two_rays: u64,
     strata_for: u32,
     multi_rays: u64,
@@ -68,7 +73,7 @@ pub(super) struct Image {
     bins: usize,
 }
 
-/// What is known of a tile beyond its pixels' light.
+/// Sums of a tile beyond its pixels' light.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct OfTile {
     /// Energy of three bounces and more, and its spread.
@@ -76,26 +81,26 @@ struct OfTile {
     spread: Spread,
     /// Variance of the energy of two bounces.
     two_variance: f64,
-    /// Energy outside the gate, of two bounces and of more.
+    /// Energy outside the gate, of two bounces and of more bounces.
     overflow: (f64, f64),
-    /// Draws of the errors of the watched pixels, of three bounces and more and of two.
+    /// Draws of the errors of the watched pixels: of three bounces and more, and of two.
     draws: Vec<Draw>,
     two_draws: Vec<f64>,
 }
 
-/// What a round does.
+/// The work of a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Round {
-    /// Passes.
+    /// The number of passes.
     pub passes: u32,
-    /// The two-bounce part is sampled as well; else it stays what it is.
+    /// Whether the two-bounce part is sampled as well. Otherwise it stays unchanged.
     pub two: bool,
-    /// More rounds may come.
+    /// Whether more rounds may follow.
     pub more: bool,
 }
 
 impl Round {
-    /// The only round of a render.
+    /// Returns the only round of a render.
     pub fn only(passes: u32) -> Self {
         Self {
             passes,
@@ -112,11 +117,11 @@ pub(super) struct Slice {
     planes: Vec<Vec<f32>>,
     stats: Vec<Stat>,
     tiles: Vec<OfTile>,
-    /// Passes over them.
+    /// The number of passes over these tiles.
     passes: u32,
 }
 
-/// Tells the caller how far the render is and hears whether to stop.
+/// Reports the progress of the render to the caller and asks whether to stop.
 pub(super) struct Watch<'a> {
     progress: &'a dyn Progress,
     stopped: AtomicBool,
@@ -126,7 +131,7 @@ pub(super) struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    /// A watch over the round that takes the render from share `from` to `to`.
+    /// Returns a watch over the round that advances the render from fraction `from` to `to`.
     pub fn new(progress: &'a dyn Progress, from: f32, to: f32) -> Self {
         Self {
             progress,
@@ -137,17 +142,17 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// False to stop.
+    /// Returns false to stop.
     pub fn go_on(&self) -> bool {
         self.ask(1, 0.0)
     }
 
-    /// Whether anyone has heard that the render shall stop.
+    /// Returns whether any call has returned that the render must stop.
     pub fn stopped(&self) -> bool {
         self.stopped.load(Ordering::Relaxed)
     }
 
-    /// False to stop. Asked often, since a tile of many passes takes long.
+    /// Returns false to stop. It is called often, because a tile of many passes takes long.
     fn ask(&self, count: usize, share: f32) -> bool {
         let done = self.tiles.load(Ordering::Relaxed);
         let at = self.from + (self.to - self.from) * (done as f32 + share) / count as f32;
@@ -162,10 +167,10 @@ fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
     shared.lock().unwrap_or_else(|e| e.into_inner())
 }
 
-/// Whether so many values find room, all at once.
+/// Checks that `count` values can be allocated at once.
 ///
 /// # Errors
-/// [`RenderError::Memory`].
+/// Returns [`RenderError::Memory`] if they cannot.
 pub(super) fn room<T>(count: usize, what: &str) -> Result<(), RenderError> {
     let mut all = Vec::<T>::new();
     all.try_reserve_exact(count)
@@ -175,16 +180,17 @@ pub(super) fn room<T>(count: usize, what: &str) -> Result<(), RenderError> {
         })
 }
 
-/// So many zeros. Pages that nobody writes to take no memory, which is why they are not written here.
+/// Returns `count` zeros. Pages that are never written take no memory, so this function does not
+/// write them.
 ///
 /// # Errors
-/// [`RenderError::Memory`].
+/// Returns [`RenderError::Memory`] if the allocation fails.
 pub(super) fn zeros(count: usize, what: &str) -> Result<Vec<f32>, RenderError> {
     room::<f32>(count, what)?;
     Ok(vec![0.0; count])
 }
 
-/// Side in pixels of the tiles that an image is rendered in.
+/// Returns the side in pixels of the tiles that an image is rendered in.
 pub(super) fn tile_side(frame: &Frame) -> u32 {
     let pixels = frame.width as usize * frame.height as usize;
     match pixels >= LARGE && frame.film.channels < MANY {
@@ -194,10 +200,10 @@ pub(super) fn tile_side(frame: &Frame) -> u32 {
 }
 
 impl Image {
-    /// An image that nothing was found in yet.
+    /// Returns an empty image.
     ///
     /// # Errors
-    /// [`RenderError::Memory`].
+    /// Returns [`RenderError::Memory`] if the allocation fails.
     pub fn new(frame: &Frame) -> Result<Self, RenderError> {
         let (width, height) = (frame.width, frame.height);
         let pixels = width as usize * height as usize;
@@ -249,21 +255,22 @@ impl Image {
         })
     }
 
-    /// How many tiles there are.
+    /// Returns the number of tiles.
     pub fn tiles(&self) -> usize {
         self.tiles.len()
     }
 
-    /// How many passes sampling two bounces takes as many rays as, in a round of so many.
+    /// Returns the number of passes that trace as many rays as the two-bounce samples of a round of
+    /// `passes`.
     pub fn strata_cost(&self, sampling: &Sampling, passes: u32) -> u32 {
         let side = |n: u32| f64::from(sampling.sides(n).0);
         let more = (side(passes) / side(self.strata_for)).powi(2);
         let of_pass = self.multi_rays as f64 / f64::from(self.passes.max(1));
-        // Casting saturates.
+        // The cast saturates.
         (more * self.two_rays as f64 / of_pass.max(1.0)).round() as u32
     }
 
-    /// The errors of what was found so far.
+    /// Returns the errors of the image so far.
     pub fn errors(&self) -> Errors {
         let tiles = self.tiles.iter().zip(&self.of_tiles);
         let watched = tiles.flat_map(|(region, of)| {
@@ -284,7 +291,7 @@ impl Image {
         }
     }
 
-    /// Everything that there is of each pixel and bin.
+    /// Returns every plane of values by pixel and bin.
     fn planes(&mut self) -> Vec<&mut Vec<f32>> {
         let mut planes = vec![&mut self.transient];
         if let Some(s) = &mut self.split {
@@ -301,7 +308,7 @@ impl Image {
         planes
     }
 
-    /// Places of the pixels of a range of tiles, a run of a tile's row each: first pixel and how many.
+    /// Returns the pixels of a range of tiles as runs, one per tile row: first pixel and length.
     fn runs(&self, range: Range<usize>) -> Vec<(usize, usize)> {
         let width = self.width;
         let of_tile = |t: &Region| {
@@ -312,7 +319,7 @@ impl Image {
         self.tiles[range].iter().flat_map(of_tile).collect()
     }
 
-    /// Takes a range of tiles out.
+    /// Extracts a range of tiles.
     pub fn take(mut self, range: Range<usize>) -> Slice {
         let (runs, bins) = (self.runs(range.clone()), self.bins);
         let cut = |plane: &mut Vec<f32>| {
@@ -332,7 +339,8 @@ impl Image {
         }
     }
 
-    /// Puts a range of tiles in; `false` if it is not one of such an image. [`Image::total`] when all are in.
+    /// Inserts a range of tiles. Returns `false` if the slice does not fit an image of this shape.
+    /// Call [`Image::total`] after the last one.
     pub fn put(&mut self, range: Range<usize>, slice: &Slice) -> bool {
         let (runs, bins) = (self.runs(range.clone()), self.bins);
         let pixels: usize = runs.iter().map(|(_, count)| count).sum();
@@ -368,7 +376,7 @@ impl Image {
         true
     }
 
-    /// One more round over a range of the tiles. Returns the rays traced.
+    /// Makes one more round over a range of the tiles. Returns the number of rays traced.
     pub fn round(
         &mut self,
         frame: &Frame,
@@ -388,7 +396,8 @@ impl Image {
             false => 0.0,
         };
         let image = Mutex::new(&mut *self);
-        // As many as threads, for the whole round: their buffers are large, and new memory is dear.
+        // At most one per thread for the whole round, because their buffers are large and
+        // allocation is expensive.
         let idle: Mutex<Vec<TileRenderer>> = Mutex::default();
         let rays: Vec<Option<(u64, u64)>> = range
             .into_par_iter()
@@ -436,8 +445,8 @@ impl Image {
         self.overflow = outside.sum();
     }
 
-    /// Joins a tile's new passes to its earlier ones, each weighed by its passes. `two` is the weight of its
-    /// new two-bounce part, 0 where there is none; `more` rounds may come.
+    /// Joins a tile's new passes with its earlier ones, weighted by passes. `two` is the weight of
+    /// the new two-bounce part, 0 if there is none. `more` is true if more rounds may follow.
     fn join(&mut self, frame: &Frame, (t, two, more): (usize, f64, bool), done: &Done) {
         let (film, region, bins) = (frame.film, self.tiles[t], self.bins);
         let (spent, added) = (f64::from(self.passes), f64::from(done.passes));
@@ -446,11 +455,12 @@ impl Image {
             false => added / (spent + added),
         };
         let (a, stays) = (1.0 - b, 1.0 - two);
-        // Render units → metres: every path has one 1/d² left over.
+        // Converts render units to metres: every path has one 1/d² left over.
         let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
         let unit2 = unit * unit;
         let blend = |(a, b): (f64, f64), old: f64, x: f64| old * a * a + x * b * b;
-        // Of a single pass nothing tells how far it is off: it errs as those before it do.
+        // A single pass gives no error estimate, so its error is assumed to be that of the passes
+        // before it.
         let alone = spent > 0.0 && done.passes == 1;
         let multi = |old: f64, x: f64| match alone {
             true => old * a,
@@ -463,10 +473,10 @@ impl Image {
                 *after = (f64::from(*after) * stays + f64::from(*new) * two) as f32;
             }
         }
-        // Both parts of a slot from what they were together.
+        // Joins both parts of a slot, from their previous sum.
         let joined = |old: f32, at: usize, x: f64| {
             let (before, after) = (f64::from(before[at]) * unit, f64::from(after[at]) * unit);
-            // What is left of rounding is no light.
+            // A rounding residue is not light.
             let old = (f64::from(old) - before).max(0.0);
             let x = x * unit;
             ((after + old * a + x * b) as f32, x - old)
@@ -524,8 +534,8 @@ impl Image {
                 ..stat
             };
         }
-        // Errors of rounds are independent: on average their squares add up. Of few passes their variance
-        // stands for draws.
+        // Errors of rounds are independent, so on average their squares add up. For few passes,
+        // their variance replaces the draws.
         let of = &mut self.of_tiles[t];
         of.draws.resize(draws::count(&region), Draw::default());
         of.two_draws.resize(of.draws.len(), 0.0);
@@ -562,13 +572,13 @@ impl Image {
     }
 }
 
-/// The values that are not 0, with their places.
+/// Returns the nonzero values with their indices.
 fn sparse(values: &[f32]) -> Vec<(u32, f32)> {
     let each = (0u32..).zip(values.iter().copied());
     each.filter(|(_, v)| *v != 0.0).collect()
 }
 
-/// All of `count` values.
+/// Expands sparse values to all `count` values.
 fn dense(values: &[(u32, f32)], count: usize) -> Vec<f32> {
     let mut all = vec![0.0; count];
     for &(at, v) in values {

@@ -1,8 +1,9 @@
-//! Sums of what light paths draw into the image. They come to few of its bins, so sums are kept of those alone, by pixel
-//! and slot.
+//! Sums of the light paths' contributions to the image. They reach few of its bins, so only the
+//! sums of those bins are stored, by pixel and slot.
 //!
-//! What a pass brings waits until there is enough of it, and is then merged with the sums, pass after pass: so that the bits
-//! do not depend on when that happens, and the work for a contribution does not grow with the number of sums.
+//! Contributions wait until there are enough of them, and are then merged with the sums pass by
+//! pass. The bits therefore do not depend on the time of the merge, and the work per contribution
+//! does not grow with the number of sums.
 
 use std::ops::Range;
 
@@ -22,9 +23,10 @@ use crate::{
     caustic::Splat,
 };
 
-/// Rows of pixels whose sums are kept together.
+/// Rows of pixels per block of sums.
 const ROWS: u32 = 16;
-/// Contributions that wait in a block at least, and share of the number of its sums, before they are merged.
+/// A block is merged when its waiting contributions reach `LEAST` plus 1/`SHARE` of the number of
+/// its sums.
 const LEAST: usize = 4096;
 const SHARE: usize = 4;
 
@@ -35,11 +37,12 @@ pub(super) struct Layer(Vec<Block>);
 /// Sums over some rows.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Block {
-    /// Of channel 0.
+    /// Sums of channel 0.
     all: Sparse<Moments>,
-    /// Of the other channels; their slots lie one channel behind the other, as [`crate::film::Film::pixel`] has them.
+    /// Sums of the other channels. Their slots are consecutive by channel, as in
+    /// [`crate::film::Film::pixel`].
     groups: Sparse<f32>,
-    /// Of channel 0, in the watched pixels.
+    /// Sums of channel 0 in the watched pixels.
     watched: Sparse<Sums>,
     #[serde(skip)]
     waiting: Vec<Waiting>,
@@ -51,17 +54,17 @@ type Moments = [f32; 3];
 /// Values by pixel and slot.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Sparse<V> {
-    /// Where each pixel's begin, and where the last one's end; empty where there are none at all.
+    /// Start of each pixel's values, and the end of the last one's; empty if there are no values.
     starts: Vec<u32>,
-    /// Their slots, ascending within a pixel.
+    /// Slots of the values, ascending within a pixel.
     slots: Vec<u32>,
     values: Vec<V>,
 }
 
-/// A contribution that is not in the sums yet.
+/// A contribution that has not been added to the sums.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Waiting {
-    /// Within the block.
+    /// Pixel within the block.
     pixel: u32,
     slot: u32,
     pass: u32,
@@ -69,22 +72,24 @@ struct Waiting {
     spot: u16,
 }
 
-/// What light paths brought to a pixel, over passes, in metres.
+/// The contributions of light paths to a pixel, over passes, in metres.
 pub(super) struct Found<'a> {
     slots: &'a [u32],
     values: &'a [Moments],
-    /// By slot, in render units.
+    /// Variance by slot, in render units.
     variance: &'a [f32],
-    /// Σ over the gate of the variance before it is pooled, and draws of the error if the pixel is watched; both in metres².
+    /// Σ over the gate of the variance before pooling, and draws of the error if the pixel is
+    /// watched; both in metres².
     own: (f64, Option<Draw>),
-    /// Factors from the sums to the mean and to a draw of its error, and from render units to metres.
+    /// Factors from the sums to the mean and to a draw of its error, and from render units to
+    /// metres.
     mean: (f64, f64),
     noise: f64,
     unit: f64,
 }
 
 impl Found<'_> {
-    /// Bin, mean, and a draw of the mean's error, for each bin that anything came to.
+    /// Returns the bin, the mean, and a draw of the mean's error, for each bin with contributions.
     pub fn light(&self) -> impl Iterator<Item = (usize, f64, f64)> {
         let last = self.variance.len() - 1;
         let each = self.slots.iter().zip(self.values);
@@ -99,24 +104,24 @@ impl Found<'_> {
         })
     }
 
-    /// Variance of the mean of each bin of the gate, pooled as the tiles' is.
+    /// Returns the variance of the mean of each bin of the gate, pooled as in the tiles.
     pub fn variance(&self) -> impl Iterator<Item = f64> {
         let inside = &self.variance[1..self.variance.len() - 1];
         inside.iter().map(|v| f64::from(*v) * self.unit * self.unit)
     }
 
-    /// Σ over the bins of the gate of their variances, before they are pooled: as the tiles have it.
+    /// Returns Σ over the bins of the gate of their variances before pooling, as the tiles do.
     pub fn pixel_variance(&self) -> f64 {
         self.own.0
     }
 
-    /// Draws of the pixel's error, if it is watched.
+    /// Returns draws of the pixel's error, if it is watched.
     pub fn draw(&self) -> Option<&Draw> {
         self.own.1.as_ref()
     }
 }
 
-/// The rows of a block.
+/// Returns the rows of a block.
 fn region(frame: &Frame, block: usize) -> Region {
     let row = block as u32 * ROWS;
     Region {
@@ -132,7 +137,7 @@ impl Layer {
         Self(vec![Block::default(); frame.height.div_ceil(ROWS) as usize])
     }
 
-    /// Whether it was made for such an image, and is whole.
+    /// Returns whether the layer was made for an image of this shape and is intact.
     pub fn fits(&self, frame: &Frame) -> bool {
         let (slots, size) = (frame.film.slots as u32, frame.film.pixel() as u32);
         let mut blocks = self.0.iter().enumerate();
@@ -145,7 +150,7 @@ impl Layer {
             })
     }
 
-    /// Adds a pass, sorted by pixel and slot; returns its energy within the gate.
+    /// Adds a pass, sorted by pixel and slot. Returns its energy within the gate.
     pub fn add(&mut self, frame: &Frame, splats: &[Splat], pass: u32) -> Result<f64, RenderError> {
         let of_block = ROWS * frame.width;
         let last = frame.film.slots - 1;
@@ -171,7 +176,7 @@ impl Layer {
         Ok(all)
     }
 
-    /// Merges all that waits.
+    /// Merges all waiting contributions.
     pub fn settle(&mut self, frame: &Frame) -> Result<(), RenderError> {
         self.merge(frame, |block| !block.waiting.is_empty())?;
         self.0.iter_mut().for_each(|b| b.waiting = vec![]);
@@ -189,7 +194,8 @@ impl Layer {
             .try_for_each(|(k, block)| block.merge(frame, &region(frame, k)))
     }
 
-    /// What was found in each pixel, over `passes`; pixels of rows to which nothing came are left out.
+    /// Calls `each` with the contributions to each pixel, over `passes`. Pixels in rows without
+    /// contributions are skipped.
     pub fn each(
         &self,
         frame: &Frame,
@@ -244,7 +250,8 @@ impl Layer {
                         draw.map(|d| d.map(|square| square * unit * unit)),
                     ),
                     mean: (unit, n),
-                    // The alternating sum has n times a pass' variance, and the mean has 1/n of it.
+                    // The alternating sum has n times the variance of a pass, and the mean has 1/n
+                    // of it.
                     noise: unit / n,
                     unit,
                 };
@@ -254,7 +261,7 @@ impl Layer {
         Ok(())
     }
 
-    /// Adds the channels beyond 0, and what lies outside the gate, to the image.
+    /// Adds the channels beyond 0, and the light outside the gate, to the image.
     pub fn join(&self, frame: &Frame, passes: u32, image: &mut Image) {
         let slots = frame.film.slots;
         let bins = frame.film.gate.bins as usize;
@@ -286,7 +293,7 @@ impl Layer {
 }
 
 impl Block {
-    /// Merges what waits with the sums of its rows.
+    /// Merges the waiting contributions with the sums of their rows.
     fn merge(&mut self, frame: &Frame, region: &Region) -> Result<(), RenderError> {
         let pixels = region.pixels();
         let film = frame.film;
@@ -331,14 +338,14 @@ impl Block {
     }
 }
 
-/// Adds what waits for one slot of a watched pixel.
+/// Adds the waiting contributions to one slot of a watched pixel.
 fn add_phases(sums: &mut Sums, group: &[Waiting]) {
     group
         .iter()
         .for_each(|w| sums[Phases::phase(w.pass)] += w.value);
 }
 
-/// Draws of a watched pixel's error, in render units², from its slots inside the gate.
+/// Returns draws of a watched pixel's error, in render units², from its slots inside the gate.
 fn drawn(phases: &Phases, (slots, sums): (&[u32], &[Sums]), inside: &Range<u32>) -> Draw {
     let mut draw = Draw::default();
     let each = slots.iter().zip(sums);
@@ -349,7 +356,7 @@ fn drawn(phases: &Phases, (slots, sums): (&[u32], &[Sums]), inside: &Range<u32>)
 }
 
 impl<V: Copy + Default> Sparse<V> {
-    /// Slots and values of a pixel.
+    /// Returns the slots and values of a pixel.
     fn of(&self, pixel: usize) -> (&[u32], &[V]) {
         match self.starts.get(pixel..pixel + 2) {
             Some(&[start, end]) => {
@@ -375,7 +382,8 @@ impl<V: Copy + Default> Sparse<V> {
             && (0..pixels).all(|k| self.of(k).0.is_sorted_by(|a, b| a < b))
     }
 
-    /// Adds contributions, sorted by pixel and slot, to the values of so many pixels: `add` gets all of one slot.
+    /// Adds contributions, sorted by pixel and slot, to the values of `pixels` pixels. `add`
+    /// receives all contributions to one slot.
     fn take(
         &mut self,
         pixels: usize,
@@ -441,7 +449,7 @@ mod tests {
         }
     }
 
-    /// Merges `found` in pieces that end where `cuts` says.
+    /// Merges `found` in pieces that end at `cuts`.
     fn merged(found: &[Waiting], cuts: &[usize]) -> Sparse<f32> {
         let mut sums = Sparse::default();
         let mut from = 0;
@@ -479,7 +487,7 @@ mod tests {
                 for (slot, value) in slots.iter().zip(values) {
                     of_slot[*slot as usize] = *value;
                 }
-                // To the bit.
+                // The values agree to the bit.
                 prop_assert_eq!(&of_slot, row);
             }
         }
@@ -487,7 +495,8 @@ mod tests {
 
     #[test]
     fn draws_of_a_watched_pixel_have_the_variance_of_its_mean() {
-        // Every slot of each of eight passes: the draws hold all that there is but the mean.
+        // Every slot of each of eight passes has light, and the draws contain everything except the
+        // mean.
         let passes = 8;
         let mut rng = Rng::new(1, Stream::Caustic, 0, 0);
         let values: Vec<[f32; SLOTS]> = (0..passes)
@@ -513,7 +522,7 @@ mod tests {
             .sum();
         let mean = draw.iter().sum::<f64>() / draw.len() as f64;
         assert!((mean / variance - 1.0).abs() < 1e-5, "{mean} {variance}");
-        // What lies outside the gate does not count, and a pixel without light has no error.
+        // Light outside the gate does not count, and a pixel without light has no error.
         let inside = drawn(&phases, watched.of(2), &(1..SLOTS as u32 - 1));
         assert!(inside.iter().sum::<f64>() < draw.iter().sum::<f64>());
         assert_eq!(

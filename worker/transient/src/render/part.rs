@@ -1,10 +1,12 @@
-//! A render in parts, so that several machines can share one heavy scene. The image's tiles are divided into
-//! ranges, which are independent of each other; light paths that are drawn into the image cross tiles and
-//! are a part by themselves. Joined, the parts give the bits that one machine would have given: every sum
-//! over tiles is made in their order, wherever they came from.
+//! A render in parts, so that several machines can share one heavy scene.
 //!
-//! Only with [`Budget::Samples`]: how many passes an error target needs is decided over the whole image
-//! after each round.
+//! The image's tiles are divided into ranges, which are independent of each other. Light paths that
+//! are drawn into the image cross tiles and are a separate part. The joined parts give the same
+//! bits as one machine: every sum over tiles is computed in their order, whichever machine rendered
+//! them.
+//!
+//! Only [`Budget::Samples`] is supported, because the passes for an error target are decided over
+//! the whole image after each round.
 
 use std::ops::Range;
 
@@ -18,21 +20,21 @@ use super::{
 };
 use crate::api::{Budget, Progress, RenderError, Rendered, Settings, Stop};
 
-/// Most ranges of tiles.
+/// The maximum number of tile ranges.
 const MAX_RANGES: u32 = 4096;
 
-/// Which part of a render: `index` of `of` ranges of tiles, or the light paths, which come after them as
+/// A part of a render: one of `of` ranges of tiles, or the light paths, which come after them at
 /// index `of`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PartOf {
-    /// 0 to `of`.
+    /// Index, 0 to `of`.
     pub index: u32,
-    /// Ranges of tiles, 1 to 4096. More than there are tiles leaves some empty.
+    /// The number of tile ranges, 1 to 4096. If there are more ranges than tiles, some are empty.
     pub of: u32,
 }
 
 impl PartOf {
-    /// All parts of a render whose tiles are divided into `of` ranges: one more than that.
+    /// Returns all parts of a render with tiles divided into `of` ranges: one more than `of`.
     pub fn all(of: u32) -> impl Iterator<Item = Self> {
         (0..=of).map(move |index| Self { index, of })
     }
@@ -43,8 +45,8 @@ impl PartOf {
     }
 }
 
-/// A rendered part: what [`join_parts`] needs of it and nothing of the scene. It is only good for the scene and
-/// the settings that it was rendered with.
+/// A rendered part: the input of [`join_parts`] without the scene. It is only valid for the scene
+/// and the settings that it was rendered with.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Part {
     which: PartOf,
@@ -54,18 +56,18 @@ pub struct Part {
 }
 
 impl Part {
-    /// Which part it is.
+    /// Returns which part this is.
     pub fn which(&self) -> PartOf {
         self.which
     }
 
-    /// Rays traced for it, without those that make the scene ready.
+    /// Returns the rays traced for the part, excluding those that prepare the scene.
     pub fn rays(&self) -> u64 {
         self.rays
     }
 }
 
-/// What must be the same in all parts of a render.
+/// Values that must be equal in all parts of a render.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Shape {
     width: u32,
@@ -95,7 +97,7 @@ impl Shape {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum Found {
     Tiles(Slice),
-    /// `None` where the scene needs no light paths.
+    /// `None` if the scene needs no light paths.
     Paths(Option<Splats>),
 }
 
@@ -119,8 +121,8 @@ fn divisible(settings: &Settings) -> Result<(), RenderError> {
 /// Renders one part of a scene. Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Those of [`crate::render`], and [`RenderError::Invalid`] for a budget other than samples or for a part that
-/// there is not.
+/// Returns the errors of [`crate::render`], and [`RenderError::Invalid`] if the budget is not a
+/// number of samples or the part does not exist.
 pub fn render_part(
     scene: &Scene,
     settings: &Settings,
@@ -161,12 +163,12 @@ pub fn render_part(
     })
 }
 
-/// Joins all parts of a scene, in any order, into what [`crate::render`] gives for it, bit for bit. Runs on the caller's
-/// rayon pool.
+/// Joins all parts of a scene, in any order, into the result of [`crate::render`], bit for bit.
+/// Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Those of [`crate::render`], and [`RenderError::Invalid`] naming the part that is missing, there twice, or of
-/// another scene or other settings.
+/// Returns the errors of [`crate::render`], and [`RenderError::Invalid`] naming a part that is
+/// missing, duplicated, or from another scene or other settings.
 pub fn join_parts(
     scene: &Scene,
     settings: &Settings,

@@ -1,5 +1,5 @@
-//! What every way of rendering begins and ends with: the scene made ready to trace, and the image made
-//! into a result.
+//! The first and last steps of every render: preparing the scene for tracing, and converting the
+//! image into a result.
 
 use picofarm_scene::{Scene, Spot};
 
@@ -30,28 +30,29 @@ use crate::{
     world::World,
 };
 
-/// Passes of light paths where no other passes are made.
+/// Passes of light paths if no other passes are made.
 pub(super) const TWO_PASSES: u32 = 64;
-/// Most point sources: arrivals name theirs in 16 bits.
+/// The maximum number of point sources, because arrivals store the source in 16 bits.
 const MOST_SPOTS: usize = 1 << 16;
-/// Rows from which the rays of the ground truth are forecast.
+/// The number of rows from which the rays of the ground truth are forecast.
 const ROWS: usize = 128;
 
-/// A scene that is ready to be traced.
+/// A scene prepared for tracing.
 pub(super) struct Ready<'a> {
     pub scene: &'a Scene,
     pub settings: &'a Settings,
     pub frame: Frame<'a>,
     centres: &'a Centres,
     spots: &'a [Option<Spot>],
-    /// All sources, where `frame` has none because none of their light comes into the gate.
+    /// All sources, including those that `frame` omits because none of their light reaches the
+    /// gate.
     sources: &'a Emitters,
     is_dark: bool,
-    /// The spots as sources: those that light the image unless the beams have a width.
+    /// The spots as sources. They light the image unless the beams have a width.
     middles: &'a Emitters,
 }
 
-/// Checks a scene and its settings, makes the scene ready and hands it to `then`.
+/// Checks a scene and its settings, prepares the scene and passes it to `then`.
 pub(super) fn prepare<R>(
     scene: &Scene,
     settings: &Settings,
@@ -138,7 +139,8 @@ pub(super) fn prepare<R>(
     };
     stop.check()?;
     walk.caustics = caustics.as_ref();
-    // Few spots light few bins: what pixels share errs as much there as what each finds alone. So it does in a narrow gate.
+    // Few spots light few bins, so the error of the light that pixels share is as large there as
+    // that of the light each finds alone. A narrow gate is similar.
     let many = contact::many(emitters) && !narrow;
     let reflectors = many.then(|| Reflectors::find(&world)).flatten();
     walk.reflectors = reflectors.as_ref();
@@ -179,13 +181,13 @@ pub(super) fn prepare<R>(
 }
 
 impl Ready<'_> {
-    /// Whether there is light of three bounces and more to look for.
+    /// Returns whether light of three bounces and more must be sampled.
     pub fn walks(&self) -> bool {
         let walk = &self.frame.walk;
         walk.max_bounces >= 3 && !walk.emitters.list.is_empty()
     }
 
-    /// Passes of the first round, which is the only one unless an error is asked for.
+    /// Returns the passes of the first round, which is the only one unless an error target is set.
     pub fn first_passes(&self) -> u32 {
         match self.settings.budget {
             _ if !self.walks() => 0,
@@ -194,12 +196,13 @@ impl Ready<'_> {
         }
     }
 
-    /// Passes of light paths that go with so many passes of the image: two bounces alone take some as well.
+    /// Returns the passes of light paths for `passes` passes of the image. Two bounces alone need
+    /// some as well.
     pub fn splat_passes(&self, passes: u32) -> u32 {
         if self.walks() { passes } else { TWO_PASSES }
     }
 
-    /// What the renderer decides to do, beginning with so many passes.
+    /// Returns the renderer's decisions for a first round of `passes`.
     pub fn plan(&self, passes: u32) -> Plan {
         let sampling = (self.frame.sampling, passes);
         let mut plan = decide(self.scene, self.settings, &self.frame.walk, sampling);
@@ -212,10 +215,10 @@ impl Ready<'_> {
         plan
     }
 
-    /// The ground truth, and the rays it took.
+    /// Returns the ground truth and the number of rays it took.
     ///
     /// # Errors
-    /// [`RenderError::Stopped`].
+    /// Returns [`RenderError::Stopped`] if the render is stopped.
     pub fn seen(&self, stop: Stop) -> Result<(GroundTruth, u64), RenderError> {
         let walk = &self.frame.walk;
         let (beams, of) = (self.spots.len(), (walk.world, self.middles));
@@ -225,7 +228,7 @@ impl Ready<'_> {
         Ok((truth, self.centres.rays + rays + photo_rays))
     }
 
-    /// About how many rays the ground truth takes, from some rows of a large image.
+    /// Returns the approximate number of rays of the ground truth, from some rows of a large image.
     pub fn seen_rays(&self) -> u64 {
         let walk = &self.frame.walk;
         let step = (self.frame.height as usize / ROWS).max(1);
@@ -233,7 +236,7 @@ impl Ready<'_> {
         self.centres.rays + truth + photo::rays(walk.world, self.settings.seed, step)
     }
 
-    /// What is wrong with scene or gate, as far as it is certain before rendering.
+    /// Returns warnings about the scene or gate that are certain before rendering.
     pub fn foreseen(&self) -> Vec<String> {
         let walk = &self.frame.walk;
         let mut warnings = warn::beams(self.spots);
@@ -245,8 +248,8 @@ impl Ready<'_> {
         warnings
     }
 
-    /// Returns the reason for a finished image without light, if it has none: `inside` is its energy, and
-    /// `outside` is whether light arrives outside the gate.
+    /// Returns the reason if a finished image has no light. `inside` is its energy, and `outside`
+    /// is whether light arrives outside the gate.
     fn dark(&self, truth: &GroundTruth, inside: f64, outside: bool) -> Option<String> {
         if inside > 0.0 {
             return None;
@@ -260,10 +263,11 @@ impl Ready<'_> {
         Some(warn::empty(gate, self.spots, (lit, any), outside))
     }
 
-    /// The result: the image with what was drawn into it and with the one-bounce peaks.
+    /// Returns the result: the image with the light paths' contributions and with the one-bounce
+    /// peaks.
     ///
     /// # Errors
-    /// [`RenderError::Stopped`].
+    /// Returns [`RenderError::Stopped`] if the render is stopped.
     pub fn finish(
         &self,
         (mut image, splats): (Image, Option<Splats>),

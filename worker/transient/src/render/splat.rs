@@ -1,5 +1,5 @@
-//! Light paths drawn into the image: what they bring where the camera sees their end. They cross tiles,
-//! so they are an estimate of their own beside the tiles', made of as many passes as the image's.
+//! Light paths drawn into the image: their contributions where the camera sees their ends. They
+//! cross tiles, so they are an estimate separate from the tiles', with as many passes as the image.
 
 use std::collections::HashMap;
 
@@ -25,23 +25,25 @@ use crate::{
     turns::{Turns, place},
 };
 
-/// Light paths by way of near-mirrors of a pass for each pixel.
+/// Light paths via near-mirrors, per pass and pixel.
 const PATHS: f64 = 4.0;
-/// Light paths by way of glass of a pass for each pixel, and those that the camera paths of a stream are connected to.
+/// Light paths via glass, per pass and pixel, and the number of them that the camera paths of a
+/// stream are connected to.
 const GLASS_PATHS: f64 = 1.0;
 const LAID: u32 = 128;
-/// Light paths that one random stream makes.
+/// Light paths per random stream.
 const CHUNK: u32 = 1024;
-/// Light paths of a pass in all zones for each pixel, and in one zone at least and at most.
+/// Divisor of the pixels that gives the light paths of a pass in all zones, and the minimum and
+/// maximum in one zone.
 const ZONE_SHARE: u32 = 4;
 const ZONE_PATHS: (u32, u32) = (256, 1024);
 
-/// What is done of a pass.
+/// The fraction of a pass to make.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Thin<'a> {
-    /// One light path of so many.
+    /// One light path in this many is traced.
     pub of: u32,
-    /// Camera paths in these regions alone; none are all.
+    /// The regions that camera paths are restricted to; an empty list means the whole image.
     pub regions: &'a [Region],
 }
 
@@ -63,7 +65,7 @@ impl Thin<'_> {
     }
 }
 
-/// A pass: its number, who may stop it, and what is done of it.
+/// A pass: its number, its stop watch, and the fraction of it to make.
 #[derive(Clone, Copy)]
 struct At<'a> {
     pass: u32,
@@ -71,7 +73,7 @@ struct At<'a> {
     thin: Thin<'a>,
 }
 
-/// Where light paths come from.
+/// The sources of light paths.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sources<'a> {
     caustics: Option<&'a Caustics>,
@@ -80,7 +82,7 @@ pub(super) struct Sources<'a> {
 }
 
 impl<'a> Sources<'a> {
-    /// Those of a scene; `None` where it needs none.
+    /// Returns the sources of a scene, or `None` if it needs none.
     pub fn of(frame: &Frame<'a>) -> Option<Self> {
         let (caustics, contacts) = (frame.walk.caustics, frame.walk.contacts);
         let glass = frame.walk.glass;
@@ -92,7 +94,7 @@ impl<'a> Sources<'a> {
         })
     }
 
-    /// What a pass brings, and the rays traced for it.
+    /// Returns the contributions of a pass and the number of rays traced for it.
     pub fn pass(
         &self,
         frame: &Frame,
@@ -113,7 +115,7 @@ impl<'a> Sources<'a> {
         (all, rays)
     }
 
-    /// A pass of light paths by way of near-mirrors.
+    /// Makes a pass of light paths via near-mirrors.
     fn by_mirrors((frame, caustics): (&Frame, &Caustics), at: At, all: &mut Vec<Splat>) -> u64 {
         let within = frame.walk.surroundings();
         let of = (within.world, frame.film);
@@ -133,7 +135,7 @@ impl<'a> Sources<'a> {
         side_by_side(frame, count.div_ceil(CHUNK), at.watch, all, chunk)
     }
 
-    /// A pass of light paths in the zones of spots beside other surfaces.
+    /// Makes a pass of light paths in the zones of spots close to other surfaces.
     fn in_zones((frame, contacts): (&Frame, &Contacts), at: At, all: &mut Vec<Splat>) -> u64 {
         let within = frame.walk.surroundings();
         let of = (within.world, frame.film);
@@ -159,7 +161,8 @@ impl<'a> Sources<'a> {
         side_by_side(frame, contacts.count(), at.watch, all, zone)
     }
 
-    /// A pass of light paths by way of glass; returns the photons that they leave, and the rays traced.
+    /// Makes a pass of light paths via glass. Returns the photons that they leave and the number of
+    /// rays traced.
     fn paths_by_glass(
         (frame, glass): (&Frame, &ByGlass),
         at: At,
@@ -193,7 +196,7 @@ impl<'a> Sources<'a> {
         (Photons::new(walk.world, walk.emitters, photons), rays)
     }
 
-    /// A pass of camera paths by way of glass.
+    /// Makes a pass of camera paths via glass.
     fn look_by_glass(
         (frame, glass, photons): (&Frame, &ByGlass, &Photons),
         at: At,
@@ -223,14 +226,14 @@ impl<'a> Sources<'a> {
     }
 }
 
-/// What light paths brought, over passes.
+/// The contributions of light paths, summed over passes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Splats {
     /// Exactly two bounces.
     two: Layer,
-    /// Three and more.
+    /// Three bounces and more.
     multi: Layer,
-    /// Energy of the whole image by pass.
+    /// Energy of the whole image, by pass.
     all: Vec<f64>,
     passes: u32,
 }
@@ -245,12 +248,12 @@ impl Splats {
         }
     }
 
-    /// Whether they were made for such an image.
+    /// Returns whether the splats were made for an image of this shape.
     pub fn fits(&self, frame: &Frame) -> bool {
         self.two.fits(frame) && self.multi.fits(frame)
     }
 
-    /// `wave` more passes; returns the rays traced.
+    /// Makes `wave` more passes and returns the number of rays traced.
     pub fn round(
         &mut self,
         (frame, sources): (&Frame, &Sources),
@@ -280,7 +283,8 @@ impl Splats {
             splats.into_iter().partition(|s| s.bounces == 2);
         let mut all = 0.0;
         for (layer, splats) in [(&mut self.two, &mut two), (&mut self.multi, &mut multi)] {
-            // Stable: what falls into one slot is summed in the order of the paths.
+            // The sort is stable, so contributions to one slot are summed in the order of the
+            // paths.
             splats.sort_by_key(|s| (s.pixel, s.slot));
             all += layer.add(frame, splats, self.passes)?;
         }
@@ -289,7 +293,7 @@ impl Splats {
         Ok(())
     }
 
-    /// The errors of the image with these passes.
+    /// Returns the errors of the image with these passes.
     pub fn errors(&self, frame: &Frame, image: &Image, stop: Stop) -> Result<Errors, RenderError> {
         let bins = frame.film.gate.bins as usize;
         let mut errors = image.errors();
@@ -303,10 +307,11 @@ impl Splats {
                     stat.norm2 += mean * (mean + 2.0 * f64::from(h[bin]));
                     stat.total += mean;
                 }
-                // Of two bounces as well: it falls with the passes as that of more does.
+                // Two bounces are included, because their variance falls with the passes as that of
+                // more bounces does.
                 stat.multi_variance += found.pixel_variance();
                 if let (Some(own), Some(&k)) = (found.draw(), places.get(&pixel)) {
-                    // Errors of different paths: on average their squares add up.
+                    // The errors come from different paths, so on average their squares add up.
                     for (square, of_layer) in errors.draws[k].1.iter_mut().zip(own) {
                         *square += of_layer;
                     }
@@ -349,7 +354,8 @@ impl Splats {
     }
 }
 
-/// `count` pieces of a pass on all threads, joined in their order; returns the rays traced.
+/// Runs `count` pieces of a pass on all threads and joins the results in order. Returns the number
+/// of rays traced.
 fn side_by_side(
     frame: &Frame,
     count: u32,
@@ -366,7 +372,8 @@ fn side_by_side(
     joined(pieces(count, watch, stack, piece), all)
 }
 
-/// What `count` pieces of a pass by way of glass find, in their order, each with the rays that it traced.
+/// Runs `count` pieces of a pass via glass. Returns the results in order, each with the number of
+/// rays traced.
 fn with_buffers<T: Default + Send>(
     frame: &Frame,
     count: u32,
@@ -381,7 +388,8 @@ fn with_buffers<T: Default + Send>(
     pieces(count, watch, || Buffers::new(&frame.walk), piece)
 }
 
-/// What `count` pieces of a pass find on all threads, in their order, each with the rays that it traced.
+/// Runs `count` pieces of a pass on all threads. Returns the results in order, each with the number
+/// of rays traced.
 fn pieces<B, T: Default + Send>(
     count: u32,
     watch: &Watch,
@@ -400,17 +408,17 @@ fn pieces<B, T: Default + Send>(
     .collect()
 }
 
-/// What light paths draw into the image, and the photons that they leave.
+/// The contributions of light paths to the image, and the photons that the paths leave.
 type Ends = (Vec<Splat>, Vec<LightVertex>);
 
-/// Joins what was found; returns the rays traced.
+/// Joins the results and returns the number of rays traced.
 fn joined(found: Vec<(Vec<Splat>, u64)>, all: &mut Vec<Splat>) -> u64 {
     let rays = found.iter().map(|f| f.1).sum();
     all.extend(found.into_iter().flat_map(|f| f.0));
     rays
 }
 
-/// Render units → metres: every path has one 1/d² left over.
+/// Returns the factor from render units to metres: every path has one 1/d² left over.
 pub(super) fn unit(frame: &Frame) -> f64 {
     f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale)
 }

@@ -1,5 +1,6 @@
-//! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
-//! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
+//! One tile of the image, from the first pass to finished histograms. A tile is the unit of work of
+//! one thread. Its random numbers depend only on its pixels and the pass, so tiles may be rendered
+//! in any order.
 
 use super::{
     draws::{Draw, Watched},
@@ -15,7 +16,7 @@ use crate::{
     walk::{Scratch, Walk},
 };
 
-/// Everything a tile needs to know.
+/// The shared inputs of all tiles.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Frame<'a> {
     pub walk: Walk<'a>,
@@ -25,20 +26,20 @@ pub(super) struct Frame<'a> {
     pub seed: u64,
     pub width: u32,
     pub height: u32,
-    /// The parts are wanted.
+    /// Whether the parts are requested.
     pub split: bool,
 }
 
-/// Passes to do: the first one's number, and how many.
+/// The passes to make: the number of the first one, and the count.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Order {
     pub first: u32,
     pub count: u32,
-    /// The two-bounce part is sampled; else it is empty.
+    /// Whether the two-bounce part is sampled. Otherwise it is empty.
     pub two: bool,
 }
 
-/// Renders one tile after another in buffers that it keeps: one for each thread.
+/// Renders one tile after another and reuses its buffers. There is one per thread.
 pub(super) struct TileRenderer {
     scratch: Scratch,
     sharing: Sharing,
@@ -46,7 +47,7 @@ pub(super) struct TileRenderer {
     strata: Strata,
     /// One pass over the pixels that share vertices.
     pass: Vec<f32>,
-    /// The last pass of even number, where the alternating sum is wanted.
+    /// The last pass of even number, if the alternating sum is requested.
     held: Vec<f32>,
     pub done: Done,
 }
@@ -56,22 +57,23 @@ pub(super) struct TileRenderer {
 pub(super) struct Done {
     /// Σ over passes of the 3+ part, slots by pixel.
     sum: Vec<f32>,
-    /// Σ over passes of its square, channel 0.
+    /// Σ over passes of the square of the 3+ part, channel 0.
     square: Vec<f32>,
-    /// Σ over passes with alternating sign, channel 0; empty where not wanted.
+    /// Σ over passes with alternating sign, channel 0; empty if not requested.
     alternating: Vec<f32>,
     /// Variance of the mean of the 3+ part, channel 0, pooled.
     multi_variance: Vec<f32>,
     /// Mean of the two-bounce part.
     two: Vec<f32>,
-    /// Variance of that mean, channel 0.
+    /// Variance of `two`, channel 0.
     two_variance: Vec<f32>,
-    /// A draw of that mean's error, channel 0; empty where not wanted.
+    /// A draw of the error of `two`, channel 0; empty if not requested.
     two_noise: Vec<f32>,
     /// Variance of the sum over slots of the two-bounce mean.
     two_total_variance: Vec<f64>,
-    /// Sums over the gate's slots of both parts' variances by pixel, before they are pooled: sums over so
-    /// many slots are sure enough by themselves, and pooling would lend bright pixels' noise to dim ones.
+    /// Sums over the gate's slots of both parts' variances by pixel, before pooling. A sum over so
+    /// many slots is precise enough by itself, and pooling would spread the noise of bright pixels
+    /// to dim ones.
     pixel_variance: Vec<(f64, f64)>,
     watched: Watched,
     /// Energy of the whole tile by pass.
@@ -83,7 +85,7 @@ pub(super) struct Done {
     pub two_rays: u64,
 }
 
-/// What a tile tells of one channel-0 slot of one pixel.
+/// Means and variances of one channel-0 slot of one pixel.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Moments {
     pub two: f64,
@@ -92,7 +94,7 @@ pub(super) struct Moments {
     pub multi_variance: f64,
 }
 
-/// Mean and its variance from Σx and Σx² over `n` passes.
+/// Returns the mean and its variance from Σx and Σx² over `n` passes.
 fn mean(sum: f64, square: f64, n: f64) -> (f64, f64) {
     if n == 0.0 {
         return (0.0, 0.0);
@@ -105,7 +107,7 @@ fn mean(sum: f64, square: f64, n: f64) -> (f64, f64) {
     (sum / n, spread / n)
 }
 
-/// Sum over the gate's slots.
+/// Returns the sum over the gate's slots.
 fn inside(film: &Film, slots: &[f32]) -> f64 {
     slots[1..film.slots - 1].iter().map(|&v| f64::from(v)).sum()
 }
@@ -138,14 +140,14 @@ impl Done {
         self.passes = 0;
     }
 
-    /// Two-bounce and 3+ means of any channel's slot of pixel `k`.
+    /// Returns the sum of the two-bounce and 3+ means of any channel's slot of pixel `k`.
     pub fn value(&self, film: &Film, k: usize, channel: usize, slot: usize) -> f64 {
         let at = k * film.pixel() + channel * film.slots + slot;
         let n = f64::from(self.passes.max(1));
         f64::from(self.two[at]) + f64::from(self.sum[at]) / n
     }
 
-    /// Means and variances of a slot of pixel `k`, channel 0.
+    /// Returns the means and variances of a slot of pixel `k`, channel 0.
     pub fn moments(&self, film: &Film, k: usize, slot: usize) -> Moments {
         let (wide, narrow) = (k * film.pixel() + slot, k * film.slots + slot);
         let n = f64::from(self.passes.max(1));
@@ -157,21 +159,21 @@ impl Done {
         }
     }
 
-    /// A draw of the 3+ part's error in a slot of pixel `k`, channel 0, with what pixels and bins have in
-    /// common; 0 with fewer than two passes.
+    /// Returns a draw of the 3+ part's error in a slot of pixel `k`, channel 0, including the
+    /// correlations between pixels and bins; 0 with fewer than two passes.
     pub fn noise(&self, film: &Film, k: usize, slot: usize) -> f64 {
         let pairs = f64::from(self.passes / 2 * 2);
         let x = f64::from(self.alternating[k * film.slots + slot]);
-        // Σ±x over n passes has n times a pass' variance; the mean has 1/n of it.
+        // Σ±x over n passes has n times the variance of a pass; the mean has 1/n of it.
         x / (pairs * f64::from(self.passes)).sqrt().max(1.0)
     }
 
-    /// The same of the two-bounce part.
+    /// Like `noise`, for the two-bounce part.
     pub fn two_noise(&self, film: &Film, k: usize, slot: usize) -> f64 {
         f64::from(self.two_noise[k * film.slots + slot])
     }
 
-    /// Brings the variances up to the passes done.
+    /// Updates the variances to the completed passes.
     fn estimate(&mut self, film: &Film, region: &Region) {
         let n = f64::from(self.passes);
         self.multi_variance.clear();
@@ -197,40 +199,40 @@ impl Done {
         pool(variance, region, film.slots, MULTI_REACH, pooling);
     }
 
-    /// Σ over the gate's slots of both parts' variances in pixel `k`.
+    /// Returns Σ over the gate's slots of both parts' variances in pixel `k`.
     pub fn pixel_variance(&self, k: usize) -> (f64, f64) {
         self.pixel_variance[k]
     }
 
-    /// Draws of the errors of the watched pixels' 3+ part.
+    /// Returns draws of the errors of the watched pixels' 3+ part.
     pub fn draws(&self) -> Vec<Draw> {
         self.watched
             .draws(self.passes, |k| self.pixel_variance[k].1)
     }
 
-    /// ‖draw of the error of their two-bounce part‖².
+    /// Returns ‖draw of the error of the watched pixels' two-bounce part‖².
     pub fn two_draws(&self) -> Vec<f64> {
         self.watched.two_draws()
     }
 
-    /// Which pixels those are.
+    /// Returns the indices of the watched pixels.
     pub fn watched(&self) -> &[usize] {
         self.watched.pixels()
     }
 
-    /// The tile's energy of three bounces and more, and its spread. Pixels that share vertices err
-    /// together, so this is not the sum of theirs.
+    /// Returns the tile's energy of three bounces and more, and its spread. Pixels that share
+    /// vertices have correlated errors, so this is not the sum of their spreads.
     pub fn multi_energy(&self) -> (f64, Spread) {
         let n = f64::from(self.passes.max(1));
         (self.all.iter().sum::<f64>() / n, Spread::of(&self.all))
     }
 
-    /// Variance of the tile's energy of two bounces.
+    /// Returns the variance of the tile's energy of two bounces.
     pub fn two_energy_variance(&self) -> f64 {
         self.two_total_variance.iter().sum()
     }
 
-    /// Energy of two bounces outside the gate, and of more.
+    /// Returns the energy outside the gate, of two bounces and of more bounces.
     pub fn overflow(&self, film: &Film) -> (f64, f64) {
         let (mut two, mut multi) = (Overflow::default(), Overflow::default());
         let n = f64::from(self.passes.max(1));
@@ -245,12 +247,12 @@ impl Done {
         (two.energy, multi.energy)
     }
 
-    /// The two-bounce means of all slots of pixel after pixel.
+    /// Returns the two-bounce means of all slots, pixel by pixel.
     pub fn two(&self) -> &[f32] {
         &self.two
     }
 
-    /// The 3+ mean of any channel's slot of pixel `k`.
+    /// Returns the 3+ mean of any channel's slot of pixel `k`.
     pub fn multi(&self, film: &Film, k: usize, channel: usize, slot: usize) -> f64 {
         let at = k * film.pixel() + channel * film.slots + slot;
         f64::from(self.sum[at]) / f64::from(self.passes.max(1))
@@ -271,8 +273,8 @@ impl TileRenderer {
         }
     }
 
-    /// Renders a region into `done`; `None` when `go_on`, called with the share done, says
-    /// to stop.
+    /// Renders a region into `done`. Returns `None` if `go_on`, called with the completed fraction,
+    /// returns false.
     pub fn render(
         &mut self,
         frame: &Frame,
@@ -298,7 +300,7 @@ impl TileRenderer {
         Some(())
     }
 
-    /// The two-bounce part of every pixel.
+    /// Samples the two-bounce part of every pixel.
     fn two(
         &mut self,
         frame: &Frame,
@@ -370,8 +372,8 @@ impl TileRenderer {
         Some(())
     }
 
-    /// One pass over the region. The grid of tiles that share vertices is moved in each pass, so that no
-    /// edge between them stays.
+    /// Makes one pass over the region. The grid of tiles that share vertices is shifted in each
+    /// pass, so that no edge between them remains visible.
     fn pass(&mut self, frame: &Frame, region: &Region, pass: u32) {
         let (film, side) = (frame.film, frame.effort.side);
         let size = film.pixel();
@@ -415,7 +417,8 @@ impl TileRenderer {
         self.done.passes += 1;
     }
 
-    /// Adds pixel `from` of the pass to pixel `to` of the region; returns its energy inside the gate.
+    /// Adds pixel `from` of the pass to pixel `to` of the region. Returns its energy inside the
+    /// gate.
     fn fold(&mut self, to: usize, from: usize, film: &Film) -> f64 {
         let size = film.pixel();
         let pass = &self.pass[from * size..(from + 1) * size];
@@ -426,7 +429,8 @@ impl TileRenderer {
         let pass = &pass[..film.slots];
         self.done.watched.add(to, self.done.passes, pass);
         if !self.done.alternating.is_empty() {
-            // Held back until its partner comes, so that the sum always has as many of either sign.
+            // Held back until the next pass, so that the sum always has equally many of either
+            // sign.
             let odd = self.done.passes % 2 == 1;
             let range = to * film.slots..(to + 1) * film.slots;
             let held = &mut self.held[range.clone()];
@@ -440,7 +444,7 @@ impl TileRenderer {
             }
         }
         let square = &mut self.done.square[to * film.slots..(to + 1) * film.slots];
-        // Eight sums side by side: exact enough, and the compiler can keep them in one register.
+        // Eight independent sums: precise enough, and the compiler can store them in one register.
         let mut totals = [0.0f32; 8];
         for (square, v) in square.iter_mut().zip(pass) {
             *square += v * v;

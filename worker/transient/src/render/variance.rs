@@ -1,4 +1,4 @@
-//! Which class of paths carries the variance, from a few tiles of the image.
+//! Measures which class of paths has the most variance, from a few tiles of the image.
 
 use picofarm_scene::Scene;
 use rayon::prelude::*;
@@ -20,20 +20,23 @@ use crate::{
     walk::Scratch,
 };
 
-/// What one class of paths brings to the part of three bounces and more, or draws into the image beside the tiles.
+/// The contribution of one class of paths to the part of three bounces and more, or to the light
+/// drawn into the image outside the tiles.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ClassVariance {
-    /// Where on the path, and how it was found.
+    /// The place on the path, and the technique.
     pub class: String,
-    /// Share of the energy.
+    /// Fraction of the energy.
     pub energy: f64,
-    /// Sum over the pixels of its squared error relative to the pixel, as a share of that of all classes.
+    /// Sum over the pixels of the class's squared error relative to the pixel, as a fraction of
+    /// that of all classes.
     pub variance: f64,
-    /// The same over the middle half of the pixels, ordered by their error: what the median follows.
+    /// Like `variance`, over the middle half of the pixels ordered by their error, which determine
+    /// the median.
     pub middle: f64,
 }
 
-/// Classes of the tiles' paths, and the techniques of what is drawn into the image.
+/// The number of classes of the tiles' paths, and of techniques that draw into the image.
 const ALL: usize = CLASSES + TECHNIQUES.len();
 
 /// Sums of one tile's pixels.
@@ -41,15 +44,17 @@ struct Found {
     region: Region,
     /// h by pixel and bin.
     light: Vec<f32>,
-    /// Energy and variance by pixel and class.
+    /// Energy and variance, by pixel and class.
     classes: Vec<[(f64, f64); ALL]>,
 }
 
-/// Shares of the classes in energy and variance of three bounces and more, and of all that is drawn into the image beside the
-/// tiles, after so many passes over a few tiles; the largest variance first, classes without light left out. Runs on the caller's rayon pool.
+/// Returns the fractions of the classes in the energy and variance of three bounces and more, and
+/// of all light drawn into the image outside the tiles, after `passes` passes over a few tiles. The
+/// largest variance is first, and classes without light are omitted. Runs on the caller's rayon
+/// pool.
 ///
 /// # Errors
-/// Those of [`crate::render`].
+/// Returns the errors of [`crate::render`].
 pub fn variance(
     scene: &Scene,
     settings: &Settings,
@@ -74,7 +79,8 @@ pub fn variance(
     })
 }
 
-/// Adds what is drawn into the image. Light paths cross tiles, so all of it is made for the tiles looked at.
+/// Adds the light drawn into the image. Light paths cross tiles, so all of them are traced for the
+/// sampled tiles.
 fn drawn(frame: &Frame, found: &mut [Found], passes: u32) -> Result<(), RenderError> {
     let Some(sources) = Sources::of(frame) else {
         return Ok(());
@@ -82,7 +88,7 @@ fn drawn(frame: &Frame, found: &mut [Found], passes: u32) -> Result<(), RenderEr
     let mut layers = TECHNIQUES.map(|_| Layer::new(frame));
     let watch = Watch::new(&Unstopped, 0.0, 1.0);
     let regions: Vec<Region> = found.iter().map(|f| f.region).collect();
-    // Light paths are as many as in a render, since their variance is wanted.
+    // The number of light paths equals that of a render, because their variance is measured.
     let thin = Thin {
         regions: &regions,
         ..Thin::WHOLE

@@ -1,5 +1,5 @@
-//! What somebody should know of a render before trusting it: beams that meet nothing, and an image without light. The image
-//! is right all the same, so these are words and no errors.
+//! Warnings that a user should read before trusting a render: beams that hit nothing, and an image
+//! without light. The image is correct all the same, so these are warnings and not errors.
 
 use picofarm_scene::{Spot, Vec3};
 
@@ -10,23 +10,26 @@ use crate::{
     world::World,
 };
 
-/// Uncertainty of the variance from which an error is worth a warning: about that of four equal bright paths.
+/// The uncertainty of the variance from which an error deserves a warning: about that of four equal
+/// bright paths.
 const UNCERTAIN: f32 = 0.5;
-/// Error of the whole image beneath which nobody asks how sure it is.
+/// The error of the whole image below which its uncertainty does not matter.
 const NEGLIGIBLE: f32 = 1e-3;
 
-/// Optical paths of two-bounce light, metres: over the spots and the points seen by the pixels' centres.
+/// Optical path lengths of two-bounce light, metres, over the spots and the points seen by the
+/// pixels' centres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Arrivals {
-    /// The shortest.
+    /// The shortest path.
     pub first: f64,
-    /// The longest.
+    /// The longest path.
     pub last: f64,
 }
 
-/// Between which paths two-bounce light arrives; `None` where no pixel sees a surface, or no beam meets one. `lit(beam,
-/// pixel)` says which pixels a spot lights. No light of three and more bounces comes before the first of all pixels and
-/// spots, lit or not: no path is shorter than a straight one.
+/// Returns the range of path lengths of two-bounce light, or `None` if no pixel sees a surface or
+/// no beam hits one. `lit(beam, pixel)` returns whether a spot lights a pixel. No light of three
+/// and more bounces arrives before the first of all pixels and spots, lit or not, because no path
+/// is shorter than a straight one.
 pub(super) fn arrivals(
     world: &World,
     emitters: &Emitters,
@@ -52,7 +55,7 @@ pub(super) fn arrivals(
     found
 }
 
-/// Beams that meet nothing.
+/// Returns a warning about beams that hit nothing.
 pub(super) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
     const SHOWN: usize = 8;
     let lost = spots.iter().enumerate().filter(|(_, spot)| spot.is_none());
@@ -76,7 +79,7 @@ pub(super) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
     }
 }
 
-/// Why a gate sees no light, where that is certain beforehand: all comes after its end.
+/// Returns the reason why a gate sees no light, if all light arrives after its end.
 pub(super) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<String> {
     let end = end(gate);
     let first = arrivals?.first;
@@ -87,7 +90,8 @@ pub(super) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<St
     })
 }
 
-/// Why there is no light in an image: `lit` are the arrivals of pixels that a spot lights, `any` those of all.
+/// Returns the reason why there is no light in an image. `lit` are the arrivals of pixels that a
+/// spot lights, `any` those of all pixels.
 pub(super) fn empty(
     gate: &Gate,
     spots: &[Option<Spot>],
@@ -127,7 +131,8 @@ pub(super) fn empty(
     }
 }
 
-/// That few bright paths hold most of the error of the whole image, and how uncertain it is by that.
+/// Returns a warning that few bright paths dominate the error of the whole image, with the
+/// resulting uncertainty.
 pub(super) fn tails(error: &ErrorEstimate) -> Option<String> {
     let u = error.total_uncertainty;
     (u > UNCERTAIN && error.total_relative > NEGLIGIBLE).then(|| {

@@ -1,26 +1,28 @@
 //! Poisson counts of small rates from tables.
 //!
-//! The sum of independent Poisson counts is a Poisson count of the summed rates. So a rate is cut into a multiple of 64, a
-//! multiple of 4 below 64, a multiple of 1/16 below 4, and a rest below 1/16. The first three have tables (the alias method; A. J.
-//! Walker, "An efficient method for generating discrete random variables with general distributions", ACM TOMS 3, 1977; tables
-//! as M. D. Vose, "A linear algorithm for generating random numbers with a given distribution", IEEE TSE 17, 1991), and the rest
-//! is nearly always nothing. No exponential, no logarithm, no loop for most bins.
+//! The sum of independent Poisson counts is a Poisson count of the summed rates. So a rate is split
+//! into a multiple of 64, a multiple of 4 below 64, a multiple of 1/16 below 4, and a rest below
+//! 1/16. The first three have tables (the alias method; A. J. Walker, "An efficient method for
+//! generating discrete random variables with general distributions", ACM TOMS 3, 1977; tables as M.
+//! D. Vose, "A linear algorithm for generating random numbers with a given distribution", IEEE TSE
+//! 17, 1991), and the count of the rest is almost always 0. Most bins need no exponential, no
+//! logarithm and no loop.
 
 use std::sync::LazyLock;
 
-/// Tables cover rates below this.
+/// Rates below this value are covered by tables.
 pub(super) const TABLED: f64 = 1024.0;
 /// Steps of the fine, the coarse and the wide tables: 1/16, 4 and 64 photons.
 const PARTS: usize = 16;
 const COARSE: usize = 4;
 const WIDE: usize = 64;
-/// Columns of a table: enough for all counts that have a chance of 10⁻¹⁶ or more.
+/// Columns of a table: enough for all counts with a probability of 10⁻¹⁶ or more.
 const FINE_COLUMNS: usize = 32;
 const COARSE_COLUMNS: usize = 128;
 const WIDE_COLUMNS: usize = 1024;
 
-/// Counts of one rate, a column for each: the chance that a column keeps its own count (the upper bits), and which column's is its
-/// other one (as many lower bits as that takes).
+/// Counts of one rate, one column each. The upper bits of a column are the probability that it
+/// keeps its own count, and the lower bits are the index of its alternative column.
 #[derive(Debug, Clone)]
 struct Table<const COLUMNS: usize> {
     first: u64,
@@ -31,12 +33,13 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
     fn new(rate: f64) -> Self {
         let (first, chances) = chances::<COLUMNS>(rate);
         let mut columns = [0; COLUMNS];
-        // Each column has room for the average chance. What is above it goes where room is left.
+        // Each column has room for the average probability. The excess of larger ones fills the
+        // columns with room left.
         let mut share = chances.map(|p| p * COLUMNS as f64);
         let (mut small, mut large): (Vec<usize>, Vec<usize>) =
             (0..COLUMNS).partition(|k| share[*k] < 1.0);
         while let Some(low) = small.pop() {
-            // What rounding left over is a whole column, but for less than 2⁻⁴⁰.
+            // A column left over by rounding is a whole one, to within 2⁻⁴⁰.
             let Some(high) = large.last().copied() else {
                 columns[low] = Self::pack(1.0, low);
                 continue;
@@ -54,35 +57,37 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
         Self { first, columns }
     }
 
-    /// The count that 64 uniform bits stand for.
+    /// Returns the count for 64 uniform bits.
     #[inline(always)]
     fn count(&self, bits: u64) -> u64 {
         let column = (bits >> (64 - COLUMNS.ilog2())) as usize;
         let rest = bits << COLUMNS.ilog2();
         let entry = self.columns[column];
-        // Without a branch: nobody could foretell it.
+        // Branchless, because the branch would be unpredictable.
         let keeps = u64::from(rest < entry).wrapping_neg();
         let other = entry & Self::OTHER;
         self.first + (other ^ ((other ^ column as u64) & keeps))
     }
 
-    /// The bits that name another column.
+    /// The bits of the index of another column.
     const OTHER: u64 = COLUMNS as u64 - 1;
 
     fn pack(share: f64, other: usize) -> u64 {
-        // Casts of numbers that are too large give the largest.
+        // The cast saturates.
         ((share * 18_446_744_073_709_551_616.0) as u64 & !Self::OTHER) | other as u64
     }
 }
 
-/// The probabilities of so many counts, those with the largest among them, from the given first one; their sum is 1.
+/// Returns the first count and the probabilities of `COLUMNS` consecutive counts from there, which
+/// include the most likely ones. Their sum is 1.
 fn chances<const COLUMNS: usize>(rate: f64) -> (u64, [f64; COLUMNS]) {
     let mut chances = [0.0; COLUMNS];
     if rate <= 0.0 {
         chances[0] = 1.0;
         return (0, chances);
     }
-    // From the most likely count outwards, where no product is small by chance alone.
+    // Computed from the most likely count outwards, so that products underflow only for negligible
+    // probabilities.
     let mode = rate as usize;
     let first = mode.saturating_sub(COLUMNS * 2 / 5);
     chances[mode - first] = 1.0;
@@ -96,7 +101,7 @@ fn chances<const COLUMNS: usize>(rate: f64) -> (u64, [f64; COLUMNS]) {
     (first as u64, chances.map(|p| p / total))
 }
 
-/// All tables: 160 KiB, of which bins below 64 photons use 32.
+/// All tables: 160 KiB. Bins below 64 photons use 32 KiB of them.
 struct Tables {
     fine: Vec<Table<FINE_COLUMNS>>,
     coarse: Vec<Table<COARSE_COLUMNS>>,
@@ -115,12 +120,12 @@ static TABLES: LazyLock<Tables> = LazyLock::new(|| Tables {
         .collect(),
 });
 
-/// A rate below [`TABLED`], cut up.
+/// A rate below [`TABLED`], split into parts.
 pub(super) struct Cut {
     wide: usize,
     coarse: usize,
     fine: usize,
-    /// What no table covers: at least 0, below 1/16.
+    /// The part that no table covers: at least 0, below 1/16.
     pub rest: f64,
 }
 
@@ -138,7 +143,7 @@ impl Cut {
         }
     }
 
-    /// A count of the part that tables cover; `bits` gives 64 uniform bits at each call.
+    /// Draws a count of the part that tables cover. `bits` returns 64 uniform bits at each call.
     #[inline(always)]
     pub fn count(&self, mut bits: impl FnMut() -> u64) -> u64 {
         let tables = &*TABLES;
@@ -160,7 +165,7 @@ impl Cut {
 mod tests {
     use super::*;
 
-    /// The chance of each count that a table gives, from its columns.
+    /// Returns the probability of each count that a table yields, from its columns.
     fn given<const COLUMNS: usize>(table: &Table<COLUMNS>) -> Vec<f64> {
         let mut chances = vec![0.0; table.first as usize + COLUMNS];
         for (k, entry) in table.columns.iter().enumerate() {

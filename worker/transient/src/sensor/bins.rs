@@ -1,4 +1,5 @@
-//! Sums over adjacent bins, cuts along the time axis, and the time-integrated image. Arrays are `[pixel][bin]`.
+//! Sums over adjacent bins, cuts along the time axis, and the time-integrated image. Arrays are
+//! `[pixel][bin]`.
 
 use std::ops::Range;
 
@@ -11,26 +12,29 @@ use picofarm_settings::SensorError;
 pub struct Rebinned<T> {
     /// `[pixel][bin]`.
     pub data: Vec<T>,
-    /// Bins of a pixel.
+    /// Bins per pixel.
     pub bins: usize,
-    /// Bins of each pixel that were left over at the end of the gate, fewer than the factor: dropped.
+    /// Bins of each pixel that remain at the end of the gate, fewer than the factor. They are
+    /// dropped.
     pub dropped_bins: usize,
 }
 
-/// Sums each `factor` adjacent bins, as f64. 1502 bins by four give 375: the first 1500 are used, two are dropped.
+/// Sums each `factor` adjacent bins, as f64. 1502 bins by four give 375: the first 1500 are used,
+/// two are dropped.
 ///
 /// # Errors
-/// [`SensorError::Invalid`] where `data` is not a whole number of pixels, or `factor` is 0 or above `bins`.
+/// Returns [`SensorError::Invalid`] if `data` is not a whole number of pixels, or `factor` is 0 or
+/// above `bins`.
 pub fn rebin(data: &[f32], bins: usize, factor: usize) -> Result<Rebinned<f32>, SensorError> {
     rebinned(data, bins, factor, |group| {
         group.iter().map(|v| f64::from(*v)).sum::<f64>() as f32
     })
 }
 
-/// [`rebin`] of counts; a sum above `u32::MAX` stays there.
+/// Like [`rebin`], for counts. A sum above `u32::MAX` saturates.
 ///
 /// # Errors
-/// As [`rebin`].
+/// Returns the errors of [`rebin`].
 pub fn rebin_counts(
     data: &[u32],
     bins: usize,
@@ -41,10 +45,11 @@ pub fn rebin_counts(
     })
 }
 
-/// [`rebin`] of the standard errors of independent bins: the root of the sum of their squares.
+/// Like [`rebin`], for the standard errors of independent bins: the square root of the sum of their
+/// squares.
 ///
 /// # Errors
-/// As [`rebin`].
+/// Returns the errors of [`rebin`].
 pub fn rebin_errors(
     data: &[f32],
     bins: usize,
@@ -89,7 +94,7 @@ pub(super) fn check_factor(bins: usize, factor: usize) -> Result<(), SensorError
     ))
 }
 
-/// The number of pixels of `values` values.
+/// Returns the number of pixels of `values` values.
 pub(super) fn pixels(values: usize, bins: usize) -> Result<usize, SensorError> {
     if bins == 0 {
         return Err(SensorError::new("bins", "expected at least 1, found 0"));
@@ -103,10 +108,11 @@ pub(super) fn pixels(values: usize, bins: usize) -> Result<usize, SensorError> {
     Ok(values / bins)
 }
 
-/// The bins `range` of each pixel.
+/// Returns the bins `range` of each pixel.
 ///
 /// # Errors
-/// [`SensorError::Invalid`] where `data` is not a whole number of pixels, or `range` is empty or goes beyond `bins`.
+/// Returns [`SensorError::Invalid`] if `data` is not a whole number of pixels, or `range` is empty
+/// or extends beyond `bins`.
 pub fn crop<T: Copy + Send + Sync>(
     data: &[T],
     bins: usize,
@@ -125,10 +131,10 @@ pub fn crop<T: Copy + Send + Sync>(
         .collect())
 }
 
-/// Σ over the bins of each pixel, summed as f64: what a camera without timing sees.
+/// Returns Σ over the bins of each pixel, summed as f64: the image of a camera without timing.
 ///
 /// # Errors
-/// [`SensorError::Invalid`] where `data` is not a whole number of pixels.
+/// Returns [`SensorError::Invalid`] if `data` is not a whole number of pixels.
 pub fn intensity(data: &[f32], bins: usize) -> Result<Vec<f32>, SensorError> {
     pixels(data.len(), bins)?;
     Ok(data

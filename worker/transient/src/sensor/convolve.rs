@@ -1,17 +1,18 @@
-//! Convolution of one pixel's histogram, directly: all terms are positive, so a bin of 0.1 photons beside one of
-//! 4·10⁷ is as exact as any other, which a Fourier transform would not give.
+//! Direct convolution of one pixel's histogram. All terms are positive, so a bin of 0.1 photons
+//! next to one of 4·10⁷ is as exact as any other, which a Fourier transform would not achieve.
 
 use pulp::{Arch, Simd, WithSimd};
 
 use super::kernel::Kernel;
 
-/// A kernel made ready for histograms of one length, with room to work in.
+/// A kernel prepared for histograms of one length, with its work buffers.
 #[derive(Debug, Clone)]
 pub(super) struct Convolver {
     bins: usize,
-    /// The taps, last first.
+    /// The taps in reverse order.
     reversed: Vec<f64>,
-    /// Bins before the histogram's own in `padded`; negative: bins of the histogram left out.
+    /// Bins before the histogram's own in `padded`. If negative, the number of bins of the
+    /// histogram that are left out.
     lead: i64,
     padded: Vec<f64>,
     /// Σ of the first n taps.
@@ -44,7 +45,8 @@ impl Convolver {
         }
     }
 
-    /// out = h ⊛ kernel inside the gate; gives what fell outside. `h` and `out` have one value a bin.
+    /// Computes out = h ⊛ kernel inside the gate and returns the energy outside it. `h` and `out`
+    /// have one value per bin.
     pub fn run(&mut self, h: &[f32], out: &mut [f64]) -> f64 {
         debug_assert!(h.len() == self.bins && out.len() == self.bins);
         out.fill(0.0);
@@ -53,7 +55,7 @@ impl Convolver {
         };
         let end = h.iter().rposition(|h| *h != 0.0).map_or(0, |i| i + 1);
         self.padded.fill(0.0);
-        // Bin b stands at b + lead, as far as there is room.
+        // Bin b is at b + lead, if the buffer includes it.
         let skipped = (start as i64 + self.lead).min(0).unsigned_abs() as usize;
         let at = (start as i64 + self.lead).max(0) as usize;
         let seen = h[start..end].iter().skip(skipped);
@@ -74,7 +76,7 @@ impl Convolver {
         self.outside(&h[start..end], start)
     }
 
-    /// Energy of the bins from `start` on that lands outside the gate.
+    /// Returns the energy of the bins from `start` on that the kernel moves outside the gate.
     fn outside(&self, h: &[f32], start: usize) -> f64 {
         let taps = self.reversed.len() as i64;
         let share = |i: usize| {
@@ -83,7 +85,7 @@ impl Convolver {
             let above = (self.bins as i64 - target).clamp(0, taps) as usize;
             f64::from(h[i]) * (self.before[below] + self.after[above])
         };
-        // All of what the bins between these two send arrives.
+        // All energy of the bins between these two stays inside the gate.
         let index = |bin: i64| (bin - start as i64).clamp(0, h.len() as i64) as usize;
         let early = index(-self.first);
         let late = index(self.bins as i64 - self.first - taps + 1).max(early);
@@ -91,11 +93,11 @@ impl Convolver {
     }
 }
 
-/// Sums that are made side by side: four registers of four.
+/// The number of independent sums: four registers of four.
 const BLOCK: usize = 16;
 
-/// out[i] = Σ_j taps[j]·x[i + j], summed in the order of j. With the machine's longest registers, to the same bits as without:
-/// products and sums stay apart.
+/// Computes out[i] = Σ_j taps[j]·x[i + j], summed in the order of j. It uses the machine's widest
+/// registers, with the same bits as without them, because products and sums are not fused.
 struct Sums<'a> {
     taps: &'a [f64],
     x: &'a [f64],
@@ -105,7 +107,7 @@ struct Sums<'a> {
 impl WithSimd for Sums<'_> {
     type Output = ();
 
-    // Inlined into a function that has these registers; a closure would not be.
+    // Inlined into a function that can use these registers; a closure would not be.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { taps, x, out } = self;

@@ -1,8 +1,9 @@
-//! Random counts: a generator of its own for each (seed, scene, pixel, bin), and exact Poisson and binomial draws.
+//! Random counts: a separate generator for each (seed, scene, pixel, bin), and exact Poisson and
+//! binomial draws.
 
 use super::alias::{Cut, TABLED};
 
-/// What a stream of numbers is for.
+/// The purpose of a stream of numbers.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Purpose {
     Counts = 1,
@@ -49,12 +50,12 @@ pub struct Draws {
 }
 
 impl Draws {
-    /// The numbers that the sensor draws its counts from.
+    /// Returns the numbers that the sensor draws its counts from.
     pub fn new(seed: u64, scene: u64, pixel: u64, bin: u64) -> Self {
         PixelKey::new(seed, Purpose::Counts, scene, pixel).bin(bin)
     }
 
-    /// 64 uniform bits.
+    /// Returns 64 uniform bits.
     #[inline(always)]
     fn bits(&mut self) -> u64 {
         // The hashed start is as good as any later number, and most bins need only one.
@@ -67,13 +68,13 @@ impl Draws {
         }
     }
 
-    /// Uniform in [0, 1), 53 bits.
+    /// Returns a uniform number in [0, 1), 53 bits.
     #[inline(always)]
     pub fn uniform(&mut self) -> f64 {
         (self.bits() >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)
     }
 
-    /// A standard normal number (Marsaglia's polar method).
+    /// Returns a standard normal number (Marsaglia's polar method).
     pub(super) fn normal(&mut self) -> f64 {
         loop {
             let (x, y) = (2.0 * self.uniform() - 1.0, 2.0 * self.uniform() - 1.0);
@@ -85,15 +86,16 @@ impl Draws {
     }
 }
 
-/// Expected successes from which on binomial counts use rejection instead of inversion.
+/// Expected successes from which binomial counts use rejection instead of inversion.
 const LARGE: f64 = 10.0;
 
-/// A Poisson count, exact for rates up to 10¹²: tables below a rate of 1024, from there Hörmann's transformed rejection
-/// (PTRS; W. Hörmann, "The transformed rejection method for generating Poisson random variables", Insurance:
-/// Mathematics and Economics 12, 1993). A rate that is not above 0 gives 0.
+/// Returns a Poisson count, exact for rates up to 10¹². It uses tables below a rate of 1024, and
+/// from there Hörmann's transformed rejection (PTRS; W. Hörmann, "The transformed rejection method
+/// for generating Poisson random variables", Insurance: Mathematics and Economics 12, 1993).
+/// Returns 0 if the rate is not above 0.
 ///
 /// # Panics
-/// Where the rate is above 10¹².
+/// Panics if the rate is above 10¹².
 #[inline(always)]
 pub fn poisson(rate: f64, draws: &mut Draws) -> u64 {
     if rate.is_nan() || rate <= 0.0 {
@@ -113,11 +115,11 @@ pub fn poisson(rate: f64, draws: &mut Draws) -> u64 {
     poisson_ptrs(rate, draws)
 }
 
-/// The smallest k with P(K ≤ k) > u.
+/// Returns the smallest k with P(K ≤ k) > u.
 fn poisson_inverse(rate: f64, mut u: f64) -> u64 {
     let mut p = libm::exp(-rate);
     let mut k = 0.0;
-    // Beyond 10⁻²⁰ no uniform number of 53 bits can tell.
+    // A uniform number of 53 bits cannot resolve probabilities below 10⁻²⁰.
     while u >= p && (p > 1e-20 || k < rate) {
         u -= p;
         k += 1.0;
@@ -142,7 +144,7 @@ fn poisson_ptrs(rate: f64, draws: &mut Draws) -> u64 {
         if x < 0.0 || (us < 0.013 && v > us) {
             continue;
         }
-        // Casts cut off the fraction, at a fraction of the cost of `floor`.
+        // A cast truncates, at a fraction of the cost of `floor`.
         let k = x as i64 as f64;
         if libm::log(v * inverse_alpha / (a / (us * us) + b)) <= ln_poisson(k, rate) {
             return k as u64;
@@ -150,8 +152,8 @@ fn poisson_ptrs(rate: f64, draws: &mut Draws) -> u64 {
     }
 }
 
-/// ln P(K = k) = −(k ln(k/λ) − (k − λ)) − ½ ln(2πk) − (ln k! − Stirling): without the cancellation of k ln λ against
-/// ln k!, which would cost seven digits at 4·10⁷.
+/// Returns ln P(K = k) = −(k ln(k/λ) − (k − λ)) − ½ ln(2πk) − (ln k! − Stirling). This form avoids
+/// the cancellation of k ln λ against ln k!, which would cost seven digits at 4·10⁷.
 fn ln_poisson(k: f64, rate: f64) -> f64 {
     if k == 0.0 {
         return -rate;
@@ -160,7 +162,7 @@ fn ln_poisson(k: f64, rate: f64) -> f64 {
     -(k * libm::log(k / rate) - (k - rate)) - root - stirling_rest(k)
 }
 
-/// ln k! − (k ln k − k + ½ ln 2πk), for whole k.
+/// Returns ln k! − (k ln k − k + ½ ln 2πk), for integer k.
 fn stirling_rest(k: f64) -> f64 {
     const EXACT: [f64; 10] = [
         0.0,
@@ -181,15 +183,16 @@ fn stirling_rest(k: f64) -> f64 {
     (1.0 / 12.0 - (1.0 / 360.0 - (1.0 / 1260.0 - r / 1680.0) * r) * r) / k
 }
 
-/// A binomial count of `n` trials, each of which succeeds with probability 1 − exp(−`rate`); exact for n up to 2⁴⁰.
-/// Inversion below 10 expected counts, from there Hörmann's BTRS ("The generation of binomial random variates",
-/// Journal of Statistical Computation and Simulation 46, 1993). A rate that is not above 0 gives 0.
+/// Returns a binomial count of `n` trials with success probability 1 − exp(−`rate`); exact for n up
+/// to 2⁴⁰. It uses inversion below 10 expected counts, and from there Hörmann's BTRS ("The
+/// generation of binomial random variates", Journal of Statistical Computation and Simulation 46,
+/// 1993). Returns 0 if the rate is not above 0.
 pub fn binomial(n: u64, rate: f64, draws: &mut Draws) -> u64 {
     if n == 0 || rate.is_nan() || rate <= 0.0 {
         return 0;
     }
     let (p, q) = (-libm::expm1(-rate), libm::exp(-rate));
-    // Failures are drawn where they are rarer.
+    // Failures are drawn if they are rarer than successes.
     if p > 0.5 {
         let failures = binomial_rare(n, q, libm::log1p(-q), draws);
         return n - failures;
@@ -197,7 +200,7 @@ pub fn binomial(n: u64, rate: f64, draws: &mut Draws) -> u64 {
     binomial_rare(n, p, -rate, draws)
 }
 
-/// p ≤ ½; `ln_q` = ln(1 − p).
+/// Returns a binomial count for p ≤ ½; `ln_q` = ln(1 − p).
 fn binomial_rare(n: u64, p: f64, ln_q: f64, draws: &mut Draws) -> u64 {
     if p <= 0.0 {
         return 0;
@@ -244,8 +247,8 @@ fn binomial_btrs(n: f64, p: f64, draws: &mut Draws) -> f64 {
     }
 }
 
-/// ln P(K = k) in the saddle-point form (C. Loader, "Fast and accurate computation of binomial probabilities", 2000),
-/// which cancels nothing large.
+/// Returns ln P(K = k) in the saddle-point form (C. Loader, "Fast and accurate computation of
+/// binomial probabilities", 2000), which has no cancellation of large terms.
 fn ln_binomial(k: f64, n: f64, p: f64) -> f64 {
     let q = 1.0 - p;
     if k == 0.0 {

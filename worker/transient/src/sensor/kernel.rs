@@ -1,31 +1,35 @@
-//! Pulse and jitter as one kernel on the histogram's bins.
+//! The pulse and the jitter as one kernel on the histogram's bins.
 
 use std::f64::consts::{FRAC_PI_2, LN_2, SQRT_2};
 
 use picofarm_settings::{Jitter, Pulse, Sensor, SensorError};
 
-/// Share of the energy cut off at each end of a kernel: beside a peak of 4·10⁷ photons less than 0.01 of one.
+/// Fraction of the energy cut off at each end of a kernel: next to a peak of 4·10⁷ photons, less
+/// than 0.01 photons.
 const CUT: f64 = 1e-10;
-/// Longest kernel, bins.
+/// The longest kernel, bins.
 const MAX_TAPS: f64 = 8192.0;
-/// Sub-bins of a kernel at most.
+/// The maximum number of sub-bins of a kernel.
 const MAX_FINE: f64 = 262_144.0;
 
-/// A blur: light that arrives in bin b is spread to bins b + first, b + first + 1, … in the shares `taps`.
+/// A blur: light that arrives in bin b is spread to bins b + first, b + first + 1, … in the
+/// fractions `taps`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Kernel {
     /// Displacement of the first tap, bins; negative = earlier.
     pub first: i64,
-    /// Shares; their sum is 1.
+    /// Fractions of the energy; their sum is 1.
     pub taps: Vec<f64>,
 }
 
 impl Kernel {
-    /// pulse ⊛ jitter for bins of `bin_width_ps`. Light is taken to arrive at its bin's centre, and a share is the
-    /// energy that falls into a bin. (Jitter of the kind `sb3d_compat` is a shift and no part of this.)
+    /// Returns pulse ⊛ jitter for bins of `bin_width_ps`. Light is assumed to arrive at its bin's
+    /// centre, and a tap is the energy that falls into a bin. (Jitter of the kind `sb3d_compat` is
+    /// a shift and not part of the kernel.)
     ///
     /// # Errors
-    /// [`SensorError::Invalid`] where a setting or `bin_width_ps` is unusable, or the kernel would span more than 8192 bins.
+    /// Returns [`SensorError::Invalid`] if a setting or `bin_width_ps` is unusable, or the kernel
+    /// would span more than 8192 bins.
     pub fn new(sensor: &Sensor, bin_width_ps: f64) -> Result<Self, SensorError> {
         sensor.check()?;
         if !(1e-3..=1e9).contains(&bin_width_ps) {
@@ -49,7 +53,8 @@ impl Kernel {
                 ),
             ));
         }
-        // Sub-bins of a fiftieth of the narrower width; odd, so that bins and sub-bins share their centres.
+        // Sub-bins of a fiftieth of the narrower width. Their number per bin is odd, so that bins
+        // and sub-bins share their centres.
         let narrow = if sigma > 0.0 {
             pulse.width.min(sigma)
         } else {
@@ -65,31 +70,31 @@ impl Kernel {
         Ok(fine.binned(per_bin as i64).trimmed())
     }
 
-    /// The same, displaced by `bins`.
+    /// Returns the kernel displaced by `bins`.
     pub fn shifted(mut self, bins: i64) -> Self {
         self.first += bins;
         self
     }
 }
 
-/// σ of a Gaussian of this full width at half maximum.
+/// Returns σ of a Gaussian with this full width at half maximum.
 pub(super) fn gaussian_sigma(fwhm: f64) -> f64 {
     fwhm / (2.0 * (2.0 * LN_2).sqrt())
 }
 
-/// A shape in time, picoseconds: its integral, and where it lies.
+/// A shape in time, picoseconds: its integral and its range.
 struct Shape {
     integral: Box<dyn Fn(f64) -> f64>,
     start: f64,
     end: f64,
-    /// A length over which it changes.
+    /// The length scale of its changes.
     width: f64,
 }
 
 impl Shape {
     fn of(pulse: &Pulse) -> Self {
         match pulse {
-            // All energy at one instant, whatever the step.
+            // All energy is at one instant, whatever the step.
             Pulse::None {} => Self {
                 integral: Box::new(|t| f64::from(t >= 0.0)),
                 start: 0.0,
@@ -187,7 +192,7 @@ impl Fine {
         }
     }
 
-    /// Sums of `per_bin` (odd) sub-bins.
+    /// Returns the sums of `per_bin` (odd) sub-bins.
     fn binned(&self, per_bin: i64) -> Kernel {
         let bin = |i: i64| (i + per_bin / 2).div_euclid(per_bin);
         let first = bin(self.first);
@@ -201,7 +206,7 @@ impl Fine {
 }
 
 impl Kernel {
-    /// Without the ends that hold next to nothing, and with the sum 1.
+    /// Removes the ends with negligible energy and normalises the sum to 1.
     fn trimmed(mut self) -> Self {
         let total: f64 = self.taps.iter().sum();
         let idle = |taps: &mut dyn Iterator<Item = &f64>| {

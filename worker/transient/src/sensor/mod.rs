@@ -1,14 +1,17 @@
-//! The sensor model: stored transients in, photon counts out. Functions on arrays; knows nothing of jobs, stores or files.
+//! The sensor model: stored transients in, photon counts out. It consists of functions on arrays,
+//! independent of jobs, stores and files.
 //!
-//! In this order, for each pixel (the model of the "Sensor model" section of the method's appendix A.5):
+//! The steps for each pixel, in this order (the model of the "Sensor model" section of the method's
+//! appendix A.5):
 //!
-//! 1. rate = scale · (h ⊛ pulse ⊛ jitter) + dark, photons a bin;
-//! 2. pile-up, where asked for: at most one photon a pulse is seen;
+//! 1. rate = scale · (h ⊛ pulse ⊛ jitter) + dark, photons per bin;
+//! 2. pile-up, if requested: at most one photon per pulse is detected;
 //! 3. counts = Poisson(rate);
 //! 4. adjacent bins are summed.
 //!
-//! What the convolution pushes out of the gate is dropped and counted. Every random number depends on
-//! (seed, scene, pixel, bin) alone: the number of threads changes nothing, nor does the order of the pixels.
+//! Light that the convolution moves out of the gate is dropped and counted. Every random number
+//! depends only on (seed, scene, pixel, bin), so neither the number of threads nor the order of the
+//! pixels changes the result.
 
 mod alias;
 mod bins;
@@ -25,5 +28,5 @@ pub use picofarm_settings::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, Se
 pub use sense::{Dropped, Histograms, Sensed, Sensing, Values, narrow, sense};
 pub use spots::{Multiplex, SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
 
-/// Version of the sensed values: change it whenever any output bit may change.
+/// Version of the sensed values. Change it whenever any output bit may change.
 pub const SENSOR_VERSION: &str = "sensor-2";

@@ -11,20 +11,21 @@ use super::{
     kernel::Kernel,
 };
 
-/// Highest rate a bin may have, photons: its count fits u32, as sums of bins must besides.
+/// The highest rate of a bin, photons. The count fits a u32; sums of bins must fit as well.
 const MAX_RATE: f64 = 4e9;
 
-/// What a sensor looks at.
+/// The input of a sensor.
 #[derive(Debug, Clone, Copy)]
 pub struct Histograms<'a> {
     /// h, all bounces, `[pixel][bin]`; finite and at least 0.
     pub transient: &'a [f32],
-    /// The exactly-two-bounce part of it, in the same shape, which sets the scale. `None`: the whole transient does
-    /// (in most pixels the brightest bin is the two-bounce peak all the same).
+    /// The exactly-two-bounce part of the transient, in the same shape, which sets the scale. If
+    /// `None`, the whole transient sets the scale (in most pixels the brightest bin is the
+    /// two-bounce peak all the same).
     pub two_bounce: Option<&'a [f32]>,
-    /// Bins of a pixel.
+    /// Bins per pixel.
     pub bins: usize,
-    /// Width of a bin, picoseconds; [`super::PS_PER_M`] times metres of path.
+    /// Width of a bin, picoseconds: [`super::PS_PER_M`] times metres of path.
     pub bin_width_ps: f64,
 }
 
@@ -33,12 +34,12 @@ pub struct Histograms<'a> {
 pub enum Values {
     /// Counted photons, `[pixel][bin]`.
     Counts(Vec<u32>),
-    /// Expected photons, `[pixel][bin]`, where no noise was asked for.
+    /// Expected photons, `[pixel][bin]`, if noise is turned off.
     Rate(Vec<f32>),
 }
 
 impl Values {
-    /// Sum of all.
+    /// Returns the sum of all values.
     pub fn sum(&self) -> f64 {
         match self {
             Self::Rate(rate) => rate.iter().map(|r| f64::from(*r)).sum(),
@@ -47,46 +48,46 @@ impl Values {
     }
 }
 
-/// Counts in 16 bits; `None` where one is too large for them.
+/// Returns the counts in 16 bits, or `None` if one is too large.
 pub fn narrow(counts: &[u32]) -> Option<Vec<u16>> {
     counts.iter().map(|c| u16::try_from(*c).ok()).collect()
 }
 
-/// What was measured, and how.
+/// The result of a measurement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sensed {
     /// The image.
     pub values: Values,
-    /// Bins of a pixel after rebinning.
+    /// Bins per pixel after rebinning.
     pub bins: usize,
-    /// Width of such a bin, picoseconds.
+    /// Width of a bin after rebinning, picoseconds.
     pub bin_width_ps: f64,
-    /// Photons for a unit of h.
+    /// Photons per unit of h.
     pub scale: f64,
     /// The peak that set the scale, photons; `None` for a fixed scale and for scenes without light.
     pub peak_photons: Option<f64>,
     /// Bins by which the pulse was shifted (`sb3d_compat` jitter; otherwise 0).
     pub shift_bins: i64,
-    /// What is not in the image.
+    /// Expected photons missing from the image.
     pub dropped: Dropped,
 }
 
-/// Expected photons that are not in the image, of all pixels.
+/// Expected photons missing from the image, of all pixels.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Dropped {
-    /// Pushed out of the gate by pulse and jitter.
+    /// Photons moved out of the gate by pulse and jitter.
     pub outside_photons: f64,
-    /// Their share of all light, dark counts left out.
+    /// These photons as a fraction of all light, excluding dark counts.
     pub outside_share: f64,
-    /// Bins of a pixel left over by rebinning.
+    /// Bins per pixel left over by rebinning.
     pub bins: usize,
-    /// Photons in these bins, dark counts included.
+    /// Photons in these bins, including dark counts.
     pub bins_photons: f64,
-    /// Photons not seen for pile-up.
+    /// Photons lost to pile-up.
     pub pile_up_photons: f64,
 }
 
-/// One pixel's part in the totals.
+/// One pixel's contribution to the totals.
 #[derive(Debug, Clone, Copy, Default)]
 struct Facts {
     light: f64,
@@ -102,11 +103,13 @@ enum Fault {
     TooBright { bin: usize, rate: f64 },
 }
 
-/// Measures scene `scene`. All random numbers depend on (`seed`, `scene`, pixel, bin) alone. Uses rayon's current pool.
+/// Measures scene `scene`. All random numbers depend only on (`seed`, `scene`, pixel, bin). Uses
+/// rayon's current pool.
 ///
 /// # Errors
-/// [`SensorError::Invalid`]: an unusable setting, shapes that do not agree, a value of h that is negative or not
-/// finite, a transient with light but no peak to scale by, or a bin of more than 10⁹ photons (2³² after rebinning).
+/// Returns [`SensorError::Invalid`] for an unusable setting, shapes that do not agree, a negative
+/// or non-finite value of h, a transient with light but no peak to scale by, or a bin of more than
+/// 10⁹ photons (2³² after rebinning).
 pub fn sense(
     sensor: &Sensor,
     h: &Histograms<'_>,
@@ -140,7 +143,7 @@ pub fn sense(
     })
 }
 
-/// A sensor that looks at many histograms of the same bins: what they have in common is worked out once.
+/// A sensor for many histograms with the same bins. Shared values are computed once.
 #[derive(Debug, Clone)]
 pub struct Sensing {
     sensor: Sensor,
@@ -150,10 +153,11 @@ pub struct Sensing {
 }
 
 impl Sensing {
-    /// Of histograms of `bins` bins that are `bin_width_ps` picoseconds wide.
+    /// Returns a sensor for histograms of `bins` bins that are `bin_width_ps` picoseconds wide.
     ///
     /// # Errors
-    /// Those of [`Kernel::new`], or [`SensorError::Invalid`] where the bins cannot be summed as the sensor says.
+    /// Returns the errors of [`Kernel::new`], or [`SensorError::Invalid`] if the bins cannot be
+    /// summed by the sensor's factor.
     pub fn new(sensor: Sensor, bins: usize, bin_width_ps: f64) -> Result<Self, SensorError> {
         let kernel = Kernel::new(&sensor, bin_width_ps)?;
         pixels(0, bins)?;
@@ -166,13 +170,15 @@ impl Sensing {
         })
     }
 
-    /// What [`sense`] measures, in units of h: photons over the scale, into `out`, which becomes as long as needed and is
-    /// overwritten. `peak` is what an earlier call for the same histograms gave, with whatever seed: it is spared a look at all of
-    /// them, to the same bits. Gives the brightest bin of the median pixel, in units of h, where the scale follows from it and it is the
-    /// same in every draw.
+    /// Measures like [`sense`], in units of h: writes photons divided by the scale into `out`,
+    /// which is resized and overwritten.
+    ///
+    /// `peak` is the result of an earlier call for the same histograms, with any seed. It saves a
+    /// pass over all histograms and gives the same bits. Returns the brightest bin of the median
+    /// pixel, in units of h, if the scale follows from it and it is the same in every draw.
     ///
     /// # Errors
-    /// Those of [`sense`].
+    /// Returns the errors of [`sense`].
     pub fn radiance(
         &self,
         transient: &[f32],
@@ -238,7 +244,7 @@ fn shift(sensor: &Sensor, seed: u64, scene: u64) -> i64 {
     }
 }
 
-/// Photons for a unit of h, and what that follows from.
+/// Photons per unit of h, and the peak that determines it.
 #[derive(Debug, Clone, Copy)]
 struct Scaled {
     per_unit: f64,
@@ -276,7 +282,7 @@ fn scale_of(
             photons: Some(photons),
             peak: Some(peak),
         }),
-        // Nothing to see: any scale gives the same image.
+        // There is no light, so any scale gives the same image.
         None if h.transient.iter().all(|h| *h == 0.0) => Ok(alone(1.0)),
         None => Err(SensorError::new(
             "sensor.scale",
@@ -286,7 +292,8 @@ fn scale_of(
     }
 }
 
-/// The median over the pixels with light of the brightest bin; `None` where no pixel has any.
+/// Returns the median over the pixels with light of the brightest bin, or `None` if no pixel has
+/// any.
 fn median_peak(h: &[f32], bins: usize, convolver: &Convolver) -> Option<f64> {
     let mut peaks: Vec<f64> = h
         .par_chunks(bins)
@@ -318,7 +325,7 @@ fn check(h: &Histograms<'_>) -> Result<(), SensorError> {
     }
 }
 
-/// What all pixels share.
+/// Values shared by all pixels.
 struct Chain<'a> {
     sensor: &'a Sensor,
     h: &'a Histograms<'a>,
@@ -355,7 +362,7 @@ impl Chain<'_> {
     /// Step 1: the expected photons of each bin.
     fn rate(&self, convolver: &mut Convolver, h: &[f32], rate: &mut [f64]) -> Facts {
         let odd = |h: &f32| !(0.0..=f32::MAX).contains(h);
-        // Without a way out early: eight bins at a time.
+        // Without an early exit, so that eight bins are tested at a time.
         if h.iter().fold(false, |any, h| any | odd(h))
             && let Some(bin) = h.iter().position(odd)
         {
@@ -394,7 +401,7 @@ impl Chain<'_> {
         }
     }
 
-    /// Expected photons lost to pile-up.
+    /// Returns the expected photons lost to pile-up.
     fn piled_up(&self, rate: &[f64]) -> f64 {
         let Some(DeadTime::FirstPhoton { pulses }) = self.sensor.dead_time else {
             return 0.0;
@@ -403,7 +410,7 @@ impl Chain<'_> {
         all + n * libm::expm1(-all / n)
     }
 
-    /// Expected counts, rebinned, and what `of` makes of them.
+    /// Writes the expected counts, rebinned and converted by `of`.
     fn expect(&self, rate: &[f64], out: &mut [f32], of: impl Fn(f32) -> f32) -> Option<Fault> {
         let mut earlier = 0.0;
         for (out, group) in out.iter_mut().zip(rate.chunks_exact(self.factor)) {
@@ -423,7 +430,7 @@ impl Chain<'_> {
         None
     }
 
-    /// Drawn counts, rebinned, and what `of` makes of them.
+    /// Writes the drawn counts, rebinned and converted by `of`.
     fn count<T>(
         &self,
         pixel: usize,
@@ -466,7 +473,7 @@ impl Chain<'_> {
     }
 }
 
-/// Sums in the order of the pixels; the first fault is the error.
+/// Sums in the order of the pixels. The first fault is the error.
 fn total(facts: &[Facts], left_over_bins: usize) -> Result<Dropped, SensorError> {
     let mut dropped = Dropped {
         bins: left_over_bins,

@@ -2,7 +2,8 @@
 
 use picofarm_settings::SensorError;
 
-/// The 25 of the 100 spots of a 10×10 grid (row by row) that are lit by 25 beams: rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9.
+/// The 25 of the 100 spots of a 10×10 grid (row by row) that 25 beams light: rows 0, 2, 4, 6, 8 and
+/// columns 1, 3, 5, 7, 9.
 pub const SPOTS_25_OF_100: [usize; 25] = {
     let mut spots = [0; 25];
     let mut i = 0;
@@ -13,14 +14,17 @@ pub const SPOTS_25_OF_100: [usize; 25] = {
     spots
 };
 
-/// The 4 of the 100 spots of a 10×10 grid that are lit by 4 beams.
+/// The 4 of the 100 spots of a 10×10 grid that 4 beams light.
 pub const SPOTS_4_OF_100: [usize; 4] = [22, 27, 72, 77];
 
-/// h(p, b) = Σ h_i(p, b) over the spots i in `chosen`, summed as f64 in that order. `per_spot` is `[spot][pixel][bin]`
-/// (or any `[spot][…]`) with `spots` spots; the result has the shape of one of them. A spot chosen twice counts twice.
+/// Returns h(p, b) = Σ h_i(p, b) over the spots i in `chosen`, summed as f64 in that order.
+///
+/// `per_spot` is `[spot][pixel][bin]` (or any `[spot][…]`) with `spots` spots; the result has the
+/// shape of one of them. A spot chosen twice counts twice.
 ///
 /// # Errors
-/// [`SensorError::Invalid`] where `per_spot` does not divide into `spots`, or a chosen spot is not among them.
+/// Returns [`SensorError::Invalid`] if `per_spot` does not divide into `spots`, or a chosen spot is
+/// not among them.
 pub fn multiplex(
     per_spot: &[f32],
     spots: usize,
@@ -53,12 +57,12 @@ pub fn multiplex(
     Ok(sum.finish())
 }
 
-/// [`multiplex`] for histograms that come one after the other.
+/// Like [`multiplex`], for histograms that arrive one after the other.
 #[derive(Debug, Clone)]
 pub struct Multiplex(Vec<f64>);
 
 impl Multiplex {
-    /// A sum of histograms of `len` values each.
+    /// Returns an empty sum of histograms of `len` values each.
     pub fn new(len: usize) -> Self {
         Self(vec![0.0; len])
     }
@@ -66,7 +70,7 @@ impl Multiplex {
     /// Adds a spot's histogram.
     ///
     /// # Errors
-    /// [`SensorError::Invalid`] where it has another number of values.
+    /// Returns [`SensorError::Invalid`] if its number of values differs.
     pub fn add(&mut self, h: &[f32]) -> Result<(), SensorError> {
         if h.len() != self.0.len() {
             return Err(SensorError::new(
@@ -84,7 +88,7 @@ impl Multiplex {
         Ok(())
     }
 
-    /// The sum.
+    /// Returns the sum.
     pub fn finish(self) -> Vec<f32> {
         self.0.into_iter().map(|sum| sum as f32).collect()
     }

@@ -77,7 +77,7 @@ impl Walk<'_> {
     }
 
     /// Multiplies each spot's weight by the MIS weight of having reached `h` from `step` by BSDF
-    /// sampling, against aiming (mirrors) or light vertices (other surfaces).
+    /// sampling, versus aiming (mirrors) or light vertices (other surfaces).
     fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32], images: &mut [f32]) {
         if h.surface.specular() {
             let Some(mirror) = self.mirrors.of(h.triangle) else {
@@ -103,8 +103,8 @@ impl Walk<'_> {
         let plain = step.pdf * h.n.dot(back).abs() / (b2 * b2.sqrt());
         let strength = &self.emitters.columns.strength;
         if h.surface.diffuse() {
-            // Both Lambertian: weight = strength · f · cos cos / d², and the light vertex' density is
-            // share(cos / π) · cos / d².
+            // Both are Lambertian: weight = strength · f · cos cos / d², and the light vertex'
+            // density is share(cos / π) · cos / d².
             let light = light_vertices::share(self.emitters, 1.0 / (PI * h.surface.lambertian()));
             for (w, &s) in weights.iter_mut().zip(&**strength) {
                 let weighed = *w * plain / (plain + light * *w / s);
@@ -124,8 +124,9 @@ impl Walk<'_> {
         }
     }
 
-    /// Looks for a spot's image in a planar mirror, `often` times on average (at most once). Returns that
-    /// number, 0 without mirrors, for MIS. `aiming`: the vertex aims at near-mirrors as well.
+    /// Connects to a spot's image in a planar mirror, `often` times on average (at most once).
+    /// Returns that number, 0 without mirrors, for MIS. `aiming` is present if the vertex aims at
+    /// near-mirrors as well.
     pub fn aim(
         &self,
         rng: &mut Rng,
@@ -158,8 +159,8 @@ impl Walk<'_> {
         if h.n.dot(aim.target - h.p) <= 0.0 {
             return;
         }
-        // From where the ray starts, not from `h.p`: it must meet the mirror where its density is known,
-        // and narrow lobes are no wider than the lift.
+        // The origin is the start of the ray, not `h.p`: the ray must hit the mirror at a point of
+        // known density, and narrow lobes are no wider than the lift.
         let from = lift(h.p, h.n);
         let to = aim.target - from;
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
@@ -190,15 +191,17 @@ impl Walk<'_> {
         sink.add(path, value, aim.spot, v.bounce + 2, Way::Image);
     }
 
-    /// Aims at near-mirrors per steradian from `x` towards `m`, for one direction drawn by scattering.
+    /// Returns the aims at near-mirrors per steradian from `x` towards `m`, for one direction drawn
+    /// by scattering.
     #[inline]
     pub fn aims(&self, aiming: Option<&Aiming>, x: Vec3, m: &Hit) -> f32 {
         let both = self.reflectors.zip(aiming);
         both.map_or(0.0, |(all, aiming)| aiming.density(all, x, m))
     }
 
-    /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution; a near-mirror's only to
-    /// those in zones, and where the camera sees it by near-mirrors alone to those beyond others that pay there.
+    /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution.
+    /// A near-mirror is connected only to those in zones and, if the camera sees it via
+    /// near-mirrors alone, to those beyond other near-mirrors that pay off there.
     pub fn light(
         &self,
         rng: &mut Rng,
@@ -228,7 +231,8 @@ impl Walk<'_> {
             Lights::Glossy => self.lights && vertices.has_gloss(),
             Lights::Beyond => !vertices.list.is_empty(),
             Lights::Contact => {
-                // Near vertices are walked to within the zones, and light paths go on by way of near-mirrors.
+                // Near vertices are reached by walks within the zones, and light paths continue via
+                // near-mirrors.
                 let theirs = |c: &Contacts| match h.surface.specular() {
                     true => v.open() > h.surface.alpha(),
                     false => c.near(self.world, h),
@@ -280,11 +284,11 @@ impl Walk<'_> {
 }
 
 /// Systematic sampling: draws `count` times in proportion to `weights`, from one random number, and
-/// calls `each` once for every entry drawn with its share of the sum. Unbiased for the sum.
+/// calls `each` once for every entry drawn, with its share of the sum. Unbiased for the sum.
 #[inline]
 pub(crate) fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
     let total: f32 = weights.iter().sum();
-    // Beneath the least normal number a step could be 0.
+    // Below the smallest normal number, a step could be 0.
     if !(total > 1e-30 && total.is_finite()) {
         return;
     }

@@ -1,4 +1,4 @@
-//! The lift off a surface: rays that start there do not meet the plane that they start from.
+//! The lift off a surface: rays that start there do not hit their own plane.
 
 use std::sync::Arc;
 
@@ -10,7 +10,8 @@ use proptest::prelude::*;
 use super::*;
 use crate::{api::Unstopped, bsdf::frame};
 
-/// A parallelogram around a point, and a far facet that stretches the scene to its greatest size in render units.
+/// Returns a parallelogram around a point, and a far facet that extends the scene to its maximum
+/// size in render units.
 fn scene(middle: Vec3, normal: Vec3, side: f32) -> Scene {
     let (t, b) = frame(normal);
     let corner = |x: f32, y: f32| middle + t * (x * side) + b * (y * side);
@@ -50,7 +51,7 @@ fn scene(middle: Vec3, normal: Vec3, side: f32) -> Scene {
 }
 
 fn unit() -> impl Strategy<Value = Vec3> {
-    // Upright planes and such as lean a little are what rooms are made of.
+    // Rooms mostly consist of upright and slightly tilted planes.
     let tilt = prop_oneof![Just(0.0f32), 1e-4f32..0.1, 0.1f32..1.0];
     (0..3usize, any::<bool>(), tilt.clone(), tilt).prop_map(|(axis, flip, a, b)| {
         let mut n = [a, b, a];
@@ -74,7 +75,7 @@ proptest! {
         let world = World::new(&s, f64::INFINITY, Stop(&Unstopped)).unwrap();
         let mut stack = world.bvh.stack();
         for (angle, height, x, y) in turns {
-            // From the camera onto some place of the plane.
+            // A ray from the camera to a point of the plane.
             let (t, b) = frame(normal);
             let goal = Vec3::new(at.0, at.1, at.2) + (t * x + b * y) * (0.3 * side);
             let Some(h) = world.closest(&mut stack, Vec3::ZERO, goal.normalized()) else {

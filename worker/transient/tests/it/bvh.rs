@@ -1,4 +1,5 @@
-//! The hierarchy against brute force, against obvhs' own CWBVH, and at shared edges and vertices.
+//! Tests the hierarchy against brute force, against obvhs' own CWBVH, and at shared edges and
+//! vertices.
 
 use crate::common;
 
@@ -19,7 +20,7 @@ fn soup(o: &Object) -> Vec<[Vec3; 3]> {
     o.mesh.triangles.iter().map(|t| t.map(corner)).collect()
 }
 
-/// Numbers in [-1, 1) without a generator crate.
+/// Returns numbers in [-1, 1) without a generator crate.
 fn noise(seed: u32) -> impl FnMut() -> f32 {
     let mut s = seed.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
     move || {
@@ -97,7 +98,7 @@ fn all_kernels_give_the_same_bits() {
     }
 }
 
-/// Every kernel's answers for the bundle are those of portable single rays.
+/// Checks that every kernel's results for the bundle equal those of portable single rays.
 fn bundles_agree(triangles: &[[Vec3; 3]], from: Vec3, to: &[Vec3]) -> Result<usize, TestCaseError> {
     let single = Bvh::build(triangles).with_kernel(Kernel::Portable).unwrap();
     let mut stack = single.stack();
@@ -119,8 +120,8 @@ fn bundles_agree(triangles: &[[Vec3; 3]], from: Vec3, to: &[Vec3]) -> Result<usi
     Ok(expected.iter().filter(|&&b| b).count())
 }
 
-/// Points about `centre`; some repeat a coordinate of `from` or of each other, so that directions have
-/// zeros and ties, and some are `from` itself or not finite.
+/// Returns points around `centre`. Some repeat a coordinate of `from` or of each other, so that
+/// directions have zeros and ties, and some are `from` itself or not finite.
 fn targets(
     from: Vec3,
     centre: Vec3,
@@ -163,7 +164,8 @@ fn bundles_in_a_room_of_axis_aligned_walls_agree_with_single_rays() {
     let mut r = noise(77);
     let mut mixed = 0;
     for i in 0..300 {
-        // On walls, on vertices and on edges too: segments that graze and end on surfaces.
+        // Origins are also on walls, vertices and edges, so that segments graze surfaces and end on
+        // them.
         let t = triangles[((r() * 0.5 + 0.5) * triangles.len() as f32) as usize % triangles.len()];
         let from = match i % 3 {
             0 => t[0],
@@ -238,7 +240,8 @@ fn the_nearest_hit_agrees_with_cwbvh() {
         if i % 9 == 0 {
             d.x = 0.0;
         }
-        // The oracle loses rays with a component of −0 (here it gets none); to ours both zeros are one.
+        // The oracle loses rays with a component of −0 (here it gets none); ours treats both zeros
+        // alike.
         let negative = v(if d.x == 0.0 { -0.0 } else { d.x }, d.y, d.z);
         assert_eq!(
             bvh.closest(&mut stack, o, negative, f32::INFINITY),
@@ -258,7 +261,7 @@ fn the_nearest_hit_agrees_with_cwbvh() {
             _ => differ += 1,
         }
     }
-    // Rays that graze an edge may be judged differently by the oracle's test.
+    // The oracle's test may decide differently for rays that graze an edge.
     assert!(hits > 5_000 && differ <= 2, "{hits} hits, {differ} differ");
 }
 
@@ -310,7 +313,7 @@ proptest! {
     ) {
         let mut triangles = random_soup(count, size, seed);
         for (i, t) in triangles.iter_mut().enumerate() {
-            // Some lie in planes of the axes; some are needles or double.
+            // Some triangles are in planes of the axes; some are needles or duplicates.
             match i % 8 {
                 0 => t.iter_mut().for_each(|p| p.y = 0.5),
                 1 => t.iter_mut().for_each(|p| p.x = -0.25),

@@ -1,5 +1,5 @@
-//! Light that glass reflects and refracts, by closed forms and by what must not change; against an independent tracer in
-//! `independent_glass.rs`.
+//! Light that glass reflects and refracts, tested against closed forms and invariants;
+//! `independent_glass.rs` tests it against an independent tracer.
 
 use crate::common;
 
@@ -19,7 +19,7 @@ fn parts(r: &Rendered) -> [f64; 2] {
     [energy(&split.two), energy(&split.multi)]
 }
 
-/// Means and standard errors of both parts over seeds.
+/// Returns means and standard errors of both parts over seeds.
 fn over_seeds(scene: &Scene, seeds: u64, samples: u32) -> [(f64, f64); 2] {
     let all: Vec<[f64; 2]> = (0..seeds)
         .map(|seed| {
@@ -59,7 +59,7 @@ fn bodies_without_a_step_of_the_index_change_no_energy() {
     }
 }
 
-/// Share of unpolarised light that a pane of index 1.5 reflects.
+/// Returns the fraction of unpolarised light that a pane of index 1.5 reflects.
 fn pane(cos: f64) -> f64 {
     let inside = (1.0 - (1.0 - cos * cos) / 2.25).sqrt();
     let s = ((cos - 1.5 * inside) / (cos + 1.5 * inside)).powi(2);
@@ -69,7 +69,8 @@ fn pane(cos: f64) -> f64 {
 
 #[test]
 fn a_wall_is_lit_by_its_spots_mirror_image_in_a_window() {
-    // The wall before the camera, the window behind it: light comes from the spot to the wall by way of the window alone.
+    // The wall is in front of the camera and the window behind it, so light reaches the wall from
+    // the spot only via the window.
     let wall = quad(
         v(-6.0, -6.0, -3.0),
         v(12.0, 0.0, 0.0),
@@ -90,7 +91,7 @@ fn a_wall_is_lit_by_its_spots_mirror_image_in_a_window() {
     };
     let got = parts(&ok(&s, &set));
     assert_eq!(got[0], 0.0, "two bounces");
-    // By the mirror image, over the middles of 4x4 parts of each pixel.
+    // Computed from the mirror image, over the middles of 4x4 parts of each pixel.
     let (mut sum, side) = (0.0, 64);
     let i = &s.camera.intrinsics;
     for row in 0..side {
@@ -102,7 +103,7 @@ fn a_wall_is_lit_by_its_spots_mirror_image_in_a_window() {
             let (dx, dy, dz) = (x - spot[0], y - spot[1], 8.0);
             let d2: f64 = dx * dx + dy * dy + dz * dz;
             let cos = dz / d2.sqrt();
-            // Where the way meets the window, half on.
+            // The midpoint of the path is its intersection with the window.
             let (wx, wy) = (spot[0] + dx / 2.0, spot[1] + dy / 2.0);
             if wx.abs() < 3.0 && wy.abs() < 2.0 {
                 let albedo = 0.5 / std::f64::consts::PI;
@@ -117,7 +118,7 @@ fn a_wall_is_lit_by_its_spots_mirror_image_in_a_window() {
 
 #[test]
 fn a_spot_seen_in_a_window_is_as_bright_as_its_mirror_image() {
-    // The spot behind the camera, the window before it.
+    // The spot is behind the camera, and the window in front of it.
     let wall = quad(
         v(-6.0, -6.0, 1.0),
         v(12.0, 0.0, 0.0),
@@ -133,7 +134,7 @@ fn a_spot_seen_in_a_window_is_as_bright_as_its_mirror_image() {
     let s = scene(vec![wall, window], 16, &[v(0.3, -0.2, 1.0)]);
     let set = settings(Budget::Samples(4096));
     let got = parts(&ok(&s, &set));
-    // Its image is at (0.3, -0.2, -5).
+    // The spot's image is at (0.3, -0.2, -5).
     let (d2, z) = (0.3f64 * 0.3 + 0.2 * 0.2 + 25.0, 5.0);
     let cos = z / d2.sqrt();
     let i = &s.camera.intrinsics;
@@ -146,7 +147,7 @@ fn a_spot_seen_in_a_window_is_as_bright_as_its_mirror_image() {
 
 #[test]
 fn a_spot_seen_in_a_window_is_as_bright_at_any_resolution_beside_the_windows_edge() {
-    // Its image is seen in the window at (0.12, -0.08).
+    // The spot's image appears in the window at (0.12, -0.08).
     let image = |edge: f32, size: u32| {
         let wall = quad(
             v(-6.0, -6.0, 1.0),
@@ -180,7 +181,7 @@ fn a_spot_seen_in_a_window_is_as_bright_at_any_resolution_beside_the_windows_edg
 fn light_takes_its_time_through_a_body_and_loses_what_fresnel_says() {
     let scene = |ior| {
         let mut objects = room(v(-2.0, -2.0, -4.0), v(2.0, 2.0, 2.0), &grey(0.5));
-        // Before the camera, which looks straight on through its middle.
+        // In front of the camera, which looks straight through the middle of the body.
         objects.extend(body(
             v(-0.3, -0.3, -1.5),
             v(0.3, 0.3, -1.0),
@@ -196,7 +197,7 @@ fn light_takes_its_time_through_a_body_and_loses_what_fresnel_says() {
         },
         ..settings(Budget::Samples(128))
     };
-    // Energy and mean path of the middle pixels.
+    // Returns the energy and the mean path length of the middle pixels.
     let middle = |ior| {
         let r = ok(&scene(ior), &set);
         let two = &r.split.as_ref().unwrap().two;
@@ -213,7 +214,8 @@ fn light_takes_its_time_through_a_body_and_loses_what_fresnel_says() {
         (all, paths / all)
     };
     let ((air, short), (glass, long)) = (middle(1.0), middle(1.5));
-    // 0.96² of the light on the straight way, and 0.5 m of glass in place of air: at most 8 degrees aslant.
+    // 0.96² of the light on the straight path, and 0.5 m of glass instead of air: at most 8 degrees
+    // from the normal.
     assert!(
         (glass / air / (0.96 * 0.96) - 1.0).abs() < 0.02,
         "{}",
@@ -224,7 +226,8 @@ fn light_takes_its_time_through_a_body_and_loses_what_fresnel_says() {
 
 #[test]
 fn beams_are_refracted_by_bodies_and_split_by_panes() {
-    // A prism's faces are not parallel: the beam leaves in another direction. A slab's are: it goes on beside its way.
+    // A prism's faces are not parallel, so the beam leaves in another direction. A slab's faces are
+    // parallel, so the beam continues in its direction with an offset.
     let mut objects = room(v(-2.0, -2.0, -4.0), v(2.0, 2.0, 2.0), &grey(0.5));
     let direction = v(0.6, 0.0, -0.8);
     objects.extend(body(
@@ -247,7 +250,7 @@ fn beams_are_refracted_by_bodies_and_split_by_panes() {
     assert!((spot.arriving - direction).length() < 1e-5);
 }
 
-/// A closed box whose facets look outwards.
+/// Returns a closed box with facets that face outwards.
 fn body(low: picofarm_scene::Vec3, high: picofarm_scene::Vec3, m: &Material) -> Vec<Object> {
     let corner = |k: usize| {
         let of = |bit: usize, a: f32, b: f32| if k >> bit & 1 == 0 { a } else { b };

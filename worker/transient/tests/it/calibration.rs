@@ -1,4 +1,4 @@
-//! The stored errors against the scatter over many seeds of the same small render.
+//! Tests the stored errors against the spread over many seeds of the same small render.
 
 use crate::bench_scenes as scenes;
 
@@ -23,7 +23,7 @@ fn gate() -> Gate {
     }
 }
 
-/// A room with things in it, four spots.
+/// Returns a furnished room with four spots.
 fn room() -> Scene {
     let set = primitive::PrimitiveSettings {
         spots: Spots::Grid(4),
@@ -70,7 +70,7 @@ fn runs() -> &'static Runs {
     })
 }
 
-/// What a deviation from a mean of n is short of one from the truth.
+/// Returns the ratio of the variance from the truth to the variance from a mean of n.
 fn unbias() -> f64 {
     SEEDS as f64 / (SEEDS as f64 - 1.0)
 }
@@ -79,7 +79,7 @@ fn unbias() -> f64 {
 fn the_rms_of_deviations_over_stored_errors_is_one() {
     let Runs { all, mean } = runs();
     let highest = mean.iter().fold(0.0f64, |a, &b| a.max(b));
-    // Bins with a signal: all that have 10⁻⁴ of the highest, and the brighter ones by themselves.
+    // Bins with a signal: all bins above 10⁻⁴ of the highest, and the brighter ones separately.
     for (floor, tolerance) in [(1e-4, 0.1), (1e-2, 0.15)] {
         let (mut sum, mut count, mut emp, mut est) = (0.0, 0.0, 0.0, 0.0);
         for r in all {
@@ -163,7 +163,7 @@ fn the_noise_draw_predicts_the_variance_of_sums_over_blocks() {
     assert!((0.7..1.4).contains(&median), "{median}");
 }
 
-/// Median over pixels of ‖h − mean‖ / ‖mean‖ of one render.
+/// Returns the median over pixels of ‖h − mean‖ / ‖mean‖ of one render.
 fn true_median(h: &[f32], mean: &[f64]) -> f64 {
     let mut all: Vec<f64> = h
         .chunks(BINS)
@@ -229,8 +229,8 @@ fn a_budget_of_ten_per_cent_ends_at_a_true_median_error_of_ten_per_cent() {
     assert!((0.08..0.12).contains(&truth), "{truth}");
 }
 
-/// Renders of a hard room, 24×24 and 32 paths: the median error that they say, the true one, and that of standard errors.
-/// The truth has `longer` times as many paths.
+/// Renders a hard room at 24×24 with 32 paths, and returns the stated median error, the true one,
+/// and that of the standard errors. The reference has `longer` times as many paths.
 fn medians(name: &str, longer: u32) -> [f64; 3] {
     const SIDE: u32 = 24;
     const PATHS: u32 = 32;
@@ -250,7 +250,7 @@ fn medians(name: &str, longer: u32) -> [f64; 3] {
             .collect();
         true_median(&noise, &truth)
     });
-    // The truth has an error as well.
+    // The reference has an error as well.
     let is = mean(&|r| true_median(&r.transient, &truth));
     let is = is / (1.0 + 1.0 / f64::from(longer)).sqrt();
     println!("{name}: says {says:.4}, is {is:.4}; standard errors {standard:.4}");
@@ -261,7 +261,7 @@ fn medians(name: &str, longer: u32) -> [f64; 3] {
 fn the_median_error_holds_where_the_bins_of_a_pixel_err_together() {
     let [says, is, standard] = medians("far-03", 16);
     assert!((says / is - 1.0).abs() < 0.1, "says {says}, is {is}");
-    // One path in many bins makes them too large for most pixels.
+    // Paths that contribute to many bins make the standard errors too large for most pixels.
     assert!(standard > 1.15 * is, "{standard} {is}");
 }
 
@@ -269,6 +269,6 @@ fn the_median_error_holds_where_the_bins_of_a_pixel_err_together() {
 fn the_median_error_holds_where_light_paths_are_drawn_into_the_image() {
     let [says, is, standard] = medians("bodies", 64);
     assert!((says / is - 1.0).abs() < 0.1, "says {says}, is {is}");
-    // Few light paths come to a pixel, and some bring much.
+    // Few light paths reach a pixel, and some contribute much.
     assert!(standard > 1.25 * is, "{standard} {is}");
 }

@@ -1,4 +1,5 @@
-//! Caustics: light paths give what chance alone gives, at far less noise, and change nothing elsewhere.
+//! Caustics: light paths give the same result as chance alone, with far less noise, and change
+//! nothing elsewhere.
 
 use crate::common;
 
@@ -21,7 +22,8 @@ fn with(caustics: Option<bool>, passes: u32, seed: u64) -> Settings {
     }
 }
 
-/// A grey room of 3 × 2 × 3 m, spots on its left wall and its floor, and things in it.
+/// Returns a grey room of 3 × 2 × 3 m with spots on its left wall and its floor, and the given
+/// objects.
 fn furnished(things: Vec<Object>, size: u32) -> Scene {
     let mut objects = room(v(-1.5, -1.0, -2.5), v(1.5, 1.0, 0.5), &grey(0.6));
     objects.extend(things);
@@ -54,13 +56,13 @@ fn mixed(alpha: f32, weight: f32) -> Material {
     }
 }
 
-/// Energies of the 3+ part by pixel.
+/// Returns energies of the 3+ part by pixel.
 fn pixels(r: &Rendered) -> Vec<f64> {
     let multi = &r.split.as_ref().unwrap().multi;
     multi.chunks(BINS).map(energy).collect()
 }
 
-/// Means and variances over seeds of each entry that `read` gives.
+/// Returns the means and variances over seeds of each entry that `read` returns.
 fn over_seeds(
     s: &Scene,
     seeds: u64,
@@ -80,7 +82,7 @@ fn over_seeds(
         .collect()
 }
 
-/// Total, the four quarters of the image, and the first quarter of its histograms.
+/// Returns the total, the four quarters of the image, and the first quarter of its histograms.
 fn parts(r: &Rendered) -> Vec<f64> {
     let all = pixels(r);
     let (w, h) = (r.width as usize, r.height as usize);
@@ -100,7 +102,8 @@ fn parts(r: &Rendered) -> Vec<f64> {
     ]
 }
 
-/// With and without light paths: the same within a few errors of the means over seeds, which are `small`.
+/// Checks that renders with and without light paths agree within a few errors of the means over
+/// seeds, and that these errors are below `small`.
 fn same(name: &str, s: &Scene, (off, on): (u32, u32), max_bounces: Option<u32>, small: f64) {
     let seeds = 24;
     let make = |caustics, passes| {
@@ -173,7 +176,8 @@ fn mixes_and_rows_of_mirrors_are_parted_without_a_rest() {
     );
 }
 
-/// A room whose caustics lie behind the camera, and what it sees them in, which hides most of the rest.
+/// Returns a room with caustics behind the camera, and a mirror in which the camera sees them,
+/// which hides most of the rest.
 fn looking_back(mirror: Object, ball: f32) -> Scene {
     let thrower = sphere(v(0.7, -0.5, -0.3), 0.3, 3, Material::mirror("ball", ball));
     furnished(vec![mirror, thrower], 8)
@@ -197,10 +201,10 @@ fn caustics_that_the_camera_sees_in_near_mirrors_are_found_in_one_way() {
     let globe = |alpha| sphere(v(0.0, 0.0, -2.1), 1.0, 3, Material::mirror("globe", alpha));
     let s = looking_back(globe(0.08), 0.05);
     same("globe", &s, (384, 32), Some(4), 0.03);
-    // So much smoother that chance finds its caustics.
+    // The plane is so much smoother that chance finds its caustics.
     let plane = pane(Material::mirror("plane", 0.005));
     same("smoother", &looking_back(plane, 0.1), (192, 64), None, 0.03);
-    // Two in a row.
+    // Two mirrors in a row.
     let mut s = looking_back(pane(Material::mirror("plane", 0.08)), 0.08);
     s.objects.push(quad(
         v(-1.2, -0.9, 0.49),
@@ -241,7 +245,7 @@ fn a_glossy_receiver_and_a_spot_on_a_mirror_are_covered() {
         glossy,
     );
     let mut s = furnished(vec![ball(Material::mirror("ball", 0.08)), board], 8);
-    // The second spot moves onto the near-mirror, where the beam meets it.
+    // The second spot moves onto the near-mirror, to the beam's intersection with it.
     let towards = v(0.02, -0.3, -1.4).normalized();
     let centre = v(0.1, -0.4, -1.7);
     let b = towards.dot(centre);
@@ -267,7 +271,8 @@ fn a_glossy_receiver_and_a_spot_on_a_mirror_are_covered() {
     same("glossy floor", &s, (192, 32), None, 0.03);
 }
 
-/// A screen before the camera, a lit plate to its left, and what throws light onto the screen from below.
+/// Returns a screen in front of the camera, a lit plate to its left, and an object that reflects
+/// light onto the screen from below.
 fn stage(extra: Object) -> Scene {
     let screen = quad(
         v(-1.0, -1.0, -2.0),
@@ -290,7 +295,7 @@ fn stage(extra: Object) -> Scene {
     s
 }
 
-/// Sums of means and of variances.
+/// Returns the sums of means and of variances.
 fn sum(x: &[(f64, f64)]) -> (f64, f64) {
     x.iter().fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1))
 }
@@ -309,7 +314,7 @@ fn caustics_of_a_curved_near_mirror_are_far_less_noisy_than_by_chance() {
     let factor = off.1 / on.1 * 512.0 / 32.0;
     println!("off {off:?} on {on:?} factor {factor:.0}");
     assert!(factor > 100.0);
-    // 64 pixels, nearly independent by chance alone.
+    // 64 pixels, which are nearly independent if only chance finds the light.
     let error = ((off.1 + on.1) / 8.0).sqrt();
     assert!((off.0 - on.0).abs() < 5.0 * error, "{off:?} {on:?}");
 }
@@ -344,7 +349,7 @@ fn groups_share_the_light_out_and_threads_change_nothing() {
         let near = |x: f32| (x - h).abs() <= 1e-4 * h.abs() + 1e-9;
         assert!(near(apart) && near(one.groups[2][k]), "{k}: {h} {apart}");
     }
-    // Alone, each spot has the light of its group.
+    // A spot alone has the light of its group.
     let mine: Vec<f64> = one.groups.iter().map(|g| energy(g)).collect();
     for spot in 0..2 {
         let all = s.laser.beams.clone();
@@ -404,7 +409,7 @@ fn the_stated_error_counts_light_paths_in() {
         .map(|r| f64::from(r.error.total_relative).powi(2));
     let stated = stated.sum::<f64>() / n * mean * mean;
     let ratio = (spread / stated).sqrt();
-    // Bin by bin.
+    // Compared bin by bin.
     let multi = |r: &Rendered, k: usize| f64::from(r.split.as_ref().unwrap().multi[k]);
     let (mut found, mut said) = (0.0, 0.0);
     for k in 0..all[0].transient.len() {

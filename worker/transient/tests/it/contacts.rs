@@ -1,4 +1,5 @@
-//! Spots on edges and beside other surfaces: energy is kept, and changes steadily as the distance goes to zero.
+//! Spots on edges and close to other surfaces: energy is conserved, and changes continuously as the
+//! distance approaches zero.
 
 use crate::common;
 
@@ -14,10 +15,11 @@ use common::{
 use picofarm_scene::{Bsdf, Distribution, Material, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Part, PartOf, Settings, join_parts, render_part};
 
-/// Light paths of a reference.
+/// Light paths per reference.
 const PATHS: usize = 120_000;
 
-/// Energies of exactly two bounces and of three and more, and the standard error that is stated for both together.
+/// Returns the energies of exactly two bounces and of three and more, and the stated standard error
+/// of their sum.
 fn energies(s: &Scene) -> ([f64; 2], f64) {
     let gate = Gate {
         start_m: 0.0,
@@ -34,7 +36,7 @@ fn energies(s: &Scene) -> ([f64; 2], f64) {
     ([energy(&split.two), energy(&split.multi)], se)
 }
 
-/// Renders with the spot stated in f32 and traces light from it in f64; both must agree.
+/// Renders with the spot stated in f32 and traces light from it in f64. Both must agree.
 #[track_caller]
 fn agrees(what: &str, s: &Scene, start: Start, paths: usize) {
     let (got, stated) = energies(s);
@@ -53,7 +55,8 @@ fn grey_room() -> Vec<Object> {
     room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6))
 }
 
-/// A room and a spot on its far wall, `d` from the right one (in f64: f32 may put it onto the edge).
+/// Returns a room with a spot on its far wall, at distance `d` from the right wall (in f64, because
+/// in f32 the spot may be on the edge).
 fn beside_wall(objects: Vec<Object>, d: f64) -> (Scene, Start) {
     let mut s = scene(objects, 32, &[]);
     let p = v((2.0 - d) as f32, 0.3, -4.0);
@@ -76,7 +79,8 @@ fn a_spot_beside_a_wall_has_the_energy_of_an_independent_tracer_at_any_distance(
 
 #[test]
 fn a_beam_that_is_traced_to_an_edge_or_a_vertex_has_the_energy_beside_it() {
-    // Onto the edges of the far wall with the right one and of the ceiling with the right wall, and onto a vertex.
+    // Spots on the edge of the far wall with the right one, on the edge of the ceiling with the
+    // right wall, and on a vertex.
     for p in [v(2.0, 0.3, -4.0), v(2.0, 1.5, -3.0), v(2.0, 1.5, -4.0)] {
         let s = scene(grey_room(), 32, &[p]);
         let r = ok(&s, &settings(Budget::Samples(1)));
@@ -157,7 +161,7 @@ fn a_white_room_keeps_all_energy_at_every_bounce_of_a_spot_on_an_edge() {
 
 #[test]
 fn spots_in_wedges_and_at_the_foot_of_things_agree_with_an_independent_tracer() {
-    // A wall that leans over the far one at some angle, through the line x = 1.
+    // A wall that leans over the far one at an angle, through the line x = 1.
     for degrees in [20.0f32, 60.0] {
         let (sin, cos) = degrees.to_radians().sin_cos();
         for d in [0.0f64, 1e-3] {
@@ -171,7 +175,7 @@ fn spots_in_wedges_and_at_the_foot_of_things_agree_with_an_independent_tracer() 
             let mut s = scene(things, 32, &[]);
             let p = v((1.0 - d) as f32, 0.2, -4.0);
             let mut beam = beam_to(p, v(0.0, 0.0, 1.0), 1);
-            // Along the wedge's middle.
+            // The beam arrives along the middle of the wedge.
             let (sin, cos) = (degrees / 2.0).to_radians().sin_cos();
             beam.spot.as_mut().unwrap().arriving = v(cos, 0.0, -sin);
             s.laser.beams.push(beam);
@@ -183,7 +187,7 @@ fn spots_in_wedges_and_at_the_foot_of_things_agree_with_an_independent_tracer() 
             agrees(&format!("wedge of {degrees}°, {d} m"), &s, start, 2 * PATHS);
         }
     }
-    // A box on the floor, whose floor goes on beneath it.
+    // A box on the floor; the floor continues beneath it.
     let mut things = grey_room();
     things.extend(room(v(-0.4, -1.5, -2.9), v(0.3, -0.8, -2.3), &grey(0.5)));
     for d in [0.0f64, 1e-4] {
@@ -201,7 +205,8 @@ fn spots_in_wedges_and_at_the_foot_of_things_agree_with_an_independent_tracer() 
 
 #[test]
 fn spots_on_rims_are_left_alone() {
-    // The rim of a sheet, and the upper edge of a box: nothing else is near, and half of the light passes by.
+    // The rim of a sheet, and the upper edge of a box: no other surface is near, and half of the
+    // light misses them.
     let mut things = grey_room();
     things.push(quad(
         v(-0.5, -0.5, -2.5),
@@ -223,7 +228,8 @@ fn spots_on_rims_are_left_alone() {
 
 #[test]
 fn light_beside_a_spot_that_goes_by_near_mirrors_is_counted_once() {
-    // Conductors of the largest roughness that counts as a mirror, seen by camera and corner.
+    // Conductors of the largest roughness that counts as a mirror, seen by the camera and the
+    // corner.
     let mirror = Material {
         bsdf: Bsdf::RoughConductor {
             alpha: 0.1,
@@ -246,7 +252,7 @@ fn light_beside_a_spot_that_goes_by_near_mirrors_is_counted_once() {
 
 #[test]
 fn an_edge_of_black_walls_and_a_facet_alone_are_dark() {
-    // A black neighbour takes half of the light of a spot on the edge.
+    // A black neighbour absorbs half of the light of a spot on the edge.
     let mut things = grey_room();
     things[3] = object_like(&things[3], black());
     things[5] = object_like(&things[5], black());

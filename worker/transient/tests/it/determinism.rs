@@ -1,4 +1,5 @@
-//! The same bits from any threads, order, interruption, machine and profile; other bits from another seed.
+//! The same bits with any threads, order, interruption, machine and profile; other bits from
+//! another seed.
 
 use crate::common;
 
@@ -14,7 +15,8 @@ use picofarm_transient::{
     join_parts, render, render_part,
 };
 
-/// A bit of everything: mirror, gloss, mix, texture, curved things, four spots.
+/// Returns a scene with a mirror, a glossy surface, a mix, a texture, curved objects and four
+/// spots.
 fn everything(size: u32) -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let mix = Material {
@@ -82,7 +84,7 @@ fn set(budget: Budget) -> Settings {
     }
 }
 
-/// FNV-1a over every bit that comes out.
+/// Returns FNV-1a over every output bit.
 fn hash(r: &Rendered) -> u64 {
     let mut h = 0xcbf2_9ce4_8422_2325u64;
     let mut eat = |bytes: &[u8]| {
@@ -129,7 +131,7 @@ fn hash(r: &Rendered) -> u64 {
     h
 }
 
-/// Sleeps now and then, so that threads steal tiles from each other in ever new orders.
+/// Sleeps occasionally, so that threads steal tiles from each other in varying orders.
 struct Dawdle(AtomicU64);
 
 impl Progress for Dawdle {
@@ -145,7 +147,7 @@ impl Progress for Dawdle {
     }
 }
 
-/// Stops after so many questions.
+/// Stops after a number of progress calls.
 struct StopAfter(AtomicU64);
 
 impl Progress for StopAfter {
@@ -196,7 +198,7 @@ impl Progress for Unwatched {
     }
 }
 
-/// All parts, as another machine reads them.
+/// Returns all parts, as another machine reads them.
 fn parts(s: &Scene, settings: &Settings, of: u32) -> Vec<Part> {
     let part = |which| {
         let part = render_part(s, settings, which, &Unwatched).unwrap();
@@ -224,7 +226,7 @@ fn parts_rendered_apart_join_to_the_bits_of_the_whole() {
             .iter()
             .any(|s| s.starts_with("light paths: caustics"));
         assert_eq!(drawn, caustics, "{:?}", whole.plan);
-        // 9 tiles: alone, unevenly, and with ranges that are empty.
+        // 9 tiles: in one range, in uneven ranges, and with empty ranges.
         for of in [1, 4, 11] {
             let mut parts = parts(&s, &settings, of);
             parts.reverse();
@@ -303,19 +305,19 @@ fn another_seed_gives_other_bits_and_the_same_light() {
     let (x, y) = (common::energy(&a.transient), common::energy(&b.transient));
     let se = f64::from(a.error.total_relative).hypot(f64::from(b.error.total_relative));
     common::near("seeds", y, x, 0.0, x * se);
-    // Truth is of the pixels' centres: no random numbers in it.
+    // The ground truth is that of the pixels' centres, without random numbers.
     assert_eq!(a.truth.depth, b.truth.depth);
     assert_eq!(a.truth.visibility, b.truth.visibility);
 }
 
-/// The bits of one render, written down: they are the same on any machine, by any kernel, in debug and
-/// in release. A change here means that outputs have changed: then give RENDERER_VERSION a new name and
+/// The recorded bits of one render. They are the same on any machine, with any kernel, in debug and
+/// in release. A change here means that outputs have changed: give RENDERER_VERSION a new name and
 /// copy both from the failure's message.
 #[test]
 fn the_bits_are_those_written_down() {
     const VERSION: &str = "transient-21";
     const HASH: u64 = 0x8a91_c5bd_3088_d486;
-    // From eight paths on errors are drawn.
+    // From eight paths on, errors are drawn.
     let found = hash(&ok(&everything(20), &set(Budget::Samples(8))));
     assert_eq!(
         (RENDERER_VERSION, found),

@@ -1,4 +1,4 @@
-//! Unusual scenes and settings: clear results or clear errors.
+//! Unusual scenes and settings give clear results or clear errors.
 
 use crate::common;
 
@@ -44,7 +44,7 @@ fn a_scene_without_beams_renders_to_nothing() {
 fn a_camera_inside_a_solid_wall_sees_only_black_from_behind() {
     let mut wall = grey(0.5);
     wall.two_sided = false;
-    // A box whose fronts face outwards, around the camera.
+    // A box around the camera with front faces that face outwards.
     let inside_out = room(v(0.1, 0.1, 0.1), v(-0.1, -0.1, -0.1), &wall);
     let r = ok(&scene(inside_out, 4, &[v(0.0, 0.0, -1.0)]), &few());
     assert_eq!(energy(&r.transient), 0.0);
@@ -152,12 +152,12 @@ fn what_falls_outside_the_gate_is_counted_and_never_clipped() {
             assert_eq!(a.two[k * 1000 + 120 + bin], b.two[k * 80 + bin]);
         }
     }
-    // Paths end with the gate, so of what lies beyond it only a part is found.
+    // Paths end with the gate, so only a part of the light beyond it is found.
     let missing = energy(&all.transient) - energy(&some.transient);
     assert!(some.overflow.energy > 0.5 * missing && some.overflow.energy < 1.05 * missing);
     let share = some.overflow.energy / (some.overflow.energy + energy(&some.transient));
     assert!((some.overflow.share - share).abs() < 1e-9);
-    // Without a random walk everything is found.
+    // Without a random walk, all light is found.
     let two = |s| Settings {
         max_bounces: Some(2),
         ..s

@@ -1,4 +1,4 @@
-//! Pixels of which a part is sensitive, beside images of finer pixels that are sensitive all over.
+//! Partly sensitive pixels, compared with images of smaller, fully sensitive pixels.
 
 use crate::common;
 
@@ -6,7 +6,8 @@ use common::{energy, grey, ok, quad, room, scene, settings, sphere, v};
 use picofarm_scene::{Bsdf, Distribution, Material, Scene};
 use picofarm_transient::{Budget, Rendered, Settings, render};
 
-/// A room with a near-mirror on its right wall, a ball before it, and a spot beside the floor.
+/// Returns a room with a near-mirror on its right wall, a ball in front of it, and a spot next to
+/// the floor.
 fn furnished(size: u32) -> Scene {
     let mirror = Material {
         bsdf: Bsdf::RoughConductor {
@@ -40,7 +41,7 @@ fn set(fill_factor: f64, samples: u32, seed: u64) -> Settings {
     }
 }
 
-/// Energy by pixel.
+/// Returns the energy by pixel.
 fn by_pixel(r: &Rendered, of: impl Fn(&Rendered) -> &[f32]) -> Vec<f64> {
     of(r).chunks(r.gate.bins as usize).map(energy).collect()
 }
@@ -52,7 +53,7 @@ fn a_pixel_is_the_mean_of_the_finer_pixels_in_its_sensitive_square() {
     let (coarse, fine) = (furnished(SIDE as u32), furnished(4 * SIDE as u32));
     let two = |r: &Rendered| by_pixel(r, |r| &r.split.as_ref().expect("parts").two);
     let multi = |r: &Rendered| by_pixel(r, |r| &r.split.as_ref().expect("parts").multi);
-    // A quarter of the area is the middle 2x2 of 4x4.
+    // The sensitive quarter of the area is the middle 2x2 of 4x4 small pixels.
     let middle = |all: Vec<f64>| -> Vec<f64> {
         let of = |k: usize| {
             let (row, col) = (4 * (k / SIDE) + 1, 4 * (k % SIDE) + 1);
@@ -92,7 +93,7 @@ fn a_pixel_is_the_mean_of_the_finer_pixels_in_its_sensitive_square() {
         }
         eprintln!("part {part}: worst {worst:.1} standard errors");
     }
-    // Pixels that are sensitive all over see other things: the test can tell.
+    // Fully sensitive pixels differ, so the test can detect a difference.
     assert!(apart > 20, "{apart}");
 }
 
@@ -106,7 +107,7 @@ fn a_spot_is_seen_where_it_falls_onto_the_sensitive_square_and_is_the_brighter_t
             v(0.0, 18.0, 0.0),
             grey(0.5),
         );
-        // Pixels are a quarter wide at unit distance.
+        // Pixels are a quarter wide, at unit distance.
         let s = scene(vec![wall], 8, &[v(x, 0.125, -1.0)]);
         let set = Settings {
             max_bounces: Some(1),
@@ -118,7 +119,7 @@ fn a_spot_is_seen_where_it_falls_onto_the_sensitive_square_and_is_the_brighter_t
     };
     let all = one(1.0, 0.125);
     assert!((one(0.25, 0.125) / all - 4.0).abs() < 1e-5);
-    // Half the side: 0.0625 to either side of the middle.
+    // Half the side is sensitive: 0.0625 to either side of the middle.
     assert!(one(0.25, 0.185) > 0.0);
     assert_eq!(one(0.25, 0.19), 0.0);
     assert!(one(1.0, 0.19) > 0.0);

@@ -1,4 +1,4 @@
-//! What `plan` says of a render is about what the render then takes.
+//! The forecast of `plan` is close to the cost and error of the render.
 
 use crate::bench_scenes as scenes;
 use crate::common;

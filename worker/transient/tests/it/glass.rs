@@ -1,5 +1,5 @@
-//! What passes thin glass, by what it must not change, and by closed forms; against an independent tracer in `independent.rs`. What it
-//! reflects is in `by_glass.rs`.
+//! Light through thin glass, tested against invariants and closed forms; `independent.rs` tests it
+//! against an independent tracer. `by_glass.rs` tests the reflected light.
 
 use crate::common;
 
@@ -19,7 +19,8 @@ fn glass(ior: f32, transmittance: f32) -> Material {
     }
 }
 
-/// A room with a mirror, a ball, a box whose corner a spot is beside, and whatever else.
+/// Returns a room with a mirror, a ball, a box with a spot next to its corner, and the given
+/// objects.
 fn furnished(more: Vec<Object>) -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     objects.push(quad(
@@ -45,7 +46,7 @@ fn furnished(more: Vec<Object>) -> Scene {
     scene(objects, 16, &beams)
 }
 
-/// A closed box of panes.
+/// Returns a closed box of panes.
 fn case(low: Vec3, high: Vec3, m: &Material) -> Vec<Object> {
     room(low, high, m)
 }
@@ -84,7 +85,8 @@ fn glass_that_takes_nothing_changes_no_bit() {
 
 #[test]
 fn glass_around_the_laser_takes_the_same_of_all_light() {
-    // The laser and the camera are in one place: the camera looks out of the box that glass closes with the laser beside it.
+    // The laser is not at the camera here: a closed glass box surrounds the laser, and the camera
+    // is outside it.
     let half = glass(1.0, 0.5);
     let mut clear = furnished(vec![]);
     clear.laser.origin = v(0.5, 0.2, 0.1);
@@ -99,7 +101,8 @@ fn glass_around_the_laser_takes_the_same_of_all_light() {
         ..settings(Budget::Samples(4))
     };
     let (a, b) = (ok(&clear, &set), ok(&dim, &set));
-    // The box hides part of the room's light from other parts as well: one bounce and two go by it.
+    // The box also dims light between other parts of the room, but most light of one and two
+    // bounces passes by it.
     let two = |r: &picofarm_transient::Rendered| r.split.as_ref().unwrap().two.clone();
     let (a2, b2) = (two(&a), two(&b));
     let mut halves = 0;
@@ -109,13 +112,13 @@ fn glass_around_the_laser_takes_the_same_of_all_light() {
     }
     let all = a2.iter().filter(|a| **a > 0.0).count();
     assert!(halves * 10 > all * 8, "{halves} of {all}");
-    // A spot that glass was before is where it was.
+    // A spot behind glass does not move.
     assert_eq!(trace_spots(&clear).unwrap(), trace_spots(&dim).unwrap());
 }
 
 #[test]
 fn a_spot_behind_a_window_loses_what_fresnel_says_twice() {
-    // One bounce: through the pane to the spot and back, at the angle that the spot is seen in.
+    // One bounce: through the pane to the spot and back, at the angle of the line of sight.
     let direction = v(0.5, 0.1, -1.0).normalized();
     let wall = || {
         quad(
@@ -160,7 +163,8 @@ fn black_glass_hides_light_and_no_surface() {
     let (a, b) = (ok(&clear, &set), ok(&dark, &set));
     assert!(a.truth.depth == b.truth.depth);
     assert!(energy(&b.transient) < energy(&a.transient));
-    // Pixels that see the far wall alone, as their neighbours do: others see the edge of the ball, which is partly in front.
+    // Pixels that see only the far wall, like their neighbours. Others see the edge of the ball,
+    // which is partly in front.
     let far = |row: usize, col: usize| {
         let around = |k: usize| k.saturating_sub(1)..=(k + 1).min(15);
         around(row).all(|r| around(col).all(|c| b.truth.depth[16 * r + c] > 3.6))

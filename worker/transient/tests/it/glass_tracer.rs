@@ -1,4 +1,5 @@
-//! What the independent tracer must fulfil with glass: closed forms, and exchanges of camera and light.
+//! Properties that the independent tracer must have with glass: closed forms, and reciprocity of
+//! camera and light.
 
 use crate::common;
 
@@ -17,8 +18,9 @@ use common::{
 use picofarm_scene::{Bsdf, Camera, Intrinsics, Scene, Vec3};
 use rayon::prelude::*;
 
-/// The mean over directions, weighted by their cosines: for light from air Walsh's closed form; from within, what leaves and what
-/// comes in are alike in radiance over the square of the index.
+/// The mean over directions, weighted by their cosines. For light from air, it must equal Walsh's
+/// closed form. From within, outgoing and incoming radiance over the square of the index must be
+/// equal.
 #[test]
 fn the_tracers_reflectances_are_those_of_closed_forms() {
     let mean = |from: f64, to: f64| -> f64 {
@@ -57,7 +59,8 @@ fn the_tracers_reflectances_are_those_of_closed_forms() {
     }
 }
 
-/// A block moves a ray aside, leaves its direction, and holds it up: closed forms. What passes without reflection is (1 − F)².
+/// A block offsets a ray, preserves its direction, and delays it: closed forms. The fraction that
+/// passes without reflection is (1 − F)².
 #[test]
 fn the_tracers_rays_pass_a_block_of_glass_in_parallel() {
     let block = cuboid(v(0.0, 0.0, -2.0), v(3.0, 3.0, 0.5), 0.0, body(1.5, 1.0));
@@ -96,7 +99,7 @@ fn the_tracers_rays_pass_a_block_of_glass_in_parallel() {
     near("what passes a block", got, share, 0.0, se);
 }
 
-/// Glass without a tint takes no light.
+/// Untinted glass absorbs no light.
 #[test]
 fn all_light_of_the_tracer_arrives_past_clear_glass() {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
@@ -126,8 +129,8 @@ fn all_light_of_the_tracer_arrives_past_clear_glass() {
     near("what arrives", whole.mean, 1.0, 1e-9, whole.se);
 }
 
-/// A patch within a ball of glass and one outside: what light carries from the one to the other is what the camera's side finds of
-/// it, with its factors for radiance in glass.
+/// A patch within a ball of glass and one outside. The light that travels from one to the other
+/// must equal the result from the camera's side, with its factors for radiance in glass.
 #[test]
 fn the_tracer_carries_light_and_radiance_alike() {
     let patch = quad(
@@ -188,12 +191,12 @@ fn the_tracer_carries_light_and_radiance_alike() {
     near("radiance against light", radiance.mean, light.mean, 0.0, se);
 }
 
-/// A point of a patch and its normal.
+/// Returns a point of a patch and the patch's normal.
 fn plane([corner, a, b]: [P; 3]) -> (P, P) {
     (corner, a.cross(b).unit())
 }
 
-/// A source that scatters all its light, as a Lambertian does.
+/// Returns a source that scatters all its light as a Lambertian surface does.
 fn spot(p: P, n: P) -> Source {
     Source {
         p,
@@ -203,8 +206,8 @@ fn spot(p: P, n: P) -> Source {
     }
 }
 
-/// Camera and source change places: energies of `[bent at the camera][bent at the source][part]` by a camera that weighs directions
-/// as a Lambertian does.
+/// Swaps camera and source. Returns energies of `[bent at the camera][bent at the source][part]`
+/// for a camera that weights directions as a Lambertian surface does.
 fn ends(scene: &Scene, camera: Camera, source: &Source) -> [[[Energy; 2]; 2]; 2] {
     let tracer = Tracer::new(&Scene {
         camera,

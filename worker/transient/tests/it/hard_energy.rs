@@ -1,4 +1,5 @@
-//! Energy: closed white rooms, bright corners, sums of very many terms, bins on their edges, textures.
+//! Energy: closed white rooms, bright corners, sums of very many terms, light on the edges of bins,
+//! textures.
 
 use crate::common;
 
@@ -18,7 +19,7 @@ fn long(bins: u32) -> Gate {
     }
 }
 
-/// A wall to look at: the camera that frames it, and its area.
+/// A wall in view: the camera that frames it, and its area.
 struct View(Camera, f64);
 
 fn view(origin: Vec3, corner: Vec3, right: Vec3, down: Vec3) -> View {
@@ -26,8 +27,8 @@ fn view(origin: Vec3, corner: Vec3, right: Vec3, down: Vec3) -> View {
     View(framed(origin, corner, right, down, (8, 8)), area)
 }
 
-/// Cumulated flux that leaves the walls in view after 2..=`longest` bounces, each with its standard
-/// error, per unit of light sent: π times mean radiance times area.
+/// Returns the cumulative flux that leaves the walls in view after 2..=`longest` bounces, each with
+/// its standard error, per unit of emitted light: π times mean radiance times area.
 fn fluxes(s: &Scene, views: &[View], longest: u32, passes: u32) -> Vec<(f64, f64)> {
     let mut all = vec![];
     for bounces in 2..=longest {
@@ -53,7 +54,7 @@ fn fluxes(s: &Scene, views: &[View], longest: u32, passes: u32) -> Vec<(f64, f64
     all
 }
 
-/// Each bounce's own flux from the cumulated ones.
+/// Returns each bounce's own flux from the cumulative ones.
 fn each(all: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let before = std::iter::once(&(0.0, 0.0)).chain(all);
     all.iter()
@@ -80,7 +81,7 @@ fn a_closed_white_room_keeps_all_energy_at_every_bounce() {
         view(o, v(low.x, low.y, low.z), x, z),
         view(o, v(low.x, high.y, high.z), x, -z),
     ];
-    // A spot 3 cm from an edge, to have the corners tried as well.
+    // The second spot is 3 cm from an edge, to test corners as well.
     for (point, longest, most) in [(v(0.4, 0.3, -1.5), 5, 0.01), (v(0.97, 0.3, -1.5), 4, 0.06)] {
         let mut s = scene(room(low, high, &grey(1.0)), 8, &[]);
         s.laser.beams.push(beam_to(point, v(0.0, 0.0, 1.0), 1));
@@ -93,7 +94,7 @@ fn a_closed_white_room_keeps_all_energy_at_every_bounce() {
 
 #[test]
 fn a_bright_corner_loses_at_least_its_absorption_at_every_bounce() {
-    // Two walls at a right angle, albedo 0.95, the spot 10 cm from the edge.
+    // Two walls at a right angle with albedo 0.95, and a spot 10 cm from the edge.
     let albedo = 0.95f32;
     let front = quad(
         v(-1.0, -1.0, -2.0),
@@ -125,7 +126,7 @@ fn a_bright_corner_loses_at_least_its_absorption_at_every_bounce() {
         assert!(flux > 0.0 && flux <= most + 3.0 * se);
         before = (flux, se);
     }
-    // Of two bounces all is known: what reaches the side wall, by quadrature.
+    // Two bounces have a closed form: the light that reaches the side wall, by quadrature.
     let (n, mut form) = (1000, 0.0);
     for i in 0..n * n {
         let at = |i: usize| 2.0 * (i as f64 + 0.5) / n as f64;
@@ -143,15 +144,16 @@ fn a_bright_corner_loses_at_least_its_absorption_at_every_bounce() {
     );
 }
 
-/// In a white sphere every path from spot to pixel counts the same: bounce k adds 1/(4π²R²).
+/// Returns a white sphere, in which every path from spot to pixel counts the same: bounce k adds
+/// 1/(4π²R²).
 fn bright_sphere(spots: u32) -> Scene {
     let mut s = scene(vec![sphere(Vec3::ZERO, 2.0, 5, grey(1.0))], 2, &[]);
     s.laser = Aim::grid(spots).unwrap().laser(&s.camera);
     s
 }
 
-/// Renders a sum of `passes` passes into a single bin; returns it relative to the exact one, and its
-/// standard error.
+/// Renders a sum of `passes` passes into a single bin. Returns it relative to the exact one, and
+/// its standard error.
 fn many_terms(spots: u32, passes: u32) -> (f64, f64) {
     let set = Settings {
         gate: long(1),
@@ -165,7 +167,7 @@ fn many_terms(spots: u32, passes: u32) -> (f64, f64) {
     (got / exact, se / exact)
 }
 
-/// Some 5·10⁶ terms a pixel here, 10⁸ with PICOFARM_LONG_TESTS set.
+/// About 5·10⁶ terms per pixel, or 10⁸ with PICOFARM_LONG_TESTS set.
 #[test]
 fn sums_of_very_many_small_terms_lose_nothing_in_f32() {
     let times = if std::env::var_os("PICOFARM_LONG_TESTS").is_some() {
@@ -213,7 +215,7 @@ fn a_one_bounce_peak_of_4e7_leaves_every_other_bin_its_bits() {
 
 #[test]
 fn a_peak_exactly_on_a_bins_edge_belongs_to_the_later_bin() {
-    // Lengths that f32 holds exactly: 4 m of path, bins of 1/4 m.
+    // Lengths that f32 represents exactly: 4 m of path, bins of 1/4 m.
     let wall = || {
         quad(
             v(-3.0, -3.0, -2.0),
@@ -294,12 +296,12 @@ fn a_shift_by_whole_bins_shifts_every_bin_and_no_bit_of_two_bounces() {
             all += f64::from(plain.multi[at]);
         }
     }
-    // Shared arrivals are counted in f32 bins: few change over.
+    // Shared arrivals are computed in f32 bins, so few change their bin.
     println!("multi moved {:e}", moved / all);
     assert!(moved < 1e-3 * all);
 }
 
-/// A checkerboard of 2×2 texels a unit of texture space.
+/// Returns a material with a checkerboard of 2×2 texels per unit of texture space.
 fn checkered(mut m: Material, bright: u8, dark: u8) -> Material {
     let texels = vec![[bright; 3], [dark; 3], [dark; 3], [bright; 3]];
     m.texture = Some(
@@ -362,7 +364,7 @@ fn a_checkerboard_gives_two_and_three_bounces_its_mean_albedo() {
         0.003,
         se.hypot(base_se * scale),
     );
-    // A spot on a texel of 0.5029.
+    // A spot on a texel of value 0.5029.
     let spot_on = |m: Material| {
         let mut wall = quad(v(-1.5, -1.0, 1.0), v(0.0, 2.0, 0.0), v(0.0, 0.0, -3.0), m);
         let mut mesh = (*wall.mesh).clone();

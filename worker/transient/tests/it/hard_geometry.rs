@@ -1,5 +1,5 @@
-//! Hard geometry: grazing light and views, tight corners, shared edges, odd triangles, odd scales and
-//! places.
+//! Hard geometry: grazing light and views, tight corners, shared edges, unusual triangles, scales
+//! and positions.
 
 use crate::common;
 
@@ -13,7 +13,8 @@ use common::{
 use picofarm_scene::{Intrinsics, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Settings, trace_spots};
 
-/// Pixel sums within `each`, the image's within `whole`, bins by relative rms within `rms`.
+/// Checks pixel sums within `each`, the image's sum within `whole`, and bins by relative rms within
+/// `rms`.
 #[track_caller]
 fn agrees(got: &[f32], expected: &[f64], bins: usize, (each, whole, rms): (f64, f64, f64)) {
     let (mut error, mut norm) = (0.0, 0.0);
@@ -33,7 +34,8 @@ fn agrees(got: &[f32], expected: &[f64], bins: usize, (each, whole, rms): (f64, 
 
 #[test]
 fn light_that_leaves_a_spot_at_grazing_angles_matches_the_integral() {
-    // The screen is a strip of 10 cm beside the spot's wall: cosines at the spot below 0.07.
+    // The screen is a strip of 10 cm next to the spot's wall, so cosines at the spot are below
+    // 0.07.
     let wall = quad(
         v(-1.5, -1.0, 1.0),
         v(0.0, 2.0, 0.0),
@@ -65,7 +67,7 @@ fn light_that_leaves_a_spot_at_grazing_angles_matches_the_integral() {
 
 #[test]
 fn a_beam_that_grazes_a_wall_makes_its_spot_where_geometry_says() {
-    // The beam closes in on the wall by 5 mm in 20 m.
+    // The beam approaches the wall by 5 mm in 20 m.
     let wall = quad(
         v(-0.005, -1.0, 1.0),
         v(0.0, 2.0, 0.0),
@@ -164,7 +166,7 @@ fn three_bounces_from_a_spot_1_cm_from_a_corner_match_the_integral_over_the_othe
     s.laser
         .beams
         .push(beam_to(v(0.99, 0.1, -2.0), v(0.0, 0.0, 1.0), 0));
-    // From 5 cm beside the corner to 80 cm.
+    // From 5 cm to 80 cm from the corner.
     let (corner, right, down) = (v(0.2, 0.5, -2.0), v(0.75, 0.0, 0.0), v(0.0, -0.8, 0.0));
     s.camera = framed(Vec3::ZERO, corner, right, down, (8, 8));
     let set = Settings {
@@ -181,7 +183,7 @@ fn three_bounces_from_a_spot_1_cm_from_a_corner_match_the_integral_over_the_othe
         let y = 0.5 - 0.8 * ((k / n) as f64 + rng.next()) / n as f64;
         let back = (x * x + y * y + 4.0f64).sqrt();
         let (e, l) = (1.0 - x, 1.0 - f64::from(0.99f32));
-        // The wall's points (1, b, c − 2), with steps that grow away from the spot.
+        // Points (1, b, c − 2) of the wall, with steps that grow with the distance from the spot.
         let (step, start) = (0.1f64, (rng.next(), rng.next()));
         for i in 0..64 {
             let t = (f64::from(i) + start.0) * step;
@@ -203,7 +205,7 @@ fn three_bounces_from_a_spot_1_cm_from_a_corner_match_the_integral_over_the_othe
     }
     let (got, se) = multi_energy(&r);
     near("corner", got, expected.iter().sum(), 0.005, se);
-    // In time: the bins' sums over the image.
+    // Compared in time: the bins' sums over the image.
     let multi = &r.split.as_ref().unwrap().multi;
     let found = |b: usize| multi.chunks(637).map(|p| f64::from(p[b])).sum::<f64>();
     let most = expected.iter().fold(0.0f64, |a, &b| a.max(b));
@@ -213,7 +215,7 @@ fn three_bounces_from_a_spot_1_cm_from_a_corner_match_the_integral_over_the_othe
     }
 }
 
-/// A room with a box in it, and its camera and beams.
+/// Returns a room with a box in it, with its camera and beams.
 fn furnished() -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     objects.extend(room(v(0.6, -1.0, -2.6), v(-0.3, -1.5, -1.9), &grey(0.4)));
@@ -238,7 +240,7 @@ fn degenerate_and_duplicate_triangles_change_no_bit_of_a_render() {
         let count = m.positions.len() as u32;
         m.positions.push(m.positions[0]);
         m.positions.push((m.positions[0] + m.positions[1]) * 0.5);
-        // A point, a line, a line through a third vertex, and everything twice.
+        // A point, a line, a line through a third vertex, and every triangle twice.
         let twice = m.triangles.clone();
         m.triangles
             .extend([[0, 0, 0], [0, 1, 1], [0, count, 1], [0, 1, count + 1]]);
@@ -267,7 +269,7 @@ fn inverted_two_sided_triangles_change_nothing_but_rounding() {
 
 #[test]
 fn a_wall_of_thousands_of_triangles_gives_what_one_triangle_gives() {
-    // Shared edges and vertices: a double hit or a gap would show at once.
+    // Shared edges and vertices: a double hit or a gap would be visible at once.
     let side = quad(
         v(-1.5, -1.0, 1.0),
         v(0.0, 2.0, 0.0),

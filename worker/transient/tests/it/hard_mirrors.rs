@@ -35,8 +35,8 @@ fn up_to(bounces: u32, passes: u32) -> Settings {
     }
 }
 
-/// A floor of some material at `height`, a screen in front, and a spot on a plate to the left at
-/// `above` the floor.
+/// Returns a floor of some material at `height`, a screen in front, and a spot on a plate to the
+/// left at `above` the floor.
 fn stage(m: Material, height: f32, above: f32, sees: Sees) -> Scene {
     let floor = quad(v(-1.5, height, 1.0), v(3.0, 0.0, 0.0), v(0.0, 0.0, -3.0), m);
     let screen = quad(
@@ -45,7 +45,7 @@ fn stage(m: Material, height: f32, above: f32, sees: Sees) -> Scene {
         v(0.0, 2.0, 0.0),
         grey(0.7),
     );
-    // Hardly wider than its spot: light that comes back to it does not count.
+    // The plate is hardly wider than its spot, so light that returns to it does not count.
     let at = v(-1.5, height + above, -0.5);
     let plate = quad(
         at - v(0.0, 1e-3, 1e-3),
@@ -81,7 +81,7 @@ enum Sees {
     Floor,
 }
 
-/// Light of the spot's image below the floor on the screen, mean over the image.
+/// Returns the mean light on the screen from the spot's image below the floor.
 fn by_image(s: &Scene, height: f32, above: f32) -> f64 {
     let brute = Brute::new(s);
     let image = P(-1.5, f64::from(height - above), -0.5);
@@ -106,7 +106,8 @@ fn near_mirrors_in_grazing_light_give_the_images_light_and_no_more() {
                 assert!(r.transient.iter().all(|h| h.is_finite() && *h >= 0.0));
                 let (got, se) = multi_energy(&r);
                 let expected = by_image(&s, -0.6, above);
-                // GGX at 0.01 scatters some per cent far aside; all lose a little by masking.
+                // GGX at 0.01 scatters some percent far away from the mirror direction, and all
+                // distributions lose a little by masking.
                 let what = format!("{distribution:?} {alpha} {above} m above");
                 near(&what, got, expected, 0.03, se);
                 assert!(
@@ -120,7 +121,7 @@ fn near_mirrors_in_grazing_light_give_the_images_light_and_no_more() {
 
 #[test]
 fn a_mirror_seen_at_grazing_angles_shows_the_screen_behind_it() {
-    // Three bounces: camera → floor → screen → spot. Camera 2 cm above the floor.
+    // Three bounces: camera → floor → screen → spot. The camera is 2 cm above the floor.
     for (alpha, tolerance) in [(0.01, 0.1), (0.001, 0.02)] {
         let mut s = stage(Material::mirror("floor", alpha), -0.02, 0.4, Sees::Screen);
         // The screen's mirror image, from 2 cm to 50 cm below the floor.
@@ -159,7 +160,7 @@ fn a_mirror_seen_at_grazing_angles_shows_the_screen_behind_it() {
     }
 }
 
-/// A mirror on the floor at which a beam arrives, and a screen that it lights.
+/// Returns a mirror on the floor at which a beam arrives, and a screen that it lights.
 fn spot_on_mirror(alpha: f32, distribution: Distribution) -> Scene {
     let floor = quad(
         v(-1.0, -0.5, 1.0),
@@ -216,7 +217,7 @@ fn two_bounces_of_a_spot_on_a_mirror_match_the_integral_over_its_lobe() {
 
 #[test]
 fn a_spot_on_a_mirror_lights_the_room_as_the_place_where_its_beam_goes_on() {
-    // Seen on the wall at the left: mirror → screen → wall, against a spot on the screen.
+    // Seen on the wall at the left: mirror → screen → wall, compared with a spot on the screen.
     let mut s = spot_on_mirror(0.002, Distribution::Beckmann);
     let (corner, right, down) = (v(-1.0, 0.8, 0.0), v(0.0, 0.0, -1.5), v(0.0, -1.0, 0.0));
     s.camera = framed(Vec3::ZERO, corner, right, down, (8, 8));
@@ -232,7 +233,7 @@ fn a_spot_on_a_mirror_lights_the_room_as_the_place_where_its_beam_goes_on() {
 
 #[test]
 fn light_to_and_fro_between_two_facing_mirrors_is_that_of_the_rows_of_images() {
-    // Mirrors at x = ±1 from a floor with a spot on it to a ceiling.
+    // Mirrors at x = ±1, between a floor with a spot on it and a ceiling.
     let alpha = 0.01;
     let m = || Material::mirror("m", alpha);
     let wall = |x: f32| quad(v(x, -0.5, 4.0), v(0.0, 1.0, 0.0), v(0.0, 0.0, -8.0), m());
@@ -284,7 +285,8 @@ fn light_to_and_fro_between_two_facing_mirrors_is_that_of_the_rows_of_images() {
             (got - before) / expected,
             se / expected
         );
-        // Blur moves light across the ceiling: by α and the way, hence more with every reflection.
+        // Blur moves light across the ceiling in proportion to α and the path length, hence more
+        // with every reflection.
         let tolerance = 0.01 * f64::from(bounces - 1);
         near(
             &format!("{bounces} bounces"),
@@ -330,7 +332,7 @@ fn an_even_mix_gives_the_mean_of_its_parts() {
                 };
                 let ((a, sa), (b, sb), (m, sm)) = (run(0.0), run(1.0), run(0.5));
                 let what = format!("{distribution:?} {alpha}, {bounces} bounces");
-                // Two bounces have no error of their own here.
+                // Two bounces have no separate error here.
                 let se = sm.hypot(0.5 * sa.hypot(sb));
                 near(&what, m, 0.5 * (a + b), 0.004, se);
             }
@@ -356,7 +358,7 @@ fn glossy_surfaces_agree_with_brute_force_quadrature_and_path_tracing() {
     for distribution in [Distribution::Beckmann, Distribution::Ggx] {
         for sees in [Sees::Floor, Sees::Screen] {
             let mut s = stage(rough(0.3, distribution), -0.6, 0.5, sees);
-            // A wall at the right brings longer ways.
+            // A wall at the right adds longer paths.
             s.objects.push(quad(
                 v(1.0, -0.6, 1.0),
                 v(0.0, 2.0, 0.0),
@@ -365,7 +367,7 @@ fn glossy_surfaces_agree_with_brute_force_quadrature_and_path_tracing() {
             ));
             let brute = Brute::new(&s).trace(4, 300_000, 7);
             let (mut before, mut se_before) = (0.0, 0.0);
-            // (The last bounce by itself is what two renders differ by: noisy.)
+            // (The last bounce by itself is the difference of two renders, which is noisy.)
             for bounces in 2..=4 {
                 let r = ok(&s, &up_to(bounces, 192));
                 let (all, se) = (energy(&r.transient), multi_energy(&r).1);

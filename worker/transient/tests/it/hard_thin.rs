@@ -1,4 +1,4 @@
-//! Thin, sealed and enclosed things: no light leaks round, through or out of them.
+//! Thin, sealed and enclosed objects: no light leaks around, through or out of them.
 
 use crate::common;
 
@@ -9,7 +9,7 @@ use common::{
 use picofarm_scene::{Affine, Material, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Settings, trace_spots};
 
-/// A prism of `sides` sides about a segment, without caps.
+/// Returns a prism of `sides` sides around a segment, without caps.
 fn rod(a: Vec3, b: Vec3, radius: f32, sides: u32, m: Material) -> Object {
     let axis = (b - a).normalized();
     let u = axis.cross(v(0.3, 0.9, 0.1)).normalized();
@@ -29,7 +29,8 @@ fn rod(a: Vec3, b: Vec3, radius: f32, sides: u32, m: Material) -> Object {
     object("rod", positions, triangles, m)
 }
 
-/// Energy that thin things take from a lit screen, against exact visibility. Returns found and expected.
+/// Computes the energy that thin objects block from a lit screen, versus exact visibility. Returns
+/// found and expected.
 fn shadow(thing: Object) -> (f64, f64) {
     let screen = quad(
         v(-1.0, -1.0, -2.0),
@@ -75,7 +76,7 @@ fn a_6_mm_rod_takes_as_much_light_as_its_outline_and_shadow() {
 
 #[test]
 fn a_rod_that_nearly_touches_the_screen_leaks_no_light() {
-    // 1 mm of air between: offsets that are too large would jump over it.
+    // 1 mm of air in between, which offsets that are too large would skip.
     let (a, b) = (v(-0.3, -1.0, -1.996), v(0.1, 1.0, -1.996));
     let (found, expected) = shadow(rod(a, b, 0.003, 8, black()));
     near("near rod", found, expected, 0.015, 0.0);
@@ -106,7 +107,7 @@ fn what_is_sealed_by_a_sheet_or_a_mesh_stays_dark() {
         grey(0.9),
     ));
     sealed.push(("sheet", scene(divided, 16, &[])));
-    // The same at an angle and through the walls.
+    // The same sheet at an angle and through the walls.
     let mut tilted = walls();
     tilted.push(quad(
         v(-2.1, -1.6, -2.3),
@@ -130,8 +131,8 @@ fn what_is_sealed_by_a_sheet_or_a_mesh_stays_dark() {
                 .beams
                 .push(beam_to(point, turn.direction(v(0.0, 0.0, 1.0)), 0));
             let r = ok(&s, &few);
-            // Points on a wall are lifted off it by some 10⁻⁵ of their coordinates: where another
-            // surface cuts the wall at an angle, that much of the other side is reached.
+            // Points on a wall are lifted off it by about 10⁻⁵ of their coordinates. If another
+            // surface cuts the wall at an angle, light reaches the other side by as much.
             let share = energy(&r.transient) / 16.0;
             println!("{name} at {yaw}: {share:e}");
             let most = if *name == "tilted sheet" { 1e-5 } else { 0.0 };
@@ -159,7 +160,7 @@ fn a_laser_inside_an_object_lights_the_inside_alone() {
     }
     let r = ok(&s, &settings(Budget::Samples(8)));
     assert_eq!(energy(&r.transient), 0.0);
-    // The camera inside with it sees light.
+    // A camera inside with the laser sees light.
     s.camera.origin = s.laser.origin;
     assert!(energy(&ok(&s, &settings(Budget::Samples(8))).transient) > 0.0);
 }

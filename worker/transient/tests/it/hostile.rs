@@ -1,5 +1,5 @@
-//! Scenes that nobody would make: a render of them ends in finite results or in a clear error.
-//! PICOFARM_LONG_TESTS=n makes n times as many.
+//! Adversarial scenes: each render ends in finite results or in a clear error.
+//! PICOFARM_LONG_TESTS=n tests n times as many scenes.
 
 use crate::common;
 
@@ -13,7 +13,7 @@ use picofarm_transient::{
 };
 use proptest::{prelude::*, strategy::Strategy as Draw};
 
-/// A coordinate: mostly of a room's size, at times absurd.
+/// A coordinate, mostly of a room's size and sometimes extreme.
 fn coordinate() -> impl Draw<Value = f32> {
     prop_oneof![
         600 => -4.0f32..4.0,
@@ -88,7 +88,8 @@ fn material() -> impl Draw<Value = Material> {
     })
 }
 
-/// A soup of triangles over few points: slivers, duplicates and triangles without area come by themselves.
+/// A soup of triangles over few points. Slivers, duplicates and triangles without area occur by
+/// themselves.
 fn soup() -> impl Draw<Value = Object> {
     (
         proptest::collection::vec(point(), 3..12),
@@ -108,7 +109,7 @@ fn soup() -> impl Draw<Value = Object> {
         })
 }
 
-/// A wall of two big triangles, or the same wall of thousands, all coplanar and some twice.
+/// A wall of two large triangles, or the same wall of thousands, all coplanar and some twice.
 fn wall() -> impl Draw<Value = Object> {
     (
         tame_point(),
@@ -189,7 +190,7 @@ fn beams(objects: usize) -> impl Draw<Value = Vec<Beam>> {
     let beam = (unit(), proptest::option::weighted(0.3, spot));
     proptest::collection::vec(
         beam.prop_map(|(direction, spot)| Beam { direction, spot }),
-        // More than five begin another way of finding light.
+        // More than five use another technique for finding light.
         0..12,
     )
 }
@@ -261,7 +262,8 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                 strategy,
                 (beam, fill_factor, wavelengths_nm),
             )| {
-                // 10⁵ bins cost memory by the pixel; an error to reach would take passes without end there.
+                // 10⁵ bins cost memory per pixel, and an error target would need passes without end
+                // there.
                 let budget = if bins > 1000 {
                     Budget::Samples(1)
                 } else {
@@ -294,7 +296,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
         )
 }
 
-/// No output is NaN, infinite or, where it is an amount, negative.
+/// Checks that no output is NaN or infinite, and that no amount is negative.
 fn sane(r: &Rendered) -> Result<(), TestCaseError> {
     let mut amounts = vec![
         ("transient", &r.transient),
@@ -368,7 +370,7 @@ proptest! {
     }
 }
 
-/// A scene that is seen from 10⁻¹⁸ m above one of its surfaces, and 100 m wide.
+/// A scene 100 m wide, seen from 10⁻¹⁸ m above one of its surfaces.
 #[test]
 fn a_camera_that_all_but_touches_a_surface_is_served_in_time() {
     let wall = |z: f32| {
@@ -391,7 +393,7 @@ fn a_camera_that_all_but_touches_a_surface_is_served_in_time() {
     }
 }
 
-/// One corner of a surface is 10⁻²⁸ m from the camera, so that squares of distances vanish.
+/// One corner of a surface is 10⁻²⁸ m from the camera, so that squares of distances underflow.
 #[test]
 fn a_surface_nearer_than_squares_can_tell_gives_finite_results() {
     let positions = [
@@ -486,7 +488,7 @@ fn a_surface_nearer_than_squares_can_tell_gives_finite_results() {
     }
 }
 
-/// Boxes that are all alike give a tree's builder nothing to go by.
+/// Identical boxes give a tree builder no information.
 #[test]
 fn copies_of_one_triangle_without_number_are_served_in_time() {
     let positions = vec![
@@ -508,8 +510,8 @@ fn copies_of_one_triangle_without_number_are_served_in_time() {
     assert!(one.transient == all.transient);
 }
 
-/// A closed box of a millimetre around the camera, and sheets of millions of kilometres behind it, each of
-/// which would be cut into hundreds of pieces.
+/// A closed box of a millimetre around the camera, and sheets of millions of kilometres behind it.
+/// Each sheet would be cut into hundreds of pieces.
 #[test]
 fn more_pieces_of_huge_triangles_than_fit_are_refused_by_name() {
     let mut objects = common::room(

@@ -1,7 +1,10 @@
-//! The whole image's energy by exactly two bounces and by three and more, against an independent tracer in f64: furnished
-//! rooms among the scenes, spots beside and in near-mirrors; pixels that hold a spot and pixels that see a near-mirror by
-//! themselves. `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test independent -- --nocapture` measures
-//! with 32 times the paths: the figures of docs/benchmarks.md. `PICOFARM_RUN=1` and so on are runs with other seeds.
+//! The whole image's energy by exactly two bounces and by three and more, against an independent
+//! tracer in f64.
+//!
+//! The scenes include furnished rooms, and spots close to and in near-mirrors. Pixels with a spot
+//! and pixels that see a near-mirror are compared separately. `PICOFARM_EFFORT=32 cargo test
+//! --release -p picofarm-transient --test independent -- --nocapture` measures with 32 times the
+//! paths: the figures of docs/benchmarks.md. `PICOFARM_RUN=1` and so on are runs with other seeds.
 
 use crate::common;
 
@@ -59,7 +62,8 @@ fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize)
     joined(&batches)
 }
 
-/// Compares, prints, and fails where the two sides differ by more than four standard errors and 0.05 %.
+/// Compares and prints both sides, and fails if they differ by more than four standard errors and
+/// 0.05 %.
 #[track_caller]
 fn agrees(name: &str, scene: &Scene, parts: usize) {
     let tracer = Tracer::new(scene);
@@ -115,7 +119,7 @@ fn a_room_with_a_mirror_on_its_wall_has_the_energy_of_an_independent_tracer() {
     agrees("primitive 3", &primitive::generate(3, &set).unwrap(), 2);
 }
 
-/// A room with a mirror on its far wall, and beams to it: `beams` are points.
+/// Returns a room with a mirror on its far wall, and beams to the points `beams`.
 fn mirrored(beams: &[Vec3]) -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let pane = Material::mirror("pane", 0.01);
@@ -129,9 +133,12 @@ fn mirrored(beams: &[Vec3]) -> Scene {
     scene(objects, PIXELS, beams)
 }
 
-/// Glass that reflects nothing, as near-mirrors and reflections at glass need both sides' machinery at once: a partition across
-/// the room, aslant, a show-case with faces of its own and a curved near-mirror in it, a window before the mirror, and one between
-/// the laser and a spot. A spot in a corner behind the partition has a zone. `independent_glass.rs` has what reflects.
+/// Glass that reflects nothing, because near-mirrors together with reflections at glass need the
+/// machinery of both sides at once.
+///
+/// The room has a slanted partition across it, a show-case of single pane faces with a curved
+/// near-mirror in it, a window in front of the mirror, and one between the laser and a spot. A spot
+/// in a corner behind the partition has a zone. `independent_glass.rs` tests reflecting glass.
 #[test]
 fn rooms_with_tinted_panes_have_the_energy_of_an_independent_tracer() {
     let glass = |transmittance, face| Material {
@@ -156,7 +163,8 @@ fn rooms_with_tinted_panes_have_the_energy_of_an_independent_tracer() {
         v(0.0, 2.2, 0.0),
         glass(0.65, false),
     ));
-    // Not on the floor itself: of glass in one plane with a wall neither side can say which is in front.
+    // The case is above the floor: if glass is in one plane with a wall, neither side can determine
+    // which is in front.
     s.objects.extend(room(
         v(-1.6, -1.49, -3.6),
         v(-0.9, -0.6, -2.9),
@@ -191,7 +199,8 @@ fn rooms_with_tinted_panes_have_the_energy_of_an_independent_tracer() {
 
 #[test]
 fn spots_beside_a_mirror_and_folded_by_it_have_the_energy_of_an_independent_tracer() {
-    // 1 and 5 cm beside the mirror's edges, onto the wall behind it; two beams that it folds; one far from it.
+    // 1 and 5 cm from the mirror's edges, onto the wall behind it; two beams that the mirror folds;
+    // one far from it.
     let beams = [
         v(0.61, 0.2, -4.0),
         v(0.1, 0.85, -4.0),
@@ -204,7 +213,7 @@ fn spots_beside_a_mirror_and_folded_by_it_have_the_energy_of_an_independent_trac
 
 #[test]
 fn a_spot_on_a_mirror_has_the_energy_of_an_independent_tracer() {
-    // A mirror on the left wall throws it onto the far one.
+    // A mirror on the left wall reflects the beam onto the far one.
     let mut s = mirrored(&[]);
     let pane = Material::mirror("pane", 0.01);
     s.objects.push(quad(
@@ -243,6 +252,6 @@ fn glints_of_curved_and_angled_mirrors_have_the_energy_of_an_independent_tracer(
         v(-0.3, 0.35, -1.0),
         v(0.05, -0.1, -1.0),
     ];
-    // Of three bounces and more only chance finds some here, on both sides.
+    // Some light of three bounces and more is found by chance alone here, on both sides.
     agrees("angled", &scene(objects, PIXELS, &beams), 1);
 }

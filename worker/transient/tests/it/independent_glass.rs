@@ -1,6 +1,7 @@
-//! As `independent.rs`, with glass that reflects and refracts: a window and a partition, a ball and a cube of glass, a vessel.
-//! `glass_tracer.rs` checks the independent tracer itself. `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test
-//! independent_glass -- --nocapture` measures with 32 times the paths.
+//! Like `independent.rs`, with glass that reflects and refracts: a window and a partition, a ball
+//! and a cube of glass, a vessel. `glass_tracer.rs` tests the independent tracer itself.
+//! `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test independent_glass --
+//! --nocapture` measures with 32 times the paths.
 
 use crate::common;
 
@@ -23,7 +24,7 @@ use rayon::prelude::*;
 
 const PIXELS: u32 = 64;
 
-/// What bends which legs.
+/// Path classes by their bent legs.
 const CLASSES: [&str; 5] = [
     "nothing bent",
     "bent, but not at the camera",
@@ -35,15 +36,15 @@ const CLASSES: [&str; 5] = [
 /// `[class]` of `[region][part]`.
 type Classes = [Sums; 5];
 
-/// Pixels of glass, and those of spots: laser and camera are in one place, so that glass before a spot shows the one that it makes
-/// by reflecting the beam.
+/// Returns the pixels of glass and those of spots. The laser and the camera are at the same place,
+/// so glass in front of a spot shows the spot that it makes by reflecting the beam.
 fn glassy(regions: &[usize]) -> Vec<usize> {
     let glass = (0..regions.len()).filter(|&k| regions[k] == 2);
     let spots = (0..regions.len()).filter(|&k| regions[k] == 1);
     glass.chain(spots).collect()
 }
 
-/// Paths that arrive at the camera by a straight leg.
+/// Returns the energies of paths that arrive at the camera by a straight leg.
 fn straight(
     tracer: &Tracer,
     sources: &[Source],
@@ -64,7 +65,8 @@ fn straight(
     }
 }
 
-/// Paths that arrive at the camera by a bent one: as many camera paths, and as many light paths to connect them to.
+/// Returns the energies of paths that arrive at the camera by a bent leg, with as many camera
+/// paths, and as many light paths to connect them to.
 fn bent(
     tracer: &Tracer,
     (sources, connects): (&[Source], Connects),
@@ -80,7 +82,7 @@ fn bent(
     });
 }
 
-/// The tracer's energies, all classes together.
+/// Returns the tracer's energies, summed over all classes.
 fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize) -> Energies {
     let lights = 1_500 * (effort as f64).sqrt() as usize;
     let batches: Vec<Classes> = (0..BATCHES)
@@ -110,7 +112,8 @@ fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize)
     joined(&batches.iter().map(whole).collect::<Vec<_>>())
 }
 
-/// Compares, prints, and fails where the two sides differ by more than four standard errors and 0.05 %.
+/// Compares and prints both sides, and fails if they differ by more than four standard errors and
+/// 0.05 %.
 #[track_caller]
 fn agrees(name: &str, scene: &Scene) {
     let materials = scene.objects.iter().flat_map(|o| &o.mesh.materials);
@@ -124,7 +127,7 @@ fn agrees(name: &str, scene: &Scene) {
     println!("{name}: {} spots of {} beams", sources.len(), beams.len());
     let regions = regions(&tracer, &sources, Tracer::meets_glass);
     let theirs = traced(&tracer, &sources, &regions, effort());
-    // What goes on of each beam makes its spot.
+    // The transmitted part of each beam determines its spot.
     let spots = trace_spots(scene).unwrap();
     for (k, (spot, found)) in spots.iter().zip(&beams).enumerate() {
         let first = P::from(spot.expect("a spot").point) - found[0].p;
@@ -134,8 +137,8 @@ fn agrees(name: &str, scene: &Scene) {
     alike(name, "pixels of glass", 2, &ours, &theirs);
 }
 
-/// A room with a window in front of its far wall, a partition aslant and a grey ball. Beams through both, and four that meet
-/// none of them first.
+/// Returns a room with a window in front of its far wall, a slanted partition and a grey ball.
+/// Beams pass through both, and four beams hit neither of them first.
 fn windows() -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     objects.push(quad(
@@ -161,7 +164,7 @@ fn windows() -> Scene {
     scene(objects, PIXELS, &beams)
 }
 
-/// A room with a ball of glass and a tinted cube. A beam goes through the ball.
+/// Returns a room with a ball of glass and a tinted cube. A beam passes through the ball.
 fn ball_and_cube() -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     objects.push(sphere(v(-0.7, -0.5, -2.4), 0.5, 3, body(1.5, 1.0)));
@@ -180,7 +183,8 @@ fn ball_and_cube() -> Scene {
     scene(objects, PIXELS, &beams)
 }
 
-/// A room with a hollow vessel and a window whose thickness its mesh has, a beam through each.
+/// Returns a room with a hollow vessel and a window with its thickness in the mesh, and a beam
+/// through each.
 fn vessel() -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let middle = v(-0.6, -0.4, -2.3);
@@ -202,7 +206,7 @@ fn vessel() -> Scene {
     scene(objects, PIXELS, &beams)
 }
 
-/// A furnished room behind a pane: the one of few without any near-mirror.
+/// Returns a furnished room behind a pane. It is one of the few without any near-mirror.
 fn furnished_behind_glass() -> Scene {
     let library = AssetLibrary::find("parametric", &[]).unwrap();
     let set = FurnishedSettings {

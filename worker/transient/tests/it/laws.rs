@@ -16,7 +16,8 @@ fn split(scene: &Scene, settings: &Settings) -> Split {
     ok(scene, settings).split.unwrap()
 }
 
-/// A spot on a plate to the left that lights a plate in front; camera sees the plate in front.
+/// Returns a scene with a spot on a plate to the left that lights a plate in front, which the
+/// camera sees.
 fn corner(rho: f32) -> Scene {
     let front = quad(
         v(-1.0, -1.0, -2.0),
@@ -86,8 +87,8 @@ fn two_bounces_on_a_lambertian_plane_match_the_integral() {
     assert!(energy(&got.multi) > 0.0);
 }
 
-/// In a sphere of radius R and albedo ρ one point of light spreads evenly at once (cos cos / d² is the
-/// constant 1/4R²): each bounce gives the radiance ρ^k / (4π² R²), whatever the pixel.
+/// In a sphere of radius R and albedo ρ, the light of one point spreads evenly at once (cos cos /
+/// d² is the constant 1/4R²): each bounce adds the radiance ρ^k / (4π² R²) in every pixel.
 #[test]
 fn a_white_sphere_gives_every_bounce_its_share_of_the_energy() {
     let radius = 2.0;
@@ -102,7 +103,8 @@ fn a_white_sphere_gives_every_bounce_its_share_of_the_energy() {
             bin_width_m: 1.0,
             bins: 400,
         };
-        // A bounce is a difference of two renders: of 1/31 of their light one seed knows 2 %.
+        // A bounce is a difference of two renders. For 1/31 of their light, the error of one seed
+        // is 2 %.
         const SEEDS: u64 = 4;
         let mut before = 0.0;
         for bounces in 2..=6 {
@@ -146,7 +148,7 @@ fn a_longer_way_to_the_spot_only_shifts_the_histogram() {
             all += f64::from(x);
         }
     }
-    // path_m is f32: a few samples change their bin by rounding.
+    // path_m is f32, so a few samples change their bin by rounding.
     assert!(same < 1e-3 * all, "{same} {all}");
 }
 
@@ -217,7 +219,7 @@ fn scenes_scaled_and_moved_obey_the_physical_law() {
         let ratio = energy(&r.transient) * law / energy(&reference.transient);
         assert!((ratio - 1.0).abs() < 0.02, "{scale}: {ratio}");
     }
-    // Far from the origin: the mesh stays small, its place is in the transform.
+    // Far from the origin: the mesh stays small, and the offset is in the transform.
     let mut far = base.clone();
     let shift = v(1000.0, -500.0, 2000.0);
     for o in &mut far.objects {
@@ -253,7 +255,7 @@ fn beams_fold_through_mirrors_to_the_first_diffuse_surface() {
     let s = scene(vec![mirror, wall], 4, &[v(0.0, 0.0, -1.0)]);
     let spot = picofarm_transient::trace_spots(&s).unwrap()[0];
     let Some(spot) = spot else {
-        // The other tilt: the beam goes left and meets nothing.
+        // With the other tilt, the beam goes left and hits nothing.
         panic!("the beam must reach the wall");
     };
     assert_eq!(spot.object, 1);

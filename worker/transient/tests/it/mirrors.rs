@@ -1,4 +1,4 @@
-//! Near-mirrors: mirror images against the light of a virtual source, and what the plan says.
+//! Near-mirrors: mirror images versus the light of a virtual source, and the text of the plan.
 
 use crate::common;
 
@@ -8,7 +8,7 @@ use common::{Quiet, energy, grey, quad, scene, settings, sphere, v};
 use picofarm_scene::{Beam, Intrinsics, Material, Object, Scene, Spot, Vec3};
 use picofarm_transient::{Budget, Settings, render};
 
-/// A lit plate to the left and a screen in front, of which the camera sees the screen alone.
+/// Returns a lit plate to the left and a screen in front. The camera sees the screen alone.
 fn stage(extra: Object) -> Scene {
     let screen = quad(
         v(-1.0, -1.0, -2.0),
@@ -64,7 +64,7 @@ fn light_by_way_of_a_planar_mirror_is_that_of_the_spots_image() {
     );
     assert!(r.plan.approximations.is_empty());
     let multi = r.split.unwrap().multi;
-    // The only way of three bounces to the screen is plate → mirror → screen.
+    // The only path of three bounces to the screen is plate → mirror → screen.
     let image = v(-1.5, -2.6, -0.5);
     let f = 0.7 / PI;
     let mut whole = (0.0, 0.0);

@@ -1,4 +1,4 @@
-//! Narrow gates: looking for light in ellipsoidal shells changes the noise and nothing else.
+//! Narrow gates: sampling ellipsoidal shells changes the noise and nothing else.
 
 use crate::common;
 
@@ -6,7 +6,7 @@ use common::{Quiet, energy, grey, quad, room, scene, settings, sphere, v};
 use picofarm_scene::{Bsdf, Distribution, Material, Scene};
 use picofarm_transient::{Budget, Gate, Rendered, Settings, render};
 
-/// A room with a ball, a one-sided sheet that hangs in it, a glossy-coated board and a mirror.
+/// Returns a room with a ball, a hanging one-sided sheet, a glossy-coated board and a mirror.
 fn stage(size: u32) -> Scene {
     let mut all = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     all.push(sphere(v(0.6, -0.9, -2.6), 0.6, 3, grey(0.8)));
@@ -62,7 +62,8 @@ fn run(scene: &Scene, gate: Gate, ellipsoidal: Option<bool>, passes: u32, seed: 
     render(scene, &set, &Quiet).unwrap()
 }
 
-/// Sums of the 3+ part over quarters of the image and groups of bins `first..first + count` in fours.
+/// Returns sums of the 3+ part over quarters of the image and groups of four of the bins
+/// `first..first + count`.
 fn sums(r: &Rendered, first: usize, count: usize) -> Vec<f64> {
     let (side, bins) = (r.width as usize, r.gate.bins as usize);
     let group = count.min(4);
@@ -77,7 +78,7 @@ fn sums(r: &Rendered, first: usize, count: usize) -> Vec<f64> {
     all
 }
 
-/// Mean and its variance, entry by entry.
+/// Returns the mean and its variance, entry by entry.
 fn moments(runs: &[Vec<f64>]) -> Vec<(f64, f64)> {
     let n = runs.len() as f64;
     (0..runs[0].len())
@@ -90,7 +91,8 @@ fn moments(runs: &[Vec<f64>]) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// Of quantities found twice, the root mean square of (difference / its error) and the largest.
+/// Returns the root mean square and the maximum of (difference / its error), of quantities measured
+/// twice.
 fn apart(a: &[(f64, f64)], b: &[(f64, f64)]) -> (f64, f64) {
     let z = a
         .iter()
@@ -125,13 +127,13 @@ fn narrow_gates_show_the_same_light_as_the_whole_gate() {
         let (on_, off_, whole_) = (of(&on, 0), of(&off, 0), of(&whole, at as usize));
         for (name, other) in [("off", &off_), ("whole gate", &whole_)] {
             let (rms, most) = apart(&on_, other);
-            // Of a single bin there are four sums, whose errors come from 16 runs.
+            // A single bin has only four sums, and their errors are estimated from 16 runs.
             assert!(
                 rms < if bins == 1 { 2.5 } else { 1.8 } && most < 5.0,
                 "{bins} bins, on against {name}: z rms {rms}, most {most}: {on_:?} {other:?}"
             );
         }
-        // Variance of single bins at equal passes, as the runs spread, and as they claim.
+        // Variance of single bins at equal passes: the spread of the runs, and the stated one.
         let found = |runs: &[Rendered]| -> f64 {
             let bins = |r: &Rendered| {
                 let multi = &r.split.as_ref().unwrap().multi;
@@ -142,8 +144,8 @@ fn narrow_gates_show_the_same_light_as_the_whole_gate() {
         };
         let (narrow, plain) = (found(&on), found(&off));
         let gain = plain / narrow;
-        // In larger rooms 1.3 to 2; of a few bins in this small one it is known to
-        // about a third from so few runs.
+        // In larger rooms the gain is 1.3 to 2. For a few bins in this small room, so few runs
+        // determine it to about a third.
         assert!(gain > 0.65, "{bins} bins: variance changes by {gain}");
         let se = |r: &Rendered| r.split.as_ref().unwrap().multi_se.clone();
         let claimed = on.iter().flat_map(se).map(|x| f64::from(x).powi(2));
@@ -153,7 +155,7 @@ fn narrow_gates_show_the_same_light_as_the_whole_gate() {
             "{bins} bins: spread / claimed {ratio}"
         );
         println!("{bins} bins: variance falls by {gain}, spread / claimed {ratio}");
-        // What two bounces bring is the same to the last bit.
+        // Light of two bounces is the same to the last bit.
         let two = |r: &Rendered| r.split.as_ref().unwrap().two.clone();
         let again = run(&s, gate(at, bins), Some(false), 48, 0);
         assert_eq!(two(&on[0]), two(&again));
@@ -179,7 +181,7 @@ fn narrow_gates_give_the_same_bits_on_any_number_of_threads() {
 
 #[test]
 fn a_gate_beyond_all_light_stays_dark_and_takes_fewer_rays() {
-    // An open stage: light leaves it after a few bounces.
+    // An open stage, which light leaves after a few bounces.
     let mut s = stage(16);
     s.objects.drain(4..6);
     for start_m in [0.0, 1000.0] {
@@ -221,11 +223,11 @@ fn a_gate_that_no_light_can_reach_takes_no_ray() {
         let said = r.plan.approximations.iter();
         said.filter(|x| x.contains("none is looked for")).count() == 1
     };
-    // The room is 6.9 m from corner to corner: 20 bounces are over after 150 m.
+    // The room is 6.9 m from corner to corner, so 20 bounces end before 150 m.
     for (gate, most) in [(from(0.0, 4), None), (from(150.0, 4), Some(20))] {
         let r = run(gate, most);
         assert!(dark(&r) && energy(&r.transient) == 0.0, "{:?}", r.plan);
-        // The picture and the masks alone, as where nothing but one bounce is asked for.
+        // Only the picture and the masks are traced, as if only one bounce were requested.
         assert_eq!(r.rays, run(gate, Some(1)).rays);
         assert!(r.overflow.energy > 0.0 && r.overflow.share == 1.0);
         assert!(
@@ -234,7 +236,7 @@ fn a_gate_that_no_light_can_reach_takes_no_ray() {
             r.warnings
         );
     }
-    // Up to the bin of the first light, and one before.
+    // Up to the bin of the first light, and up to the bin before it.
     let whole = run(from(0.0, 400), None);
     let bins = whole.transient.chunks(400);
     let first = bins.filter_map(|h| h.iter().position(|&x| x > 0.0)).min();

@@ -1,5 +1,5 @@
-//! Long thin triangles: light is the same whether a surface is made of them or of many short ones. Rays that start or end on a needle
-//! must not meet it, and what stands beside one must not be missed.
+//! Long thin triangles: light is the same for a surface of needles and one of many short triangles.
+//! Rays that start or end on a needle must not hit it, and must not miss objects next to it.
 
 use crate::common;
 
@@ -7,10 +7,12 @@ use common::{energy, grey, near, object, ok, room, scene, settings, two_only, v}
 use picofarm_scene::{Material, Mesh, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Rendered, Settings};
 
-/// Longest side of a triangle that is not cut, whatever its width: the tip of a spike stays a needle at any size.
+/// Longest side of a triangle that is not cut at any width: the tip of a spike stays a needle at
+/// any size.
 const SHORT: f32 = 0.005;
 
-/// Every triangle halved along its longest side until none is longer than four times its width.
+/// Returns the object with every triangle halved along its longest side until none is longer than
+/// four times its width.
 fn cut(o: &Object) -> Object {
     let mesh = &o.mesh;
     let mut all = Mesh {
@@ -44,7 +46,7 @@ fn cut(o: &Object) -> Object {
     }
 }
 
-/// A rectangle about `middle`.
+/// Returns a rectangle around `middle`.
 fn strip(middle: Vec3, along: Vec3, across: Vec3, (length, width): (f32, f32)) -> Object {
     let l = along.normalized();
     let n = l.cross(across).normalized();
@@ -58,7 +60,8 @@ fn strip(middle: Vec3, along: Vec3, across: Vec3, (length, width): (f32, f32)) -
     object("strip", positions, vec![[0, 1, 2], [0, 2, 3]], grey(0.7))
 }
 
-/// Triangles about an axis from `foot` to `top`: a rod where both have a radius, a spike where the top has none.
+/// Returns triangles around an axis from `foot` to `top`: a rod if both ends have a radius, a spike
+/// if the top has none.
 fn rod(foot: Vec3, top: Vec3, (below, above): (f32, f32), sides: u32) -> Object {
     let axis = (top - foot).normalized();
     let u = axis.cross(v(0.3, 0.9, 0.1)).normalized();
@@ -84,7 +87,8 @@ fn walls() -> Vec<Object> {
     room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6))
 }
 
-/// Two-bounce light of a room with a thing that a beam ends on: the thing whole, and cut.
+/// Returns the two-bounce renders of a room with an object that a beam ends on: once with the
+/// object whole, and once with it cut.
 fn whole_and_cut(thing: Object, target: Vec3) -> [Rendered; 2] {
     let render = |thing: Object| {
         let mut objects = walls();
@@ -94,8 +98,9 @@ fn whole_and_cut(thing: Object, target: Vec3) -> [Rendered; 2] {
     [render(thing.clone()), render(cut(&thing))]
 }
 
-/// Fails unless both are the same light, in all and by pixel: their camera paths are the same. The corners of short triangles are
-/// rounded to f32, which tilts those of a narrow strip: that is what is left between the two.
+/// Fails unless both renders have the same light, in total and by pixel, because their camera paths
+/// are the same. The corners of short triangles are rounded to f32, which tilts those of a narrow
+/// strip. Only this difference remains between the two.
 #[track_caller]
 fn same(what: &str, [whole, cut]: &[Rendered; 2]) {
     let place = |r: &Rendered| r.spots[0].expect("the beam ends on the thing");
@@ -128,7 +133,7 @@ fn a_spot_on_a_strip_lights_as_much_as_on_the_strip_cut_into_short_triangles() {
     for (k, (along, across)) in ways.into_iter().enumerate() {
         let length = if k == 3 { 2.2 } else { 2.6 };
         for (n, width) in [0.001, 0.003, 0.03].into_iter().enumerate() {
-            // Beside the diagonal, on either side of it, and off the middle.
+            // Targets close to the diagonal, on either side of it, and away from the middle.
             let l = along.normalized();
             let w = l.cross(across).normalized().cross(l);
             let at = [0.31, -0.22, 0.02, -0.4][(k + n) % 4] * length;
@@ -162,7 +167,7 @@ fn a_spot_on_a_rod_or_a_spike_lights_as_much_as_on_one_cut_into_short_triangles(
     }
 }
 
-/// A parallelogram of so many strips that share their vertices.
+/// Returns a parallelogram of `count` strips that share their vertices.
 fn of_strips(corner: Vec3, a: Vec3, b: Vec3, count: u32, m: Material) -> Object {
     let mut positions = vec![];
     for k in 0..=count {
@@ -176,7 +181,7 @@ fn of_strips(corner: Vec3, a: Vec3, b: Vec3, count: u32, m: Material) -> Object 
     object("strips", positions, triangles.collect(), m)
 }
 
-/// Two bounces, and three and more with their standard error, of a scene.
+/// Returns the energies of two bounces, and of three and more with their standard error.
 fn parts(s: &Scene, samples: u32) -> (f64, f64, f64) {
     let set = Settings {
         seed: 3,
@@ -193,7 +198,7 @@ fn walls_and_panes_of_needles_are_as_bright_as_whole_ones() {
     let spots = [v(0.2, -1.5, -2.0), v(-2.0, 0.3, -2.2), v(0.6, 0.5, -4.0)];
     let with = |count: u32, glass: bool| {
         let mut objects = walls();
-        // A tilted floor, and a pane before the back wall.
+        // A tilted floor, and a pane in front of the back wall.
         let (a, b) = (v(3.6, 0.1, -0.2), v(0.15, -0.05, 3.2));
         objects.push(of_strips(v(-1.9, -1.4, -3.7), a, b, count, grey(0.5)));
         if glass {

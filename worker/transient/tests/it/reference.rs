@@ -1,4 +1,5 @@
-//! Against the reference transients of an independent renderer (skipped where they are absent).
+//! Comparison with the reference transients of an independent renderer (skipped if they are
+//! absent).
 
 use crate::common;
 
@@ -61,13 +62,13 @@ fn one_bounce_peaks_stand_where_and_as_high_as_the_reference_says() {
         let k = pixel(number("film_v")) * 64 + pixel(number("film_u"));
         let bin = ((number("one_bounce_opl") - 1.0) / 0.0384) as usize;
         let area = (2.0f64 / 64.0).powi(2);
-        // Absent where the camera does not see the spot.
+        // Absent if the camera does not see the spot.
         let value = s["one_bounce_value_times_Apix"].as_f64().unwrap_or(0.0);
         expected[k * 637 + bin] += value / area;
     }
     let highest = expected.iter().fold(0.0f64, |a, &b| a.max(b));
     for (i, (&h, &e)) in r.transient.iter().zip(&expected).enumerate() {
-        // A peak on the edge between two pixels may stand in either.
+        // A peak on the edge between two pixels may be in either.
         let moved = i >= 637 && expected[i - 637] > 0.0 || e > 0.0 && h == 0.0;
         assert!(
             moved || (f64::from(h) - e).abs() < 1e-3 * highest,

@@ -1,5 +1,5 @@
-//! Rough conductors and mixes, whose vertices pixels share, and near-mirrors between: energies against an independent tracer
-//! of light paths in f64.
+//! Rough conductors and mixes, which have vertices that pixels share, and near-mirrors in between:
+//! energies against an independent tracer of light paths in f64.
 
 use crate::common;
 
@@ -54,8 +54,8 @@ fn walls(m: &Material) -> Vec<Object> {
     room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), m)
 }
 
-/// Energy of three bounces and more, against the tracer's: within 0.3 % and four standard errors of both, and of exactly
-/// two bounces likewise.
+/// Compares the energy of three bounces and more with the tracer's, within 0.3 % and four standard
+/// errors of both, and likewise that of exactly two bounces.
 #[track_caller]
 fn agrees(what: &str, objects: Vec<Object>, (passes, paths): (u32, usize)) {
     let (s, start) = with_spot(objects);

@@ -1,5 +1,5 @@
-//! Geometry far outside of what camera and light reach changes nothing, and walls far larger than the room
-//! are walls.
+//! Geometry far beyond the reach of camera and light changes nothing, and walls far larger than the
+//! room behave like walls.
 
 use crate::common;
 
@@ -7,14 +7,14 @@ use common::*;
 use picofarm_scene::{Material, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Rendered, Settings};
 
-/// A closed grey room with a box in it, two spots.
+/// Returns a closed grey room with a box in it and two spots.
 fn closed() -> Scene {
     let mut objects = room(v(-2.0, -1.5, -3.5), v(2.5, 1.5, 1.0), &grey(0.6));
     objects.extend(room(v(0.4, -1.5, -2.6), v(1.2, -0.4, -1.8), &grey(0.4)));
     scene(objects, 16, &[v(-0.4, 0.2, -1.0), v(0.3, -0.1, -1.0)])
 }
 
-/// A square of half a side `half` across −z at distance `z`.
+/// Returns a square with half side `half`, perpendicular to −z at distance `z`.
 fn plane(z: f32, half: f32) -> Object {
     let corner = v(-half, -half, -z);
     quad(
@@ -59,7 +59,7 @@ fn a_plane_far_outside_of_a_closed_room_changes_no_bit() {
             s.labels.push("far".into());
             let what = format!("a plane of {half} m at {z} m, first {first}");
             if first {
-                // Its triangles come before all others.
+                // The triangles of the new object come before all others.
                 s.objects.rotate_right(1);
             }
             same(&what, &ok(&s, &set()), &plain);
@@ -88,7 +88,7 @@ fn a_plane_far_outside_changes_no_bit_of_a_narrow_gate() {
     same("narrow", &ok(&s, &set), &plain);
 }
 
-/// The room with its wall behind, a floor and a side wall of half a side `half`.
+/// Returns the room with a back wall, a floor and a side wall of half side `half`.
 fn wide(half: f32) -> Scene {
     let mut s = closed();
     let (x, y, z) = (v(half, 0.0, 0.0), v(0.0, half, 0.0), v(0.0, 0.0, half));
@@ -138,7 +138,7 @@ fn a_large_mirror_far_outside_takes_no_strategy_from_a_mirror_in_the_room() {
 #[test]
 fn a_room_kilometres_from_the_origin_keeps_its_light() {
     let s = closed();
-    // Where vertices are millimetres apart some random draws fall to the other side of a rounding.
+    // If vertices are millimetres apart, some random draws fall to the other side of a rounding.
     let set = settings(Budget::Samples(256));
     let plain = ok(&s, &set);
     for shift in [v(256.0, -512.0, 128.0), v(4096.0, -8192.0, 2048.0)] {

@@ -1,4 +1,4 @@
-//! The sensor model: the order of the chain, determinism, and what is dropped.
+//! The sensor model: the order of the chain, determinism, and dropped light.
 
 use picofarm_transient::sensor::{
     DeadTime, Histograms, Jitter, Pulse, SPOTS_4_OF_100, SPOTS_25_OF_100, Scale, Sensed, Sensor,
@@ -6,7 +6,7 @@ use picofarm_transient::sensor::{
 };
 use proptest::prelude::*;
 
-/// Bins of 8 ps in metres are the real capture's.
+/// Bins of 8 ps in metres, as in the real capture.
 const FINE_PS: f64 = 8.0;
 
 fn fixed(photons_per_unit: f64) -> Sensor {
@@ -50,7 +50,7 @@ fn rate(s: &Sensed) -> &[f32] {
     }
 }
 
-/// Something like a pixel's transient: a rise, a peak and a tail, in `pixels` variations.
+/// Returns values like a pixel's transient, with a rise, a peak and a tail, in `pixels` variations.
 fn transients(pixels: usize, bins: usize) -> Vec<f32> {
     (0..pixels * bins)
         .map(|i| {
@@ -83,7 +83,7 @@ fn counts_add_up_to_the_expected_total() {
         (counted - expected).abs() < 5.0 * expected.sqrt(),
         "{counted} {expected}"
     );
-    // Without noise it adds up to rounding.
+    // Without noise the sums agree up to rounding.
     let quiet = Sensor {
         poisson: false,
         ..sensor
@@ -95,7 +95,7 @@ fn counts_add_up_to_the_expected_total() {
 
 #[test]
 fn counts_have_the_mean_and_the_variance_of_the_rate() {
-    // One bin a case; the seeds are the samples.
+    // One bin per case; the seeds are the samples.
     let rates = [0.3f32, 7.0, 12.0, 400.0];
     let seeds = 4000;
     let (mut sum, mut squares) = ([0f64; 4], [0f64; 4]);
@@ -265,7 +265,8 @@ fn what_leaves_the_gate_is_dropped_and_counted() {
     let inside: f64 = rate(&s).iter().map(|r| f64::from(*r)).sum();
     assert!((inside + s.dropped.outside_photons - 110.0).abs() < 1e-4);
     assert!((s.dropped.outside_share - s.dropped.outside_photons / 110.0).abs() < 1e-12);
-    // A good part of the rise comes before the first bin, nearly all of the tail after the last.
+    // A large part of the rise is before the first bin, and nearly all of the tail is after the
+    // last.
     assert!(
         s.dropped.outside_photons > 20.0 && s.dropped.outside_photons < 60.0,
         "{s:?}"
@@ -353,7 +354,7 @@ fn a_peak_that_was_found_before_gives_the_same_bits_in_every_draw() {
             },
             true,
         ),
-        // The pulse is shifted by another draw each time.
+        // Each draw shifts the pulse differently.
         (
             Sensor {
                 jitter: compat,
@@ -406,7 +407,7 @@ fn a_peak_that_was_found_before_gives_the_same_bits_in_every_draw() {
 fn the_peak_of_the_median_pixel_is_what_was_asked_for() {
     let bins = 100;
     let h = transients(51, bins);
-    // The two-bounce part sets the scale, whatever else there is.
+    // The two-bounce part alone sets the scale.
     let mut all = h.clone();
     all[7] = 1e6;
     let peak_of = |scale, seed, scene| {
@@ -496,7 +497,7 @@ fn first_photon_pile_up_follows_coates() {
     }
     let most = counts(&s).chunks(bins).map(|c| c.iter().sum::<u32>()).max();
     assert!(u64::from(most.unwrap()) <= pulses);
-    // Many pulses: no pile-up.
+    // Many pulses, so no pile-up.
     let many = Sensor {
         dead_time: Some(DeadTime::FirstPhoton { pulses: 1 << 40 }),
         ..sensor

@@ -2,8 +2,9 @@
 
 use picofarm_transient::sensor::{Draws, binomial, poisson};
 
-/// Chi-square of `samples` draws against the probabilities of the counts `first..`, grouped into cells that expect
-/// enough; as a standard normal number (Wilson & Hilferty 1931).
+/// Returns the chi-square of `samples` draws against the probabilities of the counts `first..`,
+/// grouped into cells with enough expected draws, converted to a standard normal number (Wilson &
+/// Hilferty 1931).
 fn deviation(
     samples: usize,
     first: u64,
@@ -20,7 +21,7 @@ fn deviation(
             None => below += 1,
         }
     }
-    // What lies outside is less likely than one in 10⁹.
+    // The probability of counts outside the range is less than 10⁻⁹.
     assert_eq!((below, above), (0, 0));
     let n = samples as f64;
     let cell = if probabilities.len() < 60 {
@@ -57,7 +58,7 @@ fn deviation(
     ((chi2 / dof).cbrt() - (1.0 - 2.0 / (9.0 * dof))) / (2.0 / (9.0 * dof)).sqrt()
 }
 
-/// Counts within 7 standard deviations of the mean, and then some.
+/// Returns the counts within 7 standard deviations of the mean, and some more.
 fn range(mean: f64, sigma: f64) -> std::ops::RangeInclusive<u64> {
     (mean - 7.0 * sigma).max(0.0) as u64..=(mean + 7.0 * sigma + 12.0) as u64
 }
@@ -119,7 +120,7 @@ fn binomial_counts_follow_the_exact_probabilities() {
 
 #[test]
 fn the_same_place_gives_the_same_count_for_ever() {
-    // Stored data sets depend on these numbers: change SENSOR_VERSION with them.
+    // Stored data sets depend on these numbers. If they change, change SENSOR_VERSION.
     let draw = |rate, bin| poisson(rate, &mut Draws::new(1, 2, 3, bin));
     let got: Vec<u64> = [0.5, 5.0, 30.0, 400.0, 1e5, 4e7]
         .iter()

@@ -1,4 +1,4 @@
-//! Pulse and jitter on a histogram's bins.
+//! The pulse and the jitter on a histogram's bins.
 
 use picofarm_transient::sensor::{Jitter, Kernel, Pulse, Sensor};
 
@@ -11,7 +11,7 @@ fn variance(k: &Kernel) -> f64 {
     squares.map(|(i, t)| (at(i) - mean).powi(2) * t).sum()
 }
 
-/// Full width at half maximum in bins, between interpolated crossings.
+/// Returns the full width at half maximum in bins, between interpolated crossings.
 fn fwhm(k: &Kernel) -> f64 {
     let largest = k.taps.iter().copied().fold(0.0, f64::max);
     let half = largest / 2.0;
@@ -40,7 +40,7 @@ fn the_pulse_sums_to_one_has_the_stated_width_and_peaks_at_zero() {
         );
         let largest = k.taps.iter().copied().fold(0.0, f64::max);
         assert_eq!(k.taps[(-k.first) as usize], largest);
-        // Gaussian rise, exponential tail.
+        // A Gaussian rise and an exponential tail.
         let tail = |t: f64| k.taps[((t / bin_ps) as i64 - k.first) as usize];
         let tau = fwhm_ps * 2.0 / 2.813_725;
         let (a, b) = (tail(fwhm_ps), tail(2.0 * fwhm_ps));
@@ -59,15 +59,15 @@ fn jitter_of_50_ps_is_a_gaussian_of_21_23_ps() {
         ..Sensor::default()
     };
     let k = Kernel::new(&sensor(50.0), 1.0).unwrap();
-    // Shares of bins add the bin's own variance, 1/12.
+    // Integration over bins adds the bin's own variance, 1/12.
     let sigma = (variance(&k) - 1.0 / 12.0).sqrt();
     assert!((sigma / (50.0 / 2.354_82) - 1.0).abs() < 1e-3, "{sigma}");
     assert!((fwhm(&k) / 50.0 - 1.0).abs() < 0.01);
-    // In bins of 8 ps: 2.654 bins.
+    // With bins of 8 ps: 2.654 bins.
     let k = Kernel::new(&sensor(50.0), FINE_PS).unwrap();
     let sigma = (variance(&k) - 1.0 / 12.0).sqrt();
     assert!((sigma / 2.654 - 1.0).abs() < 2e-3, "{sigma}");
-    // Symmetric.
+    // The kernel is symmetric.
     let n = k.taps.len();
     assert_eq!(k.first, -(n as i64 / 2));
     for i in 0..n {
@@ -113,7 +113,7 @@ fn a_pulse_sampled_in_the_histograms_bins_is_kept_as_it_is() {
             .first,
         0
     );
-    // In bins of 24 ps with the zero in a bin's middle: whole samples add up.
+    // With bins of 24 ps and the zero in a bin's middle, whole samples add up.
     let k = Kernel::new(&sensor(FINE_PS, Some(1.0)), 3.0 * FINE_PS).unwrap();
     for (tap, sum) in k.taps.iter().zip([5.0, 15.0]) {
         assert!((tap - sum / 20.0).abs() < 1e-9, "{k:?}");

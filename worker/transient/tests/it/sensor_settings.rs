@@ -1,4 +1,4 @@
-//! Sensor settings as files hold them, and what is refused.
+//! Sensor settings as stored in files, and invalid settings.
 
 use picofarm_transient::sensor::{Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, sense};
 

@@ -1,4 +1,4 @@
-//! A render ends where it is asked to stop, and where its time is over.
+//! A render ends when it is asked to stop, and when its time is over.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -12,7 +12,7 @@ use picofarm_transient::{
     render_within,
 };
 
-/// Counts how often it is asked, and says stop from one of them on.
+/// Counts the progress calls, and requests a stop from the call `stop_at` on.
 struct Asked {
     times: AtomicU64,
     stop_at: u64,
@@ -81,7 +81,8 @@ fn a_render_stops_within_a_few_questions_wherever_it_is() {
         let run = |asked: &Asked| pool.install(|| render(&scene, &settings, asked).map(|_| ()));
         let whole = Asked::until(u64::MAX);
         run(&whole).unwrap();
-        // Each row of what the centres see, of each spot's visibility and of the picture; each pixel of the tiles.
+        // Each row of the centres' hits, of each spot's visibility and of the picture; each pixel
+        // of the tiles.
         let rows = u64::from(side) * (1 + 4 + 1);
         let all = whole.times();
         assert!(all > rows + u64::from(side * side), "{all}");
@@ -93,7 +94,7 @@ fn a_render_stops_within_a_few_questions_wherever_it_is() {
                 matches!(ended, Err(RenderError::Stopped)),
                 "{at} of {all}: {ended:?}"
             );
-            // Rows and tiles that others have begun each ask once.
+            // Rows and tiles that other threads have begun each make one call.
             let more = asked.times() - at;
             assert!(
                 more < 4 * u64::from(side),
@@ -104,7 +105,7 @@ fn a_render_stops_within_a_few_questions_wherever_it_is() {
     }
 }
 
-/// A clock that each look takes a second of.
+/// Renders with a clock that advances by a second per reading.
 fn within(seconds: u64, budget: Budget) -> Rendered {
     let library = AssetLibrary::find("parametric", &[]).unwrap();
     let room = FurnishedSettings {

@@ -1,4 +1,5 @@
-//! The stated errors of sums against their scatter over seeds, with light that near-mirrors throw and without.
+//! The stated errors of sums versus their spread over seeds, with and without light reflected by
+//! near-mirrors.
 
 use crate::common;
 
@@ -10,7 +11,7 @@ use picofarm_transient::{Budget, Rendered, Settings};
 const SIZE: usize = 16;
 const BINS: usize = 637;
 const SEEDS: u64 = 60;
-/// Pixels a side and bins of the sums.
+/// Pixels per side and bins of the sums.
 const SIDE: usize = 4;
 const WIDE: usize = 13;
 
@@ -42,14 +43,14 @@ fn furnished(things: Vec<Object>) -> Scene {
     s
 }
 
-/// A ball that throws caustics.
+/// Returns a scene with a ball that causes caustics.
 fn caustics() -> Scene {
     let ball = Material::mirror("ball", 0.05);
     furnished(vec![sphere(v(0.1, -0.4, -1.7), 0.35, 3, ball)])
 }
 
-/// Two mirrors at an angle: the spots are seen in two mirrors, one after another. The ball adds caustics that the camera sees
-/// in mirrors, which only chance finds.
+/// Returns two mirrors at an angle, so that the spots are seen via two mirrors, one after another.
+/// The ball adds caustics that the camera sees in mirrors, which are found by chance alone.
 fn corner(ball: bool) -> Scene {
     let left = quad(
         v(-1.4, -0.9, -2.3),
@@ -86,7 +87,7 @@ fn runs(s: &Scene, passes: u32) -> Vec<Rendered> {
     (0..SEEDS).map(one).collect()
 }
 
-/// Sums over blocks of pixels and bins.
+/// Returns sums over blocks of pixels and bins.
 fn sums(h: &[f32]) -> Vec<f64> {
     let (blocks, groups) = (SIZE / SIDE, BINS / WIDE);
     let mut out = vec![0.0; blocks * blocks * groups];
@@ -99,8 +100,8 @@ fn sums(h: &[f32]) -> Vec<f64> {
     out
 }
 
-/// Scatter of the sums over their stated error: in the quadratic mean over the sums, and the median. Sums that less than a
-/// thousandth of the light falls into are left out.
+/// Returns the ratio of the spread of the sums to their stated error: the quadratic mean over the
+/// sums, and the median. Sums with less than a thousandth of the light are left out.
 fn grouped(name: &str, values: &[Vec<f64>], squares: &[Vec<f64>]) -> (f64, f64) {
     let n = values.len() as f64;
     let mut all = vec![];
@@ -120,7 +121,7 @@ fn grouped(name: &str, values: &[Vec<f64>], squares: &[Vec<f64>]) -> (f64, f64) 
     (rms, median)
 }
 
-/// Grouped z of the two-bounce part, of the rest, and of both.
+/// Returns the grouped z of the two-bounce part, of the rest, and of both.
 fn parts(name: &str, all: &[Rendered]) -> [(f64, f64); 3] {
     let split = |k: usize| all[k].split.as_ref().unwrap();
     let each = |read: &dyn Fn(usize) -> Vec<f64>| (0..all.len()).map(read).collect::<Vec<_>>();
@@ -146,7 +147,7 @@ fn parts(name: &str, all: &[Rendered]) -> [(f64, f64); 3] {
     ]
 }
 
-/// Spread of the whole image's energy over its stated error.
+/// Returns the ratio of the spread of the whole image's energy to its stated error.
 fn total(name: &str, all: &[Rendered]) -> f64 {
     let n = all.len() as f64;
     let totals: Vec<f64> = all.iter().map(|r| energy(&r.transient)).collect();
@@ -184,7 +185,8 @@ fn an_error_that_few_bright_paths_hold_is_said_to_be_uncertain_and_no_other() {
     for r in &quiet {
         assert!(!warned(r), "{:?}", r.warnings);
     }
-    // Rare paths by way of several near-mirrors hold it in some of the renders, and where they do, it is said.
+    // Rare paths via several near-mirrors dominate the error in some of the renders, and those
+    // renders must have a warning.
     let all = runs(&corner(true), 16);
     let bright = all.iter().filter(|r| r.error.total_uncertainty > 0.5);
     let count = bright.inspect(|r| assert!(warned(r))).count();

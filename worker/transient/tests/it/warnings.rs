@@ -1,4 +1,4 @@
-//! What is said of renders that hold no light, or less than somebody may expect.
+//! The warnings of renders without light, or with less than a user may expect.
 
 use crate::common;
 
@@ -6,7 +6,7 @@ use common::{beam_to, grey, ok, quad, room, scene, sphere, two_only, v};
 use picofarm_scene::{Beam, Scene, Vec3};
 use picofarm_transient::Gate;
 
-/// A wall before the camera.
+/// Returns a wall in front of the camera.
 fn wall(directions: &[Vec3]) -> Scene {
     let corner = v(-2.0, -2.0, -2.0);
     let wall = quad(corner, v(4.0, 0.0, 0.0), v(0.0, 4.0, 0.0), grey(0.7));
@@ -21,7 +21,7 @@ fn says(scene: &Scene, expected: &[&str]) {
 #[test]
 fn spots_that_hit_nothing_are_named() {
     let (at, past) = (v(0.0, 0.0, -1.0), v(0.0, 0.0, 1.0));
-    // A plane wall has no light of two bounces, so a second one stands beside it.
+    // A plane wall has no light of two bounces, so there is a second one next to it.
     let both = |directions: &[Vec3]| {
         let mut scene = wall(directions);
         let (up, away) = (v(0.0, 4.0, 0.0), v(0.0, 0.0, 4.0));

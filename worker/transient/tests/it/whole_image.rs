@@ -1,5 +1,5 @@
-//! The stated error of the whole image against its scatter over seeds: light that comes through a door or
-//! between slats, and patterns so fine that a pixel sees several of their squares.
+//! The stated error of the whole image versus its spread over seeds: light that enters through a
+//! door or between slats, and patterns so fine that a pixel sees several of their squares.
 
 use crate::bench_scenes as scenes;
 
@@ -12,7 +12,7 @@ const SIZE: u32 = 24;
 const SEEDS: u64 = 40;
 const PASSES: u32 = 8;
 
-/// Scatter over seeds over what is stated, both in the quadratic mean.
+/// Returns the ratio of the spread over seeds to the stated error, both as quadratic means.
 fn true_over_stated(name: &str) -> f64 {
     let rooms = scenes::all(SIZE).into_iter();
     let (_, room) = rooms.filter(|(of, _)| of == name).last().unwrap();
@@ -53,7 +53,7 @@ fn the_error_of_the_whole_image_holds_behind_doors_and_slats_and_over_fine_squar
         "squares-7",
     ];
     let ratios = rooms.map(true_over_stated);
-    // 40 seeds know the scatter to 11 %, those of six rooms to 5 %.
+    // With 40 seeds the spread is known to 11 %, and that of six rooms to 5 %.
     for (name, ratio) in rooms.iter().zip(ratios) {
         assert!((0.67..1.33).contains(&ratio), "{name}: {ratio}");
     }

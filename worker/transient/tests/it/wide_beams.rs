@@ -1,5 +1,6 @@
-//! Beams with a width: how wide their spots are, what they light at edges, by way of mirrors and through glass, and the light that comes from
-//! them, beside beams without a width drawn at random from the same Gaussian.
+//! Beams with a width: the width of their spots, their light at edges, via mirrors and through
+//! glass, and the light scattered from the spots, compared with beams without a width drawn at
+//! random from the same Gaussian.
 
 use crate::common;
 
@@ -35,13 +36,14 @@ fn wall(z: f32) -> picofarm_scene::Object {
     )
 }
 
-/// Energy of each pixel.
+/// Returns the energy of each pixel.
 fn pixels(r: &Rendered) -> Vec<f64> {
     let bins = r.gate.bins as usize;
     r.transient.chunks(bins).map(energy).collect()
 }
 
-/// Mean and mean square deviation of where the light is, in pixels, columns and rows.
+/// Returns the mean and the mean square deviation of the light's position, in pixels, by column and
+/// row.
 fn spread(r: &Rendered) -> ([f64; 2], [f64; 2]) {
     let all = pixels(r);
     let sum: f64 = all.iter().sum();
@@ -64,7 +66,7 @@ fn spread(r: &Rendered) -> ([f64; 2], [f64; 2]) {
     (mean, square)
 }
 
-/// A scene seen through so many degrees.
+/// Returns a scene seen with a field of view of `degrees`.
 fn narrow(mut s: Scene, degrees: f32) -> Scene {
     let i = &mut s.camera.intrinsics;
     *i = picofarm_scene::Intrinsics::from_fov(degrees, i.width, i.height);
@@ -85,14 +87,14 @@ fn a_spot_is_as_wide_as_its_beam_at_every_distance() {
         assert!((share - 1.0).abs() < 2e-3, "{share}");
         let (_, square) = spread(&r);
         let pixel = f64::from(z / s.camera.intrinsics.fx);
-        // Two coordinates, each of a quarter of the diameter; a pixel's own width is spread over.
+        // Two coordinates, each with a quarter of the diameter, and blurred by a pixel's own width.
         let sigma = ((square[0] + square[1]) / 2.0 - 1.0 / 12.0).sqrt() * pixel;
         let expected = 0.25e-3 * libm::hypot(beam.diameter_mm, beam.divergence_mrad * f64::from(z));
         assert!(
             (sigma / expected - 1.0).abs() < 0.01,
             "{z}: {sigma} {expected}"
         );
-        // Spots and truth are the middle's.
+        // Spots and truth are those of the beam's middle.
         assert_eq!(r.spots, point.spots);
         assert_eq!(r.truth.visibility, point.truth.visibility);
     }
@@ -102,7 +104,8 @@ fn a_spot_is_as_wide_as_its_beam_at_every_distance() {
 fn a_beam_at_an_edge_lights_both_sides_by_the_share_of_it_that_meets_each() {
     let beam = width(40.0, 0.0, 64);
     let sigma = 0.01f32;
-    // Energy on a plate that ends `off` standard deviations to the right of the beam's middle, and on the wall behind.
+    // Returns the energy on a plate that ends `off` standard deviations to the right of the beam's
+    // middle, and on the wall behind.
     let lit = |off: f32| {
         let plate = quad(
             v(-1.0 + off * sigma, -1.0, -2.0),
@@ -111,7 +114,8 @@ fn a_beam_at_an_edge_lights_both_sides_by_the_share_of_it_that_meets_each() {
             grey(0.5),
         );
         let mut s = scene(vec![wall(-3.0), plate], 64, &[v(0.0, 0.0, -1.0)]);
-        // Beside the laser, so that the plate hides nothing of the wall that it leaves lit.
+        // The camera is next to the laser, so that the plate does not hide the lit part of the
+        // wall.
         s.camera.origin = v(0.5, 0.0, 0.0);
         let r = ok(&s, &one(Some(beam)));
         let between = r.gate.bin(5.0).expect("within the gate") as usize;
@@ -134,7 +138,7 @@ fn a_beam_at_an_edge_lights_both_sides_by_the_share_of_it_that_meets_each() {
 
 #[test]
 fn mirrors_fold_each_ray_and_glass_takes_from_each() {
-    // A mirror at 45 degrees sends the beam, after 2 m, to a wall 3 m to the right.
+    // A mirror at 45 degrees reflects the beam, after 2 m, to a wall 3 m to the right.
     let mirror = Material {
         bsdf: Bsdf::RoughConductor {
             reflectance: 1.0,
@@ -156,7 +160,7 @@ fn mirrors_fold_each_ray_and_glass_takes_from_each() {
         grey(0.5),
     );
     let mut s = scene(vec![tilted, right], 512, &[v(0.0, 0.0, -1.0)]);
-    // Look at the wall.
+    // The camera looks at the wall.
     s.camera = picofarm_scene::Camera::look_at(
         v(0.0, 0.0, -2.0),
         v(3.0, 0.0, -2.0),
@@ -175,7 +179,7 @@ fn mirrors_fold_each_ray_and_glass_takes_from_each() {
     let sigma = ((square[0] + square[1]) / 2.0 - 1.0 / 12.0).sqrt() * pixel;
     let expected = 0.25e-3 * 12.0 * 5.0;
     assert!((sigma / expected - 1.0).abs() < 0.01, "{sigma} {expected}");
-    // A pane that the left half of a beam meets takes its share of it.
+    // A pane in the left half of a beam absorbs its share of that half.
     let glass = Material {
         bsdf: Bsdf::ThinDielectric {
             ior: 1.0,
@@ -190,7 +194,7 @@ fn mirrors_fold_each_ray_and_glass_takes_from_each() {
         v(0.0, 2.0, 0.0),
         glass,
     );
-    // Light comes back beside the pane: the camera stands to the right.
+    // Light returns past the pane, because the camera is to the right.
     let mut s = scene(vec![wall(-2.0), pane], 256, &[v(0.0, 0.0, -1.0)]);
     s.camera.origin = v(0.8, 0.0, 0.0);
     let lit = |beam| energy(&ok(&s, &one(Some(beam))).transient);
@@ -203,7 +207,7 @@ fn mirrors_fold_each_ray_and_glass_takes_from_each() {
     assert!((share - 0.625).abs() < 0.03, "{share}");
 }
 
-/// Two normal numbers (Box and Muller), of a generator of our own.
+/// Returns two normal numbers (Box and Muller) from a local generator.
 fn normal(state: &mut u64) -> [f64; 2] {
     let mut uniform = || {
         *state = state
@@ -220,7 +224,8 @@ fn normal(state: &mut u64) -> [f64; 2] {
 
 #[test]
 fn light_from_a_wide_spot_is_that_of_point_spots_drawn_from_the_same_beam() {
-    // A spot 2 cm wide (1/e²) whose middle is 5 mm from a step of the wall: a third of it falls onto the step.
+    // A spot 2 cm wide (1/e²) with its middle 5 mm from a step of the wall: a third of it falls
+    // onto the step.
     let beam = width(12.0, 8.0, 64);
     let step = quad(
         v(0.005, -3.0, -2.0),
@@ -268,7 +273,7 @@ fn light_from_a_wide_spot_is_that_of_point_spots_drawn_from_the_same_beam() {
     let mut all = vec![];
     for seed in 0..DRAWS {
         let mut one = s.clone();
-        // Place and angle are independent of each other in a Gaussian beam.
+        // Position and angle are independent of each other in a Gaussian beam.
         let ([x, y], [a, b]) = (normal(&mut state), normal(&mut state));
         one.laser.origin = v(0.003 * x as f32, 0.003 * y as f32, 0.0);
         one.laser.beams[0].direction = v(0.002 * a as f32, 0.002 * b as f32, -1.0).normalized();
@@ -289,13 +294,14 @@ fn light_from_a_wide_spot_is_that_of_point_spots_drawn_from_the_same_beam() {
             "part {part}: wide {wide:.5}, drawn {drawn:.5} ± {error:.5}, a point {:.5}",
             point[part]
         );
-        // 64 rays know shares to about a hundredth.
+        // With 64 rays, fractions are precise to about a hundredth.
         assert!(
             (wide - drawn).abs() < 3.5 * error + 0.01 * drawn,
             "part {part}: wide {wide}, drawn {drawn} ± {error}"
         );
     }
-    // Without a width the left half of the image has other light by far: the test can tell.
+    // Without a width, the light in the left half of the image is very different, so the test can
+    // detect a difference.
     let drawn = all.iter().map(|a| a[1]).sum::<f64>() / DRAWS as f64;
     assert!((point[1] / drawn - 1.0).abs() > 0.1, "{} {drawn}", point[1]);
 }
@@ -325,7 +331,7 @@ fn a_beam_of_almost_no_width_is_a_beam_without_one() {
     let of = |beam| pixels(&ok(&s, &Settings { beam, ..two_only() }));
     let (thin, none) = (of(Some(width(1e-3, 0.0, 16))), of(None));
     for (a, b) in thin.iter().zip(&none) {
-        // Other places within the pixels.
+        // The positions within the pixels differ.
         assert!((a - b).abs() <= 0.01 * b, "{a} {b}");
     }
     let (thin, whole): (f64, f64) = (thin.iter().sum(), none.iter().sum());
@@ -348,7 +354,7 @@ fn widths_that_cannot_be_used_are_refused_by_their_field() {
     assert!(error.contains("beam.diameter_mm"), "{error}");
     let error = refused(&s, width(1.0, 0.0, 65));
     assert!(error.contains("beam.points"), "{error}");
-    // A spot that is stated where the beam ends is taken; one elsewhere is not.
+    // A stated spot is used if it is where the beam ends, and not otherwise.
     let end: Vec3 = ok(&s, &two_only()).spots[0].expect("a spot").point;
     s.laser.beams = vec![beam_to(end, v(0.0, 0.0, 1.0), 4)];
     let set = Settings {
@@ -363,7 +369,7 @@ fn widths_that_cannot_be_used_are_refused_by_their_field() {
         error.contains("laser.beams[0].spot") && error.contains("drop the spot"),
         "{error}"
     );
-    // More point sources than arrivals can name.
+    // More point sources than arrivals can index.
     s.laser.beams = vec![s.laser.beams[0]; 1025];
     s.laser.beams.iter_mut().for_each(|b| b.spot = None);
     let error = refused(&s, width(5.0, 0.0, 64));

@@ -1,7 +1,9 @@
-//! What the camera sees by reflection and refraction at glass, from the camera's side: paths whose leg at the camera is bent
-//! ([`super::light::Bends`]). They are connected to spots by a straight leg; where the leg at the spot is bent too, to
-//! vertices of light paths. Where no leg is straight, camera path and light path are taken to meet where their ends are closer than
-//! [`MEET`].
+//! Light that the camera sees by reflection and refraction at glass, traced from the camera's side:
+//! paths with a bent leg at the camera ([`super::light::Bends`]).
+//!
+//! They are connected to spots by a straight leg. If the leg at the spot is bent too, they are
+//! connected to vertices of light paths. If no leg is straight, a camera path and a light path are
+//! joined if their ends are closer than [`MEET`].
 
 use std::f64::consts::PI;
 
@@ -13,41 +15,44 @@ use super::{
     tree::Vertex,
 };
 
-/// Which of its straight legs connects a path that is bent at both ends. Each gives the same energy.
+/// The straight leg that connects a path with bent legs at both ends. Each choice gives the same
+/// energy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Connects {
-    /// The one nearest to the spot: before it the light path is bent in all legs.
+    /// The straight leg nearest to the spot: all earlier legs of the light path are bent.
     NearestToSpot,
-    /// The one nearest to the camera.
+    /// The straight leg nearest to the camera.
     NearestToCamera,
 }
 
-/// How far apart the ends of a camera path and of a light path are at most, metres, where no leg is straight.
+/// The maximum distance between the ends of a camera path and of a light path, metres, if no leg is
+/// straight.
 const MEET: f64 = 0.03;
 
-/// Which legs of a path are bent.
+/// The bent legs of a path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Ends {
-    /// The one at the camera, and not the one at the spot.
+    /// The leg at the camera, and not the one at the spot.
     Camera,
-    /// Both, but not all.
+    /// Both end legs, but not all legs.
     Both,
-    /// All.
+    /// All legs.
     All,
 }
 
-/// What a camera path found.
+/// The contribution of a camera path.
 #[derive(Debug, Clone, Copy)]
 pub struct Found {
     pub pixel: usize,
     /// Three bounces and more.
     pub more: bool,
     pub ends: Ends,
-    /// Share of the mean.
+    /// Contribution to the mean.
     pub value: f64,
 }
 
-/// Radiance towards `back` by the flux of a light path that ends near by, spread over a disc.
+/// Returns the radiance towards `back` from the flux of a light path that ends nearby, spread over
+/// a disc.
 fn meeting(x: &Vertex, back: P, a: &Arrival) -> f64 {
     let to = a.at.p - x.p;
     let near = to.length() < MEET && to.dot(x.n).abs() < 1e-2 && x.n.dot(a.at.n) > 0.9;
@@ -58,7 +63,8 @@ fn meeting(x: &Vertex, back: P, a: &Arrival) -> f64 {
 }
 
 impl Tracer {
-    /// Vertices of `paths` light paths, bent in their first leg, to connect camera paths to.
+    /// Returns vertices of `paths` light paths, bent in their first leg, to connect camera paths
+    /// to.
     pub fn lights(
         &self,
         sources: &[Source],
@@ -83,8 +89,8 @@ impl Tracer {
         all
     }
 
-    /// `samples` camera paths that are bent in their first leg, nine in ten through the pixels of `likely`. `lights` are those
-    /// of [`Tracer::lights`] for the same connection.
+    /// Traces `samples` camera paths that are bent in their first leg, nine in ten through the
+    /// pixels of `likely`. `lights` are the result of [`Tracer::lights`] for the same connection.
     pub fn past_glass(
         &self,
         (sources, lights, connects): (&[Source], &[Arrival], Connects),
@@ -134,7 +140,7 @@ impl Tracer {
                     found(bounces + 1, Ends::Camera, beta * self.lit(&at, back, s));
                 }
                 if connects == Connects::NearestToSpot || !bends.straight {
-                    // Three vertices at least.
+                    // The path has three vertices at least.
                     found(3, Ends::Both, beta * self.joined(&at, back, lights, rng));
                 }
                 let pair = [rng.next(), rng.next()];
@@ -153,8 +159,9 @@ impl Tracer {
         }
     }
 
-    /// Radiance towards `back` by light that comes straight from the vertices of light paths: one of them is drawn by what it
-    /// would bring if nothing stood between, so that pairs that nearly touch bring no more than others.
+    /// Returns the radiance towards `back` from light that arrives straight from the vertices of
+    /// light paths. One of them is drawn by its unoccluded contribution, so that pairs that nearly
+    /// touch contribute no more than others.
     fn joined(&self, x: &Vertex, back: P, lights: &[Arrival], rng: &mut Noise) -> f64 {
         let brings = |a: &Arrival| {
             let to = a.at.p - x.p;

@@ -1,5 +1,6 @@
-//! An independent renderer of small scenes: f64, no hierarchy, no shared code with the renderer. Rays are
-//! tested against every triangle; integrals are quadrature or plain path tracing.
+//! An independent renderer of small scenes in f64, without a hierarchy and without code shared with
+//! the renderer. Rays are tested against every triangle; integrals are computed by quadrature or
+//! plain path tracing.
 
 use std::f64::consts::PI;
 
@@ -56,7 +57,7 @@ impl From<Vec3> for P {
     }
 }
 
-/// A surface point: place, unit normal on the side it was seen from, scattering.
+/// A surface point: position, unit normal on the side it was seen from, scattering.
 #[derive(Debug, Clone, Copy)]
 pub struct Point {
     pub p: P,
@@ -89,7 +90,7 @@ impl Brute {
         }
     }
 
-    /// The first surface along a ray, beyond 1e-7.
+    /// Returns the first surface along a ray, beyond 1e-7.
     pub fn hit(&self, o: P, d: P) -> Option<Point> {
         let mut best: Option<Point> = None;
         for (v, n, bsdf) in &self.triangles {
@@ -117,12 +118,13 @@ impl Brute {
         best
     }
 
-    /// True where nothing stands between two points (their own surfaces apart).
+    /// Returns true if nothing occludes the segment between two points (except their own surfaces).
     pub fn free(&self, a: P, b: P) -> bool {
         self.hit(a, b - a).is_none_or(|h| h.t > 1.0 - 1e-7)
     }
 
-    /// What the camera sees at a film position: surface point, and unit direction back.
+    /// Returns the surface point that the camera sees at a film position, and the unit direction
+    /// back.
     pub fn seen(&self, x: f64, y: f64) -> Option<(Point, P)> {
         let c = &self.scene.camera;
         let i = &c.intrinsics;
@@ -134,7 +136,8 @@ impl Brute {
         Some((hit, d.unit() * -1.0))
     }
 
-    /// Beam `k`'s spot: place, normal, direction back to the laser, scattering, path.
+    /// Returns beam `k`'s spot: position, normal, direction back to the laser, scattering, path
+    /// length.
     pub fn spot(&self, k: usize) -> (Point, P, f64) {
         let s = self.scene.laser.beams[k].spot.expect("a stated spot");
         let bsdf = self.scene.objects[s.object as usize].mesh.materials[s.material as usize].bsdf;
@@ -147,8 +150,8 @@ impl Brute {
         (point, P::from(s.arriving) * -1.0, f64::from(s.path_m))
     }
 
-    /// Radiance from `x` towards `wo` by one scattering of the light of spot `k`: value and path from the
-    /// laser to `x`.
+    /// Returns the radiance from `x` towards `wo` by one scattering of the light of spot `k`: its
+    /// value and the path length from the laser to `x`.
     pub fn lit(&self, x: &Point, wo: P, k: usize) -> (f64, f64) {
         let (s, back, path) = self.spot(k);
         let to = s.p - x.p;
@@ -162,7 +165,8 @@ impl Brute {
         (f(x.bsdf, x.n, wo, w) * cx * intensity / (d * d), path + d)
     }
 
-    /// Mean over a pixel of a function of what it sees, by `n`×`n` midpoints; 0 where nothing.
+    /// Calls `value` with the surface point seen at each of `n`×`n` midpoints of a pixel, and the
+    /// direction back. Midpoints without a surface are skipped.
     pub fn pixel(&self, col: usize, row: usize, n: usize, mut value: impl FnMut(&Point, P)) {
         for k in 0..n * n {
             let at = |i: usize| (i as f64 + 0.5) / n as f64;
@@ -172,8 +176,9 @@ impl Brute {
         }
     }
 
-    /// Plain path tracing with cosine-distributed directions: mean radiance of the image by number of
-    /// bounces (index 2, 3, …) and its standard errors, from `paths` camera paths.
+    /// Plain path tracing with cosine-distributed directions. Returns the mean radiance of the
+    /// image by number of bounces (index 2, 3, …) and its standard errors, from `paths` camera
+    /// paths.
     pub fn trace(&self, longest: usize, paths: usize, seed: u64) -> Vec<(f64, f64)> {
         let i = self.scene.camera.intrinsics;
         let mut rng = Noise(seed);
@@ -207,7 +212,7 @@ impl Brute {
     }
 }
 
-/// Exactly two bounces by quadrature: `[pixel][bin]`.
+/// Returns exactly two bounces by quadrature: `[pixel][bin]`.
 pub fn two_by_quadrature(s: &Scene, g: &Gate, n: usize) -> Vec<f64> {
     let brute = Brute::new(s);
     let i = s.camera.intrinsics;
@@ -228,7 +233,7 @@ pub fn two_by_quadrature(s: &Scene, g: &Gate, n: usize) -> Vec<f64> {
     all
 }
 
-/// The BRDF, 1/sr, for unit directions that leave the surface.
+/// Returns the BRDF, 1/sr, for unit directions that leave the surface.
 pub fn f(bsdf: Bsdf, n: P, i: P, o: P) -> f64 {
     match bsdf {
         Bsdf::Diffuse { reflectance } => f64::from(reflectance) / PI,

@@ -1,4 +1,5 @@
-//! The renderer's energy against the independent tracer's, by regions of the image and by bounces.
+//! Compares the renderer's energy with the independent tracer's, by regions of the image and by
+//! bounces.
 
 use picofarm_scene::Scene;
 use picofarm_transient::{Budget, Gate, Settings};
@@ -10,11 +11,11 @@ use super::{
     ok, settings,
 };
 
-/// Estimates that know nothing of each other, on both sides.
+/// The number of independent estimates on each side.
 pub const BATCHES: u64 = 16;
 pub const PARTS: [&str; 2] = ["two", "more"];
 
-/// `[region][part]`: regions are other pixels, pixels of spots, and a third kind.
+/// `[region][part]`: the regions are other pixels, pixels of spots, and a third kind.
 pub type Sums = [[f64; 2]; 3];
 pub type Energies = [[Energy; 2]; 3];
 
@@ -22,7 +23,7 @@ pub fn effort() -> usize {
     whole("PICOFARM_EFFORT", "1") as usize
 }
 
-/// Which of many runs that know nothing of each other this is.
+/// Returns the index of this run among independent runs.
 pub fn run() -> u64 {
     whole("PICOFARM_RUN", "0")
 }
@@ -41,7 +42,8 @@ pub fn joined(batches: &[Sums]) -> Energies {
     })
 }
 
-/// The region of each pixel: 1 where it holds a spot, 2 where a ray through one of nine points of it is of the third kind.
+/// Returns the region of each pixel: 1 if it contains a spot, 2 if a ray through one of nine points
+/// of it is of the third kind.
 pub fn regions(
     tracer: &Tracer,
     sources: &[Source],
@@ -96,7 +98,7 @@ pub fn rendered(scene: &Scene, regions: &[usize], effort: usize) -> Energies {
     joined(&batches)
 }
 
-/// Prints both sides, and fails where they differ by more than four standard errors and 0.05 %.
+/// Prints both sides, and fails if they differ by more than four standard errors and 0.05 %.
 #[track_caller]
 pub fn alike(name: &str, third: &str, parts: usize, ours: &Energies, theirs: &Energies) {
     let names = ["other pixels", "pixels of spots", third];
@@ -105,7 +107,7 @@ pub fn alike(name: &str, third: &str, parts: usize, ours: &Energies, theirs: &En
         let rows = (0..3).map(|k| (names[k], ours[k][part], theirs[k][part]));
         let whole = all(theirs).mean;
         for (region, a, b) in rows.chain([("whole image", all(ours), all(theirs))]) {
-            // Far tails of lobes: far below what a sum of f32 holds.
+            // Far tails of lobes, far below the precision of a sum of f32.
             if a.mean.max(b.mean) < 1e-9 * whole {
                 continue;
             }

@@ -1,5 +1,5 @@
-//! Glass in the independent tracer: what thin panes and bodies reflect and let through, the legs of paths with them, and the
-//! spots of the beams that they split.
+//! Glass in the independent tracer: reflection and transmission of thin panes and bodies, the path
+//! legs that cross them, and the spots of the beams that they split.
 
 use picofarm_scene::Bsdf;
 
@@ -9,10 +9,11 @@ use super::{
     tree::{NONE, Vertex},
 };
 
-/// Parts of beams with a smaller share of the power are left out.
+/// The minimum share of a beam's power for a part of the beam to be followed.
 const LEAST_SHARE: f64 = 1.0 / 256.0;
 
-/// Fresnel's reflectance of one face, by polarisation (s, p): indices before and behind it, cosine of the angle before it.
+/// Returns Fresnel's reflectance of one face, by polarisation (s, p), from the indices before and
+/// behind it and the cosine of the angle before it.
 pub fn fresnel(from: f64, to: f64, cos: f64) -> [f64; 2] {
     let sin2 = (from / to).powi(2) * (1.0 - cos * cos);
     if sin2 >= 1.0 {
@@ -26,15 +27,15 @@ pub fn fresnel(from: f64, to: f64, cos: f64) -> [f64; 2] {
     ]
 }
 
-/// What a pane does with light.
+/// The fractions of light that a pane transmits and reflects.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shares {
     pub passes: f64,
     pub reflects: f64,
 }
 
-/// What thin glass does with light that meets its front or its back: reflections to and fro between the faces, summed one by
-/// one, polarisations apart.
+/// Returns the transmission and reflection of thin glass for light on its front or its back:
+/// inter-reflections between the faces, summed one by one, with polarisations separate.
 pub fn pane(glass: Bsdf, cos: f64, front: bool) -> Shares {
     let Bsdf::ThinDielectric {
         ior,
@@ -51,7 +52,7 @@ pub fn pane(glass: Bsdf, cos: f64, front: bool) -> Shares {
     };
     for r in fresnel(1.0, f64::from(ior), cos) {
         whole.reflects += 0.5 * r;
-        // Within the pane, before its further face.
+        // Light within the pane, before it reaches its far face.
         let mut within = 1.0 - r;
         for _ in 0..10_000 {
             whole.passes += 0.5 * tint * within * (1.0 - r);
@@ -75,20 +76,21 @@ pub fn pane(glass: Bsdf, cos: f64, front: bool) -> Shares {
     }
 }
 
-/// A direction after reflection at a surface of normal `n`.
+/// Returns a direction after reflection at a surface of normal `n`.
 pub fn mirrored(d: P, n: P) -> P {
     (d - n * (2.0 * n.dot(d))).unit()
 }
 
-/// A direction after refraction at a surface of normal `n`, which faces it; `None` for total reflection.
+/// Returns a direction after refraction at a surface with normal `n`, which faces the direction, or
+/// `None` for total reflection.
 pub fn refracted(d: P, n: P, from: f64, to: f64) -> Option<P> {
-    // Snell: the part along the surface shrinks by the ratio of the indices.
+    // Snell: the component along the surface shrinks by the ratio of the indices.
     let along = (d - n * n.dot(d)) * (from / to);
     let rest = 1.0 - along.dot(along);
     (rest > 0.0).then(|| (along - n * rest.sqrt()).unit())
 }
 
-/// Indices before and behind a surface of glass that light meets.
+/// Returns the indices before and behind a glass surface that light hits.
 fn indices(at: &Vertex, ior: f32) -> (f64, f64) {
     let body = f64::from(ior);
     if at.front { (1.0, body) } else { (body, 1.0) }
@@ -97,9 +99,11 @@ fn indices(at: &Vertex, ior: f32) -> (f64, f64) {
 /// How legs are drawn.
 #[derive(Debug, Clone, Copy)]
 pub struct Draw {
-    /// Radiance is carried, from the camera's side: refraction scales it by the squared ratio of the indices. Otherwise flux.
+    /// True if radiance is carried, from the camera's side: refraction scales it by the squared
+    /// ratio of the indices. Otherwise flux is carried.
     pub camera: bool,
-    /// Panes reflect half of the legs that are straight so far: for those who look for bent ones.
+    /// True if panes reflect half of the legs that are straight so far, for callers that search for
+    /// bent ones.
     pub bend: bool,
 }
 
@@ -118,16 +122,16 @@ impl Draw {
     }
 }
 
-/// The way to the next surface that is no glass.
+/// A leg of a path, up to the next surface other than glass.
 #[derive(Debug, Clone, Copy)]
 pub struct Leg {
     pub end: Vertex,
     /// Unit direction of arrival.
     pub d: P,
-    /// Its share of what started, over its chance.
+    /// Its fraction of the initial value, divided by its probability.
     pub weight: f64,
     pub reflections: u32,
-    /// Reflected at glass, or through a body's surface.
+    /// Whether it was reflected at glass, or refracted at a body's surface.
     pub bent: bool,
     /// Optical length, metres, and the index of refraction at its end.
     pub length: f64,
@@ -135,7 +139,8 @@ pub struct Leg {
 }
 
 impl Tracer {
-    /// A leg along a ray that starts in a medium of an index of refraction. At glass chance decides.
+    /// Draws a leg along a ray that starts in a medium with an index of refraction. Reflection or
+    /// transmission at glass is decided at random.
     pub fn leg(
         &self,
         (mut p, mut d): (P, P),
@@ -145,7 +150,7 @@ impl Tracer {
     ) -> Option<Leg> {
         let (mut left, mut weight, mut length) = (NONE, 1.0, 0.0);
         let (mut reflections, mut bent) = (0, false);
-        // Without a lottery: light may run round within a body for long, and loses nothing.
+        // Without Russian roulette: light may circulate within a body for long, and loses nothing.
         for _ in 0..LONGEST {
             let surface = self.tree.hit_but(p, d, f64::INFINITY, left);
             let limit = surface.map_or(f64::INFINITY, |s| s.t);
@@ -205,7 +210,7 @@ impl Tracer {
         None
     }
 
-    /// Whether a ray from the camera meets glass first.
+    /// Returns whether a ray from the camera hits glass first.
     pub fn meets_glass(&self, d: P) -> bool {
         let hit = self.tree.hit(self.origin(), d, f64::INFINITY);
         let limit = hit.map_or(f64::INFINITY, |h| h.t);
@@ -213,8 +218,9 @@ impl Tracer {
         body || self.tree.pane(self.origin(), d, limit, NONE).is_some()
     }
 
-    /// The spots of beam `k`: as the beam states it, or by following the beam. It folds at near-mirrors by exact reflection; at
-    /// glass it goes on, and a part of it is reflected. What goes on comes first.
+    /// Returns the spots of beam `k`: the stated spot, or the spots found by following the beam.
+    /// The beam is folded at near-mirrors by exact reflection. At glass it is transmitted, and a
+    /// part of it is reflected. The transmitted part comes first.
     pub fn sources(&self, k: usize) -> Vec<Source> {
         let beam = &self.scene.laser.beams[k];
         if let Some(s) = beam.spot {
@@ -233,7 +239,8 @@ impl Tracer {
         all
     }
 
-    /// The spots of a part of a beam with this share of its power, after at most `more` surfaces.
+    /// Adds the spots of a part of a beam with this share of its power, after at most `more`
+    /// surfaces.
     fn follow(&self, (p, d): (P, P), left: usize, share: f64, more: u32, all: &mut Vec<Source>) {
         if share < LEAST_SHARE || more == 0 {
             return;

@@ -1,4 +1,4 @@
-//! Glass of tests: materials, and things of it.
+//! Glass for tests: materials and objects.
 
 use picofarm_scene::{Bsdf, Material, Object, Vec3};
 
@@ -22,7 +22,7 @@ pub fn body(ior: f32, transmittance: f32) -> Material {
     }
 }
 
-/// The same with its normals turned.
+/// Returns the object with its normals flipped.
 pub fn inverted(o: &Object) -> Object {
     let turned = |t: &[u32; 3]| [t[0], t[2], t[1]];
     object(
@@ -33,7 +33,7 @@ pub fn inverted(o: &Object) -> Object {
     )
 }
 
-/// Two objects of one material as one: both surfaces of a vessel.
+/// Joins two objects of one material into one: both surfaces of a vessel.
 pub fn together(a: &Object, b: &Object) -> Object {
     let (mut positions, mut triangles) = (a.mesh.positions.clone(), a.mesh.triangles.clone());
     let first = positions.len() as u32;
@@ -42,7 +42,8 @@ pub fn together(a: &Object, b: &Object) -> Object {
     object("vessel", positions, triangles, a.mesh.materials[0].clone())
 }
 
-/// A box, seen from outside, turned by an angle around the vertical through its middle. One object: a body.
+/// Returns a box, seen from outside, rotated by an angle around the vertical through its middle. As
+/// one object, it is a body.
 pub fn cuboid(middle: Vec3, half: Vec3, angle: f32, m: Material) -> Object {
     let (s, c) = angle.sin_cos();
     let (x, y, z) = (

@@ -1,7 +1,10 @@
-//! An independent tracer in f64. Light paths start at a spot, scatter as the surfaces do, and each vertex that is no
-//! near-mirror is connected to the camera. What the camera sees in near-mirrors comes from the camera's side: the glint of a
-//! spot by points drawn around its mirror image, all else by camera paths (both in [`super::seen`]). Glass is in
-//! [`super::glass`], what the camera sees by its reflection and refraction in [`super::bent`]. It shares no code with the
+//! An independent tracer in f64.
+//!
+//! Light paths start at a spot and scatter as the surfaces do, and each vertex outside near-mirrors
+//! is connected to the camera. Light that the camera sees in near-mirrors is traced from the
+//! camera's side: the glint of a spot by points drawn around its mirror image, all other light by
+//! camera paths (both in [`super::seen`]). Glass is in [`super::glass`], and light that the camera
+//! sees by its reflection and refraction in [`super::bent`]. The tracer shares no code with the
 //! renderer.
 
 use std::f64::consts::PI;
@@ -22,7 +25,7 @@ pub struct Energy {
 }
 
 impl Energy {
-    /// From estimates of equal weight that know nothing of each other.
+    /// Returns the mean and error of independent estimates of equal weight.
     pub fn of(all: &[f64]) -> Self {
         let n = all.len() as f64;
         let mean = all.iter().sum::<f64>() / n;
@@ -42,7 +45,7 @@ impl std::ops::Add for Energy {
     }
 }
 
-/// Bounces of the longest light paths: few get as far.
+/// Maximum bounces of light paths. Few reach it.
 pub const LONGEST: u32 = 400;
 
 /// Surfaces in f64 and a camera.
@@ -51,7 +54,8 @@ pub struct Tracer {
     pub scene: Scene,
 }
 
-/// Where light starts: a point in f64 that f32 could not hold, its normal, and the object whose first material it has.
+/// The start of light: a point in f64 that f32 could not represent, its normal, and the object of
+/// its material, which is the object's first.
 #[derive(Debug, Clone, Copy)]
 pub struct Start {
     pub p: P,
@@ -59,7 +63,7 @@ pub struct Start {
     pub object: usize,
 }
 
-/// A spot: place, normal, unit direction back along the beam, scattering.
+/// A spot: position, normal, unit direction back along the beam, scattering.
 #[derive(Debug, Clone, Copy)]
 pub struct Source {
     pub p: P,
@@ -69,7 +73,7 @@ pub struct Source {
 }
 
 impl Source {
-    /// Radiant intensity per unit power towards a unit direction.
+    /// Returns the radiant intensity per unit power towards a unit direction.
     pub fn intensity(&self, w: P) -> f64 {
         let c = self.n.dot(w);
         if c > 0.0 {
@@ -80,7 +84,8 @@ impl Source {
     }
 }
 
-/// The roughness of a near-mirror: beams are folded there, and the camera's side takes over.
+/// Returns the roughness of a near-mirror. Beams are folded at near-mirrors, and the camera's side
+/// takes over.
 pub fn mirror(bsdf: Bsdf) -> Option<f64> {
     match bsdf {
         Bsdf::RoughConductor { alpha, .. } if alpha <= 0.1 => Some(f64::from(alpha)),
@@ -92,17 +97,18 @@ pub fn is_mirror(bsdf: Bsdf) -> bool {
     mirror(bsdf).is_some()
 }
 
-/// Which legs of a path so far are bent: reflected at glass, or refracted. A leg is the way between two vertices.
+/// The bent legs of a path so far: reflected at glass, or refracted. A leg is the part of a path
+/// between two vertices.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Bends {
     pub first: bool,
     pub any: bool,
-    /// Whether one of them is not.
+    /// Whether any leg is not bent.
     pub straight: bool,
 }
 
 impl Bends {
-    /// After one more leg.
+    /// Returns the state after one more leg.
     pub fn and(self, bent: bool) -> Self {
         let none = !self.any && !self.straight;
         Self {
@@ -113,7 +119,8 @@ impl Bends {
     }
 }
 
-/// Where a light path arrives: vertex, direction back, flux, bounces up to and with this one, its legs.
+/// The arrival of a light path: vertex, direction back, flux, bounces up to and including this one,
+/// its legs.
 #[derive(Debug, Clone, Copy)]
 pub struct Arrival {
     pub at: Vertex,
@@ -124,7 +131,7 @@ pub struct Arrival {
 }
 
 impl Arrival {
-    /// The laser's, at a spot.
+    /// Returns the arrival of the laser at a spot.
     pub fn at_spot(s: &Source) -> Self {
         Self {
             at: Vertex {
@@ -143,17 +150,17 @@ impl Arrival {
     }
 }
 
-/// What the camera sees of a light path's vertex, by a straight leg.
+/// The camera's view of a light path's vertex, by a straight leg.
 #[derive(Debug, Clone, Copy)]
 pub struct Seen {
     pub pixel: usize,
     /// Three bounces and more.
     pub more: bool,
-    /// Share of the mean.
+    /// Contribution to the mean.
     pub value: f64,
-    /// Of the vertex.
+    /// Scattering of the vertex.
     pub bsdf: Bsdf,
-    /// The legs but that at the camera.
+    /// The legs except the one at the camera.
     pub bends: Bends,
 }
 
@@ -169,7 +176,7 @@ impl Tracer {
         P::from(self.scene.camera.origin)
     }
 
-    /// The film position of a point, pixels; `None` outside of the image.
+    /// Returns the film position of a point, pixels, or `None` outside the image.
     pub fn film(&self, p: P) -> Option<(f64, f64)> {
         let c = &self.scene.camera;
         let i = &c.intrinsics;
@@ -181,7 +188,7 @@ impl Tracer {
         (depth > 0.0 && inside).then_some((x, y))
     }
 
-    /// The unit direction of a film position.
+    /// Returns the unit direction of a film position.
     pub fn ray(&self, (x, y): (f64, f64)) -> P {
         let c = &self.scene.camera;
         let i = &c.intrinsics;
@@ -190,19 +197,19 @@ impl Tracer {
         (P::from(c.right) * right + P::from(c.down) * down + P::from(c.forward)).unit()
     }
 
-    /// Pixels of the film that a unit of solid angle covers in the direction `w` from the camera.
+    /// Returns the pixels of the film per unit of solid angle in the direction `w` from the camera.
     pub fn pixels_per_steradian(&self, w: P) -> f64 {
         let i = &self.scene.camera.intrinsics;
         let cos = P::from(self.scene.camera.forward).dot(w);
         f64::from(i.fx) * f64::from(i.fy) / cos.powi(3)
     }
 
-    /// Index of the pixel at a film position.
+    /// Returns the index of the pixel at a film position.
     pub fn pixel(&self, (x, y): (f64, f64)) -> usize {
         y as usize * self.scene.camera.intrinsics.width as usize + x as usize
     }
 
-    /// What a vertex of unit flux sends to the camera: the sum over the pixels of the radiance they see, and the pixel.
+    /// Returns the pixel that sees a vertex of unit flux, and the radiance summed over the pixels.
     fn seen(&self, v: &Vertex, back: P) -> Option<(usize, f64)> {
         let film = self.film(v.p)?;
         let to = v.p - self.origin();
@@ -220,8 +227,8 @@ impl Tracer {
         })
     }
 
-    /// Energy of the image by exactly two bounces, and by three and more, of the light of beam `k` that starts at `start`;
-    /// near-mirrors as any other surface.
+    /// Returns the energy of the image by exactly two bounces, and by three and more, of the light
+    /// of beam `k` that starts at `start`. Near-mirrors are treated like any other surface.
     pub fn energies(&self, k: usize, start: Start, paths: usize, seed: u64) -> [Energy; 2] {
         const BATCHES: usize = 50;
         let spot = self.scene.laser.beams[k].spot.expect("a stated spot");
@@ -245,7 +252,8 @@ impl Tracer {
         [0, 1].map(|part| Energy::of(&batches.iter().map(|b| b[part]).collect::<Vec<_>>()))
     }
 
-    /// Light paths from a source, as [`Tracer::arrivals`] draws them. Each vertex that the camera sees is told to `add`.
+    /// Traces light paths from a source, as [`Tracer::arrivals`] draws them. Calls `add` with each
+    /// vertex that the camera sees.
     pub fn carry(
         &self,
         source: &Source,
@@ -267,8 +275,9 @@ impl Tracer {
         });
     }
 
-    /// `paths` light paths from a source, of `longest` bounces at most, their first directions stratified. `visit` is told each
-    /// vertex after the source, and says whether the path goes on.
+    /// Traces `paths` light paths from a source, of `longest` bounces at most, with stratified
+    /// first directions. Calls `visit` with each vertex after the source; it returns whether the
+    /// path continues.
     pub fn arrivals(
         &self,
         source: &Source,
@@ -328,7 +337,7 @@ impl Tracer {
     }
 }
 
-/// Two unit vectors at right angles to `n` and to each other.
+/// Returns two unit vectors at right angles to `n` and to each other.
 pub fn frame(n: P) -> (P, P) {
     let side = if n.0.abs() > 0.7 {
         P(0.0, 1.0, 0.0)
@@ -339,8 +348,8 @@ pub fn frame(n: P) -> (P, P) {
     (t, n.cross(t))
 }
 
-/// A direction and f·cos/pdf from two numbers of [0, 1): cosine-distributed for Lambertians, by Beckmann's half vectors for
-/// conductors.
+/// Returns a direction and f·cos/pdf from two numbers in [0, 1): cosine-distributed for Lambertian
+/// surfaces, by Beckmann's half vectors for conductors.
 pub fn scatter(v: &Vertex, back: P, [a, b]: [f64; 2]) -> Option<(P, f64)> {
     let mut alpha = None;
     if let Bsdf::RoughConductor {

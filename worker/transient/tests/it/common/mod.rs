@@ -1,4 +1,4 @@
-//! Helpers of the integration tests: small scenes, settings, and the reference transients.
+//! Helpers for the integration tests: small scenes, settings, and the reference transients.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
 pub mod bent;
@@ -22,7 +22,7 @@ use picofarm_transient::{
     Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelength, render,
 };
 
-/// Lets every render run to its end.
+/// Lets every render run to completion.
 pub struct Quiet;
 
 impl Progress for Quiet {
@@ -35,7 +35,7 @@ pub fn v(x: f32, y: f32, z: f32) -> Vec3 {
     Vec3::new(x, y, z)
 }
 
-/// The data sets' gate.
+/// Returns the gate of the data sets.
 pub fn gate() -> Gate {
     Gate {
         start_m: 1.0,
@@ -60,7 +60,7 @@ pub fn settings(budget: Budget) -> Settings {
     }
 }
 
-/// A grey two-sided Lambertian.
+/// Returns a grey two-sided Lambertian material.
 pub fn grey(reflectance: f32) -> Material {
     Material {
         name: "grey".into(),
@@ -88,13 +88,13 @@ pub fn object(name: &str, positions: Vec<Vec3>, triangles: Vec<[u32; 3]>, m: Mat
     }
 }
 
-/// A parallelogram: corner and two edges; its front is on the side of a × b.
+/// Returns a parallelogram from a corner and two edges. Its front is on the side of a × b.
 pub fn quad(corner: Vec3, a: Vec3, b: Vec3, m: Material) -> Object {
     let positions = vec![corner, corner + a, corner + a + b, corner + b];
     object("quad", positions, vec![[0, 1, 2], [0, 2, 3]], m)
 }
 
-/// A sphere from a subdivided octahedron.
+/// Returns a sphere from a subdivided octahedron.
 pub fn sphere(centre: Vec3, radius: f32, levels: u32, m: Material) -> Object {
     let axis = [
         v(1.0, 0.0, 0.0),
@@ -135,7 +135,7 @@ pub fn sphere(centre: Vec3, radius: f32, levels: u32, m: Material) -> Object {
     object("sphere", positions, triangles, m)
 }
 
-/// The six walls of a box, seen from inside, all of one material.
+/// Returns the six walls of a box, seen from inside, all of one material.
 pub fn room(low: Vec3, high: Vec3, m: &Material) -> Vec<Object> {
     let s = high - low;
     let (x, y, z) = (v(s.x, 0.0, 0.0), v(0.0, s.y, 0.0), v(0.0, 0.0, s.z));
@@ -149,7 +149,7 @@ pub fn room(low: Vec3, high: Vec3, m: &Material) -> Vec<Object> {
     ]
 }
 
-/// A scene with a camera at the origin that looks along −z and a laser in the same place.
+/// Returns a scene with a camera at the origin that looks along −z and a laser at the same place.
 pub fn scene(objects: Vec<Object>, size: u32, directions: &[Vec3]) -> Scene {
     let intrinsics = Intrinsics::from_fov(90.0, size, size);
     let camera = Camera::look_at(Vec3::ZERO, v(0.0, 0.0, -1.0), intrinsics);
@@ -176,7 +176,7 @@ pub fn energy(h: &[f32]) -> f64 {
     h.iter().map(|&x| f64::from(x)).sum()
 }
 
-/// Two bounces only.
+/// Returns settings for two bounces only.
 pub fn two_only() -> Settings {
     Settings {
         max_bounces: Some(2),
@@ -184,12 +184,12 @@ pub fn two_only() -> Settings {
     }
 }
 
-/// A Lambertian that scatters nothing.
+/// Returns a Lambertian material that scatters nothing.
 pub fn black() -> Material {
     grey(0.0)
 }
 
-/// A beam that ends on a stated spot, with the laser at the origin.
+/// Returns a beam that ends on a stated spot, with the laser at the origin.
 pub fn beam_to(point: Vec3, normal: Vec3, object: u32) -> Beam {
     Beam {
         direction: point.normalized(),
@@ -204,8 +204,8 @@ pub fn beam_to(point: Vec3, normal: Vec3, object: u32) -> Beam {
     }
 }
 
-/// A camera at `origin` whose image is just the parallelogram that `corner`, `right` and `down` span (at
-/// right angles to each other, seen at a right angle).
+/// Returns a camera at `origin`. Its image is exactly the parallelogram that `corner`, `right` and
+/// `down` span (at right angles to each other, seen at a right angle).
 pub fn framed(origin: Vec3, corner: Vec3, right: Vec3, down: Vec3, (w, h): (u32, u32)) -> Camera {
     let (r, d) = (right.normalized(), down.normalized());
     let forward = r.cross(d);
@@ -230,12 +230,12 @@ pub fn framed(origin: Vec3, corner: Vec3, right: Vec3, down: Vec3, (w, h): (u32,
     }
 }
 
-/// Renders what must render.
+/// Renders a scene, and fails if there is an error.
 pub fn ok(scene: &Scene, settings: &Settings) -> Rendered {
     render(scene, settings, &Quiet).unwrap()
 }
 
-/// Energy of the 3+ part and the standard error of the whole.
+/// Returns the energy of the 3+ part and the standard error of the whole.
 pub fn multi_energy(r: &Rendered) -> (f64, f64) {
     let se = f64::from(r.error.total_relative) * energy(&r.transient);
     (energy(&r.split.as_ref().unwrap().multi), se)

@@ -1,4 +1,4 @@
-//! Just enough of numpy's .npz to read the references: little-endian f2, f4 and f8 in C order.
+//! A minimal reader of numpy's .npz for the references: little-endian f2, f4 and f8 in C order.
 
 use std::{fs::File, io::Read, path::Path};
 

@@ -1,4 +1,5 @@
-//! The reference scenes and transients beside the workspace, and how to compare with them.
+//! The reference scenes and transients in a folder next to the workspace, and the comparison with
+//! them.
 
 use std::path::PathBuf;
 
@@ -18,7 +19,8 @@ fn folder() -> PathBuf {
         .join("../../../shared/reference/transients")
 }
 
-/// The scene `name`; `None`, with a message, where the references are not beside the workspace.
+/// Returns the scene `name`, or prints a message and returns `None` if the references are not next
+/// to the workspace.
 pub fn load(name: &str) -> Option<(Scene, Value)> {
     let path = folder().join(format!("{name}.json"));
     let Ok(text) = std::fs::read_to_string(&path) else {
@@ -29,7 +31,7 @@ pub fn load(name: &str) -> Option<(Scene, Value)> {
     Some((build(&json), json))
 }
 
-/// Part `two` or `multi` of the reference.
+/// Returns part `two` or `multi` of the reference.
 pub fn part(name: &str, which: &str) -> Part {
     let path = folder().join(format!("{name}_64.npz"));
     let scale = npz::read(&path, &format!("{which}_se_scale"))[0];
@@ -110,26 +112,26 @@ fn build(json: &Value) -> Scene {
     scene
 }
 
-/// How a part compares with its reference.
+/// The comparison of a part with its reference.
 #[derive(Debug)]
 pub struct Report {
     /// Median over pixels of ‖h − r‖/‖r‖.
     pub median: f64,
-    /// The same of the reference's own standard error.
+    /// Median over pixels of the reference's own standard error, relative like `median`.
     pub reference_median: f64,
     /// Σh/Σr.
     pub ratio: f64,
-    /// Standard error of the ratio, both sides counted.
+    /// Standard error of the ratio, including both sides' errors.
     pub ratio_se: f64,
-    /// Root mean square of the deviation over groups of 8×8 pixels × 13 bins, in units of its expected
-    /// value, both variances counted.
+    /// Root mean square of the deviation over groups of 8×8 pixels × 13 bins, in units of its
+    /// expected value, including both variances.
     pub z_rms: f64,
     /// Largest deviation in units of the reference's standard error.
     pub z_max: f64,
 }
 
-/// Compares a 64×64×637 part and a draw of its error (`None` = small beside the reference's) with the
-/// reference.
+/// Compares a 64×64×637 part and a draw of its error with the reference. `None` means that the
+/// error is small compared to the reference's.
 pub fn compare(h: &[f32], noise: Option<&[f32]>, r: &Part) -> Report {
     let bins = 637;
     let (mut errors, mut noises) = (vec![], vec![]);
@@ -168,7 +170,7 @@ pub fn compare(h: &[f32], noise: Option<&[f32]>, r: &Part) -> Report {
                         reference += f64::from(r.mean[i]);
                     }
                 }
-                // Groups share little: their own errors may be added as independent.
+                // Groups have little in common, so their errors are added as independent.
                 variance += own * own + theirs;
                 if theirs > 0.0 {
                     let z2_here = d * d / theirs;

@@ -1,4 +1,4 @@
-//! What the camera sees in near-mirrors, from the camera's side: see [`super::light`].
+//! Light that the camera sees in near-mirrors, traced from the camera's side: see [`super::light`].
 
 use std::f64::consts::PI;
 
@@ -8,7 +8,8 @@ use super::{
     tree::Vertex,
 };
 
-/// Angles of the lobes around mirror images, radians: any lobe of a near-mirror lies within.
+/// Range of angles of the lobes around mirror images, radians. It includes any lobe of a
+/// near-mirror.
 const ANGLES: [f64; 2] = [1e-6, PI];
 
 /// A facet of a near-mirror and a spot that both the camera and the facet's lit side may see.
@@ -16,24 +17,24 @@ struct Pair<'a> {
     corners: [P; 3],
     area: f64,
     source: &'a Source,
-    /// Where a perfect mirror in the facet's plane would show the spot.
+    /// The position at which a perfect mirror in the facet's plane would show the spot.
     glint: P,
-    /// How far from it the lobe reaches, metres.
+    /// The radius of the lobe around `glint`, metres.
     reach: f64,
-    /// The sum of the chances of all pairs up to this one.
+    /// The sum of the probabilities of all pairs up to this one.
     chance: f64,
 }
 
-/// A plane that near-mirrors lie in: a point and a unit normal.
+/// A plane that contains near-mirrors: a point and a unit normal.
 type Plane = (P, P);
 
-/// The mirror image of a point in a plane.
+/// Returns the mirror image of a point in a plane.
 fn image(p: P, (o, n): Plane) -> P {
     p - n * (2.0 * (p - o).dot(n))
 }
 
 impl Tracer {
-    /// Corners, unit normal, area and roughness of the facets of near-mirrors.
+    /// Returns the corners, unit normal, area and roughness of the facets of near-mirrors.
     fn facets(&self) -> Vec<([P; 3], P, f64, f64)> {
         let mut facets = vec![];
         for o in &self.scene.objects {
@@ -49,7 +50,7 @@ impl Tracer {
         facets
     }
 
-    /// The planes of all near-mirrors, each once.
+    /// Returns the planes of all near-mirrors, each once.
     fn planes(&self) -> Vec<Plane> {
         let mut planes: Vec<Plane> = vec![];
         for (v, n, ..) in self.facets() {
@@ -63,8 +64,9 @@ impl Tracer {
         planes
     }
 
-    /// Exactly two bounces, the second on a near-mirror: `samples` points on facets, drawn around the glints of the spots and
-    /// evenly. Each is told to `add` with its pixel and share of the mean.
+    /// Samples exactly two bounces, the second on a near-mirror: `samples` points on facets, drawn
+    /// around the glints of the spots and evenly. Calls `add` for each with its pixel and
+    /// contribution to the mean.
     pub fn glints(
         &self,
         sources: &[Source],
@@ -130,7 +132,7 @@ impl Tracer {
                 let angle = 2.0 * PI * rng.next();
                 *glint + t * (r * angle.cos()) + u * (r * angle.sin())
             };
-            // Barycentric coordinates by areas.
+            // Barycentric coordinates from areas.
             let part = |a: P, b: P| (a - p).cross(b - p).dot(n);
             let inside = part(corners[0], corners[1]) >= 0.0
                 && part(corners[1], corners[2]) >= 0.0
@@ -144,7 +146,7 @@ impl Tracer {
             if self.tree.hit(origin, w, limit).is_some() {
                 continue;
             }
-            // The facet itself, for its side's scattering.
+            // The hit on the facet itself, for the scattering of its side.
             let Some(vertex) = self.tree.hit(origin, w, to.length() * (1.0 + 1e-9)) else {
                 continue;
             };
@@ -158,7 +160,7 @@ impl Tracer {
         }
     }
 
-    /// Radiance towards `wo` by one scattering of a spot's light.
+    /// Returns the radiance towards `wo` by one scattering of a spot's light.
     pub fn lit(&self, x: &Vertex, wo: P, source: &Source) -> f64 {
         let to = source.p - x.p;
         let d = to.length();
@@ -176,8 +178,9 @@ impl Tracer {
         }
     }
 
-    /// Three bounces and more, the last on a near-mirror that the camera sees: `samples` camera paths, nine in ten through
-    /// the pixels of `likely`. From other surfaces half of the directions are drawn around the mirror images of the spots.
+    /// Samples three bounces and more, the last on a near-mirror that the camera sees: `samples`
+    /// camera paths, nine in ten through the pixels of `likely`. From other surfaces, half of the
+    /// directions are drawn around the mirror images of the spots.
     pub fn through_mirrors(
         &self,
         sources: &[Source],
@@ -233,7 +236,7 @@ impl Tracer {
     }
 }
 
-/// Film positions: nine in ten in pixels of a list, the others anywhere.
+/// Film positions: nine in ten are in pixels of a list, the others anywhere.
 pub struct Films<'a> {
     likely: &'a [usize],
     listed: Vec<bool>,
@@ -256,10 +259,11 @@ impl<'a> Films<'a> {
         }
     }
 
-    /// One of `samples` positions, and its share of the sum over the pixels of their means.
+    /// Returns one of `samples` positions, and its weight in the sum over the pixels of their
+    /// means.
     pub fn draw(&self, sample: usize, samples: usize, rng: &mut Noise) -> ((f64, f64), f64) {
         let (chosen, pixels) = (self.chosen, self.listed.len() as f64);
-        // Pixels in turn, so that each gets its share.
+        // Pixels are taken in turn, so that each gets its share.
         let turn = (sample as f64 + rng.next()) / samples as f64;
         let pixel = if turn < chosen {
             self.likely[(turn / chosen * self.likely.len() as f64) as usize]
@@ -278,7 +282,8 @@ impl<'a> Films<'a> {
     }
 }
 
-/// A direction and f·cos/pdf: half of them cosine-distributed, half around the directions of `images`.
+/// Returns a direction and f·cos/pdf: half of the directions are cosine-distributed, half are
+/// around the directions of `images`.
 fn toward(v: &Vertex, back: P, images: &[P], pair: [f64; 2], rng: &mut Noise) -> Option<(P, f64)> {
     let spread = (ANGLES[1] / ANGLES[0]).ln();
     let w = if rng.next() < 0.5 {

@@ -1,13 +1,14 @@
-//! Triangles in f64 and a tree over them: the independent tracers' own, which shares no code with the renderer's.
+//! Triangles in f64 and a tree over them, for the independent tracers. It shares no code with the
+//! renderer.
 
 use picofarm_scene::{Bsdf, Scene};
 
 use super::{brute::P, glass};
 
-/// Triangles in a leaf, at most.
+/// The maximum number of triangles in a leaf.
 const LEAF: usize = 4;
 
-/// One triangle: corners, unit normal, what scatters on its front and on its back.
+/// One triangle: corners, unit normal, scattering of its front and of its back.
 #[derive(Clone, Copy)]
 struct Triangle {
     corners: [P; 3],
@@ -15,7 +16,8 @@ struct Triangle {
     sides: [Bsdf; 2],
 }
 
-/// Bounds, and either the place of the second child (the first follows its parent) or a range of triangles.
+/// Bounds, and either the index of the second child (the first follows its parent) or a range of
+/// triangles.
 struct Node {
     low: [f64; 3],
     high: [f64; 3],
@@ -23,8 +25,8 @@ struct Node {
     range: std::ops::Range<usize>,
 }
 
-/// A surface point: place, unit normal on the side it was met from, scattering there, distance; whether that side is the
-/// triangle's front, and which triangle it is.
+/// A surface point: position, unit normal on the side that was hit, its scattering, distance,
+/// whether that side is the triangle's front, and the triangle's index.
 #[derive(Debug, Clone, Copy)]
 pub struct Vertex {
     pub p: P,
@@ -35,14 +37,14 @@ pub struct Vertex {
     pub triangle: usize,
 }
 
-/// A binary tree of boxes, split at the median, and the glass beside it.
+/// A binary tree of boxes, split at the median, and a separate list of glass panes.
 pub struct Tree {
     nodes: Vec<Node>,
     triangles: Vec<Triangle>,
     panes: Vec<Triangle>,
 }
 
-/// No triangle.
+/// The index that stands for no triangle.
 pub const NONE: usize = usize::MAX;
 
 impl Tree {
@@ -85,7 +87,7 @@ impl Tree {
         }
     }
 
-    /// Share of light that the glass between two points lets through.
+    /// Returns the fraction of light that the glass between two points transmits.
     pub fn through(&self, a: P, b: P) -> f64 {
         let way = b - a;
         let d = way.unit();
@@ -96,7 +98,8 @@ impl Tree {
         })
     }
 
-    /// The first pane of thin glass along a unit direction, nearer than `limit` and other than `left`.
+    /// Returns the first pane of thin glass along a unit direction, nearer than `limit` and other
+    /// than `left`.
     pub fn pane(&self, o: P, d: P, limit: f64, left: usize) -> Option<Vertex> {
         let (mut nearest, mut best) = (limit, None);
         for (k, pane) in self.panes.iter().enumerate() {
@@ -111,12 +114,12 @@ impl Tree {
         best.map(|(k, pane)| pane.vertex(k, (o, d), nearest))
     }
 
-    /// The first surface along a unit direction, beyond 1e-11 and nearer than `limit`.
+    /// Returns the first surface along a unit direction, beyond 1e-11 and nearer than `limit`.
     pub fn hit(&self, o: P, d: P, limit: f64) -> Option<Vertex> {
         self.hit_but(o, d, limit, NONE)
     }
 
-    /// The same among the triangles other than `left`: the one that the ray leaves.
+    /// Like `hit`, among the triangles other than `left`, the one that the ray leaves.
     pub fn hit_but(&self, o: P, d: P, limit: f64, left: usize) -> Option<Vertex> {
         let (origin, inverse) = ([o.0, o.1, o.2], [1.0 / d.0, 1.0 / d.1, 1.0 / d.2]);
         let (mut nearest, mut best) = (limit, None);
@@ -147,7 +150,7 @@ impl Tree {
         best.map(|k| self.triangles[k].vertex(k, (o, d), nearest))
     }
 
-    /// True where nothing stands between two points.
+    /// Returns true if nothing occludes the segment between two points.
     pub fn free(&self, a: P, b: P) -> bool {
         let d = (b - a).length();
         self.hit(a, (b - a) * (1.0 / d), d * (1.0 - 1e-9)).is_none()
@@ -155,7 +158,7 @@ impl Tree {
 }
 
 impl Triangle {
-    /// The point of triangle `k`, which is this one, at a distance along a ray.
+    /// Returns the point at a distance along a ray, on this triangle, which has index `k`.
     fn vertex(&self, k: usize, (o, d): (P, P), t: f64) -> Vertex {
         let front = self.normal.dot(d) <= 0.0;
         Vertex {
@@ -191,7 +194,7 @@ impl Node {
         for k in 0..3 {
             let a = (self.low[k] - origin[k]) * inverse[k];
             let b = (self.high[k] - origin[k]) * inverse[k];
-            // A ray within a side's plane has NaN here: `max` and `min` leave it out.
+            // A ray in the plane of a side gives NaN here, which `max` and `min` ignore.
             enter = enter.max(a.min(b));
             leave = leave.min(a.max(b));
         }
