@@ -94,13 +94,15 @@ pub struct Global {
     /// Settings file [default: picofarm.toml here, else in the user's configuration folder]
     #[arg(long, global = true, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// URL of the coordinator; of several on one catalog, with commas between [env: PICOFARM_COORDINATOR]
+    /// URL of the coordinator; of several on one catalog, with commas between [env:
+    /// PICOFARM_COORDINATOR]
     #[arg(long, global = true, value_name = "URL")]
     pub coordinator: Option<String>,
     /// Folder with furniture assets [env: PICOFARM_ASSETS]
     #[arg(long, global = true, value_name = "DIR")]
     pub assets_dir: Option<PathBuf>,
-    /// Certificate authority of the coordinator, PEM [default: those of the system] [env: PICOFARM_CA]
+    /// Certificate authority of the coordinator, PEM [default: those of the system] [env:
+    /// PICOFARM_CA]
     #[arg(long, global = true, value_name = "FILE")]
     pub ca: Option<PathBuf>,
     /// Own certificate for coordinators that want one, PEM [env: PICOFARM_CERT]
@@ -109,7 +111,8 @@ pub struct Global {
     /// Private key of --cert, PEM [env: PICOFARM_KEY]
     #[arg(long, global = true, value_name = "FILE")]
     pub key: Option<PathBuf>,
-    /// File with the token that proves who you are; or set PICOFARM_TOKEN [env: PICOFARM_TOKEN_FILE]
+    /// File with the token that proves who you are; or set PICOFARM_TOKEN [env:
+    /// PICOFARM_TOKEN_FILE]
     #[arg(long, global = true, value_name = "FILE")]
     pub token_file: Option<PathBuf>,
     /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
@@ -177,9 +180,11 @@ pub enum Command {
     /// Make, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),
-    /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm: mesh, density and errors
+    /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm: mesh, density
+    /// and errors
     Reconstruct(Reconstruct),
-    /// Take one flash apart by physics: depth, and which pixels each spot lights, from the histogram of all spots at once
+    /// Take one flash apart by physics: depth, and which pixels each spot lights, from the
+    /// histogram of all spots at once
     Demultiplex(Demultiplex),
     /// Say who may use a coordinator
     #[command(subcommand)]
@@ -214,7 +219,8 @@ pub struct Demo {
     /// Image width and height in pixels
     #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: u32,
-    /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1, right and down)
+    /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1, right
+    /// and down)
     #[arg(long, default_value = "25", value_parser = ranges::spots)]
     pub spots: Spots,
     /// Seed of the data set
@@ -229,7 +235,8 @@ pub struct Demo {
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
     pub assets: String,
-    /// Then reconstruct each room in 3D, from the depth and shadows of its ground truth: meshes, errors, pictures
+    /// Then reconstruct each room in 3D, from the depth and shadows of its ground truth: meshes,
+    /// errors, pictures
     #[arg(long)]
     pub reconstruct: bool,
     #[command(flatten)]
@@ -247,7 +254,8 @@ pub struct Up {
     /// Workers to start; they share the cores
     #[arg(long, default_value_t = 1, value_parser = ranges::workers)]
     pub workers: usize,
-    /// Graphics processors, dealt to the workers in turn: how many, or which, as `picofarm model devices` names them
+    /// Graphics processors, dealt to the workers in turn: how many, or which, as `picofarm model
+    /// devices` names them
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
     #[command(flatten)]
@@ -260,7 +268,8 @@ pub struct Up {
 
 #[derive(Args)]
 pub struct Coordinator {
-    /// The catalog: a SQLite file, for one coordinator, or the URL of a Postgres database, for several
+    /// The catalog: a SQLite file, for one coordinator, or the URL of a Postgres database, for
+    /// several
     #[arg(
         long,
         default_value = "picofarm-data/catalog.sqlite",
@@ -275,11 +284,12 @@ pub struct Coordinator {
     /// Lease time to live in seconds
     #[arg(long, default_value_t = 60.0, value_name = "S", value_parser = ranges::lease)]
     pub lease_s: f64,
-    /// Forget jobs this many days after their end, with their history; results stay in their stores [default: never]
+    /// Forget jobs this many days after their end, with their history; results stay in their stores
+    /// [default: never]
     #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
-    /// Verify results in stores below this path or URL (give it again for more), or in none [default: in folders of this
-    /// machine; no host is asked]
+    /// Verify results in stores below this path or URL (give it again for more), or in none
+    /// [default: in folders of this machine; no host is asked]
     #[arg(
         long,
         value_name = "URL|none",
@@ -297,7 +307,8 @@ pub struct Coordinator {
 
 #[derive(Args)]
 pub struct Traces {
-    /// Send traces to an OpenTelemetry collector by OTLP over gRPC, e.g. http://127.0.0.1:4317 [default: nowhere]
+    /// Send traces to an OpenTelemetry collector by OTLP over gRPC, e.g. http://127.0.0.1:4317
+    /// [default: nowhere]
     #[arg(
         long,
         value_name = "URL",
@@ -321,8 +332,9 @@ impl Traces {
 
 #[derive(Args)]
 pub struct Http {
-    /// Serve /healthz, /readyz and /metrics here over plain HTTP, e.g. 127.0.0.1:7421 (port 0 = any free port; the address is
-    /// printed). Counts only, no names; whoever reaches the address may read them without a token [default: nowhere]
+    /// Serve /healthz, /readyz and /metrics here over plain HTTP, e.g. 127.0.0.1:7421 (port 0 = any
+    /// free port; the address is printed). Counts only, no names; whoever reaches the address may
+    /// read them without a token [default: nowhere]
     #[arg(long, value_name = "ADDR", env = "PICOFARM_HTTP")]
     pub http: Option<SocketAddr>,
 }
@@ -348,12 +360,12 @@ pub struct Worker {
     /// group, the Slurm job and ulimit -v leave]
     #[arg(long, value_name = "GIB", value_parser = ranges::gib)]
     pub memory_gib: Option<f64>,
-    /// Graphics processors it may use: how many, or which, as `picofarm model devices` names them (cuda:0,cuda:1). Each is tried
-    /// before it is used
+    /// Graphics processors it may use: how many, or which, as `picofarm model devices` names them
+    /// (cuda:0,cuda:1). Each is tried before it is used
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
-    /// Address of this machine at which other workers reach this one, to train a network together (`train.processes`);
-    /// whoever reaches it and can read the store can join
+    /// Address of this machine at which other workers reach this one, to train a network together
+    /// (`train.processes`); whoever reaches it and can read the store can join
     #[arg(long, value_name = "HOST[:PORT]", default_value = "127.0.0.1")]
     pub peers: String,
     /// Label that stages may ask for (give it again for more)
@@ -391,10 +403,12 @@ pub enum Dataset {
     /// Pin which scenes there are now, or see what was pinned
     #[command(subcommand)]
     Snapshot(Snapshot),
-    /// Find objects that belong to no finished scene, left by killed workers, and delete them if asked to
+    /// Find objects that belong to no finished scene, left by killed workers, and delete them if
+    /// asked to
     #[command(alias = "collect")]
     Gc(DatasetGc),
-    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set; of reconstructions, a contact sheet
+    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set; of
+    /// reconstructions, a contact sheet
     Picture {
         /// Folder or URL of the data set, or of reconstructions
         #[arg(value_parser = crate::paths::place)]
@@ -406,14 +420,16 @@ pub enum Dataset {
         #[arg(long, default_value_t = 8, value_parser = ranges::rows)]
         rows: usize,
     },
-    /// Write a page about reconstructions, and the same as JSON beside it: errors in novel views beside published ones,
-    /// meshes, the best and the worst scene
+    /// Write a page about reconstructions, and the same as JSON beside it: errors in novel views
+    /// beside published ones, meshes, the best and the worst scene
     Report(DatasetReport),
     /// Measure every scene with a sensor into another data set, without rendering; again to resume
     Reprocess(DatasetReprocess),
-    /// Pack a data set, or a part of it, into few files for sharing, or write it in the paper's layout; again to resume
+    /// Pack a data set, or a part of it, into few files for sharing, or write it in the paper's
+    /// layout; again to resume
     Export(DatasetExport),
-    /// Make a data set of the paper's release, of PlatoNeRF's or bounce-flash lidar captures, or of .npy files; again to resume
+    /// Make a data set of the paper's release, of PlatoNeRF's or bounce-flash lidar captures, or of
+    /// .npy files; again to resume
     Import(Box<DatasetImport>),
     /// Say which scenes are for training, validation and test; again to take in scenes added since
     Split(DatasetSplit),
@@ -423,7 +439,8 @@ pub enum Dataset {
 pub enum Scene {
     /// Generate a scene from a seed and write it as .glb
     Generate {
-        /// Kind of scene; desktop is a box on a desk as laboratories have it, plato the room that reconstructions are measured in
+        /// Kind of scene; desktop is a box on a desk as laboratories have it, plato the room that
+        /// reconstructions are measured in
         #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
         kind: GeneratorArg,
         /// Seed
@@ -432,8 +449,9 @@ pub enum Scene {
         /// Where to write it
         #[arg(long, default_value = "scene.glb", value_name = "FILE")]
         out: PathBuf,
-        /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1, right and down) [default: 25; 16 in
-        /// desktop and plato rooms; plato rooms take a number up to 16]
+        /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1,
+        /// right and down) [default: 25; 16 in desktop and plato rooms; plato rooms take a number
+        /// up to 16]
         #[arg(long, value_parser = ranges::spots)]
         spots: Option<Spots>,
         /// Image width and height in pixels
@@ -453,7 +471,8 @@ pub enum Scene {
         #[command(flatten)]
         root: SceneRoot,
     },
-    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, meshes and textures beside it) or one .ply mesh
+    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, meshes and textures beside it) or
+    /// one .ply mesh
     Export(SceneExport),
     /// Render one scene file without a farm into a small Zarr group
     Render(SceneRender),
@@ -475,11 +494,12 @@ pub struct SceneExport {
     /// Format [default: by the extension of --out]
     #[arg(long, value_enum)]
     pub format: Option<FormatArg>,
-    /// Laser spots in the camera's view, in place of the file's: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to
-    /// 1, right and down)
+    /// Laser spots in the camera's view, in place of the file's: a grid of 1, 4, 16, 25 or 100;
+    /// random:N; or places as X,Y/X,Y (0 to 1, right and down)
     #[arg(long, value_parser = ranges::spots)]
     pub spots: Option<Spots>,
-    /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say otherwise
+    /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say
+    /// otherwise
     #[arg(long)]
     pub frame: bool,
 }
@@ -509,13 +529,17 @@ pub enum PlatoArg {
 
 #[derive(Subcommand)]
 pub enum Bench {
-    /// Measure the renderer: CPU time against the true error, beside a converged render of the same scene
+    /// Measure the renderer: CPU time against the true error, beside a converged render of the same
+    /// scene
     Render(BenchRender),
-    /// Measure the scheduler: durable no-op tasks a second beside the database's own limit, and fleets of simulated workers
+    /// Measure the scheduler: durable no-op tasks a second beside the database's own limit, and
+    /// fleets of simulated workers
     Queue(BenchQueue),
-    /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot, gc
+    /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot,
+    /// gc
     Dataset(BenchDataset),
-    /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of reading
+    /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of
+    /// reading
     Store(BenchStore),
     /// Measure a training step of a network on the CPU, beside other forms and other programs
     Model(BenchModel),
@@ -523,7 +547,8 @@ pub enum Bench {
 
 #[derive(Args)]
 pub struct BenchQueue {
-    /// The catalog: a SQLite file or the URL of a Postgres database [default: a new SQLite file that is removed after]
+    /// The catalog: a SQLite file or the URL of a Postgres database [default: a new SQLite file
+    /// that is removed after]
     #[arg(
         long,
         value_name = "FILE|URL",
@@ -560,13 +585,15 @@ pub struct BenchQueue {
     /// Tasks a worker of a fleet
     #[arg(long, default_value_t = 3)]
     pub rounds: u64,
-    /// Kill the coordinator in the middle of a fleet's run and start another: all workers come back at once
+    /// Kill the coordinator in the middle of a fleet's run and start another: all workers come back
+    /// at once
     #[arg(long)]
     pub restart: bool,
     /// Lease time to live in seconds
     #[arg(long, default_value_t = 60.0, value_name = "S", value_parser = ranges::lease)]
     pub lease_s: f64,
-    /// Forget jobs this many days after their end, with their history; results stay in their stores [default: never]
+    /// Forget jobs this many days after their end, with their history; results stay in their stores
+    /// [default: never]
     #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
 }

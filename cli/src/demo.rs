@@ -98,14 +98,16 @@ async fn taken(task: &RenderTask) -> Result<bool> {
     Ok(recipes.iter().any(|recipe| *recipe != key))
 }
 
-/// Whether a job is refused for the data set that it names. Of several stages, the field begins with the stage's name.
+/// Whether a job is refused for the data set that it names. Of several stages, the field begins
+/// with the stage's name.
 fn is_of_dataset(error: &CliError) -> bool {
     let field = error.field.as_deref();
     field.is_some_and(|field| field.ends_with("output.dataset"))
 }
 
-/// Submits the demo. Where its data set is another demo's, whose furniture, resolution, spots or samples were others, it
-/// gets one of its own, whose name is always the same for the same settings.
+/// Submits the demo. Where its data set is another demo's, whose furniture, resolution, spots or
+/// samples were others, it gets one of its own, whose name is always the same for the same
+/// settings.
 async fn submit(
     client: &mut Client,
     mut task: RenderTask,

@@ -93,8 +93,9 @@ async fn identity_of(place: &str, create: bool) -> Result<Option<String>, String
 /// Number of manifests of a data set that are read to check its settings.
 const LOOKED_AT: usize = 8;
 
-/// Counts in a plan the scenes that lie in their store although the coordinator knows nothing of them: workers take over those
-/// of exactly these settings. Gives a line for each stage of which only some of the scenes looked at are.
+/// Counts in a plan the scenes that lie in their store although the coordinator knows nothing of
+/// them: workers take over those of exactly these settings. Gives a line for each stage of which
+/// only some of the scenes looked at are.
 pub async fn there(spec: &JobSpec, plan: &mut JobPlan) -> Vec<String> {
     let stages = spec.stages.iter().zip(&mut plan.stages);
     let asked = stages

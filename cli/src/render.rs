@@ -375,8 +375,8 @@ struct Beside {
     data: Vec<f32>,
 }
 
-/// Takes the groups out of the render, one run of values for each array. Each group is let go as soon as it is copied, so that
-/// histograms of a hundred spots never lie in memory twice.
+/// Takes the groups out of the render, one run of values for each array. Each group is let go as
+/// soon as it is copied, so that histograms of a hundred spots never lie in memory twice.
 fn beside(rendered: &mut Rendered, order: &Order) -> Vec<Beside> {
     let one = rendered.transient.len();
     let mut groups = std::mem::take(&mut rendered.groups).into_iter();

@@ -54,8 +54,8 @@ pub struct Outputs {
     pub explained: u64,
 }
 
-/// What submitting `spec` would do, given its hash, what is known of each stage's outputs, the job that has this spec, and
-/// recent jobs, latest first, to compare with.
+/// What submitting `spec` would do, given its hash, what is known of each stage's outputs, the job
+/// that has this spec, and recent jobs, latest first, to compare with.
 pub fn plan(
     spec: &JobSpec,
     hash: &str,
@@ -100,8 +100,8 @@ pub fn plan(
     }
 }
 
-/// Why tasks of a stage run or do not, given how many outputs there are, and of how many more it is known why they do not
-/// count.
+/// Why tasks of a stage run or do not, given how many outputs there are, and of how many more it is
+/// known why they do not count.
 fn reasons(
     stage: &StageSpec,
     total: u64,

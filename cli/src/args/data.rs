@@ -16,19 +16,22 @@ pub struct SensorArgs {
     /// Sensor settings (TOML); the options below go before them
     #[arg(long, value_name = "FILE")]
     pub sensor: Option<PathBuf>,
-    /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw it from [default: 10..400]
+    /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw it from
+    /// [default: 10..400]
     #[arg(long, value_name = "LOW..HIGH")]
     pub peak_photons: Option<String>,
     /// Photons for a unit of the transient, instead of a peak
     #[arg(long, value_name = "N", conflicts_with = "peak_photons")]
     pub photons_per_unit: Option<f64>,
-    /// Pulse: fwhm:PS (Gaussian rise, exponential tail) or none; measured pulses go into --sensor [default: fwhm:128]
+    /// Pulse: fwhm:PS (Gaussian rise, exponential tail) or none; measured pulses go into --sensor
+    /// [default: fwhm:128]
     #[arg(long, value_name = "PULSE")]
     pub pulse: Option<String>,
     /// Timing jitter, full width at half maximum in picoseconds [default: 50]
     #[arg(long, value_name = "PS")]
     pub jitter_ps: Option<f64>,
-    /// Jitter as in the published code: the pulse is shifted by floor(N(0, 2.654)) bins, once a scene
+    /// Jitter as in the published code: the pulse is shifted by floor(N(0, 2.654)) bins, once a
+    /// scene
     #[arg(long, conflicts_with = "jitter_ps")]
     pub jitter_sb3d: bool,
     /// Ambient and dark counts, photons a bin (before --rebin) [default: 0]
@@ -40,7 +43,8 @@ pub struct SensorArgs {
     /// Write the expected photons instead of drawing counts
     #[arg(long)]
     pub no_poisson: bool,
-    /// Pile-up: at most one photon a pixel and pulse is seen, of so many pulses [default: all photons are]
+    /// Pile-up: at most one photon a pixel and pulse is seen, of so many pulses [default: all
+    /// photons are]
     #[arg(long, value_name = "pulses:N")]
     pub dead_time: Option<String>,
 }
@@ -61,10 +65,12 @@ pub struct DatasetReprocess {
     pub spots: Vec<u32>,
     #[command(flatten)]
     pub sensor: SensorArgs,
-    /// Drop the bins that --rebin leaves over at the end of the gate; otherwise it must divide the bins
+    /// Drop the bins that --rebin leaves over at the end of the gate; otherwise it must divide the
+    /// bins
     #[arg(long)]
     pub drop_left_over: bool,
-    /// Codec: counts-u16, sqrt-u16, coarse, plain-f32 or lossless [default: counts-u16, with --no-poisson sqrt-u16]
+    /// Codec: counts-u16, sqrt-u16, coarse, plain-f32 or lossless [default: counts-u16, with
+    /// --no-poisson sqrt-u16]
     #[arg(long, value_name = "NAME")]
     pub profile: Option<String>,
     /// Chooses another draw of the same noise
@@ -90,7 +96,8 @@ pub struct DatasetReport {
 
 #[derive(Args)]
 pub struct BenchStore {
-    /// Folder or URL of a data set with the profile lossless to take scenes from, instead of rendering some
+    /// Folder or URL of a data set with the profile lossless to take scenes from, instead of
+    /// rendering some
     #[arg(long, value_name = "DATASET", value_parser = crate::paths::place, conflicts_with_all = ["keep", "resolution", "samples", "seed"])]
     pub from: Option<String>,
     /// Number of scenes
@@ -105,7 +112,8 @@ pub struct BenchStore {
     /// Seed of the rooms
     #[arg(long, default_value_t = 11, value_parser = super::ranges::whole)]
     pub seed: u64,
-    /// Render into this folder and keep it: the next run with it renders nothing [default: a folder that is removed after]
+    /// Render into this folder and keep it: the next run with it renders nothing [default: a folder
+    /// that is removed after]
     #[arg(long, value_name = "DIR")]
     pub keep: Option<PathBuf>,
     /// Leave out how fast scenes are read
@@ -143,7 +151,8 @@ pub struct DatasetExport {
     /// Folder or URL for the export
     #[arg(value_parser = crate::paths::place)]
     pub dest: String,
-    /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
+    /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default:
+    /// all]
     #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
     pub scenes: Option<Scenes>,
     /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves
@@ -207,7 +216,8 @@ bf-lidar: with --captures sum, t2.mat and two_bounce_detections.mat beside the c
 /// What overrides the files, or what their format is known for.
 #[derive(Args, Clone, Default)]
 pub struct ImportArgs {
-    /// Path of light at the start of the first bin, metres (sb3d, platonerf); bf-lidar: from where to keep bins
+    /// Path of light at the start of the first bin, metres (sb3d, platonerf); bf-lidar: from where
+    /// to keep bins
     #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub gate_start_m: Option<f64>,
     /// Width of a bin, metres of path (sb3d, platonerf, bf-lidar)
@@ -237,7 +247,8 @@ pub struct ImportArgs {
     /// Time of arrival at no distance, seconds (bf-lidar)
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     pub t0_s: Option<f64>,
-    /// Captures of single spots: each a scene, or all of a folder summed into one (platonerf, bf-lidar)
+    /// Captures of single spots: each a scene, or all of a folder summed into one (platonerf,
+    /// bf-lidar)
     #[arg(long, value_enum, default_value_t = CapturesArg::Separate)]
     pub captures: CapturesArg,
     /// No mirror folds a beam: each goes straight from the laser to its spot (sb3d, npy)

@@ -11,7 +11,8 @@ pub struct Demultiplex {
     /// Folder for the new Zarr group and picture.png (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Where the places of the spots come from: the calibration in RENDER, or each beam's own one-bounce return
+    /// Where the places of the spots come from: the calibration in RENDER, or each beam's own
+    /// one-bounce return
     #[arg(long, value_enum, default_value_t = PlacesArg::Given)]
     pub places: PlacesArg,
     /// Threads [default: all cores]

@@ -44,7 +44,8 @@ pub struct Guard {
     /// Priorities beyond this, above or below 0, are an administrator's
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub max_priority: u32,
-    /// What callers see of others' jobs: all, those of their projects (project), or nothing (own); administrators see all
+    /// What callers see of others' jobs: all, those of their projects (project), or nothing (own);
+    /// administrators see all
     #[arg(
         long,
         value_name = "WHAT",
@@ -64,11 +65,12 @@ pub struct Guard {
     /// Connections at a time, at most; never more than the limit of open files allows
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = super::ranges::at_least_one)]
     pub max_connections: usize,
-    /// Connections of one address at a time, at most; of IPv6, one /64 network [default: three quarters of all]
+    /// Connections of one address at a time, at most; of IPv6, one /64 network [default: three
+    /// quarters of all]
     #[arg(long, value_name = "N", value_parser = super::ranges::at_least_one)]
     pub max_connections_per_address: Option<usize>,
-    /// Memory that this process may use, MiB: what requests, jobs and connections may take follows from it [default: the
-    /// limit of its control group or of the machine, 4096 at most]
+    /// Memory that this process may use, MiB: what requests, jobs and connections may take follows
+    /// from it [default: the limit of its control group or of the machine, 4096 at most]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(128..=1 << 30), env = "PICOFARM_MEMORY_MIB")]
     pub memory_mib: Option<u64>,
 }

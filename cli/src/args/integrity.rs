@@ -130,10 +130,12 @@ pub enum Snapshot {
 
 #[derive(Args)]
 pub struct BenchDataset {
-    /// Folder to simulate the data set in; it must not exist, or be empty, and is removed at the end
+    /// Folder to simulate the data set in; it must not exist, or be empty, and is removed at the
+    /// end
     #[arg(long, value_name = "DIR")]
     pub dir: PathBuf,
-    /// Sizes to measure at; a scene takes some 50 inodes and, where small folders take a block each, 120 kB
+    /// Sizes to measure at; a scene takes some 50 inodes and, where small folders take a block
+    /// each, 120 kB
     #[arg(
         long,
         value_delimiter = ',',

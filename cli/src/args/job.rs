@@ -35,7 +35,8 @@ pub enum Job {
         /// Submit again although the same job failed or was cancelled
         #[arg(long, conflicts_with = "only_failed")]
         again: bool,
-        /// Only the tasks that were given up when this file was submitted before: the same as `job retry`
+        /// Only the tasks that were given up when this file was submitted before: the same as `job
+        /// retry`
         #[arg(long, conflicts_with_all = ["force", "from_stage"])]
         only_failed: bool,
         /// Run every task although its result exists; each must come out the same, byte for byte
@@ -93,7 +94,8 @@ pub enum Job {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Make a job's dead tasks pending again; with corrected scene files, in a new job that takes over what is finished
+    /// Make a job's dead tasks pending again; with corrected scene files, in a new job that takes
+    /// over what is finished
     Retry {
         /// Job id, or the first letters of one
         job: String,

@@ -27,7 +27,8 @@ pub enum Model {
         #[arg(value_parser = crate::paths::place)]
         store: String,
     },
-    /// List this machine's graphics processors, and try each: a product, a convolution and its gradients beside the CPU's
+    /// List this machine's graphics processors, and try each: a product, a convolution and its
+    /// gradients beside the CPU's
     Devices,
     /// Say what a model is, where it comes from and how good it is
     Show {
@@ -48,7 +49,8 @@ pub enum Model {
         #[arg(long, value_name = "FILE")]
         out: Option<PathBuf>,
     },
-    /// Take a network that was trained elsewhere into a store: weights by PyTorch's names, as safetensors
+    /// Take a network that was trained elsewhere into a store: weights by PyTorch's names, as
+    /// safetensors
     #[command(after_help = IMPORT_HELP)]
     Import {
         /// Folder or URL of the store
@@ -61,18 +63,21 @@ pub enum Model {
         /// Data set of the store whose histograms the network knows: its bins, gate and spots
         #[arg(long, value_name = "FOLDER")]
         dataset: String,
-        /// What the network is: a TOML file with the fields of [stage.train] (target, net, input, shadow, histogram, …)
+        /// What the network is: a TOML file with the fields of [stage.train] (target, net, input,
+        /// shadow, histogram, …)
         #[arg(long, value_name = "FILE")]
         settings: PathBuf,
     },
-    /// Check models: manifest, size and SHA-256 of each object, evaluations, checkpoints (exit code 6 where something is broken)
+    /// Check models: manifest, size and SHA-256 of each object, evaluations, checkpoints (exit code
+    /// 6 where something is broken)
     Verify {
         /// Folder or URL of the store
         store: String,
         /// Names of models [default: all]
         names: Vec<String>,
     },
-    /// Put back what is broken of a model, from bytes that have the recorded SHA-256; say which job makes the rest again
+    /// Put back what is broken of a model, from bytes that have the recorded SHA-256; say which job
+    /// makes the rest again
     #[command(after_help = REPAIR_HELP)]
     Repair {
         /// Folder or URL of the store
@@ -90,15 +95,16 @@ pub enum Model {
         store: String,
         /// Name of the model
         name: String,
-        /// Also where models or predictions build on it, its manifest cannot be read, or it is still trained
+        /// Also where models or predictions build on it, its manifest cannot be read, or it is
+        /// still trained
         #[arg(long)]
         force: bool,
         /// Only say what would be deleted, and what builds on it
         #[arg(long)]
         dry_run: bool,
     },
-    /// Write a page about models, and the same as JSON beside it: figures beside trivial answers and published ones, curves,
-    /// pictures, speed against error
+    /// Write a page about models, and the same as JSON beside it: figures beside trivial answers
+    /// and published ones, curves, pictures, speed against error
     Report {
         /// Folder or URL of the store
         #[arg(value_parser = crate::paths::place)]

@@ -45,10 +45,12 @@ pub struct BenchModel {
     /// Rows and columns of a window of attention (swinir)
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=64))]
     pub window: u32,
-    /// On a graphics processor, as `picofarm model devices` names it (a build with --features wgpu or cuda)
+    /// On a graphics processor, as `picofarm model devices` names it (a build with --features wgpu
+    /// or cuda)
     #[arg(long, value_name = "NAME")]
     pub gpu: Option<String>,
-    /// Say how far outputs and gradient are from those of the CPU in 32 bits, besides; takes a step there
+    /// Say how far outputs and gradient are from those of the CPU in 32 bits, besides; takes a step
+    /// there
     #[arg(long, requires = "gpu", conflicts_with = "record")]
     pub compare: bool,
     /// Numbers in which convolutions are computed
@@ -66,12 +68,12 @@ pub struct BenchModel {
     /// Steps of each form in a round
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: u64,
-    /// Write weights, batch, outputs, gradients and the losses of 20 steps for other programs to compare with, and do not
-    /// measure
+    /// Write weights, batch, outputs, gradients and the losses of 20 steps for other programs to
+    /// compare with, and do not measure
     #[arg(long, value_name = "FILE", conflicts_with = "peer")]
     pub record: Option<PathBuf>,
-    /// Another program that takes the same steps, e.g. "python3 tests/peers/model_torch.py bench"; it is given the record's
-    /// file as its last argument
+    /// Another program that takes the same steps, e.g. "python3 tests/peers/model_torch.py bench";
+    /// it is given the record's file as its last argument
     #[arg(long, value_name = "COMMAND")]
     pub peer: Vec<String>,
 }

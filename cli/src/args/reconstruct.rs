@@ -12,16 +12,19 @@ pub struct Reconstruct {
     pub file: PathBuf,
     #[command(flatten)]
     pub root: SceneRoot,
-    /// Folder for mesh.glb, mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not exist, or be empty)
+    /// Folder for mesh.glb, mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not
+    /// exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and visibility of the scene itself; or
-    /// networks that see one rendered histogram of all spots at once
+    /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and
+    /// visibility of the scene itself; or networks that see one rendered histogram of all spots at
+    /// once
     #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
     pub spots_from: SpotsFrom,
     #[command(flatten)]
     pub networks: NetworksArgs,
-    /// What becomes the room's density: a grid, in seconds; or PlatoNeRF's networks, the grid's oracle, in hours and more
+    /// What becomes the room's density: a grid, in seconds; or PlatoNeRF's networks, the grid's
+    /// oracle, in hours and more
     #[arg(long, value_enum, default_value_t = FieldArg::Grid)]
     pub field: FieldArg,
     #[command(flatten)]
@@ -41,7 +44,8 @@ pub struct Reconstruct {
     /// Go on where the measurements contradict one another: the result states how
     #[arg(long)]
     pub accept_inconsistent: bool,
-    /// Novel views to measure errors in: a circle in the middle of the scene, or PlatoNeRF's 139 in its room
+    /// Novel views to measure errors in: a circle in the middle of the scene, or PlatoNeRF's 139 in
+    /// its room
     #[arg(long, value_enum, default_value_t = ViewsArg::Around)]
     pub views: ViewsArg,
     /// Camera paths per pixel of the captures, for three bounces and more
@@ -71,12 +75,14 @@ pub struct NetworksArgs {
     /// Model that predicts which pixels each spot lights
     #[arg(long, value_name = "NAME")]
     pub shadow: Option<String>,
-    /// Model that predicts mirrors, whose pixels are left out [default: none, mirrors are not known]
+    /// Model that predicts mirrors, whose pixels are left out [default: none, mirrors are not
+    /// known]
     #[arg(long, value_name = "NAME")]
     pub specular: Option<String>,
 }
 
-/// A detector for `--spots-from captures`; without any of these, what is rendered is what is measured.
+/// A detector for `--spots-from captures`; without any of these, what is rendered is what is
+/// measured.
 #[derive(Args)]
 pub struct DetectorArgs {
     /// Count photons: so many in the brightest bin of the median pixel of each capture
@@ -99,7 +105,8 @@ pub struct MlpArgs {
     /// Rays of a step of the networks [default: 1024]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     pub batch: Option<u32>,
-    /// How the networks compare light with shadow masks: the paper's squares, or cross-entropy [default: squares]
+    /// How the networks compare light with shadow masks: the paper's squares, or cross-entropy
+    /// [default: squares]
     #[arg(long, value_enum)]
     pub shadow_loss: Option<ShadowLossArg>,
 }

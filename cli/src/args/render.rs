@@ -14,7 +14,8 @@ use crate::{
 /// Where the files lie that a scene file names.
 #[derive(Args, Default)]
 pub struct SceneRoot {
-    /// Folder that holds every mesh, buffer and texture the scene names [default: the scene's own folder]
+    /// Folder that holds every mesh, buffer and texture the scene names [default: the scene's own
+    /// folder]
     #[arg(long = "root", value_name = "DIR")]
     pub root: Option<PathBuf>,
 }
@@ -51,13 +52,16 @@ pub struct RenderArgs {
     /// Longest path in bounces [default: until the gate ends]
     #[arg(long)]
     pub max_bounces: Option<u32>,
-    /// Histograms of subsets of the spots too, from the same rays: 4 and 25 of a 10x10 grid, or per-spot for each beam
+    /// Histograms of subsets of the spots too, from the same rays: 4 and 25 of a 10x10 grid, or
+    /// per-spot for each beam
     #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::groups::parse)]
     pub groups: Vec<Group>,
-    /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given several times
+    /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given
+    /// several times
     #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::groups::parse_named)]
     pub group: Vec<Named>,
-    /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the renderer chooses by the scene]
+    /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the
+    /// renderer chooses by the scene]
     #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::choices::parse)]
     pub strategy: Vec<Chosen>,
     #[command(flatten)]
@@ -78,8 +82,8 @@ pub struct RenderArgs {
 /// How wide the laser's beams are.
 #[derive(Args)]
 pub struct BeamArgs {
-    /// Diameter of the laser's beams where they leave it, millimetres, 1/e² of the intensity [default: 0; without it and
-    /// --beam-divergence-mrad beams have no width]
+    /// Diameter of the laser's beams where they leave it, millimetres, 1/e² of the intensity
+    /// [default: 0; without it and --beam-divergence-mrad beams have no width]
     #[arg(long, value_name = "MM")]
     pub beam_diameter_mm: Option<f64>,
     /// Divergence of the beams, full angle, milliradians, 1/e² of the intensity [default: 0]
@@ -112,8 +116,8 @@ pub struct SceneRender {
     /// Folder for the Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Keep two-bounce and 3+ parts and their errors: arrays two, multi, two_se, multi_se, two_noise,
-    /// multi_noise
+    /// Keep two-bounce and 3+ parts and their errors: arrays two, multi, two_se, multi_se,
+    /// two_noise, multi_noise
     #[arg(long)]
     pub split: bool,
     /// Render for about this many seconds and state the error reached; ends sooner where --error or
@@ -126,7 +130,8 @@ pub struct SceneRender {
 pub struct ScenePlan {
     #[command(flatten)]
     pub render: RenderArgs,
-    /// Say which paths of three bounces and more carry energy and variance, from 64 passes over a few tiles
+    /// Say which paths of three bounces and more carry energy and variance, from 64 passes over a
+    /// few tiles
     #[arg(long)]
     pub variance: bool,
 }
@@ -152,10 +157,12 @@ pub struct BenchRender {
     /// Renders for each rung, each with a seed of its own; times and errors are averaged
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
     pub seeds: u64,
-    /// Camera paths per pixel of the converged render [default: 16 times the largest rung, at least 8 times what the stopping rule took]
+    /// Camera paths per pixel of the converged render [default: 16 times the largest rung, at least
+    /// 8 times what the stopping rule took]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
     pub truth_samples: Option<u32>,
-    /// Compare against this converged render, a folder from `picofarm scene render --split` (one scene)
+    /// Compare against this converged render, a folder from `picofarm scene render --split` (one
+    /// scene)
     #[arg(long, value_name = "DIR", conflicts_with = "truth_samples")]
     pub truth: Option<PathBuf>,
     /// Errors to give the time for; the stopping rule is tried with the first
@@ -168,8 +175,9 @@ pub struct BenchRender {
     /// Measurements of another renderer, written by tests/peers; may be given several times
     #[arg(long, value_name = "FILE")]
     pub peer: Vec<PathBuf>,
-    /// Ways of finding light to compare: default, choices as for `scene render --strategy`, joined by +, or each, which
-    /// leaves out one in turn (also what the option stands for without a value)
+    /// Ways of finding light to compare: default, choices as for `scene render --strategy`, joined
+    /// by +, or each, which leaves out one in turn (also what the option stands for without a
+    /// value)
     #[arg(long, value_delimiter = ',', num_args = 0..=1, default_value = "default", default_missing_value = "each",
           value_name = "default|each|NAME=VALUE[+…],…", value_parser = crate::choices::ways)]
     pub strategies: Vec<Ways>,

@@ -68,7 +68,7 @@ mod tests {
             (&["http://me:hush@host"], "http://…@host"),
         ] {
             let words = ["picofarm"].iter().chain(given).map(Into::into);
-            let said = match parse(words) {
+            let said = match parse(words, "0") {
                 Ok(_) => panic!("{given:?} is refused"),
                 Err(e) => e.to_string(),
             };

@@ -69,7 +69,8 @@ pub struct WhichSweep {
 /// Who chooses values.
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Sampler {
-    /// By what was found: the tree-structured Parzen estimator; at random until 10 trials have ended
+    /// By what was found: the tree-structured Parzen estimator; at random until 10 trials have
+    /// ended
     Tpe,
     /// At random
     Random,

@@ -16,8 +16,8 @@ const MASKS: usize = 4;
 /// Error of depth that is drawn brightest, metres.
 const ERROR_M: f32 = 0.2;
 
-/// Draws it. The lower row has masks: white and grey where truth and answer agree, red where a shadow was missed, blue where one
-/// was made up.
+/// Draws it. The lower row has masks: white and grey where truth and answer agree, red where a
+/// shadow was missed, blue where one was made up.
 pub fn draw(flash: &Flash, found: &Demultiplexed, truth: Option<&Truth>) -> Canvas {
     let i = &flash.camera.intrinsics;
     let size = (i.width as usize, i.height as usize);

@@ -73,7 +73,8 @@ impl Flash {
             .flatten()
             .map(|s| {
                 let way = s.point - laser;
-                // A mirror folds the beam: where it left the laser is not in the group, so its place stays as given.
+                // A mirror folds the beam: where it left the laser is not in the group, so its
+                // place stays as given.
                 let folded = s.path_m - way.length() > 1e-3 * s.path_m;
                 let known = places == PlacesArg::Given || folded;
                 Spot {

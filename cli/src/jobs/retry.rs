@@ -1,5 +1,6 @@
-//! `picofarm job retry`: dead tasks are pending again. A job names its scene files by their content; where one was corrected
-//! since, a new job takes the old one's place and takes over the scenes that are finished.
+//! `picofarm job retry`: dead tasks are pending again. A job names its scene files by their
+//! content; where one was corrected since, a new job takes the old one's place and takes over the
+//! scenes that are finished.
 
 use picofarm_proto::{
     ids::JobId,
@@ -74,7 +75,8 @@ fn lists_files(spec: &JobSpec) -> bool {
     scenes.any(|scenes| matches!(scenes.kind, SceneKind::Files { .. }))
 }
 
-/// Pins the scene files of all stages by the content that they have now; those that had another one, by field and path.
+/// Pins the scene files of all stages by the content that they have now; those that had another
+/// one, by field and path.
 fn repin(spec: &mut JobSpec) -> std::result::Result<Vec<String>, String> {
     let mut changed = Vec::new();
     for stage in &mut spec.stages {

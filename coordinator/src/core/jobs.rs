@@ -32,8 +32,8 @@ pub(crate) struct Prepared {
     pub events: Vec<NewEvent>,
 }
 
-/// Another job's scenes of a list of files in the data set that a stage writes to. But for files whose content differs, they are
-/// the stage's own: workers take them over.
+/// Another job's scenes of a list of files in the data set that a stage writes to. But for files
+/// whose content differs, they are the stage's own: workers take them over.
 #[derive(Debug, Clone)]
 pub(crate) struct Listed {
     /// The other job, where the caller may see it.
@@ -46,9 +46,10 @@ pub(crate) struct Listed {
     pub changed: BTreeMap<u64, SceneFile>,
 }
 
-/// Checks that no job has put scenes of other settings into the data set that a stage names: their keys would be the
-/// same, their bytes not. `set` is where the stage writes, `others` are the jobs that write there; those that `sight` does
-/// not see are not named. Returns what jobs with the same settings and another list of files have to do there.
+/// Checks that no job has put scenes of other settings into the data set that a stage names: their
+/// keys would be the same, their bytes not. `set` is where the stage writes, `others` are the jobs
+/// that write there; those that `sight` does not see are not named. Returns what jobs with the same
+/// settings and another list of files have to do there.
 ///
 /// # Errors
 /// Returns a [`SpecError`] at `output.dataset` that names the job and the first setting that
@@ -103,8 +104,8 @@ pub(crate) fn place_is_free(
     Ok(listed)
 }
 
-/// The scenes that two stages make of files of the same content, and those of which the first has another content than the
-/// second, with the second's files.
+/// The scenes that two stages make of files of the same content, and those of which the first has
+/// another content than the second, with the second's files.
 fn compare_files(
     stage: &StageSpec,
     there: &StageSpec,

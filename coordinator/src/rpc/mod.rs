@@ -153,7 +153,8 @@ fn at_field(why: &SpecError) -> Status {
     status
 }
 
-/// Why the catalog could not be read, as a caller hears it: what it refuses for its content is the caller's error.
+/// Why the catalog could not be read, as a caller hears it: what it refuses for its content is the
+/// caller's error.
 fn broken(error: CatalogError) -> Status {
     match error {
         CatalogError::Refused { what, .. } => Status::invalid_argument(bounds::message(&what)),

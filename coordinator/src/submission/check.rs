@@ -54,7 +54,8 @@ impl Findings {
         }
     }
 
-    /// Whether a job that is done has lost results by what was found. `trusted`: who asks is who had the job run.
+    /// Whether a job that is done has lost results by what was found. `trusted`: who asks is who
+    /// had the job run.
     pub(crate) fn lost(&self, tasks: u64, trusted: bool) -> bool {
         !self.gone.is_empty()
             || !self.differ.is_empty()

@@ -1,5 +1,6 @@
-//! Scenes of files beside an earlier job with the same settings and another list of files: a file was corrected, or files were
-//! added. What was made of equal content is taken over; what was made of another content refuses the job.
+//! Scenes of files beside an earlier job with the same settings and another list of files: a file
+//! was corrected, or files were added. What was made of equal content is taken over; what was made
+//! of another content refuses the job.
 
 use std::collections::BTreeSet;
 
@@ -45,8 +46,8 @@ pub(super) fn elsewhere(listed: &[(Listed, Vec<Recorded>)], own: &[Recorded]) ->
 }
 
 impl Submissions {
-    /// Refuses a stage one of whose files has another content than the scene was made of that the data set holds in its
-    /// place. Scenes that were deleted do not count.
+    /// Refuses a stage one of whose files has another content than the scene was made of that the
+    /// data set holds in its place. Scenes that were deleted do not count.
     pub(super) async fn unchanged(
         &self,
         draft: &Draft,

@@ -19,7 +19,8 @@ const SAME: f64 = 1.5;
 const SCALED: f64 = 3.0;
 /// Uncertainty of a rule of thumb.
 const RULE: f64 = 4.0;
-/// CPU-seconds of a furnished room of 256×256 pixels and 25 spots to an error of 10 % (docs/benchmarks.md).
+/// CPU-seconds of a furnished room of 256×256 pixels and 25 spots to an error of 10 %
+/// (docs/benchmarks.md).
 const ROOM_CPU_S: f64 = 24.0;
 /// Paths per pixel that such a room takes to that error.
 const ROOM_PATHS: f64 = 6.0;

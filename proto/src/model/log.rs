@@ -17,10 +17,12 @@ pub const LINE_BYTES: usize = 2 << 10;
 /// the job ends.
 pub const VERDICT: &str = "verdict: ";
 
-/// How a task's line begins that says why its scene is without light; where a job ends, such scenes are counted.
+/// How a task's line begins that says why its scene is without light; where a job ends, such scenes
+/// are counted.
 pub const DARK: &str = "dark: ";
 
-/// What a line of a task's history says behind its level and one of these marks: whether it is a warning, and the rest.
+/// What a line of a task's history says behind its level and one of these marks: whether it is a
+/// warning, and the rest.
 pub fn marked<'a>(message: &'a str, mark: &str) -> Option<(bool, &'a str)> {
     let (level, rest) = message.split_once(": ")?;
     let warns = level == LogLevel::Warn.name();

@@ -158,7 +158,8 @@ fn a_scene_of_a_file_is_named_by_its_own_file_and_position_and_by_no_other_file(
     assert_eq!((were[0], were[2]), (are[0], are[2]));
     assert_ne!(were[1], are[1]);
     assert_eq!(before.task.files_key(), after.task.files_key());
-    // The same content in another position has its own spots, and other settings make another scene.
+    // The same content in another position has its own spots, and other settings make another
+    // scene.
     assert_ne!(keys(&stage(["b", "b", "b"], ""))[0], were[1]);
     let other = stage(["a", "b", "c"], "spots = 4");
     assert_ne!(keys(&other), were);

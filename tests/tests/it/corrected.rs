@@ -1,5 +1,6 @@
-//! Scene files that are corrected after their job was submitted: what is finished is taken over, only the corrected file is
-//! rendered, and a scene that was made of another content never counts for it.
+//! Scene files that are corrected after their job was submitted: what is finished is taken over,
+//! only the corrected file is rendered, and a scene that was made of another content never counts
+//! for it.
 
 use std::{
     fs,
@@ -86,7 +87,8 @@ fn a_corrected_scene_file_is_all_that_a_retry_renders_and_the_data_set_is_that_o
     farm.until_done_once(&job, &second);
     assert_eq!(rendered(&farm, &second), (vec![BROKEN as u64], FILES - 1));
 
-    // What was there was not written again, and what is there now is what the corrected files give in one go.
+    // What was there was not written again, and what is there now is what the corrected files give
+    // in one go.
     let after = store::times(&job.place());
     for (name, time) in &before {
         let grows = name.starts_with("specular_any") || name == "zarr.json";
@@ -175,7 +177,8 @@ fn a_file_that_changed_after_its_scene_was_rendered_is_refused_until_the_scene_i
     }
     assert_eq!(store::hashes(&job.place()), before);
 
-    // Without the scene the new content is free to be rendered, and only what was finished of the same content is kept.
+    // Without the scene the new content is free to be rendered, and only what was finished of the
+    // same content is kept.
     for object in store::objects(&job.place(), 0) {
         fs::remove_file(job.place().join(object)).unwrap();
     }

@@ -116,7 +116,8 @@ fn a_plan_counts_the_scenes_of_a_store_that_no_coordinator_has_recorded_and_work
     worker.kill();
 }
 
-/// Takes a lease of a farm and reports a result that it has made up; returns the coordinator's answer.
+/// Takes a lease of a farm and reports a result that it has made up; returns the coordinator's
+/// answer.
 async fn lie(url: &str, renderer: &str) -> wire::Acknowledge {
     let hello = wire::Hello {
         worker_id: uuid::Uuid::new_v4().to_string(),

@@ -1,4 +1,5 @@
-//! One flash taken apart by `picofarm demultiplex`: what is written, what is said, and what is refused.
+//! One flash taken apart by `picofarm demultiplex`: what is written, what is said, and what is
+//! refused.
 
 use std::{path::Path, sync::Arc};
 

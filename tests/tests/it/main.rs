@@ -1,4 +1,5 @@
-//! Tests of the whole program, with real processes, in one executable because each one links the whole crate.
+//! Tests of the whole program, with real processes, in one executable because each one links the
+//! whole crate.
 
 mod attack;
 mod bad_input;

@@ -1,6 +1,6 @@
-//! A sweep over real workers: trials that fall behind leave them to others, one worker is killed, the best model gets its
-//! name, and more trials later are further ones: drawn, or chosen by what was found. TensorBoard reads what came out, where
-//! `PICOFARM_PYTHON` names a Python that has it.
+//! A sweep over real workers: trials that fall behind leave them to others, one worker is killed,
+//! the best model gets its name, and more trials later are further ones: drawn, or chosen by what
+//! was found. TensorBoard reads what came out, where `PICOFARM_PYTHON` names a Python that has it.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 

@@ -1,8 +1,9 @@
-//! The method's figures on furnished rooms that nothing was tuned on, a line each and their mean: depth, masks from its own depth,
-//! masks from the true depth, seconds. Rooms are parametric, of seeds 91001 and on; nothing is read or written.
+//! The method's figures on furnished rooms that nothing was tuned on, a line each and their mean:
+//! depth, masks from its own depth, masks from the true depth, seconds. Rooms are parametric, of
+//! seeds 91001 and on; nothing is read or written.
 //!
-//! In the environment, `ROOMS` (20), `FIRST` (91001), `SIDE` (128 pixels), `SPOTS` (25), `ERROR` (0.1, of the renders), and
-//! `RETURNS` takes the spots' places from their own one-bounce returns.
+//! In the environment, `ROOMS` (20), `FIRST` (91001), `SIDE` (128 pixels), `SPOTS` (25), `ERROR`
+//! (0.1, of the renders), and `RETURNS` takes the spots' places from their own one-bounce returns.
 
 use std::{env, time::Instant};
 
@@ -29,8 +30,8 @@ fn number(name: &str, usual: f64) -> f64 {
     })
 }
 
-/// Depth MAE, mirrors' MAE (NaN without any), median; IoU and IoU over carrying pairs from its own depth; the same from the true
-/// depth; IoU of "all lit"; seconds.
+/// Depth MAE, mirrors' MAE (NaN without any), median; IoU and IoU over carrying pairs from its own
+/// depth; the same from the true depth; IoU of "all lit"; seconds.
 type Row = [f64; 9];
 
 fn room(seed: u64) -> Row {

@@ -1,4 +1,5 @@
-//! The method from end to end: depth, shadows, and depth again without the spots that are in shadow.
+//! The method from end to end: depth, shadows, and depth again without the spots that are in
+//! shadow.
 
 use picofarm_scene::Vec3;
 use picofarm_settings::Gate;
@@ -24,10 +25,12 @@ const SPOT: usize = 3;
 /// Share of a spot's range within which what is seen belongs to its surface.
 const FLAT: f32 = 0.004;
 
-/// What one flash holds. Images are row-major `[row][column]`; those over spots are `[spot][row][column]`.
+/// What one flash holds. Images are row-major `[row][column]`; those over spots are
+/// `[spot][row][column]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demultiplexed {
-    /// Places of the spots, world axes; `None` where a beam has no return. Such a spot lights nothing.
+    /// Places of the spots, world axes; `None` where a beam has no return. Such a spot lights
+    /// nothing.
     pub places: Vec<Option<Place>>,
     /// z-depth, metres.
     pub depth_m: Vec<f32>,
@@ -63,7 +66,8 @@ pub fn demultiplex(
     take_apart(capture, settings, None)
 }
 
-/// The same where z-depths are known already, metres, `[row][column]`: only shadows and albedo are found.
+/// The same where z-depths are known already, metres, `[row][column]`: only shadows and albedo are
+/// found.
 ///
 /// # Errors
 /// [`DemultiplexError`] names the argument that cannot be used.
@@ -194,7 +198,8 @@ fn take_apart(
     })
 }
 
-/// The gate with bins summed that are narrower than they need be; those left over at its end are dropped.
+/// The gate with bins summed that are narrower than they need be; those left over at its end are
+/// dropped.
 fn merged(gate: &Gate, settings: &Settings) -> Gate {
     // A width that divides it does so in spite of rounding.
     let per = (settings.finest_m / gate.bin_width_m + 1e-6).floor() as u32;
@@ -220,8 +225,8 @@ fn finish(rays: &Rays, slants: &Slants) -> (Vec<f32>, Vec<f32>) {
     (depth, confidence)
 }
 
-/// Normal of the surface that a spot is on: of the planes seen around it the one, moved to the spot, to which most of what is
-/// seen around belongs.
+/// Normal of the surface that a spot is on: of the planes seen around it the one, moved to the
+/// spot, to which most of what is seen around belongs.
 fn spot_normal(rays: &Rays, depth: &[f32], normals: &[Vec3], source: &Source) -> Vec3 {
     let Some(p) = rays.pixel_of(source.point) else {
         return Vec3::ZERO;

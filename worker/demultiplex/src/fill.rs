@@ -1,4 +1,5 @@
-//! Depth where the histogram says too little: from the nearest pixel that knows its surface, along ways of alike intensity.
+//! Depth where the histogram says too little: from the nearest pixel that knows its surface, along
+//! ways of alike intensity.
 
 use std::{
     cmp::{Ordering, Reverse},
@@ -32,8 +33,8 @@ impl Ord for Cost {
     }
 }
 
-/// Sets pixels of a spot to the spot's depth, which its one-bounce return states, and gives every pixel whose score is below
-/// `weak` the plane of the nearest other one.
+/// Sets pixels of a spot to the spot's depth, which its one-bounce return states, and gives every
+/// pixel whose score is below `weak` the plane of the nearest other one.
 pub fn fill(rays: &Rays, log: &[f32], sources: &[Source], weak: f32, slants: &mut Slants) {
     for s in sources {
         let Some(p) = rays.pixel_of(s.point) else {

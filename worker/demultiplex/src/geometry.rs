@@ -111,8 +111,8 @@ pub fn places(capture: &Capture) -> Vec<Option<Place>> {
 /// Steps of a quarter of a bin along a beam.
 const STEPS_A_BIN: f64 = 4.0;
 
-/// Where the histogram is brightest along a beam at the time of its one-bounce return: laser → L → camera. The return fills one
-/// bin, so the middle of the steps that share it is taken.
+/// Where the histogram is brightest along a beam at the time of its one-bounce return: laser → L →
+/// camera. The return fills one bin, so the middle of the steps that share it is taken.
 fn own_return(capture: &Capture, direction: Vec3) -> Option<Place> {
     let camera = capture.camera;
     let rays = Rays {
@@ -167,8 +167,9 @@ fn own_return(capture: &Capture, direction: Vec3) -> Option<Place> {
     })
 }
 
-/// Unit normals of a map of z-depths, towards the camera, from a plane through each pixel's neighbourhood: inverse depth is
-/// affine in the image where a surface is plane. Neighbours whose depth leaps take no part; zero where too few are left.
+/// Unit normals of a map of z-depths, towards the camera, from a plane through each pixel's
+/// neighbourhood: inverse depth is affine in the image where a surface is plane. Neighbours whose
+/// depth leaps take no part; zero where too few are left.
 pub fn normals(rays: &Rays, depth: &[f32], reach: usize, leap: f32) -> Vec<Vec3> {
     use rayon::prelude::*;
     (0..rays.len())
@@ -198,8 +199,9 @@ pub fn normal_of(plane: Plane, ray: Vec3) -> Vec3 {
 /// Share of inverse depth by which pixels may be off one plane.
 const FLAT: f64 = 2e-3;
 
-/// The plane through a pixel's neighbours of alike depth, by least squares in inverse depth. Where they are on no one plane, the
-/// corner of the neighbourhood is taken that is flattest: an edge between two surfaces belongs to neither.
+/// The plane through a pixel's neighbours of alike depth, by least squares in inverse depth. Where
+/// they are on no one plane, the corner of the neighbourhood is taken that is flattest: an edge
+/// between two surfaces belongs to neither.
 pub fn fit(rays: &Rays, depth: &[f32], p: usize, reach: usize, leap: f32) -> Option<Plane> {
     let (whole, error) = fit_part(rays, depth, p, [reach; 4], leap)?;
     if error < FLAT {
@@ -222,8 +224,8 @@ pub fn fit(rays: &Rays, depth: &[f32], p: usize, reach: usize, leap: f32) -> Opt
     Some(best.0)
 }
 
-/// The same over pixels up to so many to the left, right, above and below; with the root mean square error as a share of inverse
-/// depth.
+/// The same over pixels up to so many to the left, right, above and below; with the root mean
+/// square error as a share of inverse depth.
 fn fit_part(
     rays: &Rays,
     depth: &[f32],

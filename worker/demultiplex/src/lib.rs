@@ -1,7 +1,9 @@
-//! One flash taken apart by physics: from a multiplexed histogram, in which the light of all spots is added up, to the depth
-//! of each pixel and to which spots light it. Nothing is learnt; every two-bounce time follows from geometry.
+//! One flash taken apart by physics: from a multiplexed histogram, in which the light of all spots
+//! is added up, to the depth of each pixel and to which spots light it. Nothing is learnt; every
+//! two-bounce time follows from geometry.
 //!
-//! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or files.
+//! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or
+//! files.
 
 mod capture;
 mod demultiplex;

@@ -1,4 +1,5 @@
-//! The light of one pixel shared out among the spots: what each would bring by geometry, and how much of it is there.
+//! The light of one pixel shared out among the spots: what each would bring by geometry, and how
+//! much of it is there.
 
 use picofarm_scene::Vec3;
 use picofarm_settings::Gate;
@@ -66,7 +67,8 @@ struct Worker {
 }
 
 impl Light<'_> {
-    /// Shares of all pairs, and the relative albedo of each pixel, from ranges and normals of what pixels see.
+    /// Shares of all pairs, and the relative albedo of each pixel, from ranges and normals of what
+    /// pixels see.
     pub fn shares(&self, range: &[f32], normals: &[Vec3]) -> (Vec<Share>, Vec<f32>) {
         let n = self.sources.len();
         let mut shares = self.raw(range, normals);
@@ -315,7 +317,8 @@ fn solve(w: &mut Worker, shares: &mut [Share]) {
     }
 }
 
-/// What full light amounts to in a pixel: an upper quantile over its spots, those that stand alone counting more.
+/// What full light amounts to in a pixel: an upper quantile over its spots, those that stand alone
+/// counting more.
 fn amplitude(shares: &[Share], scale: &[f32]) -> f32 {
     let mut all: Vec<(f32, f32)> = shares
         .iter()

@@ -1,4 +1,5 @@
-//! Semi-global matching (Hirschmüller, CVPR 2005): ranges that agree with the scores along eight directions of the image.
+//! Semi-global matching (Hirschmüller, CVPR 2005): ranges that agree with the scores along eight
+//! directions of the image.
 
 use rayon::prelude::*;
 
@@ -30,7 +31,8 @@ pub fn edges(rays: &Rays, intensity: &[f32]) -> Vec<f32> {
         .collect()
 }
 
-/// Aggregated costs and the best place between steps of each pixel, with how far its cost is below the best one elsewhere.
+/// Aggregated costs and the best place between steps of each pixel, with how far its cost is below
+/// the best one elsewhere.
 pub fn best(rays: &Rays, volume: &Volume, edges: &[f32], settings: &Settings) -> Vec<f32> {
     let count = volume.ranges.count;
     let mut sum = vec![0.0f32; volume.score.len()];

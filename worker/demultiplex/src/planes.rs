@@ -1,5 +1,6 @@
-//! Slanted planes over the image (PatchMatch stereo, Bleyer et al., BMVC 2011): each pixel takes the plane under which the
-//! scores of its neighbourhood are best, out of its neighbours' planes, those of the whole room, and small changes.
+//! Slanted planes over the image (PatchMatch stereo, Bleyer et al., BMVC 2011): each pixel takes
+//! the plane under which the scores of its neighbourhood are best, out of its neighbours' planes,
+//! those of the whole room, and small changes.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;

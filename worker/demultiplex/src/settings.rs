@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// How a capture is taken apart. The defaults were chosen on furnished rooms with seeds from 92001 on.
+/// How a capture is taken apart. The defaults were chosen on furnished rooms with seeds from 92001
+/// on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
@@ -22,8 +23,8 @@ pub struct Settings {
     pub floor: f32,
     /// Most that a bin may stand out, in natural logarithms.
     pub most_out: f32,
-    /// Sum of what stands out from which on a pixel counts in full, with 16 spots and more; pixels with less leave more to
-    /// their neighbours.
+    /// Sum of what stands out from which on a pixel counts in full, with 16 spots and more; pixels
+    /// with less leave more to their neighbours.
     pub full_score: f32,
     /// Semi-global matching: cost of one step of range between neighbours.
     pub step_cost: f32,

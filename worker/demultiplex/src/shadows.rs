@@ -1,4 +1,5 @@
-//! Which spots light what a pixel sees: by its light where there is some, and by what stands in between.
+//! Which spots light what a pixel sees: by its light where there is some, and by what stands in
+//! between.
 
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
@@ -22,7 +23,8 @@ pub enum Ground {
     Faint = 3,
 }
 
-/// Cosines below which spot and surface may be on one wall; one of the two normals may be five times as wrong.
+/// Cosines below which spot and surface may be on one wall; one of the two normals may be five
+/// times as wrong.
 const ONE_WALL: f32 = 0.06;
 /// Others' light over a spot's own from which on they share their bins,
 const SHARED: f32 = 0.5;
@@ -49,7 +51,8 @@ pub struct Way {
     pub outside: f32,
 }
 
-/// Follows a segment through a depth map. Both ends are left out: the surfaces there are no obstacles.
+/// Follows a segment through a depth map. Both ends are left out: the surfaces there are no
+/// obstacles.
 pub fn way(rays: &Rays, depth: &[f32], from: Vec3, to: Vec3) -> Way {
     let mut way = Way::default();
     let share = 1.0 / STEPS as f32;
@@ -70,8 +73,8 @@ pub fn way(rays: &Rays, depth: &[f32], from: Vec3, to: Vec3) -> Way {
     way
 }
 
-/// The greatest depth of the four pixels about a point's image: a point is behind a surface only where it is behind all of
-/// them, so that slants do not count.
+/// The greatest depth of the four pixels about a point's image: a point is behind a surface only
+/// where it is behind all of them, so that slants do not count.
 #[inline]
 fn farthest(rays: &Rays, depth: &[f32], q: Vec3) -> Option<f32> {
     if q.z <= 1e-3 {
@@ -122,7 +125,8 @@ pub fn shadows(rays: &Rays, depth: &[f32], sources: &[Source], shares: &[Share])
     Shadows { lit, ground }
 }
 
-/// Log odds of being lit. The numbers are a logistic regression's over the pairs of six furnished rooms, seeds 92001 to 92006.
+/// Log odds of being lit. The numbers are a logistic regression's over the pairs of six furnished
+/// rooms, seeds 92001 to 92006.
 fn judge(share: &Share, way: &Way) -> (f32, Ground) {
     let [at_spot, own] = share.cosines;
     let facing = at_spot.min(own);
@@ -131,7 +135,8 @@ fn judge(share: &Share, way: &Way) -> (f32, Ground) {
             true => 1.0 - 2.0 * (way.little * 8.0).min(1.0) - (way.behind * 4.0).min(1.0),
             false => 2.5,
         };
-        // On the spot's own wall, within the error of normals, nothing but what stands on it casts a shadow.
+        // On the spot's own wall, within the error of normals, nothing but what stands on it casts
+        // a shadow.
         let (low, high) = (at_spot.abs().min(own.abs()), at_spot.abs().max(own.abs()));
         let one_wall = high < ONE_WALL || (low < 0.5 * ONE_WALL && high < 5.0 * ONE_WALL);
         let logit = match facing < -CARRIES && !one_wall {

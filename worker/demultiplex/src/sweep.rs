@@ -1,4 +1,5 @@
-//! The plane sweep: for each pixel and each range, how many peaks stand where the spots' two-bounce times would be.
+//! The plane sweep: for each pixel and each range, how many peaks stand where the spots' two-bounce
+//! times would be.
 
 use picofarm_scene::Vec3;
 use picofarm_settings::Gate;
@@ -22,7 +23,8 @@ pub struct Ranges {
 }
 
 impl Ranges {
-    /// Ranges up to where the gate ends: no light that returns within it comes from beyond half its length.
+    /// Ranges up to where the gate ends: no light that returns within it comes from beyond half its
+    /// length.
     pub fn new(gate: &Gate, settings: &Settings) -> Self {
         let step_m = (settings.step_bins * gate.bin_width_m as f32).max(5e-3);
         let end = settings.farthest_m.min(0.5 * gate.end_m() as f32);
@@ -203,7 +205,8 @@ impl Worker {
     }
 }
 
-/// Scores over the pixel's median, as a share of the best: so that strong and weak pixels count alike.
+/// Scores over the pixel's median, as a share of the best: so that strong and weak pixels count
+/// alike.
 fn level(sum: &[f32], full: f32, out: &mut [f32]) {
     let mut sorted = sum.to_vec();
     let middle = sorted.len() / 2;

@@ -49,12 +49,14 @@ pub enum Bsdf {
         /// The share of the conductor, in [0, 1].
         weight: f32,
     },
-    /// Thin glass: a pane. Light goes straight on through it, or is reflected as by a plane mirror. A pane lets through
-    /// T = τ · ½ Σ (1 − r)/(1 + r) and reflects R = ½ Σ (r + τ² r (1 − r)/(1 + r)). The sums are over the two polarisations, r is
-    /// Fresnel's reflectance of one face at the light's angle and τ the `transmittance`: unpolarised light, reflected to and fro
-    /// between the faces any number of times. Reflections count as bounces, as at near-mirrors; passing through does not count.
-    /// Thin glass is no surface of the ground truth, and no beam makes its spot on it. A beam goes on straight through, and makes a
-    /// further spot where what is reflected of it ends.
+    /// Thin glass: a pane. Light goes straight on through it, or is reflected as by a plane mirror.
+    /// A pane lets through T = τ · ½ Σ (1 − r)/(1 + r) and reflects R = ½ Σ (r + τ² r (1 − r)/(1 +
+    /// r)). The sums are over the two polarisations, r is Fresnel's reflectance of one face at the
+    /// light's angle and τ the `transmittance`: unpolarised light, reflected to and fro between the
+    /// faces any number of times. Reflections count as bounces, as at near-mirrors; passing through
+    /// does not count. Thin glass is no surface of the ground truth, and no beam makes its spot on
+    /// it. A beam goes on straight through, and makes a further spot where what is reflected of it
+    /// ends.
     ThinDielectric {
         /// The index of refraction relative to air, in [1, 4]; 1 reflects nothing.
         ior: f32,
@@ -237,9 +239,9 @@ impl Material {
         }
     }
 
-    /// True for surfaces in the specular mask, at which beams are not spots but fold: bodies of glass, and rough conductors with
-    /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix. A mix below that scatters enough by its
-    /// Lambertian part to make a spot.
+    /// True for surfaces in the specular mask, at which beams are not spots but fold: bodies of
+    /// glass, and rough conductors with α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a
+    /// mix. A mix below that scatters enough by its Lambertian part to make a spot.
     pub fn is_specular(&self) -> bool {
         match self.bsdf {
             Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,

@@ -14,8 +14,8 @@ pub struct SpectrumPoint {
     pub nm: f32,
     /// The reflectance of the Lambertian part, or of a conductor alone, in [0, 1].
     pub reflectance: f32,
-    /// Reflectance of the conductor of a mix, in [0, 1]; without it that of the material's [`Bsdf`]. Other
-    /// materials have none.
+    /// Reflectance of the conductor of a mix, in [0, 1]; without it that of the material's
+    /// [`Bsdf`]. Other materials have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub specular_reflectance: Option<f32>,
 }
@@ -51,8 +51,9 @@ fn of_colour(nm: f32) -> Option<[f32; 3]> {
 }
 
 impl Material {
-    /// What it reflects at a wavelength. Where it states no [`Material::spectrum`], its colour stands for it from 400 to 700 nm: reflectances
-    /// are those of its BSDF times the colour there over the mean of the colour's three channels. Outside they are those of its BSDF.
+    /// What it reflects at a wavelength. Where it states no [`Material::spectrum`], its colour
+    /// stands for it from 400 to 700 nm: reflectances are those of its BSDF times the colour there
+    /// over the mean of the colour's three channels. Outside they are those of its BSDF.
     pub fn at(&self, nm: f32) -> AtWavelength {
         let plain = match self.bsdf {
             Bsdf::Diffuse { reflectance } => [reflectance, 0.0],

@@ -40,7 +40,8 @@ pub struct Settings {
     /// middles.
     #[serde(default = "whole", skip_serializing_if = "is_whole")]
     pub fill_factor: f64,
-    /// Wavelength of the laser. Without one, materials reflect what their [`picofarm_scene::Bsdf`] says.
+    /// Wavelength of the laser. Without one, materials reflect what their [`picofarm_scene::Bsdf`]
+    /// says.
     #[serde(default, skip_serializing_if = "Wavelength::is_none")]
     pub wavelengths_nm: Wavelength,
 }
@@ -99,7 +100,8 @@ pub struct Rendered {
     pub height: u32,
     /// The gate.
     pub gate: Gate,
-    /// h(p, b), multiplexed over the spots: `[row][col][bin]`, radiance per pulse energy (1/(m² sr)).
+    /// h(p, b), multiplexed over the spots: `[row][col][bin]`, radiance per pulse energy (1/(m²
+    /// sr)).
     pub transient: Vec<f32>,
     /// The parts, if [`Settings::split`] is set.
     pub split: Option<Split>,

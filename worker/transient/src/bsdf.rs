@@ -40,7 +40,8 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
+    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 =
+    /// black.
     strength: f32,
     /// Roughness of a conductor; of others 0.
     alpha: f32,
@@ -94,15 +95,16 @@ impl Surface {
                     of(Kind::Mixed, strength, alpha, base)
                 }
             }
-            // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see `by_glass`).
+            // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see
+            // `by_glass`).
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
                 of(Kind::Lambertian, 0.0, 0.0, 0.0)
             }
         }
     }
 
-    /// A mix to draw directions by at a vertex that pixels share: as this surface scatters, half of it or more Lambertian, of
-    /// albedo 1.
+    /// A mix to draw directions by at a vertex that pixels share: as this surface scatters, half of
+    /// it or more Lambertian, of albedo 1.
     pub fn guide(self) -> Self {
         let base = self.base.max(0.5 * self.albedo() / PI);
         let all = 1.0 / (self.strength + base * PI);
@@ -192,8 +194,8 @@ impl Surface {
         matches!(self.kind, Kind::Mixed)
     }
 
-    /// True for a mix of which a path must settle on one part: all but those whose vertices pixels share. Their
-    /// lobes are both wide, so that a vertex can scatter by both.
+    /// True for a mix of which a path must settle on one part: all but those whose vertices pixels
+    /// share. Their lobes are both wide, so that a vertex can scatter by both.
     #[inline(always)]
     pub fn is_open(&self) -> bool {
         match self.kind {
@@ -382,7 +384,8 @@ impl Surface {
         if lobe > 0.0 { lobe } else { 0.0 }
     }
 
-    /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none leaves.
+    /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none
+    /// leaves.
     #[inline]
     pub fn sample(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         if self.diffuse() {

@@ -316,9 +316,9 @@ impl Caustics {
     }
 }
 
-/// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I at
-/// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance. None where the
-/// camera sees nothing of it.
+/// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I
+/// at distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit
+/// distance. None where the camera sees nothing of it.
 pub(crate) fn splat(
     (world, film): (&World, &Film),
     (z, technique): (&LightVertex, Technique),

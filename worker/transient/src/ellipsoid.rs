@@ -1,4 +1,5 @@
-//! Narrow gates: ellipsoidal connections (Pediredla, Veeraraghavan and Gkioulekas, SIGGRAPH Asia 2019).
+//! Narrow gates: ellipsoidal connections (Pediredla, Veeraraghavan and Gkioulekas, SIGGRAPH Asia
+//! 2019).
 //!
 //! A path laser → spot → y → x → camera falls into the gate if y is between two ellipsoids with
 //! foci at the spot and at x. Shared vertices are drawn there, on patches of the surfaces, in

@@ -118,8 +118,8 @@ impl Columns {
         self.strength.push(strength);
     }
 
-    /// Writes strength · cos_s · cos_x / d² for a receiver at `x` with normal `n`: irradiance per unit
-    /// power of each Lambertian source, unshadowed.
+    /// Writes strength · cos_s · cos_x / d² for a receiver at `x` with normal `n`: irradiance per
+    /// unit power of each Lambertian source, unshadowed.
     #[inline]
     pub fn irradiance(&self, x: Vec3, n: Vec3, out: &mut [f32]) {
         self.irradiance_from(0, x, n, out);
@@ -354,8 +354,8 @@ impl Emitters {
         self.list.push(e);
     }
 
-    /// Writes the unshadowed contribution of every source to a surface point, per unit power: f_s cos_s
-    /// f_x cos_x / d². `buffer` is overwritten.
+    /// Writes the unshadowed contribution of every source to a surface point, per unit power: f_s
+    /// cos_s f_x cos_x / d². `buffer` is overwritten.
     #[inline]
     pub fn weights(&self, of: (Seen, &Surface), buffer: &mut Vec<f32>, out: &mut [f32]) {
         self.weights_of(0..self.list.len(), of, buffer, out);

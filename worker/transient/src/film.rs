@@ -5,9 +5,9 @@ use crate::{
     sink::{CLASSES, Place, Way, class},
 };
 
-/// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
-/// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
-/// what comes before the gate and one behind for what comes after.
+/// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds
+/// all spots, each further one a group of spots. A channel has one *slot* a bin, with one more in
+/// front for what comes before the gate and one behind for what comes after.
 #[derive(Debug)]
 pub(crate) struct Film {
     pub gate: Gate,

@@ -114,7 +114,8 @@ pub(crate) const TECHNIQUES: [&str; 9] = [
     "spot seen in a pane",
 ];
 
-/// Takes what a walk finds: optical path in metres, radiance, spot, bounces of the whole path, and how it was found.
+/// Takes what a walk finds: optical path in metres, radiance, spot, bounces of the whole path, and
+/// how it was found.
 pub(crate) trait Sink {
     fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way);
 

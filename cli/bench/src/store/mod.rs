@@ -1,5 +1,5 @@
-//! `picofarm bench store`: size, error and speed of each storage profile, on scenes of this renderer, and how fast they
-//! are read again.
+//! `picofarm bench store`: size, error and speed of each storage profile, on scenes of this
+//! renderer, and how fast they are read again.
 
 mod counting;
 mod cpu;
@@ -124,8 +124,8 @@ pub async fn run(
     Ok(())
 }
 
-/// The profiles that keep h, by name, for images of the data set's size. `counts-u16` stores draws of photons, which have
-/// no error of coding.
+/// The profiles that keep h, by name, for images of the data set's size. `counts-u16` stores draws
+/// of photons, which have no error of coding.
 fn codecs(spec: &DatasetSpec) -> Result<Vec<(&'static str, TransientCodec)>> {
     let codec = |name| {
         let profile = Profile::parse(name).map_err(CliError::input)?;

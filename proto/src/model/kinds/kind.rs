@@ -83,18 +83,21 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
     /// it.
     fn shaping(&self) -> Value;
 
-    /// Names the bytes of a scene that it makes, where they follow from its settings and the scene's own file alone: equal
-    /// keys, equal bytes, whichever other files a job lists. `None` where a scene is made of another, or is not listed.
+    /// Names the bytes of a scene that it makes, where they follow from its settings and the
+    /// scene's own file alone: equal keys, equal bytes, whichever other files a job lists. `None`
+    /// where a scene is made of another, or is not listed.
     fn scene_key(&self, _scene: u64) -> Option<TaskKey> {
         None
     }
 
-    /// The key of everything that shapes its scenes but the files that they are read from; `None` where they are none.
+    /// The key of everything that shapes its scenes but the files that they are read from; `None`
+    /// where they are none.
     fn files_key(&self) -> Option<StageKey> {
         None
     }
 
-    /// Where its tasks write, which decides whose that is. Without a default, so that no kind leaves it out.
+    /// Where its tasks write, which decides whose that is. Without a default, so that no kind
+    /// leaves it out.
     fn destination(&self) -> Destination<'_>;
 
     /// Returns the place of the results.
@@ -153,7 +156,8 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         None
     }
 
-    /// The paths and URLs that are read beside data sets, each with its field: by one task, or by all.
+    /// The paths and URLs that are read beside data sets, each with its field: by one task, or by
+    /// all.
     fn inputs(&self, _task: Option<u64>) -> Vec<(String, &str)> {
         Vec::new()
     }

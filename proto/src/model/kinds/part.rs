@@ -44,7 +44,8 @@ impl Declared for PartTask {
     const WRITTEN: bool = false;
 
     fn read(fields: &mut Fields) -> Result<Self, SpecError> {
-        // Jobs in older catalogs have it: the key of the stage that joins the parts, which `whole` says too.
+        // Jobs in older catalogs have it: the key of the stage that joins the parts, which `whole`
+        // says too.
         fields.optional::<String>("joined_by")?;
         Ok(Self {
             whole: RenderTask::read(fields)?,

@@ -97,8 +97,8 @@ impl RenderTask {
         StageKey::of(self.shaping())
     }
 
-    /// Everything that shapes the results. File scenes count by content and position, not by path; the place where results
-    /// go does not count, nor the number of parts.
+    /// Everything that shapes the results. File scenes count by content and position, not by path;
+    /// the place where results go does not count, nor the number of parts.
     fn described(&self, files: FilesIn<'_>) -> Value {
         json!({
             "task": "render",

@@ -153,7 +153,8 @@ impl From<SceneFileText> for SceneFile {
 }
 
 impl SceneSource {
-    /// What shapes the scenes, but for seed, field of view and spots, as keys know it. Files count by `files`.
+    /// What shapes the scenes, but for seed, field of view and spots, as keys know it. Files count
+    /// by `files`.
     pub(super) fn shaping(&self, files: FilesIn<'_>) -> Value {
         let mut value = self.kind_shaping(files);
         if !is_centre(&self.laser_m) {

@@ -1,4 +1,5 @@
-//! Tests of the catalog on SQLite and Postgres, in one executable because each one links the whole crate.
+//! Tests of the catalog on SQLite and Postgres, in one executable because each one links the whole
+//! crate.
 
 mod away;
 mod conformance;

@@ -37,8 +37,9 @@ pub(crate) fn counts_fewer(stored: &[u8], scenes: u64) -> bool {
         .is_none_or(|there| there < scenes)
 }
 
-/// Writes an array's metadata while its group has no root; `metadata` says what they are for a number of scenes. What an
-/// interrupted creation left is adopted if it differs at most in that number.
+/// Writes an array's metadata while its group has no root; `metadata` says what they are for a
+/// number of scenes. What an interrupted creation left is adopted if it differs at most in that
+/// number.
 pub(crate) async fn create_metadata(
     store: &dyn ObjectStore,
     path: &Path,

@@ -91,7 +91,8 @@ impl Element {
 }
 
 impl Quantity {
-    /// All quantities there are, in the order of their objects in a manifest; see [`crate::DatasetSpec::quantities`].
+    /// All quantities there are, in the order of their objects in a manifest; see
+    /// [`crate::DatasetSpec::quantities`].
     pub const ALL: [Self; 19] = [
         Self::Transient,
         Self::Intensity,

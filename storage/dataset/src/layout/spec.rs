@@ -271,7 +271,8 @@ impl DatasetSpec {
         self.pixels() * self.gate.bins as usize
     }
 
-    /// Images of a quantity that is a transient: one for each spot of `transient_spots`, otherwise one.
+    /// Images of a quantity that is a transient: one for each spot of `transient_spots`, otherwise
+    /// one.
     pub fn planes(&self, quantity: Quantity) -> usize {
         match quantity {
             Quantity::TransientSpots => self.spots as usize,

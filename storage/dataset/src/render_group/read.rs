@@ -18,9 +18,11 @@ use crate::scenes::read::Stored;
 const BATCH: u64 = 16;
 /// Maximum number of values of a chunk; more indicate damaged metadata.
 const MAX_CHUNK: u64 = 1 << 28;
-/// Most bytes of a metadata file: attributes say how the render was made, which takes some kilobytes.
+/// Most bytes of a metadata file: attributes say how the render was made, which takes some
+/// kilobytes.
 const MAX_METADATA: u64 = 64 << 20;
-/// Most bytes of a coded chunk beyond those of its values: what does not compress grows by far less.
+/// Most bytes of a coded chunk beyond those of its values: what does not compress grows by far
+/// less.
 const MAX_OVERHEAD: u64 = 1 << 20;
 
 /// A render group in a local folder.

@@ -39,13 +39,14 @@ pub(crate) struct ArrayCodec {
 impl Dataset {
     /// Creates the data set at `prefix`, or opens an existing one.
     ///
-    /// The metadata are written create-only, the root last: a data set exists once its root `zarr.json` does.
-    /// Where the stored number of scenes is smaller than `spec.scenes`, the data set grows: the first number of
-    /// every array's shape is replaced, the root's last. Where it is larger, the stored number stands. Of several
-    /// processes that grow it at a time the largest number stays: each object is replaced only where it counts fewer
-    /// scenes, and in stores with conditional puts only if it is still the one that was looked at. A folder has no
-    /// such put: of two that replace an object within the same instant the smaller number may stay, until the next
-    /// scene of the larger one is made (published scenes are never touched).
+    /// The metadata are written create-only, the root last: a data set exists once its root
+    /// `zarr.json` does. Where the stored number of scenes is smaller than `spec.scenes`, the data
+    /// set grows: the first number of every array's shape is replaced, the root's last. Where it is
+    /// larger, the stored number stands. Of several processes that grow it at a time the largest
+    /// number stays: each object is replaced only where it counts fewer scenes, and in stores with
+    /// conditional puts only if it is still the one that was looked at. A folder has no such put:
+    /// of two that replace an object within the same instant the smaller number may stay, until the
+    /// next scene of the larger one is made (published scenes are never touched).
     ///
     /// # Errors
     /// [`DatasetError::SpecMismatch`] names the first differing field and both values;

@@ -81,8 +81,9 @@ impl Dataset {
         self.read_histogram(scene, Quantity::Transient).await
     }
 
-    /// h of a scene from any of the data set's transients: `[row][column][bin]`, for `TransientSpots`
-    /// `[spot][row][column][bin]`. Blocks its thread while decoding on rayon's threads.
+    /// h of a scene from any of the data set's transients: `[row][column][bin]`, for
+    /// `TransientSpots` `[spot][row][column][bin]`. Blocks its thread while decoding on rayon's
+    /// threads.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] if the data set has no such transient; those of

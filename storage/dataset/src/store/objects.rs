@@ -169,9 +169,10 @@ pub(crate) async fn overwrite(
         .map_err(|e| DatasetError::store("replace", shown(store, path), e))
 }
 
-/// Puts metadata that count more in place of those that `counts_fewer`; what counts as many or more stays. Of several that put
-/// at a time the one that counts most stays, whichever comes last: an object is replaced only if it is still the one that was
-/// looked at. A store that cannot put on that condition (a folder) is looked at right before.
+/// Puts metadata that count more in place of those that `counts_fewer`; what counts as many or more
+/// stays. Of several that put at a time the one that counts most stays, whichever comes last: an
+/// object is replaced only if it is still the one that was looked at. A store that cannot put on
+/// that condition (a folder) is looked at right before.
 pub(crate) async fn grow(
     store: &dyn ObjectStore,
     path: &Path,
@@ -202,7 +203,8 @@ pub(crate) async fn grow(
         let options = PutOptions::from(PutMode::Update(version));
         match store.put_opts(path, bytes.clone().into(), options).await {
             Ok(_) => return Ok(()),
-            // Another was faster. Each replacement counts more than the one before, so that this ends.
+            // Another was faster. Each replacement counts more than the one before, so that this
+            // ends.
             Err(Error::Precondition { .. } | Error::AlreadyExists { .. })
                 if before.as_ref() != Some(&found) =>
             {

@@ -181,8 +181,9 @@ impl Stores {
         Ok(())
     }
 
-    /// Stores a recipe, under a key and for one scene or all, where there is none yet; `false` where there is one. It is looked
-    /// for with every scene: who deletes a data set while this worker runs gets a whole one again.
+    /// Stores a recipe, under a key and for one scene or all, where there is none yet; `false`
+    /// where there is one. It is looked for with every scene: who deletes a data set while this
+    /// worker runs gets a whole one again.
     pub(super) fn note_recipe(
         &self,
         dataset: &Dataset,

@@ -1,6 +1,7 @@
-//! Recipes: beside the scenes of a data set stands how they are made, so that `dataset repair` can make one again. A
-//! recipe is the stage of the job, without its place and its number of scenes; the key that it is stored under follows
-//! from what it says. Where scenes are files each has a recipe of its own, under a key that counts no file.
+//! Recipes: beside the scenes of a data set stands how they are made, so that `dataset repair` can
+//! make one again. A recipe is the stage of the job, without its place and its number of scenes;
+//! the key that it is stored under follows from what it says. Where scenes are files each has a
+//! recipe of its own, under a key that counts no file.
 
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
@@ -16,9 +17,10 @@ use super::{Control, Task, TaskError, output::Stores};
 /// The data set that the recipe lies in.
 pub(super) const HERE: &str = "here";
 
-/// Stores the recipe of a rendering. That of a scene file is stored under what all scenes of the list have in common, so that it
-/// has one name whichever other files a job lists. Where a recipe of the file's earlier content has that name, because its scene
-/// was begun and never published, this one is stored under the key of its stage.
+/// Stores the recipe of a rendering. That of a scene file is stored under what all scenes of the
+/// list have in common, so that it has one name whichever other files a job lists. Where a recipe
+/// of the file's earlier content has that name, because its scene was begun and never published,
+/// this one is stored under the key of its stage.
 pub(super) fn note(
     stores: &Stores,
     dataset: &Dataset,
@@ -84,8 +86,8 @@ fn here(profile: &str) -> OutputSettings {
     }
 }
 
-/// The key that a scene of a data set has, if a rendering made it. Scenes of files were once named by all files of their
-/// job, which only the key of the recipe's stage still tells.
+/// The key that a scene of a data set has, if a rendering made it. Scenes of files were once named
+/// by all files of their job, which only the key of the recipe's stage still tells.
 pub(super) fn made(
     stage: &StageKey,
     task: &RenderTask,
@@ -115,7 +117,8 @@ pub(super) fn read(
             render.output.store = store.to_owned();
             render.output.dataset = dataset.to_owned();
             match render.scenes.kind {
-                // It may have been stored under the key of its stage, which counts files that it does not name.
+                // It may have been stored under the key of its stage, which counts files that it
+                // does not name.
                 SceneKind::Files { .. } => key,
                 _ => render.stage_key(),
             }

@@ -348,7 +348,8 @@ impl Repairer {
         }))
     }
 
-    /// A candidate with the key of its task for `scene`; `made_by` is the key in the scene's manifest.
+    /// A candidate with the key of its task for `scene`; `made_by` is the key in the scene's
+    /// manifest.
     fn keyed(
         &self,
         stage: Option<StageKey>,

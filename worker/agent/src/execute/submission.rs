@@ -90,7 +90,8 @@ fn within(root: Option<&str>) -> Bounds {
     }
 }
 
-/// Pins scene files by the content that they have now. Returns the positions of those that had another one.
+/// Pins scene files by the content that they have now. Returns the positions of those that had
+/// another one.
 ///
 /// # Errors
 /// A file that cannot be read on this machine.
@@ -111,8 +112,8 @@ pub fn repin(source: &mut SceneSource) -> Result<Vec<usize>, SpecError> {
     Ok(changed)
 }
 
-/// The place that `path` means in `base`, without `.` and `..`: what they mean in a shell. (Jobs on the wire must name
-/// places without them: there they would mean another folder to each machine.)
+/// The place that `path` means in `base`, without `.` and `..`: what they mean in a shell. (Jobs on
+/// the wire must name places without them: there they would mean another folder to each machine.)
 ///
 /// # Errors
 /// Fails if the path is empty, or there is no current folder.

@@ -1,4 +1,5 @@
-//! Tests of scenes, formats and generated rooms, in one executable because each one links the whole crate.
+//! Tests of scenes, formats and generated rooms, in one executable because each one links the whole
+//! crate.
 
 mod common;
 mod furnished;

@@ -255,7 +255,8 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     .map(|(name, scene)| (name.to_owned(), scene))
     .into();
     all.extend((1..=FAR).map(|seed| (format!("far-{seed:02}"), far(seed, None, pixels))));
-    // Rooms of rough and mixed walls with Lambertians of the same albedo in their place: what roughness costs.
+    // Rooms of rough and mixed walls with Lambertians of the same albedo in their place: what
+    // roughness costs.
     let twins = ["coated", "glossy", "far-03"].map(|name| {
         let (_, rough) = all.iter().find(|(of, _)| of == name).expect("it is one");
         (format!("{name}-lambertian"), lambertian(rough))

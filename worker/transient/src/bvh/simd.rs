@@ -132,8 +132,8 @@ mod native {
     macro_rules! lanes {
         ($t:ident, $n:literal, $splat:ident, $load:ident, $store:ident, $add:ident, $sub:ident,
          $mul:ident, $div:ident, $min:ident, $max:ident, $least:ident, $greatest:ident, $compare:ident) => {
-            // SAFETY of every block: a value of this type exists only if the instructions do (module
-            // proof), and the slices are as long as a register.
+            // SAFETY of every block: a value of this type exists only if the instructions do
+            // (module proof), and the slices are as long as a register.
             impl Lanes for $t {
                 const N: usize = $n;
                 #[inline(always)]

@@ -75,8 +75,8 @@ impl Photons {
         [p.x, p.y, p.z].map(|x| (x / self.cell).floor() as i32)
     }
 
-    /// Calls `each` with what every photon near a camera path's point brings; without `spots`, what lies behind the first
-    /// bounce alone.
+    /// Calls `each` with what every photon near a camera path's point brings; without `spots`, what
+    /// lies behind the first bounce alone.
     pub(super) fn around(
         &self,
         (max_bounces, world, spots): (u32, &World, bool),

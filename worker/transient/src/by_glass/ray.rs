@@ -246,8 +246,8 @@ pub(super) fn arrive(
 }
 
 impl Point {
-    /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive` says with which chance a step
-    /// of a weight does.
+    /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive`
+    /// says with which chance a step of a weight does.
     pub fn scatter(&self, survive: impl Fn(f32) -> f32, rng: &mut Rng) -> Option<(Carried, Ray)> {
         let h = &self.hit;
         let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
@@ -258,9 +258,9 @@ impl Point {
         Some(self.onward((w, weight / chance), false))
     }
 
-    /// Radiance goes on by the surface's scattering or to where glass is. What the path carries then, the ray, and what is left of
-    /// `left`: what it would carry by scattering alone, since how narrow the cones are says nothing of what lies in them. Roulette
-    /// goes by that.
+    /// Radiance goes on by the surface's scattering or to where glass is. What the path carries
+    /// then, the ray, and what is left of `left`: what it would carry by scattering alone, since
+    /// how narrow the cones are says nothing of what lies in them. Roulette goes by that.
     pub fn seek(&self, aim: &Aim, left: f32, rng: &mut Rng) -> Option<(Carried, Ray, f32)> {
         let h = &self.hit;
         let (w, weight, own) = match aim.from(h) {

@@ -132,7 +132,8 @@ fn a_texture_colours_a_wavelength_by_its_own_channels() {
     let nm = [611.4, 464.3, 905.0];
     let set = settings(Budget::Samples(128));
     for (k, nm) in nm.into_iter().enumerate() {
-        // Red, blue, and the mean of the three channels, laid out in strips that each are of one reflectance.
+        // Red, blue, and the mean of the three channels, laid out in strips that each are of one
+        // reflectance.
         let reflectance = |u: f32| {
             let texel = texture.at([u, 0.5]);
             let mean = |c: [f32; 3]| (c[0] + c[1] + c[2]) / 3.0;

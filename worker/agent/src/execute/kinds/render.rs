@@ -63,7 +63,8 @@ impl RunTask for RenderTask {
         }
         let render = |scene: &Scene, settings: &Settings| {
             stores.check_render(settings, scene)?;
-            // Not before the scene is there: a file that cannot be read leaves no recipe beside its corrected form's.
+            // Not before the scene is there: a file that cannot be read leaves no recipe beside its
+            // corrected form's.
             recipe::note(stores, &dataset, task, control)?;
             if spec.parts > 1 {
                 let parts = Parts::new(stores, &dataset, spec, task.index, key);

@@ -21,8 +21,9 @@ use text::{
 /// Writes the scene to `file` (an `.xml`), with its meshes and textures in folders next to it.
 /// Returns the features that Mitsuba's model cannot represent, a sentence each; often none.
 ///
-/// A mesh is written once per material that it uses. Colours are the materials' `rgb`, scaled so that their mean
-/// is the reflectance at the laser's wavelength. Every beam is a `projector` of 0.1°.
+/// A mesh is written once per material that it uses. Colours are the materials' `rgb`, scaled so
+/// that their mean is the reflectance at the laser's wavelength. Every beam is a `projector` of
+/// 0.1°.
 ///
 /// # Errors
 /// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`], [`SceneError::Write`] naming

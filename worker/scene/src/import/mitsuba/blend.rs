@@ -1,16 +1,17 @@
 //! Mitsuba's blends as materials of one or two parts.
 //!
-//! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a blend again. What is read are the
-//! leaves, Lambertians and conductors. The share of a leaf is the product of the weights on the way to it. Lambertians side by
-//! side are one Lambertian of their mean, and so are conductors of one roughness and distribution: both scatter in proportion
-//! to what they reflect. What remains is one Lambertian, one conductor, or [`Bsdf::Mixed`] of both. Conductors that differ are
-//! refused.
+//! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a
+//! blend again. What is read are the leaves, Lambertians and conductors. The share of a leaf is the
+//! product of the weights on the way to it. Lambertians side by side are one Lambertian of their
+//! mean, and so are conductors of one roughness and distribution: both scatter in proportion to
+//! what they reflect. What remains is one Lambertian, one conductor, or [`Bsdf::Mixed`] of both.
+//! Conductors that differ are refused.
 //!
-//! - **Colour**: a material's `rgb` is the mean of its leaves' colours by their shares, so that the mean of its three channels
-//!   is the sum of shares times reflectances. At a stated wavelength both parts have the hue of this `rgb`. A note says so where
-//!   hues differ that were joined.
-//! - **Texture**: it scales both parts. So all leaves with a share have the same bitmap, or none has one. Leaves that reflect
-//!   nothing need none.
+//! - **Colour**: a material's `rgb` is the mean of its leaves' colours by their shares, so that the
+//!   mean of its three channels is the sum of shares times reflectances. At a stated wavelength
+//!   both parts have the hue of this `rgb`. A note says so where hues differ that were joined.
+//! - **Texture**: it scales both parts. So all leaves with a share have the same bitmap, or none
+//!   has one. Leaves that reflect nothing need none.
 //! - **Sides**: a blend is two-sided where both its BSDFs are.
 
 use std::{rc::Rc, sync::Arc};
@@ -208,7 +209,8 @@ fn texture_of(leaves: &[Share]) -> Result<Option<(Arc<Texture>, Matrix)>, &'stat
     }
 }
 
-/// The same with all Lambertians as one, and conductors that differ in colour alone, each in the place of the first.
+/// The same with all Lambertians as one, and conductors that differ in colour alone, each in the
+/// place of the first.
 fn joined(leaves: Leaves) -> Leaves {
     let mut all: Vec<Leaves> = vec![];
     for leaf in leaves {
