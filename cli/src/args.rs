@@ -379,7 +379,7 @@ pub struct Worker {
     /// minute before the end of the Slurm job (SLURM_JOB_END_TIME); otherwise never]
     #[arg(long, value_name = "TIME|DURATION", env = "PICOFARM_END_AT", value_parser = crate::ends::parse)]
     pub end_at: Option<crate::ends::EndAt>,
-    /// Touch only what lies in this path or URL (give it again for more) [default: anything]
+    /// Touch only stores in this path or URL (give it again for more) [default: anything]
     #[arg(long, value_name = "URL", value_parser = crate::paths::place)]
     pub store_prefix: Vec<String>,
     #[command(flatten)]
@@ -398,7 +398,7 @@ pub enum Dataset {
     Show(DatasetShow),
     /// Check a data set against its manifests; exit code 6 if anything is wrong
     Verify(DatasetVerify),
-    /// Make broken scenes again, exactly those, and put back what is broken of them
+    /// Make broken scenes again, exactly those, and restore their damaged objects
     Repair(DatasetRepair),
     /// Pin which scenes there are now, or see what was pinned
     #[command(subcommand)]
@@ -420,8 +420,8 @@ pub enum Dataset {
         #[arg(long, default_value_t = 8, value_parser = ranges::rows)]
         rows: usize,
     },
-    /// Write a page about reconstructions, and the same as JSON beside it: errors in novel views
-    /// beside published ones, meshes, the best and the worst scene
+    /// Write a page about reconstructions, and its data as JSON: errors of novel views next to
+    /// published ones, meshes, the best and the worst scene
     Report(DatasetReport),
     /// Measure every scene with a sensor into another data set, without rendering; again to resume
     Reprocess(DatasetReprocess),
@@ -471,7 +471,7 @@ pub enum Scene {
         #[command(flatten)]
         root: SceneRoot,
     },
-    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, meshes and textures beside it) or
+    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, with meshes and textures) or
     /// one .ply mesh
     Export(SceneExport),
     /// Render one scene file without a farm into a small Zarr group
@@ -529,19 +529,19 @@ pub enum PlatoArg {
 
 #[derive(Subcommand)]
 pub enum Bench {
-    /// Measure the renderer: CPU time against the true error, beside a converged render of the same
+    /// Measure the renderer: CPU time against the true error, by a converged render of the same
     /// scene
     Render(BenchRender),
-    /// Measure the scheduler: durable no-op tasks a second beside the database's own limit, and
+    /// Measure the scheduler: durable no-op tasks a second against the database's own limit, and
     /// fleets of simulated workers
     Queue(BenchQueue),
-    /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot,
+    /// Measure the cost of very many (simulated, tiny) scenes: list, verify, snapshot,
     /// gc
     Dataset(BenchDataset),
     /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of
     /// reading
     Store(BenchStore),
-    /// Measure a training step of a network on the CPU, beside other forms and other programs
+    /// Measure a training step of a network on the CPU against other forms and other programs
     Model(BenchModel),
 }
 
@@ -573,7 +573,7 @@ pub struct BenchQueue {
     /// Sizes of fleets to simulate with tasks of a fixed length, e.g. 10,100,1000,4000
     #[arg(long, value_delimiter = ',', value_name = "N,…")]
     pub fleet: Vec<usize>,
-    /// Plans of large jobs beside which heartbeats are measured; 0 leaves this part out
+    /// Plans of large jobs that run while heartbeats are measured; 0 omits this part
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub plans: usize,
     /// Size of such a job in MB

@@ -45,7 +45,7 @@ pub fn expand(
 /// Threads of the worker assumed for a plan's memory estimate. Each has some megabytes of its own.
 const THREADS: u32 = 8;
 
-/// What is known of a stage's outputs.
+/// The known state of a stage's outputs.
 #[derive(Debug, Clone, Default)]
 pub struct Outputs {
     /// Those of exactly its settings that count.
@@ -54,7 +54,8 @@ pub struct Outputs {
     pub explained: u64,
 }
 
-/// What submitting `spec` would do, given its hash, what is known of each stage's outputs, the job
+/// Returns the effect of submitting `spec`, given its hash, the known state of each stage's
+/// outputs, the job
 /// that has this spec, and recent jobs, latest first, to compare with.
 pub fn plan(
     spec: &JobSpec,

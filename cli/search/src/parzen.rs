@@ -36,7 +36,7 @@ enum Place {
 }
 
 impl Place {
-    /// Where a value lies; `None` for one that cannot.
+    /// Returns the position of a value, or `None` for one that has none.
     fn of(domain: &Domain, value: &Value) -> Option<Self> {
         match domain {
             Domain::OneOf(_) => domain.position(value).map(Self::Number),
@@ -180,7 +180,7 @@ fn at_share(weights: impl Iterator<Item = f64>, mut share: f64) -> usize {
     weights.take_while(passed).count()
 }
 
-/// The share of a standard normal distribution that lies below x.
+/// Returns the share of a standard normal distribution below x.
 fn normal_below(x: f64) -> f64 {
     0.5 * libm::erfc(-x * FRAC_1_SQRT_2)
 }

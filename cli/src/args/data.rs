@@ -86,7 +86,7 @@ pub struct DatasetReport {
     /// Folders or URLs of reconstructions, in the order in which they shall appear
     #[arg(required = true, value_name = "PLACE", value_parser = crate::paths::place)]
     pub places: Vec<String>,
-    /// The page to write; the same as JSON lies beside it
+    /// The page to write; the same data as JSON goes next to it
     #[arg(long, value_name = "FILE", default_value = "reconstructions.html")]
     pub out: PathBuf,
     /// Title of the page

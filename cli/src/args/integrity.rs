@@ -26,7 +26,7 @@ pub struct DatasetRepair {
     /// Folder or URL of the data set
     #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
-    /// Find what is broken by manifests and sizes only; a flipped bit is not found so
+    /// Compare manifests and sizes only; this does not find a flipped bit
     #[arg(long)]
     pub fast: bool,
     /// Make the scenes that are not finished, too
@@ -35,7 +35,7 @@ pub struct DatasetRepair {
     /// Bring the scenes of this snapshot back to what they were then, and no others
     #[arg(long, value_name = "NAME", conflicts_with = "complete")]
     pub snapshot: Option<String>,
-    /// Only say what is broken and how it would be repaired
+    /// List the damage and its repair; change nothing
     #[arg(long)]
     pub dry_run: bool,
     /// The job that made the data set, where the data set does not say itself how
@@ -57,7 +57,7 @@ pub struct DatasetGc {
     /// Folder or URL of the data set
     #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
-    /// Spare what is younger, e.g. 90m, 24h or 7d; a worker may still be writing it
+    /// Keep younger objects, e.g. 90m, 24h or 7d; a worker may still be writing them
     #[arg(long, default_value = "24h", value_name = "AGE", value_parser = age)]
     pub older_than: Duration,
     /// Delete them; otherwise only say what would be deleted

@@ -95,7 +95,7 @@ pub enum Job {
         job: String,
     },
     /// Make a job's dead tasks pending again; with corrected scene files, in a new job that takes
-    /// over what is finished
+    /// over the finished scenes
     Retry {
         /// Job id, or the first letters of one
         job: String,
@@ -144,7 +144,7 @@ pub enum ListedState {
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub enum JobKind {
-    /// Render furnished rooms (what is written without --kind)
+    /// Render furnished rooms (the default)
     Furnished,
     /// Render primitive rooms
     Primitive,

@@ -28,9 +28,9 @@ pub enum Model {
         store: String,
     },
     /// List this machine's graphics processors, and try each: a product, a convolution and its
-    /// gradients beside the CPU's
+    /// gradients against the CPU's
     Devices,
-    /// Say what a model is, where it comes from and how good it is
+    /// Show a model: its network, origin and quality
     Show {
         /// Folder or URL of the store
         #[arg(value_parser = crate::paths::place)]
@@ -76,7 +76,7 @@ pub enum Model {
         /// Names of models [default: all]
         names: Vec<String>,
     },
-    /// Put back what is broken of a model, from bytes that have the recorded SHA-256; say which job
+    /// Restore damaged objects of a model, from bytes that have the recorded SHA-256; say which job
     /// makes the rest again
     #[command(after_help = REPAIR_HELP)]
     Repair {
@@ -103,15 +103,15 @@ pub enum Model {
         #[arg(long)]
         dry_run: bool,
     },
-    /// Write a page about models, and the same as JSON beside it: figures beside trivial answers
-    /// and published ones, curves, pictures, speed against error
+    /// Write a page about models, and its data as JSON: figures next to trivial answers and
+    /// published ones, curves, pictures, speed against error
     Report {
         /// Folder or URL of the store
         #[arg(value_parser = crate::paths::place)]
         store: String,
         /// Names of models; a name that ends with * means all that begin so [default: all]
         names: Vec<String>,
-        /// The page to write; the same as JSON lies beside it
+        /// The page to write; the same data as JSON goes next to it
         #[arg(long, value_name = "FILE", default_value = "report.html")]
         out: PathBuf,
         /// Title of the page

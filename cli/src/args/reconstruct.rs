@@ -81,14 +81,13 @@ pub struct NetworksArgs {
     pub specular: Option<String>,
 }
 
-/// A detector for `--spots-from captures`; without any of these, what is rendered is what is
-/// measured.
+/// A detector for `--spots-from captures`; without any of these, the sensor is perfect.
 #[derive(Args)]
 pub struct DetectorArgs {
     /// Count photons: so many in the brightest bin of the median pixel of each capture
     #[arg(long, value_name = "N", value_parser = super::ranges::photons)]
     pub photons: Option<f64>,
-    /// Ambient photons in each bin of each pixel, beside those of --photons
+    /// Ambient photons in each bin of each pixel, in addition to --photons
     #[arg(long, value_name = "N", requires = "photons", value_parser = super::ranges::ambient)]
     pub ambient: Option<f64>,
 }

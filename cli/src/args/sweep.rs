@@ -22,7 +22,7 @@ pub enum Sweep {
     Report {
         #[command(flatten)]
         which: WhichSweep,
-        /// The page to write; the same as JSON lies beside it
+        /// The page to write; the same data as JSON goes next to it
         #[arg(long, value_name = "FILE", default_value = "sweep.html")]
         out: PathBuf,
     },

@@ -1,4 +1,4 @@
-//! The picture of one flash: intensity, depth, its error, and masks beside the true ones.
+//! The picture of one flash: intensity, depth, its error, and masks next to the true ones.
 
 use picofarm_demultiplex::{Demultiplexed, Truth};
 use picofarm_figures::{Canvas, TEXT, inferno, viridis};

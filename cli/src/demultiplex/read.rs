@@ -14,7 +14,7 @@ use crate::{
     error::{CliError, Code, Result},
 };
 
-/// One flash and what is known about it.
+/// One flash with its calibration and, if the render has it, its ground truth.
 pub struct Flash {
     pub attributes: Map<String, Value>,
     pub histogram: Vec<f32>,
@@ -100,7 +100,7 @@ impl Flash {
         })
     }
 
-    /// What is taken apart.
+    /// The histogram and its calibration.
     pub fn capture(&self) -> Capture<'_> {
         Capture {
             histogram: &self.histogram,

@@ -87,7 +87,7 @@ fn repin(spec: &mut JobSpec) -> std::result::Result<Vec<String>, String> {
         if positions.is_empty() {
             continue;
         }
-        // What is finished is taken over, not made again to be compared.
+        // Finished scenes are taken over. They are not rendered again for a comparison.
         stage.force = false;
         for at in positions {
             let path = scenes.kind.file(at as u64).map_or("", |file| &*file.path);

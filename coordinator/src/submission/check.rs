@@ -29,7 +29,7 @@ pub(crate) struct Findings {
     pub unseen: u64,
     /// The reason why some outputs could not be checked.
     pub why: Option<String>,
-    /// What is recorded of other jobs of the same files.
+    /// Records of other jobs with the same files.
     pub elsewhere: Elsewhere,
 }
 

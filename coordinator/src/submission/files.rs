@@ -1,6 +1,6 @@
-//! Scenes of files beside an earlier job with the same settings and another list of files: a file
-//! was corrected, or files were added. What was made of equal content is taken over; what was made
-//! of another content refuses the job.
+//! Compares scenes of files with an earlier job that has the same settings and another list of
+//! files, because a file was corrected or files were added. Results of equal content are taken
+//! over. Results of other content refuse the job.
 
 use std::collections::BTreeSet;
 
@@ -24,7 +24,7 @@ pub(crate) struct Elsewhere {
     pub job: Option<JobId>,
 }
 
-/// What is recorded of equal files, but for what is recorded of the stage itself.
+/// Returns the records of equal files, except those of the stage itself.
 pub(super) fn elsewhere(listed: &[(Listed, Vec<Recorded>)], own: &[Recorded]) -> Elsewhere {
     let own: BTreeSet<u64> = own.iter().map(|output| output.task).collect();
     let mut scenes = BTreeSet::new();

@@ -174,7 +174,7 @@ pub struct JobPlan {
     pub total: u64,
     /// Tasks with an existing output.
     pub reuse: u64,
-    /// Tasks whose output lies in the store without a record of it: workers look at each, and take
+    /// Tasks whose output is in the store without a record: workers look at each, and take
     /// it over. The client counts them, where it can read the store.
     pub taken: u64,
     /// Tasks that will run.
@@ -234,7 +234,7 @@ pub struct StagePlan {
     pub total: u64,
     /// Tasks with an existing output.
     pub reuse: u64,
-    /// Tasks whose output lies in the store without a record of it: workers look at each, and take
+    /// Tasks whose output is in the store without a record: workers look at each, and take
     /// it over. The client counts them, where it can read the store.
     pub taken: u64,
     /// Tasks that will run.

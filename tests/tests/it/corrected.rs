@@ -1,6 +1,5 @@
-//! Scene files that are corrected after their job was submitted: what is finished is taken over,
-//! only the corrected file is rendered, and a scene that was made of another content never counts
-//! for it.
+//! Scene files that are corrected after their job was submitted: finished scenes are taken over,
+//! only the corrected file is rendered, and a scene of other content never counts for it.
 
 use std::{
     fs,
@@ -133,7 +132,7 @@ fn the_job_file_of_corrected_and_added_scene_files_is_submitted_again_and_render
     farm.until_done_once(&second, &id(&submitted));
     assert_eq!(rendered(&farm, &id(&submitted)), (vec![1, 4], 3));
 
-    // What is lost of a scene is made again by the recipe in the data set.
+    // A lost object of a scene is made again by the recipe in the data set.
     let place = second.place();
     let whole = store::hashes(&place);
     for scene in [1, 2] {

@@ -1,5 +1,4 @@
-//! One flash taken apart by `picofarm demultiplex`: what is written, what is said, and what is
-//! refused.
+//! One flash taken apart by `picofarm demultiplex`: output files, printed text, and refused inputs.
 
 use std::{path::Path, sync::Arc};
 

@@ -1,4 +1,4 @@
-//! What is taken apart: one histogram of all spots at once, and the calibration that goes with it.
+//! The input: one histogram of all spots at once, and its calibration.
 
 use picofarm_scene::{Camera, Vec3};
 use picofarm_settings::Gate;

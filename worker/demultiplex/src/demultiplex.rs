@@ -22,7 +22,7 @@ const LEAP: f32 = 0.04;
 
 /// The same around spots, at least.
 const SPOT: usize = 3;
-/// Share of a spot's range within which what is seen belongs to its surface.
+/// Share of a spot's range within which a visible point belongs to the spot's surface.
 const FLAT: f32 = 0.004;
 
 /// What one flash holds. Images are row-major `[row][column]`; those over spots are
@@ -226,7 +226,7 @@ fn finish(rays: &Rays, slants: &Slants) -> (Vec<f32>, Vec<f32>) {
 }
 
 /// Normal of the surface that a spot is on: of the planes seen around it the one, moved to the
-/// spot, to which most of what is seen around belongs.
+/// spot, to which most of the visible points around it belong.
 fn spot_normal(rays: &Rays, depth: &[f32], normals: &[Vec3], source: &Source) -> Vec3 {
     let Some(p) = rays.pixel_of(source.point) else {
         return Vec3::ZERO;

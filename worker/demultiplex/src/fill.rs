@@ -11,7 +11,7 @@ use crate::{
     planes::Slants,
 };
 
-/// What a step to a neighbour costs beside the change of log intensity.
+/// Cost of a step to a neighbour, in addition to the change of log intensity.
 const STEP: f32 = 0.02;
 /// Least score of a pixel that a spot answers for.
 const SURE: f32 = 1.0;

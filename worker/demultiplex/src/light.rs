@@ -25,7 +25,7 @@ pub const CARRIES: f32 = 0.02;
 pub struct Share {
     /// cos·cos/r², 1/m²; 0 where the cosines cannot carry light or the time is outside of the gate.
     pub expected: f32,
-    /// Amplitude by non-negative least squares over all spots, over what is expected.
+    /// Amplitude by non-negative least squares over all spots, divided by the expected amplitude.
     pub found: f32,
     /// The same for all spots in its bins together.
     pub pooled: f32,

@@ -2,7 +2,7 @@
 
 use crate::Settings;
 
-/// The histogram of one pixel, taken apart into what is slow and what stands out.
+/// The histogram of one pixel, separated into a slow background and peaks.
 #[derive(Debug, Clone, Default)]
 pub struct Peaks {
     /// Slow background of each bin: an opening, smoothed.

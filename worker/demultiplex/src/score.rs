@@ -1,4 +1,4 @@
-//! What was found beside what is true.
+//! Scores of the result against the ground truth.
 
 use serde::Serialize;
 
@@ -28,7 +28,7 @@ pub struct DepthScore {
     pub mirrors_mae_m: Option<f64>,
 }
 
-/// Masks, at a probability of a half: intersection over union of what is lit.
+/// Masks, at a probability of a half: intersection over union of the lit pairs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MaskScore {
     /// Over all pairs of pixel and spot.
@@ -41,7 +41,7 @@ pub struct MaskScore {
     pub all_lit_iou: f64,
 }
 
-/// Depth beside the truth. Without pixels that see something all errors are 0.
+/// Compares depth with the truth. If no pixel sees a surface, all errors are 0.
 pub fn depth(found: &[f32], truth: &Truth) -> DepthScore {
     let (mut plain, mut mirrors) = (Vec::new(), Vec::new());
     for (p, z) in truth.depth_m.iter().enumerate().filter(|(_, z)| **z > 0.0) {
@@ -62,7 +62,7 @@ pub fn depth(found: &[f32], truth: &Truth) -> DepthScore {
     }
 }
 
-/// Masks beside the truth; `None` where the truth has none.
+/// Compares masks with the truth. Returns `None` if the truth has no masks.
 pub fn masks(found: &Demultiplexed, truth: &Truth) -> Option<MaskScore> {
     if truth.visibility.len() != found.lit.len() {
         return None;

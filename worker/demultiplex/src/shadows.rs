@@ -35,17 +35,17 @@ const VISIBLE: f32 = 3.0;
 
 /// Steps of a ray through the depth map.
 const STEPS: usize = 32;
-/// What is behind a surface by so much is hidden, share of its depth.
+/// A point this far behind a surface is hidden, as a share of its depth.
 const BEHIND: f32 = 0.006;
-/// What is deeper than this behind a surface may pass behind it, metres.
+/// A ray deeper than this behind a surface may pass behind it, metres.
 const THIN_M: f32 = 0.4;
 
 /// What the depth map knows of a segment from a spot to what a pixel sees.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Way {
-    /// Share of steps behind what is seen.
+    /// Share of steps behind the visible surface.
     pub behind: f32,
-    /// Share of steps little behind what is seen.
+    /// Share of steps closely behind the visible surface.
     pub little: f32,
     /// Share of steps outside of the image.
     pub outside: f32,

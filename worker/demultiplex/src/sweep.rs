@@ -79,7 +79,7 @@ impl Volume {
     }
 }
 
-/// What is known before the sweep: which spots may light what a pixel sees.
+/// The knowledge before the sweep: the spots that may light a pixel's surface.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Known<'a> {
     /// Normals of what pixels see; empty = unknown.

@@ -50,7 +50,7 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
     peaks
 }
 
-/// Adds a peak to a histogram; returns false where it lies outside the gate.
+/// Adds a peak to a histogram. Returns false if it is outside the gate.
 pub(crate) fn add(p: &Peak, gate: &Gate, transient: &mut [f32]) -> bool {
     let bin = gate.bin(p.path_m);
     if let Some(b) = bin {

@@ -156,8 +156,8 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         None
     }
 
-    /// The paths and URLs that are read beside data sets, each with its field: by one task, or by
-    /// all.
+    /// The paths and URLs that are read in addition to data sets, each with its field: by one task,
+    /// or by all.
     fn inputs(&self, _task: Option<u64>) -> Vec<(String, &str)> {
         Vec::new()
     }

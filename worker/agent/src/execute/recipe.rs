@@ -1,7 +1,7 @@
-//! Recipes: beside the scenes of a data set stands how they are made, so that `dataset repair` can
-//! make one again. A recipe is the stage of the job, without its place and its number of scenes;
-//! the key that it is stored under follows from what it says. Where scenes are files each has a
-//! recipe of its own, under a key that counts no file.
+//! Recipes: a data set stores how its scenes are made, so that `dataset repair` can make one again.
+//! A recipe is the stage of the job, without its place and its number of scenes. Its key follows
+//! from its content. Each scene from a file has a recipe of its own, under a key that counts no
+//! file.
 
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
@@ -14,7 +14,7 @@ use serde_json::json;
 
 use super::{Control, Task, TaskError, output::Stores};
 
-/// The data set that the recipe lies in.
+/// The data set that contains the recipe.
 pub(super) const HERE: &str = "here";
 
 /// Stores the recipe of a rendering. That of a scene file is stored under what all scenes of the

@@ -202,7 +202,7 @@ fn one_bitmap_scales_both_parts() {
     let m = material(&named(&tree));
     alike(&mixed(&m), &[1.0, 1.0, 0.1, 0.25]);
     assert!(m.texture.is_some());
-    // What is black has no texture to scale.
+    // A black surface has no texture to scale.
     let m = material(&named(&blend(0.5, &tree, &diffuse("0"))));
     alike(&mixed(&m), &[0.375 / 0.875, 1.0, 0.1, 0.125]);
     assert!(m.texture.is_some());

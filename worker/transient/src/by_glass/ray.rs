@@ -112,7 +112,7 @@ impl Ray {
 /// The state of a path.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Carried {
-    /// What is left of radiance or flux.
+    /// The remaining radiance or flux.
     pub weight: f32,
     /// Optical path, metres.
     pub length_m: f64,

@@ -1,7 +1,7 @@
 //! Mitsuba's blends as materials of one or two parts.
 //!
 //! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a
-//! blend again. What is read are the leaves, Lambertians and conductors. The share of a leaf is the
+//! blend again. The leaves are read: Lambertians and conductors. The share of a leaf is the
 //! product of the weights on the way to it. Lambertians side by side are one Lambertian of their
 //! mean, and so are conductors of one roughness and distribution: both scatter in proportion to
 //! what they reflect. What remains is one Lambertian, one conductor, or [`Bsdf::Mixed`] of both.
