@@ -5,7 +5,8 @@
 //! safetensors):
 //!
 //! ```sh
-//! PICOFARM_TWIN=input.safetensors cargo test --release -p picofarm-platonerf writes_what_the_twin_reads -- --ignored
+//! PICOFARM_TWIN=input.safetensors cargo test --release -p picofarm-platonerf \
+//!     writes_what_the_twin_reads -- --ignored
 //! python tests/twin/twin.py input.safetensors tests/twin/twin.safetensors
 //! ```
 //!
