@@ -12,7 +12,7 @@ use picofarm_demultiplex::{
 };
 use picofarm_scene::{AssetLibrary, furnished};
 use picofarm_settings::Spots;
-use picofarm_transient::{self as transient, Budget, Gate, Progress, Strategy, Wavelengths};
+use picofarm_transient::{self as transient, Budget, Gate, Progress, Strategy, Wavelength};
 
 struct Unstopped;
 
@@ -59,7 +59,7 @@ fn room(seed: u64) -> Row {
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
-        wavelengths_nm: Wavelengths::NONE,
+        wavelengths_nm: Wavelength::NONE,
     };
     let rendered = transient::render(&scene, &settings, &Unstopped).expect("a render");
     let returns = env::var_os("RETURNS").is_some();
