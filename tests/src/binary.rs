@@ -72,7 +72,7 @@ fn build() -> PathBuf {
             "--bin",
             "picofarm",
             "--test",
-            "story",
+            "it",
         ])
         .args([
             "--message-format",

@@ -133,7 +133,7 @@ const DICTIONARY: &str = r#"{"type":"scene","sensor":{"type":"perspective","fov"
  "film":{"type":"hdrfilm","width":64,"height":64}},"white":{"type":"twosided","inner":{"type":"blendbsdf","weight":0.3,
  "a":{"type":"diffuse","reflectance":{"type":"rgb","value":[0.5,0.6,0.7]}},"b":{"type":"roughconductor","material":"none","alpha":0.1}}},
  "paint":{"type":"diffuse","reflectance":{"type":"spectrum","value":[[450,0.25],[550,0.5],[905,0.75]]}},
- "coat":{"type":"blendbsdf","weight":0.25,"a":{"type":"ref","id":"white"},"b":{"type":"blendbsdf","weight":0.5,"a":{"type":"ref","id":"paint"},"b":{"type":"conductor","material":"Al"}}},
+ "coat":{"type":"blendbsdf","weight":0.25,"a":{"type":"ref","id":"white"},"b":{"type":"blendbsdf","weight":0.5,"a":{"type":"ref","id":"paint"},"b":{"type":"roughconductor","material":"Al","alpha":0.1}}},
  "wall":{"type":"rectangle","bsdf":{"type":"ref","id":"white"}},"floor":{"type":"cube","bsdf":{"type":"ref","id":"coat"}},"ball":{"type":"sphere","center":[0,0,1],"radius":0.3,"bsdf":{"type":"ref","id":"paint"}},
  "part":{"type":"obj","filename":"part.obj"},"beam":{"type":"projector","fov":0.2}}"#;
 
