@@ -101,6 +101,9 @@ fn wide(half: f32) -> Scene {
 
 #[test]
 fn walls_of_any_size_close_a_room_alike() {
+    // A last bit of a wall's distance turns a draw here and there: 0.012 % after 8 paths, 0.003 %
+    // after 32 and 0.0006 % after 128.
+    let set = || settings(Budget::Samples(32));
     let plain = ok(&closed(), &set());
     let whole = energy(&plain.transient);
     for half in [1e2f32, 1e4, 1e7, 5e8] {
@@ -138,7 +141,8 @@ fn a_large_mirror_far_outside_takes_no_strategy_from_a_mirror_in_the_room() {
 #[test]
 fn a_room_kilometres_from_the_origin_keeps_its_light() {
     let s = closed();
-    // If vertices are millimetres apart, some random draws fall to the other side of a rounding.
+    // Eight kilometres away f32 rounds vertices to half a millimetre, so the room itself differs:
+    // by -0.031 % after 256 paths and by -0.029 % after 1024.
     let set = settings(Budget::Samples(256));
     let plain = ok(&s, &set);
     for shift in [v(256.0, -512.0, 128.0), v(4096.0, -8192.0, 2048.0)] {
@@ -150,6 +154,6 @@ fn a_room_kilometres_from_the_origin_keeps_its_light() {
         far.laser.origin = shift;
         let (got, whole) = (energy(&ok(&far, &set).transient), energy(&plain.transient));
         println!("moved by {shift:?}: {:+.4} %", 100.0 * (got / whole - 1.0));
-        assert!((got / whole - 1.0).abs() < 3e-4, "{shift:?}");
+        assert!((got / whole - 1.0).abs() < 4e-4, "{shift:?}");
     }
 }

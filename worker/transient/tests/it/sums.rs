@@ -173,8 +173,9 @@ fn errors_of_sums_with_two_bounce_light_are_those_of_the_noise_draws() {
             assert!((rms - 1.0).abs() < 0.15, "{name}: {rms}");
             assert!((median - 1.0).abs() < 0.15, "{name}: median {median}");
         }
+        // Sixteen runs know the error of a whole image to 18 %.
         let z = total(name, &all);
-        assert!((z - 1.0).abs() < 0.15, "{name}: total {z}");
+        assert!((0.7..1.3).contains(&z), "{name}: total {z}");
     }
 }
 
