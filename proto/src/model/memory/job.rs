@@ -6,23 +6,8 @@ use crate::model::{JobSpec, StageSpec, TaskSpec};
 /// Returns the most bytes that a task takes in a process of its own; `None` if that depends on an
 /// unknown data set.
 ///
-/// Each kind takes the following, in addition to the program (70 MB) and the store (60 MB), with H
-/// = 4·pixels·bins:
-///
-/// - render: H for each histogram, the truth (260 + spots bytes a pixel), and tiles of each thread;
-///   plus the larger of .6 of the light paths' sums and the coded result (.45·H).
-/// - render of parts: the same, and all parts (as much as the image).
-/// - part: the image and truth of its range of tiles, the sums over light paths, and both again as
-///   a message.
-/// - generate: nothing that grows with pixels, because its scene is counted with the program.
-/// - import: 3.2·H.
-/// - reprocess: 3.4·H; from single spots 5·H.
-/// - split: nothing that grows with pixels.
-/// - promote: twice the weights.
-/// - reconstruct: 28 bytes a node of the grid, 40 a pixel and spot; from single spots 2·H.
-/// - export: 3.5·H.
-/// - verify: 2.6·H.
-/// - train, evaluate, infer, report: see [`Network`]; and two scenes.
+/// Each kind computes its own estimate (`memory` in `kinds/`), in addition to the program (70 MB)
+/// and the store (60 MB).
 pub fn peak_bytes(task: &TaskSpec, known: &Known, threads: u32) -> Option<u64> {
     let estimate = task.memory(known, threads)?;
     // The cast saturates.
