@@ -35,8 +35,8 @@ pub fn line(text: &str) -> Cow<'_, str> {
     escaped(text, |_| false)
 }
 
-/// Like [`line`], but keeps `\n`. This is the last check before a terminal. It cannot tell a forged
-/// line from another, so each foreign text must pass through [`line`] first.
+/// Like [`line()`], but keeps `\n`. This is the last check before a terminal. It cannot tell a
+/// forged line from another, so each foreign text must pass through [`line()`] first.
 pub fn lines(text: &str) -> Cow<'_, str> {
     escaped(text, |c| c == '\n')
 }

@@ -1,4 +1,4 @@
-//! Authentication and authorization. [`Guard`] precedes every service. It identifies the caller by
+//! Authentication and authorization. `Guard` precedes every service. It identifies the caller by
 //! a token or a client certificate, compares the caller's roles with the method's requirement, and
 //! passes the [`Caller`] to the handlers.
 

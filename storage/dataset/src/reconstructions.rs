@@ -52,7 +52,7 @@ pub struct ReconstructionManifest {
     pub settings: Value,
     /// Its objects. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
+    /// Checksum of the other fields, from `layout::manifest::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

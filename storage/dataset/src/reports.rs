@@ -43,7 +43,7 @@ pub struct ReportManifest {
     pub models: Vec<ReportedModel>,
     /// Its objects, with keys relative to the report's folder. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
+    /// Checksum of the other fields, from `layout::manifest::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

@@ -12,7 +12,7 @@
 //! # Agreeing
 //! The leading process has a connection with each other one. Whenever one arrives or is lost, and
 //! only between two steps, the leading one asks all for their state of progress, brings those
-//! behind to the most advanced state ([`Message::State`]), and assigns a rank to each. A lost
+//! behind to the most advanced state (`Message::State`), and assigns a rank to each. A lost
 //! process costs only the current step: no process takes a step before it has the gradients of all
 //! batches. If the leading process is lost, the others make a new call.
 //!

@@ -35,7 +35,7 @@ impl Baseline {
         })
     }
 
-    /// Returns the names of the baselines, in the order of [`Baseline::answers`].
+    /// Returns the names of the baselines, in the order of `Baseline::answers`.
     pub fn names(&self) -> &'static [&'static str] {
         match self {
             Self::Depth(_) => &["constant", "peak", "median image"],

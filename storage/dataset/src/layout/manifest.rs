@@ -78,7 +78,7 @@ pub struct Manifest {
     pub subsets: BTreeMap<String, SubsetCoding>,
     /// The scene's objects.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from [`seal`], to detect flipped bits; `None` in manifests
+    /// Checksum of the other fields, from `seal`, to detect flipped bits; `None` in manifests
     /// from before it existed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,

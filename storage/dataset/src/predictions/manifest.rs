@@ -38,7 +38,7 @@ pub struct PredictionManifest {
     pub agreement: Value,
     /// Its objects. Set on encoding.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from [`crate::layout::manifest::seal`].
+    /// Checksum of the other fields, from `layout::manifest::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

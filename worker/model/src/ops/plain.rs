@@ -14,7 +14,7 @@ use crate::kernel::AdamW;
 /// multiple (e.g. 637 bins), kernels of graphics processors read its values one by one.
 const ALIGNED: usize = 16;
 
-/// See [`super::conv3x3`]. Channels are padded with zeros to a multiple of [`ALIGNED`], unless
+/// See [`super::conv3x3`]. Channels are padded with zeros to a multiple of `ALIGNED`, unless
 /// there are fewer.
 pub fn conv3x3(x: Tensor<4>, w: Tensor<4>) -> Tensor<4> {
     let outputs = w.dims()[0];
