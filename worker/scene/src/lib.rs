@@ -26,6 +26,7 @@ mod texture;
 mod trace;
 mod vec3;
 mod view;
+mod viewpoint;
 
 pub use assets::{AssetLibrary, install};
 pub use camera::{Camera, Intrinsics};

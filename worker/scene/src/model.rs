@@ -80,14 +80,6 @@ pub enum SceneError {
         /// The field, the expected and actual values, and how to correct it.
         what: String,
     },
-    /// A file contains no laser, and none was given on import.
-    #[error("{path}: has no laser: {hint}")]
-    NoLaser {
-        /// The file.
-        path: PathBuf,
-        /// How to add a laser in this format.
-        hint: &'static str,
-    },
     /// A scene's content cannot be used, whatever its source.
     #[error("scene {scene:?}: {field}: {what}")]
     Invalid {

@@ -2,6 +2,7 @@
 //! JSON), PLY meshes and the reference scenes' JSON.
 
 mod buffers;
+mod complete;
 mod far;
 mod fingerprint;
 mod gltf_file;
@@ -19,7 +20,7 @@ use std::{
 
 use picofarm_files::{FileError, Opener};
 
-use crate::{Aim, Camera, Scene, SceneError};
+use crate::{Aim, Camera, Scene, SceneError, Vec3};
 
 pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
@@ -29,11 +30,85 @@ pub use reference::read_reference_json;
 pub struct ImportOptions {
     /// The camera that replaces the file's.
     pub camera: Option<Camera>,
+    /// Changes to the file's camera, or to the camera that is chosen if the file has none.
+    pub view: View,
     /// The aim of beams that replace the file's laser, over the camera's view.
     pub laser: Option<Aim>,
-    /// Whether to place a camera in front of a lone mesh (PLY) if there is no camera: 60°, on its
-    /// +z side, seeing all of it.
-    pub frame: bool,
+    /// The aim of beams for a file without a laser; `None` = a grid of 25 spots.
+    pub spots_if_none: Option<Aim>,
+    /// The unit of length of the file; `None` = the format's own. For formats without a unit (PLY),
+    /// `None` means metres, or millimetres if the scene would measure more than 50 m.
+    pub unit: Option<Unit>,
+}
+
+/// A view of a scene.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct View {
+    /// The camera of the file by name, or by number from 0.
+    pub camera: Option<String>,
+    /// The position of the camera, metres.
+    pub from: Option<Vec3>,
+    /// A point in the middle of the image, metres.
+    pub at: Option<Vec3>,
+    /// The horizontal field of view, degrees.
+    pub fov_deg: Option<f32>,
+    /// The direction that is upwards in the image; `None` = +y.
+    pub up: Option<Vec3>,
+}
+
+/// A unit of length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unit {
+    /// 1 m.
+    Metre,
+    /// 0.01 m.
+    Centimetre,
+    /// 0.001 m.
+    Millimetre,
+    /// 0.0254 m.
+    Inch,
+    /// 0.3048 m.
+    Foot,
+}
+
+impl Unit {
+    /// All units with their short names.
+    pub const ALL: [(&'static str, Self); 5] = [
+        ("m", Self::Metre),
+        ("cm", Self::Centimetre),
+        ("mm", Self::Millimetre),
+        ("in", Self::Inch),
+        ("ft", Self::Foot),
+    ];
+
+    /// Returns the length in metres.
+    pub fn metres(self) -> f32 {
+        match self {
+            Self::Metre => 1.0,
+            Self::Centimetre => 0.01,
+            Self::Millimetre => 0.001,
+            Self::Inch => 0.0254,
+            Self::Foot => 0.3048,
+        }
+    }
+}
+
+impl std::fmt::Display for Unit {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let name = Self::ALL.iter().find(|(_, unit)| unit == self);
+        f.write_str(name.map_or("m", |(name, _)| name))
+    }
+}
+
+impl std::str::FromStr for Unit {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let known = Self::ALL.iter().find(|(name, _)| *name == text);
+        known
+            .map(|(_, unit)| *unit)
+            .ok_or_else(|| format!("{}: expected m, cm, mm, in or ft", quoted(text)))
+    }
 }
 
 /// The allowed locations of a scene file and of the files that it names.
@@ -100,7 +175,7 @@ pub fn read_scene_with(
 ) -> Result<Scene, SceneError> {
     let bytes = read_file(&bounds.files, path)?;
     let files = &bounds.of_scene(path);
-    let mut scene = if bytes.starts_with(b"glTF") {
+    let draft = if bytes.starts_with(b"glTF") {
         gltf_file::read(path, &bytes, options, files)?
     } else if ply::is_ply(&bytes) {
         ply::read(path, &bytes, options)?
@@ -113,12 +188,9 @@ pub fn read_scene_with(
             Kind::Mitsuba => mitsuba::read_dictionary(path, &bytes, options, files)?,
         }
     };
-    if let Some(camera) = options.camera {
-        scene.camera = camera;
-    }
-    if let Some(aim) = &options.laser {
-        scene.laser = aim.laser(&scene.camera);
-    }
+    let scene = draft
+        .complete(options)
+        .map_err(|what| format_error(path, what))?;
     validated(path, scene)
 }
 

@@ -10,7 +10,11 @@ use crate::{
     Provenance, Scene, SceneError, Spot, Vec3,
 };
 
-use super::{Opener, format_error, read_file, validated};
+use super::{
+    ImportOptions, Opener,
+    complete::{Draft, FileLaser},
+    format_error, read_file, validated,
+};
 
 /// The resolution of a camera if the file has none; callers resize it.
 const DEFAULT_PIXELS: u32 = 64;
@@ -19,7 +23,7 @@ const DEFAULT_PIXELS: u32 = 64;
 struct File {
     name: String,
     camera: FileCamera,
-    laser: FileLaser,
+    laser: FilePlace,
     spots: Vec<FileSpot>,
     meshes: Vec<FileMesh>,
 }
@@ -34,7 +38,7 @@ struct FileCamera {
 }
 
 #[derive(Deserialize)]
-struct FileLaser {
+struct FilePlace {
     origin: Vec3,
 }
 
@@ -72,10 +76,12 @@ struct FileBsdf {
 /// # Errors
 /// [`SceneError::Read`] or [`SceneError::Format`] naming file and field.
 pub fn read_reference_json(path: &Path) -> Result<Scene, SceneError> {
-    validated(path, parse(path, &read_file(&Opener::anywhere(), path)?)?)
+    let draft = parse(path, &read_file(&Opener::anywhere(), path)?)?;
+    let scene = draft.complete(&ImportOptions::default());
+    validated(path, scene.map_err(|what| format_error(path, what))?)
 }
 
-pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Scene, SceneError> {
+pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Draft, SceneError> {
     let file: File = serde_json::from_slice(bytes)
         .map_err(|e| format_error(path, format!("is not a reference scene: {e}")))?;
     let c = &file.camera;
@@ -131,15 +137,16 @@ pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Scene, SceneError> {
                 .map_err(|what| format_error(path, format!("spots[{i}].{what}")))
         })
         .collect::<Result<Vec<_>, _>>()?;
-    Ok(Scene {
+    Ok(Draft {
         name: file.name,
         objects,
         labels,
-        camera,
-        laser: Laser {
+        cameras: vec![(String::new(), Ok(camera))],
+        laser: Some(FileLaser::Beams(Laser {
             origin: file.laser.origin,
             beams,
-        },
+        })),
+        has_unit: true,
         provenance: Provenance {
             source: "reference-json".into(),
             seed: None,

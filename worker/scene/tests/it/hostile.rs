@@ -106,7 +106,6 @@ fn survives(folder: &Path, name: &str, bytes: &[u8]) -> Result<(), TestCaseError
     std::fs::write(&path, bytes).expect("writes");
     let options = ImportOptions {
         laser: Aim::grid(4),
-        frame: true,
         ..ImportOptions::default()
     };
     let _ = import::fingerprint(&path, &Bounds::default());
@@ -306,7 +305,6 @@ fn the_undamaged_files_are_read() {
     let folder = folder();
     let options = ImportOptions {
         laser: Aim::grid(4),
-        frame: true,
         ..ImportOptions::default()
     };
     for (name, bytes) in FILES.iter().zip(files()) {

@@ -89,19 +89,23 @@ fn a_foreign_gltf_is_understood() {
 }
 
 #[test]
-fn a_missing_camera_or_laser_is_named_and_can_be_stated() {
+fn a_missing_camera_or_laser_is_chosen_and_can_be_stated() {
     let folder = Folder::new();
     let uri = data_uri(&corners(0.0));
-    let none = folder.file("bare.gltf", gltf(&uri, ""));
-    assert!(refusal(&none).contains("camera: no node has one"));
+    let bare = folder.file("bare.gltf", gltf(&uri, ""));
+    let scene = read_scene(&bare).expect("a camera is chosen");
+    let notes = &scene.provenance.notes;
+    assert!(notes.contains_key("chosen.camera") && notes.contains_key("chosen.laser"));
+    assert!(!notes.contains_key("chosen.unit"), "glTF is in metres");
     let dark = folder.file("dark.gltf", gltf(&uri, r#","camera":0"#));
-    assert!(refusal(&dark).contains("laser_spots"));
+    let scene = read_scene(&dark).expect("a laser is chosen");
+    assert_eq!(scene.camera.intrinsics.width, 128);
     let options = ImportOptions {
-        laser: Aim::grid(25),
+        laser: Aim::grid(4),
         ..ImportOptions::default()
     };
     let scene = read_scene_with(&dark, &options, &Bounds::default()).expect("the grid is stated");
-    assert_eq!(scene.laser.beams.len(), 25);
+    assert_eq!(scene.laser.beams.len(), 4);
 }
 
 #[test]

@@ -15,3 +15,4 @@ mod ply;
 mod primitive;
 mod round_trip;
 mod strangers;
+mod viewpoint;

@@ -249,7 +249,6 @@ fn elements_outside_the_subset_are_refused_by_name() {
             "<shape type=\"ply\"><string name=\"filename\" value=\"gone.ply\"/></shape>",
             "gone.ply",
         ),
-        (GGX.into(), "<emitter type=\"spot\"/>", "is 40 degrees wide"),
         (
             GGX.into(),
             "<emitter type=\"projector\"><float name=\"fov\" value=\"1\"/></emitter>",
@@ -274,11 +273,21 @@ fn elements_outside_the_subset_are_refused_by_name() {
         .expect_err("cut")
         .to_string();
     assert!(error.contains("not readable XML"), "{error}");
-    let dark = whole.replace("type=\"projector\"", "type=\"point\"");
-    let error = read_text("dark.xml", &dark)
-        .expect_err("no beam")
-        .to_string();
-    assert!(error.contains("has no beam"), "{error}");
+}
+
+#[test]
+fn lamps_are_left_out_with_a_note_and_do_not_make_a_laser() {
+    let dark = xml(GGX, "").replace("type=\"projector\"", "type=\"point\"");
+    let scene = read_text("dark.xml", &dark).expect("reads");
+    let notes = &scene.provenance.notes;
+    assert!(notes.contains_key("import.emitters"), "{notes:?}");
+    assert!(notes.contains_key("chosen.laser"), "{notes:?}");
+    assert_eq!(scene.laser.beams.len(), 25);
+    let lit = xml(GGX, "<emitter type=\"spot\"/>");
+    let scene = read_text("lit.xml", &lit).expect("reads");
+    let notes = &scene.provenance.notes;
+    assert!(notes.contains_key("import.emitters"), "{notes:?}");
+    assert!(!notes.contains_key("chosen.laser"), "{notes:?}");
 }
 
 const DICTIONARY: &str = r#"{

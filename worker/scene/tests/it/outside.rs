@@ -67,7 +67,6 @@ impl Place {
 fn options() -> ImportOptions {
     ImportOptions {
         laser: Aim::grid(1),
-        frame: true,
         ..ImportOptions::default()
     }
 }

@@ -57,13 +57,12 @@ fn binary(big: bool) -> Vec<u8> {
     out
 }
 
-fn read(name: &str, bytes: &[u8], frame: bool) -> Result<Scene, SceneError> {
+fn read(name: &str, bytes: &[u8]) -> Result<Scene, SceneError> {
     let folder = tempfile::tempdir().expect("a folder");
     let path: PathBuf = folder.path().join(name);
     std::fs::write(&path, bytes).expect("writes");
     let options = ImportOptions {
         laser: Aim::grid(4),
-        frame,
         ..ImportOptions::default()
     };
     read_scene_with(&path, &options, &Bounds::default())
@@ -72,7 +71,7 @@ fn read(name: &str, bytes: &[u8], frame: bool) -> Result<Scene, SceneError> {
 #[test]
 fn every_encoding_gives_the_same_mesh() {
     for bytes in [ascii(), binary(false), binary(true)] {
-        let scene = read("a.ply", &bytes, true).expect("reads");
+        let scene = read("a.ply", &bytes).expect("reads");
         let mesh = &scene.objects[0].mesh;
         assert_eq!(mesh.triangles, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 1, 2]]);
         assert_eq!(mesh.positions[3].y, 1.5);
@@ -91,17 +90,6 @@ fn every_encoding_gives_the_same_mesh() {
 }
 
 #[test]
-fn a_mesh_without_camera_says_what_to_do() {
-    let error = read("a.ply", &ascii(), false)
-        .expect_err("no camera")
-        .to_string();
-    assert!(
-        error.contains("a.ply") && error.contains("--frame"),
-        "{error}"
-    );
-}
-
-#[test]
 fn damage_is_refused_and_named() {
     let text = String::from_utf8(ascii()).expect("text");
     for (from, to, expected) in [
@@ -116,7 +104,7 @@ fn damage_is_refused_and_named() {
         ("end_header", "end", "header line"),
         ("vertex_indices", "corners", "no list vertex_indices"),
     ] {
-        let error = read("bad.ply", text.replacen(from, to, 1).as_bytes(), true)
+        let error = read("bad.ply", text.replacen(from, to, 1).as_bytes())
             .expect_err(to)
             .to_string();
         assert!(
@@ -126,7 +114,7 @@ fn damage_is_refused_and_named() {
     }
     let whole = binary(false);
     for keep in [3, 20, whole.len() - 40, whole.len() - 1] {
-        assert!(read("cut.ply", &whole[..keep], true).is_err());
+        assert!(read("cut.ply", &whole[..keep]).is_err());
     }
 }
 
@@ -136,7 +124,7 @@ fn a_scene_written_as_ply_has_the_same_triangles() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("room.ply");
     export::write_ply(&scene, &path).expect("writes");
-    let back = read("room.ply", &std::fs::read(&path).expect("the file"), true).expect("reads");
+    let back = read("room.ply", &std::fs::read(&path).expect("the file")).expect("reads");
     assert_eq!(back.triangle_count(), scene.triangle_count());
     let all = scene.objects.iter().flat_map(|o| {
         let place = |p: &picofarm_scene::Vec3| o.to_world.point(*p);

@@ -19,14 +19,13 @@ enum Expected {
 }
 use Expected::{Read, Refused};
 
-fn read(files: &[(&str, &[u8])], frame: bool) -> Result<Scene, SceneError> {
+fn read(files: &[(&str, &[u8])]) -> Result<Scene, SceneError> {
     let folder = tempfile::tempdir().expect("a folder");
     for (name, bytes) in files {
         std::fs::write(folder.path().join(name), bytes).expect("writes");
     }
     let options = ImportOptions {
         laser: Aim::grid(4),
-        frame,
         ..ImportOptions::default()
     };
     let path = folder.path().join(files[0].0);
@@ -201,20 +200,13 @@ fn meshes_in_ply() {
             Refused("element tristrips: is not supported"),
         ),
         (
-            "edge-on",
-            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
-             element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n0 1 0\n0 1 1\n3 0 1 2\n"
-                .into(),
-            Refused("edge-on as seen from +z"),
-        ),
-        (
             "no faces",
             ply("", 0.0).replace("element face 1\n", "element face 0\n"),
             Refused("no point cloud"),
         ),
     ];
     for (name, text, expected) in &cases {
-        check(name, read(&[("a.ply", text.as_bytes())], true), expected);
+        check(name, read(&[("a.ply", text.as_bytes())]), expected);
     }
 }
 
@@ -459,27 +451,36 @@ fn scenes_in_mitsubas_xml() {
             ("l.obj", L_OBJ.as_bytes()),
             ("far.ply", far.as_bytes()),
         ];
-        check(name, read(&files, false), expected);
+        check(name, read(&files), expected);
     }
 }
 
 #[test]
-fn a_scene_without_a_laser_is_known_by_its_type() {
+fn a_scene_without_a_laser_gets_spots_over_the_view_of_its_camera() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("a.xml");
     std::fs::write(&path, xml("3.0.0", "", "")).expect("writes");
-    let options = ImportOptions::default();
-    let said = read_scene_with(&path, &options, &Bounds::default()).expect_err("no laser");
-    assert!(matches!(said, SceneError::NoLaser { .. }), "{said}");
-    let path = folder.path().join("a.gltf");
     let mut file = Gltf::new();
     file.json["nodes"][1]
         .as_object_mut()
         .expect("a node")
         .remove("extras");
-    std::fs::write(&path, file.bytes()).expect("writes");
-    let said = read_scene_with(&path, &options, &Bounds::default()).expect_err("no laser");
-    assert!(matches!(said, SceneError::NoLaser { .. }), "{said}");
+    let gltf = folder.path().join("a.gltf");
+    std::fs::write(&gltf, file.bytes()).expect("writes");
+    for path in [path, gltf] {
+        let read = |options| read_scene_with(&path, &options, &Bounds::default()).expect("reads");
+        let scene = read(ImportOptions::default());
+        assert_eq!(scene.laser.beams.len(), 25);
+        assert_eq!(scene.laser.origin, scene.camera.origin);
+        let note = &scene.provenance.notes["chosen.laser"];
+        assert!(note.contains("--spots"), "{note}");
+        let scene = read(ImportOptions {
+            spots_if_none: Aim::grid(4),
+            ..ImportOptions::default()
+        });
+        assert_eq!(scene.laser.beams.len(), 4);
+        assert!(!scene.provenance.notes.contains_key("chosen.laser"));
+    }
 }
 
 /// A glTF file under construction: a wall, a camera with a laser, and a quad 2 m in front of it.
@@ -783,7 +784,7 @@ fn scenes_in_gltf() {
             Box::new(|f| {
                 f.json["cameras"] = json!([{"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 1, "zfar": 9, "znear": 1}}]);
             }),
-            Refused("is orthographic"),
+            quad("cameras"),
         ),
         (
             "another scene without nodes",
@@ -887,6 +888,6 @@ fn scenes_in_gltf() {
     for (name, edit, expected) in &cases {
         let mut file = Gltf::new();
         edit(&mut file);
-        check(name, read(&[("a.gltf", &file.bytes())], false), expected);
+        check(name, read(&[("a.gltf", &file.bytes())]), expected);
     }
 }

@@ -14,15 +14,20 @@ use gltf::{Node, camera::Projection};
 use serde::de::DeserializeOwned;
 
 use crate::{
-    Affine, Camera, Mesh, Object, Provenance, Scene, SceneError, Vec3, Wrap,
+    Affine, Camera, Mesh, Object, Provenance, SceneError, Vec3, Wrap,
     extras::{FORMAT, Keyed, NodeExtras, SceneExtras},
 };
 
 use super::{
-    ImportOptions, Opener, buffers::Buffers, far, format_error, image::Images, mitsuba::Matrix,
+    ImportOptions, Opener,
+    buffers::Buffers,
+    complete::{Draft, FileLaser},
+    far, format_error,
+    image::Images,
+    mitsuba::Matrix,
 };
 use document::Facts;
-use parts::laser_of;
+use parts::{camera_of, laser_of};
 
 /// The deepest nesting of nodes.
 const MAX_DEPTH: usize = 1000;
@@ -35,7 +40,7 @@ pub(super) fn read(
     bytes: &[u8],
     options: &ImportOptions,
     files: &Opener,
-) -> Result<Scene, SceneError> {
+) -> Result<Draft, SceneError> {
     let (document, buffers, facts) = open(path, bytes, files)?;
     let root = root(path, &document)?;
     let ours: Option<SceneExtras> = keyed(
@@ -61,10 +66,10 @@ pub(super) fn read(
     }
     walk.labels = labels;
     if ours.is_none() && options.camera.is_none() {
-        walk.move_to_camera(&root);
+        walk.move_near_origin(&root);
     }
     walk.walk(&root)?;
-    walk.finish(&root, ours, options)
+    walk.finish(&root, ours)
 }
 
 /// Reads `.glb` or `.gltf` bytes as one mesh in the file's own frame, with the notes on dropped
@@ -214,8 +219,8 @@ struct Walk<'a> {
     labels: Vec<String>,
     /// The indices of `labels`.
     known_labels: BTreeMap<String, usize>,
-    /// The first perspective camera; an error is reported only if the camera is used.
-    camera: Option<Result<Camera, SceneError>>,
+    /// The perspective cameras with their names; an error is reported only if the camera is used.
+    cameras: Vec<(String, Result<Camera, String>)>,
     laser: Option<(Affine, NodeExtras)>,
     notes: BTreeMap<String, String>,
 }
@@ -245,7 +250,7 @@ impl<'a> Walk<'a> {
             objects: Vec::new(),
             labels: Vec::new(),
             known_labels: BTreeMap::new(),
-            camera: None,
+            cameras: Vec::new(),
             laser: None,
             notes: BTreeMap::new(),
         })
@@ -260,23 +265,31 @@ impl<'a> Walk<'a> {
         Ok(())
     }
 
-    /// Moves a scene far from the origin of its file to its camera.
-    fn move_to_camera(&mut self, root: &gltf::Scene<'_>) {
+    /// Moves a scene far from the origin of its file to its camera, or to its first mesh without a
+    /// camera.
+    fn move_near_origin(&mut self, root: &gltf::Scene<'_>) {
         // In the order of the walk.
         let mut open: Vec<Node<'_>> = root.nodes().collect();
         open.reverse();
+        let mut mesh = None;
+        let mut camera = None;
         while let Some(node) = open.pop() {
             if node.camera().is_some_and(|c| is_perspective(&c)) {
-                let world = self.worlds.get(node.index()).copied().flatten();
-                let origin = world.unwrap_or(Matrix::IDENTITY).origin();
-                if far::is_lossy(origin, f64::INFINITY) {
-                    self.origin = origin;
-                    self.note("origin", far::note(origin));
-                }
-                return;
+                camera = Some(node.index());
+                break;
+            }
+            if mesh.is_none() && node.mesh().is_some() {
+                mesh = Some(node.index());
             }
             let children: Vec<Node<'_>> = node.children().collect();
             open.extend(children.into_iter().rev());
+        }
+        let Some(node) = camera.or(mesh) else { return };
+        let world = self.worlds.get(node).copied().flatten();
+        let origin = world.unwrap_or(Matrix::IDENTITY).origin();
+        if far::is_lossy(origin, f64::INFINITY) {
+            self.origin = origin;
+            self.note("origin", far::note(origin));
         }
     }
 
@@ -318,11 +331,12 @@ impl<'a> Walk<'a> {
             }
         }
         if let Some(camera) = node.camera() {
-            match (is_perspective(&camera), &self.camera) {
-                (false, _) => self.note("cameras", "orthographic ones ignored"),
-                (true, Some(_)) => {}
-                (true, None) => {
-                    self.camera = Some(self.camera_of(&to_world.affine(), &camera));
+            match is_perspective(&camera) {
+                false => self.note("cameras", "orthographic ones ignored"),
+                true => {
+                    let name = node.name().or(camera.name()).unwrap_or_default().to_owned();
+                    let read = camera_of(&to_world.affine(), &camera);
+                    self.cameras.push((name, read));
                 }
             }
         }
@@ -403,8 +417,7 @@ impl<'a> Walk<'a> {
         mut self,
         root: &gltf::Scene<'_>,
         ours: Option<SceneExtras>,
-        options: &ImportOptions,
-    ) -> Result<Scene, SceneError> {
+    ) -> Result<Draft, SceneError> {
         let path = self.path;
         let count = self.objects.len();
         let mut ids: Vec<Option<u32>> = self.objects.iter().map(|(id, _)| *id).collect();
@@ -417,53 +430,35 @@ impl<'a> Walk<'a> {
                 format!("ids in extras are not 0..{count}; objects are numbered in file order"),
             );
         }
-        let (camera, laser, mut provenance, name) = match ours {
-            Some(e) => (e.camera, e.laser, e.provenance, e.name),
+        let (cameras, laser, mut provenance, name) = match ours {
+            Some(e) => (
+                vec![(String::new(), Ok(e.camera))],
+                Some(FileLaser::Beams(e.laser)),
+                e.provenance,
+                e.name,
+            ),
             None => {
-                let camera = match (options.camera, self.camera) {
-                    (Some(camera), _) => camera,
-                    (None, Some(camera)) => camera?,
-                    (None, None) => {
-                        let what = match self.notes.contains_key("cameras") {
-                            true => {
-                                "camera: is orthographic; add a perspective camera, or state one on import"
-                            }
-                            false => {
-                                "camera: no node has one; add a perspective camera, or state one on import"
-                            }
-                        };
-                        return Err(format_error(path, what));
-                    }
-                };
-                let laser = match (&options.laser, &self.laser) {
-                    (Some(aim), _) => aim.laser(&camera),
-                    (None, Some((to_world, extras))) => laser_of(path, to_world, extras, &camera)?,
-                    (None, None) => {
-                        return Err(SceneError::NoLaser {
-                            path: path.to_path_buf(),
-                            hint: "no node's extras have \"laser_spots\" (1, 4, 16, 25 or 100) or \"laser_directions\" \
-                                   ([[x, y, z], …]); add one, or state a grid on import",
-                        });
-                    }
-                };
+                let laser = self.laser.as_ref();
+                let laser = laser.map(|(to_world, extras)| laser_of(path, to_world, extras));
                 let provenance = Provenance {
                     source: "gltf".into(),
                     ..Provenance::default()
                 };
                 let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned());
                 let name = root.name().map(str::to_owned).or(stem).unwrap_or_default();
-                (camera, laser, provenance, name)
+                (self.cameras, laser.transpose()?, provenance, name)
             }
         };
         for (key, note) in self.notes {
             provenance.notes.insert(format!("import.{key}"), note);
         }
-        Ok(Scene {
+        Ok(Draft {
             name,
             objects: self.objects.into_iter().map(|(_, object)| object).collect(),
             labels: self.labels,
-            camera,
+            cameras,
             laser,
+            has_unit: true,
             provenance,
         })
     }

@@ -16,8 +16,7 @@
 //! **The laser.** Mitsuba has no collimated emitter. As in mitransient scenes, a beam is an emitter
 //! `projector` with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`.
 //! Several beams form a grid, and all must start at one point. The power is not read: every beam
-//! has unit energy. Other emitters are omitted with a note. Without beams, a grid must be given on
-//! import.
+//! has unit energy. Other emitters are omitted with a note.
 //!
 //! **Labels.** A shape's category is its id up to the first `.` (`chair.2` is a `chair`), else
 //! `unlabelled`.
@@ -47,10 +46,10 @@ use std::{
 };
 
 use crate::{
-    Affine, Material, Mesh, Object, Provenance, Scene, SceneError, Wrap,
-    export::mitsuba::text::Extras,
+    Affine, Material, Mesh, Object, Provenance, SceneError, Wrap, export::mitsuba::text::Extras,
 };
 
+use super::complete::{Draft, FileLaser};
 use super::{ImportOptions, Opener, add_note, far, format_error, image::Images, of_file, quoted};
 use blend::Leaf;
 use bsdf::Look;
@@ -70,7 +69,7 @@ pub(super) fn read_xml(
     bytes: &[u8],
     options: &ImportOptions,
     files: &Opener,
-) -> Result<Scene, SceneError> {
+) -> Result<Draft, SceneError> {
     let fail = |what: String| format_error(path, what);
     let text = std::str::from_utf8(bytes).map_err(|e| fail(format!("is not UTF-8 text: {e}")))?;
     let (root, extras) = xml::parse(text.trim_start_matches('\u{feff}')).map_err(fail)?;
@@ -80,7 +79,7 @@ pub(super) fn read_xml(
         .map_err(|e| fail(format!("comment picofarm: {e}; remove it, or export again")))?;
     Reader::new((path, files), root, extras)
         .scene(options)
-        .map_err(|refusal| refusal.of_file(path))
+        .map_err(|what| format_error(path, what))
 }
 
 /// Reads a scene from its dictionary in JSON; the caller validates the result.
@@ -89,12 +88,12 @@ pub(super) fn read_dictionary(
     bytes: &[u8],
     options: &ImportOptions,
     files: &Opener,
-) -> Result<Scene, SceneError> {
+) -> Result<Draft, SceneError> {
     let fail = |what: String| format_error(path, what);
     let root = dictionary::parse(bytes).map_err(fail)?;
     Reader::new((path, files), root, None)
         .scene(options)
-        .map_err(|refusal| refusal.of_file(path))
+        .map_err(|what| format_error(path, what))
 }
 
 /// Returns the files that a scene in XML or JSON refers to, in order of their names.
@@ -128,32 +127,6 @@ pub(super) fn files(path: &Path, bytes: &[u8]) -> Result<Vec<PathBuf>, SceneErro
 
 fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
-}
-
-/// The reason why a scene is not read.
-enum Refusal {
-    /// It has no beam, and none was given.
-    NoLaser,
-    Format(String),
-}
-
-impl From<String> for Refusal {
-    fn from(what: String) -> Self {
-        Self::Format(what)
-    }
-}
-
-impl Refusal {
-    fn of_file(self, path: &Path) -> SceneError {
-        match self {
-            Self::Format(what) => format_error(path, what),
-            Self::NoLaser => SceneError::NoLaser {
-                path: path.to_path_buf(),
-                hint: "it has no beam; add <emitter type=\"projector\"> with fov 0.1 and to_world for each beam, or state a grid \
-                       on import",
-            },
-        }
-    }
 }
 
 struct Reader<'a> {
@@ -296,7 +269,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn scene(mut self, options: &ImportOptions) -> Result<Scene, Refusal> {
+    fn scene(mut self, options: &ImportOptions) -> Result<Draft, String> {
         let root = self.root.clone();
         let shapes = self.children(&root, "shape")?;
         self.only(&root, &properties::SCENE)?;
@@ -307,25 +280,17 @@ impl<'a> Reader<'a> {
         }
         let (objects, labels) = self.objects(&shapes)?;
         if sensors.len() > 1 {
-            self.note("sensors", "more than one; the first is the camera");
+            self.note(
+                "sensors",
+                "more than one; the first is the camera, unless --camera names another",
+            );
         }
-        let camera = match (options.camera, sensors.first()) {
-            (Some(camera), _) => camera,
-            (None, Some(sensor)) => self.camera(sensor)?,
-            (None, None) => {
-                return Err(Refusal::from(
-                    "has no <sensor>; add a perspective one, or state a camera on import"
-                        .to_owned(),
-                ));
-            }
-        };
-        let laser = match &options.laser {
-            Some(aim) => aim.laser(&camera),
-            None => {
-                let emitters = self.children(&root, "emitter")?;
-                self.laser(&emitters)?.ok_or(Refusal::NoLaser)?
-            }
-        };
+        let cameras = sensors
+            .iter()
+            .map(|sensor| (sensor.id.clone(), self.camera(sensor)))
+            .collect();
+        let emitters = self.children(&root, "emitter")?;
+        let laser = self.laser(&emitters)?;
         let stem = self.path.file_stem().unwrap_or_default();
         let (name, mut provenance) = match self.extras {
             Some(extras) => (extras.scene.name, extras.scene.provenance),
@@ -340,12 +305,13 @@ impl<'a> Reader<'a> {
         for (key, note) in self.notes {
             provenance.notes.insert(format!("import.{key}"), note);
         }
-        Ok(Scene {
+        Ok(Draft {
             name,
             objects,
             labels,
-            camera,
-            laser,
+            cameras,
+            laser: laser.map(FileLaser::Beams),
+            has_unit: true,
             provenance,
         })
     }

@@ -148,12 +148,8 @@ impl Reader<'_> {
                         .ok_or_else(|| node.fail("to_world: has no inverse"))?;
                     beams.push((pose.affine().translation, along, node));
                 }
-                Some(angle) => {
-                    return Err(node.fail(format!(
-                        "is {angle} degrees wide and so no beam; narrow it to {BEAM_DEG} degrees or less"
-                    )));
-                }
-                None => self.note(
+                // Wider emitters are lamps.
+                _ => self.note(
                     "emitters",
                     "other than beams are ignored; only the laser shines",
                 ),

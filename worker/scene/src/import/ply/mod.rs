@@ -6,22 +6,14 @@ mod header;
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
-use crate::{
-    Affine, Camera, Intrinsics, Material, Mesh, Object, Provenance, Scene, SceneError, Vec3,
-};
+use crate::{Affine, Material, Mesh, Object, Provenance, SceneError};
 
-use super::{ImportOptions, far, format_error, polygon::Triangulation};
+use super::{ImportOptions, complete::Draft, far, format_error, polygon::Triangulation};
 use body::{Body, Row};
 use header::{Element, Number};
 
 /// The linear albedo of a mesh without colours.
 const GREY: f32 = 0.5;
-/// The image size and field of view of a camera that frames a mesh.
-const FRAME_PIXELS: u32 = 256;
-const FRAME_FOV_DEG: f32 = 60.0;
-
-/// The share of its area below which a mesh is edge-on to a camera.
-const EDGE_ON: f64 = 1e-3;
 /// Elements with geometry that cannot be read. They are refused, so that no geometry is lost
 /// unnoticed.
 const UNREAD_SURFACES: [&str; 2] = ["tristrips", "range_grid"];
@@ -53,13 +45,12 @@ pub(super) fn is_ply(bytes: &[u8]) -> bool {
     bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
 }
 
-/// Reads a PLY file as a scene of one object. It has no camera and no laser, so `options` must
-/// define them.
+/// Reads a PLY file as a scene of one object, without camera and laser.
 pub(super) fn read(
     path: &Path,
     bytes: &[u8],
     options: &ImportOptions,
-) -> Result<Scene, SceneError> {
+) -> Result<Draft, SceneError> {
     let ply = parse(bytes).map_err(|what| format_error(path, what))?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy();
     let mut notes: BTreeMap<String, String> = ply
@@ -89,25 +80,7 @@ pub(super) fn read(
         triangles: ply.triangles,
         materials: vec![Material::diffuse("ply", ply.colour.unwrap_or([GREY; 3]))],
     };
-    let camera = options
-        .camera
-        .or_else(|| options.frame.then(|| frame(&mesh))?);
-    let (Some(camera), Some(aim)) = (camera, &options.laser) else {
-        return Err(format_error(
-            path,
-            "is a mesh without camera and laser: place it in a glTF or Mitsuba scene, or let \
-             `picofarm scene export FILE --frame --out scene.glb` put both in front of it",
-        ));
-    };
-    if options.camera.is_none() && is_edge_on(&mesh) {
-        return Err(format_error(
-            path,
-            "is edge-on as seen from +z, where --frame puts the camera: turn the mesh, or place it in a glTF or Mitsuba \
-             scene with a camera",
-        ));
-    }
-    notes.insert("import.units".into(), "not stated; metres assumed".into());
-    Ok(Scene {
+    Ok(Draft {
         name: name.clone().into_owned(),
         objects: vec![Object {
             mesh: Arc::new(mesh),
@@ -116,43 +89,15 @@ pub(super) fn read(
             name: name.into_owned(),
         }],
         labels: vec!["unlabelled".into()],
-        camera,
-        laser: aim.laser(&camera),
+        cameras: Vec::new(),
+        laser: None,
+        has_unit: false,
         provenance: Provenance {
             source: "ply".into(),
             notes,
             ..Provenance::default()
         },
     })
-}
-
-/// Returns whether a camera on the mesh's +z side sees it as a line.
-fn is_edge_on(mesh: &Mesh) -> bool {
-    let (mut seen, mut whole) = (0.0, 0.0);
-    for t in &mesh.triangles {
-        let [a, b, c] = t.map(|v| mesh.positions[v as usize]);
-        let normal = (b - a).cross(c - a);
-        seen += f64::from(normal.z.abs());
-        whole += f64::from(normal.length());
-    }
-    seen <= EDGE_ON * whole
-}
-
-/// Returns a camera in front (towards +z) of a mesh that sees all of it.
-fn frame(mesh: &Mesh) -> Option<Camera> {
-    let (lo, hi) = mesh.bounds()?;
-    let (centre, radius) = ((lo + hi) * 0.5, (hi - lo).length() * 0.5);
-    let distance = radius / libm::sinf(FRAME_FOV_DEG.to_radians() * 0.5);
-    let distance = distance.max(f32::MIN_POSITIVE);
-    let intrinsics = Intrinsics::from_fov(FRAME_FOV_DEG, FRAME_PIXELS, FRAME_PIXELS);
-    let origin = centre + Vec3::new(0.0, 0.0, distance);
-    let mut camera = Camera::look_at(origin, centre, intrinsics);
-    (camera.right, camera.down, camera.forward) = (
-        Vec3::new(1.0, 0.0, 0.0),
-        Vec3::new(0.0, -1.0, 0.0),
-        Vec3::new(0.0, 0.0, -1.0),
-    );
-    Some(camera)
 }
 
 /// Parses a whole file. The message names the element and quotes nothing, because the file may have

@@ -1,0 +1,212 @@
+//! Completes scenes from files: chooses the unit, the camera and the laser that a file does not
+//! state, and notes each choice with the option that changes it.
+
+use crate::{
+    Affine, Aim, Camera, Intrinsics, Laser, Object, Provenance, Scene, Vec3, viewpoint::Viewpoint,
+};
+
+use super::{ImportOptions, Unit, add_note, quoted};
+
+/// The number of spots of a laser that neither the file nor the options describe.
+const SPOTS: u32 = 25;
+/// The image size of a camera that the file does not describe, pixels on each side.
+const PIXELS: u32 = 256;
+/// The horizontal field of view of such a camera, degrees.
+const FOV_DEG: f32 = 60.0;
+/// The largest diagonal of a scene that is taken to be in metres, if its format has no unit. A
+/// larger one is taken to be in millimetres.
+const LARGEST_M: f32 = 50.0;
+
+/// A scene as its file describes it.
+pub(super) struct Draft {
+    pub(super) name: String,
+    pub(super) objects: Vec<Object>,
+    pub(super) labels: Vec<String>,
+    /// The cameras in the order of the file, with their names (which may be empty). An error is
+    /// reported only if the camera is used.
+    pub(super) cameras: Vec<(String, Result<Camera, String>)>,
+    pub(super) laser: Option<FileLaser>,
+    /// Whether the format or the file defines the unit of length.
+    pub(super) has_unit: bool,
+    pub(super) provenance: Provenance,
+}
+
+/// The laser of a file.
+pub(super) enum FileLaser {
+    /// A position and directions.
+    Beams(Laser),
+    /// Spots over the view of the camera.
+    Spots(Aim),
+}
+
+impl Draft {
+    /// Returns the scene with everything that the renderer needs. The error is the fault, without
+    /// the file.
+    pub(super) fn complete(mut self, options: &ImportOptions) -> Result<Scene, String> {
+        self.scale(options);
+        let camera = self.camera(options)?;
+        let laser = self.laser(options, &camera);
+        Ok(Scene {
+            name: self.name,
+            objects: self.objects,
+            labels: self.labels,
+            camera,
+            laser,
+            provenance: self.provenance,
+        })
+    }
+
+    fn note(&mut self, key: &str, what: String) {
+        add_note(&mut self.provenance.notes, &format!("chosen.{key}"), what);
+    }
+
+    /// Converts all lengths to metres.
+    fn scale(&mut self, options: &ImportOptions) {
+        let unit = match options.unit {
+            Some(unit) => unit,
+            None if self.has_unit => return,
+            None => {
+                let diagonal = bounds(&self.objects).map_or(0.0, |(lo, hi)| (hi - lo).length());
+                let unit = match diagonal > LARGEST_M {
+                    true => Unit::Millimetre,
+                    false => Unit::Metre,
+                };
+                let what = format!(
+                    "{unit}, because the file has no unit and measures {diagonal:.3} across; --unit changes it"
+                );
+                self.note("unit", what);
+                unit
+            }
+        };
+        let metres = unit.metres();
+        if metres == 1.0 {
+            return;
+        }
+        for object in &mut self.objects {
+            let Affine {
+                linear,
+                translation,
+            } = object.to_world;
+            object.to_world = Affine {
+                linear: linear.map(|row| row * metres),
+                translation: translation * metres,
+            };
+        }
+        for camera in self.cameras.iter_mut().filter_map(|c| c.1.as_mut().ok()) {
+            camera.origin = camera.origin * metres;
+        }
+        if let Some(FileLaser::Beams(laser)) = &mut self.laser {
+            laser.origin = laser.origin * metres;
+            for spot in laser.beams.iter_mut().filter_map(|b| b.spot.as_mut()) {
+                spot.point = spot.point * metres;
+                spot.path_m *= metres;
+            }
+        }
+    }
+
+    /// Returns the stated camera, one of the file's, or a chosen one.
+    fn camera(&mut self, options: &ImportOptions) -> Result<Camera, String> {
+        if let Some(camera) = options.camera {
+            return Ok(camera);
+        }
+        let view = &options.view;
+        let own = match &view.camera {
+            Some(wanted) => Some(self.named_camera(wanted)?),
+            None => self.cameras.first().map(|(_, camera)| camera.clone()),
+        };
+        let own = own.transpose()?;
+        let mut camera = match (own, view.from, view.at) {
+            (Some(camera), None, None) => camera,
+            (own, from, at) => {
+                let fov_deg = view.fov_deg.unwrap_or(FOV_DEG);
+                let intrinsics = match own {
+                    Some(camera) => camera.intrinsics,
+                    None => Intrinsics::from_fov(fov_deg, PIXELS, PIXELS),
+                };
+                let viewpoint = Viewpoint {
+                    from: from.or(own.map(|c| c.origin)),
+                    at,
+                    up: view.up.unwrap_or(Vec3::new(0.0, 1.0, 0.0)),
+                };
+                let (camera, kind) = viewpoint.camera(&self.objects, intrinsics)?;
+                if from.is_none() && at.is_none() {
+                    let [x, y, z] = <[f32; 3]>::from(camera.origin);
+                    let ahead = camera.origin + camera.forward;
+                    self.note(
+                        "camera",
+                        format!(
+                            "{kind}, at {x:.3},{y:.3},{z:.3} towards {:.3},{:.3},{:.3}, {fov_deg}° wide, because the file \
+                             has none; --look-from, --look-at, --fov and --up change it",
+                            ahead.x, ahead.y, ahead.z
+                        ),
+                    );
+                }
+                camera
+            }
+        };
+        if let Some(fov_deg) = view.fov_deg {
+            let i = camera.intrinsics;
+            camera.intrinsics = Intrinsics::from_fov(fov_deg, i.width, i.height);
+        }
+        Ok(camera)
+    }
+
+    /// Returns the camera of a name or number (from 0).
+    fn named_camera(&self, wanted: &str) -> Result<Result<Camera, String>, String> {
+        let by_name = self.cameras.iter().find(|(name, _)| name == wanted);
+        let by_number = || self.cameras.get(wanted.parse::<usize>().ok()?);
+        by_name
+            .or_else(by_number)
+            .map(|(_, camera)| camera.clone())
+            .ok_or_else(|| {
+                let names = self.cameras.iter().enumerate();
+                let names: Vec<String> = names
+                    .take(20)
+                    .map(|(k, (name, _))| format!("{k} ({})", quoted(name)))
+                    .collect();
+                let has = match names.is_empty() {
+                    true => "it has none".to_owned(),
+                    false => format!("it has {}", names.join(", ")),
+                };
+                format!(
+                    "camera {}: the file has no such camera; {has}",
+                    quoted(wanted)
+                )
+            })
+    }
+
+    fn laser(&mut self, options: &ImportOptions, camera: &Camera) -> Laser {
+        if let Some(aim) = &options.laser {
+            return aim.laser(camera);
+        }
+        match (self.laser.take(), &options.spots_if_none) {
+            (Some(FileLaser::Beams(laser)), _) => laser,
+            (Some(FileLaser::Spots(aim)), _) => aim.laser(camera),
+            (None, Some(aim)) => aim.laser(camera),
+            (None, None) => {
+                self.note(
+                    "laser",
+                    format!(
+                        "at the camera, {SPOTS} spots in a grid over its view, because the file has none; --spots changes it"
+                    ),
+                );
+                let aim = Aim::grid(SPOTS).expect("a grid of that size exists");
+                aim.laser(camera)
+            }
+        }
+    }
+}
+
+/// Returns the smallest and largest world coordinates of all finite vertices.
+fn bounds(objects: &[Object]) -> Option<(Vec3, Vec3)> {
+    let points = objects.iter().flat_map(|o| {
+        let vertices = o.mesh.triangles.iter().flatten();
+        vertices.map(|&v| o.to_world.point(o.mesh.positions[v as usize]))
+    });
+    points
+        .filter(|p| p.is_finite())
+        .fold(None, |known, p| match known {
+            None => Some((p, p)),
+            Some((lo, hi)) => Some((p.min(lo), p.max(hi))),
+        })
+}
