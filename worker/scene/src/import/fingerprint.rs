@@ -20,7 +20,7 @@ pub fn fingerprint(path: &Path, bounds: &Bounds) -> Result<String, SceneError> {
     let files = &bounds.of_scene(path);
     let mut hash = Sha256::new_with_prefix(&bytes);
     if is_xml(&bytes) || bytes.trim_ascii_start().first() == Some(&b'{') {
-        for external in mitsuba::files(path, &bytes)? {
+        for external in mitsuba::files(path, &bytes, files)? {
             let data = read_file(files, &external)?;
             hash.update(external.file_name().unwrap_or_default().as_encoded_bytes());
             hash.update((data.len() as u64).to_le_bytes());

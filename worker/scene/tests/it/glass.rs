@@ -215,11 +215,6 @@ fn mitsubas_glass_that_is_no_body_is_refused_with_a_way_out() {
             r#"{"type": "twosided", "inner": {"type": "dielectric"}}"#,
             "dielectric or thindielectric by itself",
         ),
-        (
-            sphere,
-            r#"{"type": "roughdielectric"}"#,
-            "\"roughdielectric\" is not supported",
-        ),
     ] {
         let error = dictionary(shape, bsdf).expect_err(expected).to_string();
         assert!(

@@ -9,6 +9,7 @@ mod hostile;
 mod import;
 mod mitsuba;
 mod mitsuba_blends;
+mod mitsuba_collections;
 mod mitsuba_spectra;
 mod outside;
 mod ply;

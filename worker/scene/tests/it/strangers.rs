@@ -386,12 +386,12 @@ fn scenes_in_mitsubas_xml() {
         (
             "an include",
             xml("3.0.0", "", "<include filename=\"b.xml\"/>"),
-            Refused("<include>: is not supported"),
+            Refused("<include>: cannot read"),
         ),
         (
             "a path",
-            xml("3.0.0", "", "<path value=\"b\"/>"),
-            Refused("<path>: is not supported"),
+            xml("3.0.0", "<path value=\"b\"/>", &cube("")),
+            unit(""),
         ),
         (
             "a concave face",

@@ -90,7 +90,7 @@ impl Mix {
     }
 
     /// Returns a mix of `self` and `other`, which has the share `weight`.
-    fn beside(self, other: Self, weight: f64) -> Self {
+    pub(super) fn joined_with(self, other: Self, weight: f64) -> Self {
         let two_sided = self.two_sided && other.two_sided;
         let first = self.leaves.into_iter().map(|l| (l.0 * (1.0 - weight), l.1));
         let second = other.leaves.into_iter().map(|l| (l.0 * weight, l.1));
@@ -109,9 +109,14 @@ impl Mix {
 impl Reader<'_> {
     pub(super) fn blend(&mut self, node: &Rc<Node>, depth: usize) -> Result<Mix, String> {
         self.only(node, &properties::BLEND)?;
-        let weight = node.number("weight")?.ok_or_else(|| {
-            node.fail("weight: expected a number (textures as weights are not supported)")
-        })? as f32;
+        let weight = match self.colour(node, "weight")? {
+            Some(weight) if weight.texture.is_some() => {
+                self.note("blends.weight", "is not read from textures; 0.5 used");
+                0.5
+            }
+            Some(weight) => weight.mean(),
+            None => return Err(node.fail("weight: expected a number from 0 to 1")),
+        };
         if !(0.0..=1.0).contains(&weight) {
             return Err(node.fail(format!("weight: {weight} lies outside [0, 1]")));
         }
@@ -126,7 +131,7 @@ impl Reader<'_> {
                 "of a two-sided and a one-sided BSDF are one-sided",
             );
         }
-        let mix = a.beside(b, f64::from(weight));
+        let mix = a.joined_with(b, f64::from(weight));
         let count = mix.leaves.iter().filter(|l| has_share(l)).count();
         match count <= MAX_LEAVES {
             true => Ok(mix),

@@ -27,18 +27,35 @@ const METALS: [(&str, [f32; 3]); 5] = [
     ("Cr", [0.550, 0.556, 0.554]),
     ("Cu", [0.955, 0.638, 0.538]),
 ];
-const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these, or dielectric or thindielectric by \
-                      itself";
+const SUBSET: &str = "use diffuse, plastic, roughplastic, principled, roughconductor, conductor, or twosided, mask, bumpmap, \
+                      normalmap or blendbsdf of these, or dielectric, roughdielectric or thindielectric by itself";
 /// The text in exports of thin glass from the time when its reflections were not rendered.
 const UNREFLECTED: &str = r#"<rgb name="specular_reflectance" value="0 0 0"/>"#;
 
 /// Mitsuba's names of media, with their indices of refraction.
-const MEDIA: [(&str, f64); 5] = [
+const MEDIA: [(&str, f64); 22] = [
     ("vacuum", 1.0),
+    ("helium", 1.000_04),
+    ("hydrogen", 1.000_13),
     ("air", 1.000_277),
+    ("carbon dioxide", 1.000_45),
     ("water", 1.333),
+    ("water ice", 1.31),
+    ("acetone", 1.36),
+    ("ethanol", 1.361),
+    ("fused quartz", 1.458),
+    ("carbon tetrachloride", 1.461),
+    ("pyrex", 1.47),
+    ("glycerol", 1.4729),
     ("acrylic glass", 1.49),
+    ("polypropylene", 1.49),
+    ("benzene", 1.501),
     ("bk7", 1.5046),
+    ("silicone oil", 1.520_45),
+    ("sodium chloride", 1.544),
+    ("amber", 1.55),
+    ("pet", 1.575),
+    ("diamond", 2.419),
 ];
 
 /// A material, and the transform that its textures apply to texture coordinates.
@@ -61,13 +78,18 @@ impl Reader<'_> {
                 material,
                 to_uv: Matrix::IDENTITY,
             },
-            None if matches!(node.kind.as_str(), "dielectric" | "thindielectric") => Look {
-                material: self.glass(node)?,
-                to_uv: Matrix::IDENTITY,
-            },
             None => {
-                let mix = self.mix(node, 0)?;
-                self.assemble(node, mix)?
+                let bare = self.bare(node)?;
+                match is_glass(&bare) {
+                    true => Look {
+                        material: self.glass(&bare)?,
+                        to_uv: Matrix::IDENTITY,
+                    },
+                    false => {
+                        let mix = self.mix(node, 0)?;
+                        self.assemble(node, mix)?
+                    }
+                }
             }
         };
         self.looks.insert(key, look.clone());
@@ -142,8 +164,96 @@ impl Reader<'_> {
                 Ok(mix)
             }
             "blendbsdf" => self.blend(node, depth),
+            "plastic" | "roughplastic" | "pplastic" => {
+                self.only(node, &properties::PLASTIC)?;
+                self.note("plastics", "are Lambertian: their gloss is left out");
+                let colour = self.colour(node, "diffuse_reflectance")?;
+                Ok(Mix::of(Rc::new(Leaf {
+                    colour: colour.unwrap_or(Colour::grey(0.5)),
+                    metal: None,
+                })))
+            }
+            "principled" | "principledthin" => self.principled(node),
+            "mask" | "bumpmap" | "normalmap" => {
+                let inner = self.inner(node)?;
+                self.mix(&inner, depth + 1)
+            }
             other => Err(node.fail(format!("bsdf {} is not supported; {SUBSET}", quoted(other)))),
         }
+    }
+
+    /// Returns the BSDF inside of one that changes only its shading.
+    fn inner(&mut self, node: &Node) -> Result<Rc<Node>, String> {
+        match node.kind.as_str() {
+            "mask" => {
+                self.only(node, &properties::MASK)?;
+                if node
+                    .number("opacity")
+                    .ok()
+                    .flatten()
+                    .is_none_or(|o| o < 1.0)
+                {
+                    self.note("masks", "are opaque: holes and transparency are left out");
+                }
+            }
+            _ => {
+                self.only(node, &properties::RELIEF)?;
+                self.note("relief", "of bump maps and normal maps is left out");
+            }
+        }
+        match self.children(node, "bsdf")?.as_slice() {
+            [inner] => Ok(inner.clone()),
+            other => Err(node.fail(format!("expected one BSDF, found {}", other.len()))),
+        }
+    }
+
+    /// Returns the BSDF below all that change only its shading.
+    fn bare(&mut self, node: &Rc<Node>) -> Result<Rc<Node>, String> {
+        let mut bare = node.clone();
+        for _ in 0..=MAX_DEPTH {
+            if !matches!(bare.kind.as_str(), "mask" | "bumpmap" | "normalmap") {
+                return Ok(bare);
+            }
+            bare = self.inner(&bare)?;
+        }
+        Err(node.fail(format!("nested deeper than {MAX_DEPTH}")))
+    }
+
+    /// Returns Disney's BSDF as the materials of glTF: a Lambertian and a GGX conductor of
+    /// α = roughness², with the share `metallic`.
+    fn principled(&mut self, node: &Node) -> Result<Mix, String> {
+        self.only(node, &properties::PRINCIPLED)?;
+        let colour = self.colour(node, "base_color")?;
+        let colour = colour.unwrap_or(Colour::grey(0.5));
+        let mut scalar = |name: &str, usual: f32| {
+            let known = self.colour(node, name)?;
+            if known.as_ref().is_some_and(|c| c.texture.is_some()) {
+                self.note(
+                    &format!("textures.{name}"),
+                    format!("is not read from textures; {usual} used"),
+                );
+                return Ok(usual);
+            }
+            Ok::<f32, String>(known.map_or(usual, |c| c.mean()))
+        };
+        let metallic = scalar("metallic", 0.0)?.clamp(0.0, 1.0);
+        let roughness = scalar("roughness", 0.5)?;
+        let alpha = (roughness * roughness).clamp(Material::MIN_ALPHA, 1.0);
+        let lambertian = Mix::of(Rc::new(Leaf {
+            colour: colour.clone(),
+            metal: None,
+        }));
+        let metal = Mix::of(Rc::new(Leaf {
+            colour,
+            metal: Some((alpha, Distribution::Ggx)),
+        }));
+        let mut mix = match metallic {
+            0.0 => lambertian,
+            1.0 => metal,
+            share => lambertian.joined_with(metal, f64::from(share)),
+        };
+        mix.two_sided = node.kind == "principledthin";
+        Ok(mix)
     }
 
     /// Returns a Lambertian or a conductor, which is read once even if several blends refer to it.
@@ -172,11 +282,16 @@ impl Reader<'_> {
 
     /// Returns a material of glass, thin or solid.
     fn glass(&mut self, node: &Node) -> Result<Material, String> {
-        self.only(node, &properties::GLASS)?;
+        if node.kind == "roughdielectric" {
+            self.only(node, &properties::ROUGH_GLASS)?;
+            self.note("rough_glass", "is smooth");
+        } else {
+            self.only(node, &properties::GLASS)?;
+        }
         let ior = index(node, "int_ior", "bk7")? / index(node, "ext_ior", "air")?;
         if !(1.0..=f64::from(Material::MAX_IOR)).contains(&ior) {
             let hint = match node.kind.as_str() {
-                "dielectric" => {
+                "dielectric" | "roughdielectric" => {
                     "; a cavity belongs into the mesh of the body around it, with facets that face the cavity"
                 }
                 _ => "; int_ior is that of the glass",
@@ -205,7 +320,7 @@ impl Reader<'_> {
         let tint = plain(tint, "specular_transmittance")?;
         let (ior, transmittance) = (ior as f32, tint.mean());
         let bsdf = match node.kind.as_str() {
-            "dielectric" => Bsdf::Dielectric { ior, transmittance },
+            "dielectric" | "roughdielectric" => Bsdf::Dielectric { ior, transmittance },
             _ => Bsdf::ThinDielectric {
                 ior,
                 transmittance,
@@ -236,11 +351,30 @@ impl Reader<'_> {
             );
             Material::MIN_ALPHA
         } else {
-            let (u, v) = (node.number("alpha_u")?, node.number("alpha_v")?);
-            if u != v {
-                return Err(node.fail("alpha_u and alpha_v differ: anisotropy is not supported"));
-            }
-            let alpha = node.number("alpha")?.or(u).unwrap_or(0.1) as f32;
+            let mut roughness = |name: &str| {
+                let known = self.colour(node, name)?;
+                if known.as_ref().is_some_and(|c| c.texture.is_some()) {
+                    self.note("alpha", "is not read from textures; 0.1 used");
+                    return Ok(Some(0.1));
+                }
+                Ok::<Option<f32>, String>(known.map(|c| c.mean()))
+            };
+            let (u, v) = (roughness("alpha_u")?, roughness("alpha_v")?);
+            let alpha = roughness("alpha")?;
+            let alpha = match (alpha, u, v) {
+                (Some(alpha), _, _) => alpha,
+                (None, None, None) => 0.1,
+                (None, u, v) => {
+                    let (u, v) = (u.unwrap_or(0.1), v.unwrap_or(0.1));
+                    if u != v {
+                        self.note(
+                            "anisotropy",
+                            "is left out: the geometric mean of alpha_u and alpha_v used",
+                        );
+                    }
+                    (u * v).sqrt()
+                }
+            };
             if alpha < Material::MIN_ALPHA {
                 self.note(
                     "alpha",
@@ -259,20 +393,23 @@ impl Reader<'_> {
                 )));
             }
         };
-        let fresnel = match node.text("material")? {
-            Some("none") => [1.0; 3],
-            Some(name) if METALS.iter().any(|(known, _)| *known == name) => {
+        let stated = self.fresnel_of_index(node)?;
+        let fresnel = match (node.text("material")?, stated) {
+            (None, Some(stated)) => stated,
+            (Some("none"), _) => [1.0; 3],
+            (name, _) => {
+                let name = name.unwrap_or("Cu");
+                let known = METALS.iter().find(|(known, _)| *known == name);
+                let Some((_, reflectance)) = known else {
+                    let names: Vec<&str> = METALS.iter().map(|m| m.0).collect();
+                    return Err(node.fail(format!(
+                        "material: {} is not known; use \"none\" with specular_reflectance, or one of {}",
+                        quoted(name),
+                        names.join(", ")
+                    )));
+                };
                 self.note("metals", "Fresnel reflectance at normal incidence used");
-                METALS
-                    .iter()
-                    .find(|(known, _)| *known == name)
-                    .map_or([1.0; 3], |m| m.1)
-            }
-            found => {
-                return Err(node.fail(format!(
-                    "material: {}; use \"none\" with specular_reflectance, or one of Ag, Al, Au, Cr, Cu",
-                    found.map_or("missing (Mitsuba's default is Cu)".into(), |m| format!("{} is not known", quoted(m)))
-                )));
+                *reflectance
             }
         };
         let mut colour = self
@@ -288,6 +425,29 @@ impl Reader<'_> {
         }
         Ok((colour, alpha, distribution))
     }
+}
+
+impl Reader<'_> {
+    /// Returns the reflectance at normal incidence of the complex index of refraction `eta` + i `k`,
+    /// if the file states it in numbers.
+    fn fresnel_of_index(&mut self, node: &Node) -> Result<Option<[f32; 3]>, String> {
+        let (Some(eta), Some(k)) = (self.colour(node, "eta")?, self.colour(node, "k")?) else {
+            return Ok(None);
+        };
+        self.note("metals", "Fresnel reflectance at normal incidence used");
+        let reflectance = |c: usize| {
+            let (n, k) = (eta.rgb[c], k.rgb[c]);
+            ((n - 1.0) * (n - 1.0) + k * k) / ((n + 1.0) * (n + 1.0) + k * k)
+        };
+        Ok(Some([0, 1, 2].map(reflectance)))
+    }
+}
+
+fn is_glass(node: &Node) -> bool {
+    matches!(
+        node.kind.as_str(),
+        "dielectric" | "thindielectric" | "roughdielectric"
+    )
 }
 
 /// Returns the name of a material.

@@ -141,6 +141,26 @@ impl Reader<'_> {
         }
         match self.children_named(node, name)?.as_slice() {
             [] => Ok(None),
+            [texture] if texture.kind == "checkerboard" => {
+                self.only(texture, &properties::CHECKERBOARD)?;
+                self.note(
+                    "textures.checkerboard",
+                    "replaced by the mean of both colours",
+                );
+                let one = self.colour(texture, "color0")?.unwrap_or(Colour::grey(0.4));
+                let other = self.colour(texture, "color1")?.unwrap_or(Colour::grey(0.2));
+                match (&one.texture, &other.texture) {
+                    (None, None) => Ok(Some(mean_of(&[(0.5, &one), (0.5, &other)]))),
+                    _ => Err(texture.fail("color0 and color1: expected colours, no textures")),
+                }
+            }
+            [texture] if texture.kind == "mesh_attribute" => {
+                self.note(
+                    "textures.mesh_attribute",
+                    "left out; a reflectance of 0.5 used",
+                );
+                Ok(Some(Colour::grey(0.5)))
+            }
             [texture] => {
                 let texture = self.bitmap(&texture.clone())?;
                 Ok(Some(Colour {
@@ -155,7 +175,7 @@ impl Reader<'_> {
     fn bitmap(&mut self, node: &Node) -> Result<(Arc<Texture>, Matrix), String> {
         if node.kind != "bitmap" {
             return Err(node.fail(format!(
-                "texture {} is not supported; use bitmap",
+                "texture {} is not supported; use bitmap or checkerboard",
                 quoted(&node.kind)
             )));
         }

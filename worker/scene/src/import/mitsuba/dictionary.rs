@@ -1,6 +1,11 @@
 //! Mitsuba's Python dictionary, written as JSON: `type` keys, and `to_world` as rows of numbers.
 
-use std::{collections::BTreeSet, fmt, rc::Rc};
+use std::{
+    collections::BTreeSet,
+    fmt,
+    path::{Path, PathBuf},
+    rc::Rc,
+};
 
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 
@@ -15,7 +20,18 @@ use super::{
 const TAGS: [(&str, &[&str]); 6] = [
     (
         "shape",
-        &["ply", "obj", "rectangle", "cube", "sphere", "disk"],
+        &[
+            "ply",
+            "obj",
+            "serialized",
+            "rectangle",
+            "cube",
+            "sphere",
+            "disk",
+            "cylinder",
+            "instance",
+            "shapegroup",
+        ],
     ),
     (
         "bsdf",
@@ -27,9 +43,19 @@ const TAGS: [(&str, &[&str]); 6] = [
             "blendbsdf",
             "thindielectric",
             "dielectric",
+            "roughdielectric",
+            "plastic",
+            "roughplastic",
+            "pplastic",
+            "principled",
+            "principledthin",
+            "mask",
+            "bumpmap",
+            "normalmap",
+            "null",
         ],
     ),
-    ("sensor", &["perspective"]),
+    ("sensor", &["perspective", "thinlens", "orthographic"]),
     (
         "emitter",
         &[
@@ -44,7 +70,7 @@ const TAGS: [(&str, &[&str]); 6] = [
             "angulararea",
         ],
     ),
-    ("texture", &["bitmap"]),
+    ("texture", &["bitmap", "checkerboard", "mesh_attribute"]),
     (
         "film",
         &[
@@ -177,16 +203,22 @@ fn field<'a>(fields: &'a [(String, Json)], key: &str) -> Option<&'a Json> {
 }
 
 /// Returns the scene's node of a dictionary.
-pub(super) fn parse(bytes: &[u8]) -> Result<Node, String> {
+pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Node, String> {
     let json = serde_json::from_slice(bytes).map_err(|e| e.to_string())?;
     let Json::Fields(root) = json else {
         return Err("expected a dictionary".into());
     };
-    node(&root, "scene", "scene")?.ok_or_else(|| "the scene is empty".into())
+    let folders = Rc::new(vec![path.parent().unwrap_or(Path::new("")).to_owned()]);
+    node(&root, "scene", "scene", &folders)?.ok_or_else(|| "the scene is empty".into())
 }
 
 /// Returns a plugin, or `None` for irrelevant ones.
-fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, String> {
+fn node(
+    json: &[(String, Json)],
+    key: &str,
+    at: &str,
+    folders: &Rc<Vec<PathBuf>>,
+) -> Result<Option<Node>, String> {
     let Some(kind) = field(json, "type").and_then(Json::text) else {
         return Err(format!("{at}: needs the key \"type\" (text)"));
     };
@@ -203,6 +235,7 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
             .unwrap_or(key)
             .to_owned(),
         at: format!("{at} (type {})", quoted(kind)),
+        folders: folders.clone(),
         ..Node::default()
     };
     for (name, value) in json {
@@ -236,7 +269,7 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
                     )
                 }
                 _ => {
-                    match node(fields, name, &inner)? {
+                    match node(fields, name, &inner, folders)? {
                         Some(child) => out
                             .children
                             .push((name.clone(), Child::Node(Rc::new(child)))),

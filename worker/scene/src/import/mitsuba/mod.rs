@@ -1,15 +1,19 @@
 //! Mitsuba 3 scenes, as XML or as the Python dictionary written as JSON.
 //!
-//! Supported: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size);
-//! shapes `ply`, `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs
-//! `diffuse`, `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001),
-//! `twosided` and `blendbsdf` of all these, nested too; `dielectric` on closed shapes and
-//! `thindielectric`, on their own; `bitmap` textures; `spectrum` with values by wavelength
-//! (`450:0.2, 905:0.7`) as a reflectance; references, `<default>` parameters, and every transform.
-//! A shape without BSDF has Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex
-//! normals are not used. Integrators, samplers and media are skipped with a note; any other plugin
-//! is an error that names it. As in Mitsuba, every property of a plugin must be used: any other is
-//! an error, unless it changes neither geometry nor light. Files of versions before 2 may have the
+//! Supported: sensors `perspective` and `thinlens` (as a pinhole), with crop windows; shapes `ply`,
+//! `obj`, `serialized`, `rectangle`, `cube`, `disk`, `sphere` and `cylinder` (the last three
+//! tessellated), and instances of shape groups; BSDFs `diffuse`, `roughconductor` and `conductor`
+//! (`material` none, a common metal, or `eta` and `k`; α of a smooth one = 0.001), `plastic`,
+//! `roughplastic` and `pplastic` (their Lambertian part), `principled` (as glTF's metallic and
+//! rough materials), and `twosided`, `mask`, `bumpmap`, `normalmap` and `blendbsdf` of all these,
+//! nested too; `dielectric` and `roughdielectric` on closed shapes and `thindielectric`, on their
+//! own; `bitmap` textures, `checkerboard` as its mean; `spectrum` with values by wavelength
+//! (`450:0.2, 905:0.7`) as a reflectance; references, `<alias>`, `<default>` parameters,
+//! `<include>`, `<path>`, and every transform. A shape without BSDF has Mitsuba's default, a
+//! one-sided diffuse of 0.5. Facets are flat: vertex normals are not used. Integrators, samplers
+//! and media are skipped with a note, and so is each approximation above; any other plugin is an
+//! error that names it. As in Mitsuba, every property of a plugin must be used: any other is an
+//! error, unless it changes neither geometry nor light. Files of versions before 2 may have the
 //! names of their time (`toWorld`, `fovAxis`). As in Mitsuba, `rotate` does not normalise its axis:
 //! if its length is not 1, the map shears.
 //!
@@ -33,6 +37,7 @@ mod dictionary;
 mod node;
 mod old;
 mod properties;
+mod serialized;
 mod shape;
 mod transform;
 mod view;
@@ -45,9 +50,7 @@ use std::{
     sync::Arc,
 };
 
-use crate::{
-    Affine, Material, Mesh, Object, Provenance, SceneError, Wrap, export::mitsuba::text::Extras,
-};
+use crate::{Material, Mesh, Object, Provenance, SceneError, Wrap, export::mitsuba::text::Extras};
 
 use super::complete::{Draft, FileLaser};
 use super::{ImportOptions, Opener, add_note, far, format_error, image::Images, of_file, quoted};
@@ -72,12 +75,13 @@ pub(super) fn read_xml(
 ) -> Result<Draft, SceneError> {
     let fail = |what: String| format_error(path, what);
     let text = std::str::from_utf8(bytes).map_err(|e| fail(format!("is not UTF-8 text: {e}")))?;
-    let (root, extras) = xml::parse(text.trim_start_matches('\u{feff}')).map_err(fail)?;
-    let extras = extras
+    let parsed = xml::parse(text, path, files).map_err(fail)?;
+    let extras = parsed
+        .extras
         .map(|text| serde_json::from_str::<Extras>(&text))
         .transpose()
         .map_err(|e| fail(format!("comment picofarm: {e}; remove it, or export again")))?;
-    Reader::new((path, files), root, extras)
+    Reader::new((path, files), parsed.root, extras)
         .scene(options)
         .map_err(|what| format_error(path, what))
 }
@@ -90,7 +94,7 @@ pub(super) fn read_dictionary(
     files: &Opener,
 ) -> Result<Draft, SceneError> {
     let fail = |what: String| format_error(path, what);
-    let root = dictionary::parse(bytes).map_err(fail)?;
+    let root = dictionary::parse(bytes, path).map_err(fail)?;
     Reader::new((path, files), root, None)
         .scene(options)
         .map_err(|what| format_error(path, what))
@@ -100,19 +104,26 @@ pub(super) fn read_dictionary(
 ///
 /// # Errors
 /// A name that is not a plain path.
-pub(super) fn files(path: &Path, bytes: &[u8]) -> Result<Vec<PathBuf>, SceneError> {
+pub(super) fn files(
+    path: &Path,
+    bytes: &[u8],
+    opener: &Opener,
+) -> Result<Vec<PathBuf>, SceneError> {
+    let mut names = Vec::new();
     let root = match std::str::from_utf8(bytes) {
-        Ok(text) if text.trim_start().starts_with('{') => dictionary::parse(bytes).ok(),
-        Ok(text) => xml::parse(text.trim_start_matches('\u{feff}'))
-            .ok()
-            .map(|x| x.0),
+        Ok(text) if text.trim_start().starts_with('{') => dictionary::parse(bytes, path).ok(),
+        Ok(text) => xml::parse(text, path, opener).ok().map(|parsed| {
+            names = parsed.included;
+            parsed.root
+        }),
         Err(_) => None,
     };
-    let mut names = Vec::new();
     let mut open: Vec<Rc<Node>> = root.map(Rc::new).into_iter().collect();
     while let Some(node) = open.pop() {
-        if let Ok(Some(name)) = node.text("filename") {
-            names.push(Opener::named(folder(path), name).map_err(of_file)?);
+        if let Ok(Some(name)) = node.text("filename")
+            && node.tag != "emitter"
+        {
+            names.push(xml::resolved(opener, &node.folders, name).map_err(of_file)?);
         }
         for (_, child) in &node.children {
             if let Child::Node(child) = child {
@@ -125,8 +136,14 @@ pub(super) fn files(path: &Path, bytes: &[u8]) -> Result<Vec<PathBuf>, SceneErro
     Ok(names)
 }
 
-fn folder(path: &Path) -> &Path {
-    path.parent().unwrap_or(Path::new(""))
+/// The greatest number of objects of a scene, instances included.
+const MAX_OBJECTS: usize = 1_000_000;
+
+/// A shape, and the transform of its instance.
+struct Placed {
+    shape: Rc<Node>,
+    to_world: Matrix,
+    in_group: bool,
 }
 
 struct Reader<'a> {
@@ -140,7 +157,8 @@ struct Reader<'a> {
     looks: BTreeMap<usize, Look>,
     /// The parts of blends, likewise.
     leaves: BTreeMap<usize, Rc<Leaf>>,
-    geometries: BTreeMap<PathBuf, Geometry>,
+    /// Geometries by file and index of the mesh in it.
+    geometries: BTreeMap<(PathBuf, usize), Geometry>,
     notes: BTreeMap<String, String>,
     /// The position of the scene's origin in the file's coordinates.
     origin: [f64; 3],
@@ -149,7 +167,7 @@ struct Reader<'a> {
 impl<'a> Reader<'a> {
     fn new((path, files): (&'a Path, &'a Opener), root: Node, extras: Option<Extras>) -> Self {
         let root = Rc::new(root);
-        let mut ids = BTreeMap::new();
+        let mut ids: BTreeMap<String, Rc<Node>> = root.aliases.iter().cloned().collect();
         let mut open = vec![root.clone()];
         while let Some(node) = open.pop() {
             for (_, child) in &node.children {
@@ -178,7 +196,7 @@ impl<'a> Reader<'a> {
 
     /// Returns the file that an element names.
     fn named(&self, node: &Node, name: &str) -> Result<PathBuf, String> {
-        Opener::named(folder(self.path), name).map_err(|e| node.fail(e))
+        xml::resolved(self.files, &node.folders, name).map_err(|e| node.fail(e))
     }
 
     fn note(&mut self, key: &str, what: impl Into<String>) {
@@ -285,10 +303,15 @@ impl<'a> Reader<'a> {
                 "more than one; the first is the camera, unless --camera names another",
             );
         }
-        let cameras = sensors
-            .iter()
-            .map(|sensor| (sensor.id.clone(), self.camera(sensor)))
-            .collect();
+        let mut cameras = Vec::new();
+        for sensor in &sensors {
+            match sensor.kind.as_str() {
+                "perspective" | "thinlens" => {
+                    cameras.push((sensor.id.clone(), self.camera(sensor)));
+                }
+                kind => self.note("sensors.kind", format!("{} ignored", quoted(kind))),
+            }
+        }
         let emitters = self.children(&root, "emitter")?;
         let laser = self.laser(&emitters)?;
         let stem = self.path.file_stem().unwrap_or_default();
@@ -328,9 +351,15 @@ impl<'a> Reader<'a> {
         let mut objects = Vec::new();
         let mut size = 0;
         let mut shared: BTreeMap<Vec<String>, Arc<Mesh>> = BTreeMap::new();
-        let groups: Vec<&[Rc<Node>]> = shapes.chunk_by(|a, b| self.same_object(a, b)).collect();
+        // The meshes of shape groups, by the address of their shape.
+        let mut grouped: BTreeMap<usize, (Arc<Mesh>, Matrix)> = BTreeMap::new();
+        let shapes = self.expanded(shapes)?;
+        let groups: Vec<&[Placed]> = shapes
+            .chunk_by(|a, b| self.same_object(&a.shape, &b.shape))
+            .collect();
         for parts in groups {
-            let first = &parts[0];
+            let first = &parts[0].shape;
+            let instance = parts[0].to_world;
             let ours = self.our_object(first);
             let (name, label) = match ours {
                 Some(k) => {
@@ -354,30 +383,96 @@ impl<'a> Reader<'a> {
             });
             let label =
                 u16::try_from(label).map_err(|_| first.fail("more than 65535 categories"))?;
-            let (mesh, place) = self.mesh(parts, &name, ours)?;
+            let key = Rc::as_ptr(first).addr();
+            if let Some((mesh, place)) = grouped.get(&key) {
+                size += mesh.positions.len() + mesh.triangles.len();
+                if size > MAX_SIZE {
+                    return Err(first.fail(too_large()));
+                }
+                objects.push(Object {
+                    mesh: mesh.clone(),
+                    to_world: self.placed(&parts[0].to_world.after(place)).affine(),
+                    label,
+                    name,
+                });
+                continue;
+            }
+            let nodes: Vec<Rc<Node>> = parts.iter().map(|p| p.shape.clone()).collect();
+            let (mesh, place) = self.mesh(&nodes, &name, ours)?;
             let rows: usize = mesh.materials.iter().map(|m| m.spectrum.len()).sum();
             size += mesh.positions.len() + mesh.triangles.len() + rows;
             if size > MAX_SIZE {
-                return Err(first.fail(format!(
-                    "more than {MAX_SIZE} vertices, triangles and rows of spectra in all"
-                )));
+                return Err(first.fail(too_large()));
             }
             // Equal shapes of our own files share their mesh, as in the original scene.
             let mesh = match ours {
                 Some(_) => {
-                    let key = parts.iter().map(|p| self.identity(p)).collect();
+                    let key = nodes.iter().map(|p| self.identity(p)).collect();
                     shared.entry(key).or_insert_with(|| Arc::new(mesh)).clone()
                 }
                 None => Arc::new(mesh),
             };
+            if parts[0].in_group {
+                grouped.insert(key, (mesh.clone(), place));
+            }
             objects.push(Object {
                 mesh,
-                to_world: place,
+                to_world: self.placed(&instance.after(&place)).affine(),
                 label,
                 name,
             });
         }
         Ok((objects, labels))
+    }
+
+    /// Returns the shapes of a scene, with the shapes of a group in the place of each instance.
+    fn expanded(&mut self, shapes: &[Rc<Node>]) -> Result<Vec<Placed>, String> {
+        let mut all = Vec::new();
+        for shape in shapes {
+            match shape.kind.as_str() {
+                // Groups are visible only as instances.
+                "shapegroup" => self.only(shape, &properties::GROUP)?,
+                "instance" => {
+                    self.only(shape, &properties::INSTANCE)?;
+                    let groups = self.children(shape, "shape")?;
+                    let [group] = groups.as_slice() else {
+                        return Err(shape.fail("expected a reference to one shapegroup"));
+                    };
+                    if group.kind != "shapegroup" {
+                        return Err(shape.fail("expected a reference to a shapegroup"));
+                    }
+                    let to_world = shape.transform("to_world")?;
+                    for part in self.children(group, "shape")? {
+                        if matches!(part.kind.as_str(), "shapegroup" | "instance") {
+                            return Err(part.fail("groups cannot contain instances"));
+                        }
+                        all.push(Placed {
+                            shape: part,
+                            to_world,
+                            in_group: true,
+                        });
+                    }
+                    if all.len() > MAX_OBJECTS {
+                        return Err(shape.fail(format!("more than {MAX_OBJECTS} objects in all")));
+                    }
+                }
+                _ if self.is_null(shape)? => {
+                    self.note("null", "shapes with the BSDF null left out");
+                }
+                _ => all.push(Placed {
+                    shape: shape.clone(),
+                    to_world: Matrix::IDENTITY,
+                    in_group: false,
+                }),
+            }
+        }
+        Ok(all)
+    }
+
+    /// Returns whether light passes a shape unchanged.
+    fn is_null(&self, shape: &Node) -> Result<bool, String> {
+        let bsdfs = self.children(shape, "bsdf")?;
+        Ok(matches!(bsdfs.as_slice(), [bsdf] if bsdf.kind == "null"))
     }
 
     /// Returns the key by which shapes of our own files have the same mesh: file and material.
@@ -408,7 +503,7 @@ impl<'a> Reader<'a> {
         parts: &[Rc<Node>],
         name: &str,
         ours: Option<usize>,
-    ) -> Result<(Mesh, Affine), String> {
+    ) -> Result<(Mesh, Matrix), String> {
         let mut mesh = Mesh {
             name: name.to_owned(),
             ..Mesh::default()
@@ -453,8 +548,12 @@ impl<'a> Reader<'a> {
             }
             mesh.materials.push(material);
             geometry.append_to(&mut mesh, slot, &look.to_uv);
-            place = self.placed(&part.transform("to_world")?.after(&inner));
+            place = part.transform("to_world")?.after(&inner);
         }
-        Ok((mesh, place.affine()))
+        Ok((mesh, place))
     }
+}
+
+fn too_large() -> String {
+    format!("more than {MAX_SIZE} vertices, triangles and rows of spectra in all")
 }

@@ -1,6 +1,6 @@
 //! The tree to which both XML and the dictionary are parsed: plugins with parameters and children.
 
-use std::{collections::BTreeMap, rc::Rc};
+use std::{collections::BTreeMap, path::PathBuf, rc::Rc};
 
 use crate::{SpectrumPoint, import::quoted};
 
@@ -46,6 +46,10 @@ pub(super) struct Node {
     pub(super) skipped: Vec<String>,
     /// The children in order: (parameter name or empty, child).
     pub(super) children: Vec<(String, Child)>,
+    /// Other ids of elements of a scene.
+    pub(super) aliases: Vec<(String, Rc<Node>)>,
+    /// The folders of the files that this element names, in order of preference.
+    pub(super) folders: Rc<Vec<PathBuf>>,
 }
 
 impl Node {

@@ -39,7 +39,7 @@ const IN_SHAPES: &[&str] = &["bsdf", "emitter"];
 
 pub(super) const SCENE: Properties = with(
     &[],
-    &[],
+    &["embree_use_robust_intersections"],
     &["shape", "sensor", "emitter", "bsdf", "texture", "film"],
 );
 pub(super) const MESH_FILE: Properties = with(
@@ -75,7 +75,72 @@ pub(super) const GLASS: Properties = with(
     &[],
     &[],
 );
-pub(super) const CONDUCTOR: Properties = with(&["material", "specular_reflectance"], &[], &[]);
+pub(super) const ROUGH_GLASS: Properties = with(
+    &[
+        "int_ior",
+        "ext_ior",
+        "specular_reflectance",
+        "specular_transmittance",
+    ],
+    &[
+        "alpha",
+        "alpha_u",
+        "alpha_v",
+        "distribution",
+        "sample_visible",
+    ],
+    &[],
+);
+pub(super) const PLASTIC: Properties = with(
+    &["diffuse_reflectance"],
+    &[
+        "specular_reflectance",
+        "int_ior",
+        "ext_ior",
+        "nonlinear",
+        "alpha",
+        "distribution",
+        "sample_visible",
+    ],
+    &[],
+);
+pub(super) const PRINCIPLED: Properties = with(
+    &["base_color", "metallic", "roughness"],
+    &[
+        "anisotropic",
+        "clearcoat",
+        "clearcoat_gloss",
+        "diff_trans",
+        "eta",
+        "flatness",
+        "sheen",
+        "sheen_tint",
+        "spec_tint",
+        "spec_trans",
+        "specular",
+        "diffuse_reflectance_sampling_rate",
+        "specular_sampling_rate",
+        "clearcoat_sampling_rate",
+    ],
+    &[],
+);
+pub(super) const MASK: Properties = with(&["opacity"], &[], &["bsdf"]);
+pub(super) const RELIEF: Properties = with(&[], &["scale"], &["bsdf", "texture"]);
+pub(super) const CHECKERBOARD: Properties = with(&["color0", "color1"], &["to_uv"], &[]);
+pub(super) const SERIALIZED: Properties = with(
+    &["filename", "shape_index", "to_world", "flip_normals"],
+    &["face_normals"],
+    IN_SHAPES,
+);
+pub(super) const CYLINDER: Properties = with(
+    &["p0", "p1", "radius", "to_world", "flip_normals"],
+    &[],
+    IN_SHAPES,
+);
+pub(super) const GROUP: Properties = with(&[], &[], &["shape"]);
+pub(super) const INSTANCE: Properties = with(&["to_world"], &[], &["shape"]);
+pub(super) const CONDUCTOR: Properties =
+    with(&["material", "eta", "k", "specular_reflectance"], &[], &[]);
 pub(super) const ROUGH_CONDUCTOR: Properties = with(
     &[
         "alpha",
@@ -83,6 +148,8 @@ pub(super) const ROUGH_CONDUCTOR: Properties = with(
         "alpha_v",
         "distribution",
         "material",
+        "eta",
+        "k",
         "specular_reflectance",
         // The sampling of light paths.
         "sample_visible",
@@ -102,6 +169,7 @@ pub(super) const PERSPECTIVE: Properties = with(
         "to_world",
         "fov",
         "fov_axis",
+        "focal_length",
         "principal_point_offset_x",
         "principal_point_offset_y",
         // For a pinhole, these have no effect.
@@ -109,10 +177,10 @@ pub(super) const PERSPECTIVE: Properties = with(
         "far_clip",
         "focus_distance",
     ],
-    &["shutter_open", "shutter_close"],
+    &["shutter_open", "shutter_close", "aperture_radius", "srf"],
     &["film"],
 );
-/// The properties of a film. The reader refuses crop windows.
+/// The properties of a film.
 pub(super) const FILM: Properties = with(
     &[
         "width",
@@ -179,7 +247,8 @@ impl Reader<'_> {
         for (name, child) in &node.children {
             let resolved = self.resolved(node, child)?;
             let by_name = !name.is_empty() && known.used.contains(&name.as_str());
-            if known.children.contains(&resolved.tag.as_str()) || by_name {
+            let skipped = super::xml::SKIPPED.contains(&resolved.tag.as_str());
+            if known.children.contains(&resolved.tag.as_str()) || by_name || skipped {
                 continue;
             }
             if known.harmless.contains(&name.as_str()) {

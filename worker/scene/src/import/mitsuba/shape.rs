@@ -7,7 +7,7 @@ use crate::{
     import::{far, obj, ply, quoted, read_file},
 };
 
-use super::{Reader, node::Node, properties as p, transform::Matrix};
+use super::{Reader, node::Node, properties as p, serialized, transform::Matrix};
 
 /// The number of facets of a tessellated sphere from pole to pole, and half of those around it.
 const SPHERE_ROWS: u32 = 48;
@@ -24,7 +24,7 @@ pub(super) struct Geometry {
     /// before it is rounded.
     pub(super) origin: [f64; 3],
     /// The notes, by key.
-    notes: BTreeMap<String, String>,
+    pub(super) notes: BTreeMap<String, String>,
 }
 
 impl Geometry {
@@ -90,6 +90,20 @@ impl Reader<'_> {
                 self.only(node, &p::MESH_FILE)?;
                 self.file(node)?
             }
+            "serialized" => {
+                self.only(node, &p::SERIALIZED)?;
+                self.file(node)?
+            }
+            "cylinder" => {
+                self.only(node, &p::CYLINDER)?;
+                self.note("cylinders", format!("have {DISK_SECTORS} flat sectors"));
+                let ends = [("p0", [0.0; 3]), ("p1", [0.0, 0.0, 1.0])];
+                let ends = ends.map(|(name, usual)| Ok(node.vector(name)?.unwrap_or(usual)));
+                let [p0, p1]: [Result<[f64; 3], String>; 2] = ends;
+                place = along(p0?, p1?, positive(node, "radius")?)
+                    .ok_or_else(|| node.fail("p0 and p1: are the same point"))?;
+                cylinder()
+            }
             "rectangle" => {
                 self.only(node, &p::PRIMITIVE)?;
                 rectangle()
@@ -110,17 +124,14 @@ impl Reader<'_> {
                     "spheres",
                     format!("have {} by {rows} flat facets", 2 * rows),
                 );
-                let radius = node.number("radius")?.unwrap_or(1.0);
-                if radius.partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
-                    return Err(node.fail("radius: must be positive"));
-                }
+                let radius = positive(node, "radius")?;
                 let centre = node.vector("center")?.unwrap_or([0.0; 3]);
                 place = Matrix::translation(centre).after(&Matrix::scale([radius; 3]));
                 sphere()
             }
             other => {
                 return Err(node.fail(format!(
-                    "shape {} is not supported; use ply, obj, rectangle, cube, sphere or disk",
+                    "shape {} is not supported; use ply, obj, serialized, rectangle, cube, sphere, disk or cylinder",
                     quoted(other)
                 )));
             }
@@ -137,17 +148,22 @@ impl Reader<'_> {
         // In OBJ, v points upwards; in PLY, as in our meshes, downwards.
         let obj = node.kind == "obj";
         let flip = node.switch("flip_tex_coords")?.unwrap_or(obj);
-        let mut geometry = match self.geometries.get(&path) {
+        let index = node.number("shape_index")?.unwrap_or(0.0);
+        if !(0.0..1e9).contains(&index) || index.fract() != 0.0 {
+            return Err(node.fail("shape_index: expected a whole number from 0"));
+        }
+        let key = (path.clone(), index as usize);
+        let mut geometry = match self.geometries.get(&key) {
             Some(known) => known.clone(),
             None => {
                 let bytes = read_file(self.files, &path).map_err(|e| node.fail(e))?;
-                let read = if obj {
-                    read_obj(&bytes)
-                } else {
-                    read_ply(&bytes)
+                let read = match node.kind.as_str() {
+                    "obj" => read_obj(&bytes),
+                    "serialized" => serialized::read(&bytes, key.1),
+                    _ => read_ply(&bytes),
                 };
                 let geometry = read.map_err(|e| node.fail(format!("{}: {e}", path.display())))?;
-                self.geometries.insert(path, geometry.clone());
+                self.geometries.insert(key, geometry.clone());
                 geometry
             }
         };
@@ -252,6 +268,50 @@ fn disk() -> Geometry {
         g.vertex([c, s, 0.0], [1.0, v]);
         if k > 0 {
             g.triangles.push([2 * k - 2, 2 * k - 1, 2 * k + 1]);
+        }
+    }
+    g
+}
+
+fn positive(node: &Node, name: &str) -> Result<f64, String> {
+    let number = node.number(name)?.unwrap_or(1.0);
+    match number.partial_cmp(&0.0) {
+        Some(std::cmp::Ordering::Greater) => Ok(number),
+        _ => Err(node.fail(format!("{name}: must be positive"))),
+    }
+}
+
+/// Returns the map from the unit cylinder to the one between two points, or `None` if they are the
+/// same.
+fn along(p0: [f64; 3], p1: [f64; 3], radius: f64) -> Option<Matrix> {
+    let axis = [0, 1, 2].map(|k: usize| p1[k] - p0[k]);
+    let length = axis.iter().map(|x| x * x).sum::<f64>().sqrt();
+    if length.partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
+        return None;
+    }
+    let z = axis.map(|x| x / length);
+    // Any direction across the axis will do.
+    let up = match z[0].abs() < 0.9 {
+        true => [1.0, 0.0, 0.0],
+        false => [0.0, 1.0, 0.0],
+    };
+    let turned = Matrix::look_at([0.0; 3], z, up).ok()?;
+    let scaled = turned.after(&Matrix::scale([radius, radius, length]));
+    Some(Matrix::translation(p0).after(&scaled))
+}
+
+/// Returns the open unit cylinder from z = 0 to 1, facing outwards; u is the angle, v the height.
+fn cylinder() -> Geometry {
+    let mut g = Geometry::default();
+    for k in 0..=DISK_SECTORS {
+        let u = k as f32 / DISK_SECTORS as f32;
+        let (s, c) = libm::sincosf(std::f32::consts::TAU * u);
+        g.vertex([c, s, 0.0], [u, 0.0]);
+        g.vertex([c, s, 1.0], [u, 1.0]);
+        if k > 0 {
+            let base = 2 * k - 2;
+            g.triangles.push([base, base + 2, base + 3]);
+            g.triangles.push([base, base + 3, base + 1]);
         }
     }
     g

@@ -24,22 +24,27 @@ impl Reader<'_> {
                 "edited since export; the sensor's parameters used",
             );
         }
-        if node.kind != "perspective" {
-            let what = format!(
-                "sensor {} is not supported; use perspective",
-                quoted(&node.kind)
-            );
-            return Err(node.fail(what));
+        match node.kind.as_str() {
+            "perspective" => {}
+            "thinlens" => self.note("camera", "has a lens; a pinhole used"),
+            other => {
+                let what = format!("sensor {} is not supported; use perspective", quoted(other));
+                return Err(node.fail(what));
+            }
         }
         self.only(node, &properties::PERSPECTIVE)?;
         let mut film = FILM;
+        let (mut crop, mut offset) = ([None; 2], [0.0; 2]);
         for child in self.children(node, "film")? {
             self.film(&child)?;
             for (k, name) in ["width", "height"].into_iter().enumerate() {
                 film[k] = child.number(name)?.unwrap_or(film[k]);
             }
-            if child.parameters.keys().any(|k| k.starts_with("crop_")) {
-                return Err(child.fail("crop windows are not supported; remove them"));
+            for (k, name) in ["width", "height"].into_iter().enumerate() {
+                crop[k] = child.number(&format!("crop_{name}"))?;
+            }
+            for (k, name) in ["x", "y"].into_iter().enumerate() {
+                offset[k] = child.number(&format!("crop_offset_{name}"))?.unwrap_or(0.0);
             }
         }
         let whole = |x: f64| (1.0..=65536.0).contains(&x) && x.fract() == 0.0;
@@ -47,16 +52,39 @@ impl Reader<'_> {
             return Err(node.fail("film: width and height must be whole numbers from 1 to 65536"));
         }
         let [width, height] = film;
-        let fov = node
-            .number("fov")?
-            .ok_or_else(|| node.fail("needs fov, in degrees (focal_length is not supported)"))?;
+        let inside = |k: usize| {
+            let size = crop[k].unwrap_or(film[k]);
+            whole(size)
+                && offset[k] >= 0.0
+                && offset[k].fract() == 0.0
+                && offset[k] + size <= film[k]
+        };
+        if !(inside(0) && inside(1)) {
+            return Err(node.fail("film: the crop window must be whole pixels inside the film"));
+        }
+        let diagonal = (width * width + height * height).sqrt();
+        let fov = match (node.number("fov")?, self.focal_length_mm(node)?) {
+            (Some(_), Some(_)) => return Err(node.fail("states both fov and focal_length")),
+            (Some(fov), None) => fov,
+            // As in Mitsuba, the focal length is that of a film of 36 mm by 24 mm, and its diagonal
+            // is the film's.
+            (None, focal) => {
+                let mm = focal.unwrap_or(50.0);
+                let half = libm::atan((36.0f64 * 36.0 + 24.0 * 24.0).sqrt() * 0.5 / mm);
+                2.0 * half.to_degrees()
+            }
+        };
+        let axis = match node.number("fov")? {
+            Some(_) => node.text("fov_axis")?.unwrap_or("x"),
+            None => "diagonal",
+        };
         if !(0.001..=179.0).contains(&fov) {
             return Err(node.fail(format!("fov: {fov}; expected 0.001 to 179 degrees")));
         }
-        let across = match node.text("fov_axis")?.unwrap_or("x") {
+        let across = match axis {
             "x" => width,
             "y" => height,
-            "diagonal" => (width * width + height * height).sqrt(),
+            "diagonal" => diagonal,
             "smaller" => width.min(height),
             "larger" => width.max(height),
             other => {
@@ -67,7 +95,7 @@ impl Reader<'_> {
             }
         };
         let f = (across * 0.5 / libm::tan(fov.to_radians() * 0.5)) as f32;
-        let offset = |name: &str| Ok::<_, String>(0.5 - node.number(name)?.unwrap_or(0.0));
+        let principal = |name: &str| Ok::<_, String>(0.5 - node.number(name)?.unwrap_or(0.0));
         let pose = self.placed(&node.transform("to_world")?);
         let axis = |k: usize| {
             pose.axis(k)
@@ -77,16 +105,31 @@ impl Reader<'_> {
             intrinsics: Intrinsics {
                 fx: f,
                 fy: f,
-                cx: (width * offset("principal_point_offset_x")?) as f32,
-                cy: (height * offset("principal_point_offset_y")?) as f32,
-                width: width as u32,
-                height: height as u32,
+                cx: (width * principal("principal_point_offset_x")? - offset[0]) as f32,
+                cy: (height * principal("principal_point_offset_y")? - offset[1]) as f32,
+                width: crop[0].unwrap_or(width) as u32,
+                height: crop[1].unwrap_or(height) as u32,
             },
             origin: pose.affine().translation,
             right: -axis(0)?,
             down: -axis(1)?,
             forward: axis(2)?,
         })
+    }
+
+    /// Returns `focal_length`, a text such as `50mm`.
+    fn focal_length_mm(&self, node: &Node) -> Result<Option<f64>, String> {
+        let Some(text) = node.text("focal_length")? else {
+            return Ok(None);
+        };
+        let number = text.trim().trim_end_matches("mm").trim().parse::<f64>();
+        match number {
+            Ok(mm) if mm > 0.0 && mm.is_finite() => Ok(Some(mm)),
+            _ => Err(node.fail(format!(
+                "focal_length: {}; expected millimetres such as 50mm",
+                quoted(text)
+            ))),
+        }
     }
 
     /// Checks a film's properties. Adds a note for a gate, because gates belong to renders.
@@ -130,18 +173,19 @@ impl Reader<'_> {
         let mut beams: Vec<(Vec3, Vec3, &Node)> = Vec::new();
         for node in emitters {
             let angle = match node.kind.as_str() {
-                "projector" => {
-                    self.only(node, &properties::PROJECTOR)?;
-                    node.number("fov")?
-                }
-                "spot" => {
-                    self.only(node, &properties::SPOT)?;
-                    Some(2.0 * node.number("cutoff_angle")?.unwrap_or(20.0))
-                }
+                "projector" => node.number("fov")?,
+                "spot" => Some(2.0 * node.number("cutoff_angle")?.unwrap_or(20.0)),
                 _ => None,
             };
             match angle {
                 Some(angle) if angle <= BEAM_DEG => {
+                    self.only(
+                        node,
+                        match node.kind.as_str() {
+                            "spot" => &properties::SPOT,
+                            _ => &properties::PROJECTOR,
+                        },
+                    )?;
                     let pose = self.placed(&node.transform("to_world")?);
                     let along = pose
                         .axis(2)

@@ -2,12 +2,15 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    path::{Path, PathBuf},
     rc::Rc,
 };
 
 use roxmltree::{Document, ParsingOptions};
 
-use crate::import::quoted;
+use picofarm_files::FileError;
+
+use crate::import::{Opener, quoted, read_file};
 
 use super::{
     node::{Child, Node, Value, numbers, pairs, triple},
@@ -23,12 +26,25 @@ const MAX_NODES: u32 = 4_000_000;
 const MAX_VALUE: usize = 1 << 16;
 /// The greatest number of `<default>` parameters of a file.
 const MAX_DEFAULTS: usize = 1024;
+/// The greatest number of `<include>` elements of a scene.
+const MAX_INCLUDES: usize = 256;
 /// The elements that are plugins.
 const PLUGINS: [&str; 7] = [
     "scene", "shape", "bsdf", "sensor", "emitter", "texture", "film",
 ];
+/// Elements of emitters that are read; the laser needs no others.
+const EMITTER_VALUES: [&str; 8] = [
+    "transform",
+    "float",
+    "integer",
+    "boolean",
+    "string",
+    "vector",
+    "point",
+    "rgb",
+];
 /// Plugins with settings for rendering, which belong to the job.
-const SKIPPED: [&str; 6] = [
+pub(super) const SKIPPED: [&str; 6] = [
     "integrator",
     "sampler",
     "rfilter",
@@ -37,8 +53,67 @@ const SKIPPED: [&str; 6] = [
     "phase",
 ];
 
-/// Returns the scene's node, and the text of its comment that starts with `picofarm`.
-pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
+/// A scene's tree.
+pub(super) struct Parsed {
+    pub(super) root: Node,
+    /// The text of its comment that starts with `picofarm`.
+    pub(super) extras: Option<String>,
+    /// The files that it includes, in order.
+    pub(super) included: Vec<PathBuf>,
+}
+
+/// Parses a scene at `path`, with the files that it includes.
+pub(super) fn parse(text: &str, path: &Path, files: &Opener) -> Result<Parsed, String> {
+    let mut shared = Shared {
+        files: files.clone(),
+        ids: BTreeSet::new(),
+        aliases: Vec::new(),
+        skipped: Vec::new(),
+        defaults: BTreeMap::new(),
+        folders: Rc::new(vec![folder(path)]),
+        included: Vec::new(),
+        depth: 0,
+    };
+    let (mut root, extras) = scene(text, "", &mut shared)?;
+    root.aliases = std::mem::take(&mut shared.skipped);
+    for (id, known, at) in std::mem::take(&mut shared.aliases) {
+        let target = find(&root, &known).ok_or_else(|| {
+            format!(
+                "{at}: refers to {}, which no element has as its id",
+                quoted(&known)
+            )
+        })?;
+        root.aliases.push((id, target));
+    }
+    Ok(Parsed {
+        root,
+        extras,
+        included: shared.included,
+    })
+}
+
+/// Returns the descendant of a node with an id.
+fn find(root: &Node, id: &str) -> Option<Rc<Node>> {
+    let nodes = |node: &Node| -> Vec<Rc<Node>> {
+        let children = node.children.iter().filter_map(|(_, child)| match child {
+            Child::Node(child) => Some(child.clone()),
+            Child::Reference(_) => None,
+        });
+        children.collect()
+    };
+    let mut open = nodes(root);
+    while let Some(node) = open.pop() {
+        if node.id == id {
+            return Some(node);
+        }
+        open.extend(nodes(&node));
+    }
+    None
+}
+
+/// Parses one document. `place` names it in errors; it is empty for the scene itself.
+fn scene(text: &str, place: &str, shared: &mut Shared) -> Result<(Node, Option<String>), String> {
+    let text = text.trim_start_matches('\u{feff}');
     let options = ParsingOptions {
         allow_dtd: false,
         nodes_limit: MAX_NODES,
@@ -48,22 +123,24 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
         // The parser's message would quote the file.
         .map_err(|e| {
             format!(
-                "is not readable XML: line {}, column {}",
+                "{place}is not readable XML: line {}, column {}",
                 e.pos().row,
                 e.pos().col
             )
         })?;
     let root = document.root_element();
     if root.tag_name().name() != "scene" {
-        return Err("expected <scene> as the outermost element: not a Mitsuba scene".into());
+        return Err(format!(
+            "{place}expected <scene> as the outermost element: not a Mitsuba scene"
+        ));
     }
     let ends = text.bytes().enumerate().filter(|(_, b)| *b == b'\n');
     let mut parser = Parser {
         text,
+        place,
         line_ends: ends.map(|(k, _)| k).collect(),
         old: old::is_old(root.attribute("version"))?,
-        ids: BTreeSet::new(),
-        defaults: BTreeMap::new(),
+        shared,
     };
     let node = parser.plugin(root, 0)?;
     let extras = root
@@ -73,26 +150,56 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
     Ok((node, extras.map(str::to_owned)))
 }
 
-struct Parser<'a> {
+fn folder(path: &Path) -> PathBuf {
+    path.parent().unwrap_or(Path::new("")).to_owned()
+}
+
+/// What a scene shares with the files that it includes.
+struct Shared {
+    files: Opener,
+    ids: BTreeSet<String>,
+    /// The aliases: (new id, known id, position).
+    aliases: Vec<(String, String, String)>,
+    /// The skipped elements with an id, which other elements may refer to.
+    skipped: Vec<(String, Rc<Node>)>,
+    /// The parameters; longer names are replaced first.
+    defaults: BTreeMap<String, String>,
+    /// The folders that files are searched in.
+    folders: Rc<Vec<PathBuf>>,
+    included: Vec<PathBuf>,
+    /// The number of documents that include the current one.
+    depth: usize,
+}
+
+impl Shared {
+    fn add_folder(&mut self, folder: PathBuf) {
+        if !self.folders.contains(&folder) {
+            Rc::make_mut(&mut self.folders).push(folder);
+        }
+    }
+}
+
+struct Parser<'a, 's> {
     text: &'a str,
+    /// The start of the positions in errors: empty, or the name of an included file.
+    place: &'s str,
     line_ends: Vec<usize>,
     /// Whether the file's version is before 2, with names in camelCase.
     old: bool,
-    ids: BTreeSet<String>,
-    /// The parameters; longer names are replaced first.
-    defaults: BTreeMap<String, String>,
+    shared: &'s mut Shared,
 }
 
 type Element<'a> = roxmltree::Node<'a, 'a>;
 
-impl<'a> Parser<'a> {
+impl<'a> Parser<'a, '_> {
     fn at(&self, e: Element<'a>) -> String {
         let line = self.line_ends.partition_point(|k| *k < e.range().start) + 1;
         let name = quoted(e.tag_name().name());
         let name = name.trim_matches('"');
+        let place = self.place;
         match e.attribute("type") {
-            Some(kind) => format!("line {line}, <{name} type={}>", quoted(kind)),
-            None => format!("line {line}, <{name}>"),
+            Some(kind) => format!("{place}line {line}, <{name} type={}>", quoted(kind)),
+            None => format!("{place}line {line}, <{name}>"),
         }
     }
 
@@ -119,10 +226,10 @@ impl<'a> Parser<'a> {
             return Ok(Some(raw.to_owned()));
         }
         let mut value = raw.to_owned();
-        let mut names: Vec<&String> = self.defaults.keys().collect();
+        let mut names: Vec<&String> = self.shared.defaults.keys().collect();
         names.sort_by_key(|n| std::cmp::Reverse(n.len()));
         for known in names {
-            let (key, new) = (format!("${known}"), &self.defaults[known]);
+            let (key, new) = (format!("${known}"), &self.shared.defaults[known]);
             let count = value.matches(&key).count();
             if count > 0 && value.len() + count * new.len() > MAX_VALUE {
                 return Err(format!(
@@ -157,6 +264,7 @@ impl<'a> Parser<'a> {
             id: self.attribute(e, "id")?.unwrap_or_default(),
             at: self.at(e),
             text: self.text[e.range()].to_owned(),
+            folders: self.shared.folders.clone(),
             ..Node::default()
         };
         match depth {
@@ -169,7 +277,7 @@ impl<'a> Parser<'a> {
                 }
             }
         }
-        if !node.id.is_empty() && !self.ids.insert(node.id.clone()) {
+        if !node.id.is_empty() && !self.shared.ids.insert(node.id.clone()) {
             return Err(node.fail(format!("the id {} is stated twice", quoted(&node.id))));
         }
         for child in e.children().filter(Element::is_element) {
@@ -188,20 +296,45 @@ impl<'a> Parser<'a> {
             } else if tag == "default" {
                 self.only(child, &["name", "value"])?;
                 let value = self.needs(child, "value")?;
-                self.defaults.entry(name).or_insert(value);
-                if self.defaults.len() > MAX_DEFAULTS {
+                self.shared.defaults.entry(name).or_insert(value);
+                if self.shared.defaults.len() > MAX_DEFAULTS {
                     let what = format!("more than {MAX_DEFAULTS} <default> parameters");
                     return Err(format!("{}: {what}", self.at(child)));
                 }
             } else if SKIPPED.contains(&tag) {
                 node.skipped.push(tag.to_owned());
+                if let Some(id) = self.attribute(child, "id")? {
+                    let skipped = Node {
+                        tag: tag.to_owned(),
+                        at: self.at(child),
+                        ..Node::default()
+                    };
+                    self.shared.skipped.push((id, Rc::new(skipped)));
+                }
+            } else if tag == "include" {
+                self.include(child, &mut node, depth)?;
+            } else if tag == "path" {
+                self.only(child, &["value"])?;
+                let value = self.needs(child, "value")?;
+                let at = self.at(child);
+                for folder in self.shared.folders.to_vec() {
+                    let folder =
+                        Opener::named(&folder, &value).map_err(|e| format!("{at}: {e}"))?;
+                    self.shared.add_folder(folder);
+                }
+            } else if tag == "alias" {
+                self.only(child, &["id", "as"])?;
+                let (known, id) = (self.needs(child, "id")?, self.needs(child, "as")?);
+                let at = self.at(child);
+                self.shared.aliases.push((id, known, at));
+            } else if node.tag == "emitter" && !EMITTER_VALUES.contains(&tag) {
+                // The colour and power of lamps are not used.
             } else {
                 let at = self.at(child);
                 let value = self.value(child, tag).map_err(|e| {
-                    if e.starts_with("line ") {
-                        e
-                    } else {
-                        format!("{at}: {e}")
+                    match e.starts_with("line ") || e.starts_with(&at) {
+                        true => e,
+                        false => format!("{at}: {e}"),
                     }
                 })?;
                 if name.is_empty() {
@@ -216,6 +349,35 @@ impl<'a> Parser<'a> {
         Ok(node)
     }
 
+    /// Puts the elements of another file in the place of `<include>`.
+    fn include(&mut self, e: Element<'a>, node: &mut Node, depth: usize) -> Result<(), String> {
+        self.only(e, &["filename"])?;
+        let name = self.needs(e, "filename")?;
+        let at = self.at(e);
+        let path = resolved(&self.shared.files, &self.shared.folders, &name)
+            .map_err(|what| format!("{at}: {what}"))?;
+        if self.shared.included.len() >= MAX_INCLUDES || self.shared.depth >= MAX_DEPTH {
+            return Err(format!(
+                "{at}: more than {MAX_INCLUDES} files are included, or a file includes itself"
+            ));
+        }
+        self.shared.included.push(path.clone());
+        let bytes = read_file(&self.shared.files, &path).map_err(|what| format!("{at}: {what}"))?;
+        let text = std::str::from_utf8(&bytes)
+            .map_err(|e| format!("{at}: {}: is not UTF-8 text: {e}", path.display()))?;
+        self.shared.add_folder(folder(&path));
+        self.shared.depth += 1;
+        let place = format!("{}: ", path.display());
+        let (inner, _) = scene(text, &place, self.shared)?;
+        self.shared.depth -= 1;
+        node.children.extend(inner.children);
+        node.skipped.extend(inner.skipped);
+        match depth {
+            0 => Ok(()),
+            _ => Err(format!("{at}: is only supported directly in <scene>")),
+        }
+    }
+
     fn value(&self, e: Element<'a>, tag: &str) -> Result<Value, String> {
         if tag == "transform" {
             self.only(e, &["name"])?;
@@ -224,14 +386,6 @@ impl<'a> Parser<'a> {
         if matches!(tag, "vector" | "point") {
             self.only(e, &["name", "value", "x", "y", "z"])?;
             return self.vector(e, 0.0).map(Value::Vector);
-        }
-        if tag == "include" {
-            return Err("is not supported; put the elements of the file in its place".into());
-        }
-        if tag == "path" {
-            return Err(
-                "is not supported; state the path of each file relative to the scene file".into(),
-            );
         }
         if !matches!(
             tag,
@@ -314,6 +468,29 @@ impl<'a> Parser<'a> {
             all = matrix.after(&all);
         }
         Ok(all)
+    }
+}
+
+/// Returns the path of a file by its name: in the first folder where it exists, else in the first.
+///
+/// # Errors
+/// A name that is not a plain path.
+pub(super) fn resolved(
+    files: &Opener,
+    folders: &[PathBuf],
+    name: &str,
+) -> Result<PathBuf, FileError> {
+    let mut first = None;
+    for folder in folders {
+        let path = Opener::named(folder, name)?;
+        if files.check(&path).is_ok() && path.is_file() {
+            return Ok(path);
+        }
+        first.get_or_insert(path);
+    }
+    match first {
+        Some(path) => Ok(path),
+        None => Opener::named(Path::new(""), name),
     }
 }
 
