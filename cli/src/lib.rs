@@ -6,45 +6,14 @@
 #![allow(missing_docs)]
 
 pub mod args;
-mod assets;
-mod audit;
-pub mod choices;
 pub mod client;
-pub mod dataset;
-mod demo;
-mod demultiplex;
-mod describe;
-mod doctor;
-pub mod ends;
+pub mod commands;
 pub mod error;
-mod explain;
 mod files;
-pub mod follow;
-mod groups;
-pub mod jobfile;
-mod jobs;
-mod listing;
-pub mod local;
 mod logging;
-mod model;
 pub mod output;
-mod pace;
-mod paths;
-pub mod picture;
-mod reach;
-mod reconstruct;
-mod render;
-pub mod roles;
-mod scene;
-mod sense;
 pub mod settings;
 pub mod signals;
-mod stored;
-#[cfg(feature = "networks")]
-mod sweep;
-mod tail;
-mod template;
-mod token;
 #[cfg(feature = "traces")]
 mod traces;
 #[cfg(not(feature = "traces"))]
@@ -63,7 +32,7 @@ use tracing_subscriber::{Layer, prelude::*};
 use crate::{
     args::{Cli, Command},
     error::Result,
-    output::{Output, table},
+    output::Output,
     settings::{Resolved, resolve},
     traces::Traces,
 };
@@ -125,7 +94,7 @@ fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
     };
     let _last_lines = log(&resolved.settings.log, traces.as_ref())?;
     let ended = runtime
-        .block_on(run(cli.command, &resolved, output, bench))
+        .block_on(commands::run(cli.command, &resolved, output, bench))
         .and_then(|()| output::printed());
     if let Some(traces) = traces {
         traces.end();
@@ -135,7 +104,7 @@ fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
 
 /// Runs a worker process of `up` or `demo`. Its parent has resolved the settings.
 fn local_worker() -> Result<()> {
-    let order = local::received()?;
+    let order = commands::local_worker::received()?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
@@ -149,92 +118,11 @@ fn local_worker() -> Result<()> {
     };
     let _last_lines = log(&order.settings.log, traces.as_ref())?;
     picofarm_dataset::limit_bandwidth(order.settings.bandwidth()?);
-    let ended = runtime.block_on(local::serve(order));
+    let ended = runtime.block_on(commands::local_worker::serve(order));
     if let Some(traces) = traces {
         traces.end();
     }
     ended
-}
-
-async fn run(
-    command: Command,
-    resolved: &Resolved,
-    output: Output,
-    bench: Option<Bench>,
-) -> Result<()> {
-    let settings = &resolved.settings;
-    picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
-    match command {
-        Command::Demo(args) => demo::demo(args, settings, output).await,
-        Command::Up(args) => demo::up(args, settings, output).await,
-        Command::Coordinator(args) => roles::coordinator(args, output).await,
-        Command::Worker(args) => roles::worker(args, settings, output).await,
-        Command::LocalWorker => unreachable!("it is started before settings are resolved"),
-        Command::Job(command) => jobs::run(command, settings, output).await,
-        Command::Workers { what } => explain::workers(what, settings, output).await,
-        Command::Events {
-            follow,
-            last,
-            verbose,
-        } => tail::events(follow, last, verbose, settings, output).await,
-        Command::Dataset(command) => dataset::run(command, settings, output).await,
-        Command::Model(command) => model::run(command, output).await,
-        #[cfg(feature = "networks")]
-        Command::Sweep(command) => sweep::run(command, settings, output).await,
-        #[cfg(not(feature = "networks"))]
-        Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
-        Command::Scene(command) => scene::run(command, settings, output).await,
-        Command::Reconstruct(args) => reconstruct::run(args, output).await,
-        Command::Demultiplex(args) => demultiplex::run(args, output).await,
-        Command::Token(command) => token::run(command, resolved, output).await,
-        Command::Audit(args) => audit::run(&args, settings, output).await,
-        Command::Assets(command) => assets::run(command, settings, output).await,
-        Command::Bench(command) => match bench {
-            Some(bench) => bench(command, settings, output).await,
-            None => Err(error::not_built("bench", "benches")),
-        },
-        Command::Config => {
-            show_settings(resolved, output);
-            Ok(())
-        }
-        Command::Doctor(args) => doctor::run(args, settings, output).await,
-        Command::Completions { shell } => {
-            let mut script = Vec::new();
-            clap_complete::generate(shell, &mut args::command(), "picofarm", &mut script);
-            output::print(&script);
-            Ok(())
-        }
-    }
-}
-
-fn show_settings(resolved: &Resolved, output: Output) {
-    let values = serde_json::to_value(&resolved.settings).expect("settings are plain data");
-    let mut rows: Vec<_> = resolved
-        .sources
-        .iter()
-        .map(|(name, source)| {
-            let value = match &values[name] {
-                serde_json::Value::Null => String::new(),
-                serde_json::Value::String(text) => args::without_secrets(text),
-                other => other.to_string(),
-            };
-            vec![(*name).to_owned(), value, source.clone()]
-        })
-        .collect();
-    if resolved.token {
-        let source = "environment PICOFARM_TOKEN".to_owned();
-        rows.push(vec!["token".into(), "(a secret)".into(), source]);
-    }
-    let document: serde_json::Map<_, _> = rows
-        .iter()
-        .map(|r| {
-            (
-                r[0].clone(),
-                serde_json::json!({"value": r[1], "source": r[2]}),
-            )
-        })
-        .collect();
-    output.result(&document, || table(&rows));
 }
 
 /// Sends log lines to stderr, those of tasks also to their coordinator, and spans to a trace

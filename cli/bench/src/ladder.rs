@@ -6,8 +6,10 @@ use serde::Serialize;
 use tokio_util::sync::CancellationToken;
 
 use picofarm_cli::{
-    args::BenchRender,
-    choices::{Variant, variants},
+    args::{
+        BenchRender,
+        strategy::{Variant, variants},
+    },
     error::Result,
     output::Output,
 };

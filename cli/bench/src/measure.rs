@@ -14,7 +14,7 @@ use picofarm_cli::{
     args::BenchRender,
     error::{CliError, Code, Result},
     output::{Meter, Output},
-    roles, signals,
+    signals,
 };
 
 /// Time and result of a render.
@@ -68,7 +68,7 @@ impl<'a> Bench<'a> {
         output: Output,
         stop: &'a CancellationToken,
     ) -> Result<Self> {
-        let threads = threads.unwrap_or_else(roles::cores).max(1);
+        let threads = threads.unwrap_or_else(picofarm_agent::cores).max(1);
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .build()

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use picofarm_cli::{error::Result, picture::save};
+use picofarm_cli::{error::Result, output::files::save};
 use picofarm_figures::Canvas;
 
 use super::{

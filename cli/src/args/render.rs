@@ -6,9 +6,9 @@ use clap::Args;
 use picofarm_scene::import::Bounds;
 use picofarm_transient::{BeamWidth, Gate};
 
-use crate::{
-    choices::{Chosen, Ways},
+use crate::args::{
     groups::{Group, Named},
+    strategy::{Chosen, Ways},
 };
 
 /// Where the files lie that a scene file names.
@@ -54,15 +54,15 @@ pub struct RenderArgs {
     pub max_bounces: Option<u32>,
     /// Histograms of subsets of the spots too, from the same rays: 4 and 25 of a 10x10 grid, or
     /// per-spot for each beam
-    #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::groups::parse)]
+    #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::args::groups::parse)]
     pub groups: Vec<Group>,
     /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given
     /// several times
-    #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::groups::parse_named)]
+    #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::args::groups::parse_named)]
     pub group: Vec<Named>,
     /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the
     /// renderer chooses by the scene]
-    #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::choices::parse)]
+    #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::args::strategy::parse)]
     pub strategy: Vec<Chosen>,
     #[command(flatten)]
     pub beam: BeamArgs,
@@ -179,7 +179,7 @@ pub struct BenchRender {
     /// by +, or each, which leaves out one in turn (also what the option stands for without a
     /// value)
     #[arg(long, value_delimiter = ',', num_args = 0..=1, default_value = "default", default_missing_value = "each",
-          value_name = "default|each|NAME=VALUE[+…],…", value_parser = crate::choices::ways)]
+          value_name = "default|each|NAME=VALUE[+…],…", value_parser = crate::args::strategy::ways)]
     pub strategies: Vec<Ways>,
     /// Draw time against error into this PNG
     #[arg(long, value_name = "FILE")]

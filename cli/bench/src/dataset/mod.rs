@@ -17,7 +17,7 @@ use self::simulate::{Simulated, empty};
 use super::measure::cpu_time;
 use picofarm_cli::{
     args::BenchDataset,
-    dataset::failed,
+    commands::dataset::failed,
     error::{CliError, Code, Result, io},
     output::{Meter, Output, bytes, duration, table},
     signals,

@@ -14,7 +14,7 @@ use picofarm_dataset::{
 };
 
 use picofarm_cli::{
-    dataset::failed,
+    commands::dataset::failed,
     error::{CliError, Code, Result, io as io_error},
 };
 

@@ -12,14 +12,14 @@ use tokio_util::sync::CancellationToken;
 use super::sample::Sample;
 use picofarm_cli::{
     args::BenchStore,
-    client::Client,
-    dataset,
+    client::{
+        Client,
+        follow::{Show, follow, verdict},
+        jobfile,
+    },
+    commands::{coordinator::Guarded, dataset, local::Local},
     error::{CliError, Result, io},
-    follow::{Show, follow, verdict},
-    jobfile,
-    local::Local,
     output::Output,
-    roles::Guarded,
     settings::Settings,
     signals,
 };
