@@ -8,7 +8,7 @@ exec python3 - <<'PYTHON'
 import pathlib, re, sys
 
 pages = [pathlib.Path(p) for p in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")]
-pages += sorted(pathlib.Path("docs").rglob("*.md")) + sorted(pathlib.Path("deploy").rglob("*.md")) + [pathlib.Path("tests/peers/README.md")]
+pages += sorted(pathlib.Path("docs").rglob("*.md")) + sorted(pathlib.Path("deploy").rglob("*.md")) + [pathlib.Path("tests/lab/peers/README.md")]
 
 def prose(page):
     return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)

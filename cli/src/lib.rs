@@ -1,8 +1,8 @@
 //! The commands of the `picofarm` program: every role of the farm, and the users' commands. The
-//! program itself (`cli/program`) selects the features. Benches (`cli/bench`) are a crate above
-//! this one, so that the program of a farm does not contain code that only comparisons need.
+//! program itself (`cli/program`) selects the features. Benchmarks (`tests/lab`) are a program of
+//! their own that uses this library.
 //!
-//! Only these two crates use this library, so its public items are not all documented.
+//! Only these two use this library, so its public items are not all documented.
 #![allow(missing_docs)]
 
 pub mod args;
@@ -21,9 +21,7 @@ mod traces;
 mod traces;
 
 use std::{
-    future::Future,
     io::{ErrorKind, Write},
-    pin::Pin,
     process::ExitCode,
 };
 
@@ -37,26 +35,16 @@ use crate::{
     traces::Traces,
 };
 
-/// Runs `picofarm bench …`, if the program has it.
-pub type Bench = for<'a> fn(
-    args::Bench,
-    &'a settings::Settings,
-    Output,
-) -> Pin<Box<dyn Future<Output = Result<()>> + Send + 'a>>;
-
 /// Runs the whole program, from its command line to its exit code. `version` is the text of
 /// `--version`.
-pub fn run_program(version: &'static str, bench: Option<Bench>) -> ExitCode {
-    // A single cryptography provider for all TLS code of this program.
-    rustls::crypto::ring::default_provider()
-        .install_default()
-        .expect("nothing has chosen one before main");
+pub fn run_program(version: &'static str) -> ExitCode {
+    provide_cryptography();
     let cli = match args::parse(std::env::args_os(), version) {
         Ok(cli) => cli,
         Err(asked) => return usage(&asked),
     };
     let json = cli.global.json;
-    match start(cli, bench) {
+    match start(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => ExitCode::from(e.report(json)),
     }
@@ -73,33 +61,64 @@ fn usage(asked: &clap::Error) -> ExitCode {
     }
 }
 
-fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
+fn start(cli: Cli) -> Result<()> {
     if let Command::LocalWorker = cli.command {
         return local_worker();
     }
-    let resolved = resolve(&cli.global)?;
-    let output = Output {
-        json: cli.global.json,
-    };
+    let Cli { global, command } = cli;
+    let traces = command.traces();
+    let traces = traces.map(|(url, service)| (url.to_owned(), service));
+    with_settings(&global, traces, async |resolved, output| {
+        commands::run(command, resolved, output).await
+    })
+}
+
+/// Runs a program of this workspace that has the global options: resolves the settings, starts the
+/// runtime and the log, and runs `work`. Returns the exit code.
+pub fn run_with_settings(
+    global: &args::Global,
+    work: impl AsyncFnOnce(&Resolved, Output) -> Result<()>,
+) -> ExitCode {
+    provide_cryptography();
+    match with_settings(global, None, work) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => ExitCode::from(e.report(global.json)),
+    }
+}
+
+/// Runs `work` with the settings. `traces` is the collector's URL and the name of the service.
+fn with_settings(
+    global: &args::Global,
+    traces: Option<(String, &'static str)>,
+    work: impl AsyncFnOnce(&Resolved, Output) -> Result<()>,
+) -> Result<()> {
+    let resolved = resolve(global)?;
+    let output = Output { json: global.json };
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .map_err(|e| error::io("cannot start the runtime", &e))?;
     let traces = {
         let _in = runtime.enter();
-        let traces = cli.command.traces();
         traces
-            .map(|(url, service)| Traces::start(url, service))
+            .map(|(url, service)| Traces::start(&url, service))
             .transpose()?
     };
     let _last_lines = log(&resolved.settings.log, traces.as_ref())?;
     let ended = runtime
-        .block_on(commands::run(cli.command, &resolved, output, bench))
+        .block_on(work(&resolved, output))
         .and_then(|()| output::printed());
     if let Some(traces) = traces {
         traces.end();
     }
     ended
+}
+
+/// Selects the only cryptography provider of all TLS code of this process.
+fn provide_cryptography() {
+    rustls::crypto::ring::default_provider()
+        .install_default()
+        .expect("nothing has chosen one before main");
 }
 
 /// Runs a worker process of `up` or `demo`. Its parent has resolved the settings.
@@ -167,7 +186,6 @@ mod tests {
             &["demo", "--seed", "-1"][..],
             &["demo", "--scenes", "-5"],
             &["scene", "generate", "--seed", "-1"],
-            &["bench", "queue", "--workers", "-2"],
             &["dataset", "show", "rooms", "-1"],
             &["job", "logs", "j", "--last", "-1"],
         ] {

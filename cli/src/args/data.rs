@@ -95,33 +95,6 @@ pub struct DatasetReport {
 }
 
 #[derive(Args)]
-pub struct BenchStore {
-    /// Folder or URL of a data set with the profile lossless to take scenes from, instead of
-    /// rendering some
-    #[arg(long, value_name = "DATASET", value_parser = crate::args::location::parse, conflicts_with_all = ["keep", "resolution", "samples", "seed"])]
-    pub from: Option<String>,
-    /// Number of scenes
-    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..=64))]
-    pub scenes: u64,
-    /// Image width and height in pixels
-    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(8..=1024))]
-    pub resolution: u32,
-    /// Camera paths per pixel for three bounces and more
-    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(2..=1_048_576))]
-    pub samples: u32,
-    /// Seed of the rooms
-    #[arg(long, default_value_t = 11, value_parser = super::ranges::whole)]
-    pub seed: u64,
-    /// Render into this folder and keep it: the next run with it renders nothing [default: a folder
-    /// that is removed after]
-    #[arg(long, value_name = "DIR")]
-    pub keep: Option<PathBuf>,
-    /// Leave out how fast scenes are read
-    #[arg(long)]
-    pub no_reading: bool,
-}
-
-#[derive(Args)]
 pub struct DatasetSplit {
     /// Folder or URL of the data set
     #[arg(value_parser = crate::args::location::parse)]

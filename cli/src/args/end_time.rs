@@ -87,16 +87,19 @@ fn slurms(text: Option<&str>, now: SystemTime) -> Result<Option<SystemTime>> {
 mod tests {
     use super::*;
 
-    fn at(seconds: u64) -> SystemTime {
+    fn unix_time(seconds: u64) -> SystemTime {
         SystemTime::UNIX_EPOCH + Duration::from_secs(seconds)
     }
 
     #[test]
     fn the_end_is_a_time_or_a_duration_to_come() {
-        let now = at(1_000_000);
+        let now = unix_time(1_000_000);
         let end = |text: &str| own(Some(parse(text).unwrap()), now);
-        assert_eq!(end("3h 50m").unwrap(), Some(at(1_000_000 + 13_800)));
-        assert_eq!(end("1970-01-13T00:00:00Z").unwrap(), Some(at(1_036_800)));
+        assert_eq!(end("3h 50m").unwrap(), Some(unix_time(1_000_000 + 13_800)));
+        assert_eq!(
+            end("1970-01-13T00:00:00Z").unwrap(),
+            Some(unix_time(1_036_800))
+        );
         assert_eq!(own(None, now).unwrap(), None);
         let late = end("1970-01-01T00:00:00Z").unwrap_err();
         assert!(late.message.contains("has passed"), "{}", late.message);
@@ -105,8 +108,11 @@ mod tests {
 
     #[test]
     fn a_slurm_job_ends_its_worker_a_minute_before() {
-        let now = at(1_000_000);
-        assert_eq!(slurms(Some("1003600"), now).unwrap(), Some(at(1_003_540)));
+        let now = unix_time(1_000_000);
+        assert_eq!(
+            slurms(Some("1003600"), now).unwrap(),
+            Some(unix_time(1_003_540))
+        );
         assert_eq!(slurms(Some("1000030"), now).unwrap(), Some(now));
         assert_eq!(slurms(Some("999999"), now).unwrap(), None);
         assert_eq!(slurms(None, now).unwrap(), None);

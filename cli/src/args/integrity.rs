@@ -128,26 +128,6 @@ pub enum Snapshot {
     },
 }
 
-#[derive(Args)]
-pub struct BenchDataset {
-    /// Folder to simulate the data set in; it must not exist, or be empty, and is removed at the
-    /// end
-    #[arg(long, value_name = "DIR")]
-    pub dir: PathBuf,
-    /// Sizes to measure at; a scene takes some 50 inodes and, where small folders take a block
-    /// each, 120 kB
-    #[arg(
-        long,
-        value_delimiter = ',',
-        value_name = "N,…",
-        default_value = "1000,3000,10000"
-    )]
-    pub scenes: Vec<u64>,
-    /// Leave the data set there
-    #[arg(long)]
-    pub keep: bool,
-}
-
 /// Parses an age with its unit: `30s`, `90m`, `24h`, `7d`.
 fn age(text: &str) -> Result<Duration, String> {
     let expected = || format!("expected a number with s, m, h or d, e.g. 24h, found {text:?}");

@@ -1,6 +1,5 @@
 //! The command line. A single definition drives the parser, the help and the completions.
 
-mod bench;
 mod data;
 mod dataset;
 mod demultiplex;
@@ -12,8 +11,7 @@ mod integrity;
 mod job;
 pub mod location;
 mod model;
-mod network;
-mod ranges;
+pub mod ranges;
 mod reconstruct;
 mod render;
 mod scene;
@@ -25,21 +23,18 @@ use std::{ffi::OsString, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
-pub use bench::{Bench, BenchQueue};
 pub use data::{
-    BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
-    SensorArgs,
+    DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, SensorArgs,
 };
 pub use dataset::Dataset;
 pub use demultiplex::{Demultiplex, PlacesArg};
 pub use farm::{Coordinator, Demo, Http, Traces, Up, Worker, Workers};
 pub use guard::{Audit, Guard, Token};
-pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
+pub use integrity::{DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
-pub use network::{BenchModel, Kind, Learns, Numbers};
 pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
-pub use render::{BenchRender, GateArgs, RenderArgs, ScenePlan, SceneRender, SceneRoot};
+pub use render::{GateArgs, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use scene::{FormatArg, GeneratorArg, PlatoArg, Scene, SceneExport, SceneSense};
 pub use secrets::without_secrets;
 pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
@@ -204,9 +199,6 @@ pub enum Command {
     /// Furniture for generated rooms
     #[command(subcommand)]
     Assets(Assets),
-    /// Measure on this machine
-    #[command(subcommand)]
-    Bench(Bench),
     /// Show the settings in force and where each comes from
     Config,
     /// Check this machine: store, disk, coordinator, furniture

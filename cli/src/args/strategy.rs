@@ -1,4 +1,4 @@
-//! `--strategy` and `--strategies`: manual choice of the renderer's sampling strategies.
+//! `--strategy`: manual choice of the renderer's sampling strategies.
 
 use picofarm_settings::{Choice, Strategy};
 
@@ -9,13 +9,6 @@ use crate::error::{CliError, Result};
 pub struct Chosen {
     name: String,
     choice: Choice,
-}
-
-/// A set of strategies for comparison in a benchmark.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Variant {
-    pub name: String,
-    pub strategy: Strategy,
 }
 
 /// Parses `path-reuse=1` or `mirror-images=off`.
@@ -60,56 +53,6 @@ pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
     Ok(all)
 }
 
-/// The variants of one word of `--strategies`.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Ways(Vec<Variant>);
-
-/// Parses `default`, `each` (each strategy turned off in turn), `path-reuse=1` or
-/// `path-reuse=1+mirror-images=off`.
-///
-/// # Errors
-/// Returns the errors of [`parse`], or an error if a strategy is chosen twice.
-pub fn ways(text: &str) -> Result<Ways, String> {
-    let default = Variant {
-        name: "picofarm".into(),
-        strategy: Strategy::default(),
-    };
-    let of = |text: &str| -> Result<Variant, String> {
-        let chosen = text.split('+').map(parse).collect::<Result<Vec<_>, _>>()?;
-        Ok(Variant {
-            name: text.into(),
-            strategy: together(&chosen).map_err(|e| e.message)?,
-        })
-    };
-    match text {
-        "default" => Ok(Ways(vec![default])),
-        "each" => {
-            // A strategy without a switch is a size, and size 1 turns it off.
-            let without = |name: &str| {
-                let name = name.replace('_', "-");
-                of(&format!("{name}=off")).or_else(|_| of(&format!("{name}=1")))
-            };
-            let all = Strategy::NAMES
-                .into_iter()
-                .map(without)
-                .collect::<Result<Vec<_>, _>>()?;
-            Ok(Ways([vec![default], all].concat()))
-        }
-        _ => Ok(Ways(vec![of(text)?])),
-    }
-}
-
-/// Returns all variants to compare, in order and without duplicates.
-pub fn variants(ways: &[Ways]) -> Vec<Variant> {
-    let mut all: Vec<Variant> = vec![];
-    for way in ways.iter().flat_map(|w| &w.0) {
-        if !all.contains(way) {
-            all.push(way.clone());
-        }
-    }
-    all
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -141,32 +84,5 @@ mod tests {
             let error = parse(text).unwrap_err();
             assert!(error.contains(part), "{text}: {error}");
         }
-    }
-
-    #[test]
-    fn ways_have_the_name_they_were_given() {
-        let all = |words: &[&str]| {
-            let ways: Vec<_> = words.iter().map(|w| ways(w).unwrap()).collect();
-            variants(&ways)
-        };
-        let found = all(&["default", "path-reuse=1+mirror-images=off", "default"]);
-        let names: Vec<_> = found.iter().map(|v| v.name.as_str()).collect();
-        assert_eq!(names, ["picofarm", "path-reuse=1+mirror-images=off"]);
-        assert_eq!(found[0].strategy, Strategy::default());
-        let both = found[1].strategy;
-        assert_eq!(
-            (both.path_reuse, both.mirror_images),
-            (Some(1), Some(false))
-        );
-        assert!(
-            ways("path-reuse=1+path-reuse=2")
-                .unwrap_err()
-                .contains("twice")
-        );
-
-        let each = all(&["each"]);
-        assert_eq!(each.len(), 1 + Strategy::NAMES.len());
-        assert_eq!(each[1].name, "path-reuse=1");
-        assert!(each.iter().any(|v| v.name == "light-vertices=off"));
     }
 }

@@ -124,7 +124,7 @@ async fn stream(
             }
             failures(client, job, watching).await?;
             let (fraction, message) = watching.pace.describe(&status, Instant::now());
-            watching.meter.at(fraction, message);
+            watching.meter.update(fraction, message);
         }
         if status.state != JobState::Active {
             return Ok(Some(status));

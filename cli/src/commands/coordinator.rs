@@ -36,7 +36,7 @@ pub struct Guarded {
 
 impl Guarded {
     /// Creates the rules from the options.
-    pub fn of(args: &args::Guard) -> Self {
+    pub fn from_args(args: &args::Guard) -> Self {
         let pair = args.tls_cert.clone().zip(args.tls_key.clone());
         Self {
             access: Access {
@@ -219,7 +219,7 @@ pub async fn run(args: args::Coordinator, output: Output) -> Result<()> {
     let stored = StoreReader::asked_for(&args.check_stores)?;
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
-    let guarded = Guarded::of(&args.guard);
+    let guarded = Guarded::from_args(&args.guard);
     let coordinator = Coordinator::start(
         args.catalog.clone(),
         args.listen,

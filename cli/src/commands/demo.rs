@@ -61,7 +61,7 @@ fn task(args: &Demo) -> RenderTask {
     }
 }
 
-fn place(task: &RenderTask) -> String {
+fn dataset_of(task: &RenderTask) -> String {
     format!("{}/{}", task.output.store, task.output.dataset)
 }
 
@@ -86,7 +86,7 @@ impl Asked<'_> {
 
 /// Returns whether the data set already belongs to other settings.
 async fn taken(task: &RenderTask) -> Result<bool> {
-    let place = place(task);
+    let place = dataset_of(task);
     if !Path::new(&place).join("zarr.json").exists() {
         return Ok(false);
     }
@@ -123,13 +123,13 @@ async fn submit(
             Err(e) => return Err(e),
         }
     }
-    let before = place(&task);
+    let before = dataset_of(&task);
     let key = task.stage_key().to_string();
     task.output.dataset += &format!("-{}", key.get(..8).unwrap_or(&key));
     output.say(format!(
         "{before} is for rooms of other settings (furniture, resolution, spots, seed or samples) and stays as it is; these \
          go to {}",
-        place(&task)
+        dataset_of(&task)
     ));
     let mut own = asked.job(&task)?;
     stores::identify(&mut own, Identity::Create, output).await;
@@ -229,7 +229,7 @@ async fn render(
     } else {
         Show::Progress
     };
-    let place = place(&task);
+    let place = dataset_of(&task);
     output.say(format!(
         "pictures of finished rooms: {}",
         asked.dir.join(dataset::SHEET).display()
@@ -254,7 +254,7 @@ async fn tell(
     output.say("drawing …");
     let pictures = dataset::draw(place, &scenes[..scenes.len().min(sheet::ROOMS)], dir).await?;
     let rooms = match args.reconstruct {
-        true => Some(Rooms::of(place, dir).await?),
+        true => Some(Rooms::verify(place, dir).await?),
         false => None,
     };
     let took = status.ended_at_ms.map_or(0, |e| e - status.submitted_at_ms) as f64 / 1000.0;
@@ -285,7 +285,7 @@ async fn tell(
             show::line(place),
             pictures.sheet.display(),
             pictures.flight.display(),
-            rooms.as_ref().map(Rooms::told).unwrap_or_default(),
+            rooms.as_ref().map(Rooms::summary).unwrap_or_default(),
             show::argument(place),
             rooms.as_ref().map(Rooms::next).unwrap_or_default(),
         )

@@ -10,7 +10,7 @@ mod demo;
 mod demultiplex;
 mod doctor;
 mod events;
-mod job;
+pub(crate) mod job;
 pub mod local;
 pub(crate) mod local_worker;
 mod model;
@@ -23,21 +23,10 @@ mod up;
 mod worker;
 mod workers;
 
-use crate::{
-    Bench,
-    args::Command,
-    error::{self, Result},
-    output::Output,
-    settings::Resolved,
-};
+use crate::{args::Command, error::Result, output::Output, settings::Resolved};
 
 /// Runs a command.
-pub(crate) async fn run(
-    command: Command,
-    resolved: &Resolved,
-    output: Output,
-    bench: Option<Bench>,
-) -> Result<()> {
+pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
     let settings = &resolved.settings;
     picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
     match command {
@@ -58,17 +47,13 @@ pub(crate) async fn run(
         #[cfg(feature = "networks")]
         Command::Sweep(command) => sweep::run(command, settings, output).await,
         #[cfg(not(feature = "networks"))]
-        Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
+        Command::Sweep(_) => Err(crate::error::not_built("networks", "sweeps")),
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Reconstruct(args) => reconstruct::run(args, output).await,
         Command::Demultiplex(args) => demultiplex::run(args, output).await,
         Command::Token(command) => token::run(command, resolved, output).await,
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,
-        Command::Bench(command) => match bench {
-            Some(bench) => bench(command, settings, output).await,
-            None => Err(error::not_built("bench", "benches")),
-        },
         Command::Config => {
             config::show(resolved, output);
             Ok(())

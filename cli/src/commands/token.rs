@@ -161,7 +161,7 @@ async fn revoke(name: &str, path: &Path, resolved: &Resolved, output: Output) ->
         })
         .collect();
     let document = json!({"revoked": name, "file": path, "coordinators": answers});
-    output.result(&document, || told(name, path, &asked));
+    output.result(&document, || describe_revocation(name, path, &asked));
     let accepting: Vec<_> = asked
         .iter()
         .filter(|(_, standing)| matches!(standing, Standing::Accepted(_)))
@@ -219,7 +219,7 @@ async fn refused_soon(url: &str, access: &Access, proof: &str) -> Standing {
     }
 }
 
-fn told(name: &str, path: &Path, asked: &[(&str, Standing)]) -> String {
+fn describe_revocation(name: &str, path: &Path, asked: &[(&str, Standing)]) -> String {
     let mut text = format!("{name} is no longer in {}\n", path.display());
     if asked.is_empty() {
         text += "only the file was changed: no coordinator is configured, so none was asked; name them with \

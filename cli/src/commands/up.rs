@@ -20,7 +20,7 @@ use crate::{
 /// # Errors
 /// Fails if the address or catalog is in use, or if a worker ends.
 pub async fn run(args: Up, settings: &Settings, output: Output) -> Result<()> {
-    let guarded = Guarded::of(&args.guard);
+    let guarded = Guarded::from_args(&args.guard);
     refuse_unguarded(args.listen, &args.guard, true)?;
     let gpus = gpu_names(&args.gpus)?;
     std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;

@@ -166,7 +166,7 @@ impl Meter {
     }
 
     /// Shows `fraction` in [0, 1] and a message.
-    pub fn at(&mut self, fraction: f64, message: String) {
+    pub fn update(&mut self, fraction: f64, message: String) {
         let message = show::line(&message).into_owned();
         self.fit();
         match &self.bar {

@@ -38,7 +38,7 @@ const ONE_IN: u64 = 8;
 /// Reads stores, on a runtime of its own.
 pub struct StoreReader {
     allowed: Allowed,
-    opened: Mutex<HashMap<String, Place>>,
+    opened: Mutex<HashMap<String, StorePath>>,
     /// `None` only while being dropped.
     runtime: Option<Runtime>,
 }
@@ -54,7 +54,7 @@ enum Allowed {
     Any,
 }
 
-type Place = (Arc<dyn ObjectStore>, Path);
+type StorePath = (Arc<dyn ObjectStore>, Path);
 
 impl StoreReader {
     /// Creates the reader for `--check-stores`: folders of this machine by default, no reader for
@@ -104,7 +104,7 @@ impl StoreReader {
         })
     }
 
-    fn open(&self, location: &str) -> std::result::Result<Place, String> {
+    fn open(&self, location: &str) -> std::result::Result<StorePath, String> {
         match &self.allowed {
             Allowed::Any => {}
             Allowed::Folders if folder(location).is_some() => {}
@@ -164,7 +164,7 @@ enum Question {
 impl Question {
     /// Returns the question about results of a stage and the store to ask, or the reason why there
     /// is none.
-    fn of(
+    fn new(
         stage: &StageSpec,
         results: &[(u64, [u8; 32])],
     ) -> std::result::Result<(String, Self), String> {
@@ -254,7 +254,7 @@ impl Stored for StoreReader {
         results: &'a [(u64, [u8; 32])],
     ) -> BoxFuture<'a, std::result::Result<Vec<Found>, String>> {
         Box::pin(async move {
-            let (location, question) = Question::of(stage, results)?;
+            let (location, question) = Question::new(stage, results)?;
             let (store, prefix) = self.open(&location)?;
             let folder = folder(&location);
             // If an operator names a store, it is known to be the workers' store.

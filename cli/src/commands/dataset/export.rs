@@ -29,7 +29,7 @@ pub async fn run(args: DatasetExport, output: Output) -> Result<()> {
     let mut meter = Meter::new(output);
     let steps = export.steps();
     for k in 0..steps {
-        meter.at(k as f64 / steps as f64, format!("{k} of {steps} steps"));
+        meter.update(k as f64 / steps as f64, format!("{k} of {steps} steps"));
         tokio::select! {
             done = export.step(k) => done.map_err(failed)?,
             () = stop.cancelled() => return Err(signals::interrupted(HINT)),

@@ -57,7 +57,7 @@ pub async fn run(args: DatasetImport, output: Output) -> Result<()> {
     for index in 0..scenes {
         let name = work.source.name(index).unwrap_or_default();
         let text = format!("{index} of {scenes} scenes, {}: {name}", bytes(done.read));
-        meter.at(index as f64 / scenes as f64, text);
+        meter.update(index as f64 / scenes as f64, text);
         if !work.one(index, &stop, &mut done, output).await? {
             return Err(signals::interrupted(HINT));
         }

@@ -28,13 +28,13 @@ impl Late {
         }
     }
 
-    pub fn at(&self, done: u64, of: u64) {
+    pub fn update(&self, done: u64, of: u64) {
         if self.since.elapsed() > Self::AFTER {
             let mut meter = self.meter.lock().expect("no panic while locked");
             let text = format!("{done} of {of} {}", self.what);
             meter
                 .get_or_insert_with(|| Meter::new(self.output))
-                .at(done as f64 / of.max(1) as f64, text);
+                .update(done as f64 / of.max(1) as f64, text);
         }
     }
 

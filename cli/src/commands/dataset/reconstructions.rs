@@ -140,7 +140,7 @@ pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Outpu
         )));
     }
     let late = Late::new("scenes checked", output);
-    let watch = |done, of| late.at(done, of);
+    let watch = |done, of| late.update(done, of);
     let report = there.verify(mode(args.fast), &watch).await;
     late.finish();
     let report = report.map_err(failed)?;

@@ -172,7 +172,7 @@ impl Work {
         let mut meter = Meter::new(output);
         let of = broken.len();
         for (at, (scene, problems)) in broken.into_iter().enumerate() {
-            meter.at(
+            meter.update(
                 at as f64 / of as f64,
                 format!("{at} of {of} broken scenes, making scene {scene} again"),
             );

@@ -137,7 +137,7 @@ impl Work {
         let mut meter = Meter::new(output);
         for (at, scene) in scenes.iter().enumerate() {
             let text = format!("{at} of {} scenes, {}", scenes.len(), bytes(done.bytes));
-            meter.at(at as f64 / scenes.len() as f64, text);
+            meter.update(at as f64 / scenes.len() as f64, text);
             let result = self.one(*scene).map_err(task_failed)?;
             done.bytes += result.bytes;
             match result.adopted {

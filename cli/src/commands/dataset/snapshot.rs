@@ -72,7 +72,7 @@ async fn create(place: &str, name: String, output: Output) -> Result<()> {
 
 async fn present(dataset: &Dataset, output: Output) -> Result<Snapshot> {
     let late = Late::new("manifests read", output);
-    let watch = |done, of| late.at(done, of);
+    let watch = |done, of| late.update(done, of);
     let snapshot = dataset.present(&watch).await.map_err(failed);
     late.finish();
     snapshot

@@ -47,7 +47,7 @@ pub struct How<'a> {
 /// Verifies a data set and shows progress.
 pub async fn look(dataset: &Dataset, how: &How<'_>, output: Output) -> Result<Verification> {
     let late = Late::new("scenes checked", output);
-    let watch = |done, of| late.at(done, of);
+    let watch = |done, of| late.update(done, of);
     let options = VerifyOptions {
         mode: mode(how.fast),
         complete: how.complete,

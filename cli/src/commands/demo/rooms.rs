@@ -56,7 +56,7 @@ pub fn stage(task: &RenderTask, dir: &Path, settings: &Settings) -> Result<Stage
             ..ReconstructSettings::default()
         },
         output: OutputSettings {
-            dataset: beside(&task.output.dataset),
+            dataset: reconstructions_of(&task.output.dataset),
             ..task.output.clone()
         },
     });
@@ -65,7 +65,7 @@ pub fn stage(task: &RenderTask, dir: &Path, settings: &Settings) -> Result<Stage
 }
 
 /// Returns the location of the reconstructions of a data set.
-fn beside(dataset: &str) -> String {
+fn reconstructions_of(dataset: &str) -> String {
     format!("{dataset}-3d")
 }
 
@@ -82,8 +82,8 @@ impl Rooms {
     ///
     /// # Errors
     /// Exit code 6 naming the broken objects; fails if the folder cannot be written.
-    pub async fn of(place: &str, dir: &Path) -> Result<Self> {
-        let place = beside(place);
+    pub async fn verify(place: &str, dir: &Path) -> Result<Self> {
+        let place = reconstructions_of(place);
         let there = opened(&place).await?;
         let report = check(&place, &there).await?;
         let sheet = dir.join("reconstructions.png");
@@ -102,7 +102,7 @@ impl Rooms {
     }
 
     /// Describes where the reconstructions are.
-    pub fn told(&self) -> String {
+    pub fn summary(&self) -> String {
         format!(
             "rooms in 3D      {} ({}, all verified): scenes/<scene>/ with mesh.glb, views.png, metrics.json\n\
              novel views      {}\n",

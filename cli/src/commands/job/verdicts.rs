@@ -41,12 +41,12 @@ pub async fn lines(client: &mut Client, status: &JobStatus) -> Vec<Line> {
     let Ok((events, _)) = client.history(page).await else {
         return Vec::new();
     };
-    told(status, &events)
+    verdict_lines(status, &events)
 }
 
 /// Returns the lines of a history. A stage with few lines has each shown; otherwise the number of
 /// doubtful results is shown, with an example.
-fn told(status: &JobStatus, events: &[Event]) -> Vec<Line> {
+fn verdict_lines(status: &JobStatus, events: &[Event]) -> Vec<Line> {
     // By stage, then by task and text, because a task that ran twice logs the same line twice.
     let mut stages: BTreeMap<u32, BTreeMap<(u64, &str), bool>> = BTreeMap::new();
     for event in events.iter().filter(|e| e.kind == EventKind::Log) {
@@ -147,7 +147,7 @@ mod tests {
             event(3, bad),
             event(4, "info: something else"),
         ];
-        let shown = told(&status(), &few);
+        let shown = verdict_lines(&status(), &few);
         let expected = [
             (false, "scene 2: times agree".to_owned()),
             (true, "scene 3: do not trust it".to_owned()),
@@ -155,7 +155,7 @@ mod tests {
         assert_eq!(shown, expected);
         let good = |task| event(task, &format!("info: verdict: scene {task}: fine"));
         let many: Vec<Event> = (10..70).map(good).chain([event(3, bad)]).collect();
-        let [(doubtful, line)] = &told(&status(), &many)[..] else {
+        let [(doubtful, line)] = &verdict_lines(&status(), &many)[..] else {
             panic!("one line");
         };
         assert!(*doubtful);

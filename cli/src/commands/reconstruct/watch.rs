@@ -64,7 +64,7 @@ impl Watch {
             if elapsed > WATCHED_S && done > 0.01 && done < 1.0 {
                 text += &format!(", about {} left", duration(elapsed * (1.0 - done) / done));
             }
-            shown.meter.at(done, text);
+            shown.meter.update(done, text);
         }
         !self.stop.is_cancelled()
     }

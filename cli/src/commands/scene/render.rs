@@ -36,7 +36,7 @@ impl Progress for Watcher {
         if self.done.fetch_max(share, Ordering::Relaxed) < share
             && let Ok(mut meter) = self.meter.try_lock()
         {
-            meter.at(f64::from(done), "rendering".into());
+            meter.update(f64::from(done), "rendering".into());
         }
         !self.stop.is_cancelled()
     }

@@ -57,7 +57,7 @@ pub async fn run(store: &str, names: &[String], output: Output) -> Result<()> {
                 .iter()
                 .any(|other| other.id == id && other.name == name)
             {
-                compared.push(of(&Records::of(&models, name, id).await?));
+                compared.push(compare(&Records::read(&models, name, id).await?));
             }
         }
     }
@@ -74,7 +74,7 @@ pub async fn run(store: &str, names: &[String], output: Output) -> Result<()> {
     Ok(())
 }
 
-fn of(records: &Records) -> Compared {
+fn compare(records: &Records) -> Compared {
     let count = |end: fn(&TrialEnd) -> bool| records.ended.iter().filter(|t| end(&t.end)).count();
     let mut open: Vec<u64> = records.rungs.iter().map(|rung| rung.index).collect();
     open.sort_unstable();
@@ -176,7 +176,7 @@ mod tests {
     #[test]
     fn a_sweep_is_counted_and_its_best_followed_by_epochs_spent() {
         let diverged = || TrialEnd::Diverged("x".into());
-        let found = of(&records(vec![
+        let found = compare(&records(vec![
             record(0, 1e-2, TrialEnd::Finished, &[0.9, 0.5, 0.4]),
             record(1, 1e-3, TrialEnd::Pruned, &[0.1]),
             record(2, 2e-2, TrialEnd::Finished, &[0.9, 0.5, 0.5]),
@@ -194,7 +194,7 @@ mod tests {
             [after(&found, 2), after(&found, 10), after(&found, 11)],
             [None, Some(0.4), Some(0.25)]
         );
-        let other = of(&records(vec![record(0, 1e-2, TrialEnd::Finished, &[0.3])]));
+        let other = compare(&records(vec![record(0, 1e-2, TrialEnd::Finished, &[0.3])]));
         let text = described(&[found, other]);
         assert!(text.contains("m.5") && text.contains("lr = 0.03"), "{text}");
         // The other sweep has spent one epoch; its later results are unknown.

@@ -107,7 +107,7 @@ async fn extend_or_find(more: &MoreTrials, settings: &Settings) -> Result<PathBu
     let spec = jobfile::read_counted(&more.file, more.scale.as_deref(), &settings.assets).await?;
     let sweep = find(&spec.stages, more.stage.as_deref())?;
     let trials = sweep.trials.len() as u64;
-    let next = beside(&more.file, trials, trials + more.trials);
+    let next = extended_name(&more.file, trials, trials + more.trials);
     match next.exists() {
         true => {
             let spec =
@@ -150,7 +150,7 @@ async fn extend(
             named(what).hint("name each parameter's, e.g. over = { lr = { log = [1e-4, 1e-1] } }")
         );
     }
-    let records = Records::of(&open(&store)?, &name, first.id.clone()).await?;
+    let records = Records::read(&open(&store)?, &name, first.id.clone()).await?;
     let tried = all(&trials, &records.ended).map_err(named)?;
     let (begin, count) = (tried.len() as u64, more.trials);
     let search = match more.sampler {
@@ -170,10 +170,10 @@ async fn extend(
     let after = with_values(&before, &stage, &values, &promote).map_err(named)?;
     let out = match out {
         Some(out) => same_folder(file, out)?,
-        None => beside(file, trials.len() as u64, total),
+        None => extended_name(file, trials.len() as u64, total),
     };
     let failed = |e: std::io::Error| io(out.display(), &e);
-    let written = NewFile::beside(&out, &after).map_err(failed)?;
+    let written = NewFile::create(&out, &after).map_err(failed)?;
     // Checks that the written file has the same sweep with the new trials.
     let spec = jobfile::read_counted(written.path(), scale.as_deref(), &settings.assets).await?;
     let found = find(&spec.stages, Some(&stage))?;
@@ -201,7 +201,7 @@ struct NewFile(tempfile::NamedTempFile);
 
 impl NewFile {
     /// Creates a file with this content in the folder of `out`.
-    fn beside(out: &Path, content: &str) -> std::io::Result<Self> {
+    fn create(out: &Path, content: &str) -> std::io::Result<Self> {
         let folder = out.parent().filter(|p| !p.as_os_str().is_empty());
         let mut file = tempfile::Builder::new()
             .prefix(".sweep-")
@@ -312,7 +312,7 @@ fn all(trials: &[Trial], ended: &[TrialRecord]) -> Result<Vec<Tried>, String> {
 
 /// Returns `job-40.toml` in the folder of `job.toml` or `job-32.toml`, for a file of 32 trials
 /// extended to 40.
-fn beside(file: &Path, trials: u64, total: u64) -> PathBuf {
+fn extended_name(file: &Path, trials: u64, total: u64) -> PathBuf {
     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
     let stem = stem.strip_suffix(&format!("-{trials}")).unwrap_or(&stem);
     file.with_file_name(format!("{stem}-{total}.toml"))
@@ -419,7 +419,7 @@ mod tests {
     fn a_file_that_says_something_else_is_never_overwritten() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("job-8.toml");
-        let write = |content| NewFile::beside(&out, content).unwrap().keep(&out).unwrap();
+        let write = |content| NewFile::create(&out, content).unwrap().keep(&out).unwrap();
         assert!(write("a = 1"));
         assert!(write("a = 1"), "the same again");
         assert!(!write("a = 2"));
@@ -431,7 +431,9 @@ mod tests {
     #[test]
     fn files_of_rounds_are_called_by_their_number_of_trials() {
         let name = |file: &str, trials, total| {
-            beside(Path::new(file), trials, total).display().to_string()
+            extended_name(Path::new(file), trials, total)
+                .display()
+                .to_string()
         };
         assert_eq!(name("a/job.toml", 32, 40), "a/job-40.toml");
         assert_eq!(name("a/job-32.toml", 32, 40), "a/job-40.toml");

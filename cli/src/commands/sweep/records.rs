@@ -34,7 +34,7 @@ pub async fn read(which: &WhichSweep) -> Result<Records> {
     let models = open(&which.store)?;
     let mut ids = ids(&models, &which.name, &which.id).await?;
     match (ids.pop(), ids.is_empty()) {
-        (Some(id), true) => Records::of(&models, &which.name, id).await,
+        (Some(id), true) => Records::read(&models, &which.name, id).await,
         (Some(id), false) => {
             ids.push(id);
             let what = format!("there are {} sweeps called {:?}", ids.len(), which.name);
@@ -60,7 +60,7 @@ pub fn nothing(name: &str) -> CliError {
 
 impl Records {
     /// Reads all records of a sweep.
-    pub async fn of(models: &Models, name: &str, id: String) -> Result<Self> {
+    pub async fn read(models: &Models, name: &str, id: String) -> Result<Self> {
         let (ended, rungs) = models.trials(name, &id).await.map_err(failed)?;
         Ok(Self {
             name: name.to_owned(),

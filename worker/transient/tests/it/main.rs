@@ -1,7 +1,5 @@
 //! Tests of the renderer, in one executable because each one links the whole crate.
 
-#[path = "../../benches/stop/scenes.rs"]
-mod bench_scenes;
 mod bvh;
 mod by_glass;
 mod calibration;
@@ -17,6 +15,7 @@ mod glass_tracer;
 mod hard_energy;
 mod hard_geometry;
 mod hard_mirrors;
+mod hard_scenes;
 mod hard_thin;
 mod hostile;
 mod independent;

@@ -67,7 +67,7 @@ fn table(report: &Report) -> String {
             out,
             "<tr><th scope=\"row\">{}<small>{}</small></th><td class=\"n\">{}</td>",
             Safe(name(group)),
-            Safe(told(group)),
+            Safe(describe_group(group)),
             thousands(group.scenes as u64)
         );
         for (figure, _, _) in COLUMNS {
@@ -105,7 +105,7 @@ fn name(group: &Group) -> &str {
 }
 
 /// Formats the settings that distinguish groups, in one line.
-fn told(group: &Group) -> String {
+fn describe_group(group: &Group) -> String {
     let text = |way: &str| match group.settings.pointer(way) {
         Some(Value::String(text)) => text.clone(),
         Some(value) => value.to_string(),
@@ -172,7 +172,7 @@ fn extremes(report: &Report) -> String {
             out,
             "<h3>{} <small>{}</small></h3>",
             Safe(name(group)),
-            Safe(told(group))
+            Safe(describe_group(group))
         );
         if group.extremes.is_empty() {
             out.push_str(

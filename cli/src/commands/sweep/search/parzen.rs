@@ -21,23 +21,23 @@ use super::{Space, Values, below, bits, uniform};
 pub(crate) struct Mixture<'a> {
     space: &'a Space,
     /// Centre of each kernel, by parameter. The last kernel is the prior, which has no centre.
-    kernels: Vec<Vec<Option<Place>>>,
+    kernels: Vec<Vec<Option<Position>>>,
     /// Width of the trials' kernels.
     width: f64,
 }
 
 /// Position of a value in its domain.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Place {
+enum Position {
     /// A share of an interval, and half of a step's width: 0 where there are no steps.
     At(f64, f64),
     /// Index in a list.
     Number(usize),
 }
 
-impl Place {
+impl Position {
     /// Returns the position of a value, or `None` for one that has none.
-    fn of(domain: &Domain, value: &Value) -> Option<Self> {
+    fn find(domain: &Domain, value: &Value) -> Option<Self> {
         match domain {
             Domain::OneOf(_) => domain.position(value).map(Self::Number),
             Domain::Within(interval) => {
@@ -53,9 +53,9 @@ impl Place {
 
 impl<'a> Mixture<'a> {
     /// Creates the mixture of some trials.
-    pub(crate) fn of<'v>(space: &'a Space, trials: impl Iterator<Item = &'v Values>) -> Self {
-        let place = |values: &Values| -> Vec<Option<Place>> {
-            let of = |(name, domain): (&String, &Domain)| Place::of(domain, values.get(name)?);
+    pub(crate) fn new<'v>(space: &'a Space, trials: impl Iterator<Item = &'v Values>) -> Self {
+        let place = |values: &Values| -> Vec<Option<Position>> {
+            let of = |(name, domain): (&String, &Domain)| Position::find(domain, values.get(name)?);
             space.iter().map(of).collect()
         };
         let mut kernels: Vec<_> = trials.map(place).collect();
@@ -71,10 +71,10 @@ impl<'a> Mixture<'a> {
 
     /// Returns the logarithm of the density at some values.
     pub(crate) fn log_density(&self, values: &Values) -> f64 {
-        let places: Vec<Option<Place>> = self
+        let places: Vec<Option<Position>> = self
             .space
             .iter()
-            .map(|(name, domain)| Place::of(domain, values.get(name)?))
+            .map(|(name, domain)| Position::find(domain, values.get(name)?))
             .collect();
         let logs: Vec<f64> = self
             .kernels
@@ -94,13 +94,13 @@ impl<'a> Mixture<'a> {
     pub(crate) fn draw(&self, seed: u64, trial: u64, number: u64) -> Values {
         let bits = |of: &str| bits(seed, of, [trial, number]);
         let kernel = &self.kernels[below(self.kernels.len(), bits("kernel"))];
-        let of = |((name, domain), centre): ((&String, &Domain), &Option<Place>)| {
+        let of = |((name, domain), centre): ((&String, &Domain), &Option<Position>)| {
             // No parameter can have this name.
             let share = uniform(bits(&format!("value of {name}")));
             let value = match domain {
                 Domain::OneOf(list) => {
                     let weights = (0..list.len()).map(|number| {
-                        let hit = *centre == Some(Place::Number(number));
+                        let hit = *centre == Some(Position::Number(number));
                         self.weight(list.len(), centre.is_some(), hit)
                     });
                     list[at_share(weights, share).min(list.len() - 1)].clone()
@@ -112,13 +112,18 @@ impl<'a> Mixture<'a> {
         self.space.iter().zip(kernel).map(of).collect()
     }
 
-    fn log_kernel(&self, domain: &Domain, centre: &Option<Place>, place: &Option<Place>) -> f64 {
+    fn log_kernel(
+        &self,
+        domain: &Domain,
+        centre: &Option<Position>,
+        place: &Option<Position>,
+    ) -> f64 {
         match (domain, place) {
-            (Domain::OneOf(list), Some(Place::Number(number))) => {
-                let hit = *centre == Some(Place::Number(*number));
+            (Domain::OneOf(list), Some(Position::Number(number))) => {
+                let hit = *centre == Some(Position::Number(*number));
                 libm::log(self.weight(list.len(), centre.is_some(), hit))
             }
-            (Domain::Within(_), Some(Place::At(share, half))) => {
+            (Domain::Within(_), Some(Position::At(share, half))) => {
                 let (mean, width) = self.normal(*centre);
                 let all = normal_below((1.0 - mean) / width) - normal_below(-mean / width);
                 let here = match *half > 0.0 {
@@ -138,9 +143,9 @@ impl<'a> Mixture<'a> {
     }
 
     /// Returns centre and width of a kernel over an interval.
-    fn normal(&self, centre: Option<Place>) -> (f64, f64) {
+    fn normal(&self, centre: Option<Position>) -> (f64, f64) {
         match centre {
-            Some(Place::At(share, _)) => (share, self.width),
+            Some(Position::At(share, _)) => (share, self.width),
             _ => (0.5, 1.0),
         }
     }
@@ -155,7 +160,7 @@ impl<'a> Mixture<'a> {
 
     /// Returns the quantile of a kernel at a given share of its weight, as a fraction of the
     /// interval. Found by bisection to the last significant bit.
-    fn quantile(&self, centre: Option<Place>, share: f64) -> f64 {
+    fn quantile(&self, centre: Option<Position>, share: f64) -> f64 {
         let (mean, width) = self.normal(centre);
         let below = |x: f64| normal_below((x - mean) / width);
         let wanted = below(0.0) + share * (below(1.0) - below(0.0));
@@ -210,7 +215,7 @@ mod tests {
         for trials in [&trials[..], &trials[..1], &[]] {
             for (name, domain) in space() {
                 let space = Space::from([(name.clone(), domain.clone())]);
-                let mixture = Mixture::of(&space, trials.iter());
+                let mixture = Mixture::new(&space, trials.iter());
                 let density = |value: Value| {
                     libm::exp(mixture.log_density(&Values::from([(name.clone(), value)])))
                 };
@@ -234,13 +239,13 @@ mod tests {
     fn draws_follow_the_density() {
         let space = space();
         let trials = vec![values(1e-2, 3, "b", 0.5); 8];
-        let mixture = Mixture::of(&space, trials.iter());
+        let mixture = Mixture::new(&space, trials.iter());
         let draws: Vec<Values> = (0..2000).map(|i| mixture.draw(7, 1, i)).collect();
         // The density of one parameter, for any values of the others.
         let density = |name: &str, value: Value| {
             let one = Space::from([(name.to_owned(), space[name].clone())]);
             let alone = Mixture {
-                kernels: Mixture::of(&one, trials.iter()).kernels,
+                kernels: Mixture::new(&one, trials.iter()).kernels,
                 space: &one,
                 width: mixture.width,
             };
@@ -268,12 +273,12 @@ mod tests {
         fn draws_lie_in_their_domains(seed: u64, trial: u64, number: u64, n in 0usize..5) {
             let space = space();
             let trials = vec![values(1e-4, 9, "c", 3.0); n];
-            let drawn = Mixture::of(&space, trials.iter()).draw(seed, trial, number);
+            let drawn = Mixture::new(&space, trials.iter()).draw(seed, trial, number);
             prop_assert_eq!(drawn.len(), 4);
             for (name, value) in &drawn {
                 prop_assert!(space[name].contains(value), "{name}: {value}");
             }
-            prop_assert!(Mixture::of(&space, trials.iter()).log_density(&drawn).is_finite());
+            prop_assert!(Mixture::new(&space, trials.iter()).log_density(&drawn).is_finite());
         }
     }
 }

@@ -28,7 +28,7 @@ pub fn propose(space: &Space, tried: &[Tried], seed: u64, first: u64, count: u64
     let ended = ranked(tried);
     let best = ended.len().div_ceil(10).min(MOST);
     let (good, bad) = ended.split_at(best);
-    let good = Mixture::of(space, good.iter().map(|t| &t.values));
+    let good = Mixture::new(space, good.iter().map(|t| &t.values));
     let open = tried.iter().filter(|t| !t.outcome.ended());
     let others: Vec<&Values> = bad.iter().copied().chain(open).map(|t| &t.values).collect();
     let mut proposed: Vec<Values> = Vec::new();
@@ -40,7 +40,7 @@ pub fn propose(space: &Space, tried: &[Tried], seed: u64, first: u64, count: u64
             true => None,
             false => {
                 let others = others.iter().copied().chain(&proposed);
-                let others = Mixture::of(space, others);
+                let others = Mixture::new(space, others);
                 let candidates = (0..CANDIDATES).map(|number| good.draw(seed, trial, number));
                 let candidates = candidates.filter(|values| !known(values));
                 let scored = candidates.map(|values| {
