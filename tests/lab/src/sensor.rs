@@ -1,7 +1,7 @@
 //! Measures the speed of the sensor model on one thread, for a scene of 256×256×637:
 //! `just lab sensor`.
 
-use picofarm_transient::sensor::{
+use picofarm_sensor::{
     DeadTime, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values, sense,
 };
 
