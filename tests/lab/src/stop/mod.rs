@@ -4,8 +4,9 @@
 //!
 //! ERROR 0 renders fixed numbers of passes and prints the error by pixel and of the whole image,
 //! CPU seconds, slope and merit. A negative ERROR prints the share of each path class in the
-//! variance. `json` instead of a number prints the scene for `tests/lab/peers`. If `STOP_TRUTHS` is a folder, truths are
-//! stored there and reused, so that two versions are compared with the same truth.
+//! variance. `json` instead of a number prints the scene for `tests/lab/peers`. If `STOP_TRUTHS` is
+//! a folder, truths are stored there and reused, so that two versions are compared with the same
+//! truth.
 //!
 //! `rooms [ROOMS [PIXELS [ERROR [LIBRARY [FOLDER]]]]]` renders furnished rooms of fresh seeds with
 //! 25 spots to an error, and prints their cost. Without further arguments: 20 rooms at 256×256 with
