@@ -14,8 +14,7 @@ use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use self::simulate::{Simulated, empty};
-use super::measure::cpu_time;
-use crate::args::Dataset as DatasetArgs;
+use crate::{args::Dataset as DatasetArgs, render::cpu_time};
 use picofarm_cli::{
     commands::dataset::failed,
     error::{CliError, Code, Result, io},

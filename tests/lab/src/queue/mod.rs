@@ -111,7 +111,6 @@ pub async fn run(args: QueueArgs, output: Output, stop: &CancellationToken) -> R
         submit: Vec::new(),
         throughput: None,
         fleets: Vec::new(),
-        beside: None,
     };
     let bench = Bench {
         place,
@@ -127,9 +126,6 @@ pub async fn run(args: QueueArgs, output: Output, stop: &CancellationToken) -> R
     }
     for workers in &args.fleet {
         report.fleets.push(bench.fleet(*workers).await?);
-    }
-    if args.plans > 0 {
-        report.beside = Some(bench.beside().await?);
     }
     output.result(&report, || describe(&report));
     Ok(())
@@ -433,9 +429,6 @@ fn describe(report: &Report) -> String {
             ]));
         }
         text += &format!("\n{}", table(&rows));
-    }
-    if let Some(beside) = &report.beside {
-        text += &format!("\n{}", beside.describe());
     }
     text
 }

@@ -121,11 +121,6 @@ impl Stats {
         latency(self.measured().lease.clone())
     }
 
-    /// Returns the latencies of heartbeats since the last call.
-    pub fn heartbeats_since(&self) -> Latency {
-        latency(std::mem::take(&mut self.measured().heartbeat))
-    }
-
     pub fn heartbeat(&self) -> Latency {
         latency(self.measured().heartbeat.clone())
     }

@@ -63,10 +63,10 @@ fn rooms(files: &[String]) -> Vec<(String, Scene)> {
         }
     }
     for file in files {
-        let mut scene = read_scene(std::path::Path::new(&file)).expect("a scene");
+        let mut scene = read_scene(std::path::Path::new(file)).expect("a scene");
         let i = &mut scene.camera.intrinsics;
         *i = i.resized(SIDE, SIDE);
-        all.push((file.rsplit('/').next().unwrap_or(&file).to_owned(), scene));
+        all.push((file.rsplit('/').next().unwrap_or(file).to_owned(), scene));
     }
     all
 }

@@ -26,7 +26,7 @@ pub struct Measured {
 }
 
 /// Returns the CPU time that this process has used.
-pub(super) fn cpu_time() -> Duration {
+pub fn cpu_time() -> Duration {
     let now = clock_gettime(ClockId::ProcessCPUTime);
     Duration::new(
         now.tv_sec.unsigned_abs(),

@@ -22,6 +22,8 @@ use picofarm_cli::{
 
 use crate::args::Render as RenderArgs;
 
+pub use measure::cpu_time;
+
 fn check(args: &RenderArgs) -> Result<()> {
     if let Some(e) = args.error.iter().find(|e| !(**e > 0.0 && **e < 1.0)) {
         return Err(CliError::input(format!("--error {e}: expected a share"))
