@@ -100,7 +100,8 @@ pooled = sorted(
 out = ["# Command reference\n"]
 out.append("This page is made by `docs/reference.sh` from the help texts of picofarm. Do not edit it by hand.\n")
 out.append("## Commands\n")
-out.append("".join(f"- {anchor('picofarm ' + n)}: {markdown(t)}\n" for n, t in root.entries("Commands") if n not in FOR_CONTRIBUTORS))
+names = [n for n, _ in root.entries("Commands") if n not in FOR_CONTRIBUTORS]
+out.append(", ".join(f"[{n}](#picofarm-{n})" for n in names) + "\n")
 out.append("## Options of every command\n")
 out.append(listing(root.entries("Global options")))
 out.append("## Arguments of many commands\n")
