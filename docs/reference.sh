@@ -114,9 +114,11 @@ for command in commands:
     out.append(markdown(command.about) + "\n")
     if command.commands:
         out.append("Commands: " + ", ".join(f"[{c.name.split()[-1]}](#{c.name.replace(' ', '-')})" for c in command.commands) + "\n")
-    elif command.usage not in (command.name, command.name + " [OPTIONS]"):
-        out.append(f"Usage: `{command.usage}`\n")
-    own = [e for e in command.entries("Arguments") if e not in pooled]
+    arguments = command.entries("Arguments")
+    usage = "" if command.commands else command.usage.removeprefix(command.name).replace("[OPTIONS]", "").strip()
+    if len(usage.split()) > 1 or any(e in pooled for e in arguments):
+        out.append(f"Arguments: `{usage}`\n")
+    own = [e for e in arguments if e not in pooled]
     places = [home.get(("Options", *entry), command) for entry in command.entries("Options")]
     places = [command if places.count(place) == 1 else place for place in places]  # a single option is repeated
     elsewhere = collections.defaultdict(list)
