@@ -50,16 +50,14 @@ for page in pages:
     code = "\n".join(re.findall(r"^```.*?^```|`[^`\n]*`", page.read_text(), flags=re.M | re.S))
     wrong += [f"{page}: {name}: there is no such file in the repository" for name in missing(code)]
 for name in files:
-    if name.endswith(".rs"):
-        text = pathlib.Path(name).read_text()
-        comments = "\n".join(re.findall(r"^\s*//[/!]?\s?(.*)$", text, flags=re.M))
-        places = [n for n in missing(comments) if not n.endswith(".py")]  # comments cite programs of others
-    elif re.search(r"\.(toml|sh|py|example|service|ya?ml)$|/run$|justfile$", name):
-        text, places = pathlib.Path(name).read_text(), []
-    else:
+    if not re.search(r"\.(rs|toml|sh|py|example|service|ya?ml)$|(^|/)(run|justfile)$", name):
         continue
-    places += [m for m in re.findall(r"(?<![\w./-])docs/[\w/-]+\.(?:md|py|sh)\b", text) if m not in whole]
-    wrong += [f"{name}: {place}: there is no such file in the repository" for place in sorted(set(places))]
+    text = pathlib.Path(name).read_text()
+    places = {n for n in ROOTED.findall(text) if re.search(r"\.(rs|md|py|sh|proto)$", n) and n not in known}
+    if name.endswith(".rs"):
+        comments = "\n".join(re.findall(r"^\s*//[/!]?\s?(.*)$", text, flags=re.M))
+        places |= {n for n in missing(comments) if not n.endswith(".py")}  # comments cite programs of others
+    wrong += [f"{name}: {place}: there is no such file in the repository" for place in sorted(places)]
 contents = pathlib.Path("docs/SUMMARY.md").read_text()
 for page in sorted(pathlib.Path("docs").glob("*.md")):
     if page.name != "SUMMARY.md" and f"({page.name})" not in contents:
