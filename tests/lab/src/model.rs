@@ -81,7 +81,7 @@ pub fn run(args: &ModelArgs, output: Output, stop: &CancellationToken) -> Result
         let wrote = serde_json::json!({ "record": path, "trial": trial });
         output.result(&wrote, || {
             format!(
-                "wrote {}; python3 tests/peers/model_torch.py parity {} compares",
+                "wrote {}; python3 tests/lab/peers/model_torch.py parity {} compares",
                 path.display(),
                 path.display()
             )
@@ -328,7 +328,7 @@ impl Peer {
         let mut words = command.split_whitespace();
         let failed = |what: String| {
             CliError::input(format!("--peer {command:?}: {what}"))
-                .hint("for PyTorch: --peer \"python3 tests/peers/model_torch.py bench\"")
+                .hint("for PyTorch: --peer \"python3 tests/lab/peers/model_torch.py bench\"")
         };
         let program = words.next().ok_or_else(|| failed("no command".into()))?;
         let mut child = Command::new(program)

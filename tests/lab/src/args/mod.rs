@@ -102,7 +102,7 @@ pub struct Render {
     /// Threads of the measured renders (the converged one uses all cores)
     #[arg(long, default_value_t = 1, value_parser = ranges::threads)]
     pub threads: usize,
-    /// Measurements of another renderer, written by tests/peers; may be given several times
+    /// Measurements of another renderer, written by tests/lab/peers; may be given several times
     #[arg(long, value_name = "FILE")]
     pub peer: Vec<PathBuf>,
     /// Ways of finding light to compare: default, choices as for `scene render --strategy`, joined

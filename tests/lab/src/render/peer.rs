@@ -1,4 +1,4 @@
-//! Measurements of other renderers, as written by tests/peers.
+//! Measurements of other renderers, as written by tests/lab/peers.
 
 use std::path::PathBuf;
 
@@ -47,7 +47,7 @@ pub fn read(paths: &[PathBuf]) -> Result<Vec<Peer>> {
         let bytes = std::fs::read(path).map_err(|e| io(what(), &e))?;
         serde_json::from_slice(&bytes).map_err(|e| {
             CliError::input(format!("{}: {e}", what()))
-                .hint("tests/peers/mitransient.sh writes such files")
+                .hint("tests/lab/peers/mitransient.sh writes such files")
         })
     };
     paths.iter().map(one).collect()
