@@ -1,4 +1,4 @@
-//! One module for each command: the code of `picofarm X` is in `x.rs`.
+//! One module for each command: the code of `picofarm demo` is in `demo.rs`.
 
 mod assets;
 mod audit;
