@@ -18,6 +18,7 @@ mod hard_mirrors;
 mod hard_scenes;
 mod hard_thin;
 mod hostile;
+mod imports;
 mod independent;
 mod independent_glass;
 mod laws;
