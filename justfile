@@ -17,9 +17,9 @@ lint:
 demo *args:
     cargo run --release -- demo {{args}}
 
-# Run one of the benchmarks: `just lab render`.
+# Run one of the benchmarks: `just lab render`; `just lab --help` lists them.
 lab *args:
-    cargo run --release --features full -- bench {{args}}
+    cargo run --release -p picofarm-lab -- {{args}}
 
 # Check links, regenerate the command reference, and build the book if mdbook is installed.
 docs:

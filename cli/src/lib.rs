@@ -1,50 +1,19 @@
 //! The commands of the `picofarm` program: every role of the farm, and the users' commands. The
-//! program itself (`cli/program`) selects the features. Benches (`cli/bench`) are a crate above
-//! this one, so that the program of a farm does not contain code that only comparisons need.
+//! program itself (`cli/program`) selects the features. Benchmarks (`tests/lab`) are a program of
+//! their own that uses this library.
 //!
-//! Only these two crates use this library, so its public items are not all documented.
+//! Only these two use this library, so its public items are not all documented.
 #![allow(missing_docs)]
 
 pub mod args;
-mod assets;
-mod audit;
-pub mod choices;
 pub mod client;
-pub mod dataset;
-mod demo;
-mod demultiplex;
-mod describe;
-mod doctor;
-pub mod ends;
+pub mod commands;
 pub mod error;
-mod explain;
 mod files;
-pub mod follow;
-mod groups;
-pub mod jobfile;
-mod jobs;
-mod listing;
-pub mod local;
 mod logging;
-mod model;
 pub mod output;
-mod pace;
-mod paths;
-pub mod picture;
-mod reach;
-mod reconstruct;
-mod render;
-pub mod roles;
-mod scene;
-mod sense;
 pub mod settings;
 pub mod signals;
-mod stored;
-#[cfg(feature = "networks")]
-mod sweep;
-mod tail;
-mod template;
-mod token;
 #[cfg(feature = "traces")]
 mod traces;
 #[cfg(not(feature = "traces"))]
@@ -52,9 +21,7 @@ mod traces;
 mod traces;
 
 use std::{
-    future::Future,
     io::{ErrorKind, Write},
-    pin::Pin,
     process::ExitCode,
 };
 
@@ -63,31 +30,21 @@ use tracing_subscriber::{Layer, prelude::*};
 use crate::{
     args::{Cli, Command},
     error::Result,
-    output::{Output, table},
+    output::Output,
     settings::{Resolved, resolve},
     traces::Traces,
 };
 
-/// Runs `picofarm bench …`, if the program has it.
-pub type Bench = for<'a> fn(
-    args::Bench,
-    &'a settings::Settings,
-    Output,
-) -> Pin<Box<dyn Future<Output = Result<()>> + Send + 'a>>;
-
 /// Runs the whole program, from its command line to its exit code. `version` is the text of
 /// `--version`.
-pub fn run_program(version: &'static str, bench: Option<Bench>) -> ExitCode {
-    // A single cryptography provider for all TLS code of this program.
-    rustls::crypto::ring::default_provider()
-        .install_default()
-        .expect("nothing has chosen one before main");
+pub fn run_program(version: &'static str) -> ExitCode {
+    provide_cryptography();
     let cli = match args::parse(std::env::args_os(), version) {
         Ok(cli) => cli,
         Err(asked) => return usage(&asked),
     };
     let json = cli.global.json;
-    match start(cli, bench) {
+    match start(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => ExitCode::from(e.report(json)),
     }
@@ -104,28 +61,52 @@ fn usage(asked: &clap::Error) -> ExitCode {
     }
 }
 
-fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
+fn start(cli: Cli) -> Result<()> {
     if let Command::LocalWorker = cli.command {
         return local_worker();
     }
-    let resolved = resolve(&cli.global)?;
-    let output = Output {
-        json: cli.global.json,
-    };
+    let Cli { global, command } = cli;
+    let traces = command.traces();
+    let traces = traces.map(|(url, service)| (url.to_owned(), service));
+    with_settings(&global, traces, async |resolved, output| {
+        commands::run(command, resolved, output).await
+    })
+}
+
+/// Runs a program of this workspace that has the global options: resolves the settings, starts the
+/// runtime and the log, and runs `work`. Returns the exit code.
+pub fn run_with_settings(
+    global: &args::Global,
+    work: impl AsyncFnOnce(&Resolved, Output) -> Result<()>,
+) -> ExitCode {
+    provide_cryptography();
+    match with_settings(global, None, work) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => ExitCode::from(e.report(global.json)),
+    }
+}
+
+/// Runs `work` with the settings. `traces` is the collector's URL and the name of the service.
+fn with_settings(
+    global: &args::Global,
+    traces: Option<(String, &'static str)>,
+    work: impl AsyncFnOnce(&Resolved, Output) -> Result<()>,
+) -> Result<()> {
+    let resolved = resolve(global)?;
+    let output = Output { json: global.json };
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .map_err(|e| error::io("cannot start the runtime", &e))?;
     let traces = {
         let _in = runtime.enter();
-        let traces = cli.command.traces();
         traces
-            .map(|(url, service)| Traces::start(url, service))
+            .map(|(url, service)| Traces::start(&url, service))
             .transpose()?
     };
     let _last_lines = log(&resolved.settings.log, traces.as_ref())?;
     let ended = runtime
-        .block_on(run(cli.command, &resolved, output, bench))
+        .block_on(work(&resolved, output))
         .and_then(|()| output::printed());
     if let Some(traces) = traces {
         traces.end();
@@ -133,9 +114,16 @@ fn start(cli: Cli, bench: Option<Bench>) -> Result<()> {
     ended
 }
 
+/// Selects the only cryptography provider of all TLS code of this process.
+fn provide_cryptography() {
+    rustls::crypto::ring::default_provider()
+        .install_default()
+        .expect("nothing has chosen one before main");
+}
+
 /// Runs a worker process of `up` or `demo`. Its parent has resolved the settings.
 fn local_worker() -> Result<()> {
-    let order = local::received()?;
+    let order = commands::local_worker::received()?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
@@ -149,92 +137,11 @@ fn local_worker() -> Result<()> {
     };
     let _last_lines = log(&order.settings.log, traces.as_ref())?;
     picofarm_dataset::limit_bandwidth(order.settings.bandwidth()?);
-    let ended = runtime.block_on(local::serve(order));
+    let ended = runtime.block_on(commands::local_worker::serve(order));
     if let Some(traces) = traces {
         traces.end();
     }
     ended
-}
-
-async fn run(
-    command: Command,
-    resolved: &Resolved,
-    output: Output,
-    bench: Option<Bench>,
-) -> Result<()> {
-    let settings = &resolved.settings;
-    picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
-    match command {
-        Command::Demo(args) => demo::demo(args, settings, output).await,
-        Command::Up(args) => demo::up(args, settings, output).await,
-        Command::Coordinator(args) => roles::coordinator(args, output).await,
-        Command::Worker(args) => roles::worker(args, settings, output).await,
-        Command::LocalWorker => unreachable!("it is started before settings are resolved"),
-        Command::Job(command) => jobs::run(command, settings, output).await,
-        Command::Workers { what } => explain::workers(what, settings, output).await,
-        Command::Events {
-            follow,
-            last,
-            verbose,
-        } => tail::events(follow, last, verbose, settings, output).await,
-        Command::Dataset(command) => dataset::run(command, settings, output).await,
-        Command::Model(command) => model::run(command, output).await,
-        #[cfg(feature = "networks")]
-        Command::Sweep(command) => sweep::run(command, settings, output).await,
-        #[cfg(not(feature = "networks"))]
-        Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
-        Command::Scene(command) => scene::run(command, settings, output).await,
-        Command::Reconstruct(args) => reconstruct::run(args, output).await,
-        Command::Demultiplex(args) => demultiplex::run(args, output).await,
-        Command::Token(command) => token::run(command, resolved, output).await,
-        Command::Audit(args) => audit::run(&args, settings, output).await,
-        Command::Assets(command) => assets::run(command, settings, output).await,
-        Command::Bench(command) => match bench {
-            Some(bench) => bench(command, settings, output).await,
-            None => Err(error::not_built("bench", "benches")),
-        },
-        Command::Config => {
-            show_settings(resolved, output);
-            Ok(())
-        }
-        Command::Doctor(args) => doctor::run(args, settings, output).await,
-        Command::Completions { shell } => {
-            let mut script = Vec::new();
-            clap_complete::generate(shell, &mut args::command(), "picofarm", &mut script);
-            output::print(&script);
-            Ok(())
-        }
-    }
-}
-
-fn show_settings(resolved: &Resolved, output: Output) {
-    let values = serde_json::to_value(&resolved.settings).expect("settings are plain data");
-    let mut rows: Vec<_> = resolved
-        .sources
-        .iter()
-        .map(|(name, source)| {
-            let value = match &values[name] {
-                serde_json::Value::Null => String::new(),
-                serde_json::Value::String(text) => args::without_secrets(text),
-                other => other.to_string(),
-            };
-            vec![(*name).to_owned(), value, source.clone()]
-        })
-        .collect();
-    if resolved.token {
-        let source = "environment PICOFARM_TOKEN".to_owned();
-        rows.push(vec!["token".into(), "(a secret)".into(), source]);
-    }
-    let document: serde_json::Map<_, _> = rows
-        .iter()
-        .map(|r| {
-            (
-                r[0].clone(),
-                serde_json::json!({"value": r[1], "source": r[2]}),
-            )
-        })
-        .collect();
-    output.result(&document, || table(&rows));
 }
 
 /// Sends log lines to stderr, those of tasks also to their coordinator, and spans to a trace
@@ -279,7 +186,6 @@ mod tests {
             &["demo", "--seed", "-1"][..],
             &["demo", "--scenes", "-5"],
             &["scene", "generate", "--seed", "-1"],
-            &["bench", "queue", "--workers", "-2"],
             &["dataset", "show", "rooms", "-1"],
             &["job", "logs", "j", "--last", "-1"],
         ] {

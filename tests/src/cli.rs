@@ -14,6 +14,8 @@ use crate::{binary, process::Process};
 #[derive(Clone)]
 pub struct Cli {
     dir: PathBuf,
+    /// The program; `None` = `picofarm`.
+    program: Option<PathBuf>,
     variables: Vec<(String, String)>,
 }
 
@@ -22,8 +24,15 @@ impl Cli {
     pub fn new(dir: &Path) -> Self {
         Self {
             dir: dir.to_owned(),
+            program: None,
             variables: Vec::new(),
         }
+    }
+
+    /// Runs another program of this workspace instead.
+    pub fn of_program(mut self, program: &Path) -> Self {
+        self.program = Some(program.to_owned());
+        self
     }
 
     /// Adds an environment variable.
@@ -34,7 +43,8 @@ impl Cli {
 
     /// Returns the command for the caller to start.
     pub fn command(&self, args: &[&str]) -> Command {
-        self.other(binary::picofarm().as_ref(), args)
+        let program = self.program.as_deref();
+        self.other(program.unwrap_or_else(|| binary::picofarm()).as_ref(), args)
     }
 
     /// Returns another program's command in the same folder, with the same variables.

@@ -20,6 +20,7 @@ pub mod postgres;
 pub mod process;
 pub mod proxy;
 pub mod rng;
+pub mod rooms;
 pub mod s3;
 pub mod scratch;
 pub mod shapes;
@@ -32,6 +33,7 @@ pub use cluster::Cluster;
 pub use farm::Farm;
 pub use job::Job;
 pub use process::{Process, Signal};
+pub use rooms::Rooms;
 pub use scratch::Scratch;
 pub use slurm::Slurm;
 

@@ -18,10 +18,5 @@ const VERSION: &str = concat!(
 );
 
 fn main() -> ExitCode {
-    #[cfg(feature = "bench")]
-    let bench: Option<picofarm_cli::Bench> =
-        Some(|command, settings, output| Box::pin(picofarm_perf::run(command, settings, output)));
-    #[cfg(not(feature = "bench"))]
-    let bench = None;
-    picofarm_cli::run_program(VERSION, bench)
+    picofarm_cli::run_program(VERSION)
 }

@@ -52,10 +52,10 @@ pub struct SensorArgs {
 #[derive(Args)]
 pub struct DatasetReprocess {
     /// Folder or URL of the data set to read
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub source: String,
     /// Folder or URL of the data set to make, or to go on with
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub target: String,
     /// Which histogram: transient, transient_4, transient_25, or transient_spots with --spots
     #[arg(long, default_value = "transient", value_name = "NAME", value_parser = Histogram::parse)]
@@ -84,7 +84,7 @@ pub struct DatasetReprocess {
 #[derive(Args)]
 pub struct DatasetReport {
     /// Folders or URLs of reconstructions, in the order in which they shall appear
-    #[arg(required = true, value_name = "PLACE", value_parser = crate::paths::place)]
+    #[arg(required = true, value_name = "PLACE", value_parser = crate::args::location::parse)]
     pub places: Vec<String>,
     /// The page to write; the same data as JSON goes next to it
     #[arg(long, value_name = "FILE", default_value = "reconstructions.html")]
@@ -95,36 +95,9 @@ pub struct DatasetReport {
 }
 
 #[derive(Args)]
-pub struct BenchStore {
-    /// Folder or URL of a data set with the profile lossless to take scenes from, instead of
-    /// rendering some
-    #[arg(long, value_name = "DATASET", value_parser = crate::paths::place, conflicts_with_all = ["keep", "resolution", "samples", "seed"])]
-    pub from: Option<String>,
-    /// Number of scenes
-    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..=64))]
-    pub scenes: u64,
-    /// Image width and height in pixels
-    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(8..=1024))]
-    pub resolution: u32,
-    /// Camera paths per pixel for three bounces and more
-    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(2..=1_048_576))]
-    pub samples: u32,
-    /// Seed of the rooms
-    #[arg(long, default_value_t = 11, value_parser = super::ranges::whole)]
-    pub seed: u64,
-    /// Render into this folder and keep it: the next run with it renders nothing [default: a folder
-    /// that is removed after]
-    #[arg(long, value_name = "DIR")]
-    pub keep: Option<PathBuf>,
-    /// Leave out how fast scenes are read
-    #[arg(long)]
-    pub no_reading: bool,
-}
-
-#[derive(Args)]
 pub struct DatasetSplit {
     /// Folder or URL of the data set
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
     /// Name of the split
     #[arg(long, default_value = "default")]
@@ -146,10 +119,10 @@ pub struct DatasetSplit {
 #[derive(Args)]
 pub struct DatasetExport {
     /// Folder or URL of the data set
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
     /// Folder or URL for the export
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dest: String,
     /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default:
     /// all]
@@ -166,7 +139,7 @@ pub struct DatasetImport {
     /// Folder with the files
     pub source: PathBuf,
     /// Folder or URL of the data set to make, or to go on with
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub target: String,
     /// Layout of the files: sb3d, platonerf, bf-lidar or npy [default: whichever is found]
     #[arg(long, value_name = "NAME", value_parser = Format::parse)]

@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 #[derive(Args)]
 pub struct DatasetVerify {
     /// Folder or URL of the data set
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
     /// Manifests and sizes only; otherwise every object is hashed and decoded
     #[arg(long)]
@@ -24,7 +24,7 @@ pub struct DatasetVerify {
 #[derive(Args)]
 pub struct DatasetRepair {
     /// Folder or URL of the data set
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
     /// Compare manifests and sizes only; this does not find a flipped bit
     #[arg(long)]
@@ -42,7 +42,7 @@ pub struct DatasetRepair {
     #[arg(long, value_name = "FILE")]
     pub job: Option<PathBuf>,
     /// Where the data set is now that this one was reprocessed from
-    #[arg(long, value_name = "DATASET", value_parser = crate::paths::place)]
+    #[arg(long, value_name = "DATASET", value_parser = crate::args::location::parse)]
     pub source: Option<String>,
     /// Where the files are that the data set was imported from
     #[arg(long, value_name = "DIR")]
@@ -55,7 +55,7 @@ pub struct DatasetRepair {
 #[derive(Args)]
 pub struct DatasetGc {
     /// Folder or URL of the data set
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
     /// Keep younger objects, e.g. 90m, 24h or 7d; a worker may still be writing them
     #[arg(long, default_value = "24h", value_name = "AGE", value_parser = age)]
@@ -74,7 +74,7 @@ pub struct DatasetGc {
 #[derive(Args)]
 pub struct DatasetShow {
     /// Folder or URL of the data set
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
     /// The scene's number
     #[arg(value_parser = super::ranges::whole)]
@@ -86,7 +86,7 @@ pub enum Snapshot {
     /// Pin the finished scenes under a name, for good
     Create {
         /// Folder or URL of the data set
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
         /// Name of the snapshot, e.g. v1
         name: String,
@@ -94,13 +94,13 @@ pub enum Snapshot {
     /// List the snapshots
     List {
         /// Folder or URL of the data set
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
     },
     /// Say what a snapshot pins
     Show {
         /// Folder or URL of the data set
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
         /// Name of the snapshot
         name: String,
@@ -108,7 +108,7 @@ pub enum Snapshot {
     /// Check that the scenes of a snapshot are as they were; exit code 6 if not
     Verify {
         /// Folder or URL of the data set
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
         /// Name of the snapshot
         name: String,
@@ -119,33 +119,13 @@ pub enum Snapshot {
     /// Say which scenes differ between a snapshot and another, or the data set as it is now
     Diff {
         /// Folder or URL of the data set
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
         /// Name of the first snapshot
         from: String,
         /// Name of the second snapshot [default: the data set as it is now]
         to: Option<String>,
     },
-}
-
-#[derive(Args)]
-pub struct BenchDataset {
-    /// Folder to simulate the data set in; it must not exist, or be empty, and is removed at the
-    /// end
-    #[arg(long, value_name = "DIR")]
-    pub dir: PathBuf,
-    /// Sizes to measure at; a scene takes some 50 inodes and, where small folders take a block
-    /// each, 120 kB
-    #[arg(
-        long,
-        value_delimiter = ',',
-        value_name = "N,…",
-        default_value = "1000,3000,10000"
-    )]
-    pub scenes: Vec<u64>,
-    /// Leave the data set there
-    #[arg(long)]
-    pub keep: bool,
 }
 
 /// Parses an age with its unit: `30s`, `90m`, `24h`, `7d`.

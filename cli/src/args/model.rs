@@ -24,7 +24,7 @@ pub enum Model {
     /// List the models of a store, those that are still trained, too
     List {
         /// Folder or URL of the store (in which data sets lie)
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         store: String,
     },
     /// List this machine's graphics processors, and try each: a product, a convolution and its
@@ -33,7 +33,7 @@ pub enum Model {
     /// Show a model: its network, origin and quality
     Show {
         /// Folder or URL of the store
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         store: String,
         /// Name of the model
         name: String,
@@ -41,7 +41,7 @@ pub enum Model {
     /// Write a model's weights to a file (safetensors), which PyTorch reads too
     Export {
         /// Folder or URL of the store
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         store: String,
         /// Name of the model
         name: String,
@@ -54,7 +54,7 @@ pub enum Model {
     #[command(after_help = IMPORT_HELP)]
     Import {
         /// Folder or URL of the store
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         store: String,
         /// Name of the model
         name: String,
@@ -107,7 +107,7 @@ pub enum Model {
     /// published ones, curves, pictures, speed against error
     Report {
         /// Folder or URL of the store
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         store: String,
         /// Names of models; a name that ends with * means all that begin so [default: all]
         names: Vec<String>,

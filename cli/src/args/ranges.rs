@@ -112,7 +112,7 @@ mod tests {
     use clap::error::ErrorKind;
 
     /// A command line, and the expected text of its error.
-    const REFUSED: [(&str, &str); 36] = [
+    const REFUSED: [(&str, &str); 34] = [
         ("up --workers 0", "expected 1 to 1024 workers"),
         ("demo --workers 0", "expected 1 to 1024 workers"),
         ("demo --samples 0", "2..=1048576"),
@@ -121,7 +121,6 @@ mod tests {
         ("demo --spots 9", "1, 4, 16, 25 and 100"),
         ("demo --spots random:0", "1 to 100 spots"),
         ("demo --spots 0.5,1.5", "from 0 up to 1"),
-        ("bench render --spots random:4", "a grid of 1, 4, 16"),
         ("demo --scenes 0", "expected 1 to 100000000 scenes"),
         ("demo --scenes -5", "expected 1 to 100000000 scenes"),
         ("demo --seed -1", "expected 0 to 18446744073709551615"),
@@ -159,7 +158,6 @@ mod tests {
         ),
         ("job wait j --timeout-s nan", "seconds"),
         ("model report s --pictures 101", "expected 0 to 100 scenes"),
-        ("bench queue --workers 0", "simulated workers"),
         ("coordinator --lease-s 0", "expected 0.1 to 86400 seconds"),
     ];
 

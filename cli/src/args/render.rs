@@ -1,4 +1,4 @@
-//! Arguments of commands that render: `scene render`, `scene plan`, `bench render`.
+//! Arguments of commands that render: `scene render`, `scene plan`.
 
 use std::path::PathBuf;
 
@@ -6,9 +6,9 @@ use clap::Args;
 use picofarm_scene::import::Bounds;
 use picofarm_transient::{BeamWidth, Gate};
 
-use crate::{
-    choices::{Chosen, Ways},
+use crate::args::{
     groups::{Group, Named},
+    strategy::Chosen,
 };
 
 /// Where the files lie that a scene file names.
@@ -54,15 +54,15 @@ pub struct RenderArgs {
     pub max_bounces: Option<u32>,
     /// Histograms of subsets of the spots too, from the same rays: 4 and 25 of a 10x10 grid, or
     /// per-spot for each beam
-    #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::groups::parse)]
+    #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::args::groups::parse)]
     pub groups: Vec<Group>,
     /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given
     /// several times
-    #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::groups::parse_named)]
+    #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::args::groups::parse_named)]
     pub group: Vec<Named>,
     /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the
     /// renderer chooses by the scene]
-    #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::choices::parse)]
+    #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::args::strategy::parse)]
     pub strategy: Vec<Chosen>,
     #[command(flatten)]
     pub beam: BeamArgs,
@@ -134,64 +134,6 @@ pub struct ScenePlan {
     /// few tiles
     #[arg(long)]
     pub variance: bool,
-}
-
-#[derive(Args)]
-pub struct BenchRender {
-    /// Scene files, or presets: furnished, primitive, furnished:SEED, primitive:SEED
-    #[arg(default_values = ["furnished", "primitive"], value_name = "SCENE")]
-    pub scenes: Vec<String>,
-    /// Image width and height in pixels [default: 32; with --scaling 256, with --quick 32]
-    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
-    pub resolution: Option<u32>,
-    /// Laser spots of the presets: 1, 4, 16, 25 or 100
-    #[arg(long, default_value_t = 25, value_parser = super::ranges::grid)]
-    pub spots: u32,
-    /// Split triangles into four until the scene has at least this many
-    #[arg(long, value_name = "N")]
-    pub triangles: Option<usize>,
-    /// Camera paths per pixel of each rung
-    #[arg(long, value_delimiter = ',', default_value = "2,8,32,128", value_name = "N,…",
-          value_parser = clap::value_parser!(u32).range(1..))]
-    pub ladder: Vec<u32>,
-    /// Renders for each rung, each with a seed of its own; times and errors are averaged
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
-    pub seeds: u64,
-    /// Camera paths per pixel of the converged render [default: 16 times the largest rung, at least
-    /// 8 times what the stopping rule took]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
-    pub truth_samples: Option<u32>,
-    /// Compare against this converged render, a folder from `picofarm scene render --split` (one
-    /// scene)
-    #[arg(long, value_name = "DIR", conflicts_with = "truth_samples")]
-    pub truth: Option<PathBuf>,
-    /// Errors to give the time for; the stopping rule is tried with the first
-    #[arg(long, value_delimiter = ',', default_value = "10%,5%,2%", value_name = "E,…",
-          value_parser = picofarm_proto::model::parse_share)]
-    pub error: Vec<f64>,
-    /// Threads of the measured renders (the converged one uses all cores)
-    #[arg(long, default_value_t = 1, value_parser = super::ranges::threads)]
-    pub threads: usize,
-    /// Measurements of another renderer, written by tests/peers; may be given several times
-    #[arg(long, value_name = "FILE")]
-    pub peer: Vec<PathBuf>,
-    /// Ways of finding light to compare: default, choices as for `scene render --strategy`, joined
-    /// by +, or each, which leaves out one in turn (also what the option stands for without a
-    /// value)
-    #[arg(long, value_delimiter = ',', num_args = 0..=1, default_value = "default", default_missing_value = "each",
-          value_name = "default|each|NAME=VALUE[+…],…", value_parser = crate::choices::ways)]
-    pub strategies: Vec<Ways>,
-    /// Draw time against error into this PNG
-    #[arg(long, value_name = "FILE")]
-    pub plot: Option<PathBuf>,
-    /// Instead: how the time to the first error grows with triangles, spots, bins and pixels
-    #[arg(long, conflicts_with_all = ["ladder", "seeds", "truth_samples", "truth", "peer", "plot", "triangles", "spots", "strategies"])]
-    pub scaling: bool,
-    /// With --scaling: small sizes, for a look in a minute or two
-    #[arg(long, requires = "scaling")]
-    pub quick: bool,
-    #[command(flatten)]
-    pub gate: GateArgs,
 }
 
 #[derive(Args, Clone, Copy, PartialEq)]

@@ -40,7 +40,7 @@ pub enum Sweep {
     /// Compare sweeps: the best of each, how its trials ended, and the least error by epochs spent
     Compare {
         /// Folder or URL of the store
-        #[arg(value_parser = crate::paths::place)]
+        #[arg(value_parser = crate::args::location::parse)]
         store: String,
         /// Names of sweeps; NAME/ID for one of several that are called so, NAME for all of them
         #[arg(required = true)]
@@ -57,7 +57,7 @@ pub enum Sweep {
 #[derive(Args)]
 pub struct WhichSweep {
     /// Folder or URL of the store (in which data sets and models lie)
-    #[arg(value_parser = crate::paths::place)]
+    #[arg(value_parser = crate::args::location::parse)]
     pub store: String,
     /// Name of the sweep: that of the model which it is about
     pub name: String,

@@ -4,7 +4,7 @@
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
-use picofarm_tests::{Farm, Process, cli::Cli, scratch::Scratch, store};
+use picofarm_tests::{Farm, Process, Rooms, cli::Cli, scratch::Scratch, store};
 
 /// Returns the name of a device, and whether it is a software device.
 fn device() -> Option<(String, bool)> {
@@ -27,19 +27,11 @@ fn device() -> Option<(String, bool)> {
 
 /// Returns a job that renders rooms, and trains, evaluates and runs a network on a GPU.
 fn job(store: &Path, processes: u32) -> String {
+    let rooms = Rooms::small(8).split_stages(store, [6, 1, 1]);
     format!(
         r#"
 name = "gpu"
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = 8, seed = 3, spots = 4 }}
-render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
-kind = "split"
-source = "rooms"
-split = {{ counts = [6, 1, 1] }}
-[[stage]]
+{rooms}[[stage]]
 name = "tof"
 kind = "train"
 source = "rooms"

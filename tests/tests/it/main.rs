@@ -3,7 +3,6 @@
 
 mod attack;
 mod bad_input;
-mod bench;
 mod chaos;
 mod chaos_disks;
 mod clouds;

@@ -3,23 +3,19 @@
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
-use picofarm_tests::{Farm, Signal, rng::Rng, store};
+use picofarm_tests::{Farm, Rooms, Signal, rng::Rng, store};
 use serde_json::Value;
 
 const SCENES: u64 = 64;
 
 fn job(store: &Path, scenes: u64) -> String {
+    let rooms = Rooms::fine(scenes).per_spot().stage(store);
     format!(
         r#"
 name = "rooms in 3D"
 [limits]
 max_crashes = 1000
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = {scenes}, seed = 8, spots = 4 }}
-render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768, per_spot = true }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
+{rooms}[[stage]]
 name = "from-captures"
 kind = "reconstruct"
 source = "rooms"
@@ -171,19 +167,11 @@ fn rooms_come_from_predictions_and_truth_alike_and_what_is_missing_is_named() {
     let farm = Farm::start("rooms-predicted");
     let store = farm.store();
     let network = "net = { width = 4, levels = 3 }\noptimise = { epochs = 20, batch = 4 }\ninput = { bins = 40 }";
+    let rooms = Rooms::fine(12).split_stages(&store, [8, 2, 2]);
     let text = format!(
         r#"
 name = "rooms in 3D"
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = 12, seed = 8, spots = 4 }}
-render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
-kind = "split"
-source = "rooms"
-split = {{ counts = [8, 2, 2] }}
-[[stage]]
+{rooms}[[stage]]
 name = "tof"
 kind = "train"
 source = "rooms"
@@ -302,15 +290,16 @@ output = {{ store = {store:?}, dataset = "captures-3d" }}
         ),
         &["per_spot = true"],
     );
+    let others = Rooms {
+        name: "others".into(),
+        seed: 9,
+        ..Rooms::fine(12)
+    };
+    let others = others.stage(&store);
     fails(
         &format!(
             r#"
-[[stage]]
-name = "others"
-scenes = {{ kind = "primitive", count = 12, seed = 9, spots = 4 }}
-render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
-output = {{ store = {store:?}, dataset = "others" }}
-[[stage]]
+{others}[[stage]]
 name = "mixed"
 kind = "reconstruct"
 source = "others"

@@ -4,24 +4,16 @@
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
-use picofarm_tests::{Farm, store};
+use picofarm_tests::{Farm, Rooms, store};
 
 fn job(store: &Path, trials: u64, promote: &str) -> String {
+    let rooms = Rooms::small(12).split_stages(store, [8, 2, 2]);
     format!(
         r#"
 name = "sweep of {trials}"
 [limits]
 max_crashes = 1000
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = 12, seed = 3, spots = 4 }}
-render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
-kind = "split"
-source = "rooms"
-split = {{ counts = [8, 2, 2] }}
-[[stage]]
+{rooms}[[stage]]
 name = "tof"
 kind = "train"
 source = "rooms"
@@ -142,21 +134,13 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
 
 /// A job with a sweep of one stage for extension, and a sweep of values chosen by hand.
 fn learning(store: &Path) -> String {
+    let rooms = Rooms::small(8).split_stages(store, [5, 2, 1]);
     format!(
         r#"# What follows keeps its comments.
 name = "search"
 [limits]
 max_crashes = 1000
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = 8, seed = 3, spots = 4 }}
-render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
-kind = "split"
-source = "rooms"
-split = {{ counts = [5, 2, 1] }}
-[[stage]]
+{rooms}[[stage]]
 name = "tof"
 kind = "train"
 source = "rooms"

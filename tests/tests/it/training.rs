@@ -6,7 +6,7 @@
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
-use picofarm_tests::{Farm, Signal, rng::Rng, store, wait};
+use picofarm_tests::{Farm, Rooms, Signal, rng::Rng, store, wait};
 
 /// Number of kills of training workers.
 fn kills_wanted() -> u64 {
@@ -17,21 +17,13 @@ fn kills_wanted() -> u64 {
 
 /// Returns a job that renders rooms and splits them, for stages that learn from them.
 fn rooms(name: &str, store: &Path) -> String {
+    let rooms = Rooms::small(16).split_stages(store, [12, 2, 2]);
     format!(
         r#"
 name = {name:?}
 [limits]
 max_crashes = 1000
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = 16, seed = 3, spots = 4 }}
-render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
-kind = "split"
-source = "rooms"
-split = {{ counts = [12, 2, 2] }}
-"#
+{rooms}"#
     )
 }
 

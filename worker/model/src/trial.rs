@@ -1,5 +1,5 @@
 //! A network with random weights and data, for measurements and for comparison with the same
-//! network in PyTorch (`tests/peers/model_torch.py`).
+//! network in PyTorch (`tests/lab/peers/model_torch.py`).
 
 use std::collections::BTreeMap;
 

@@ -1,6 +1,6 @@
 //! Tests the stored errors against the spread over many seeds of the same small render.
 
-use crate::bench_scenes as scenes;
+use crate::hard_scenes as scenes;
 
 use crate::common;
 

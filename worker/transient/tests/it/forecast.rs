@@ -1,7 +1,7 @@
 //! The forecast of `plan` is close to the cost and error of the render.
 
-use crate::bench_scenes as scenes;
 use crate::common;
+use crate::hard_scenes as scenes;
 
 use common::{Quiet, grey, room, scene, settings, v};
 use picofarm_scene::Scene;

@@ -1,7 +1,5 @@
 //! Tests of the renderer, in one executable because each one links the whole crate.
 
-#[path = "../../benches/stop/scenes.rs"]
-mod bench_scenes;
 mod bvh;
 mod by_glass;
 mod calibration;
@@ -17,8 +15,10 @@ mod glass_tracer;
 mod hard_energy;
 mod hard_geometry;
 mod hard_mirrors;
+mod hard_scenes;
 mod hard_thin;
 mod hostile;
+mod imports;
 mod independent;
 mod independent_glass;
 mod laws;
@@ -28,10 +28,6 @@ mod needles;
 mod reference;
 mod rough;
 mod scale;
-mod sensor;
-mod sensor_draws;
-mod sensor_kernel;
-mod sensor_settings;
 mod stop;
 mod sums;
 mod warnings;

@@ -1,7 +1,7 @@
 //! A render at a wavelength is the render of a scene that reflects as it does there.
 
-use crate::bench_scenes as scenes;
 use crate::common;
+use crate::hard_scenes as scenes;
 
 use std::sync::Arc;
 

@@ -1,7 +1,7 @@
 //! The stated error of the whole image versus its spread over seeds: light that enters through a
 //! door or between slats, and patterns so fine that a pixel sees several of their squares.
 
-use crate::bench_scenes as scenes;
+use crate::hard_scenes as scenes;
 
 use crate::common;
 

@@ -1,0 +1,226 @@
+//! The command line. A single definition drives the parser, the help and the completions.
+
+mod data;
+mod dataset;
+mod demultiplex;
+pub mod end_time;
+mod farm;
+pub mod groups;
+mod guard;
+mod integrity;
+mod job;
+pub mod location;
+mod model;
+pub mod ranges;
+mod reconstruct;
+mod render;
+mod scene;
+mod secrets;
+pub mod strategy;
+mod sweep;
+
+use std::{ffi::OsString, path::PathBuf};
+
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
+
+pub use data::{
+    DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, SensorArgs,
+};
+pub use dataset::Dataset;
+pub use demultiplex::{Demultiplex, PlacesArg};
+pub use farm::{Coordinator, Demo, Http, Traces, Up, Worker, Workers};
+pub use guard::{Audit, Guard, Token};
+pub use integrity::{DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
+pub use job::{Job, JobKind, ListedState};
+pub use model::Model;
+pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
+pub use render::{GateArgs, RenderArgs, ScenePlan, SceneRender, SceneRoot};
+pub use scene::{FormatArg, GeneratorArg, PlatoArg, Scene, SceneExport, SceneSense};
+pub use secrets::without_secrets;
+pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
+
+/// Render farm for time-resolved lidar histograms.
+#[derive(Parser)]
+#[command(name = "picofarm", version, propagate_version = true, after_help = EXIT_CODES)]
+pub struct Cli {
+    #[command(flatten)]
+    pub global: Global,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// Returns the command line's definition. `-1` is parsed as a value if a value is expected, so that
+/// it is rejected as a value and not as an unknown option.
+pub fn command() -> clap::Command {
+    fn numbers(command: clap::Command) -> clap::Command {
+        command
+            .mut_args(|arg| match arg.get_action().takes_values() {
+                true => arg.allow_negative_numbers(true),
+                false => arg,
+            })
+            .mut_subcommands(numbers)
+    }
+    numbers(Cli::command())
+}
+
+/// Parses a command line.
+///
+/// # Errors
+/// Returns clap's error, without possible secrets in URLs.
+pub fn parse(
+    words: impl IntoIterator<Item = OsString>,
+    version: &'static str,
+) -> Result<Cli, clap::Error> {
+    let mut command = command().long_version(version);
+    let cli = command
+        .try_get_matches_from_mut(words)
+        .and_then(|mut given| Cli::from_arg_matches_mut(&mut given));
+    cli.map_err(|e| secrets::hidden(e.format(&mut command)))
+}
+
+const EXIT_CODES: &str = "\
+Exit codes:
+  0    done
+  1    something failed that is not listed here
+  2    wrong arguments
+  3    bad input: a job file, scene file, setting or scene that cannot be used
+  4    the coordinator cannot be reached, or refused (another version, no access)
+  5    the job ended with dead tasks, or was cancelled
+  6    a data set is damaged or incomplete
+  7    a resource is taken or missing: port in use, disk full, store read-only
+  130  interrupted";
+
+#[derive(Args, Clone)]
+#[command(next_help_heading = "Global options")]
+pub struct Global {
+    /// Print machine-readable JSON (one document; one a line where a command streams)
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Settings file [default: picofarm.toml here, else in the user's configuration folder]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// URL of the coordinator; of several on one catalog, with commas between [env:
+    /// PICOFARM_COORDINATOR]
+    #[arg(long, global = true, value_name = "URL")]
+    pub coordinator: Option<String>,
+    /// Folder with furniture assets [env: PICOFARM_ASSETS]
+    #[arg(long, global = true, value_name = "DIR")]
+    pub assets_dir: Option<PathBuf>,
+    /// Certificate authority of the coordinator, PEM [default: those of the system] [env:
+    /// PICOFARM_CA]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub ca: Option<PathBuf>,
+    /// Own certificate for coordinators that want one, PEM [env: PICOFARM_CERT]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub cert: Option<PathBuf>,
+    /// Private key of --cert, PEM [env: PICOFARM_KEY]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub key: Option<PathBuf>,
+    /// File with the token that proves who you are; or set PICOFARM_TOKEN [env:
+    /// PICOFARM_TOKEN_FILE]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
+    /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
+    #[arg(long, global = true, value_name = "FILTER")]
+    pub log: Option<String>,
+}
+
+impl Command {
+    /// Returns the trace collector's URL and the command's service name; `None` for commands that
+    /// run no part of a farm.
+    pub fn traces(&self) -> Option<(&str, &'static str)> {
+        let (traces, service) = match self {
+            Self::Demo(demo) => (&demo.traces, "picofarm"),
+            Self::Up(up) => (&up.traces, "picofarm"),
+            Self::Coordinator(coordinator) => (&coordinator.traces, "picofarm-coordinator"),
+            Self::Worker(worker) => (&worker.traces, "picofarm-worker"),
+            _ => return None,
+        };
+        traces.given().map(|url| (url, service))
+    }
+}
+
+#[derive(Subcommand)]
+pub enum Command {
+    /// Render a small furnished-room data set end to end on this machine, and show it
+    Demo(Demo),
+    /// Run a coordinator and workers on this machine until stopped
+    Up(Up),
+    /// Run a coordinator
+    Coordinator(Coordinator),
+    /// Run a worker
+    Worker(Worker),
+    /// The process of a worker that `up` or `demo` starts
+    #[command(hide = true)]
+    LocalWorker,
+    /// Write, plan, submit and follow jobs
+    #[command(subcommand)]
+    Job(Job),
+    /// List the workers connected to the coordinator, or tell one to end
+    Workers {
+        #[command(subcommand)]
+        what: Option<Workers>,
+    },
+    /// Show what happened, of all jobs
+    Events {
+        /// Go on showing what happens, until Ctrl-C
+        #[arg(long, short)]
+        follow: bool,
+        /// The last N lines before now
+        #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+        last: u32,
+        /// What tasks logged on their workers, too
+        #[arg(long, short)]
+        verbose: bool,
+    },
+    /// Look at data sets, check them, and make others of them
+    #[command(subcommand)]
+    Dataset(Dataset),
+    /// Look at trained models, and take their weights out
+    #[command(subcommand)]
+    Model(Model),
+    /// Look at sweeps: how their trials fare, which is the best, which values to try next
+    #[command(subcommand)]
+    Sweep(Sweep),
+    /// Make, inspect and render single scenes
+    #[command(subcommand)]
+    Scene(Scene),
+    /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm: mesh, density
+    /// and errors
+    Reconstruct(Reconstruct),
+    /// Take one flash apart by physics: depth, and which pixels each spot lights, from the
+    /// histogram of all spots at once
+    Demultiplex(Demultiplex),
+    /// Say who may use a coordinator
+    #[command(subcommand)]
+    Token(Token),
+    /// Show who submitted, stopped, held, retried or drained what, or tried to; for administrators
+    Audit(Audit),
+    /// Furniture for generated rooms
+    #[command(subcommand)]
+    Assets(Assets),
+    /// Show the settings in force and where each comes from
+    Config,
+    /// Check this machine: store, disk, coordinator, furniture
+    Doctor(Doctor),
+    /// Print completions for a shell
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
+}
+
+#[derive(Subcommand)]
+pub enum Assets {
+    /// Fetch Sweet Home 3D's furniture (Debian package, 120 MB) into the assets folder
+    Install,
+    /// Say which furniture is installed
+    List,
+}
+
+#[derive(Args)]
+pub struct Doctor {
+    /// Store to check, which is not made if it does not exist [default: the current folder]
+    #[arg(long, default_value = ".", value_name = "PATH_OR_URL", value_parser = crate::args::location::parse)]
+    pub store: String,
+}

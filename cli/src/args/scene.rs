@@ -1,0 +1,120 @@
+//! Arguments of `picofarm scene`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand, ValueEnum};
+use picofarm_settings::Spots;
+
+use super::{ScenePlan, SceneRender, SceneRoot, SensorArgs, ranges};
+
+#[derive(Subcommand)]
+pub enum Scene {
+    /// Generate a scene from a seed and write it as .glb
+    Generate {
+        /// Kind of scene; desktop is a box on a desk as laboratories have it, plato the room that
+        /// reconstructions are measured in
+        #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
+        kind: GeneratorArg,
+        /// Seed
+        #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
+        seed: u64,
+        /// Where to write it
+        #[arg(long, default_value = "scene.glb", value_name = "FILE")]
+        out: PathBuf,
+        /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1,
+        /// right and down) [default: 25; 16 in desktop and plato rooms; plato rooms take a number
+        /// up to 16]
+        #[arg(long, value_parser = ranges::spots)]
+        spots: Option<Spots>,
+        /// Image width and height in pixels
+        #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
+        resolution: u32,
+        /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
+        #[arg(long, default_value = "auto")]
+        assets: String,
+        /// What stands in a plato room
+        #[arg(long, value_enum, default_value_t = PlatoArg::Chair)]
+        object: PlatoArg,
+    },
+    /// Say what a scene file holds
+    Show {
+        /// A .glb, .gltf, .xml (Mitsuba) or .json scene
+        file: PathBuf,
+        #[command(flatten)]
+        root: SceneRoot,
+    },
+    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, with meshes and textures) or
+    /// one .ply mesh
+    Export(SceneExport),
+    /// Render one scene file without a farm into a small Zarr group
+    Render(SceneRender),
+    /// Say what rendering a scene file would take, without rendering it
+    Plan(ScenePlan),
+    /// Measure a rendered scene with a sensor: pulse, jitter, photon noise, wider bins
+    Sense(SceneSense),
+}
+
+#[derive(Args)]
+pub struct SceneExport {
+    /// A .glb, .gltf, .xml (Mitsuba), .json or .ply scene
+    pub file: PathBuf,
+    #[command(flatten)]
+    pub root: SceneRoot,
+    /// Where to write it: a file, or a folder for scene.glb, scene.xml or scene.ply
+    #[arg(long, value_name = "DIR_OR_FILE")]
+    pub out: PathBuf,
+    /// Format [default: by the extension of --out]
+    #[arg(long, value_enum)]
+    pub format: Option<FormatArg>,
+    /// Laser spots in the camera's view, in place of the file's: a grid of 1, 4, 16, 25 or 100;
+    /// random:N; or places as X,Y/X,Y (0 to 1, right and down)
+    #[arg(long, value_parser = ranges::spots)]
+    pub spots: Option<Spots>,
+    /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say
+    /// otherwise
+    #[arg(long)]
+    pub frame: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum FormatArg {
+    Glb,
+    Mitsuba,
+    Ply,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum GeneratorArg {
+    Furnished,
+    Primitive,
+    Desktop,
+    Plato,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum PlatoArg {
+    Chair,
+    Armchair,
+    HiddenBox,
+    Empty,
+}
+
+#[derive(Args)]
+pub struct SceneSense {
+    /// A Zarr group that `picofarm scene render` wrote; it is only read
+    pub render: PathBuf,
+    /// Folder for the new Zarr group (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    #[command(flatten)]
+    pub sensor: SensorArgs,
+    /// Seed of the random numbers
+    #[arg(long, default_value_t = 0, value_parser = ranges::whole)]
+    pub seed: u64,
+    /// Number of the scene, which gives scenes of one seed random numbers of their own
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = ranges::whole)]
+    pub scene: u64,
+    /// Threads [default: all cores]
+    #[arg(long, value_parser = ranges::threads)]
+    pub threads: Option<usize>,
+}

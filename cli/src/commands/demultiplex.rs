@@ -1,0 +1,170 @@
+//! `picofarm demultiplex`: one flash taken apart by physics.
+
+mod picture;
+mod read;
+
+use std::time::Instant;
+
+use picofarm_dataset::{RenderArray, write_render_group};
+use picofarm_demultiplex::{
+    Demultiplexed, DepthScore, MaskScore, Settings, VERSION, demultiplex, score,
+};
+use serde_json::{Map, json};
+
+use self::read::Flash;
+use crate::{
+    args::Demultiplex,
+    error::{CliError, Code, Result},
+    output::{
+        Output, duration,
+        files::{free_folder, save},
+    },
+};
+
+/// `demultiplex`.
+///
+/// # Errors
+/// A render that cannot be read or used, or a folder that is taken.
+pub async fn run(args: Demultiplex, output: Output) -> Result<()> {
+    free_folder(&args.out)?;
+    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| {
+            let what = format!("cannot start {threads} threads: {e}");
+            CliError::new(Code::Resource, what)
+        })?;
+    let made = tokio::task::spawn_blocking(move || pool.install(|| make(args)))
+        .await
+        .map_err(|e| CliError::new(Code::Failed, format!("the method broke: {e}")))??;
+    let mut facts = made.attributes["scores"].clone();
+    facts["out"] = json!(made.args.out);
+    facts["threads"] = json!(threads);
+    facts["seconds"] = json!(made.seconds);
+    output.result(&facts, || summary(&made));
+    Ok(())
+}
+
+/// What was made.
+struct Made {
+    args: Demultiplex,
+    attributes: Map<String, serde_json::Value>,
+    depth: Option<DepthScore>,
+    masks: Option<MaskScore>,
+    spots: usize,
+    placed: usize,
+    seconds: f64,
+}
+
+fn make(args: Demultiplex) -> Result<Made> {
+    let flash = Flash::read(&args.render, args.places)?;
+    let settings = Settings::default();
+    let start = Instant::now();
+    let found = demultiplex(&flash.capture(), &settings)
+        .map_err(|e| CliError::input(format!("{}: {e}", args.render.display())))?;
+    let seconds = start.elapsed().as_secs_f64();
+    let truth = flash.truth();
+    let depth = truth.as_ref().map(|t| score::depth(&found.depth_m, t));
+    let masks = truth.as_ref().and_then(|t| score::masks(&found, t));
+    let attributes = json!({
+        "demultiplexed": args.render.file_name().map(|n| n.to_string_lossy()),
+        "scene": flash.attributes.get("scene"),
+        "camera": flash.camera,
+        "gate": flash.gate,
+        "laser_origin": flash.laser,
+        "beams": flash.beams,
+        "places": found.places.iter().map(|p| p.map(|p| json!({"point": p.point, "path_m": p.path_m}))).collect::<Vec<_>>(),
+        "depth": "z-depth, metres",
+        "lit": "probability that the spot of each beam lights what a pixel sees",
+        "ground": "what lit rests on: 0 = light, 1 = geometry alone, 2 = other spots' light comes at the same time",
+        "albedo": "relative to the median pixel's",
+        "confidence": "0 to 1: how well the histogram speaks for the depth",
+        "settings": settings,
+        "version": VERSION,
+        "scores": {"depth": depth, "masks": masks},
+    });
+    let attributes = attributes
+        .as_object()
+        .expect("written as an object")
+        .clone();
+    write(&args, &flash, &found, &attributes)?;
+    let canvas = picture::draw(&flash, &found, truth.as_ref());
+    save(&canvas, &args.out.join("picture.png"))?;
+    Ok(Made {
+        spots: found.places.len(),
+        placed: found.places.iter().flatten().count(),
+        args,
+        attributes,
+        depth,
+        masks,
+        seconds,
+    })
+}
+
+fn write(
+    args: &Demultiplex,
+    flash: &Flash,
+    found: &Demultiplexed,
+    attributes: &Map<String, serde_json::Value>,
+) -> Result<()> {
+    let i = &flash.camera.intrinsics;
+    let cube = [
+        found.places.len() as u64,
+        u64::from(i.height),
+        u64::from(i.width),
+    ];
+    let ground: Vec<f32> = found.ground.iter().map(|g| f32::from(*g as u8)).collect();
+    let image = |name, data| RenderArray {
+        name,
+        shape: &cube[1..],
+        dimension_names: &["row", "column"],
+        data,
+    };
+    let by_spot = |name, data| RenderArray {
+        name,
+        shape: &cube,
+        dimension_names: &["spot", "row", "column"],
+        data,
+    };
+    let arrays = [
+        image("depth", &found.depth_m),
+        image("confidence", &found.confidence),
+        image("albedo", &found.albedo),
+        by_spot("lit", &found.lit),
+        by_spot("ground", &ground),
+    ];
+    write_render_group(&args.out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
+}
+
+fn summary(made: &Made) -> String {
+    let mut text = format!(
+        "{}: depth, and masks of {} spots, in {}; look at picture.png\n",
+        made.args.out.display(),
+        made.spots,
+        duration(made.seconds),
+    );
+    if made.placed < made.spots {
+        let lost = made.spots - made.placed;
+        text += &format!("  {lost} spots have no return in the histogram and light nothing\n");
+    }
+    if let Some(d) = &made.depth {
+        text += &format!(
+            "  depth: MAE {:.4} m without mirrors, median {:.1} mm, {:.1} % off by more than 5 cm",
+            d.mae_m,
+            d.median_m * 1e3,
+            d.over_5cm * 100.0
+        );
+        if let Some(mirrors) = d.mirrors_mae_m {
+            text += &format!("; mirrors {mirrors:.3} m");
+        }
+        text += "\n";
+    }
+    if let Some(m) = &made.masks {
+        text += &format!(
+            "  masks: IoU {:.3} over all pairs ({:.3} for \"all lit\"), {:.3} over those that can carry light\n",
+            m.iou, m.all_lit_iou, m.iou_carrying
+        );
+    }
+    text
+}

@@ -1,0 +1,390 @@
+//! `picofarm scene sense`: passes a rendered scene through a sensor.
+
+use std::{path::Path, time::Instant};
+
+use picofarm_dataset::{DatasetError, RenderArray, RenderGroup, write_render_group};
+use picofarm_sensor::{
+    Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
+    sense as measure,
+};
+use picofarm_transient::Gate;
+use serde_json::{Map, Value, json};
+
+use super::sensor;
+use crate::{
+    args::SceneSense,
+    error::{CliError, Code, Result},
+    output::{Output, duration, files},
+};
+
+pub async fn run(args: SceneSense, output: Output) -> Result<()> {
+    let sensor = sensor::settings(&args.sensor)?;
+    files::free_folder(&args.out)?;
+    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| {
+            CliError::new(
+                Code::Resource,
+                format!("cannot start {threads} threads: {e}"),
+            )
+        })?;
+    let start = Instant::now();
+    let report = tokio::task::spawn_blocking(move || pool.install(|| sense(&args, &sensor)))
+        .await
+        .map_err(|e| CliError::new(Code::Failed, format!("the sensor model broke: {e}")))??;
+    let seconds = start.elapsed().as_secs_f64();
+    let mut document = report.facts;
+    document.insert("seconds".into(), json!(seconds));
+    output.result(&document, || {
+        format!("{} in {}\n", report.text, duration(seconds))
+    });
+    Ok(())
+}
+
+struct Report {
+    facts: Map<String, Value>,
+    text: String,
+}
+
+fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
+    let group = RenderGroup::open(&args.render).map_err(|e| unreadable(args, e))?;
+    let gate = gate(&group, &args.render)?;
+    let (shape, transient) = read(&group, "transient", args)?;
+    let bins = gate.bins as usize;
+    if shape.last() != Some(&u64::from(gate.bins)) {
+        return Err(CliError::input(format!(
+            "{}: the transient has the shape {shape:?}, but the gate has {bins} bins",
+            args.render.display()
+        )));
+    }
+    // Only a scale by peak depends on the two-bounce part.
+    let by_peak = !matches!(sensor.scale, Scale::Fixed { .. });
+    let two = if by_peak && group.has("two") {
+        Some(read(&group, "two", args)?.1)
+    } else {
+        None
+    };
+    let input = Histograms {
+        transient: &transient,
+        two_bounce: two.as_deref(),
+        bins,
+        bin_width_ps: gate.bin_width_m * PS_PER_M,
+    };
+    let sensed = measure(sensor, &input, args.seed, args.scene)
+        .map_err(|e: SensorError| CliError::input(format!("{}: {e}", args.render.display())))?;
+    let scale_from = match (by_peak, &two) {
+        (false, _) => "settings",
+        (true, Some(_)) => "two",
+        (true, None) => "transient",
+    };
+    let attributes = attributes(&group, gate, sensor, &sensed, args, scale_from);
+    let mut shape = shape;
+    if let Some(last) = shape.last_mut() {
+        *last = sensed.bins as u64;
+    }
+    let (array, data_type, photons) = write(&args.out, &shape, &sensed.values, &attributes)?;
+    let mut facts = Map::new();
+    for name in [
+        "scale",
+        "scale_from",
+        "peak_photons",
+        "shift_bins",
+        "dropped",
+        "gate",
+    ] {
+        facts.insert(name.into(), attributes[name].clone());
+    }
+    for (name, value) in [
+        ("out", json!(args.out)),
+        ("array", json!(array)),
+        ("data_type", json!(data_type)),
+        ("shape", json!(shape)),
+        ("photons", json!(photons)),
+    ] {
+        facts.insert(name.into(), value);
+    }
+    let mut text = format!(
+        "{}: {array} ({data_type}, {} bins of {:.1} ps), {photons:.4e} photons",
+        args.out.display(),
+        sensed.bins,
+        sensed.bin_width_ps
+    );
+    if let Some(peak) = sensed.peak_photons {
+        text += &format!(", {peak:.1} in the median peak");
+    }
+    let dropped = &sensed.dropped;
+    text += &format!(
+        ", {:.2e} ({:.3} %) pushed out of the gate",
+        dropped.outside_photons,
+        dropped.outside_share * 100.0
+    );
+    if dropped.bins > 0 {
+        text += &format!(
+            ", last {} bin(s) left over and dropped ({:.2e} photons)",
+            dropped.bins, dropped.bins_photons
+        );
+    }
+    if dropped.pile_up_photons > 0.0 {
+        text += &format!(", {:.2e} lost to pile-up", dropped.pile_up_photons);
+    }
+    Ok(Report { facts, text })
+}
+
+fn read(group: &RenderGroup, name: &str, args: &SceneSense) -> Result<(Vec<u64>, Vec<f32>)> {
+    group.read(name).map_err(|e| unreadable(args, e))
+}
+
+fn unreadable(args: &SceneSense, error: DatasetError) -> CliError {
+    let code = match &error {
+        DatasetError::Codec { .. } => Code::Damaged,
+        _ => Code::Input,
+    };
+    CliError::new(code, format!("{}: {error}", args.render.display()))
+        .hint("expected a folder that `picofarm scene render FILE --out FOLDER` wrote")
+}
+
+fn gate(group: &RenderGroup, path: &Path) -> Result<Gate> {
+    let gate: Gate = serde_json::from_value(group.attributes()["gate"].clone()).map_err(|e| {
+        CliError::input(format!(
+            "{}/zarr.json: attributes.gate: expected start_m, bin_width_m and bins: {e}",
+            path.display()
+        ))
+    })?;
+    Ok(gate)
+}
+
+/// Returns the attributes that are needed to interpret the counts, and to reproduce them.
+fn attributes(
+    group: &RenderGroup,
+    gate: Gate,
+    sensor: &Sensor,
+    sensed: &Sensed,
+    args: &SceneSense,
+    scale_from: &str,
+) -> Map<String, Value> {
+    let render = group.attributes();
+    let mut all = Map::new();
+    for name in ["scene", "provenance", "camera", "laser_origin", "spots"] {
+        if let Some(value) = render.get(name) {
+            all.insert(name.into(), value.clone());
+        }
+    }
+    let mut of_render = Map::new();
+    for name in ["gate", "settings", "error", "overflow", "plan", "renderer"] {
+        if let Some(value) = render.get(name) {
+            of_render.insert(name.into(), value.clone());
+        }
+    }
+    let sensed_gate = Gate {
+        bin_width_m: gate.bin_width_m * f64::from(sensor.rebin),
+        bins: sensed.bins as u32,
+        ..gate
+    };
+    let value = match sensed.values {
+        Values::Counts(_) => "counts: photons counted in the bin",
+        Values::Rate(_) => "rate: photons expected in the bin",
+    };
+    for (name, value) in [
+        ("value", json!(value)),
+        ("gate", json!(sensed_gate)),
+        ("sensor", json!(sensor)),
+        ("sensor_version", json!(SENSOR_VERSION)),
+        ("seed", json!(args.seed)),
+        ("scene_number", json!(args.scene)),
+        ("scale", json!(sensed.scale)),
+        ("scale_from", json!(scale_from)),
+        ("peak_photons", json!(sensed.peak_photons)),
+        ("shift_bins", json!(sensed.shift_bins)),
+        ("dropped", json!(sensed.dropped)),
+        ("render", Value::Object(of_render)),
+    ] {
+        all.insert(name.into(), value);
+    }
+    all
+}
+
+/// Writes the array in the narrowest type. Returns its name, type and sum.
+fn write(
+    out: &Path,
+    shape: &[u64],
+    values: &Values,
+    attributes: &Map<String, Value>,
+) -> Result<(&'static str, &'static str, f64)> {
+    let names = ["row", "column", "bin"];
+    let dimension_names = &names[..shape.len().min(3)];
+    macro_rules! array {
+        ($name:literal, $data:expr) => {
+            write_render_group(
+                out,
+                &[RenderArray {
+                    name: $name,
+                    shape,
+                    dimension_names,
+                    data: $data,
+                }],
+                attributes,
+            )
+        };
+    }
+    let (name, data_type, written) = match values {
+        Values::Rate(rate) => ("rate", "float32", array!("rate", rate)),
+        Values::Counts(counts) => match narrow(counts) {
+            Some(narrow) => ("counts", "uint16", array!("counts", &narrow)),
+            None => ("counts", "uint32", array!("counts", counts)),
+        },
+    };
+    written.map_err(|e| CliError::new(Code::Resource, e))?;
+    Ok((name, data_type, values.sum()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::args::SensorArgs;
+
+    fn args(folder: &Path, out: &str) -> SceneSense {
+        SceneSense {
+            render: folder.join("render"),
+            out: folder.join(out),
+            sensor: SensorArgs {
+                rebin: Some(4),
+                ..SensorArgs::default()
+            },
+            seed: 7,
+            scene: 0,
+            threads: Some(1),
+        }
+    }
+
+    fn measure(args: &SceneSense) -> Result<Report> {
+        sense(args, &sensor::settings(&args.sensor)?)
+    }
+
+    /// A render group of 3×2 pixels and 50 bins of 8 ps, as `scene render --split` writes it.
+    fn rendered(folder: &Path) {
+        let shape = [3u64, 2, 50];
+        let two: Vec<f32> = (0..300)
+            .map(|i| if i % 50 == 20 { 0.01 } else { 0.0 })
+            .collect();
+        let mut transient = two.clone();
+        transient[5] = 0.05;
+        let array = |name, data| RenderArray {
+            name,
+            shape: &shape,
+            dimension_names: &["row", "column", "bin"],
+            data,
+        };
+        let attributes = json!({
+            "scene": "room",
+            "gate": {"start_m": 1.0, "bin_width_m": 0.002_398_34, "bins": 50},
+            "camera": {"a": 1}, "spots": [], "renderer": "transient-1",
+        });
+        write_render_group(
+            &folder.join("render"),
+            &[array("transient", &transient), array("two", &two)],
+            attributes.as_object().unwrap(),
+        )
+        .unwrap();
+    }
+
+    #[test]
+    fn counts_and_rates_are_written_with_all_that_made_them() {
+        let folder = tempfile::tempdir().unwrap();
+        rendered(folder.path());
+        let with = |out: &str, change: fn(&mut SensorArgs)| {
+            let mut args = args(folder.path(), out);
+            change(&mut args.sensor);
+            args
+        };
+        let counts = measure(&with("counts", |s| {
+            s.peak_photons = Some("100".into());
+        }))
+        .unwrap();
+        assert_eq!(counts.facts["data_type"], "uint16");
+        assert_eq!(counts.facts["scale_from"], "two");
+        assert_eq!(counts.facts["peak_photons"], 100.0);
+        assert!(
+            counts.text.contains("last 2 bin(s) left over"),
+            "{}",
+            counts.text
+        );
+        let group = RenderGroup::open(&folder.path().join("counts")).unwrap();
+        let (shape, values) = group.read::<u16>("counts").unwrap();
+        assert_eq!(shape, [3, 2, 12]);
+        let sum: f64 = values.iter().map(|v| f64::from(*v)).sum();
+        assert_eq!(counts.facts["photons"], sum);
+        let a = group.attributes();
+        assert_eq!(a["gate"]["bins"], 12);
+        assert_eq!(a["gate"]["bin_width_m"], 4.0 * 0.002_398_34);
+        assert_eq!(a["render"]["gate"]["bins"], 50);
+        assert_eq!(a["render"]["renderer"], "transient-1");
+        assert_eq!(a["camera"]["a"], 1);
+        assert_eq!(a["dropped"]["bins"], 2);
+        let sensor: Sensor = serde_json::from_value(a["sensor"].clone()).unwrap();
+        assert_eq!(sensor.scale, Scale::Peak { photons: 100.0 });
+        let mut expected = with("rate", |s| s.no_poisson = true);
+        expected.sensor.photons_per_unit = a["scale"].as_f64();
+        let rate = measure(&expected).unwrap();
+        assert_eq!(rate.facts["data_type"], "float32");
+        let group = RenderGroup::open(&folder.path().join("rate")).unwrap();
+        let (_, rate) = group.read::<f32>("rate").unwrap();
+        let expected: f64 = rate.iter().map(|r| f64::from(*r)).sum();
+        assert!((sum - expected).abs() < 5.0 * expected.sqrt());
+        // Bright counts need 32 bits.
+        let bright = measure(&with("bright", |s| s.photons_per_unit = Some(1e8))).unwrap();
+        assert_eq!(bright.facts["data_type"], "uint32");
+    }
+
+    #[test]
+    fn nothing_is_overwritten_and_faults_name_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        rendered(folder.path());
+        let list = || {
+            let mut all: Vec<_> = std::fs::read_dir(folder.path())
+                .unwrap()
+                .map(|e| e.unwrap().file_name())
+                .collect();
+            all.sort();
+            all
+        };
+        let before = list();
+        let fails = |args: SceneSense| {
+            let Err(error) = measure(&args) else {
+                panic!("expected an error")
+            };
+            (error.code, error.message)
+        };
+        let (_, message) = fails(args(folder.path(), "render"));
+        assert!(message.contains("not empty"), "{message}");
+        let (code, message) = fails(SceneSense {
+            render: folder.path().join("absent"),
+            ..args(folder.path(), "out")
+        });
+        assert!(
+            code == Code::Input && message.contains("absent"),
+            "{message}"
+        );
+        let with = |change: fn(&mut SensorArgs)| {
+            let mut args = args(folder.path(), "out");
+            change(&mut args.sensor);
+            args
+        };
+        let (_, message) = fails(with(|s| s.rebin = Some(51)));
+        assert!(message.contains("rebin: expected 1 to 50"), "{message}");
+        let (_, message) = fails(with(|s| s.dark = Some(-1.0)));
+        assert!(message.contains("sensor.dark_per_bin"), "{message}");
+        let chunk = folder.path().join("render/transient/c/0/0/0");
+        let mut bytes = std::fs::read(&chunk).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(&chunk, bytes).unwrap();
+        let (code, message) = fails(args(folder.path(), "out"));
+        assert!(
+            code == Code::Damaged && message.contains("transient/c/0/0/0"),
+            "{message}"
+        );
+        assert_eq!(list(), before);
+    }
+}

@@ -1,0 +1,64 @@
+//! `picofarm up`: a coordinator and workers on one machine.
+
+use picofarm_settings::Gpus;
+use serde_json::json;
+
+use crate::{
+    args::Up,
+    commands::{
+        coordinator::{Guarded, refuse_unguarded},
+        local::Local,
+    },
+    error::{Result, io},
+    output::{Output, program},
+    settings::Settings,
+    signals,
+};
+
+/// Runs a coordinator and workers until a signal.
+///
+/// # Errors
+/// Fails if the address or catalog is in use, or if a worker ends.
+pub async fn run(args: Up, settings: &Settings, output: Output) -> Result<()> {
+    let guarded = Guarded::from_args(&args.guard);
+    refuse_unguarded(args.listen, &args.guard, true)?;
+    let gpus = gpu_names(&args.gpus)?;
+    std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
+    let stop = signals::stop_on_signal()?;
+    let catalog = args.dir.join("catalog.sqlite");
+    let mut farm = Local::start(
+        &catalog,
+        args.listen,
+        (args.workers, &gpus),
+        settings,
+        guarded,
+        args.http.http,
+        args.traces.url(),
+    )
+    .await?;
+    output.result(&json!({"coordinator": farm.url, "workers": args.workers, "http": farm.http}), || {
+        format!(
+            "coordinator at {} with {} worker(s); submit with `{} --coordinator {} job submit FILE`",
+            farm.url, args.workers, program(), farm.url
+        )
+    });
+    let lost = tokio::select! {
+        lost = farm.worker_lost() => Some(lost),
+        () = stop.cancelled() => None,
+    };
+    farm.stop().await?;
+    lost.map_or(Ok(()), Err)
+}
+
+/// Returns the names of the GPUs, which workers open.
+fn gpu_names(gpus: &Gpus) -> Result<Vec<String>> {
+    #[cfg(feature = "networks")]
+    let names = picofarm_model::device::names(gpus)
+        .map_err(|e| crate::error::CliError::input(e.to_string()));
+    #[cfg(not(feature = "networks"))]
+    let names = match gpus == &Gpus::default() {
+        true => Ok(Vec::new()),
+        false => Err(crate::error::not_built("networks", "graphics processors")),
+    };
+    names
+}

@@ -1,0 +1,5 @@
+//! Benchmarks of reconstructions.
+
+pub mod agreement;
+pub mod chair;
+pub mod plato;

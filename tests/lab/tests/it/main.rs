@@ -1,0 +1,3 @@
+//! Tests of the benchmarks, in one executable because each one links the whole program.
+
+mod render;
