@@ -53,6 +53,11 @@ pub fn gib(text: &str) -> Result<f64, String> {
     within(text, 0.05..=1e6, "GiB (of 1.07 GB)")
 }
 
+/// Parses the width of a view.
+pub fn degrees(text: &str) -> Result<f32, String> {
+    within(text, 1.0..=170.0, "degrees")
+}
+
 /// Parses the photons of a peak.
 pub fn photons(text: &str) -> Result<f64, String> {
     within(text, 1e-3..=1e6, "photons")

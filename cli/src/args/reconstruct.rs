@@ -4,14 +4,14 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::render::{GateArgs, SceneRoot};
+use super::{SceneInput, render::GateArgs};
 
 #[derive(Args)]
 pub struct Reconstruct {
-    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
+    /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
     pub file: PathBuf,
     #[command(flatten)]
-    pub root: SceneRoot,
+    pub input: SceneInput,
     /// Folder for mesh.glb, mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not
     /// exist, or be empty)
     #[arg(long, value_name = "DIR")]

@@ -3,43 +3,26 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use picofarm_scene::import::Bounds;
 use picofarm_transient::{BeamWidth, Gate};
+
+use super::SceneInput;
 
 use crate::args::{
     groups::{Group, Named},
     strategy::Chosen,
 };
 
-/// Where the files lie that a scene file names.
-#[derive(Args, Default)]
-pub struct SceneRoot {
-    /// Folder that holds every mesh, buffer and texture the scene names [default: the scene's own
-    /// folder]
-    #[arg(long = "root", value_name = "DIR")]
-    pub root: Option<PathBuf>,
-}
-
-impl SceneRoot {
-    /// Converts the arguments to the readers' bounds.
-    pub fn bounds(&self) -> Bounds {
-        Bounds {
-            root: self.root.clone(),
-            ..Bounds::default()
-        }
-    }
-}
-
 /// What to render and how.
 #[derive(Args)]
 pub struct RenderArgs {
-    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
+    /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
     pub file: PathBuf,
     #[command(flatten)]
-    pub root: SceneRoot,
-    /// Image width and height in pixels [default: the scene's own]
-    #[arg(long, value_name = "PX")]
-    pub resolution: Option<u32>,
+    pub input: SceneInput,
+    /// Image width in pixels, or width and height as 320x240; the height follows from the camera
+    /// [default: the scene's own]
+    #[arg(long, value_name = "PX|WxH", value_parser = resolution)]
+    pub resolution: Option<Resolution>,
     /// Render until the median per-pixel error falls to this share, e.g. 10%
     #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::model::parse_share)]
     pub error: Option<f64>,
@@ -77,6 +60,57 @@ pub struct RenderArgs {
     pub threads: Option<usize>,
     #[command(flatten)]
     pub gate: GateArgs,
+    /// Time gate as a whole: auto fits it to the scene; START,END in metres of optical path fit the
+    /// bins into it [default: the options above, but auto if their defaults would miss much of the
+    /// scene]
+    #[arg(long = "gate", value_name = "auto|START,END", value_parser = gate_choice,
+          conflicts_with_all = ["gate_start_m", "bin_width_m"])]
+    pub gate_choice: Option<GateChoice>,
+}
+
+/// A size of the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Resolution {
+    pub width: u32,
+    /// The height; `None` follows from the camera.
+    pub height: Option<u32>,
+}
+
+/// Parses a width, or a width and a height.
+fn resolution(text: &str) -> Result<Resolution, String> {
+    let side = |text: &str| -> Option<u32> {
+        let side = text.trim().parse().ok()?;
+        (1..=4096).contains(&side).then_some(side)
+    };
+    let parsed = match text.split_once('x') {
+        Some((width, height)) => side(width).zip(side(height)).map(|(w, h)| (w, Some(h))),
+        None => side(text).map(|w| (w, None)),
+    };
+    let (width, height) =
+        parsed.ok_or("expected 1 to 4096 pixels, or width and height such as 320x240")?;
+    Ok(Resolution { width, height })
+}
+
+/// A time gate as a whole.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum GateChoice {
+    /// Fitted to the scene.
+    Auto,
+    /// From start to end, metres of optical path.
+    Range([f64; 2]),
+}
+
+fn gate_choice(text: &str) -> Result<GateChoice, String> {
+    if text == "auto" {
+        return Ok(GateChoice::Auto);
+    }
+    let range = text.split_once(',').and_then(|(start, end)| {
+        let range = [start.trim().parse().ok()?, end.trim().parse().ok()?];
+        (range[0] >= 0.0 && range[1] > range[0] && f64::is_finite(range[1])).then_some(range)
+    });
+    range
+        .map(GateChoice::Range)
+        .ok_or_else(|| "expected auto, or start and end in metres such as 1,25".into())
 }
 
 /// How wide the laser's beams are.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 use picofarm_settings::Spots;
 
-use super::{ScenePlan, SceneRender, SceneRoot, SensorArgs, ranges};
+use super::{SceneInput, ScenePlan, SceneRender, SensorArgs, ranges};
 
 #[derive(Subcommand)]
 pub enum Scene {
@@ -38,10 +38,10 @@ pub enum Scene {
     },
     /// Say what a scene file holds
     Show {
-        /// A .glb, .gltf, .xml (Mitsuba) or .json scene
+        /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
         file: PathBuf,
         #[command(flatten)]
-        root: SceneRoot,
+        input: SceneInput,
     },
     /// Write a scene in another format: .glb, Mitsuba 3 (.xml, with meshes and textures) or
     /// one .ply mesh
@@ -56,24 +56,16 @@ pub enum Scene {
 
 #[derive(Args)]
 pub struct SceneExport {
-    /// A .glb, .gltf, .xml (Mitsuba), .json or .ply scene
+    /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
     pub file: PathBuf,
     #[command(flatten)]
-    pub root: SceneRoot,
+    pub input: SceneInput,
     /// Where to write it: a file, or a folder for scene.glb, scene.xml or scene.ply
     #[arg(long, value_name = "DIR_OR_FILE")]
     pub out: PathBuf,
     /// Format [default: by the extension of --out]
     #[arg(long, value_enum)]
     pub format: Option<FormatArg>,
-    /// Laser spots in the camera's view, in place of the file's: a grid of 1, 4, 16, 25 or 100;
-    /// random:N; or places as X,Y/X,Y (0 to 1, right and down)
-    #[arg(long, value_parser = ranges::spots)]
-    pub spots: Option<Spots>,
-    /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say
-    /// otherwise
-    #[arg(long)]
-    pub frame: bool,
 }
 
 #[derive(Clone, Copy, ValueEnum)]

@@ -27,7 +27,6 @@ use picofarm_reconstruct::{
 };
 use picofarm_scene::{
     Camera, Scene,
-    import::{self, ImportOptions},
     plato,
 };
 use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
@@ -66,8 +65,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     mlp::check(&args)?;
     check_networks(&args)?;
     free_folder(&args.out)?;
-    let options = ImportOptions::default();
-    let mut scene = import::read_scene_with(&args.file, &options, &args.root.bounds())?;
+    let mut scene = args.input.read(&args.file)?;
     let i = &mut scene.camera.intrinsics;
     *i = i.resized(args.resolution, args.resolution);
     if scene.laser.beams.is_empty() {

@@ -1,8 +1,10 @@
 //! `picofarm scene …`: single scenes without a farm.
 
+mod gate;
 mod group;
 mod order;
 mod plan;
+mod preview;
 mod render;
 mod sense;
 pub mod sensor;
@@ -13,7 +15,6 @@ use picofarm_proto::show;
 use picofarm_scene::{
     Aim, AssetLibrary, Scene, export,
     furnished::{self, FurnishedSettings},
-    import::{self, ImportOptions},
     plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},
 };
@@ -49,8 +50,8 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
             );
             Ok(())
         }
-        Command::Show { file, root } => {
-            let scene = import::read_scene_with(&file, &ImportOptions::default(), &root.bounds())?;
+        Command::Show { file, input } => {
+            let scene = input.read(&file)?;
             scene.validate()?;
             let facts = facts(&scene);
             output.result(&facts, || describe(&scene));
@@ -65,16 +66,6 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
 
 /// `scene export`.
 fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
-    let spots = args.spots.clone();
-    let spots = spots.or(args.frame.then_some(Spots::Grid(25)));
-    let aim = |spots: Spots| {
-        Aim::of(&spots, 0).map_err(|what| CliError::input(format!("--spots {spots}: {what}")))
-    };
-    let options = ImportOptions {
-        laser: spots.map(aim).transpose()?,
-        frame: args.frame,
-        ..ImportOptions::default()
-    };
     let extension = args.out.extension().and_then(|e| e.to_str());
     let (format, name) = match (args.format, extension) {
         (Some(FormatArg::Glb), _) | (None, Some("glb")) => (FormatArg::Glb, "scene.glb"),
@@ -87,7 +78,7 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
             );
         }
     };
-    let scene = import::read_scene_with(&args.file, &options, &args.root.bounds())?;
+    let scene = args.input.read(&args.file)?;
     let mut out = args.out.clone();
     if extension.is_none() || out.is_dir() {
         std::fs::create_dir_all(&out)
@@ -110,7 +101,7 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
             for note in &notes {
                 text += &format!("\n  {}", show::line(note));
             }
-            text
+            text + "\n" + order::notes(&scene).trim_end()
         },
     );
     Ok(())

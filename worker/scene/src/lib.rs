@@ -19,6 +19,7 @@ mod mesh;
 mod model;
 pub mod plato;
 pub mod primitive;
+mod range;
 mod rng;
 mod shape;
 mod spectrum;

@@ -157,14 +157,16 @@ fn in_front(
     Ok(at + away * (distance * MARGIN).max(1e-3))
 }
 
-/// A scene's geometry, ready for rays.
-struct Surroundings {
+/// A scene's geometry in world space, ready for rays.
+pub(crate) struct Surroundings {
     world: World,
+    /// The smallest and largest coordinates, without stray triangles.
     bounds: (Vec3, Vec3),
 }
 
 impl Surroundings {
-    fn new(objects: &[Object]) -> Option<Self> {
+    /// Builds the trees. Returns `None` without triangles with finite corners.
+    pub(crate) fn new(objects: &[Object]) -> Option<Self> {
         let mut mesh = Mesh {
             materials: vec![crate::Material::diffuse("any", [0.5; 3])],
             ..Mesh::default()
@@ -186,7 +188,8 @@ impl Surroundings {
         Some(Self { world, bounds })
     }
 
-    fn closest(&self, from: Vec3, direction: Vec3) -> Option<Hit> {
+    /// Returns the closest intersection with t > 0.
+    pub(crate) fn closest(&self, from: Vec3, direction: Vec3) -> Option<Hit> {
         self.world.closest(from, direction)
     }
 

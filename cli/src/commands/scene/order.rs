@@ -2,12 +2,10 @@
 
 use picofarm_agent::SceneSize;
 use picofarm_proto::{model::RenderSettings, show};
-use picofarm_scene::{
-    Scene,
-    import::{self, ImportOptions},
-};
+use picofarm_scene::{Intrinsics, Scene};
 use picofarm_transient::{Budget, Settings, Wavelength};
 
+use super::gate;
 use crate::{
     args::{
         RenderArgs,
@@ -29,14 +27,27 @@ pub struct Order {
 impl Order {
     /// Reads the scene and checks the arguments against it.
     pub fn new(args: &RenderArgs, split: bool) -> Result<Self> {
-        let mut scene =
-            import::read_scene_with(&args.file, &ImportOptions::default(), &args.root.bounds())?;
+        let mut scene = args.input.read(&args.file)?;
+        if let Some(size) = args.resolution {
+            let i = &mut scene.camera.intrinsics;
+            let ratio = f64::from(i.height) / f64::from(i.width);
+            let height = size.height.unwrap_or_else(|| {
+                let height = (f64::from(size.width) * ratio).round();
+                height.clamp(1.0, f64::from(RenderSettings::MAX_SIDE)) as u32
+            });
+            *i = match size.height {
+                None => i.resized(size.width, height),
+                // Square pixels: the width of the view is kept.
+                Some(_) => reshaped(i, size.width, height),
+            };
+        }
+        let gate = gate::choose(args, &mut scene);
         let samples = args.samples.unwrap_or(64);
         let asked = RenderSettings {
-            resolution: args.resolution.unwrap_or(RenderSettings::MAX_SIDE),
-            gate_start_m: args.gate.gate_start_m,
-            bin_width_m: args.gate.bin_width_m,
-            bins: args.gate.bins,
+            resolution: args.resolution.map_or(RenderSettings::MAX_SIDE, |r| r.width),
+            gate_start_m: gate.gate_start_m,
+            bin_width_m: gate.bin_width_m,
+            bins: gate.bins,
             budget: match args.error {
                 Some(e) => Budget::Error(e),
                 None => Budget::Samples(samples),
@@ -54,10 +65,6 @@ impl Order {
             let option = option.replace(['_', '.'], "-");
             CliError::input(format!("--{option}: {}", e.what))
         })?;
-        if let Some(px) = args.resolution {
-            let i = &mut scene.camera.intrinsics;
-            *i = i.resized(px, px);
-        }
         let wanted = groups::wanted(&args.groups, &args.group, scene.laser.beams.len())?;
         let settings = Settings {
             gate: asked.gate(),
@@ -117,12 +124,33 @@ pub fn decisions(plan: &picofarm_transient::Plan) -> String {
         .collect()
 }
 
-/// Returns a line for each change or omission made while the scene was read.
+/// Returns intrinsics of another size and shape with the same width of the view and square pixels.
+fn reshaped(i: &Intrinsics, width: u32, height: u32) -> Intrinsics {
+    let scale = width as f32 / i.width as f32;
+    let (cx, cy) = (i.cx / i.width as f32, i.cy / i.height as f32);
+    Intrinsics {
+        fx: i.fx * scale,
+        fy: i.fx * scale,
+        cx: cx * width as f32,
+        cy: cy * height as f32,
+        width,
+        height,
+    }
+}
+
+/// Returns a line for each choice, change or omission made while the scene was read.
 pub fn notes(scene: &Scene) -> String {
-    let notes = scene.provenance.notes.iter();
-    let read = notes.filter_map(|(key, note)| Some((key.strip_prefix("import.")?, note)));
-    read.map(|(key, note)| show::line(&format!("note: {key}: {note}")).to_string() + "\n")
-        .collect()
+    let line = |text: String| show::line(&text).to_string() + "\n";
+    let notes = &scene.provenance.notes;
+    let chosen = notes.iter().filter_map(|(key, note)| {
+        let key = key.strip_prefix("chosen.")?;
+        Some(line(format!("{key}: {note}")))
+    });
+    let read = notes.iter().filter_map(|(key, note)| {
+        let key = key.strip_prefix("import.")?;
+        Some(line(format!("note: {key}: {note}")))
+    });
+    chosen.chain(read).collect()
 }
 
 /// Formats the renderer's warnings, one per line.

@@ -205,3 +205,19 @@ fn faults_of_a_view_name_the_option() {
         );
     }
 }
+
+#[test]
+fn light_arrives_between_the_nearest_and_the_farthest_surface() {
+    let (lo, hi) = ([-2.0, 0.0, -3.0], [2.0, 2.5, 3.0]);
+    let text = cuboid(lo, hi, true);
+    let scene = read("a.ply", text.as_bytes(), &ImportOptions::default()).expect("reads");
+    let [first, last] = scene.path_range_m().expect("light returns");
+    let diagonal = (16.0f64 + 6.25 + 36.0).sqrt();
+    assert!(first > 0.1 && last < 3.0 * diagonal, "{first} {last}");
+    assert!(last > 2.0 * 4.0, "{first} {last}");
+    // Three times the size, three times the paths.
+    let text = cuboid(lo.map(|x| 3.0 * x), hi.map(|x| 3.0 * x), true);
+    let large = read("a.ply", text.as_bytes(), &ImportOptions::default()).expect("reads");
+    let [a, b] = large.path_range_m().expect("light returns");
+    assert!((a / first - 3.0).abs() < 1e-3 && (b / last - 3.0).abs() < 1e-3);
+}

@@ -1,0 +1,131 @@
+//! The picture of one render: light summed over time, depth, the energy over time, and light in
+//! flight at four times.
+
+use picofarm_figures::{Canvas, TEXT, inferno, quantile, viridis};
+
+/// What is drawn.
+pub struct Preview<'a> {
+    pub width: usize,
+    pub height: usize,
+    pub bins: usize,
+    pub gate_start_m: f64,
+    pub bin_width_m: f64,
+    /// `[row][column][bin]`.
+    pub transient: &'a [f32],
+    /// z-depth in metres, `[row][column]`; 0 = nothing.
+    pub depth: &'a [f32],
+}
+
+/// The longer side of an image, pixels.
+const CELL: usize = 256;
+const GAP: usize = 6;
+const HEAD: usize = TEXT + 8;
+const BACKGROUND: [u8; 3] = [16, 16, 20];
+const INK: [u8; 3] = [210, 210, 215];
+/// Shares of the energy that have arrived at the times of the lower row.
+const SHARES: [f64; 3] = [0.1, 0.4, 0.75];
+/// Metres that light travels in a nanosecond.
+const METRES_PER_NS: f64 = 0.299_792_458;
+
+/// Draws the picture.
+pub fn draw(p: &Preview<'_>) -> Canvas {
+    let longer = p.width.max(p.height).max(1);
+    let cell_height = (CELL * p.height).div_ceil(longer);
+    let row = HEAD + cell_height + GAP;
+    let mut canvas = Canvas::new(GAP + 3 * (CELL + GAP), 2 * row, BACKGROUND);
+    let mut image = |n: usize, title: &str, colour: &dyn Fn(usize) -> [u8; 3]| {
+        let (x, y) = (GAP + n % 3 * (CELL + GAP), n / 3 * row);
+        canvas.text(x, y + 4, title, INK);
+        let (w, h) = ((CELL * p.width).div_ceil(longer), cell_height);
+        for v in 0..h {
+            for u in 0..w {
+                let pixel = (v * p.height / h) * p.width + u * p.width / w;
+                canvas.set(x + u, y + HEAD + v, colour(pixel));
+            }
+        }
+    };
+    let sum = |lo: usize, hi: usize| -> Vec<f32> {
+        let pixels = p.transient.chunks_exact(p.bins);
+        pixels.map(|h| h[lo..hi].iter().sum()).collect()
+    };
+    let ns = |bin: usize| (p.gate_start_m + bin as f64 * p.bin_width_m) / METRES_PER_NS;
+    let all = sum(0, p.bins);
+    let white = quantile(&all, 0.99).max(f32::MIN_POSITIVE);
+    image(0, "all light", &|i| inferno((all[i] / white).powf(0.5)));
+    let seen: Vec<f32> = p.depth.iter().copied().filter(|d| *d > 0.0).collect();
+    let (near, far) = (quantile(&seen, 0.001), quantile(&seen, 1.0));
+    image(1, &format!("depth, {near:.2} to {far:.2} m"), &|i| {
+        match p.depth[i] {
+            d if d > 0.0 => viridis(1.0 - (d - near) / (far - near).max(1e-6)),
+            _ => BACKGROUND,
+        }
+    });
+    // Without the brightest pixels, which the laser's spots make.
+    let mut energy = vec![0.0f64; p.bins];
+    for (histogram, total) in p.transient.chunks_exact(p.bins).zip(&all) {
+        if *total <= white {
+            for (e, x) in energy.iter_mut().zip(histogram) {
+                *e += f64::from(*x);
+            }
+        }
+    }
+    let total: f64 = energy.iter().sum();
+    for (n, share) in SHARES.into_iter().enumerate() {
+        let mut reached = 0.0;
+        let bin = energy.iter().position(|e| {
+            reached += e;
+            reached >= share * total
+        });
+        let bin = bin.unwrap_or(0);
+        let slice = sum(bin.saturating_sub(1), (bin + 2).min(p.bins));
+        let white = quantile(&slice, 0.995).max(f32::MIN_POSITIVE);
+        image(3 + n, &format!("light at {:.2} ns", ns(bin)), &|i| {
+            inferno((slice[i] / white).powf(0.6))
+        });
+    }
+    curve(&mut canvas, &energy, cell_height, [ns(0), ns(p.bins)]);
+    canvas
+}
+
+/// Draws the energy over time in the third cell.
+fn curve(canvas: &mut Canvas, energy: &[f64], height: usize, [start, end]: [f64; 2]) {
+    let (x, y) = (GAP + 2 * (CELL + GAP), HEAD);
+    let title = format!("light over time, {start:.1} to {end:.1} ns");
+    canvas.text(x, 4, &title, INK);
+    let most = energy.iter().fold(f64::MIN_POSITIVE, |m, e| m.max(*e));
+    for u in 0..CELL {
+        let lo = u * energy.len() / CELL;
+        let hi = ((u + 1) * energy.len() / CELL).clamp(lo + 1, energy.len().max(lo + 1));
+        let bins = energy.get(lo..hi).unwrap_or_default();
+        let peak = bins.iter().fold(0.0f64, |m, e| m.max(*e));
+        let bar = ((peak / most) * height.saturating_sub(1) as f64).round() as usize;
+        for v in 0..=bar.min(height.saturating_sub(1)) {
+            canvas.set(x + u, y + height - 1 - v, inferno(0.75));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_of_any_shape_and_of_darkness_are_drawn() {
+        for (width, height, bins) in [(1, 1, 1), (7, 3, 5), (3, 40, 300)] {
+            for light in [0.0, 1.0] {
+                let transient = vec![light; width * height * bins];
+                let depth = vec![light; width * height];
+                let canvas = draw(&Preview {
+                    width,
+                    height,
+                    bins,
+                    gate_start_m: 1.0,
+                    bin_width_m: 0.1,
+                    transient: &transient,
+                    depth: &depth,
+                });
+                assert!(Canvas::from_png(&canvas.png()).is_ok());
+            }
+        }
+    }
+}
