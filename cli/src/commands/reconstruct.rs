@@ -25,10 +25,7 @@ use picofarm_reconstruct::{
     source::{self, CaptureSettings, Disturbed},
     surface,
 };
-use picofarm_scene::{
-    Camera, Scene,
-    plato,
-};
+use picofarm_scene::{Camera, Scene, plato};
 use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
 use picofarm_transient::RenderError;
 use serde_json::{Value, json};

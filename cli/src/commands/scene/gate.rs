@@ -33,9 +33,8 @@ pub fn choose(args: &RenderArgs, scene: &mut Scene) -> GateArgs {
     };
     let usual = args.gate.gate();
     let end = usual.start_m + usual.bin_width_m * f64::from(usual.bins);
-    let fits = first >= usual.start_m
-        && last <= end
-        && last - first >= LEAST_BINS * usual.bin_width_m;
+    let fits =
+        first >= usual.start_m && last <= end && last - first >= LEAST_BINS * usual.bin_width_m;
     if fits && !auto {
         return args.gate;
     }

@@ -6,11 +6,17 @@ use picofarm_dataset::{RenderArray, write_render_group};
 use picofarm_transient::Rendered;
 use serde_json::json;
 
-use super::order::Order;
+use super::{
+    order::Order,
+    preview::{self, Preview},
+};
 use crate::{
     args::groups::Wanted,
-    error::{CliError, Code, Result},
+    error::{CliError, Code, Result, io},
 };
+
+/// The picture in the folder of a render.
+pub const PREVIEW: &str = "preview.png";
 
 /// The histograms of a subset of the beams.
 pub struct Subset {
@@ -166,5 +172,17 @@ pub fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Subset]) -> Res
             ));
         }
     }
-    write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
+    write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))?;
+    let picture = preview::draw(&Preview {
+        width: r.width as usize,
+        height: r.height as usize,
+        bins: r.gate.bins as usize,
+        gate_start_m: r.gate.start_m,
+        bin_width_m: r.gate.bin_width_m,
+        transient: &r.transient,
+        depth: &r.truth.depth,
+    });
+    let path = out.join(PREVIEW);
+    std::fs::write(&path, picture.png())
+        .map_err(|e| io(format!("cannot write {}", path.display()), &e))
 }

@@ -44,7 +44,9 @@ impl Order {
         let gate = gate::choose(args, &mut scene);
         let samples = args.samples.unwrap_or(64);
         let asked = RenderSettings {
-            resolution: args.resolution.map_or(RenderSettings::MAX_SIDE, |r| r.width),
+            resolution: args
+                .resolution
+                .map_or(RenderSettings::MAX_SIDE, |r| r.width),
             gate_start_m: gate.gate_start_m,
             bin_width_m: gate.bin_width_m,
             bins: gate.bins,

@@ -1,7 +1,7 @@
 //! The picture of one render: light summed over time, depth, the energy over time, and light in
 //! flight at four times.
 
-use picofarm_figures::{Canvas, TEXT, inferno, quantile, viridis};
+use picofarm_figures::{Canvas, TEXT, inferno, scene::quantile, viridis};
 
 /// What is drawn.
 pub struct Preview<'a> {
@@ -54,12 +54,14 @@ pub fn draw(p: &Preview<'_>) -> Canvas {
     image(0, "all light", &|i| inferno((all[i] / white).powf(0.5)));
     let seen: Vec<f32> = p.depth.iter().copied().filter(|d| *d > 0.0).collect();
     let (near, far) = (quantile(&seen, 0.001), quantile(&seen, 1.0));
-    image(1, &format!("depth, {near:.2} to {far:.2} m"), &|i| {
-        match p.depth[i] {
+    image(
+        1,
+        &format!("depth, {near:.2} to {far:.2} m"),
+        &|i| match p.depth[i] {
             d if d > 0.0 => viridis(1.0 - (d - near) / (far - near).max(1e-6)),
             _ => BACKGROUND,
-        }
-    });
+        },
+    );
     // Without the brightest pixels, which the laser's spots make.
     let mut energy = vec![0.0f64; p.bins];
     for (histogram, total) in p.transient.chunks_exact(p.bins).zip(&all) {

@@ -13,7 +13,7 @@ use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use super::{
-    group::{take_subsets, write},
+    group::{PREVIEW, take_subsets, write},
     order::{Order, decisions, notes, warnings},
 };
 use crate::{
@@ -98,7 +98,8 @@ pub async fn run(args: SceneRender, output: Output) -> Result<()> {
         &json!({
             "out": args.out, "seconds": seconds, "threads": threads, "rays": rendered.rays,
             "error": e, "overflow": rendered.overflow, "plan": rendered.plan, "subsets": arrays,
-            "warnings": rendered.warnings,
+            "warnings": rendered.warnings, "picture": args.out.join(PREVIEW),
+            "notes": order.scene.provenance.notes,
         }),
         || {
             let mut text = format!(
@@ -109,6 +110,7 @@ pub async fn run(args: SceneRender, output: Output) -> Result<()> {
             if !arrays.is_empty() {
                 text += &format!("  also {}\n", arrays.join(", "));
             }
+            text += &format!("  picture: {}\n", args.out.join(PREVIEW).display());
             text + &notes(&order.scene) + &decisions(&rendered.plan) + &warnings(&rendered.warnings)
         },
     );

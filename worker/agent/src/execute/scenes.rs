@@ -148,18 +148,11 @@ fn read(
 
 /// Reads a scene with its own laser, or with a laser aimed as the job specifies if it has none.
 fn with_laser(path: &Path, aim: &Aim, bounds: &Bounds) -> Result<Scene, SceneError> {
-    match import::read_scene_with(path, &ImportOptions::default(), bounds) {
-        // A file with an unusable laser is rejected, not repaired.
-        Err(SceneError::NoLaser { .. }) => {
-            warn!(path = %path.display(), spots = aim.film().len(), "the file has no laser; the job's spots are used");
-            let options = ImportOptions {
-                laser: Some(aim.clone()),
-                ..ImportOptions::default()
-            };
-            import::read_scene_with(path, &options, bounds)
-        }
-        read => read,
-    }
+    let options = ImportOptions {
+        spots_if_none: Some(aim.clone()),
+        ..ImportOptions::default()
+    };
+    import::read_scene_with(path, &options, bounds)
 }
 
 /// Adds the scene's field in the job to an error.

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::{Bounds, buffers::buffer_file, gltf_file, is_xml, mitsuba, read_file};
+use super::{Bounds, buffers::buffer_file, gltf_file, is_xml, mesh_file, mitsuba, read_file};
 use crate::SceneError;
 
 /// Returns the SHA-256 of a scene's content, hexadecimal. For a file without external buffers
@@ -21,6 +21,14 @@ pub fn fingerprint(path: &Path, bounds: &Bounds) -> Result<String, SceneError> {
     let mut hash = Sha256::new_with_prefix(&bytes);
     if is_xml(&bytes) || bytes.trim_ascii_start().first() == Some(&b'{') {
         for external in mitsuba::files(path, &bytes, files)? {
+            let data = read_file(files, &external)?;
+            hash.update(external.file_name().unwrap_or_default().as_encoded_bytes());
+            hash.update((data.len() as u64).to_le_bytes());
+            hash.update(&data);
+        }
+    }
+    if mesh_file::is_obj(path, &bytes) {
+        for external in mesh_file::files(path, &bytes, files) {
             let data = read_file(files, &external)?;
             hash.update(external.file_name().unwrap_or_default().as_encoded_bytes());
             hash.update((data.len() as u64).to_le_bytes());

@@ -75,23 +75,23 @@ pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, St
     Texture::new(name, size.0, size.1, texels, wrap)
 }
 
-/// Returns the smallest alpha of an image, or 255 if it has none.
+/// Returns the size and the alpha channel of an image, or `None` if it has none.
 ///
 /// # Errors
 /// An image that cannot be read.
-pub(super) fn least_alpha(bytes: &[u8]) -> Result<u8, String> {
+pub(super) fn alpha(bytes: &[u8]) -> Result<Option<Alpha>, String> {
     if !bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
-        return Ok(255);
+        return Ok(None);
     }
-    let (_, samples, each) = png_samples(bytes).map_err(|refused| match refused {
+    let (size, samples, each) = png_samples(bytes).map_err(|refused| match refused {
         Refused::Damaged(why) | Refused::TooLarge(why) => format!("image is not readable ({why})"),
     })?;
     let alpha = samples.chunks_exact(each).map(|p| p[each - 1]);
-    Ok(match each {
-        2 | 4 => alpha.min().unwrap_or(255),
-        _ => 255,
-    })
+    Ok(matches!(each, 2 | 4).then(|| (size, alpha.collect())))
 }
+
+/// Width and height, and the alpha of each pixel row by row.
+pub(super) type Alpha = ((u32, u32), Vec<u8>);
 
 enum Refused {
     Damaged(String),

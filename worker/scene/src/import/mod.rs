@@ -1,5 +1,5 @@
 //! Reads scenes from files: glTF 2.0 (`.glb`, `.gltf`), Mitsuba 3 (XML, and its dictionary as
-//! JSON), PLY meshes and the reference scenes' JSON.
+//! JSON), meshes in PLY, OBJ and STL, and the reference scenes' JSON.
 
 mod buffers;
 mod complete;
@@ -7,11 +7,13 @@ mod far;
 mod fingerprint;
 mod gltf_file;
 mod image;
+mod mesh_file;
 mod mitsuba;
 mod obj;
 mod ply;
 pub(crate) mod polygon;
 mod reference;
+mod stl;
 
 use std::{
     collections::BTreeMap,
@@ -146,7 +148,8 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 
 /// Reads a scene. The content determines the format: `glTF` magic or a JSON object with `asset` is
 /// glTF, `ply` a lone mesh, XML or a JSON object with `"type": "scene"` a Mitsuba scene, and a JSON
-/// object with `meshes` and `spots` a reference scene.
+/// object with `meshes` and `spots` a reference scene. STL is known by its structure, and OBJ by its
+/// extension.
 ///
 /// Files written by [`crate::export`] are restored exactly. In other glTF files, metals become GGX
 /// conductors with α = roughness², partial metals a mix, and all other materials Lambertian with
@@ -160,7 +163,8 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 /// `twosided`, and `blendbsdf` of all these, nested too; `dielectric` and `thindielectric`;
 /// `bitmap` textures, and spectra over wavelengths as reflectances. Beams are emitters `projector`
 /// of `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°) that start at one point; a shape's category is
-/// its id up to the first `.`. A PLY needs camera and laser from `options`. Features of a format
+/// its id up to the first `.`. Camera, laser and unit that neither the file nor `options` state are
+/// chosen, with notes under keys that start with `chosen.`. Features of a format
 /// that our scenes cannot represent are listed in the provenance's notes, under keys that start
 /// with `import.`, or refused.
 ///
@@ -179,6 +183,10 @@ pub fn read_scene_with(
         gltf_file::read(path, &bytes, options, files)?
     } else if ply::is_ply(&bytes) {
         ply::read(path, &bytes, options)?
+    } else if stl::is_stl(&bytes) {
+        mesh_file::read_stl(path, &bytes, options)?
+    } else if mesh_file::is_obj(path, &bytes) {
+        mesh_file::read_obj(path, &bytes, options, files)?
     } else if is_xml(&bytes) {
         mitsuba::read_xml(path, &bytes, options, files)?
     } else {
@@ -224,7 +232,7 @@ fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
         r#type: Option<serde_json::Value>,
     }
     let expected = "expected binary glTF (.glb), glTF JSON (.gltf), a Mitsuba scene (.xml, or its dictionary as \
-                    .json), PLY (.ply) or a reference scene (.json)";
+                    .json), a mesh (.ply, .obj, .stl) or a reference scene (.json)";
     let keys: Keys = serde_json::from_slice(bytes)
         .map_err(|e| format_error(path, format!("{expected}, found none of them: {e}")))?;
     match (keys.asset, keys.meshes, keys.spots) {

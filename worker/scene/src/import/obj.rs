@@ -1,19 +1,18 @@
-//! Wavefront OBJ: vertices, texture coordinates and polygons; materials and normals are not read.
+//! Wavefront OBJ: vertices, texture coordinates, polygons and the names of their materials; normals
+//! are not read.
 
 use std::collections::{BTreeMap, btree_map::Entry};
 
 use super::polygon::Triangulation;
 
 /// Statements without geometry.
-const SKIPPED: [&[u8]; 19] = [
+const SKIPPED: [&[u8]; 17] = [
     b"vn",
     b"vp",
     b"g",
     b"o",
     b"s",
     b"mg",
-    b"usemtl",
-    b"mtllib",
     b"usemap",
     b"maplib",
     b"lod",
@@ -39,9 +38,18 @@ pub(super) struct Obj {
     /// Texture coordinates, one a vertex, v upwards, or none.
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) triangles: Vec<[u32; 3]>,
+    /// The index into `materials` of each triangle.
+    pub(super) triangle_material: Vec<u32>,
+    /// The names of the materials; the first is that of faces before any `usemtl`.
+    pub(super) materials: Vec<String>,
+    /// The names of the material files.
+    pub(super) libraries: Vec<String>,
     /// The notes on changes and omissions, by key.
     pub(super) notes: BTreeMap<String, String>,
 }
+
+/// The greatest number of materials and of material files.
+const MAX_MATERIALS: usize = 65_536;
 
 /// The statements of a file.
 #[derive(Default)]
@@ -50,8 +58,12 @@ struct Statements {
     uv: Vec<[f32; 2]>,
     /// The indices of position and texture coordinates.
     corners: Vec<(usize, Option<usize>)>,
-    /// The line and the number of corners of each face.
-    faces: Vec<(usize, usize)>,
+    /// The line, the number of corners and the material of each face.
+    faces: Vec<(usize, usize, u32)>,
+    /// The materials by name.
+    materials: BTreeMap<String, u32>,
+    material: u32,
+    libraries: Vec<String>,
     lines_and_points: usize,
     /// The number of faces with fewer than three corners.
     degenerate: usize,
@@ -140,13 +152,18 @@ impl Statements {
                 }
                 let corners = self.corners.len() - before;
                 self.degenerate += usize::from(corners < 3);
-                self.faces.push((number, corners));
+                self.faces.push((number, corners, self.material));
             }
             _ if FREE_FORM.contains(&keyword) => {
                 return Err(
                     "free-form curves and surfaces are not supported; export polygons".into(),
                 );
             }
+            b"usemtl" => {
+                let next = self.materials.len() as u32 + 1;
+                self.material = *self.materials.entry(rest_of(line)).or_insert(next);
+            }
+            b"mtllib" => self.libraries.push(rest_of(line)),
             b"l" | b"p" => self.lines_and_points += 1,
             _ if SKIPPED.contains(&keyword) => {}
             _ => {
@@ -155,6 +172,9 @@ impl Statements {
                         .into(),
                 );
             }
+        }
+        if self.materials.len().max(self.libraries.len()) > MAX_MATERIALS {
+            return Err(format!("more than {MAX_MATERIALS} materials or material files"));
         }
         Ok(())
     }
@@ -196,7 +216,7 @@ impl Statements {
         let (mut places, mut vertices, mut parts) = (Vec::new(), Vec::new(), Vec::new());
         let textured = self.corners.iter().any(|c| c.1.is_some());
         let mut rest = self.corners.as_slice();
-        for &(line, length) in &self.faces {
+        for &(line, length, material) in &self.faces {
             let (corners, after) = rest.split_at(length);
             rest = after;
             if length < 3 {
@@ -247,10 +267,16 @@ impl Statements {
             split.split(&places, &mut parts).map_err(fail)?;
             let triangle = |t: &[u32; 3]| t.map(|c| vertices[c as usize]);
             obj.triangles.extend(parts.iter().map(triangle));
+            obj.triangle_material.resize(obj.triangles.len(), material);
         }
         if obj.triangles.is_empty() {
             return Err("has no faces; export a mesh with faces (no point cloud)".into());
         }
+        obj.materials = vec![String::new(); self.materials.len() + 1];
+        for (name, index) in self.materials {
+            obj.materials[index as usize] = name;
+        }
+        obj.libraries = self.libraries;
         if let Some(note) = split.note() {
             obj.notes.insert("polygons".into(), note);
         }
@@ -264,6 +290,14 @@ impl Statements {
         }
         Ok(obj)
     }
+}
+
+/// Returns the text after the keyword, which may contain spaces.
+fn rest_of(line: &[u8]) -> String {
+    let line = line.trim_ascii();
+    let keyword = line.iter().position(u8::is_ascii_whitespace);
+    let rest = &line[keyword.unwrap_or(line.len())..];
+    String::from_utf8_lossy(rest.trim_ascii()).into_owned()
 }
 
 fn numbers<'a>(words: impl Iterator<Item = &'a [u8]>) -> Result<Vec<f64>, String> {

@@ -7,6 +7,7 @@ mod glass;
 mod gltf_materials;
 mod hostile;
 mod import;
+mod meshes;
 mod mitsuba;
 mod mitsuba_blends;
 mod mitsuba_collections;

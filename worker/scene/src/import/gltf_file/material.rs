@@ -3,7 +3,7 @@
 
 use std::{borrow::Cow, path::Path};
 
-use gltf::{image::Source, material::AlphaMode, texture::WrappingMode};
+use gltf::{image::Source, texture::WrappingMode};
 
 use crate::{
     Bsdf, Distribution, Material, SceneError, SpectrumPoint, Texture, Wrap,
@@ -109,9 +109,6 @@ impl Walk<'_> {
             Some(pbr) => self.specular_glossiness(&pbr, tint),
             None => self.metallic_roughness(file, &at, tint)?,
         };
-        if self.strict && file.alpha_mode() == AlphaMode::Mask {
-            self.check_mask(file, &at, has_uv)?;
-        }
         let mut material =
             Material::diffuse(file.name().unwrap_or("material").to_owned(), standard.rgb);
         material.bsdf = standard.bsdf;
@@ -154,41 +151,9 @@ impl Walk<'_> {
 
     /// Returns whether a texture has no image at all. A texture with an image in an unsupported
     /// format has one.
-    fn is_sourceless(&self, texture: &gltf::Texture<'_>) -> bool {
+    pub(super) fn is_sourceless(&self, texture: &gltf::Texture<'_>) -> bool {
         self.facts.sourceless.contains(&texture.index())
             && texture.extensions().is_none_or(|all| all.is_empty())
-    }
-
-    /// Refuses a mask that cuts holes, because our surfaces have none.
-    fn check_mask(
-        &mut self,
-        file: &gltf::Material<'_>,
-        at: &str,
-        has_uv: bool,
-    ) -> Result<(), SceneError> {
-        let [.., factor] = match file.pbr_specular_glossiness() {
-            Some(pbr) => pbr.diffuse_factor(),
-            None => file.pbr_metallic_roughness().base_color_factor(),
-        };
-        let texture = albedo_texture(file).map(|info| info.texture());
-        let least = match texture.filter(|t| has_uv && !self.is_sourceless(t)) {
-            None => 1.0,
-            Some(texture) => {
-                let fail = |what: String| format_error(self.path, format!("{at}: {what}"));
-                let (bytes, _) = self.image_bytes(&texture, at)?;
-                let least = image::least_alpha(&bytes).map_err(fail)?;
-                f32::from(least) / 255.0
-            }
-        };
-        match factor * least >= file.alpha_cutoff().unwrap_or(0.5) {
-            true => Ok(()),
-            false => Err(format_error(
-                self.path,
-                format!(
-                    "{at}: alphaMode MASK cuts holes into surfaces, which is not supported; cut the mesh, or set alphaMode OPAQUE"
-                ),
-            )),
-        }
     }
 
     /// Returns the spectrum that any program may define in a material's extras; unchecked.
@@ -423,11 +388,7 @@ impl Walk<'_> {
         if sampler.mag_filter() == Some(gltf::texture::MagFilter::Nearest) {
             self.note("textures.filter", "nearest; bilinear used");
         }
-        let wrap = match sampler.wrap_s() {
-            WrappingMode::ClampToEdge => Wrap::Clamp,
-            WrappingMode::MirroredRepeat => Wrap::Mirror,
-            WrappingMode::Repeat => Wrap::Repeat,
-        };
+        let wrap = wrap(file);
         let (bytes, name) = self.image_bytes(file, at)?;
         let (path, image) = (self.path, file.source().index());
         self.images
@@ -438,7 +399,7 @@ impl Walk<'_> {
 
 impl<'a> Walk<'a> {
     /// Returns the bytes of a texture's image, and its name.
-    fn image_bytes(
+    pub(super) fn image_bytes(
         &self,
         file: &gltf::Texture<'_>,
         at: &str,
@@ -491,7 +452,16 @@ fn tinted([r, g, b, _]: [f32; 4], tint: [f32; 3]) -> [f32; 3] {
     [r * tint[0], g * tint[1], b * tint[2]]
 }
 
-fn albedo_texture<'a>(file: &gltf::Material<'a>) -> Option<gltf::texture::Info<'a>> {
+/// Returns how a texture continues beyond its image, along u.
+pub(super) fn wrap(file: &gltf::Texture<'_>) -> Wrap {
+    match file.sampler().wrap_s() {
+        WrappingMode::ClampToEdge => Wrap::Clamp,
+        WrappingMode::MirroredRepeat => Wrap::Mirror,
+        WrappingMode::Repeat => Wrap::Repeat,
+    }
+}
+
+pub(super) fn albedo_texture<'a>(file: &gltf::Material<'a>) -> Option<gltf::texture::Info<'a>> {
     match file.pbr_specular_glossiness() {
         Some(pbr) => pbr.diffuse_texture(),
         None => file.pbr_metallic_roughness().base_color_texture(),

@@ -140,16 +140,20 @@ impl Walk<'_> {
                     accessor.count()
                 )));
             }
-            let triangles = triangles(&corners, primitive.mode());
+            let mut triangles = triangles(&corners, primitive.mode());
+            triangles.iter_mut().flatten().for_each(|v| *v += base);
+            let mask = self.mask(&material, uv_accessor.is_some())?;
+            let before = mesh.positions.len();
+            let triangles = self.without_holes(&mut mesh, triangles, &mask);
+            self.corners += mesh.positions.len() - before;
             mesh.triangle_material
                 .extend(triangles.iter().map(|_| slot));
-            mesh.triangles
-                .extend(triangles.iter().map(|t| t.map(|v| v + base)));
+            mesh.triangles.extend(triangles);
         }
         Ok((!mesh.triangles.is_empty()).then_some(mesh))
     }
 
-    /// Returns the common colour of a primitive's vertices, which multiplies its material's colour.
+    /// Returns the mean colour of a primitive's vertices, which multiplies its material's colour.
     fn vertex_colour(
         &mut self,
         primitive: &gltf::Primitive<'_>,
@@ -183,16 +187,27 @@ impl Walk<'_> {
         let Some(colours) = reader.read_colors(0) else {
             return Ok(WHITE);
         };
-        let mut colours = colours.into_rgb_f32();
-        let first = colours.next().unwrap_or(WHITE);
-        let differs = |c: [f32; 3]| (0..3).any(|k| (c[k] - first[k]).abs() > SAME_COLOUR);
-        if !first.iter().all(|c| (0.0..=1.0).contains(c)) || colours.any(differs) {
-            return Err(fail(
-                "colours that differ by vertex are not supported; bake them into a base colour texture, or remove them"
-                    .into(),
-            ));
+        let (mut sum, mut count) = ([0.0f64; 3], 0u32);
+        let mut first = None;
+        let mut differ = false;
+        for colour in colours.into_rgb_f32() {
+            if !colour.iter().all(|c| c.is_finite()) {
+                return Err(fail("a colour is not finite; export again".into()));
+            }
+            let colour = colour.map(|c| c.clamp(0.0, 1.0));
+            let known = *first.get_or_insert(colour);
+            differ |= (0..3).any(|k| (colour[k] - known[k]).abs() > SAME_COLOUR);
+            (0..3).for_each(|k| sum[k] += f64::from(colour[k]));
+            count += 1;
         }
-        Ok(first)
+        if !differ {
+            return Ok(first.unwrap_or(WHITE));
+        }
+        self.note(
+            "vertex_colours",
+            "replaced by their mean over each part of a mesh",
+        );
+        Ok(sum.map(|s| (s / f64::from(count)) as f32))
     }
 
     fn check_uv(&self, uv: &Accessor<'_>, vertices: usize) -> Result<(), String> {

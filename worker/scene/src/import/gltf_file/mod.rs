@@ -3,6 +3,7 @@
 
 mod deform;
 pub(super) mod document;
+mod mask;
 mod material;
 mod mesh;
 mod nodes;
@@ -212,6 +213,8 @@ struct Walk<'a> {
     images: Images<(usize, Wrap)>,
     /// The number of vertices and corners read so far.
     corners: usize,
+    /// The number of triangles that masks added so far.
+    cut_triangles: usize,
     /// The number of vertices and corners of all objects.
     placed: usize,
     meshes: BTreeMap<MeshKey, Option<Arc<Mesh>>>,
@@ -245,6 +248,7 @@ impl<'a> Walk<'a> {
             strict: true,
             images: Images::default(),
             corners: 0,
+            cut_triangles: 0,
             placed: 0,
             meshes: BTreeMap::new(),
             objects: Vec::new(),
