@@ -25,7 +25,9 @@ const ALBEDO: [f32; 2] = [0.04, 0.9];
 
 /// Returns whether a file is read as OBJ. The format has no signature.
 pub(super) fn is_obj(path: &Path, bytes: &[u8]) -> bool {
-    let extension = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj"));
+    let extension = path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("obj"));
     extension && !matches!(bytes.trim_ascii_start().first(), Some(b'{' | b'<'))
 }
 
@@ -120,7 +122,10 @@ fn materials(
     let mut known: BTreeMap<String, tobj::Material> = BTreeMap::new();
     for library in &obj.libraries {
         let Some(file) = existing(path, library, files) else {
-            notes.add("materials", "a material file is missing; its surfaces are grey".into());
+            notes.add(
+                "materials",
+                "a material file is missing; its surfaces are grey".into(),
+            );
             continue;
         };
         match read_library(&file, files) {
@@ -208,7 +213,10 @@ fn near_origin(positions: &[[f64; 3]], options: &ImportOptions, notes: &mut Note
 }
 
 fn stem(path: &Path) -> String {
-    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    path.file_stem()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned()
 }
 
 fn draft(path: &Path, source: &str, mesh: Mesh, notes: Notes) -> Draft {

@@ -174,7 +174,9 @@ impl Statements {
             }
         }
         if self.materials.len().max(self.libraries.len()) > MAX_MATERIALS {
-            return Err(format!("more than {MAX_MATERIALS} materials or material files"));
+            return Err(format!(
+                "more than {MAX_MATERIALS} materials or material files"
+            ));
         }
         Ok(())
     }

@@ -32,7 +32,11 @@ fn is_text(bytes: &[u8]) -> bool {
 fn is_binary(bytes: &[u8]) -> bool {
     let count = bytes.get(80..HEADER).map(|b| [b[0], b[1], b[2], b[3]]);
     let facets = count.map_or(0, |b| u32::from_le_bytes(b) as usize);
-    facets > 0 && facets.checked_mul(FACET).and_then(|n| n.checked_add(HEADER)) == Some(bytes.len())
+    facets > 0
+        && facets
+            .checked_mul(FACET)
+            .and_then(|n| n.checked_add(HEADER))
+            == Some(bytes.len())
 }
 
 /// Parses a whole file. The message quotes nothing, because the file may have another format.
@@ -65,7 +69,9 @@ fn binary(bytes: &[u8], solid: &mut Solid) -> Result<(), String> {
 fn text(bytes: &[u8], solid: &mut Solid) -> Result<(), String> {
     let mut corners: Vec<[f32; 3]> = Vec::new();
     for (k, line) in bytes.split(|b| matches!(b, b'\n' | b'\r')).enumerate() {
-        let mut words = line.split(u8::is_ascii_whitespace).filter(|w| !w.is_empty());
+        let mut words = line
+            .split(u8::is_ascii_whitespace)
+            .filter(|w| !w.is_empty());
         let fail = |what: &str| Err(format!("line {}: {what}", k + 1));
         match words.next() {
             Some(b"vertex") => {
@@ -86,8 +92,7 @@ fn text(bytes: &[u8], solid: &mut Solid) -> Result<(), String> {
                 }
                 corners.clear();
             }
-            None
-            | Some(b"solid" | b"facet" | b"outer" | b"endloop" | b"endsolid" | b"color") => {}
+            None | Some(b"solid" | b"facet" | b"outer" | b"endloop" | b"endsolid" | b"color") => {}
             Some(_) => return fail("is no statement of STL, such as facet or vertex"),
         }
     }

@@ -36,7 +36,13 @@ fn an_obj_has_the_colours_of_its_material_file() {
 fn an_obj_without_its_material_file_is_grey_with_a_note() {
     let scene = read(&[("a.obj", OBJ.as_bytes())]).expect("reads");
     assert!(scene.provenance.notes.contains_key("import.materials"));
-    assert!(scene.objects[0].mesh.materials.iter().all(|m| m.rgb == [0.5; 3]));
+    assert!(
+        scene.objects[0]
+            .mesh
+            .materials
+            .iter()
+            .all(|m| m.rgb == [0.5; 3])
+    );
 }
 
 #[test]
@@ -77,7 +83,10 @@ fn binary() -> Vec<u8> {
     out.extend(2u32.to_le_bytes());
     for facet in FACETS {
         out.extend([0; 12]);
-        facet.iter().flatten().for_each(|x| out.extend(x.to_le_bytes()));
+        facet
+            .iter()
+            .flatten()
+            .for_each(|x| out.extend(x.to_le_bytes()));
         out.extend([0; 2]);
     }
     out
@@ -98,13 +107,24 @@ fn both_forms_of_stl_give_the_same_mesh() {
 fn damaged_stl_is_refused_by_place() {
     let whole = text();
     for (from, to, expected) in [
-        ("vertex 1", "vertex one", "line 5: vertex: expected three numbers"),
+        (
+            "vertex 1",
+            "vertex one",
+            "line 5: vertex: expected three numbers",
+        ),
         ("vertex 1", "vertex nan", "not finite"),
         ("outer loop", "inner loop", "line 3: is no statement of STL"),
     ] {
-        let damaged = String::from_utf8(whole.clone()).expect("text").replacen(from, to, 1);
-        let error = read(&[("part.stl", damaged.as_bytes())]).expect_err(expected).to_string();
-        assert!(error.contains("part.stl") && error.contains(expected), "{error}");
+        let damaged = String::from_utf8(whole.clone())
+            .expect("text")
+            .replacen(from, to, 1);
+        let error = read(&[("part.stl", damaged.as_bytes())])
+            .expect_err(expected)
+            .to_string();
+        assert!(
+            error.contains("part.stl") && error.contains(expected),
+            "{error}"
+        );
     }
     for end in [whole.len() / 2, 20] {
         assert!(read(&[("part.stl", &whole[..end])]).is_err());

@@ -726,11 +726,7 @@ fn scenes_in_gltf() {
             }),
             at(-3.0, "hidden"),
         ),
-        (
-            "a mask with holes",
-            mask([0, 255]),
-            quad("masks"),
-        ),
+        ("a mask with holes", mask([0, 255]), quad("masks")),
         ("a mask without holes", mask([255, 200]), quad("")),
         (
             "a mask by its factor",
@@ -742,11 +738,7 @@ fn scenes_in_gltf() {
             quad("masks"),
         ),
         ("one vertex colour", colours(0.5), quad("")),
-        (
-            "vertex colours",
-            colours(0.9),
-            quad("vertex_colours"),
-        ),
+        ("vertex colours", colours(0.9), quad("vertex_colours")),
         ("extras of text", extras(json!("text")), quad("")),
         ("extras of a list", extras(json!(["chair", 2])), quad("")),
         ("extras of a number", extras(json!(5)), quad("")),

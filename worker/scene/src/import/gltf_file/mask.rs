@@ -94,9 +94,8 @@ impl Cut<'_> {
             Some(true) => out.push(t),
             Some(false) => {}
             None if fine || divisions == MAX_DIVISIONS || self.left < 3 => {
-                let centre = [0, 1].map(|k: usize| {
-                    texel((corners[0][k] + corners[1][k] + corners[2][k]) / 3.0)
-                });
+                let centre = [0, 1]
+                    .map(|k: usize| texel((corners[0][k] + corners[1][k] + corners[2][k]) / 3.0));
                 if self.mask.is_solid(centre[0], centre[1]) {
                     out.push(t);
                 }
@@ -119,7 +118,9 @@ impl Cut<'_> {
             let [p, q] = [a, b].map(|v| self.mesh.positions[v as usize]);
             let [s, t] = [a, b].map(|v| self.mesh.uv[v as usize]);
             self.mesh.positions.push((p + q) * 0.5);
-            self.mesh.uv.push([0.5 * (s[0] + t[0]), 0.5 * (s[1] + t[1])]);
+            self.mesh
+                .uv
+                .push([0.5 * (s[0] + t[0]), 0.5 * (s[1] + t[1])]);
         }
         vertex
     }

@@ -3,7 +3,7 @@
 
 use std::{borrow::Cow, path::Path};
 
-use gltf::{image::Source, texture::WrappingMode};
+use gltf::{image::Source, material::AlphaMode, texture::WrappingMode};
 
 use crate::{
     Bsdf, Distribution, Material, SceneError, SpectrumPoint, Texture, Wrap,

@@ -103,7 +103,7 @@ impl Walk<'_> {
             let reader = primitive.reader(|b| self.buffers.get(&b));
             let key = (
                 accessor.index(),
-                uv_accessor.map(|a| a.index()),
+                uv_accessor.as_ref().map(Accessor::index),
                 coordinates.bits(),
             );
             // Deformed vertices depend on more than their accessor.

@@ -318,8 +318,7 @@ impl<'a> Parser<'a, '_> {
                 let value = self.needs(child, "value")?;
                 let at = self.at(child);
                 for folder in self.shared.folders.clone().iter() {
-                    let folder =
-                        Opener::named(&folder, &value).map_err(|e| format!("{at}: {e}"))?;
+                    let folder = Opener::named(folder, &value).map_err(|e| format!("{at}: {e}"))?;
                     self.shared.add_folder(folder);
                 }
             } else if tag == "alias" {
