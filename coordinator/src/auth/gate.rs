@@ -23,7 +23,7 @@ use super::{
     tokens::{Entry, TokenError, Tokens},
     trust::{GRACE, Judge, Reader, Source, Trouble, Trust, Verdict, too_slow},
 };
-use crate::{
+use crate::observe::{
     audit::{Audit, COORDINATOR},
     health::Health,
 };

@@ -1,12 +1,10 @@
-//! Authentication and authorization. `Guard` precedes every service. It identifies the caller by
-//! a token or a client certificate, compares the caller's roles with the method's requirement, and
-//! passes the [`Caller`] to the handlers.
+//! Identifies callers by a token or a client certificate, and decides what each may do. The layer
+//! that asks for this before every call is in `edge`.
 
 mod access;
-pub(crate) mod caller;
+mod caller;
 mod expiry;
 mod gate;
-mod guard;
 mod quota;
 mod rights;
 mod roles;
@@ -14,12 +12,10 @@ mod tls;
 mod tokens;
 mod trust;
 
-pub use access::Access;
+pub use access::{ACCEPTED, Access, BY_CERTIFICATE, BY_DIGEST};
 pub use caller::Caller;
 pub use expiry::Expiry;
 pub(crate) use gate::Gate;
-pub use guard::{ACCEPTED, BY_CERTIFICATE, BY_DIGEST};
-pub(crate) use guard::{Guard, SameMachine};
 pub use quota::Quotas;
 pub(crate) use quota::{Throttle, WorkerIds};
 pub use rights::Visibility;

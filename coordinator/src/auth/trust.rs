@@ -14,7 +14,7 @@ use tokio::{sync::watch, task::JoinHandle};
 use tonic::Status;
 
 use super::tokens::{Entry, Tokens};
-use crate::health::Health;
+use crate::observe::health::Health;
 
 /// Time for which a file may be unusable before every caller is refused. Editors and `kubectl`
 /// replace files in several steps.

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use picofarm_proto::{ids::WorkerId, model::FailureKind};
 
-use crate::budget::Backoff;
+use super::budget::Backoff;
 
 /// A worker is excluded after this many different tasks in a row failed on it.
 const TASKS: usize = 3;

@@ -9,8 +9,7 @@ use picofarm_proto::{
     model::EventKind,
 };
 
-use super::{About, Core, ready::Ready};
-use crate::{place, transition::RangeEvent};
+use super::{history::About, placement, ready::Ready, state::Core, transition::RangeEvent};
 
 /// Leases claimed for each lease wanted now, so that short tasks do not cost a transaction
 /// each.
@@ -149,7 +148,7 @@ impl Core {
     /// Returns the number of tasks in the next lease of a stage, at most `in_range`.
     pub(super) fn lease_size(
         &self,
-        entry: &super::StageEntry,
+        entry: &super::stages::StageEntry,
         able: u64,
         in_range: u64,
         now_ms: i64,
@@ -161,7 +160,7 @@ impl Core {
             false => claimable.known(),
         };
         let (plain, suspects) = entry.stage.ready(now_ms, &[]);
-        place::lease_size(
+        placement::lease_size(
             self.sets[entry.set].timing.mean(),
             (plain + suspects).saturating_add(free),
             in_range,
@@ -379,7 +378,7 @@ fn give_back(range: &Range, changes: &mut Changes) {
     let mut minted = Vec::new();
     let pieces = match range.state {
         RangeState::Leased(_) => {
-            crate::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
+            super::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
                 let id = picofarm_proto::ids::RangeId::from_uuid(uuid::Uuid::now_v7());
                 minted.push(id);
                 id

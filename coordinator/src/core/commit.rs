@@ -8,8 +8,14 @@ use picofarm_proto::{
     model::{EventKind, Finished},
 };
 
-use super::{About, Core, Say, SessionId, StageEntry, stores::store_of};
-use crate::transition::RangeEvent;
+use super::{
+    history::About,
+    message::{Say, SessionId},
+    stages::StageEntry,
+    state::Core,
+    stores::store_of,
+    transition::RangeEvent,
+};
 
 /// The recorded result of a reported task, which is looked up before [`Core::finished`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

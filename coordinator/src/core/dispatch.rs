@@ -9,10 +9,9 @@ use picofarm_proto::{
     model::{EventKind, Lease},
 };
 
-use super::{About, Core, Say, stores::store_of};
-use crate::{
-    explain::{Barred, span},
-    transition::RangeEvent,
+use super::{
+    NotEligible, history::About, message::Say, state::Core, stores::store_of,
+    transition::RangeEvent, words::span,
 };
 
 /// The other workers that may run a stage.
@@ -93,7 +92,7 @@ impl Core {
         id: StageRef,
         worker: WorkerId,
         now_ms: i64,
-    ) -> Result<(), Barred> {
+    ) -> Result<(), NotEligible> {
         if let Some(why) = self.doubts.blocked(worker) {
             return Err(why.into());
         }
@@ -103,25 +102,25 @@ impl Core {
         self.away.may_use(store, worker, now_ms)?;
         let most = entry.job.spec.limits.max_workers;
         if most > 0 && !self.load.may_join(id.job, worker, most) {
-            return Err(Barred::from(format!(
+            return Err(NotEligible::from(format!(
                 "limits.max_workers = {most}, and so many work on the job"
             )));
         }
         if let Err((needs, left)) = self.has_time(id, worker, now_ms) {
-            return Err(Barred::from(format!(
+            return Err(NotEligible::from(format!(
                 "a task is taken to need {}, and the worker ends in {}",
                 span(needs),
                 span(left)
             )));
         }
         if let Some(ms) = self.sick.rests(worker, now_ms) {
-            return Err(Barred::from(format!(
+            return Err(NotEligible::from(format!(
                 "it failed, or gave back, one lease after another; it gets no tasks for another {}",
                 span(ms)
             )));
         }
         if self.sick.is_try(worker) && !self.workers[&worker].leases.is_empty() {
-            return Err(Barred::from(
+            return Err(NotEligible::from(
                 "it failed, or gave back, one lease after another; one task is trying it now",
             ));
         }
@@ -130,7 +129,7 @@ impl Core {
                 "tasks of the stage failed on it one after another; one task is trying it now"
                     .into(),
             ),
-            Some(ms) => Err(Barred::from(format!(
+            Some(ms) => Err(NotEligible::from(format!(
                 "tasks of the stage failed on it one after another; it is passed over for another {}",
                 span(ms)
             ))),

@@ -12,7 +12,12 @@ use picofarm_proto::{
     model::{EventKind, FailureKind, Finished, JobSpec, kinds::Manifest},
 };
 
-use super::{About, Core, Say, SessionId, stores::store_of};
+use super::{
+    history::About,
+    message::{Say, SessionId},
+    state::Core,
+    stores::store_of,
+};
 
 /// Most results for which the reporting worker is remembered.
 const REPORTERS: usize = 100_000;

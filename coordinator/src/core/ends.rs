@@ -4,7 +4,7 @@
 use picofarm_catalog::{Mark, RangeState, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};
 
-use super::{Core, SessionId};
+use super::{message::SessionId, state::Core};
 
 /// A task is expected to need this multiple of the mean of its stage and of its longest interrupted
 /// attempt.

@@ -5,10 +5,13 @@ use picofarm_proto::{
     model::ConnectedWorker,
 };
 
-use super::{Core, StageEntry, WorkerEntry};
-use crate::{
-    explain::{Candidate, Runs, span},
-    place,
+use super::{
+    candidate::{Candidate, RunningOn},
+    placement,
+    stages::StageEntry,
+    state::Core,
+    words::span,
+    workers::WorkerEntry,
 };
 
 /// A snapshot of the instance's knowledge.
@@ -41,7 +44,7 @@ pub(crate) struct JobLook {
     /// Workers connected to other instances.
     pub elsewhere: u32,
     /// Progress of the requested task, if a worker of this instance has reported on it.
-    pub running: Option<Runs>,
+    pub running: Option<RunningOn>,
 }
 
 impl Core {
@@ -162,7 +165,7 @@ impl Core {
                     true => Err("it is asked to end".into()),
                     false => self.may_run(here, *id, now_ms),
                 },
-                lacks_memory: place::lacks_memory(
+                lacks_memory: placement::lacks_memory(
                     entry.spec(here),
                     &entry.known,
                     &worker.abilities,
@@ -199,10 +202,10 @@ impl Core {
         }
     }
 
-    fn runs(&self, entry: &StageEntry, task: u64) -> Option<Runs> {
+    fn runs(&self, entry: &StageEntry, task: u64) -> Option<RunningOn> {
         entry.stage.leased().find_map(|(range, lease)| {
             let progress = self.progress.get(&range.id)?.get(&task)?;
-            Some(Runs {
+            Some(RunningOn {
                 worker: self.name_of(lease.worker),
                 fraction: progress.fraction,
                 text: progress.at.text.clone(),

@@ -6,9 +6,14 @@ use picofarm_proto::{
     model::{EventKind, FailureKind},
 };
 
-use super::{About, Core, Say, SessionId, dispatch::Others, sick::Trouble, stores::store_of};
-use crate::{
+use super::{
     budget::{self, Attempt, Verdict},
+    dispatch::Others,
+    history::About,
+    message::{Say, SessionId},
+    sick::Trouble,
+    state::Core,
+    stores::store_of,
     transition::RangeEvent,
 };
 

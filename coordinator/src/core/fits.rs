@@ -2,8 +2,7 @@
 
 use picofarm_proto::model::JobSpec;
 
-use super::Core;
-use crate::place;
+use super::{placement, state::Core};
 
 /// Distinct reasons stored for each stage.
 const REASONS: usize = 3;
@@ -37,7 +36,7 @@ impl Core {
             let known = spec.known(position);
             let mut fit = Fit::default();
             for worker in self.workers.values().filter(|worker| !worker.drains) {
-                match place::may_run(stage, &known, &worker.abilities) {
+                match placement::may_run(stage, &known, &worker.abilities) {
                     Ok(()) => {
                         fit.able += 1;
                         fit.cores = fit.cores.saturating_add(worker.abilities.cores);

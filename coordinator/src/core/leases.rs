@@ -6,8 +6,15 @@ use picofarm_proto::{
     model::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
-use super::{About, Core, Progress, Say, SessionId, dispatch::Others, sick::Trouble};
-use crate::transition::RangeEvent;
+use super::{
+    dispatch::Others,
+    history::About,
+    message::{Say, SessionId},
+    progress::Progress,
+    sick::Trouble,
+    state::Core,
+    transition::RangeEvent,
+};
 
 /// Most lost workers that are remembered.
 const CHARGED: usize = 4096;

@@ -2,7 +2,7 @@
 
 use picofarm_proto::model::{EventKind, TaskLog};
 
-use super::{About, Core, Progress, SessionId};
+use super::{history::About, message::SessionId, progress::Progress, state::Core};
 
 impl Core {
     /// Records log lines of a task that this session's worker runs, within the task's allowance.

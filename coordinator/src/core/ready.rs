@@ -5,7 +5,7 @@
 use picofarm_catalog::{Free, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};
 
-use super::{Core, StageEntry};
+use super::{stages::StageEntry, state::Core};
 
 /// Tasks of a stage that can be granted now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -8,8 +8,11 @@ use picofarm_proto::{
     model::{EventKind, bounds},
 };
 
-use super::{Core, Say, SessionId};
-use crate::budget::fresh;
+use super::{
+    budget::fresh,
+    message::{Say, SessionId},
+    state::Core,
+};
 
 impl Core {
     /// Removes rejected rows from the changes that [`Core::take`] returned. If `again`, their

@@ -3,7 +3,11 @@
 use picofarm_catalog::{Range, Worker};
 use picofarm_proto::{ids::LeaseRef, model::WorkerHello};
 
-use super::{Core, Say, SessionId, WorkerEntry};
+use super::{
+    message::{Say, SessionId},
+    state::Core,
+    workers::WorkerEntry,
+};
 
 impl Core {
     /// Connects a worker. Leases that it still has stay live. Leases that it does not know become

@@ -10,7 +10,7 @@
 use picofarm_catalog::{Mark, Run};
 use picofarm_proto::ids::StageRef;
 
-use super::Core;
+use super::state::Core;
 
 impl Core {
     /// Returns the tasks of a stage that workers run for other stages with the same outputs, as

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use picofarm_proto::ids::{StageRef, WorkerId};
 
-use crate::budget::Backoff;
+use super::budget::Backoff;
 
 /// Consecutive returned leases without penalty, because a worker that ends returns all its leases.
 const FREE: u32 = 3;

@@ -10,7 +10,7 @@ use picofarm_proto::{
     model::TaskSpec,
 };
 
-use crate::{budget::Backoff, explain::Barred};
+use super::{NotEligible, budget::Backoff};
 
 /// Longest delay between tries of a store, milliseconds.
 const MOST_MS: u32 = 300_000;
@@ -134,7 +134,12 @@ impl Stores {
     ///
     /// # Errors
     /// Why not, and when it is tried again.
-    pub(super) fn may_use(&self, store: &str, worker: WorkerId, now_ms: i64) -> Result<(), Barred> {
+    pub(super) fn may_use(
+        &self,
+        store: &str,
+        worker: WorkerId,
+        now_ms: i64,
+    ) -> Result<(), NotEligible> {
         let Some(row) = self.rows.get(store) else {
             return Ok(());
         };
@@ -152,7 +157,7 @@ impl Stores {
             return Ok(());
         };
         let why = own.map_or(&row.why, |own| &own.why);
-        Err(Barred::Store(format!(
+        Err(NotEligible::Store(format!(
             "waits for store {store}: {why}; {when}"
         )))
     }

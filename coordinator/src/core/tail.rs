@@ -12,8 +12,12 @@ use picofarm_proto::{
     model::{EventKind, Lease},
 };
 
-use super::{About, Core, Say, SessionId};
-use crate::transition::RangeEvent;
+use super::{
+    history::About,
+    message::{Say, SessionId},
+    state::Core,
+    transition::RangeEvent,
+};
 
 /// Interval at which idle workers are considered, milliseconds.
 const LOOK_MS: i64 = 200;

@@ -6,8 +6,8 @@ use picofarm_catalog::{Gone, Recorded, ResultSet, Run};
 use picofarm_proto::model::StageSpec;
 use sha2::{Digest, Sha256};
 
-use super::files::Elsewhere;
-use crate::{plan::Outputs, stored::Found};
+use super::{conflicts::Elsewhere, stored::Found};
+use crate::core::plan::Outputs;
 
 /// Up to this many outputs of a stage are all checked. Beyond it, those found before are sampled.
 pub(crate) const ALL: usize = 1_000;

@@ -6,10 +6,7 @@ use picofarm_catalog::{Job, ResultSet, Timing};
 use picofarm_proto::model::{Estimate, JobPlan, JobSpec, StageSpec, TaskSpec};
 use picofarm_settings::Budget;
 
-use crate::{
-    core::{Fit, Fits},
-    plan::changes,
-};
+use crate::core::{Fit, Fits, plan::changes};
 
 /// Earlier stages with speeds to be looked up, for each stage of a plan.
 pub(super) const SIMILAR: usize = 3;

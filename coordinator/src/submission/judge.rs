@@ -6,11 +6,10 @@ use picofarm_proto::{
     model::{Finished, StageSpec},
 };
 
-use super::{Submissions, look};
+use super::{look, service::Submissions, stored::Found};
 use crate::{
     actor::{Aside, Command, Dispute, Ruling},
     core::{Reported, SessionId},
-    stored::Found,
 };
 
 impl Aside for Submissions {

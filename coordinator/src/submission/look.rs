@@ -14,7 +14,7 @@ use tokio::{
     time::{Instant, timeout_at},
 };
 
-use crate::stored::{Found, Stored};
+use super::stored::{Found, Stored};
 
 /// Longest time that a plan or submission waits for stores.
 const PATIENCE: Duration = Duration::from_secs(20);

@@ -7,38 +7,20 @@
 //! that it sees another disk, and commits the results as unverified.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap},
-    sync::{Arc, Mutex},
+    collections::{BTreeMap, HashMap},
+    sync::Arc,
     time::Duration,
 };
 
 use picofarm_catalog::Recorded;
-use picofarm_proto::{
-    ids::{StageRef, WorkerId},
-    model::JobSpec,
-};
+use picofarm_proto::{ids::StageRef, model::JobSpec};
 
-use super::{Submissions, look};
-use crate::{actor::Verdict, core::Reported, stored::Found};
+use super::{look, service::Submissions, stored::Found};
+use crate::{actor::Verdict, core::Reported};
 
 /// Delay before a missing result is looked up again, because a network file system may show it
 /// late.
 const AGAIN: Duration = Duration::from_millis(500);
-/// Most stores remembered.
-const STORES: usize = 1_024;
-
-/// Evidence of whether this coordinator sees the stores of its workers.
-pub(super) type Evidence = Arc<Mutex<HashMap<String, Seen>>>;
-
-/// This coordinator's evidence about a store.
-#[derive(Debug, Default)]
-pub(super) struct Seen {
-    /// A result that was found in the store.
-    witness: Option<(Arc<JobSpec>, StageRef, Recorded)>,
-    /// Workers with missing results, before the first result was found.
-    doubted: BTreeSet<WorkerId>,
-}
-
 impl Submissions {
     /// Checks reported results against the store. Also returns whether the store turned out not to
     /// be the workers' one.
@@ -69,7 +51,7 @@ impl Submissions {
             for (reported, found) in reports.into_iter().zip(found) {
                 let verdict = match found {
                     Some(Found::Equal) => {
-                        self.seen(store, |seen| {
+                        self.evidence.with(store, |seen| {
                             seen.witness = Some(witness(&reported));
                             seen.doubted.clear();
                         });
@@ -119,7 +101,7 @@ impl Submissions {
 
     /// Returns the verdict on a result that the store does not contain as reported.
     async fn missing(&self, store: &str, reported: &Reported, what: &str) -> Verdict {
-        let witness = self.seen(store, |seen| seen.witness.clone());
+        let witness = self.evidence.with(store, |seen| seen.witness.clone());
         let sure = match witness {
             Some((job, stage, result)) => {
                 let found = match job.stages.get(stage.stage as usize) {
@@ -133,7 +115,7 @@ impl Submissions {
                 };
                 found.get(&result.task) == Some(&Found::Equal)
             }
-            None => self.seen(store, |seen| {
+            None => self.evidence.with(store, |seen| {
                 seen.doubted.insert(reported.worker);
                 seen.doubted.len() < 2
             }),
@@ -151,26 +133,6 @@ impl Submissions {
              write to another disk (is the store mounted there?), or it does not tell the truth",
             reported.report.index, reported.report.manifest_sha256
         ))
-    }
-
-    /// Returns why the store's content is no evidence: none of the workers' results were found.
-    pub(super) fn sees_another_disk(&self, store: &str) -> Option<String> {
-        let blind = self.seen(store, |seen| {
-            seen.witness.is_none() && seen.doubted.len() >= 2
-        });
-        blind.then(|| {
-            "the coordinator finds none of what workers report there, and may see another disk (mount the store there, or \
-             start it with --check-stores none)"
-                .to_owned()
-        })
-    }
-
-    fn seen<T>(&self, store: &str, with: impl FnOnce(&mut Seen) -> T) -> T {
-        let mut evidence = self.evidence.lock().expect("no panic while locked");
-        if evidence.len() > STORES {
-            evidence.clear();
-        }
-        with(evidence.entry(store.to_owned()).or_default())
     }
 }
 

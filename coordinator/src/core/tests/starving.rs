@@ -37,7 +37,7 @@ impl World {
     async fn check_nobody_starves(&self) {
         let instance = &self.instances[0];
         let core = &instance.core;
-        let asks = |(_, w): &(_, &super::super::WorkerEntry)| w.hungry();
+        let asks = |(_, w): &(_, &super::super::workers::WorkerEntry)| w.hungry();
         let hungry: Vec<_> = core.workers.iter().filter(asks).collect();
         for job in self.jobs.iter().filter(|_| !hungry.is_empty()) {
             let record = instance.catalog.job(*job).await.unwrap().unwrap();

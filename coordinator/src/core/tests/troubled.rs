@@ -9,7 +9,7 @@ use super::{
 
 impl World {
     /// Returns the entry of this worker in the output of `explain`.
-    fn candidate(&self, w: usize) -> crate::explain::Candidate {
+    fn candidate(&self, w: usize) -> crate::core::Candidate {
         let core = &self.instances[0].core;
         let look = core.look_at(self.jobs[0], None, None, self.now);
         let name = format!("w{w}");

@@ -21,8 +21,10 @@ use picofarm_proto::{
 use proptest::prelude::*;
 use uuid::Uuid;
 
-use super::super::{Core, OutputHint, Say, Settings, Timings, prepare, stands_for};
-use crate::{budget::Backoff, submission::Draft};
+use crate::{
+    core::{Backoff, Core, OutputHint, Say, Settings, Timings},
+    submission::{Draft, prepare, stands_for},
+};
 
 pub(super) const TASKS: u64 = 12;
 /// The same value as the actor's.
