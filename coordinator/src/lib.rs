@@ -15,7 +15,7 @@
 //! | `edge` | connections, gRPC services, HTTP pages, start and stop |
 //!
 //! `auth` is a folder of its own and not a part of `edge`, because a submission depends on the
-//! rights of its caller.
+//! rights of its caller. `tests/it/layers.rs` checks the order.
 
 mod actor;
 pub mod auth;

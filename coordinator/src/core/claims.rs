@@ -9,7 +9,10 @@ use picofarm_proto::{
     model::EventKind,
 };
 
-use super::{history::About, placement, ready::Ready, state::Core, transition::RangeEvent};
+use super::{
+    history::About, placement, ready::Ready, stage_entry::StageEntry, state::Core,
+    transition::RangeEvent,
+};
 
 /// Leases claimed for each lease wanted now, so that short tasks do not cost a transaction
 /// each.
@@ -23,17 +26,12 @@ impl Core {
     /// for more. Jobs of lower priority get the remaining capacity. Tasks that cannot run now, or
     /// on none of the asking workers, keep no worker from other jobs.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
-        let mut hungry = Hungry::new(
-            self.workers
-                .iter()
-                .filter(|(_, worker)| worker.hungry())
-                .map(|(id, worker)| Asks {
-                    id: *id,
-                    credits: worker.credits,
-                    empty_handed: worker.leases.is_empty(),
-                    ends: worker.ends_ms.is_some(),
-                }),
-        );
+        let mut hungry = Hungry::new(self.workers.hungry().map(|(id, worker)| Asks {
+            id: *id,
+            credits: worker.credits,
+            empty_handed: worker.leases.is_empty(),
+            ends: worker.ends_ms.is_some(),
+        }));
         // Usually all workers are busy, so that nothing needs to be searched.
         if hungry.credits == 0 {
             return Vec::new();
@@ -67,7 +65,7 @@ impl Core {
     /// no worker may run it or no task is left.
     fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
         let id = demand.stage;
-        let job = &self.stages[&id].job;
+        let job = self.stages[&id].job();
         let most = job.spec.limits.max_workers;
         while hungry.credits > 0
             && let Some(worker) = hungry.workers.get_mut(demand.next)
@@ -115,7 +113,7 @@ impl Core {
 
     fn supply(&self, id: StageRef, now_ms: i64) -> Supply {
         let entry = &self.stages[&id];
-        let size = match entry.spec(id).task.resumes() {
+        let size = match entry.spec().task.resumes() {
             true => 1,
             false => self.lease_size(entry, self.able(id, now_ms), u64::MAX, now_ms),
         };
@@ -140,7 +138,7 @@ impl Core {
             stage: demand.stage,
             tasks: AHEAD * needed,
             now_ms,
-            force: entry.spec(demand.stage).force,
+            force: entry.spec().force,
             suspects: demand.suspects,
         })
     }
@@ -148,7 +146,7 @@ impl Core {
     /// Returns the number of tasks in the next lease of a stage, at most `in_range`.
     pub(super) fn lease_size(
         &self,
-        entry: &super::stages::StageEntry,
+        entry: &StageEntry,
         able: u64,
         in_range: u64,
         now_ms: i64,
@@ -159,12 +157,12 @@ impl Core {
             true => u64::MAX / 2,
             false => claimable.known(),
         };
-        let (plain, suspects) = entry.stage.ready(now_ms, &[]);
+        let (plain, suspects) = entry.held.ready(now_ms, &[]);
         placement::lease_size(
-            self.sets[entry.set].timing.mean(),
+            self.stages.mean_seconds(entry),
             (plain + suspects).saturating_add(free),
             in_range,
-            able * u64::from(self.instances),
+            able * u64::from(self.peers.instances()),
         )
     }
 
@@ -173,29 +171,23 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&stage) else {
             return;
         };
-        entry.free = Some(claim.left);
+        entry.set_free(claim.left);
         if claim.owned.ranges.is_empty() {
-            entry.ask_at_ms = now_ms + ASK_AGAIN_MS;
+            entry.ask_not_before(now_ms + ASK_AGAIN_MS);
         }
         self.receive(claim.owned, now_ms);
         for run in claim.existing {
             let entry = self.stages.get_mut(&stage).expect("looked up above");
             // Every run is contained in one claimed range, because runs end where claimed ranges
             // end.
-            let Some(range) = entry.stage.pending_at(run.lo).cloned() else {
+            let Some(range) = entry.held.pending_at(run.lo).cloned() else {
                 continue;
             };
-            entry
-                .stage
-                .apply(
-                    &range,
-                    &RangeEvent::Settle { run },
-                    &mut Self::range_id(&mut self.make_id),
-                    &mut self.changes,
-                )
+            self.outcome
+                .apply(&mut entry.held, &range, &RangeEvent::Settle { run })
                 .expect("pending tasks can be settled");
             let about = About::message("the outputs exist already").tasks(run.lo, run.hi);
-            self.event(now_ms, stage, EventKind::Reused, about);
+            self.outcome.event(now_ms, stage, EventKind::Reused, about);
             self.perhaps_over(stage, now_ms);
         }
     }
@@ -205,7 +197,7 @@ impl Core {
     pub(crate) fn receive(&mut self, owned: Owned, now_ms: i64) {
         for exception in owned.exceptions {
             if let Some(entry) = self.stages.get_mut(&exception.stage) {
-                entry.note(exception);
+                entry.note_exception(exception);
             }
         }
         for range in owned.ranges {
@@ -214,15 +206,15 @@ impl Core {
             match self.stages.get_mut(&range.stage) {
                 Some(entry) => {
                     if let RangeState::Leased(lease) = &range.state {
-                        self.leases.insert(id, range.stage);
-                        self.load.begun(id, &entry.job, lease.worker);
+                        self.leases.begin(id, range.stage);
+                        self.load.begun(id, entry.job(), lease.worker);
                     }
-                    entry.stage.receive(range, &mut self.changes);
+                    entry.held.receive(range, self.outcome.changes());
                     self.renew(id, now_ms);
                 }
                 // The job is no longer active, so the range goes back as it would have when the job
                 // ended.
-                None => give_back(&range, &mut self.changes),
+                None => give_back(&range, self.outcome.changes()),
             }
         }
     }
@@ -234,16 +226,16 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&range.stage) else {
             return;
         };
-        let mut ended = entry.stage.outdated_by(range);
+        let mut ended = entry.held.outdated_by(range);
         // The same range, now without its worker or with another one.
         let pending = matches!(range.state, RangeState::Pending { .. });
-        let same = entry.stage.leased_range(range.id);
+        let same = entry.held.leased_range(range.id);
         let same = same.filter(|old| pending || old.epoch != range.epoch);
         ended.extend(same.map(|old| old.id));
         for id in ended {
             tracing::info!(range = %id, "this lease ended at another coordinator");
             if let Some(entry) = self.stages.get_mut(&range.stage) {
-                entry.stage.forget(id);
+                entry.held.forget(id);
             }
             self.lease_over(id);
         }
@@ -252,19 +244,19 @@ impl Core {
     /// Gives back the pending tasks that no worker took, so that other instances may claim them.
     pub(crate) fn give_back(&mut self) {
         for entry in self.stages.values_mut() {
-            let before = self.changes.free.len();
-            entry.stage.give_pending(&mut self.changes);
-            if self.changes.free.len() > before {
-                entry.free = None;
+            let before = self.outcome.changes().free.len();
+            entry.held.give_pending(self.outcome.changes());
+            if self.outcome.changes().free.len() > before {
+                entry.ask_again();
             }
         }
     }
 
     /// Applies the catalog's news. Returns the active jobs that this instance does not know yet.
     pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
-        self.sick.tidy(now_ms);
-        self.instances = news.instances.max(1);
-        self.elsewhere = news.workers.saturating_sub(self.connected());
+        self.failing_workers.tidy(now_ms);
+        let workers = news.workers.saturating_sub(self.workers.count());
+        self.peers.hear(news.instances, workers, news.shared);
         let over: Vec<JobId> = self
             .stages
             .keys()
@@ -275,27 +267,24 @@ impl Core {
             self.drop_job(job, "the job was stopped");
         }
         let mut held = BTreeSet::new();
-        for (id, entry) in &mut self.stages {
-            entry.free = Some(news.free.get(id).copied().unwrap_or_default());
+        for (id, entry) in self.stages.iter_mut() {
+            entry.set_free(news.free.get(id).copied().unwrap_or_default());
             let paused = news.active.get(&id.job).copied().unwrap_or(false);
-            if paused && !entry.job.paused {
+            if entry.set_paused(paused) {
                 held.insert(id.job);
             }
-            entry.job.paused = paused;
         }
         self.load.hear_elsewhere(news.busy);
-        self.shared_elsewhere = news.shared;
         if let Some(leased) = &news.leased {
             let lost: Vec<_> = self
                 .leases
                 .iter()
                 .filter(|(range, _)| !leased.contains(range))
-                .map(|(range, stage)| (*range, *stage))
                 .collect();
             for (range, stage) in lost {
                 tracing::info!(%range, "a worker has taken this lease along to another coordinator");
                 if let Some(entry) = self.stages.get_mut(&stage) {
-                    entry.stage.forget(range);
+                    entry.held.forget(range);
                 }
                 self.lease_over(range);
                 // Our last task may have been reported while this one still seemed to be leased,

@@ -7,8 +7,7 @@ use picofarm_proto::{
 
 use super::{
     candidate::{Candidate, RunningOn},
-    placement,
-    stages::StageEntry,
+    stage_entry::StageEntry,
     state::Core,
     words::span,
     workers::WorkerEntry,
@@ -79,8 +78,8 @@ impl Core {
             jobs,
             ready: self.ready_now(now_ms),
             workers: workers.collect(),
-            elsewhere: self.elsewhere,
-            instances: self.instances,
+            elsewhere: self.peers.workers(),
+            instances: self.peers.instances(),
         }
     }
 
@@ -103,7 +102,7 @@ impl Core {
         if worker.drains {
             return "asked to end".into();
         }
-        if let Some(ms) = self.sick.rests(id, now_ms) {
+        if let Some(ms) = self.failing_workers.rests(id, now_ms) {
             return format!(
                 "failed, or gave back, one lease after another: no tasks for another {}",
                 span(ms)
@@ -116,8 +115,8 @@ impl Core {
 
     fn tasks_of(&self, worker: &WorkerEntry) -> u64 {
         let ranges = worker.leases.iter().filter_map(|id| {
-            let stage = self.stages.get(self.leases.get(id)?)?;
-            stage.stage.leased_range(*id)
+            let stage = self.leases.stage_of(*id)?;
+            self.stages.get(&stage)?.held.leased_range(*id)
         });
         ranges
             .map(|range| match &range.state {
@@ -152,7 +151,7 @@ impl Core {
         };
         let Some(entry) = self.stages.get(&here) else {
             return JobLook {
-                elsewhere: self.elsewhere,
+                elsewhere: self.peers.workers(),
                 ..JobLook::default()
             };
         };
@@ -165,11 +164,7 @@ impl Core {
                     true => Err("it is asked to end".into()),
                     false => self.may_run(here, *id, now_ms),
                 },
-                lacks_memory: placement::lacks_memory(
-                    entry.spec(here),
-                    &entry.known,
-                    &worker.abilities,
-                ),
+                lacks_memory: entry.lacks_memory(&worker.abilities),
                 idle: worker.credits > 0,
                 gets: !self.ready_for(here, *id, now_ms).is_none(),
                 lacks_time: self.lacks_time(here, *id, now_ms),
@@ -197,16 +192,16 @@ impl Core {
             shared: self.waits_for_others(here),
             suspects: self.ready(here, now_ms).suspects,
             ahead,
-            elsewhere: self.elsewhere,
+            elsewhere: self.peers.workers(),
             running: task.and_then(|task| self.runs(entry, task)),
         }
     }
 
     fn runs(&self, entry: &StageEntry, task: u64) -> Option<RunningOn> {
-        entry.stage.leased().find_map(|(range, lease)| {
-            let progress = self.progress.get(&range.id)?.get(&task)?;
+        entry.held.leased().find_map(|(range, lease)| {
+            let progress = self.leases.progress(range.id, task)?;
             Some(RunningOn {
-                worker: self.name_of(lease.worker),
+                worker: self.workers.name(lease.worker),
                 fraction: progress.fraction,
                 text: progress.at.text.clone(),
                 since_ms: progress.since_ms,
@@ -216,6 +211,6 @@ impl Core {
 
     /// Returns the number of history lines that wait to be written.
     pub(crate) fn noted(&self) -> usize {
-        self.changes.events.len()
+        self.outcome.events()
     }
 }

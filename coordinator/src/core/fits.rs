@@ -51,8 +51,8 @@ impl Core {
         });
         Fits {
             stages: stages.collect(),
-            here: self.connected(),
-            elsewhere: self.elsewhere,
+            here: self.workers.count(),
+            elsewhere: self.peers.workers(),
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 
 use picofarm_catalog::{Job, Range, ResultSet, StageRecord, Timing};
-use picofarm_proto::ids::{JobId, RangeId, StageRef, WorkerId};
+use picofarm_proto::ids::{JobId, RangeId, WorkerId};
 
 use super::{message::Say, state::Core, transition::RangeEvent};
 
@@ -29,10 +29,10 @@ impl Core {
             self.free_what_waits(job);
         }
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
-            entry.job.paused = paused;
-            entry.free = None;
+            entry.set_paused(paused);
+            entry.ask_again();
             if paused {
-                entry.stage.give_pending(&mut self.changes);
+                entry.held.give_pending(self.outcome.changes());
             }
         }
     }
@@ -41,7 +41,7 @@ impl Core {
     /// known. A worker runs one task at a time and works through a lease in order.
     fn free_what_waits(&mut self, job: JobId) {
         let stages = self.stages.iter().filter(|(id, _)| id.job == job);
-        let leases = stages.flat_map(|(_, entry)| entry.stage.leased());
+        let leases = stages.flat_map(|(_, entry)| entry.held.leased());
         let leases: Vec<(Range, WorkerId)> = leases
             .map(|(range, lease)| (range.clone(), lease.worker))
             .collect();
@@ -50,14 +50,11 @@ impl Core {
                 continue;
             };
             let session = entry.session;
-            let busy = |id: &RangeId| self.progress.get(id).is_some_and(|tasks| !tasks.is_empty());
+            let busy = |id: &RangeId| self.leases.is_running(*id);
             let elsewhere = entry.leases.iter().any(|id| *id != range.id && busy(id));
             if elsewhere && !busy(&range.id) {
-                let revoke = Say::Revoke {
-                    lease: range.lease(),
-                    reason: "the job is held".into(),
-                };
-                self.say.push((session, revoke));
+                self.outcome
+                    .revoke(session, range.lease(), "the job is held");
                 self.close(&range, false);
                 continue;
             }
@@ -67,7 +64,7 @@ impl Core {
             let at = last + 1;
             if at < range.hi && (at..range.hi).all(|task| range.has_to_do(task)) {
                 let lease = range.lease();
-                self.say.push((session, Say::Trim { lease, hi: at }));
+                self.outcome.send(session, Say::Trim { lease, hi: at });
                 self.mark(&range, &RangeEvent::Trim { at });
             }
         }
@@ -75,42 +72,30 @@ impl Core {
 
     /// Returns the jobs that have passed their deadline.
     pub(crate) fn overdue(&self, now_ms: i64) -> BTreeMap<JobId, String> {
-        let late = self.stages.iter().filter(|(_, entry)| {
-            let deadline = entry.deadline_ms;
-            deadline.is_some_and(|at| at <= now_ms)
-        });
-        late.map(|(id, entry)| (id.job, entry.job.spec.limits.deadline.clone()))
+        let late = self.stages.iter();
+        let late = late.filter(|(_, entry)| entry.is_overdue(now_ms));
+        late.map(|(id, entry)| (id.job, entry.job_spec().limits.deadline.clone()))
             .collect()
     }
 
     /// Removes a job after it has ended. Its leases are revoked, and its unfinished tasks go
     /// back to the catalog.
     pub(crate) fn drop_job(&mut self, job: JobId, reason: &str) {
-        let stages: Vec<StageRef> = self
-            .stages
-            .keys()
-            .copied()
-            .filter(|stage| stage.job == job)
-            .collect();
-        for id in stages {
+        for id in self.stages.ids_of(job) {
             let leases: Vec<_> = self.stages[&id]
-                .stage
+                .held
                 .leased()
                 .map(|(range, lease)| (range.clone(), lease.worker))
                 .collect();
             for (range, worker) in leases {
                 if let Some(entry) = self.workers.get(&worker) {
-                    let revoke = Say::Revoke {
-                        lease: range.lease(),
-                        reason: reason.to_owned(),
-                    };
-                    self.say.push((entry.session, revoke));
+                    self.outcome
+                        .revoke(entry.session, range.lease(), reason.to_owned());
                 }
                 self.close(&range, false);
             }
-            if let Some(mut entry) = self.stages.remove(&id) {
-                self.sets[entry.set].stages.remove(&id);
-                entry.stage.give_pending(&mut self.changes);
+            if let Some(mut entry) = self.stages.remove(id) {
+                entry.held.give_pending(self.outcome.changes());
             }
         }
     }
@@ -118,9 +103,8 @@ impl Core {
     /// Makes the given-up tasks of an active job pending again.
     pub(crate) fn retried(&mut self, job: JobId) {
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
-            entry.exceptions.clear();
-            entry.longest_ms = 0;
-            entry.free = None;
+            entry.forget_exceptions();
+            entry.ask_again();
         }
     }
 }

@@ -11,9 +11,9 @@ use uuid::Uuid;
 
 use super::{
     budget::{Attempt, Backoff, charge, fresh},
+    held_ranges::HeldRanges,
     placement::lease_size,
     plan::expand,
-    stage::Stage,
     transition::RangeEvent,
 };
 
@@ -33,12 +33,12 @@ fn stage_ref() -> StageRef {
 }
 
 /// Returns a stage with these pending tasks.
-fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> Stage {
+fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> HeldRanges {
     let existing: Vec<Run> = (0..total)
         .filter(|i| cut.get(*i as usize) == Some(&true))
         .map(|i| Run { lo: i, hi: i + 1 })
         .collect();
-    let mut stage = Stage::default();
+    let mut stage = HeldRanges::default();
     for range in expand(stage_ref(), total, &existing, ids) {
         if matches!(range.state, RangeState::Pending { .. }) {
             stage.receive(range, &mut Changes::default());

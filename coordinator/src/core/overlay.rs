@@ -94,17 +94,18 @@ impl Core {
         };
         let stages = self.stages.iter();
         for (id, entry) in stages.filter(|(id, _)| one.is_none_or(|job| id.job == job)) {
-            let mean = self.sets[entry.set].timing.mean();
+            let mean = self.stages.mean_seconds(entry);
             overlay.means.insert(*id, mean);
-            for (range, lease) in entry.stage.leased() {
-                let Some(tasks) = self.progress.get(&range.id) else {
+            for (range, lease) in entry.held.leased() {
+                if !self.leases.is_running(range.id) {
                     continue;
-                };
+                }
                 let running = overlay.running.entry(id.job).or_default();
-                running.extend(tasks.iter().map(|(index, progress)| RunningTask {
+                let tasks = self.leases.running(range.id);
+                running.extend(tasks.map(|(index, progress)| RunningTask {
                     stage: id.stage,
-                    index: *index,
-                    worker: self.name_of(lease.worker),
+                    index,
+                    worker: self.workers.name(lease.worker),
                     fraction: progress.fraction,
                     text: progress.at.text.clone(),
                     figures: progress.at.figures.clone(),
@@ -120,11 +121,11 @@ impl Core {
 
     /// Returns the number of workers connected to this instance.
     pub(crate) fn connected(&self) -> u32 {
-        u32::try_from(self.workers.len()).unwrap_or(u32::MAX)
+        self.workers.count()
     }
 
     /// Returns the number of workers connected to any instance.
     pub(crate) fn everywhere(&self) -> u32 {
-        self.connected() + self.elsewhere
+        self.workers.count() + self.peers.workers()
     }
 }

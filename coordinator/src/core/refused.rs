@@ -4,12 +4,11 @@
 
 use picofarm_catalog::{Changes, Culprit, Mark, NewEvent, Range, RangeState, Row, Run};
 use picofarm_proto::{
-    ids::{LeaseRef, RangeId, StageRef, WorkerId},
+    ids::{LeaseRef, StageRef, WorkerId},
     model::{EventKind, bounds},
 };
 
 use super::{
-    budget::fresh,
     message::{Say, SessionId},
     state::Core,
 };
@@ -41,9 +40,8 @@ impl Core {
                     if again {
                         changes.exceptions.remove(&(*stage, *task));
                     }
-                    let entry = self.stages.get_mut(stage);
-                    if let Some(known) = entry.and_then(|e| e.exceptions.get_mut(task)) {
-                        known.last_error = said;
+                    if let Some(entry) = self.stages.get_mut(stage) {
+                        entry.set_last_error(*task, said);
                     }
                 }
             }
@@ -70,11 +68,8 @@ impl Core {
         if again {
             changes.workers.remove(&id);
         }
-        self.names.insert(id, id.to_string());
+        self.workers.rename(id, &id.to_string());
         if let Some(worker) = changes.workers.get_mut(&id) {
-            worker.name = id.to_string();
-        }
-        if let Some(worker) = self.workers.get_mut(&id) {
             worker.name = id.to_string();
         }
     }
@@ -107,11 +102,7 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&stage) else {
             return;
         };
-        let exception = entry.exceptions.entry(task).or_insert(fresh(stage, task));
-        exception.failures += 1;
-        exception.dead = true;
-        exception.last_error.clone_from(&why);
-        let exception = exception.clone();
+        let exception = entry.give_up(task, &why);
         changes.exceptions.insert((stage, task), exception);
         let worker = unsay(&mut changes.events, stage, task);
         changes.events.push(NewEvent {
@@ -123,7 +114,7 @@ impl Core {
             worker,
             ..NewEvent::of(stage.job, now_ms, EventKind::Dead, why)
         });
-        if entry.stage.is_empty() {
+        if entry.held.is_empty() {
             changes.perhaps_over.insert(stage, now_ms);
         }
     }
@@ -144,7 +135,7 @@ impl Core {
         let range = all.find(|range| of_stage(range) && done(range))?.clone();
         if let RangeState::Leased(_) = range.state {
             let entry = self.stages.get_mut(&stage)?;
-            if let Some(left) = entry.stage.leave(range.id, task) {
+            if let Some(left) = entry.held.leave(range.id, task) {
                 changes.put(left);
             }
         } else {
@@ -173,7 +164,7 @@ impl Core {
 
     /// Writes a range under a new id.
     fn give_new(&mut self, changes: &mut Changes, mut range: Range) {
-        range.id = RangeId::from_uuid((self.make_id)());
+        range.id = self.outcome.new_range_id();
         changes.minted.insert(range.id);
         changes.give(range);
     }

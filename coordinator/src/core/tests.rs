@@ -92,8 +92,8 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
         let mut world = World::on_sqlite(folder.path()).await;
         world.connect(0, 0).await;
         let able = |world: &mut World, able: bool| {
-            let mut workers = world.instances[0].core.workers.values_mut();
-            let kinds = &mut workers.next().unwrap().abilities.kinds;
+            let mut workers = world.instances[0].core.workers.iter_mut();
+            let kinds = &mut workers.next().unwrap().1.abilities.kinds;
             match able {
                 true => kinds.insert("reprocess".into(), "r".into()),
                 false => kinds.remove("reprocess"),
@@ -259,7 +259,7 @@ fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
             world.act(&Op::Credit(1)).await;
         }
         world.check().await;
-        let held = world.instances[0].core.leases.len();
+        let held = world.instances[0].core.leases.iter().count();
         assert_eq!(
             held,
             world.workers[1].leases.len(),

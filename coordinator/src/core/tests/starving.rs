@@ -37,8 +37,7 @@ impl World {
     async fn check_nobody_starves(&self) {
         let instance = &self.instances[0];
         let core = &instance.core;
-        let asks = |(_, w): &(_, &super::super::workers::WorkerEntry)| w.hungry();
-        let hungry: Vec<_> = core.workers.iter().filter(asks).collect();
+        let hungry: Vec<_> = core.workers.hungry().collect();
         for job in self.jobs.iter().filter(|_| !hungry.is_empty()) {
             let record = instance.catalog.job(*job).await.unwrap().unwrap();
             for (ordinal, stage) in (0..).zip(&record.stages) {

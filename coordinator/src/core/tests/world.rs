@@ -598,10 +598,10 @@ impl World {
     /// know each other's leases, so the check needs a single one.
     pub(super) fn check_shared(&self) {
         if let [instance] = &*self.instances {
-            for set in &instance.core.sets {
+            for stages in instance.core.stages.sets() {
                 let mut seen = BTreeSet::new();
-                for stage in &set.stages {
-                    for (range, _) in instance.core.stages[stage].stage.leased() {
+                for stage in stages {
+                    for (range, _) in instance.core.stages[stage].held.leased() {
                         let mut to_do = (range.lo..range.hi).filter(|task| range.has_to_do(*task));
                         assert!(to_do.all(|task| seen.insert(task)), "under way twice");
                     }

@@ -11,7 +11,7 @@ use super::transition::{self, Illegal, RangeEvent};
 /// The held ranges. Pending ones never overlap. A leased range overlaps the ranges of tasks removed
 /// from it.
 #[derive(Debug, Default)]
-pub struct Stage {
+pub struct HeldRanges {
     /// Pending ranges, by first task.
     pending: BTreeMap<u64, Range>,
     leased: BTreeMap<RangeId, Range>,
@@ -22,7 +22,7 @@ pub struct Stage {
     leased_tasks: u64,
 }
 
-impl Stage {
+impl HeldRanges {
     /// Adds a range that the catalog assigns to this instance. A pending range merges with its
     /// neighbours.
     pub fn receive(&mut self, mut range: Range, changes: &mut Changes) {

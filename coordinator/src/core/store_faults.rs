@@ -1,4 +1,4 @@
-//! Stores that tasks wait for because they are unavailable, full, forbidden or not mounted. If one
+//! StoreFaults that tasks wait for because they are unavailable, full, forbidden or not mounted. If one
 //! worker fails at a store, that worker waits for increasing times while others continue. If
 //! several workers fail and none succeeds, the store waits: one task at a time tries it, at
 //! increasing intervals, however many tasks wait for it. Meanwhile workers do other work.
@@ -10,7 +10,7 @@ use picofarm_proto::{
     model::TaskSpec,
 };
 
-use super::{NotEligible, budget::Backoff};
+use super::{budget::Backoff, candidate::NotEligible};
 
 /// Longest delay between tries of a store, milliseconds.
 const MOST_MS: u32 = 300_000;
@@ -25,7 +25,7 @@ const DAMAGED: usize = 4096;
 
 /// The stores at which tasks failed last.
 #[derive(Debug, Default)]
-pub(super) struct Stores {
+pub(super) struct StoreFaults {
     /// State of each store, by location.
     rows: BTreeMap<String, Row>,
     /// How often each task found its inputs damaged.
@@ -83,7 +83,7 @@ fn patient(backoff: &Backoff) -> Backoff {
     }
 }
 
-impl Stores {
+impl StoreFaults {
     /// Records that a worker could not use a store.
     pub(super) fn failed(
         &mut self,
@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn one_task_at_a_time_tries_a_store_and_ever_more_rarely() {
-        let mut stores = Stores::default();
+        let mut stores = StoreFaults::default();
         let mut now = 0;
         let mut waits = Vec::new();
         for _ in 0..12 {
@@ -271,7 +271,7 @@ mod tests {
 
     #[test]
     fn one_worker_that_cannot_use_a_store_stops_no_other() {
-        let mut stores = Stores::default();
+        let mut stores = StoreFaults::default();
         let (mut now, mut waits) = (0, Vec::new());
         for _ in 0..12 {
             stores.failed(S, worker(1), "wrong keys", &backoff(), now);
@@ -311,7 +311,7 @@ mod tests {
 
     #[test]
     fn a_task_that_reads_what_is_damaged_waits_alone() {
-        let mut stores = Stores::default();
+        let mut stores = StoreFaults::default();
         let stage = StageRef {
             job: picofarm_proto::ids::JobId::from_uuid(Uuid::nil()),
             stage: 0,
@@ -327,7 +327,7 @@ mod tests {
 
     #[test]
     fn a_store_that_works_again_is_open_to_all_but_those_that_failed() {
-        let mut stores = Stores::default();
+        let mut stores = StoreFaults::default();
         stores.failed(S, worker(1), "no keys", &backoff(), 0);
         stores.failed(S, worker(4), "no keys", &backoff(), 0);
         assert!(stores.may_use(S, worker(3), 0).is_err());
@@ -343,7 +343,7 @@ mod tests {
 
     #[test]
     fn a_try_that_ends_without_a_word_leaves_the_store_to_the_next() {
-        let mut stores = Stores::default();
+        let mut stores = StoreFaults::default();
         stores.failed(S, worker(1), "away", &backoff(), 0);
         stores.failed(S, worker(2), "away", &backoff(), 0);
         stores.begun(S, worker(1), range(7));

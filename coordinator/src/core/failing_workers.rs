@@ -18,7 +18,7 @@ const FORGET_MS: i64 = 300_000;
 
 /// The workers without a success since their last failure.
 #[derive(Debug, Default)]
-pub(super) struct Sick(BTreeMap<WorkerId, Row>);
+pub(super) struct FailingWorkers(BTreeMap<WorkerId, Row>);
 
 /// A failure on a worker.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -40,7 +40,7 @@ struct Row {
     last_ms: i64,
 }
 
-impl Sick {
+impl FailingWorkers {
     /// Records a failure on a worker. `others`: whether other workers could take its work.
     pub(super) fn failed(
         &mut self,
@@ -120,47 +120,47 @@ mod tests {
 
     #[test]
     fn a_worker_that_gives_everything_back_gets_ever_less() {
-        let (mut sick, mut now, mut leases) = (Sick::default(), 0, 0);
+        let (mut failing, mut now, mut leases) = (FailingWorkers::default(), 0, 0);
         // The worker asks again every millisecond.
         while now < 60_000 {
-            if sick.rests(worker(1), now).is_none() {
+            if failing.rests(worker(1), now).is_none() {
                 leases += 1;
-                sick.failed(worker(1), Trouble::GaveBack, false, &BACKOFF, now);
+                failing.failed(worker(1), Trouble::GaveBack, false, &BACKOFF, now);
             }
             now += 1;
         }
         assert!((5..=10).contains(&leases), "{leases} leases in a minute");
-        assert!(sick.is_try(worker(1)) && sick.rests(worker(2), 0).is_none());
-        sick.succeeded(worker(1));
-        assert_eq!(sick.rests(worker(1), 4), None);
+        assert!(failing.is_try(worker(1)) && failing.rests(worker(2), 0).is_none());
+        failing.succeeded(worker(1));
+        assert_eq!(failing.rests(worker(1), 4), None);
     }
 
     #[test]
     fn failures_of_one_stage_are_not_the_workers_and_those_of_three_are() {
-        let mut sick = Sick::default();
+        let mut failing = FailingWorkers::default();
         for _ in 0..9 {
-            sick.failed(worker(1), stage(1), true, &BACKOFF, 0);
+            failing.failed(worker(1), stage(1), true, &BACKOFF, 0);
         }
-        sick.failed(worker(1), stage(2), true, &BACKOFF, 0);
-        assert_eq!(sick.rests(worker(1), 0), None);
+        failing.failed(worker(1), stage(2), true, &BACKOFF, 0);
+        assert_eq!(failing.rests(worker(1), 0), None);
         let store = Trouble::Store("s3://b/x".into());
-        sick.failed(worker(1), store, true, &BACKOFF, 0);
-        assert_eq!(sick.rests(worker(1), 0), Some(1_000));
+        failing.failed(worker(1), store, true, &BACKOFF, 0);
+        assert_eq!(failing.rests(worker(1), 0), Some(1_000));
         for n in 1..=9 {
-            sick.failed(worker(2), stage(n), false, &BACKOFF, 0);
+            failing.failed(worker(2), stage(n), false, &BACKOFF, 0);
         }
-        assert_eq!(sick.rests(worker(2), 0), None, "it is the only one");
+        assert_eq!(failing.rests(worker(2), 0), None, "it is the only one");
     }
 
     #[test]
     fn trouble_long_ago_is_forgotten() {
-        let mut sick = Sick::default();
+        let mut failing = FailingWorkers::default();
         for hour in 0..9 {
             let now = hour * 3_600_000;
-            sick.failed(worker(1), Trouble::GaveBack, true, &BACKOFF, now);
-            assert_eq!(sick.rests(worker(1), now), None);
+            failing.failed(worker(1), Trouble::GaveBack, true, &BACKOFF, now);
+            assert_eq!(failing.rests(worker(1), now), None);
         }
-        sick.tidy(9 * 3_600_000);
-        assert!(sick.0.is_empty());
+        failing.tidy(9 * 3_600_000);
+        assert!(failing.0.is_empty());
     }
 }

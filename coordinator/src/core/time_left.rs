@@ -19,9 +19,7 @@ fn with_margin(ms: f64) -> i64 {
 impl Core {
     /// Records the milliseconds until a worker must end.
     pub(crate) fn ends(&mut self, session: SessionId, ends_in_ms: Option<u64>, now_ms: i64) {
-        if let Some(worker) = self.sessions.get(&session)
-            && let Some(entry) = self.workers.get_mut(worker)
-        {
+        if let Some(entry) = self.workers.of_session_mut(session) {
             entry.ends_ms = at(ends_in_ms, now_ms);
         }
     }
@@ -32,12 +30,12 @@ impl Core {
         let entry = self.workers.get(&worker)?;
         let left = entry.ends_ms? - now_ms;
         let leases = entry.leases.iter().filter_map(|id| {
-            let entry = self.stages.get(self.leases.get(id)?)?;
-            let RangeState::Leased(lease) = &entry.stage.leased_range(*id)?.state else {
+            let entry = self.stages.get(&self.leases.stage_of(*id)?)?;
+            let RangeState::Leased(lease) = &entry.held.leased_range(*id)?.state else {
                 return None;
             };
             let todo = lease.marks.iter().filter(|m| **m == Mark::Todo).count();
-            Some(todo as f64 * 1000.0 * self.sets[entry.set].timing.mean()?)
+            Some(todo as f64 * 1000.0 * self.stages.mean_seconds(entry)?)
         });
         let busy: f64 = leases.sum();
         Some(left.saturating_sub(busy as i64))
@@ -47,12 +45,12 @@ impl Core {
     /// unknown, or if a task continues from its saved progress.
     fn needs_ms(&self, id: StageRef) -> Option<i64> {
         let entry = &self.stages[&id];
-        if entry.spec(id).task.resumes() {
+        if entry.spec().task.resumes() {
             return None;
         }
-        match self.sets[entry.set].timing.mean() {
+        match self.stages.mean_seconds(entry) {
             Some(mean) => Some(with_margin(mean * 1000.0)),
-            None => (entry.longest_ms > 0).then(|| with_margin(entry.longest_ms as f64)),
+            None => (entry.longest_ms() > 0).then(|| with_margin(entry.longest_ms() as f64)),
         }
     }
 
@@ -80,10 +78,10 @@ impl Core {
         let Some(left) = self.time_left(worker, now_ms) else {
             return Vec::new();
         };
-        if with_margin(entry.longest_ms as f64) <= left || entry.spec(id).task.resumes() {
+        if with_margin(entry.longest_ms() as f64) <= left || entry.spec().task.resumes() {
             return Vec::new();
         }
-        let long = entry.exceptions.values();
+        let long = entry.exceptions();
         long.filter(|e| with_margin(e.longest_ms as f64) > left)
             .map(|e| Run {
                 lo: e.task,
@@ -117,14 +115,14 @@ impl Core {
     pub(super) fn lacks_time(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let entry = &self.stages[&id];
         let abilities = &self.workers.get(&worker)?.abilities;
-        entry.suits(id, abilities).ok()?;
+        entry.suits(abilities).ok()?;
         if let Err((needs, _)) = self.has_time(id, worker, now_ms) {
             return Some(needs);
         }
         let long = self.too_long(id, worker, now_ms);
-        let pending = |run: &&Run| entry.stage.pending_at(run.lo).is_some();
+        let pending = |run: &&Run| entry.held.pending_at(run.lo).is_some();
         let needs = long.iter().filter(pending).filter_map(|run| {
-            let exception = entry.exceptions.get(&run.lo)?;
+            let exception = entry.exception(run.lo)?;
             Some(with_margin(exception.longest_ms as f64))
         });
         let needs = needs.min()?;
