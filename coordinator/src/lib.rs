@@ -29,4 +29,4 @@ mod submission;
 pub use core::{Backoff, Clock, VERSION};
 pub use edge::{Connections, CoordinatorConfig, CoordinatorError, Running, serve};
 pub use memory::MemoryBounds;
-pub use submission::{Found, Stored};
+pub use submission::{ResultReader, ResultState};

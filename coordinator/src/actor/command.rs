@@ -9,8 +9,10 @@ use picofarm_proto::{
 };
 use tokio::sync::{mpsc, oneshot};
 
-use super::sessions::Waiting;
-use crate::core::{Fits, JobLook, Learnt, Look, Overlay, Reported, Say, SessionId};
+use super::sessions::HeartbeatQueue;
+use crate::core::{
+    EligibleWorkers, FarmSnapshot, JobSnapshot, NewJob, Overlay, Reported, SessionId, ToWorker,
+};
 
 /// Sends the answer to a request, or the reason for its refusal.
 pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
@@ -41,9 +43,9 @@ pub(crate) enum Command {
     Open {
         session: SessionId,
         hello: WorkerHello,
-        say: mpsc::Sender<Say>,
+        say: mpsc::Sender<ToWorker>,
         /// The session's heartbeats that wait in the queue.
-        waiting: Waiting,
+        waiting: HeartbeatQueue,
         /// Whether the worker runs on the coordinator's machine.
         here: bool,
     },
@@ -51,7 +53,7 @@ pub(crate) enum Command {
     /// Reports that were checked against their store.
     Verified {
         store: String,
-        reports: Vec<(Reported, Verdict)>,
+        reports: Vec<(Reported, StoreCheck)>,
         /// Whether the store that was checked is not the one that the workers write to.
         blind: bool,
     },
@@ -62,7 +64,7 @@ pub(crate) enum Command {
     Broken(CatalogError),
     /// A job was recorded. Contains its content if the job is active; otherwise only watchers are
     /// notified.
-    Learn(Option<Box<Learnt>>, Reply<()>),
+    Learn(Option<Box<NewJob>>, Reply<()>),
     /// Returns this instance's knowledge of one job, or of all jobs.
     Overlay(Option<JobId>, Reply<Overlay>),
     Cancel {
@@ -80,14 +82,14 @@ pub(crate) enum Command {
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
     /// Returns which connected workers could run a planned job.
-    Fits(Arc<JobSpec>, Reply<Fits>),
+    EligibleWorkers(Arc<JobSpec>, Reply<EligibleWorkers>),
     /// Returns this instance's knowledge without a query to the catalog.
-    Look(Reply<Look>),
-    LookAt {
+    FarmSnapshot(Reply<FarmSnapshot>),
+    JobSnapshot {
         job: JobId,
         stage: Option<u32>,
         task: Option<u64>,
-        reply: Reply<JobLook>,
+        reply: Reply<JobSnapshot>,
     },
 }
 
@@ -105,7 +107,7 @@ pub(crate) enum Ruling {
 
 /// The result of checking a report against its store.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum StoreCheck {
     /// The store contains the reported result.
     Held,
     /// This coordinator cannot check the store.
@@ -147,8 +149,8 @@ pub(super) fn refuse(command: Command, error: &str) {
         Command::Drain(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),
-        Command::Fits(_, reply) => no(reply, error),
-        Command::Look(reply) => no(reply, error),
-        Command::LookAt { reply, .. } => no(reply, error),
+        Command::EligibleWorkers(_, reply) => no(reply, error),
+        Command::FarmSnapshot(reply) => no(reply, error),
+        Command::JobSnapshot { reply, .. } => no(reply, error),
     }
 }

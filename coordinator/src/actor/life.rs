@@ -24,12 +24,12 @@ use tracing::Span;
 use uuid::Uuid;
 
 use super::{
-    aside::Aside,
     command::{Command, refuse},
     sessions::Sessions,
+    slow_work::SlowWork,
 };
 use crate::{
-    core::{Clock, Core, Learnt, Reported, Settings, Timings},
+    core::{Clock, Core, NewJob, Reported, Settings, Timings},
     memory::{Memory, kept_cost},
     observe::{
         health::Health,
@@ -63,7 +63,7 @@ pub(crate) struct Actor {
     pub health: Arc<Health>,
     pub stop: CancellationToken,
     pub memory: Arc<Memory>,
-    pub aside: Arc<dyn Aside>,
+    pub slow_work: Arc<dyn SlowWork>,
 }
 
 /// One life of a core, from a load of the catalog to the first failed write.
@@ -75,15 +75,15 @@ struct Life<'a> {
     /// Spans of the reports that are not durable yet.
     commits: Vec<Span>,
     /// Time at which stalls were last checked, by the clock that also counts suspended time.
-    looked_ms: i64,
+    stall_checked_ms: i64,
     /// Memory used by the specs of the jobs that have not ended.
     kept: HashMap<JobId, u64>,
     /// Jobs that are being read, with the time at which each read began.
-    learning: HashMap<JobId, Instant>,
+    reading: HashMap<JobId, Instant>,
     /// Number of reports that are being checked because they differ from the record.
     disputes: usize,
     /// Stores that are being checked, with the reports that wait for the next check.
-    looking: HashMap<String, Vec<Reported>>,
+    checking: HashMap<String, Vec<Reported>>,
 }
 
 impl Actor {
@@ -141,10 +141,10 @@ impl Actor {
             sessions: Sessions::default(),
             tally: Tally::default(),
             commits: Vec::new(),
-            looked_ms: self.clock.passed_ms(),
-            learning: HashMap::new(),
+            stall_checked_ms: self.clock.passed_ms(),
+            reading: HashMap::new(),
             disputes: 0,
-            looking: HashMap::new(),
+            checking: HashMap::new(),
         };
         life.note_kept();
         Ok(life)
@@ -231,7 +231,7 @@ impl Life<'_> {
     /// before any decision that depends on the clock.
     fn after_stall(&mut self) {
         let passed = self.actor.clock.passed_ms();
-        let stall = passed - std::mem::replace(&mut self.looked_ms, passed);
+        let stall = passed - std::mem::replace(&mut self.stall_checked_ms, passed);
         let tick = i64::try_from(self.actor.tick.as_millis()).unwrap_or(i64::MAX);
         if stall > tick.saturating_add(i64::from(self.actor.settings.lease_ms) / 2) {
             let seconds = stall as f64 / 1000.0;
@@ -271,28 +271,28 @@ impl Life<'_> {
         let news = self.actor.catalog.beat(connected, self.now()).await?;
         self.actor.health.beat();
         let now = self.now();
-        let unknown = self.core.hear(news, now);
+        let unknown = self.core.apply_news(news, now);
         self.kept.retain(|job, _| self.core.knows(*job));
         self.note_kept();
         let begun = |at: &mut Instant| at.elapsed() < READ_AGAIN;
-        self.learning
+        self.reading
             .retain(|job, at| unknown.contains(job) && begun(at));
         for job in unknown {
-            if let Entry::Vacant(entry) = self.learning.entry(job) {
+            if let Entry::Vacant(entry) = self.reading.entry(job) {
                 entry.insert(Instant::now());
-                self.actor.aside.learn(job);
+                self.actor.slow_work.learn(job);
             }
         }
         Ok(())
     }
 
     /// Adds a job new to this instance.
-    fn learn(&mut self, learnt: Learnt) {
-        self.learning.remove(&learnt.job.id);
-        if !self.core.knows(learnt.job.id) {
-            self.kept.insert(learnt.job.id, learnt.kept);
+    fn learn(&mut self, new_job: NewJob) {
+        self.reading.remove(&new_job.job.id);
+        if !self.core.knows(new_job.job.id) {
+            self.kept.insert(new_job.job.id, new_job.kept);
             self.core
-                .add_job(&learnt.job, learnt.stages, &learnt.timings);
+                .add_job(&new_job.job, new_job.stages, &new_job.timings);
             self.note_kept();
         }
     }

@@ -2,15 +2,15 @@
 //! core decide, and commits the outcome. It answers only after the commit. Commands that arrive
 //! during a commit form the next batch.
 
-mod aside;
 mod command;
 pub(crate) mod forget;
 mod lanes;
 mod life;
 mod sessions;
+mod slow_work;
 
-pub(crate) use aside::{Aside, Dispute};
-pub(crate) use command::{Command, FromWorker, Refusal, Reply, Ruling, Submitted, Verdict};
+pub(crate) use command::{Command, FromWorker, Refusal, Reply, Ruling, StoreCheck, Submitted};
 pub(crate) use lanes::Lanes;
 pub(crate) use life::Actor;
-pub(crate) use sessions::Waiting;
+pub(crate) use sessions::HeartbeatQueue;
+pub(crate) use slow_work::{Dispute, SlowWork};

@@ -10,13 +10,13 @@ use std::{
 
 use tokio::sync::mpsc;
 
-use crate::core::{Say, SessionId};
+use crate::core::{SessionId, ToWorker};
 
 /// Counts a session's heartbeats that have arrived and are not handled yet.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Waiting(Arc<AtomicU32>);
+pub(crate) struct HeartbeatQueue(Arc<AtomicU32>);
 
-impl Waiting {
+impl HeartbeatQueue {
     /// Records the arrival of a heartbeat.
     pub(crate) fn arrived(&self) {
         self.0.fetch_add(1, Ordering::Relaxed);
@@ -30,10 +30,15 @@ impl Waiting {
 
 /// The open sessions.
 #[derive(Debug, Default)]
-pub(crate) struct Sessions(HashMap<SessionId, (mpsc::Sender<Say>, Waiting)>);
+pub(crate) struct Sessions(HashMap<SessionId, (mpsc::Sender<ToWorker>, HeartbeatQueue)>);
 
 impl Sessions {
-    pub(crate) fn open(&mut self, session: SessionId, say: mpsc::Sender<Say>, waiting: Waiting) {
+    pub(crate) fn open(
+        &mut self,
+        session: SessionId,
+        say: mpsc::Sender<ToWorker>,
+        waiting: HeartbeatQueue,
+    ) {
         self.0.insert(session, (say, waiting));
     }
 
@@ -41,12 +46,12 @@ impl Sessions {
         self.0.remove(&session);
     }
 
-    pub(crate) fn get(&self, session: SessionId) -> Option<&mpsc::Sender<Say>> {
+    pub(crate) fn get(&self, session: SessionId) -> Option<&mpsc::Sender<ToWorker>> {
         self.0.get(&session).map(|(say, _)| say)
     }
 
     /// Records that a heartbeat of this session was handled.
-    pub(crate) fn heard(&self, session: SessionId) {
+    pub(crate) fn heartbeat_handled(&self, session: SessionId) {
         if let Some((_, waiting)) = self.0.get(&session) {
             waiting.0.fetch_sub(1, Ordering::Relaxed);
         }

@@ -56,7 +56,7 @@ impl Caller {
         let expired = async {
             match self.until {
                 Some(until) => {
-                    until.over().await;
+                    until.passed().await;
                     self.expired(until)
                 }
                 None => std::future::pending().await,

@@ -10,7 +10,7 @@ use picofarm_proto::{
 };
 
 use super::{
-    history::About, placement, ready::Ready, stage_entry::StageEntry, state::Core,
+    history::EventDetails, placement, ready::Ready, stage_entry::StageEntry, state::Core,
     transition::RangeEvent,
 };
 
@@ -26,14 +26,15 @@ impl Core {
     /// for more. Jobs of lower priority get the remaining capacity. Tasks that cannot run now, or
     /// on none of the asking workers, keep no worker from other jobs.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
-        let mut hungry = Hungry::new(self.workers.hungry().map(|(id, worker)| Asks {
-            id: *id,
-            credits: worker.credits,
-            empty_handed: worker.leases.is_empty(),
-            ends: worker.ends_ms.is_some(),
-        }));
+        let mut asking =
+            AskingWorkers::new(self.workers.asking().map(|(id, worker)| AskingWorker {
+                id: *id,
+                credits: worker.credits,
+                empty_handed: worker.leases.is_empty(),
+                ends: worker.ends_ms.is_some(),
+            }));
         // Usually all workers are busy, so that nothing needs to be searched.
-        if hungry.credits == 0 {
+        if asking.credits == 0 {
             return Vec::new();
         }
         let mut ranked: Vec<StageRef> = self
@@ -47,31 +48,31 @@ impl Core {
         for level in ranked.chunk_by(|a, b| self.priority(*a) == self.priority(*b)) {
             let mut demands: Vec<Demand> = level.iter().map(|id| Demand::new(*id)).collect();
             let mut taken = true;
-            while taken && hungry.credits > 0 {
+            while taken && asking.credits > 0 {
                 taken = false;
                 for demand in &mut demands {
-                    taken |= self.give_one(demand, &mut hungry, now_ms);
+                    taken |= self.give_one(demand, &mut asking, now_ms);
                 }
             }
             wants.extend(demands.iter().filter_map(|d| self.want(d, now_ms)));
-            if hungry.credits == 0 {
+            if asking.credits == 0 {
                 break;
             }
         }
         wants
     }
 
-    /// Gives a stage one more lease, for the next hungry worker that may run it. Returns `false` if
+    /// Gives a stage one more lease, for the next asking worker that may run it. Returns `false` if
     /// no worker may run it or no task is left.
-    fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
+    fn give_one(&self, demand: &mut Demand, asking: &mut AskingWorkers, now_ms: i64) -> bool {
         let id = demand.stage;
         let job = self.stages[&id].job();
         let most = job.spec.limits.max_workers;
-        while hungry.credits > 0
-            && let Some(worker) = hungry.workers.get_mut(demand.next)
+        while asking.credits > 0
+            && let Some(worker) = asking.workers.get_mut(demand.next)
         {
             let joins = most > 0 && !self.load.works(job.id, worker.id);
-            let joined = hungry.joined.get(&job.id);
+            let joined = asking.joined.get(&job.id);
             let room = !joins
                 || joined.is_none_or(|all| {
                     all.contains(&worker.id) || (all.len() as u64) < self.load.room(job.id, most)
@@ -93,7 +94,7 @@ impl Core {
                 ready.suspects = ready.suspects.saturating_sub(supply.size);
             } else if !ready.unknown {
                 if ready.is_none() {
-                    demand.next = hungry.workers.len();
+                    demand.next = asking.workers.len();
                 } else {
                     demand.next += 1;
                 }
@@ -102,9 +103,9 @@ impl Core {
             demand.leases += 1;
             demand.suspects |= worker.empty_handed;
             worker.credits -= 1;
-            hungry.credits -= 1;
+            asking.credits -= 1;
             if joins {
-                hungry.joined.entry(job.id).or_default().insert(worker.id);
+                asking.joined.entry(job.id).or_default().insert(worker.id);
             }
             return true;
         }
@@ -186,7 +187,7 @@ impl Core {
             self.outcome
                 .apply(&mut entry.held, &range, &RangeEvent::Settle { run })
                 .expect("pending tasks can be settled");
-            let about = About::message("the outputs exist already").tasks(run.lo, run.hi);
+            let about = EventDetails::message("the outputs exist already").tasks(run.lo, run.hi);
             self.outcome.event(now_ms, stage, EventKind::Reused, about);
             self.perhaps_over(stage, now_ms);
         }
@@ -207,7 +208,7 @@ impl Core {
                 Some(entry) => {
                     if let RangeState::Leased(lease) = &range.state {
                         self.leases.begin(id, range.stage);
-                        self.load.begun(id, entry.job(), lease.worker);
+                        self.load.lease_begun(id, entry.job(), lease.worker);
                     }
                     entry.held.receive(range, self.outcome.changes());
                     self.renew(id, now_ms);
@@ -253,10 +254,10 @@ impl Core {
     }
 
     /// Applies the catalog's news. Returns the active jobs that this instance does not know yet.
-    pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
+    pub(crate) fn apply_news(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
         self.failing_workers.tidy(now_ms);
         let workers = news.workers.saturating_sub(self.workers.count());
-        self.peers.hear(news.instances, workers, news.shared);
+        self.peers.record(news.instances, workers, news.shared);
         let over: Vec<JobId> = self
             .stages
             .keys()
@@ -274,7 +275,7 @@ impl Core {
                 held.insert(id.job);
             }
         }
-        self.load.hear_elsewhere(news.busy);
+        self.load.record_elsewhere(news.busy);
         if let Some(leased) = &news.leased {
             let lost: Vec<_> = self
                 .leases
@@ -305,15 +306,15 @@ impl Core {
 }
 
 /// The workers that ask for leases.
-struct Hungry {
-    workers: Vec<Asks>,
+struct AskingWorkers {
+    workers: Vec<AskingWorker>,
     /// Total number of leases that the workers ask for.
     credits: u64,
     /// Workers that would join the workers of a job with a limit.
     joined: HashMap<JobId, BTreeSet<WorkerId>>,
 }
 
-struct Asks {
+struct AskingWorker {
     id: WorkerId,
     credits: u32,
     empty_handed: bool,
@@ -321,9 +322,9 @@ struct Asks {
     ends: bool,
 }
 
-impl Hungry {
-    fn new(workers: impl Iterator<Item = Asks>) -> Self {
-        let workers: Vec<Asks> = workers.collect();
+impl AskingWorkers {
+    fn new(workers: impl Iterator<Item = AskingWorker>) -> Self {
+        let workers: Vec<AskingWorker> = workers.collect();
         Self {
             credits: workers.iter().map(|w| u64::from(w.credits)).sum(),
             workers,

@@ -9,7 +9,7 @@ use picofarm_proto::{
 };
 
 use super::{
-    history::About, message::SessionId, stage_entry::StageEntry, state::Core,
+    history::EventDetails, message::SessionId, stage_entry::StageEntry, state::Core,
     store_faults::store_of, transition::RangeEvent,
 };
 
@@ -70,7 +70,9 @@ impl Core {
         };
         let name = self.workers.session_name(session);
         tracing::error!(job = %stage.job, worker = name, "{message}");
-        let about = About::message(message).task(report.index).worker(name);
+        let about = EventDetails::message(message)
+            .task(report.index)
+            .worker(name);
         self.outcome.event(now_ms, stage, EventKind::Alarm, about);
     }
 
@@ -119,7 +121,7 @@ impl Core {
                     hex_of(&known),
                     report.manifest_sha256
                 );
-                self.undecided(&range, session, report.index, &message, now_ms);
+                self.rerun_undecided(&range, session, report.index, &message, now_ms);
                 Err(message)
             }
             (live, Some(known)) => {
@@ -141,7 +143,7 @@ impl Core {
                             true => EventKind::Reused,
                             false => EventKind::Committed,
                         };
-                        let about = About::message("the same result as before")
+                        let about = EventDetails::message("the same result as before")
                             .task(report.index)
                             .worker(self.workers.session_name(session))
                             .seconds(report.seconds);
@@ -157,7 +159,7 @@ impl Core {
                     report.manifest_sha256
                 );
                 tracing::error!(job = %id.job, worker = name, "{message}");
-                let about = About::message(message.clone())
+                let about = EventDetails::message(message.clone())
                     .task(report.index)
                     .worker(name);
                 self.outcome.event(now_ms, id, EventKind::Alarm, about);
@@ -208,7 +210,7 @@ impl Core {
             self.stages.add_time(set, report.seconds, report.bytes);
             EventKind::Committed
         };
-        let about = About::default()
+        let about = EventDetails::default()
             .task(task)
             .worker(self.workers.session_name(session))
             .seconds(report.seconds);

@@ -10,8 +10,8 @@ use picofarm_proto::{
 };
 
 use super::{
-    candidate::NotEligible, history::About, message::Say, state::Core, store_faults::store_of,
-    transition::RangeEvent, words::span,
+    candidate::NotEligible, history::EventDetails, message::ToWorker, state::Core,
+    store_faults::store_of, transition::RangeEvent, words::span,
 };
 
 /// The other workers that may run a stage.
@@ -38,8 +38,8 @@ impl Core {
         for stage in &waiting {
             self.explain_waiting(*stage, now_ms);
         }
-        let hungry: Vec<WorkerId> = self.workers.hungry().map(|(id, _)| *id).collect();
-        if hungry.is_empty() {
+        let asking: Vec<WorkerId> = self.workers.asking().map(|(id, _)| *id).collect();
+        if asking.is_empty() {
             return;
         }
         let mut waiting: Vec<(StageRef, u64)> = waiting
@@ -52,14 +52,14 @@ impl Core {
         let mut granted = true;
         while granted {
             granted = false;
-            for worker in &hungry {
+            for worker in &asking {
                 waiting.sort_by_cached_key(|(stage, _)| self.rank(*stage));
                 granted |= waiting
                     .iter()
                     .any(|(stage, able)| self.grant(*stage, *worker, *able, now_ms));
             }
         }
-        self.help(&hungry, now_ms);
+        self.help(&asking, now_ms);
     }
 
     /// Returns the precedence of a stage: higher priority first, then the user with the fewest
@@ -68,8 +68,8 @@ impl Core {
         let job = self.stages[&id].job();
         (
             Reverse(job.spec.priority),
-            self.load.of_user(&job.user),
-            self.load.of_job(job.id),
+            self.load.leases_of_user(&job.user),
+            self.load.leases_of_job(job.id),
             id,
         )
     }
@@ -179,11 +179,11 @@ impl Core {
     pub(super) fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let who = &self.workers[&worker];
-        if !who.hungry() || self.may_run(id, worker, now_ms).is_err() {
+        if !who.wants_leases() || self.may_run(id, worker, now_ms).is_err() {
             return false;
         }
         // A suspect range runs alone on its worker, so that a crash affects no other lease.
-        let others = self.not_for(id, worker, now_ms);
+        let others = self.excluded_tasks(id, worker, now_ms);
         let suspects = who.leases.is_empty();
         let Some((range, run)) = entry.held.front(now_ms, suspects, &others) else {
             return false;
@@ -221,8 +221,8 @@ impl Core {
         who.leases.insert(granted.id);
         who.quarantined = granted.crashes > 0;
         self.leases.begin(granted.id, id);
-        self.store_faults.begun(&store, worker, granted.id);
-        self.load.begun(granted.id, entry.job(), worker);
+        self.store_faults.lease_begun(&store, worker, granted.id);
+        self.load.lease_begun(granted.id, entry.job(), worker);
         let lease = Lease {
             lease: granted.lease(),
             job: id.job,
@@ -235,8 +235,9 @@ impl Core {
             key,
             traceparent: String::new(),
         };
-        self.outcome.send(who.session, Say::Lease(Box::new(lease)));
-        let about = About::message(format!("tasks {}..{}", granted.lo, granted.hi))
+        self.outcome
+            .send(who.session, ToWorker::Lease(Box::new(lease)));
+        let about = EventDetails::message(format!("tasks {}..{}", granted.lo, granted.hi))
             .tasks(granted.lo, granted.hi)
             .worker(who.name.clone());
         self.outcome.event(now_ms, id, EventKind::Leased, about);
@@ -273,7 +274,7 @@ impl Core {
             now_ms,
             id,
             EventKind::Waiting,
-            About::message(message).worker(name),
+            EventDetails::message(message).worker(name),
         );
     }
 }

@@ -9,7 +9,7 @@ use picofarm_proto::{
     model::{EventKind, FailureKind, Finished, JobSpec, kinds::Manifest},
 };
 
-use super::{history::About, message::SessionId, state::Core, store_faults::store_of};
+use super::{history::EventDetails, message::SessionId, state::Core, store_faults::store_of};
 
 /// A reported result, with everything needed to check its store.
 #[derive(Debug, Clone)]
@@ -35,14 +35,14 @@ impl Core {
             stage,
             job: Arc::clone(&entry.job().spec),
             store: store_of(&entry.spec().task).to_owned(),
-            here: self.doubts.is_here(session),
+            here: self.doubts.is_local(session),
             report: report.clone(),
         })
     }
 
     /// Records whether a session's worker runs on the coordinator's machine.
-    pub(crate) fn is_here(&mut self, session: SessionId, here: bool) {
-        self.doubts.set_here(session, here);
+    pub(crate) fn set_local(&mut self, session: SessionId, here: bool) {
+        self.doubts.set_local(session, here);
     }
 
     /// Handles a report that its store contradicts. The task runs again, and the worker gets no
@@ -160,7 +160,7 @@ impl Core {
     }
 
     /// Runs a task again until two workers agree on its result.
-    pub(super) fn undecided(
+    pub(super) fn rerun_undecided(
         &mut self,
         range: &Range,
         session: SessionId,
@@ -176,7 +176,7 @@ impl Core {
         ) {
             entry.blocklist.succeeded(worker);
         }
-        let about = About::message(message)
+        let about = EventDetails::message(message)
             .task(task)
             .worker(self.workers.session_name(session));
         self.outcome

@@ -62,7 +62,7 @@ impl Doubts {
     }
 
     /// Records whether a session's worker runs on the coordinator's machine.
-    pub(super) fn set_here(&mut self, session: SessionId, here: bool) {
+    pub(super) fn set_local(&mut self, session: SessionId, here: bool) {
         match here {
             true => self.here.insert(session),
             false => self.here.remove(&session),
@@ -70,7 +70,7 @@ impl Doubts {
     }
 
     /// Returns whether a session's worker runs on the coordinator's machine.
-    pub(super) fn is_here(&self, session: SessionId) -> bool {
+    pub(super) fn is_local(&self, session: SessionId) -> bool {
         self.here.contains(&session)
     }
 

@@ -6,7 +6,7 @@ use picofarm_proto::{
     model::{EventKind, FailureKind},
 };
 
-use super::{history::About, message::SessionId, state::Core};
+use super::{history::EventDetails, message::SessionId, state::Core};
 
 impl Core {
     /// Extends a worker's leases that would run out now. Its heartbeat has arrived and waits only
@@ -45,7 +45,7 @@ impl Core {
             return "the lease ran out".to_owned();
         };
         let name = self.workers.name(lease.worker);
-        let tasks = self.in_hand(range);
+        let tasks = self.running_tasks(range);
         let tasks = match &tasks[..] {
             [] => String::new(),
             [task] => format!(" while it ran task {task}"),
@@ -79,12 +79,14 @@ impl Core {
             self.outcome
                 .revoke(entry.session, range.lease(), why.to_owned());
         }
-        let about = About::message(why).tasks(range.lo, range.hi).worker(&*name);
+        let about = EventDetails::message(why)
+            .tasks(range.lo, range.hi)
+            .worker(&*name);
         self.outcome
             .event(now_ms, range.stage, EventKind::Expired, about);
-        let in_hand = self.in_hand(range);
+        let running_tasks = self.running_tasks(range);
         let mut counted = Vec::new();
-        for task in in_hand {
+        for task in running_tasks {
             if let Some(range) = self.range(range.id).cloned()
                 && self.leave(&range, task, FailureKind::Crash, why, now_ms)
             {

@@ -18,7 +18,7 @@ const FORGET_MS: i64 = 300_000;
 
 /// The workers without a success since their last failure.
 #[derive(Debug, Default)]
-pub(super) struct FailingWorkers(BTreeMap<WorkerId, Row>);
+pub(super) struct FailingWorkers(BTreeMap<WorkerId, Troubles>);
 
 /// A failure on a worker.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -32,7 +32,7 @@ pub(super) enum Trouble {
 }
 
 #[derive(Debug, Default)]
-struct Row {
+struct Troubles {
     subjects: BTreeSet<Trouble>,
     given_back: u32,
     tries: u32,
@@ -52,7 +52,7 @@ impl FailingWorkers {
     ) {
         let row = self.0.entry(worker).or_default();
         if row.last_ms.max(row.until_ms) + FORGET_MS < now_ms {
-            *row = Row::default();
+            *row = Troubles::default();
         }
         row.last_ms = now_ms;
         let blamed = if trouble == Trouble::GaveBack {

@@ -10,7 +10,7 @@ use super::{
     budget::{self, Attempt, Verdict},
     dispatch::Others,
     failing_workers::Trouble,
-    history::About,
+    history::EventDetails,
     message::SessionId,
     state::Core,
     store_faults::store_of,
@@ -60,7 +60,7 @@ impl Core {
             ),
             _ => message.to_owned(),
         };
-        let about = About::message(about)
+        let about = EventDetails::message(about)
             .task(task)
             .worker(self.workers.name(worker));
         self.outcome.event(now_ms, range.stage, event, about);
@@ -87,7 +87,7 @@ impl Core {
                 RangeState::Leased(lease) => self.workers.name(lease.worker),
                 _ => String::new(),
             };
-            let about = About::message(why).task(task).worker(worker);
+            let about = EventDetails::message(why).task(task).worker(worker);
             self.outcome
                 .event(now_ms, range.stage, EventKind::Dead, about);
         }
@@ -108,7 +108,7 @@ impl Core {
             RangeState::Leased(lease) => self.workers.name(lease.worker),
             _ => String::new(),
         };
-        let about = About::message(message).task(task).worker(worker);
+        let about = EventDetails::message(message).task(task).worker(worker);
         self.outcome
             .event(now_ms, range.stage, EventKind::Released, about);
     }

@@ -4,14 +4,14 @@ use picofarm_catalog::Run;
 
 /// The optional part of an event.
 #[derive(Default)]
-pub(super) struct About {
+pub(super) struct EventDetails {
     pub(super) tasks: Option<Run>,
     pub(super) worker: String,
     pub(super) seconds: f64,
     pub(super) message: String,
 }
 
-impl About {
+impl EventDetails {
     pub(super) fn message(message: impl Into<String>) -> Self {
         Self {
             message: message.into(),

@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, HashMap};
 use picofarm_catalog::{Job, Range, ResultSet, StageRecord, Timing};
 use picofarm_proto::ids::{JobId, RangeId, WorkerId};
 
-use super::{message::Say, state::Core, transition::RangeEvent};
+use super::{message::ToWorker, state::Core, transition::RangeEvent};
 
 /// A job to be added to the core.
 #[derive(Debug, Clone)]
-pub(crate) struct Learnt {
+pub(crate) struct NewJob {
     pub job: Job,
     pub stages: Vec<StageRecord>,
     /// Timings of the job's result sets.
@@ -26,7 +26,7 @@ impl Core {
     /// tasks continue.
     pub(crate) fn paused(&mut self, job: JobId, paused: bool) {
         if paused {
-            self.free_what_waits(job);
+            self.return_waiting(job);
         }
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
             entry.set_paused(paused);
@@ -39,7 +39,7 @@ impl Core {
 
     /// Takes back the tasks of a job's leases that their workers have not begun, as far as is
     /// known. A worker runs one task at a time and works through a lease in order.
-    fn free_what_waits(&mut self, job: JobId) {
+    fn return_waiting(&mut self, job: JobId) {
         let stages = self.stages.iter().filter(|(id, _)| id.job == job);
         let leases = stages.flat_map(|(_, entry)| entry.held.leased());
         let leases: Vec<(Range, WorkerId)> = leases
@@ -58,13 +58,13 @@ impl Core {
                 self.close(&range, false);
                 continue;
             }
-            let Some(last) = self.in_hand(&range).into_iter().max() else {
+            let Some(last) = self.running_tasks(&range).into_iter().max() else {
                 continue;
             };
             let at = last + 1;
             if at < range.hi && (at..range.hi).all(|task| range.has_to_do(task)) {
                 let lease = range.lease();
-                self.outcome.send(session, Say::Trim { lease, hi: at });
+                self.outcome.send(session, ToWorker::Trim { lease, hi: at });
                 self.mark(&range, &RangeEvent::Trim { at });
             }
         }

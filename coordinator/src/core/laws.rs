@@ -33,7 +33,7 @@ fn stage_ref() -> StageRef {
 }
 
 /// Returns a stage with these pending tasks.
-fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> HeldRanges {
+fn running_tasks(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> HeldRanges {
     let existing: Vec<Run> = (0..total)
         .filter(|i| cut.get(*i as usize) == Some(&true))
         .map(|i| Run { lo: i, hi: i + 1 })
@@ -72,7 +72,7 @@ proptest! {
             .map(|i| if cut[i as usize] { Task::Done } else { Task::Pending })
             .collect();
         let mut changes = Changes::default();
-        let mut stage = in_hand(total, &cut, &mut ids);
+        let mut stage = running_tasks(total, &cut, &mut ids);
         for (op, a, b, flag) in ops {
             let leased: Vec<Range> = stage.leased().map(|(r, _)| r.clone()).collect();
             let lease = (!leased.is_empty()).then(|| leased[a as usize % leased.len()].clone());
@@ -189,7 +189,7 @@ proptest! {
     fn epochs_never_fall(grants in prop::collection::vec(any::<bool>(), 1..20)) {
         let mut ids = counter();
         let mut changes = Changes::default();
-        let mut stage = in_hand(4, &[], &mut ids);
+        let mut stage = running_tasks(4, &[], &mut ids);
         let mut last = Epoch(0);
         for halve in grants {
             let front = stage.front(i64::MAX, true, &[]).unwrap().0.clone();

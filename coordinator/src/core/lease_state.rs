@@ -47,8 +47,8 @@ impl Core {
     /// Forgets a lease.
     pub(super) fn lease_over(&mut self, id: RangeId) {
         self.leases.end(id);
-        self.store_faults.over(id);
-        self.load.over(id);
+        self.store_faults.lease_over(id);
+        self.load.lease_over(id);
         self.workers.lease_over(id);
     }
 
@@ -102,7 +102,7 @@ impl Core {
 
     /// Returns the tasks of a lease that its worker runs, as far as is known. If the worker has
     /// reported nothing, this is the first unfinished task.
-    pub(super) fn in_hand(&self, range: &Range) -> Vec<u64> {
+    pub(super) fn running_tasks(&self, range: &Range) -> Vec<u64> {
         let todo = |task: &u64| range.has_to_do(*task);
         let reported = self.leases.running(range.id).map(|(task, _)| task);
         let mut tasks: Vec<u64> = reported.filter(todo).collect();
@@ -114,7 +114,7 @@ impl Core {
 
     /// Returns the tasks of a lease that its worker has begun, as far as is known. A worker runs
     /// one at a time.
-    pub(super) fn begun(&self, range: &Range) -> Vec<u64> {
+    pub(super) fn begun_tasks(&self, range: &Range) -> Vec<u64> {
         let runs = |id: &RangeId| self.leases.is_running(*id);
         let RangeState::Leased(lease) = &range.state else {
             return Vec::new();
@@ -124,7 +124,7 @@ impl Core {
             holder.is_some_and(|w| w.leases.iter().any(|id| *id != range.id && runs(id)));
         match elsewhere && !runs(&range.id) {
             true => Vec::new(),
-            false => self.in_hand(range),
+            false => self.running_tasks(range),
         }
     }
 }

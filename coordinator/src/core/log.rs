@@ -2,7 +2,7 @@
 
 use picofarm_proto::model::{EventKind, TaskLog};
 
-use super::{history::About, message::SessionId, state::Core};
+use super::{history::EventDetails, message::SessionId, state::Core};
 
 impl Core {
     /// Records log lines of a task that this session's worker runs, within the task's allowance.
@@ -26,7 +26,7 @@ impl Core {
             if !task.log.take(line.text.len()) {
                 return;
             }
-            let about = About::message(format!("{}: {}", line.level, line.text))
+            let about = EventDetails::message(format!("{}: {}", line.level, line.text))
                 .task(log.index)
                 .worker(&*worker);
             let at_ms = now_ms - i64::from(line.ago_ms);

@@ -7,7 +7,7 @@ pub(crate) type SessionId = u64;
 
 /// A message to a worker, sent once the changes are durable.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Say {
+pub(crate) enum ToWorker {
     Lease(Box<Lease>),
     Acknowledge {
         lease: LeaseRef,

@@ -1,6 +1,6 @@
 //! The coordinator's state in memory, with synchronous methods and no I/O. Times and ids are
-//! arguments. Each method records the changes that must become durable ([`Changes`]) and the
-//! messages to send afterwards ([`Say`]).
+//! arguments. Each method records the changes that must become durable, and the messages to send
+//! afterwards ([`ToWorker`]).
 //!
 //! The state contains the active jobs, the ranges leased to workers that are connected or may
 //! reconnect, and the pending ranges claimed for them. The catalog has everything else.
@@ -14,11 +14,10 @@ mod commit;
 mod dispatch;
 mod disputes;
 mod doubts;
+mod eligible_workers;
 mod expiry;
-mod facts;
 mod failing_workers;
 mod failures;
-mod fits;
 mod held_ranges;
 mod history;
 mod jobs;
@@ -43,6 +42,7 @@ mod second_runs;
 mod sessions;
 mod settings;
 mod shared;
+mod snapshot;
 mod stage_entry;
 mod stages;
 mod state;
@@ -60,12 +60,12 @@ pub(crate) use candidate::{Candidate, NotEligible, RunningOn};
 pub use clock::Clock;
 pub(crate) use commit::OutputHint;
 pub(crate) use disputes::Reported;
-pub(crate) use facts::{JobLook, Look};
-pub(crate) use fits::{Fit, Fits};
-pub(crate) use jobs::{Learnt, Timings};
-pub(crate) use message::{Say, SessionId};
+pub(crate) use eligible_workers::{EligibleWorkers, StageWorkers};
+pub(crate) use jobs::{NewJob, Timings};
+pub(crate) use message::{SessionId, ToWorker};
 pub(crate) use overlay::{Overlay, recorded_status};
 pub(crate) use settings::Settings;
 pub use settings::VERSION;
+pub(crate) use snapshot::{FarmSnapshot, JobSnapshot};
 pub(crate) use state::Core;
 pub(crate) use words::span;

@@ -11,8 +11,8 @@ use picofarm_proto::{
 
 use super::{
     held_ranges::HeldRanges,
-    history::About,
-    message::{Say, SessionId},
+    history::EventDetails,
+    message::{SessionId, ToWorker},
     settings::MakeId,
     stage_entry::SetId,
     transition::{Illegal, RangeEvent},
@@ -22,7 +22,7 @@ use super::{
 pub(super) struct Outcome {
     make_id: MakeId,
     changes: Changes,
-    messages: Vec<(SessionId, Say)>,
+    messages: Vec<(SessionId, ToWorker)>,
     /// Outputs in `changes`, by set and task.
     outputs: HashMap<(SetId, u64), [u8; 32]>,
 }
@@ -38,7 +38,7 @@ impl Outcome {
     }
 
     /// Returns the changes and the messages, and begins with none.
-    pub(super) fn take(&mut self) -> (Changes, Vec<(SessionId, Say)>) {
+    pub(super) fn take(&mut self) -> (Changes, Vec<(SessionId, ToWorker)>) {
         self.outputs.clear();
         (
             std::mem::take(&mut self.changes),
@@ -72,7 +72,7 @@ impl Outcome {
     }
 
     /// Adds a message to a session's worker.
-    pub(super) fn send(&mut self, session: SessionId, message: Say) {
+    pub(super) fn send(&mut self, session: SessionId, message: ToWorker) {
         self.messages.push((session, message));
     }
 
@@ -84,7 +84,7 @@ impl Outcome {
         reason: impl Into<String>,
     ) {
         let reason = reason.into();
-        self.send(session, Say::Revoke { lease, reason });
+        self.send(session, ToWorker::Revoke { lease, reason });
     }
 
     /// Answers a worker's report on a task.
@@ -99,7 +99,7 @@ impl Outcome {
             Ok(()) => (true, String::new()),
             Err(reason) => (false, reason),
         };
-        let acknowledge = Say::Acknowledge {
+        let acknowledge = ToWorker::Acknowledge {
             lease,
             index,
             accepted,
@@ -141,7 +141,13 @@ impl Outcome {
     }
 
     /// Adds a line of history. Adjacent tasks that a worker finished in one batch share a line.
-    pub(super) fn event(&mut self, at_ms: i64, stage: StageRef, kind: EventKind, about: About) {
+    pub(super) fn event(
+        &mut self,
+        at_ms: i64,
+        stage: StageRef,
+        kind: EventKind,
+        about: EventDetails,
+    ) {
         if let (Some(last), Some(tasks)) = (self.changes.events.last_mut(), about.tasks)
             && matches!(kind, EventKind::Committed | EventKind::Reused)
             && (last.kind, last.job, last.stage) == (kind, stage.job, Some(stage.stage))

@@ -25,7 +25,7 @@ impl Default for Peers {
 impl Peers {
     /// Records the number of live instances and of the others' workers, and the tasks that those
     /// run.
-    pub(super) fn hear(
+    pub(super) fn record(
         &mut self,
         instances: u32,
         workers: u32,

@@ -84,7 +84,7 @@ impl StageEntry {
 impl Core {
     /// Returns the claimed tasks of a stage that can be granted now.
     pub(super) fn ready_here(&self, id: StageRef, now_ms: i64) -> Ready {
-        self.ready_but(id, &self.done_for_others(id), now_ms)
+        self.ready_but(id, &self.tasks_of_other_jobs(id), now_ms)
     }
 
     /// Like `ready_here`, without the tasks in `except`.
@@ -120,7 +120,7 @@ impl Core {
         if who.quarantined || who.drains || self.may_run(id, worker, now_ms).is_err() {
             return Ready::default();
         }
-        let here = self.ready_but(id, &self.not_for(id, worker, now_ms), now_ms);
+        let here = self.ready_but(id, &self.excluded_tasks(id, worker, now_ms), now_ms);
         let claimable = self.stages[&id].claimable(now_ms);
         here.and(claimable).to_worker(who.leases.is_empty())
     }

@@ -9,7 +9,7 @@ use picofarm_proto::{
 };
 
 use super::{
-    message::{Say, SessionId},
+    message::{SessionId, ToWorker},
     state::Core,
 };
 
@@ -19,7 +19,7 @@ impl Core {
     pub(crate) fn refused(
         &mut self,
         changes: &mut Changes,
-        say: &mut [(SessionId, Say)],
+        say: &mut [(SessionId, ToWorker)],
         culprits: &[Culprit],
         again: bool,
         now_ms: i64,
@@ -78,7 +78,7 @@ impl Core {
     fn give_up(
         &mut self,
         changes: &mut Changes,
-        say: &mut [(SessionId, Say)],
+        say: &mut [(SessionId, ToWorker)],
         (stage, task): (StageRef, u64),
         why: &str,
         now_ms: i64,
@@ -86,7 +86,7 @@ impl Core {
         let why = format!("the result cannot be recorded: {why}");
         if let Some(lease) = self.undo(changes, stage, task) {
             for (_, say) in say.iter_mut() {
-                if let Say::Acknowledge {
+                if let ToWorker::Acknowledge {
                     lease: of,
                     index,
                     accepted,
@@ -112,7 +112,7 @@ impl Core {
                 hi: task + 1,
             }),
             worker,
-            ..NewEvent::of(stage.job, now_ms, EventKind::Dead, why)
+            ..NewEvent::new(stage.job, now_ms, EventKind::Dead, why)
         });
         if entry.held.is_empty() {
             changes.perhaps_over.insert(stage, now_ms);

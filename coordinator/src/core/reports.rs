@@ -8,8 +8,8 @@ use picofarm_proto::{
 use super::{
     dispatch::Others,
     failing_workers::Trouble,
-    history::About,
-    message::{Say, SessionId},
+    history::EventDetails,
+    message::{SessionId, ToWorker},
     state::Core,
 };
 
@@ -89,12 +89,12 @@ impl Core {
         }
         let held = self.held(session, lease, now_ms).cloned();
         let verdict = held.map(|range| {
-            let about = About::message(reason)
+            let about = EventDetails::message(reason)
                 .tasks(range.lo, range.hi)
                 .worker(self.workers.session_name(session));
             self.outcome
                 .event(now_ms, range.stage, EventKind::Released, about);
-            for task in self.begun(&range) {
+            for task in self.begun_tasks(&range) {
                 self.interrupted(&range, task, reason, now_ms);
             }
             if let Some(range) = self.range(range.id).cloned() {
@@ -145,7 +145,7 @@ impl Core {
         let ttl_ms = self.settings.lease_ms;
         self.outcome.send(
             session,
-            Say::Renewed {
+            ToWorker::Renewed {
                 leases: alive,
                 ttl_ms,
             },

@@ -7,7 +7,7 @@ use picofarm_proto::{
 };
 
 use super::{
-    message::{Say, SessionId},
+    message::{SessionId, ToWorker},
     state::Core,
     workers::WorkerEntry,
 };
@@ -18,7 +18,7 @@ impl Core {
     pub(crate) fn hello(&mut self, session: SessionId, hello: WorkerHello, now_ms: i64) {
         let id = hello.id;
         if let Some(old) = self.workers.replace(id, &hello.name) {
-            self.outcome.send(old, Say::Replaced);
+            self.outcome.send(old, ToWorker::Replaced);
         }
         self.second_runs.remove_worker(id);
         self.refund(id, hello.incarnation);
@@ -56,7 +56,7 @@ impl Core {
                 version: hello.version,
                 since_ms: now_ms,
                 heard_ms: now_ms,
-                ends_ms: super::time_left::at(hello.ends_in_ms, now_ms),
+                ends_ms: super::time_left::end_time(hello.ends_in_ms, now_ms),
                 abilities: hello.abilities,
                 credits: 0,
                 leases: Default::default(),
@@ -116,7 +116,7 @@ impl Core {
         for (id, entry) in self.workers.iter_mut() {
             if entry.name == worker || id.to_string() == worker {
                 entry.drains = true;
-                self.outcome.send(entry.session, Say::Drain);
+                self.outcome.send(entry.session, ToWorker::Drain);
                 count += 1;
             }
         }

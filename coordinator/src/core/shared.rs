@@ -15,7 +15,7 @@ use super::state::Core;
 impl Core {
     /// Returns the tasks of a stage that workers run for other stages with the same outputs, as
     /// ascending, disjoint runs. Returns none for a stage that does not reuse existing outputs.
-    pub(super) fn done_for_others(&self, id: StageRef) -> Vec<Run> {
+    pub(super) fn tasks_of_other_jobs(&self, id: StageRef) -> Vec<Run> {
         let entry = &self.stages[&id];
         let sharing = self.stages.sharing(entry);
         if sharing.len() < 2 || entry.spec().force {
@@ -39,7 +39,7 @@ impl Core {
 
     /// Returns how many tasks of a stage wait only because they run for other stages.
     pub(super) fn waits_for_others(&self, id: StageRef) -> u64 {
-        let runs = self.done_for_others(id);
+        let runs = self.tasks_of_other_jobs(id);
         let among = |task: u64| {
             let before = runs.partition_point(|run| run.lo <= task);
             before > 0 && task < runs[before - 1].hi

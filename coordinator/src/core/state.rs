@@ -13,7 +13,7 @@ use super::{
     failing_workers::FailingWorkers,
     leases::Leases,
     load::Load,
-    message::{Say, SessionId},
+    message::{SessionId, ToWorker},
     outcome::Outcome,
     peers::Peers,
     refunds::Refunds,
@@ -113,7 +113,7 @@ impl Core {
     }
 
     /// Returns the changes to commit, and the messages to send after the commit.
-    pub(crate) fn take(&mut self) -> (Changes, Vec<(SessionId, Say)>) {
+    pub(crate) fn take(&mut self) -> (Changes, Vec<(SessionId, ToWorker)>) {
         self.outcome.take()
     }
 

@@ -27,27 +27,27 @@ const DAMAGED: usize = 4096;
 #[derive(Debug, Default)]
 pub(super) struct StoreFaults {
     /// State of each store, by location.
-    rows: BTreeMap<String, Row>,
+    rows: BTreeMap<String, StoreFault>,
     /// How often each task found its inputs damaged.
     damaged: HashMap<(StageRef, u64), u32>,
 }
 
 #[derive(Debug, Default)]
-struct Row {
+struct StoreFault {
     /// Whether several workers failed at the store and none has used it since.
     shut: bool,
-    wait: Wait,
+    wait: RetryDelay,
     /// The lease that currently tries the store.
     trying: Option<RangeId>,
     /// Workers that failed to use the store. Others may be able to.
-    workers: BTreeMap<WorkerId, Faulty>,
+    workers: BTreeMap<WorkerId, FaultyWorker>,
     why: String,
 }
 
 /// A worker that failed to use a store.
 #[derive(Debug, Default)]
-struct Faulty {
-    wait: Wait,
+struct FaultyWorker {
+    wait: RetryDelay,
     /// The worker's lease that currently tries the store.
     trying: Option<RangeId>,
     /// Whether another worker has used the store since, so that the fault is this worker's own.
@@ -56,12 +56,12 @@ struct Faulty {
 }
 
 #[derive(Debug, Default, Clone, Copy)]
-struct Wait {
+struct RetryDelay {
     tries: u32,
     until_ms: i64,
 }
 
-impl Wait {
+impl RetryDelay {
     fn failed(&mut self, backoff: &Backoff, now_ms: i64) {
         // Failures of tasks that ran at the same time count once.
         if now_ms >= self.until_ms {
@@ -95,7 +95,7 @@ impl StoreFaults {
     ) {
         let backoff = &patient(backoff);
         let row = self.rows.entry(store.to_owned()).or_default();
-        let old = |faulty: &Faulty| faulty.wait.until_ms + FORGET_MS < now_ms;
+        let old = |faulty: &FaultyWorker| faulty.wait.until_ms + FORGET_MS < now_ms;
         row.workers.retain(|_, faulty| !old(faulty));
         let faulty = row.workers.entry(worker).or_default();
         faulty.wait.failed(backoff, now_ms);
@@ -119,7 +119,7 @@ impl StoreFaults {
             return;
         };
         row.shut = false;
-        row.wait = Wait::default();
+        row.wait = RetryDelay::default();
         row.trying = None;
         row.workers.remove(&worker);
         for faulty in row.workers.values_mut() {
@@ -169,7 +169,7 @@ impl StoreFaults {
     }
 
     /// Records that a worker's lease that uses a store begins.
-    pub(super) fn begun(&mut self, store: &str, worker: WorkerId, lease: RangeId) {
+    pub(super) fn lease_begun(&mut self, store: &str, worker: WorkerId, lease: RangeId) {
         let Some(row) = self.rows.get_mut(store) else {
             return;
         };
@@ -182,7 +182,7 @@ impl StoreFaults {
     }
 
     /// Records the end of a lease.
-    pub(super) fn over(&mut self, lease: RangeId) {
+    pub(super) fn lease_over(&mut self, lease: RangeId) {
         for row in self.rows.values_mut() {
             let workers = row.workers.values_mut().map(|faulty| &mut faulty.trying);
             for trying in workers.chain([&mut row.trying]) {
@@ -255,14 +255,14 @@ mod tests {
             }
             waits.push(now - begun);
             assert!(stores.is_try(S, worker(99)));
-            stores.begun(S, worker(99), range(1));
+            stores.lease_begun(S, worker(99), range(1));
             let why = stores
                 .may_use(S, worker(98), now)
                 .unwrap_err()
                 .words()
                 .to_owned();
             assert!(why.contains("trying it now"), "{why}");
-            stores.over(range(1));
+            stores.lease_over(range(1));
         }
         assert_eq!(waits[..3], [1_000, 2_000, 4_000]);
         assert_eq!(*waits.last().unwrap(), i64::from(MOST_MS));
@@ -294,9 +294,9 @@ mod tests {
             waits.push(now - begun);
             // The worker tries the store with one task at a time.
             assert!(stores.is_try(S, worker(1)));
-            stores.begun(S, worker(1), range(1));
+            stores.lease_begun(S, worker(1), range(1));
             assert!(stores.may_use(S, worker(1), now).is_err());
-            stores.over(range(1));
+            stores.lease_over(range(1));
         }
         assert_eq!(waits[..3], [1_000, 2_000, 4_000]);
         assert_eq!(*waits.last().unwrap(), i64::from(MOST_MS));
@@ -346,9 +346,9 @@ mod tests {
         let mut stores = StoreFaults::default();
         stores.failed(S, worker(1), "away", &backoff(), 0);
         stores.failed(S, worker(2), "away", &backoff(), 0);
-        stores.begun(S, worker(1), range(7));
+        stores.lease_begun(S, worker(1), range(7));
         assert!(stores.may_use(S, worker(2), 5_000).is_err());
-        stores.over(range(7));
+        stores.lease_over(range(7));
         assert_eq!(stores.may_use(S, worker(2), 5_000), Ok(()));
     }
 }

@@ -13,8 +13,8 @@ use picofarm_proto::{
 };
 
 use super::{
-    history::About,
-    message::{Say, SessionId},
+    history::EventDetails,
+    message::{SessionId, ToWorker},
     second_runs::SecondRun,
     state::Core,
     transition::RangeEvent,
@@ -26,13 +26,13 @@ const SLOW: f64 = 3.0;
 impl Core {
     /// Gives idle workers a part of other workers' leases. Call it when all pending tasks have been
     /// granted. It searches only a few times a second, because it visits every lease.
-    pub(super) fn help(&mut self, hungry: &[WorkerId], now_ms: i64) {
+    pub(super) fn help(&mut self, asking: &[WorkerId], now_ms: i64) {
         // A worker that asks for leases ahead of time is not idle.
         let idle = |worker: &&WorkerId| {
             let who = &self.workers[*worker];
-            who.hungry() && who.leases.is_empty()
+            who.wants_leases() && who.leases.is_empty()
         };
-        let mut idle: Vec<WorkerId> = hungry.iter().filter(idle).copied().collect();
+        let mut idle: Vec<WorkerId> = asking.iter().filter(idle).copied().collect();
         if idle.is_empty() || !self.second_runs.is_due(now_ms) {
             return;
         }
@@ -102,13 +102,13 @@ impl Core {
         }
         let (range, holder) = (range.clone(), lease.worker);
         if let Some(entry) = self.workers.get(&holder) {
-            let trim = Say::Trim {
+            let trim = ToWorker::Trim {
                 lease: range.lease(),
                 hi: at,
             };
             self.outcome.send(entry.session, trim);
         }
-        let about = About::message("an idle worker takes the rest over")
+        let about = EventDetails::message("an idle worker takes the rest over")
             .tasks(at, range.hi)
             .worker(self.workers.name(holder));
         self.outcome.event(now_ms, id, EventKind::Released, about);
@@ -163,16 +163,16 @@ impl Core {
             worker: idle,
         };
         self.second_runs.insert(lease.range, second);
-        let who = self.workers.get_mut(&idle).expect("it is hungry");
+        let who = self.workers.get_mut(&idle).expect("it is asking");
         who.credits -= 1;
         who.leases.insert(lease.range);
         let (session, name) = (who.session, who.name.clone());
-        self.outcome.send(session, Say::Lease(Box::new(grant)));
+        self.outcome.send(session, ToWorker::Lease(Box::new(grant)));
         let seconds = (now_ms - since_ms) / 1000;
         let message = format!(
             "a second time, as the first has taken {seconds} s and others took {mean:.1} s"
         );
-        let about = About::message(message).task(task).worker(name);
+        let about = EventDetails::message(message).task(task).worker(name);
         self.outcome.event(now_ms, id, EventKind::Leased, about);
         true
     }
@@ -214,7 +214,7 @@ impl Core {
             if let Some(entry) = self.workers.get_mut(&worker)
                 && entry.leases.remove(&id)
             {
-                let revoke = Say::Revoke {
+                let revoke = ToWorker::Revoke {
                     lease: LeaseRef {
                         range: id,
                         epoch: Epoch(0),

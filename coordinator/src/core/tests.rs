@@ -51,7 +51,11 @@ fn jobs_that_want_the_same_outputs_share_the_work() {
         let (a, b) = (lease(0), lease(1));
         assert_eq!((a.job, b.job), (first, second), "either job has a worker");
         assert_eq!((a.lo, b.lo), (0, a.hi), "the second begins after the first");
-        let look = |job| world.instances[0].core.look_at(job, None, None, world.now);
+        let look = |job| {
+            world.instances[0]
+                .core
+                .job_snapshot(job, None, None, world.now)
+        };
         assert_eq!(look(first).shared, b.hi - b.lo);
         assert_eq!(look(second).shared, a.hi - a.lo);
         world.check_shared();
@@ -109,7 +113,7 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
             }
         }
         let core = &world.instances[0].core;
-        let why = core.look_at(world.jobs[0], None, None, world.now);
+        let why = core.job_snapshot(world.jobs[0], None, None, world.now);
         let why = why.candidates[0]
             .may_run
             .clone()

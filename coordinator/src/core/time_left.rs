@@ -20,7 +20,7 @@ impl Core {
     /// Records the milliseconds until a worker must end.
     pub(crate) fn ends(&mut self, session: SessionId, ends_in_ms: Option<u64>, now_ms: i64) {
         if let Some(entry) = self.workers.of_session_mut(session) {
-            entry.ends_ms = at(ends_in_ms, now_ms);
+            entry.ends_ms = end_time(ends_in_ms, now_ms);
         }
     }
 
@@ -92,8 +92,8 @@ impl Core {
 
     /// Returns the tasks of a stage not to be given to this worker now, as ascending, disjoint
     /// runs.
-    pub(super) fn not_for(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
-        let mut runs = self.done_for_others(id);
+    pub(super) fn excluded_tasks(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
+        let mut runs = self.tasks_of_other_jobs(id);
         let long = self.too_long(id, worker, now_ms);
         if !long.is_empty() {
             runs.extend(long);
@@ -133,7 +133,7 @@ impl Core {
 }
 
 /// Converts a worker's reported milliseconds until its end to a time.
-pub(super) fn at(ends_in_ms: Option<u64>, now_ms: i64) -> Option<i64> {
+pub(super) fn end_time(ends_in_ms: Option<u64>, now_ms: i64) -> Option<i64> {
     let ms = i64::try_from(ends_in_ms?).unwrap_or(i64::MAX);
     Some(now_ms.saturating_add(ms))
 }

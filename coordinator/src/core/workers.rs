@@ -35,7 +35,7 @@ pub(super) struct WorkerEntry {
 
 impl WorkerEntry {
     /// Returns whether the worker may be given leases now.
-    pub(super) fn hungry(&self) -> bool {
+    pub(super) fn wants_leases(&self) -> bool {
         self.credits > 0 && !self.quarantined && !self.drains
     }
 }
@@ -124,8 +124,10 @@ impl Workers {
     }
 
     /// Returns the workers that may be given leases now.
-    pub(super) fn hungry(&self) -> impl Iterator<Item = (&WorkerId, &WorkerEntry)> {
-        self.connected.iter().filter(|(_, worker)| worker.hungry())
+    pub(super) fn asking(&self) -> impl Iterator<Item = (&WorkerId, &WorkerEntry)> {
+        self.connected
+            .iter()
+            .filter(|(_, worker)| worker.wants_leases())
     }
 
     pub(super) fn get(&self, id: &WorkerId) -> Option<&WorkerEntry> {

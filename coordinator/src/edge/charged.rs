@@ -16,7 +16,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Status, body::Body};
 use tower::{Layer, Service};
 
-use super::connections::{Peer, Place};
+use super::connections::{ConnectionSlot, Peer};
 use crate::{
     auth::Caller,
     memory::{Account, Charge, Charged, Memory, TWICE},
@@ -77,7 +77,7 @@ where
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        let place = request.extensions().get::<Peer>().map(Peer::place);
+        let slot = request.extensions().get::<Peer>().map(Peer::slot);
         let account = account(&self.memory, &request);
         // `self.inner` is the service that reported ready, so the clone replaces it.
         let ready = self.inner.clone();
@@ -99,7 +99,7 @@ where
                 Body::new(Answer {
                     body,
                     account,
-                    place,
+                    slot,
                     part: None,
                     _call: call,
                 })
@@ -121,7 +121,7 @@ fn account<B>(memory: &Arc<Memory>, request: &http::Request<B>) -> Account {
         false => name,
     };
     let who = who.unwrap_or_else(|| Charged::Name("".into()));
-    let connection = peer.map_or(u64::MAX, |peer| peer.place().id());
+    let connection = peer.map_or(u64::MAX, |peer| peer.slot().id());
     Account::new(Arc::clone(memory), who, connection)
 }
 
@@ -281,7 +281,7 @@ impl HttpBody for Messages {
 struct Answer {
     body: Body,
     account: Account,
-    place: Option<Arc<Place>>,
+    slot: Option<Arc<ConnectionSlot>>,
     part: Option<(Charge, Option<DropGuard>)>,
     _call: Charge,
 }
@@ -301,8 +301,8 @@ impl HttpBody for Answer {
             && let Some(data) = frame.data_ref()
         {
             let charge = self.account.count(data.len() as u64);
-            let place = self.place.as_ref().filter(|_| data.len() > LARGE);
-            let watched = place.map(|place| watch(Arc::clone(place), data.len()));
+            let slot = self.slot.as_ref().filter(|_| data.len() > LARGE);
+            let watched = slot.map(|slot| watch(Arc::clone(slot), data.len()));
             self.part = Some((charge, watched));
         }
         polled
@@ -318,7 +318,7 @@ impl HttpBody for Answer {
 }
 
 /// Ends a connection that does not receive a part of an answer, unless the value is dropped first.
-fn watch(place: Arc<Place>, bytes: usize) -> DropGuard {
+fn watch(slot: Arc<ConnectionSlot>, bytes: usize) -> DropGuard {
     let taken = CancellationToken::new();
     let guard = taken.clone().drop_guard();
     let patience = TAKEN * u32::try_from(1 + (bytes >> 20)).unwrap_or(u32::MAX);
@@ -327,7 +327,7 @@ fn watch(place: Arc<Place>, bytes: usize) -> DropGuard {
             .await
             .is_err()
         {
-            place.hang_up();
+            slot.hang_up();
         }
     });
     guard

@@ -29,7 +29,7 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 
 use super::{
-    connections::{Doors, Place},
+    connections::{ConnectionSlot, ConnectionSlots},
     rpc::Link,
 };
 use crate::{
@@ -63,21 +63,21 @@ pub(crate) struct Pages {
     pub metrics: Arc<Metrics>,
     pub health: Arc<Health>,
     /// Connections of the gRPC port.
-    pub doors: Arc<Doors>,
+    pub slots: Arc<ConnectionSlots>,
     pub memory: Arc<Memory>,
-    pub gauges: Kept,
+    pub gauges: GaugeCache,
     /// The runtime of the actor and of the catalog's connections.
     pub main: Handle,
 }
 
 /// The gauges as last read.
-pub(crate) struct Kept {
-    read: Mutex<Option<Read>>,
+pub(crate) struct GaugeCache {
+    read: Mutex<Option<CachedGauges>>,
     /// The holder of the permit reads them again.
     reading: Arc<Semaphore>,
 }
 
-impl Default for Kept {
+impl Default for GaugeCache {
     fn default() -> Self {
         Self {
             read: Mutex::default(),
@@ -87,7 +87,7 @@ impl Default for Kept {
 }
 
 #[derive(Clone, Copy)]
-struct Read {
+struct CachedGauges {
     at: Instant,
     fresh_until: Instant,
     gauges: Gauges,
@@ -116,7 +116,7 @@ pub(crate) fn start(
 }
 
 async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) {
-    let doors = Arc::new(Doors::new(CONNECTIONS, CONNECTIONS, CONNECTIONS));
+    let slots = Arc::new(ConnectionSlots::new(CONNECTIONS, CONNECTIONS, CONNECTIONS));
     let failed = Throttle::default();
     loop {
         let accepted = tokio::select! {
@@ -126,17 +126,17 @@ async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) 
         match accepted {
             Ok((stream, peer)) => {
                 // All places have connections with answers being written, which takes a moment.
-                let Ok(held) = doors.enter(peer.ip()) else {
+                let Ok(held) = slots.enter(peer.ip()) else {
                     continue;
                 };
                 let pages = Arc::clone(&pages);
                 tokio::spawn(async move {
                     // hyper's own time limit would need a timer and do the same.
-                    let over = Arc::clone(held.place()).over(PATIENCE, PATIENCE);
+                    let ended = Arc::clone(held.slot()).ended(PATIENCE, PATIENCE);
                     tokio::select! {
                         // A client that disconnects early is no loss.
-                        _ = serve(pages, stream, peer, held.place()) => {}
-                        _ = over => {}
+                        _ = serve(pages, stream, peer, held.slot()) => {}
+                        _ = ended => {}
                     }
                 });
             }
@@ -155,12 +155,12 @@ async fn serve(
     pages: Arc<Pages>,
     stream: TcpStream,
     peer: SocketAddr,
-    place: &Arc<Place>,
+    slot: &Arc<ConnectionSlot>,
 ) -> hyper::Result<()> {
     let service = service_fn(|request| {
         let pages = Arc::clone(&pages);
         async move {
-            let _answering = place.stream();
+            let _answering = slot.stream();
             let answer = pages
                 .answer(request.method(), request.uri().path(), peer)
                 .await;
@@ -207,7 +207,7 @@ impl Pages {
             "/readyz" => self.readiness(peer),
             "/metrics" => {
                 let ready = self.health.ready().is_ok();
-                let (gauges, connections) = (self.gauges().await, self.doors.counts());
+                let (gauges, connections) = (self.gauges().await, self.slots.counts());
                 page(
                     StatusCode::OK,
                     self.metrics
@@ -235,12 +235,12 @@ impl Pages {
 
     /// Returns the farm's counts; `None` if they are not available now.
     async fn gauges(self: &Arc<Self>) -> Option<Gauges> {
-        let kept = |until: fn(&Read) -> Instant| {
+        let cached = |until: fn(&CachedGauges) -> Instant| {
             let read = *self.gauges.read.lock().expect("no panic while locked");
             read.filter(|read| Instant::now() < until(read))
                 .map(|read| read.gauges)
         };
-        if let Some(gauges) = kept(|read| read.fresh_until) {
+        if let Some(gauges) = cached(|read| read.fresh_until) {
             return Some(gauges);
         }
         let turn = Arc::clone(&self.gauges.reading);
@@ -256,7 +256,7 @@ impl Pages {
             let began = Instant::now();
             if let Ok(Some(gauges)) = timeout(OLD, pages.read_gauges()).await {
                 let at = Instant::now();
-                *pages.gauges.read.lock().expect("no panic while locked") = Some(Read {
+                *pages.gauges.read.lock().expect("no panic while locked") = Some(CachedGauges {
                     at,
                     fresh_until: at + FRESH.max(10 * began.elapsed()),
                     gauges,
@@ -264,11 +264,11 @@ impl Pages {
             }
         });
         let _ = timeout(WAIT, read).await;
-        kept(|read| (read.at + OLD).max(read.fresh_until))
+        cached(|read| (read.at + OLD).max(read.fresh_until))
     }
 
     async fn read_gauges(&self) -> Option<Gauges> {
-        let look = self.link.ask(Command::Look).await.ok()?;
+        let look = self.link.ask(Command::FarmSnapshot).await.ok()?;
         Some(Gauges {
             ready: look.ready,
             jobs: look.jobs.len() as u64,

@@ -19,7 +19,7 @@ use super::{
     charged::{Charging, MAX_MESSAGE_BYTES},
     connections::{Connections, Streams, accept, follow_certificates, raise_open_files},
     guard::Guard,
-    http::{self, Kept, Pages},
+    http::{self, GaugeCache, Pages},
     rpc::{FarmService, JobsService, Link},
     timed::Timed,
 };
@@ -33,7 +33,7 @@ use crate::{
         health::{self, Health},
         metrics::Metrics,
     },
-    submission::{Stored, Submissions},
+    submission::{ResultReader, Submissions},
 };
 
 /// Largest message of a worker: a heartbeat or hello that names some ten thousand leases.
@@ -93,7 +93,7 @@ pub struct CoordinatorConfig {
     /// Time for which lines of the audit log are kept (default a year).
     pub audit_for: Duration,
     /// Reads stores to check recorded results. By default nothing does, and workers look for them.
-    pub stored: Option<Arc<dyn Stored>>,
+    pub result_reader: Option<Arc<dyn ResultReader>>,
 }
 
 impl CoordinatorConfig {
@@ -117,7 +117,7 @@ impl CoordinatorConfig {
             http: None,
             forget_after: None,
             audit_for: Duration::from_secs(365 * 86_400),
-            stored: None,
+            result_reader: None,
         }
     }
 }
@@ -223,12 +223,12 @@ async fn start(
             Some((files.clone(), loaded))
         }
     };
-    let doors = config.connections.doors(raise_open_files(), config.memory);
-    let doors = Arc::new(doors);
-    let counted = Arc::clone(&doors);
+    let slots = config.connections.slots(raise_open_files(), config.memory);
+    let slots = Arc::new(slots);
+    let counted = Arc::clone(&slots);
     let memory = Memory::new(config.memory, move || counted.counts().open);
     let memory = Arc::new(memory);
-    let (all, per_address) = doors.bounds();
+    let (all, per_address) = slots.bounds();
     let mib = config.memory.process >> 20;
     tracing::info!(mib, all, per_address, "memory and connections at most");
     let (audit, writer) = Audit::new(config.clock.clone());
@@ -259,7 +259,7 @@ async fn start(
     let submissions = Submissions::new(
         Arc::clone(&catalog),
         lanes.clone(),
-        config.stored,
+        config.result_reader,
         commands.clone(),
         config.clock.clone(),
         config.access.visibility,
@@ -281,7 +281,7 @@ async fn start(
         health: Arc::clone(&health),
         stop: shutdown.clone(),
         memory: Arc::clone(&memory),
-        aside: Arc::new(submissions.clone()),
+        slow_work: Arc::new(submissions.clone()),
     };
     let link = Link {
         commands,
@@ -303,8 +303,8 @@ async fn start(
             metrics: Arc::clone(&metrics),
             health,
             memory: Arc::clone(&memory),
-            doors: Arc::clone(&doors),
-            gauges: Kept::default(),
+            slots: Arc::clone(&slots),
+            gauges: GaugeCache::default(),
             main: Handle::current(),
         };
         tracing::info!(%address, "health and metrics over HTTP");
@@ -320,7 +320,7 @@ async fn start(
     let tls = tls.map(|(files, loaded)| {
         follow_certificates(files, loaded, judge, audit.clone(), shutdown.clone())
     });
-    let connections = accept(listener, doors, config.connections, tls, shutdown.clone());
+    let connections = accept(listener, slots, config.connections, tls, shutdown.clone());
     let server = Server::builder()
         .http2_max_header_list_size(Some(MAX_HEADERS_BYTES))
         .max_concurrent_streams(MAX_STREAMS)

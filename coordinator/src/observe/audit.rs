@@ -45,15 +45,15 @@ const FORGET: Duration = Duration::from_secs(3_600);
 /// The sending end of the audit log.
 #[derive(Clone)]
 pub(crate) struct Audit {
-    lines: mpsc::Sender<Line>,
+    lines: mpsc::Sender<QueuedLine>,
     floods: Arc<Mutex<HashMap<String, Flood>>>,
     clock: Clock,
 }
 
 /// The receiving end, which writes the lines.
-pub(crate) struct Writer(mpsc::Receiver<Line>);
+pub(crate) struct Writer(mpsc::Receiver<QueuedLine>);
 
-struct Line {
+struct QueuedLine {
     new: NewAudit,
     /// Notified when the line was written, or cannot be written now.
     tried: Option<oneshot::Sender<()>>,
@@ -95,7 +95,7 @@ impl Audit {
             return;
         };
         let (tried, heard) = oneshot::channel();
-        let line = Line {
+        let line = QueuedLine {
             new,
             tried: Some(tried),
         };
@@ -108,7 +108,10 @@ impl Audit {
     /// Records an act without waiting.
     pub(crate) fn note(&self, who: &str, act: Act, outcome: Outcome, detail: &str) {
         if let Some(new) = self.line(who, act, None, outcome, detail)
-            && self.lines.try_send(Line { new, tried: None }).is_err()
+            && self
+                .lines
+                .try_send(QueuedLine { new, tried: None })
+                .is_err()
         {
             tracing::error!("the audit log's queue is full: a line is in this log only");
         }
@@ -207,7 +210,7 @@ impl Writer {
         let mut forget = tokio::time::interval(FORGET);
         let mut again = tokio::time::interval(AGAIN);
         let mut arrived = Vec::with_capacity(BATCH);
-        let mut waiting = Waiting::default();
+        let mut waiting = UnwrittenLines::default();
         loop {
             tokio::select! {
                 n = self.0.recv_many(&mut arrived, BATCH) => {
@@ -244,13 +247,13 @@ impl Writer {
 
 /// Lines that are not written yet.
 #[derive(Default)]
-struct Waiting {
+struct UnwrittenLines {
     lines: VecDeque<NewAudit>,
     /// Whether the last write failed.
     failing: bool,
 }
 
-impl Waiting {
+impl UnwrittenLines {
     async fn write(&mut self, catalog: &dyn Catalog) {
         while !self.lines.is_empty() {
             let some = self.lines.len().min(BATCH);

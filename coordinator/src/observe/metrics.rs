@@ -13,7 +13,7 @@ use std::{
 use picofarm_catalog::Changes;
 use picofarm_proto::model::{EventKind, FailureKind, TaskCounts};
 
-use crate::core::{Say, SessionId};
+use crate::core::{SessionId, ToWorker};
 
 const SECONDS: &[f64] = &[
     0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0,
@@ -122,7 +122,7 @@ impl Tally {
     }
 
     /// Counts the core's decisions. Tasks that fail without a report were lost with their worker.
-    pub(crate) fn note(&mut self, changes: &Changes, say: &[(SessionId, Say)]) {
+    pub(crate) fn note(&mut self, changes: &Changes, say: &[(SessionId, ToWorker)]) {
         let reported = self.user + self.crash;
         let mut failed = 0;
         for event in &changes.events {
@@ -145,10 +145,10 @@ impl Tally {
                 self.seconds.push(output.seconds);
             }
         }
-        let refused = |(_, say): &&(SessionId, Say)| {
+        let refused = |(_, say): &&(SessionId, ToWorker)| {
             matches!(
                 say,
-                Say::Acknowledge {
+                ToWorker::Acknowledge {
                     accepted: false,
                     ..
                 }

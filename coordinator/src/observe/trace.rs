@@ -4,16 +4,16 @@
 use picofarm_proto::{model::Finished, trace};
 use tracing::{Level, Span, debug_span, enabled};
 
-use crate::core::{Say, SessionId};
+use crate::core::{SessionId, ToWorker};
 
 /// Creates a span for each lease about to be committed and sent. The lease messages carry it.
-pub(crate) fn grants(say: &mut [(SessionId, Say)]) -> Vec<Span> {
+pub(crate) fn grants(say: &mut [(SessionId, ToWorker)]) -> Vec<Span> {
     if !enabled!(target: trace::TARGET, Level::DEBUG) {
         return Vec::new();
     }
     let mut spans = Vec::new();
     for (_, said) in say {
-        if let Say::Lease(lease) = said {
+        if let ToWorker::Lease(lease) = said {
             let span = debug_span!(target: trace::TARGET, parent: None, "grant", job = %lease.job,
                 stage = &*lease.stage.name, lo = lease.lo, hi = lease.hi, range = %lease.lease.range);
             lease.traceparent = trace::traceparent(&span);

@@ -13,14 +13,14 @@ use picofarm_proto::{
 };
 
 use crate::{
-    auth::{Caller, not_yours},
+    auth::{Caller, not_owner},
     core::plan,
 };
 
 /// Another job's scenes of a list of files in the data set that a stage writes to. But for files
 /// whose content differs, they are the stage's own: workers take them over.
 #[derive(Debug, Clone)]
-pub(crate) struct Listed {
+pub(crate) struct FileOverlap {
     /// The other job, where the caller may see it.
     pub job: Option<(JobId, String)>,
     /// Where its outputs are recorded.
@@ -39,17 +39,17 @@ pub(crate) struct Listed {
 /// # Errors
 /// Returns a [`SpecError`] at `output.dataset` that names the job and the first setting that
 /// differs.
-pub(crate) fn place_is_free(
+pub(crate) fn check_dataset_free(
     stage: &StageSpec,
     set: &ResultSet,
     others: &[Job],
     sight: &Sight,
-) -> Result<Vec<Listed>, SpecError> {
+) -> Result<Vec<FileOverlap>, SpecError> {
     let mut listed = Vec::new();
     let files = stage.task.files_key();
     for other in others {
         for there in &other.spec.stages {
-            let theirs = ResultSet::of(there);
+            let theirs = ResultSet::of_stage(there);
             if (&theirs.store, &theirs.dataset) != (&set.store, &set.dataset)
                 || theirs.stage_key == set.stage_key
             {
@@ -58,7 +58,7 @@ pub(crate) fn place_is_free(
             let seen = sight.sees(&Owner::from(other));
             if files.is_some() && there.task.files_key() == files {
                 let (equal, changed) = compare_files(stage, there);
-                listed.push(Listed {
+                listed.push(FileOverlap {
                     job: seen.then(|| (other.id, other.spec.name.clone())),
                     set: theirs,
                     equal,
@@ -112,11 +112,11 @@ fn compare_files(
 }
 
 /// Says that a scene of the data set was made of another content than its file has now.
-pub(crate) fn made_of_another(
+pub(crate) fn changed_file_error(
     stage: &StageSpec,
     set: &ResultSet,
     scene: u64,
-    listed: &Listed,
+    listed: &FileOverlap,
 ) -> SpecError {
     let field = format!("scenes.files[{scene}]");
     let (Some(was), Some(is)) = (
@@ -155,7 +155,12 @@ pub(crate) fn may_force(
     by: &Caller,
     sight: &Sight,
 ) -> Result<(), String> {
-    let has = |job: &&Job| job.spec.stages.iter().any(|s| ResultSet::of(s) == *set);
+    let has = |job: &&Job| {
+        job.spec
+            .stages
+            .iter()
+            .any(|s| ResultSet::of_stage(s) == *set)
+    };
     let Some(first) = others.iter().rev().find(has) else {
         return Ok(());
     };
@@ -164,7 +169,7 @@ pub(crate) fn may_force(
         return Ok(());
     }
     let whose = match sight.sees(&owner) {
-        true => not_yours(&first.id, &owner),
+        true => not_owner(&first.id, &owner),
         false => "you may not see its job".to_owned(),
     };
     Err(format!(
@@ -175,7 +180,7 @@ pub(crate) fn may_force(
 
 /// Scenes that other jobs have made of files that a stage lists, too.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Elsewhere {
+pub(crate) struct ReusedScenes {
     /// How many.
     pub scenes: u64,
     /// The latest of these jobs that the caller may see.
@@ -183,7 +188,7 @@ pub(crate) struct Elsewhere {
 }
 
 /// Returns the records of equal files, except those of the stage itself.
-pub(super) fn elsewhere(listed: &[(Listed, Vec<Recorded>)], own: &[Recorded]) -> Elsewhere {
+pub(super) fn elsewhere(listed: &[(FileOverlap, Vec<Recorded>)], own: &[Recorded]) -> ReusedScenes {
     let own: BTreeSet<u64> = own.iter().map(|output| output.task).collect();
     let mut scenes = BTreeSet::new();
     let mut job = None;
@@ -197,7 +202,7 @@ pub(super) fn elsewhere(listed: &[(Listed, Vec<Recorded>)], own: &[Recorded]) ->
         }
         scenes.extend(equal);
     }
-    Elsewhere {
+    ReusedScenes {
         scenes: scenes.len() as u64,
         job,
     }

@@ -10,11 +10,12 @@ use picofarm_proto::{
 
 use super::{
     check::{self, Findings},
-    conflicts::{Listed, elsewhere, made_of_another, may_force, place_is_free},
+    conflicts::{FileOverlap, changed_file_error, check_dataset_free, elsewhere, may_force},
     draft::Draft,
-    foresee, look, places, report,
+    foresee, places, report,
+    result_reader::ResultState,
     service::{Submissions, broken},
-    stored::Found,
+    store_checks::plan_deadline,
 };
 use crate::{
     actor::{Command, Refusal},
@@ -25,19 +26,19 @@ use crate::{
 const RECENT: u32 = 50;
 
 /// The catalog's data about a draft.
-struct Facts {
+struct CatalogFacts {
     /// Recorded outputs, by stage.
     recorded: Vec<Vec<Recorded>>,
     /// By stage, of jobs with other lists of files; with the outputs that are recorded of them.
-    listed: Vec<Vec<(Listed, Vec<Recorded>)>>,
-    latest: Option<Latest>,
+    listed: Vec<Vec<(FileOverlap, Vec<Recorded>)>>,
+    latest: Option<EqualJob>,
     /// Normal forms of others' places that the caller may write into.
     permitted: Vec<String>,
 }
 
 /// The latest job with the same spec.
 #[derive(Debug, Clone)]
-pub(super) struct Latest {
+pub(super) struct EqualJob {
     pub(super) id: JobId,
     pub(super) state: JobState,
     pub(super) owner: Owner,
@@ -46,7 +47,7 @@ pub(super) struct Latest {
 /// A draft with its plan.
 pub(super) struct Considered {
     pub(super) plan: JobPlan,
-    pub(super) latest: Option<Latest>,
+    pub(super) latest: Option<EqualJob>,
     /// Whether the latest job is done but some of its results are missing.
     pub(super) lost: bool,
     /// Findings, by stage.
@@ -69,20 +70,20 @@ impl Submissions {
                 |it, draft| async move { it.facts(&draft, &whose).await },
             )
             .await?;
-        let Facts {
+        let CatalogFacts {
             recorded,
             listed,
             latest,
             permitted,
         } = facts;
-        let until = look::deadline();
+        let until = plan_deadline();
         for (position, listed) in listed.iter().enumerate() {
             self.unchanged(draft, position, listed, until).await?;
         }
         let mut findings = Vec::with_capacity(recorded.len());
         for (position, recorded) in recorded.into_iter().enumerate() {
             let elsewhere = elsewhere(&listed[position], &recorded);
-            let mut found = self.look(draft, position, recorded, until).await?;
+            let mut found = self.check_stage(draft, position, recorded, until).await?;
             found.elsewhere = elsewhere;
             findings.push(found);
         }
@@ -116,7 +117,7 @@ impl Submissions {
     }
 
     /// Collects the catalog's data about a draft.
-    async fn facts(&self, draft: &Draft, by: &Caller) -> Result<Facts, Refusal> {
+    async fn facts(&self, draft: &Draft, by: &Caller) -> Result<CatalogFacts, Refusal> {
         let catalog = &self.catalog;
         let sight = by.sight(self.visibility);
         let permitted = self.permitted(draft, by).await?;
@@ -132,7 +133,7 @@ impl Submissions {
                 let others = catalog.jobs_at(&set.store, &set.dataset).await;
                 let others = others.map_err(broken)?;
                 if writes {
-                    let there = place_is_free(stage, set, &others, &sight)
+                    let there = check_dataset_free(stage, set, &others, &sight)
                         .map_err(|why| Refusal::Spec(draft.spec.at(stage, why)))?;
                     for other in there {
                         let recorded = catalog.recorded(&other.set, record.tasks).await;
@@ -151,10 +152,10 @@ impl Submissions {
         let _charge = self.charge(draft, Specs::With(&identity)).await?;
         let latest = catalog.job_with(&identity).await;
         let latest = latest.map_err(broken)?;
-        Ok(Facts {
+        Ok(CatalogFacts {
             recorded,
             listed: others_listed,
-            latest: latest.map(|job| Latest {
+            latest: latest.map(|job| EqualJob {
                 owner: Owner::from(&job),
                 id: job.id,
                 state: job.state,
@@ -175,7 +176,7 @@ impl Submissions {
         for (position, mine) in places::written(&draft.spec.stages, draft.stages(), &owner) {
             let (stage, record) = (&draft.spec.stages[position], &draft.stages()[position]);
             let near = self.catalog.owned_near(&mine.place).await.map_err(broken)?;
-            for (other, may_write) in places::of_others(&mine, &near, by) {
+            for (other, may_write) in places::owned_by_others(&mine, &near, by) {
                 if !may_write {
                     // The same results may be reused, but none may be added.
                     let theirs = self.catalog.largest_stage(&record.set, &other.owner.user);
@@ -192,7 +193,7 @@ impl Submissions {
     }
 
     /// Checks a stage's recorded outputs against its store.
-    async fn look(
+    async fn check_stage(
         &self,
         draft: &Draft,
         position: usize,
@@ -202,11 +203,11 @@ impl Submissions {
         let (stage, set) = (&draft.spec.stages[position], &draft.stages()[position].set);
         let chosen = check::choose(&recorded, &draft.hash);
         let some: Vec<Recorded> = chosen.iter().map(|i| recorded[*i]).collect();
-        let (mut found, mut why) = self.stores.look(stage, &set.store, &some, until).await;
+        let (mut found, mut why) = self.stores.check(stage, &set.store, &some, until).await;
         if why.is_none() && check::suspicious(&recorded, &found) {
             let passed = recorded.iter().filter(|o| !found.contains_key(&o.task));
             let passed: Vec<Recorded> = passed.copied().collect();
-            let (more, stopped) = self.stores.look(stage, &set.store, &passed, until).await;
+            let (more, stopped) = self.stores.check(stage, &set.store, &passed, until).await;
             found.extend(more);
             why = stopped;
         }
@@ -214,10 +215,10 @@ impl Submissions {
             .evidence
             .sees_another_disk(set.store.trim_end_matches('/'))
         {
-            found.retain(|_, found| *found == Found::Equal);
+            found.retain(|_, found| *found == ResultState::Equal);
             why = Some(another);
         }
-        let is_new = |o: &&Recorded| !o.checked && found.get(&o.task) == Some(&Found::Equal);
+        let is_new = |o: &&Recorded| !o.checked && found.get(&o.task) == Some(&ResultState::Equal);
         let new: Vec<Recorded> = recorded.iter().filter(is_new).copied().collect();
         if !new.is_empty()
             && let Err(error) = self.catalog.mark_checked(set, &new).await
@@ -233,7 +234,7 @@ impl Submissions {
         &self,
         draft: &Draft,
         position: usize,
-        listed: &[(Listed, Vec<Recorded>)],
+        listed: &[(FileOverlap, Vec<Recorded>)],
         until: tokio::time::Instant,
     ) -> Result<(), Refusal> {
         let (stage, set) = (&draft.spec.stages[position], &draft.stages()[position].set);
@@ -241,16 +242,16 @@ impl Submissions {
             let made = recorded.iter();
             let made = made.filter(|output| other.changed.contains_key(&output.task));
             let made: Vec<Recorded> = made.copied().collect();
-            let (found, _) = self.stores.look(stage, &set.store, &made, until).await;
+            let (found, _) = self.stores.check(stage, &set.store, &made, until).await;
             // What cannot be looked at is there.
             let there = made.iter().find(|output| {
                 matches!(
                     found.get(&output.task),
-                    None | Some(Found::Equal | Found::NoFolder)
+                    None | Some(ResultState::Equal | ResultState::NoFolder)
                 )
             });
             if let Some(output) = there {
-                let why = made_of_another(stage, set, output.task, other);
+                let why = changed_file_error(stage, set, output.task, other);
                 return Err(Refusal::Spec(draft.spec.at(stage, why)));
             }
         }
@@ -265,7 +266,7 @@ impl Submissions {
         recent: &[Job],
     ) -> Result<(), Refusal> {
         let (reply, answer) = tokio::sync::oneshot::channel();
-        let ask = Command::Fits(Arc::clone(&draft.spec), reply);
+        let ask = Command::EligibleWorkers(Arc::clone(&draft.spec), reply);
         let gone = || Refusal::NotNow("the coordinator is stopping; try again".into());
         self.commands.send(ask).await.map_err(|_| gone())?;
         let fits = answer.await.map_err(|_| gone())??;
@@ -277,7 +278,7 @@ impl Submissions {
             }
             let mut measured = Vec::new();
             for other in foresee::similar(stage, recent) {
-                let timing = self.catalog.timing(&ResultSet::of(other)).await;
+                let timing = self.catalog.timing(&ResultSet::of_stage(other)).await;
                 measured.push((other, timing.map_err(broken)?));
             }
             (planned.task_seconds, planned.task_bytes, planned.measured) =

@@ -16,11 +16,11 @@ const STORES: usize = 1_024;
 
 /// Evidence of whether this coordinator sees the stores of its workers, by store.
 #[derive(Debug, Default)]
-pub(super) struct Evidence(Mutex<HashMap<String, Seen>>);
+pub(super) struct Evidence(Mutex<HashMap<String, StoreEvidence>>);
 
 /// This coordinator's evidence about a store.
 #[derive(Debug, Default)]
-pub(super) struct Seen {
+pub(super) struct StoreEvidence {
     /// A result that was found in the store.
     pub(super) witness: Option<(Arc<JobSpec>, StageRef, Recorded)>,
     /// Workers with missing results, before the first result was found.
@@ -41,7 +41,7 @@ impl Evidence {
     }
 
     /// Reads or changes the evidence about one store.
-    pub(super) fn with<T>(&self, store: &str, change: impl FnOnce(&mut Seen) -> T) -> T {
+    pub(super) fn with<T>(&self, store: &str, change: impl FnOnce(&mut StoreEvidence) -> T) -> T {
         let mut evidence = self.0.lock().expect("no panic while locked");
         if evidence.len() > STORES {
             evidence.clear();

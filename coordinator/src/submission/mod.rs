@@ -12,18 +12,18 @@ mod draft;
 mod evidence;
 mod foresee;
 mod judge;
-mod look;
 mod places;
 mod prepare;
 mod report;
+mod result_reader;
 mod service;
-mod stored;
+mod store_checks;
 mod submit;
 mod verify;
 
 #[cfg(test)]
-pub(crate) use prepare::{prepare, stands_for};
+pub(crate) use prepare::{prepare, reuses_job};
 
 pub(crate) use draft::Draft;
+pub use result_reader::{ResultReader, ResultState};
 pub(crate) use service::Submissions;
-pub use stored::{Found, Stored};

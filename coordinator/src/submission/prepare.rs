@@ -22,7 +22,7 @@ pub(crate) struct Prepared {
 
 /// Returns whether the latest job with a spec, in this state, is reused for a new submission. It is
 /// not if the job ended badly and the caller asks to run it again.
-pub(crate) fn stands_for(state: JobState, again: bool) -> bool {
+pub(crate) fn reuses_job(state: JobState, again: bool) -> bool {
     !(again && matches!(state, JobState::Failed | JobState::Cancelled))
 }
 
@@ -50,10 +50,10 @@ pub(crate) fn prepare(
         reused.extend(existing.iter().map(|run| (stage.id.stage, *run)));
     }
     let message = format!("{total} tasks, {} to run", total - there);
-    let mut events = vec![NewEvent::of(id, now_ms, EventKind::Submitted, message)];
+    let mut events = vec![NewEvent::new(id, now_ms, EventKind::Submitted, message)];
     for (stage, run) in reused {
         let message = format!("outputs of tasks {}..{} exist already", run.lo, run.hi);
-        let event = NewEvent::of(id, now_ms, EventKind::Reused, message);
+        let event = NewEvent::new(id, now_ms, EventKind::Reused, message);
         events.push(NewEvent {
             stage: Some(stage),
             tasks: Some(run),

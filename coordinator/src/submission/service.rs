@@ -6,11 +6,13 @@ use picofarm_catalog::{Catalog, CatalogError, Job, Specs, StageRecord};
 use picofarm_proto::{ids::JobId, model::JobState};
 use tokio::sync::{Mutex, mpsc};
 
-use super::{draft::Draft, evidence::Evidence, look::Stores, stored::Stored};
+use super::{
+    draft::Draft, evidence::Evidence, result_reader::ResultReader, store_checks::StoreChecks,
+};
 use crate::{
     actor::{Command, Lanes, Refusal},
     auth::Visibility,
-    core::{Clock, Learnt, Timings},
+    core::{Clock, NewJob, Timings},
     memory::{Charge, Memory, kept_cost},
 };
 
@@ -19,7 +21,7 @@ use crate::{
 pub(crate) struct Submissions {
     pub(super) catalog: Arc<dyn Catalog>,
     pub(super) lanes: Lanes,
-    pub(super) stores: Stores,
+    pub(super) stores: StoreChecks,
     pub(super) commands: mpsc::Sender<Command>,
     pub(super) clock: Clock,
     /// Which jobs of others a caller can see.
@@ -35,7 +37,7 @@ impl Submissions {
     pub(crate) fn new(
         catalog: Arc<dyn Catalog>,
         lanes: Lanes,
-        stored: Option<Arc<dyn Stored>>,
+        stored: Option<Arc<dyn ResultReader>>,
         commands: mpsc::Sender<Command>,
         clock: Clock,
         visibility: Visibility,
@@ -44,7 +46,7 @@ impl Submissions {
         Self {
             catalog,
             lanes,
-            stores: Stores::new(stored),
+            stores: StoreChecks::new(stored),
             commands,
             clock,
             visibility,
@@ -73,15 +75,15 @@ impl Submissions {
         }
         // A job without any task to run has already ended.
         let state = self.catalog.state(job.id).await.map_err(broken)?;
-        let learnt = Learnt {
+        let new_job = NewJob {
             kept: kept_cost(&job.spec),
             job,
             stages,
             timings,
         };
-        let learnt = (state == Some(JobState::Active)).then_some(learnt);
+        let new_job = (state == Some(JobState::Active)).then_some(new_job);
         let (reply, answer) = tokio::sync::oneshot::channel();
-        let command = Command::Learn(learnt.map(Box::new), reply);
+        let command = Command::Learn(new_job.map(Box::new), reply);
         if self.commands.send(command).await.is_ok() {
             // If the actor is between two lives, it finds the job in the catalog.
             let _ = answer.await;

@@ -13,12 +13,12 @@ use super::{
     consider::Considered,
     draft::Draft,
     places,
-    prepare::{Prepared, prepare, stands_for},
+    prepare::{Prepared, prepare, reuses_job},
     service::{Submissions, broken},
 };
 use crate::{
     actor::{Refusal, Submitted},
-    auth::{Caller, not_yours},
+    auth::{Caller, not_owner},
 };
 
 /// Most attempts to plan a submission again because the catalog changed meanwhile.
@@ -57,7 +57,7 @@ impl Submissions {
         for _ in 0..ATTEMPTS {
             let considered = self.consider(draft, by).await?;
             let latest = considered.latest.as_ref();
-            let stands = latest.filter(|job| !considered.lost && stands_for(job.state, again));
+            let stands = latest.filter(|job| !considered.lost && reuses_job(job.state, again));
             if let Some(job) = stands {
                 return Ok(Submitted {
                     job: job.id,
@@ -69,7 +69,7 @@ impl Submissions {
             if let Some(job) = latest.filter(|job| job.state != JobState::Done)
                 && !by.may_change(&job.owner)
             {
-                return Err(Refusal::Denied(not_yours(&job.id, &job.owner)));
+                return Err(Refusal::Denied(not_owner(&job.id, &job.owner)));
             }
             if let Some(submitted) = self.record(draft, by, most, considered).await? {
                 return Ok(submitted);
@@ -99,7 +99,7 @@ impl Submissions {
         let anyone = by.is_anyone();
         let recorded = self.heavy(draft, move |it, draft| async move {
             let _turn = it.turn.lock().await;
-            if it.catalog.jobs_of(&owner).await.map_err(broken)? >= most {
+            if it.catalog.unfinished_jobs(&owner).await.map_err(broken)? >= most {
                 return Err(Refusal::TooMany(format!(
                     "{owner:?} has {most} jobs that have not ended, the most that --max-jobs-per-user allows; wait for \
                      some to end, or cancel some"

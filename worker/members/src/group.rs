@@ -26,7 +26,7 @@ use tracing::{info, warn};
 use crate::{
     Call, Rendezvous,
     endpoint::{Endpoint, visit},
-    link::{Heard, Link},
+    link::{Link, LinkEvent},
     mesh::{Breaker, Mesh},
     message::{Address, Message, Wish},
 };
@@ -47,8 +47,8 @@ pub struct Members<'a> {
     machine: String,
     endpoint: Endpoint,
     breaker: Arc<Breaker>,
-    heard: Receiver<(u64, Heard)>,
-    hears: Sender<(u64, Heard)>,
+    events: Receiver<(u64, LinkEvent)>,
+    events_sender: Sender<(u64, LinkEvent)>,
     /// Connections for the all-reduce that arrived before this process knew of the agreement.
     early: Vec<(u64, usize, TcpStream)>,
     role: Role,
@@ -70,8 +70,8 @@ enum Role {
 }
 
 /// The result of waiting for a message.
-enum Waited {
-    Said(Message, Vec<u8>),
+enum WaitResult {
+    Message(Message, Vec<u8>),
     Lost,
     Stop,
 }
@@ -99,7 +99,7 @@ impl<'a> Members<'a> {
                  machine"
             ))
         })?;
-        let (hears, heard) = channel();
+        let (events_sender, events) = channel();
         Ok(Self {
             rendezvous,
             stopped,
@@ -107,8 +107,8 @@ impl<'a> Members<'a> {
             machine: machine.to_owned(),
             endpoint,
             breaker: Arc::default(),
-            heard,
-            hears,
+            events,
+            events_sender,
             early: Vec::new(),
             role: Role::None,
             mesh: None,
@@ -119,7 +119,7 @@ impl<'a> Members<'a> {
     }
 
     /// Tells the others that the result is stored.
-    pub fn over(&mut self) {
+    pub fn announce_end(&mut self) {
         self.greet();
         if let Role::Leads(leads) = &mut self.role {
             for other in leads.others.iter().chain(&leads.coming) {
@@ -186,7 +186,12 @@ impl<'a> Members<'a> {
 
     fn link(&mut self, stream: TcpStream) -> io::Result<Link> {
         self.links += 1;
-        Link::open(self.links, stream, self.hears.clone(), self.breaker.clone())
+        Link::open(
+            self.links,
+            stream,
+            self.events_sender.clone(),
+            self.breaker.clone(),
+        )
     }
 
     /// Handles newly arrived connections.
@@ -271,13 +276,13 @@ impl Group for Members<'_> {
         }
         match &self.role {
             Role::None => Ok(false),
-            Role::Follows { .. } => match self.said() {
-                Waited::Said(Message::Go, _) => Ok(true),
-                Waited::Said(message, payload) => {
+            Role::Follows { .. } => match self.next_message() {
+                WaitResult::Message(Message::Go, _) => Ok(true),
+                WaitResult::Message(message, payload) => {
                     self.put_back(message, payload);
                     Ok(false)
                 }
-                Waited::Lost | Waited::Stop => Ok(false),
+                WaitResult::Lost | WaitResult::Stop => Ok(false),
             },
             Role::Leads(_) => Ok(self.lead_on()),
         }
@@ -329,23 +334,23 @@ impl Group for Members<'_> {
     }
 
     fn hear(&mut self, digest: u64) -> Result<Option<Line>, ModelError> {
-        match self.said() {
-            Waited::Said(
+        match self.next_message() {
+            WaitResult::Message(
                 Message::Epoch {
                     line,
                     digest: theirs,
                 },
                 _,
             ) if theirs == digest => Ok(Some(line)),
-            Waited::Said(Message::Epoch { .. }, _) => Err(failed(
+            WaitResult::Message(Message::Epoch { .. }, _) => Err(failed(
                 "after an epoch this process has other numbers than the one that leads; processes of one training must \
                  compute alike: give them the same kind of device and the same program",
             )),
-            Waited::Said(message, payload) => {
+            WaitResult::Message(message, payload) => {
                 self.put_back(message, payload);
                 Ok(None)
             }
-            Waited::Lost | Waited::Stop => Ok(None),
+            WaitResult::Lost | WaitResult::Stop => Ok(None),
         }
     }
 }

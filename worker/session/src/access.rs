@@ -18,7 +18,7 @@ use tonic::{
 };
 
 use diagnosis::causes;
-pub use diagnosis::{Trouble, lost_connection};
+pub use diagnosis::{ConnectionFailure, lost_connection};
 
 /// Credentials of a client or worker, and the certificate authorities it trusts.
 #[derive(Debug, Clone, Default)]

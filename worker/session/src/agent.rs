@@ -36,7 +36,7 @@ use connection::Link;
 use leaving::{Haste, Leaving};
 
 /// Interval for sending the log of the running task.
-const TELL: Duration = Duration::from_secs(1);
+const LOG_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Runs a worker with this executor until `shutdown` or a refusal.
 ///
@@ -88,7 +88,7 @@ async fn work(
         runner: Runner::start(executor, config.threads, allowed)?,
         control: None,
         unsent: Unsent::default(),
-        tell_at: Instant::now(),
+        log_at: Instant::now(),
         suspends: Suspends::new(),
         targets,
         target: 0,
@@ -125,7 +125,7 @@ struct Agent {
     /// Unsent log lines of tasks.
     unsent: Unsent,
     /// The next time to send the log of the running task.
-    tell_at: Instant,
+    log_at: Instant,
     /// The configured coordinators.
     targets: Vec<Target>,
     /// Index of the coordinator in use or to be tried next.
@@ -198,16 +198,16 @@ impl Agent {
             self.control = Some(control.clone());
             let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
                 task = task.index);
-            if let Some(hand) = self.assignments.in_hand() {
+            if let Some(hand) = self.assignments.current() {
                 trace::join(&span, &hand.traceparent);
             }
             self.assignments.traced(trace::traceparent(&span));
             self.runner.begin(task, control, span);
         }
-        if let Some(hand) = self.assignments.in_hand()
-            && now >= self.tell_at
+        if let Some(hand) = self.assignments.current()
+            && now >= self.log_at
         {
-            self.tell_at = now + TELL;
+            self.log_at = now + LOG_INTERVAL;
             let lines = self.runner.log().take();
             self.unsent.push(hand.lease, hand.task.index, lines);
         }
@@ -229,7 +229,7 @@ impl Agent {
             .chain(idle.map(|(since, most)| since + most))
             .chain(self.assignments.paused_until())
             .chain(self.assignments.ends_at())
-            .chain(self.assignments.in_hand().map(|_| self.tell_at))
+            .chain(self.assignments.current().map(|_| self.log_at))
             .filter(|at| *at > now)
             .min()
             .unwrap_or(now + Duration::from_secs(60))

@@ -31,7 +31,7 @@ const AHEAD: Duration = Duration::from_secs(2);
 
 /// The running task.
 #[derive(Debug)]
-pub(crate) struct InHand {
+pub(crate) struct CurrentTask {
     /// Its lease.
     pub(crate) lease: LeaseRef,
     /// The task itself.
@@ -46,7 +46,7 @@ pub(crate) struct InHand {
 #[derive(Debug)]
 pub(crate) struct Assignments {
     leases: Vec<HeldLease>,
-    in_hand: Option<InHand>,
+    current: Option<CurrentTask>,
     outbox: Outbox,
     /// Unanswered heartbeats of this connection, oldest first. Each answer belongs to the oldest.
     beats: VecDeque<Beat>,
@@ -67,7 +67,7 @@ impl Assignments {
     pub(crate) fn new() -> Self {
         Self {
             leases: Vec::new(),
-            in_hand: None,
+            current: None,
             outbox: Outbox::default(),
             beats: VecDeque::new(),
             asked: false,
@@ -85,8 +85,8 @@ impl Assignments {
     }
 
     /// Returns the running task.
-    pub(crate) fn in_hand(&self) -> Option<&InHand> {
-        self.in_hand.as_ref()
+    pub(crate) fn current(&self) -> Option<&CurrentTask> {
+        self.current.as_ref()
     }
 
     /// Returns the number of unacknowledged reports.
@@ -159,7 +159,7 @@ impl Assignments {
             .iter()
             .any(|h| h.lease == lease && now < h.end());
         self.leases.retain(|h| h.lease != lease);
-        live && self.in_hand.as_ref().is_some_and(|t| t.lease == lease)
+        live && self.current.as_ref().is_some_and(|t| t.lease == lease)
     }
 
     /// Handles a lease with tasks from `hi` on moved to another worker.
@@ -180,7 +180,7 @@ impl Assignments {
 
     /// Takes the next task that may be started, if none is running.
     pub(crate) fn begin(&mut self, now: Instant) -> Option<Task> {
-        if self.in_hand.is_some() || self.draining || self.paused(now) {
+        if self.current.is_some() || self.draining || self.paused(now) {
             return None;
         }
         let held = self
@@ -195,7 +195,7 @@ impl Assignments {
         };
         held.next += 1;
         held.pass_skipped();
-        self.in_hand = Some(InHand {
+        self.current = Some(CurrentTask {
             lease: held.lease,
             task: task.clone(),
             traceparent: held.traceparent.clone(),
@@ -206,7 +206,7 @@ impl Assignments {
 
     /// Records the running task's own span in a trace.
     pub(crate) fn traced(&mut self, traceparent: String) {
-        if let Some(hand) = &mut self.in_hand {
+        if let Some(hand) = &mut self.current {
             hand.traceparent = traceparent;
         }
     }
@@ -214,9 +214,13 @@ impl Assignments {
     /// Handles the end of the running task. Its report goes to the outbox: every finished task,
     /// even if its lease is lost (the output is valid anyway), and failures only if the worker
     /// still has the lease.
-    pub(crate) fn ended(&mut self, now: Instant, result: &Result<Output, TaskError>) -> InHand {
+    pub(crate) fn ended(
+        &mut self,
+        now: Instant,
+        result: &Result<Output, TaskError>,
+    ) -> CurrentTask {
         let hand = self
-            .in_hand
+            .current
             .take()
             .expect("only the task in hand can end: the runner runs one at a time");
         let held = self.leases.iter().any(|h| h.lease == hand.lease);
@@ -265,10 +269,10 @@ impl Assignments {
     /// lease is requested while the worker has tasks of another stage.
     fn wants(&self) -> bool {
         let waiting: u64 = self.leases.iter().map(|h| h.hi - h.next).sum();
-        let left = waiting + u64::from(self.in_hand.is_some());
+        let left = waiting + u64::from(self.current.is_some());
         let ahead = self.leases.iter().filter(|h| h.next < h.hi);
-        let in_hand = self.in_hand.iter().map(|hand| hand.task.stage);
-        let mut stages = ahead.map(|h| h.stage).chain(in_hand);
+        let current = self.current.iter().map(|hand| hand.task.stage);
+        let mut stages = ahead.map(|h| h.stage).chain(current);
         let soon_over = self.pace.is_some_and(|(stage, pace)| {
             if stages.any(|other| other != stage) {
                 return false;
@@ -302,9 +306,9 @@ impl Assignments {
 
     /// Drops leases that are finished and have no unacknowledged reports.
     fn tidy(&mut self) {
-        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
+        let current = self.current.as_ref().map(|t| t.lease);
         let outbox = &self.outbox;
         self.leases
-            .retain(|h| h.next < h.hi || Some(h.lease) == in_hand || outbox.mentions(h.lease));
+            .retain(|h| h.next < h.hi || Some(h.lease) == current || outbox.mentions(h.lease));
     }
 }

@@ -6,7 +6,7 @@ use picofarm_catalog::{CatalogError, Changes, Settled};
 
 use super::Life;
 use crate::{
-    core::{Say, SessionId},
+    core::{SessionId, ToWorker},
     observe::trace,
 };
 
@@ -19,7 +19,7 @@ impl Life<'_> {
     async fn commit_the_rest(
         &mut self,
         changes: &mut Changes,
-        say: &mut [(SessionId, Say)],
+        say: &mut [(SessionId, ToWorker)],
         mut error: CatalogError,
     ) -> Result<Settled, CatalogError> {
         let catalog = &self.actor.catalog;
@@ -62,7 +62,7 @@ impl Life<'_> {
         self.core.settled(&settled);
         let mut deaf = Vec::new();
         for (session, what) in say {
-            let over = what == Say::Replaced;
+            let over = what == ToWorker::Replaced;
             let Some(sender) = self.sessions.get(session) else {
                 continue;
             };

@@ -8,7 +8,7 @@ use picofarm_proto::{
     model::{FailureKind, JobState},
 };
 
-use super::{Life, reports::Known};
+use super::{Life, reports::KnownManifests};
 use crate::{
     actor::command::{Command, FromWorker, Refusal, Reply, Ruling},
     core::{Reported, SessionId},
@@ -32,7 +32,7 @@ impl Life<'_> {
             .collect();
         let mut new: HashMap<String, Vec<Reported>> = HashMap::new();
         let found = self.actor.catalog.manifests(&asked).await?;
-        let known: Known = asked.into_iter().zip(found).collect();
+        let known: KnownManifests = asked.into_iter().zip(found).collect();
         for command in batch.drain(..) {
             match command {
                 Command::Open {
@@ -49,11 +49,11 @@ impl Life<'_> {
                     self.core.receive(owned, now);
                     self.sessions.open(session, say, waiting);
                     self.core.hello(session, hello, now);
-                    self.core.is_here(session, here);
+                    self.core.set_local(session, here);
                 }
                 Command::Worker(session, FromWorker::Done(report)) => {
-                    let looks = self.actor.aside.looks();
-                    match self.core.reported(session, &report).filter(|_| looks) {
+                    let checks = self.actor.slow_work.can_check_stores();
+                    match self.core.reported(session, &report).filter(|_| checks) {
                         _ if self.disputed(session, &report, &known) => {}
                         Some(reported) => {
                             let reports = new.entry(reported.store.clone()).or_default();
@@ -84,9 +84,9 @@ impl Life<'_> {
                 }
                 Command::Worker(session, said) => self.worker_said(session, said),
                 Command::Broken(error) => return Err(error),
-                Command::Learn(learnt, reply) => {
-                    if let Some(learnt) = learnt {
-                        self.learn(*learnt);
+                Command::Learn(new_job, reply) => {
+                    if let Some(new_job) = new_job {
+                        self.learn(*new_job);
                     }
                     self.actor.revision.send_modify(|n| *n += 1);
                     let _ = reply.send(Ok(()));
@@ -115,19 +115,19 @@ impl Life<'_> {
                 Command::Workers(reply) => {
                     let _ = reply.send(Ok(self.core.everywhere()));
                 }
-                Command::Fits(spec, reply) => {
-                    let _ = reply.send(Ok(self.core.fits(&spec)));
+                Command::EligibleWorkers(spec, reply) => {
+                    let _ = reply.send(Ok(self.core.eligible_workers(&spec)));
                 }
-                Command::Look(reply) => {
-                    let _ = reply.send(Ok(self.core.look(self.now())));
+                Command::FarmSnapshot(reply) => {
+                    let _ = reply.send(Ok(self.core.farm_snapshot(self.now())));
                 }
-                Command::LookAt {
+                Command::JobSnapshot {
                     job,
                     stage,
                     task,
                     reply,
                 } => {
-                    let look = self.core.look_at(job, stage, task, self.now());
+                    let look = self.core.job_snapshot(job, stage, task, self.now());
                     let _ = reply.send(Ok(look));
                 }
                 Command::Drain(worker, reply) => {
@@ -136,7 +136,7 @@ impl Life<'_> {
             }
         }
         for (store, reports) in new {
-            self.look_for(store, reports);
+            self.start_check(store, reports);
         }
         Ok(())
     }
@@ -146,23 +146,23 @@ impl Life<'_> {
         match said {
             FromWorker::Credit(n) => self.core.credit(session, n),
             FromWorker::Heartbeat(leases, progress, ends_in_ms) => {
-                self.sessions.heard(session);
+                self.sessions.heartbeat_handled(session);
                 self.core.ends(session, ends_in_ms, now);
                 self.core.heartbeat(session, &leases, &progress, now);
             }
             FromWorker::Done(_) => unreachable!("handled with what the catalog holds"),
             FromWorker::Unusable(lease, index, why) => {
-                let before = self.core.noted();
+                let before = self.core.new_events();
                 self.core.unusable(session, lease, index, &why, now);
-                if self.core.noted() > before {
+                if self.core.new_events() > before {
                     self.tally.failed(FailureKind::User);
                 }
             }
             FromWorker::Failed(failure) => {
-                let before = self.core.noted();
+                let before = self.core.new_events();
                 self.core.failed(session, &failure, now);
                 // A refused report adds no line to the history.
-                if self.core.noted() > before {
+                if self.core.new_events() > before {
                     self.tally.failed(failure.kind);
                 }
             }
@@ -171,7 +171,7 @@ impl Life<'_> {
             FromWorker::Closed => {
                 self.sessions.close(session);
                 self.core.closed(session, now);
-                self.core.is_here(session, false);
+                self.core.set_local(session, false);
             }
         }
     }

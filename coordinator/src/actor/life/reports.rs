@@ -6,26 +6,26 @@ use picofarm_proto::{ids::StageRef, model::Finished};
 
 use super::Life;
 use crate::{
-    actor::{aside::Dispute, command::Verdict},
+    actor::{command::StoreCheck, slow_work::Dispute},
     core::{OutputHint, Reported, SessionId},
     observe::trace,
 };
 
 /// Most disputed reports that are checked against a store at a time. For further reports the
 /// recorded result stands.
-const DISPUTES: usize = 64;
+const MOST_DISPUTES: usize = 64;
 
 /// The recorded manifest hash of each task in a batch of reports.
-pub(super) type Known = HashMap<(StageRef, u64), Option<[u8; 32]>>;
+pub(super) type KnownManifests = HashMap<(StageRef, u64), Option<[u8; 32]>>;
 
 impl Life<'_> {
     /// Starts a check of reported results against their store. Each store has one check at a time;
     /// reports that arrive meanwhile are part of the next check.
-    pub(super) fn look_for(&mut self, store: String, reports: Vec<Reported>) {
-        match self.looking.entry(store) {
+    pub(super) fn start_check(&mut self, store: String, reports: Vec<Reported>) {
+        match self.checking.entry(store) {
             Entry::Occupied(mut waiting) => waiting.get_mut().extend(reports),
             Entry::Vacant(entry) if !reports.is_empty() => {
-                self.actor.aside.verify(entry.key().clone(), reports);
+                self.actor.slow_work.verify(entry.key().clone(), reports);
                 entry.insert(Vec::new());
             }
             Entry::Vacant(_) => {}
@@ -36,9 +36,9 @@ impl Life<'_> {
     pub(super) fn verified(
         &mut self,
         store: &str,
-        reports: Vec<(Reported, Verdict)>,
+        reports: Vec<(Reported, StoreCheck)>,
         blind: bool,
-        known: &Known,
+        known: &KnownManifests,
     ) {
         if blind {
             self.core.forgive(store);
@@ -51,15 +51,15 @@ impl Life<'_> {
         ) in reports
         {
             match verdict {
-                Verdict::Contradicted(why) => {
+                StoreCheck::Contradicted(why) => {
                     self.core.contradicted(session, &report, &why, self.now());
                 }
                 _ if self.disputed(session, &report, known) => {}
-                verdict => self.done(session, &report, known, verdict == Verdict::Held),
+                verdict => self.done(session, &report, known, verdict == StoreCheck::Held),
             }
         }
-        if let Some(waiting) = self.looking.remove(store) {
-            self.look_for(store.to_owned(), waiting);
+        if let Some(waiting) = self.checking.remove(store) {
+            self.start_check(store.to_owned(), waiting);
         }
     }
 
@@ -69,7 +69,7 @@ impl Life<'_> {
         &mut self,
         session: SessionId,
         report: &Finished,
-        known: &Known,
+        known: &KnownManifests,
     ) -> bool {
         let Some(dispute) = self.dispute(report, known) else {
             return false;
@@ -77,7 +77,7 @@ impl Life<'_> {
         let outvoted = self.core.outvoted(session, report);
         if outvoted {
             self.disputes += 1;
-            self.actor.aside.replace(session, report, dispute);
+            self.actor.slow_work.replace(session, report, dispute);
         }
         outvoted
     }
@@ -89,18 +89,19 @@ impl Life<'_> {
         &mut self,
         session: SessionId,
         report: &Finished,
-        known: &Known,
+        known: &KnownManifests,
     ) -> bool {
         let Some(dispute) = self.dispute(report, known) else {
             return false;
         };
-        let asked = self.disputes < DISPUTES && self.actor.aside.judge(session, report, dispute);
+        let asked =
+            self.disputes < MOST_DISPUTES && self.actor.slow_work.judge(session, report, dispute);
         self.disputes += usize::from(asked);
         asked || self.outvoted(session, report, known)
     }
 
     /// Returns the record that a report contradicts.
-    fn dispute(&self, report: &Finished, known: &Known) -> Option<Dispute> {
+    fn dispute(&self, report: &Finished, known: &KnownManifests) -> Option<Dispute> {
         let stage = self.core.stage_of(report)?;
         let recorded = known.get(&(stage, report.index)).copied().flatten()?;
         let same = hex::encode(recorded).eq_ignore_ascii_case(&report.manifest_sha256);
@@ -111,7 +112,7 @@ impl Life<'_> {
         &mut self,
         session: SessionId,
         report: &Finished,
-        known: &Known,
+        known: &KnownManifests,
         checked: bool,
     ) {
         self.commits.extend(trace::commit(report));

@@ -11,7 +11,7 @@ impl World {
     /// Returns the entry of this worker in the output of `explain`.
     fn candidate(&self, w: usize) -> crate::core::Candidate {
         let core = &self.instances[0].core;
-        let look = core.look_at(self.jobs[0], None, None, self.now);
+        let look = core.job_snapshot(self.jobs[0], None, None, self.now);
         let name = format!("w{w}");
         let mut candidates = look.candidates.into_iter();
         candidates.find(|c| c.name == name).unwrap()
@@ -173,7 +173,7 @@ fn a_frozen_worker_is_silent_after_its_lease_too() {
         assert_eq!(core.leases.iter().count(), 0, "its lease has run out");
         let silent = Some(i64::from(SETTINGS.lease_ms) * 3);
         assert_eq!(world.candidate(0).silent_ms, silent);
-        let note = &core.look(world.now).workers[0].note;
+        let note = &core.farm_snapshot(world.now).workers[0].note;
         assert!(note.starts_with("not heard of for 3 s"), "{note}");
         world.close().await;
     });

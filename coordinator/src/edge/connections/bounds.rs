@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::doors::Doors;
+use super::slots::ConnectionSlots;
 use crate::memory::MemoryBounds;
 
 /// Bounds on connections to the gRPC port.
@@ -35,9 +35,9 @@ impl Default for Connections {
 const OTHER_FILES: u64 = 512;
 
 impl Connections {
-    /// Creates doors for these bounds, a limit of open files, and the available memory. If the
+    /// Creates slots for these bounds, a limit of open files, and the available memory. If the
     /// limit is small, most of it is for connections.
-    pub(crate) fn doors(&self, files: u64, memory: MemoryBounds) -> Doors {
+    pub(crate) fn slots(&self, files: u64, memory: MemoryBounds) -> ConnectionSlots {
         let room = files.saturating_sub(OTHER_FILES).max(files / 2);
         let all = self
             .all
@@ -45,7 +45,7 @@ impl Connections {
             .min(memory.connections())
             .max(1);
         let share = self.per_address.unwrap_or(all - all / 4);
-        Doors::new(all, share.clamp(1, all), memory.silent().min(all))
+        ConnectionSlots::new(all, share.clamp(1, all), memory.silent().min(all))
     }
 }
 
@@ -73,18 +73,18 @@ mod tests {
 
     #[test]
     fn bounds_stay_below_the_limit_of_open_files() {
-        let doors = |all, per_address, files| {
+        let slots = |all, per_address, files| {
             let bounds = Connections {
                 all,
                 per_address,
                 ..Connections::default()
             };
-            bounds.doors(files, MemoryBounds::default()).bounds()
+            bounds.slots(files, MemoryBounds::default()).bounds()
         };
-        assert_eq!(doors(20_000, None, 1 << 20), (20_000, 15_000));
-        assert_eq!(doors(20_000, None, 1024), (512, 384));
-        assert_eq!(doors(20_000, None, 256), (128, 96));
-        assert_eq!(doors(100, Some(500), 1024), (100, 100));
-        assert_eq!(doors(100, Some(0), 1024), (100, 1));
+        assert_eq!(slots(20_000, None, 1 << 20), (20_000, 15_000));
+        assert_eq!(slots(20_000, None, 1024), (512, 384));
+        assert_eq!(slots(20_000, None, 256), (128, 96));
+        assert_eq!(slots(100, Some(500), 1024), (100, 100));
+        assert_eq!(slots(100, Some(0), 1024), (100, 1));
     }
 }

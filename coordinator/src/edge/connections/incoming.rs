@@ -24,7 +24,7 @@ use tonic::transport::server::Connected;
 
 use super::{
     bounds::Connections,
-    doors::{Doors, Held, Place},
+    slots::{ConnectionSlot, ConnectionSlots, HeldSlot},
     watched::Certificates,
 };
 use crate::auth::Throttle;
@@ -40,7 +40,7 @@ const READY: usize = 64;
 /// Returns the connections of a listener, until `stop`. `tls` contains the current certificates.
 pub(crate) fn accept(
     listener: TcpListener,
-    doors: Arc<Doors>,
+    slots: Arc<ConnectionSlots>,
     bounds: Connections,
     tls: Option<watch::Receiver<Certificates>>,
     stop: CancellationToken,
@@ -65,13 +65,13 @@ pub(crate) fn accept(
                 }
             };
             loop {
-                let wait = doors.patience();
+                let wait = slots.patience();
                 if wait.is_zero() {
                     break;
                 }
                 tokio::time::sleep(wait).await;
             }
-            let held = match doors.enter(address.ip()) {
+            let held = match slots.enter(address.ip()) {
                 Ok(held) => held,
                 Err(why) => {
                     if let Some(unsaid) = full.allows() {
@@ -108,7 +108,7 @@ pub(crate) struct Connection {
     address: SocketAddr,
     /// Number of changes of the client certificate authorities when the connection began.
     authorities: u64,
-    held: Held,
+    held: HeldSlot,
     over: Option<Pin<Box<dyn Future<Output = &'static str> + Send>>>,
 }
 
@@ -121,13 +121,13 @@ pub(crate) struct Peer {
     pub certificates: Option<Arc<Vec<CertificateDer<'static>>>>,
     /// Number of changes of the client certificate authorities when the connection began.
     pub authorities: u64,
-    pub(super) place: Arc<Place>,
+    pub(super) slot: Arc<ConnectionSlot>,
 }
 
 impl Peer {
     /// Returns the place of the connection.
-    pub(crate) fn place(&self) -> Arc<Place> {
-        Arc::clone(&self.place)
+    pub(crate) fn slot(&self) -> Arc<ConnectionSlot> {
+        Arc::clone(&self.slot)
     }
 }
 
@@ -136,13 +136,13 @@ impl Connection {
     async fn begin(
         stream: TcpStream,
         address: SocketAddr,
-        held: Held,
+        held: HeldSlot,
         bounds: Connections,
         tls: Option<Certificates>,
     ) -> Option<Self> {
         let authorities = tls.as_ref().map_or(0, |tls| tls.authorities);
-        let over = Arc::clone(held.place()).over(bounds.first_request, bounds.idle);
-        let mut over: Pin<Box<dyn Future<Output = _> + Send>> = Box::pin(over);
+        let ended = Arc::clone(held.slot()).ended(bounds.first_request, bounds.idle);
+        let mut over: Pin<Box<dyn Future<Output = _> + Send>> = Box::pin(ended);
         let io = match tls {
             None => Io::Plain(stream),
             Some(Certificates { config, .. }) => tokio::select! {
@@ -200,7 +200,7 @@ impl Connected for Connection {
             address: self.address,
             certificates,
             authorities: self.authorities,
-            place: Arc::clone(self.held.place()),
+            slot: Arc::clone(self.held.slot()),
         }
     }
 }

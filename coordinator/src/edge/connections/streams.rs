@@ -12,7 +12,7 @@ use http_body::{Body as HttpBody, Frame, SizeHint};
 use tonic::{Status, body::Body};
 use tower::{Layer, Service};
 
-use super::{doors::Stream, incoming::Peer};
+use super::{incoming::Peer, slots::Stream};
 
 /// Counts requests.
 #[derive(Clone)]
@@ -48,7 +48,7 @@ where
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
         // Later layers do not need the peer, and a copy would keep the connection's record alive.
         let peer = request.extensions_mut().remove::<Peer>();
-        let stream = peer.map(|peer| peer.place.stream());
+        let stream = peer.map(|peer| peer.slot.stream());
         let answer = self.inner.call(request);
         Box::pin(async move {
             let answer = answer.await?;

@@ -12,16 +12,18 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    auth::{GRACE, Judge, Loaded, Reader, Source, TlsFiles, Trouble, Verdict, too_slow},
+    auth::{
+        CredentialFile, FileTrouble, FileVerdict, GRACE, Judge, Loaded, Reader, TlsFiles, too_slow,
+    },
     observe::audit::{Audit, COORDINATOR},
 };
 
 /// Interval between checks of the files.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The result of a check of the files, given the previous check.
 #[derive(Debug, PartialEq, Eq)]
-enum Seen {
+enum CheckResult {
     Same,
     New,
     /// The files cannot be used, with the same message twice in a row. Certificate and key are two
@@ -31,28 +33,32 @@ enum Seen {
 
 /// Compares successive checks.
 #[derive(Default)]
-struct Looks {
+struct CheckHistory {
     complaint: String,
     said: bool,
 }
 
-impl Looks {
-    fn judge(&mut self, now: [u8; 32], read: Result<[u8; 32], &CredentialError>) -> Seen {
+impl CheckHistory {
+    fn judge(&mut self, now: [u8; 32], read: Result<[u8; 32], &CredentialError>) -> CheckResult {
         match read {
             Ok(new) => {
                 *self = Self::default();
-                if new == now { Seen::Same } else { Seen::New }
+                if new == now {
+                    CheckResult::Same
+                } else {
+                    CheckResult::New
+                }
             }
             Err(error) => {
                 let error = error.to_string();
                 if error != self.complaint {
                     (self.complaint, self.said) = (error, false);
-                    return Seen::Same;
+                    return CheckResult::Same;
                 }
                 if std::mem::replace(&mut self.said, true) {
-                    return Seen::Same;
+                    return CheckResult::Same;
                 }
-                Seen::Unusable(self.complaint.clone())
+                CheckResult::Unusable(self.complaint.clone())
             }
         }
     }
@@ -86,11 +92,11 @@ pub(crate) fn follow(
     });
     let (mut now, mut authorities) = (loaded.digest, loaded.authorities);
     tokio::spawn(async move {
-        let (mut looks, mut trouble) = (Looks::default(), Trouble::default());
+        let (mut checks, mut trouble) = (CheckHistory::default(), FileTrouble::default());
         let mut reader = Reader::default();
         loop {
             tokio::select! {
-                () = tokio::time::sleep(LOOK) => {}
+                () = tokio::time::sleep(CHECK_INTERVAL) => {}
                 () = stop.cancelled() => return,
             }
             let aside = files.clone();
@@ -108,23 +114,23 @@ pub(crate) fn follow(
             let unknown = read.as_ref().err().filter(|_| !same);
             let unknown = unknown.map(ToString::to_string);
             match trouble.judge(unknown.as_deref(), Instant::now()) {
-                Verdict::Warn => tracing::error!(
+                FileVerdict::Warn => tracing::error!(
                     "{}; every caller is refused unless this is repaired within {} s",
                     unknown.unwrap_or_default(),
                     GRACE.as_secs()
                 ),
-                Verdict::Close => {
+                FileVerdict::Close => {
                     let why = unknown.unwrap_or_default();
                     tracing::error!("{why}; every caller is refused until this is repaired");
                     let line = format!("every caller is refused: {why}");
                     audit.note(COORDINATOR, Act::Certificates, Outcome::Failed, &line);
-                    judge.fault(Source::Authorities, Some(why));
+                    judge.fault(CredentialFile::Authorities, Some(why));
                 }
-                Verdict::Same | Verdict::Reopen => {}
+                FileVerdict::Same | FileVerdict::Reopen => {}
             }
-            match looks.judge(now, read.as_ref().map(|loaded| loaded.digest)) {
-                Seen::Same => {}
-                Seen::New => {
+            match checks.judge(now, read.as_ref().map(|loaded| loaded.digest)) {
+                CheckResult::Same => {}
+                CheckResult::New => {
                     let loaded = read.expect("files that cannot be read are not new");
                     now = loaded.digest;
                     let changed = loaded.authorities != authorities;
@@ -141,7 +147,7 @@ pub(crate) fn follow(
                     tracing::info!(certificate = %files.certificate.display(), "the certificates were read again");
                     audit.note(COORDINATOR, Act::Certificates, Outcome::Done, &loaded.about);
                 }
-                Seen::Unusable(why) => {
+                CheckResult::Unusable(why) => {
                     if same {
                         tracing::error!("{why}; the certificates read before stay in force");
                     }
@@ -149,7 +155,7 @@ pub(crate) fn follow(
                 }
             }
             if trouble.is_over() {
-                judge.fault(Source::Authorities, None);
+                judge.fault(CredentialFile::Authorities, None);
             }
         }
     });
@@ -166,22 +172,31 @@ mod tests {
             path: "c.pem".into(),
             what: what.into(),
         };
-        let mut looks = Looks::default();
-        assert_eq!(looks.judge([1; 32], Ok([1; 32])), Seen::Same);
+        let mut checks = CheckHistory::default();
+        assert_eq!(checks.judge([1; 32], Ok([1; 32])), CheckResult::Same);
         assert_eq!(
-            looks.judge([1; 32], Err(&bad("does not match"))),
-            Seen::Same
+            checks.judge([1; 32], Err(&bad("does not match"))),
+            CheckResult::Same
         );
-        assert_eq!(looks.judge([1; 32], Ok([2; 32])), Seen::New);
-        assert_eq!(looks.judge([2; 32], Err(&bad("is no PEM"))), Seen::Same);
-        let seen = looks.judge([2; 32], Err(&bad("is no PEM")));
-        assert_eq!(seen, Seen::Unusable("c.pem: is no PEM".into()));
-        assert_eq!(looks.judge([2; 32], Err(&bad("is no PEM"))), Seen::Same);
-        assert_eq!(looks.judge([2; 32], Ok([2; 32])), Seen::Same);
-        assert_eq!(looks.judge([2; 32], Err(&bad("is no PEM"))), Seen::Same);
+        assert_eq!(checks.judge([1; 32], Ok([2; 32])), CheckResult::New);
+        assert_eq!(
+            checks.judge([2; 32], Err(&bad("is no PEM"))),
+            CheckResult::Same
+        );
+        let seen = checks.judge([2; 32], Err(&bad("is no PEM")));
+        assert_eq!(seen, CheckResult::Unusable("c.pem: is no PEM".into()));
+        assert_eq!(
+            checks.judge([2; 32], Err(&bad("is no PEM"))),
+            CheckResult::Same
+        );
+        assert_eq!(checks.judge([2; 32], Ok([2; 32])), CheckResult::Same);
+        assert_eq!(
+            checks.judge([2; 32], Err(&bad("is no PEM"))),
+            CheckResult::Same
+        );
         assert!(matches!(
-            looks.judge([2; 32], Err(&bad("is no PEM"))),
-            Seen::Unusable(_)
+            checks.judge([2; 32], Err(&bad("is no PEM"))),
+            CheckResult::Unusable(_)
         ));
     }
 }

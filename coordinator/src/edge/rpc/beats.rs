@@ -10,7 +10,7 @@ use std::{
 
 use picofarm_proto::ids::LeaseRef;
 
-use crate::core::Say;
+use crate::core::ToWorker;
 
 /// Longest time for which leases are extended without an answer of the actor: this time, or the
 /// number of lease periods below. Afterwards the worker should look for another coordinator.
@@ -91,26 +91,26 @@ impl Beats {
 
     /// Returns the messages to the worker that follow from a message of the actor. Each heartbeat
     /// has one answer.
-    pub(super) fn hear(&self, say: Say) -> Vec<Say> {
+    pub(super) fn hear(&self, say: ToWorker) -> Vec<ToWorker> {
         let mut state = self.lock();
         state.heard = Instant::now();
         match &say {
-            Say::Lease(lease) => {
+            ToWorker::Lease(lease) => {
                 let told = state.told;
                 let tasks = (lease.hi - lease.lo).saturating_sub(lease.skip.len() as u64);
                 let left = Some(tasks);
                 state.live.insert(lease.lease, Live { told, left });
             }
-            Say::Revoke { lease, .. } => {
+            ToWorker::Revoke { lease, .. } => {
                 state.live.remove(lease);
             }
-            Say::Renewed { leases, .. } => {
+            ToWorker::Renewed { leases, .. } => {
                 if let Some((told, answered)) = state.open.pop_front() {
                     let instead = state.renewed(told, answered, leases);
                     return instead.unwrap_or_else(|| vec![say]);
                 }
             }
-            Say::Acknowledge { lease, .. } => {
+            ToWorker::Acknowledge { lease, .. } => {
                 let live = state.live.get_mut(lease);
                 let left = live.map(|live| {
                     live.left = live.left.map(|left| left.saturating_sub(1));
@@ -120,12 +120,12 @@ impl Beats {
                     state.live.remove(lease);
                 }
             }
-            Say::Trim { lease, .. } => {
+            ToWorker::Trim { lease, .. } => {
                 if let Some(live) = state.live.get_mut(lease) {
                     live.left = None;
                 }
             }
-            Say::Drain | Say::Replaced => {}
+            ToWorker::Drain | ToWorker::Replaced => {}
         }
         vec![say]
     }
@@ -143,11 +143,11 @@ impl State {
         told: u64,
         answered: Option<Vec<LeaseRef>>,
         leases: &[LeaseRef],
-    ) -> Option<Vec<Say>> {
+    ) -> Option<Vec<ToWorker>> {
         if self.withdrawn.is_some_and(|at| at <= told) {
             self.withdrawn = None;
         }
-        let revoke = |lease: LeaseRef| Say::Revoke {
+        let revoke = |lease: LeaseRef| ToWorker::Revoke {
             lease,
             reason: "the lease is no longer live: it ran out or is finished".into(),
         };
@@ -181,8 +181,8 @@ mod tests {
         }
     }
 
-    fn renewed(leases: &[LeaseRef]) -> Say {
-        Say::Renewed {
+    fn renewed(leases: &[LeaseRef]) -> ToWorker {
+        ToWorker::Renewed {
             leases: leases.to_vec(),
             ttl_ms: 1,
         }
@@ -203,7 +203,7 @@ mod tests {
         beats.tell(beats.answer(&[a]));
         let heard = beats.hear(renewed(&[]));
         assert!(
-            matches!(&heard[..], [Say::Revoke { lease, .. }] if *lease == a),
+            matches!(&heard[..], [ToWorker::Revoke { lease, .. }] if *lease == a),
             "the actor knows better: {heard:?}"
         );
         assert_eq!(beats.answer(&[a]), None);
@@ -216,7 +216,7 @@ mod tests {
         beats.tell(None);
         beats.hear(renewed(&[a]));
         assert_eq!(beats.answer(&[a]), Some(vec![a]));
-        beats.hear(Say::Acknowledge {
+        beats.hear(ToWorker::Acknowledge {
             lease: a,
             index: 0,
             accepted: true,
@@ -251,7 +251,7 @@ mod tests {
         }
         assert_eq!(beats.answer(&[a]), None, "the worker named it no more");
         let reason = String::new();
-        beats.hear(Say::Revoke { lease: b, reason });
+        beats.hear(ToWorker::Revoke { lease: b, reason });
         assert_eq!(beats.answer(&[b]), None);
         beats.tell(None);
         beats.hear(renewed(&[a]));

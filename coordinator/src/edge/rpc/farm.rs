@@ -28,9 +28,9 @@ use super::{
     link::{Link, caller, invalid},
 };
 use crate::{
-    actor::{Command, FromWorker, Waiting},
+    actor::{Command, FromWorker, HeartbeatQueue},
     auth::{Caller, Quotas, WorkerIds},
-    core::{Say, SessionId, VERSION},
+    core::{SessionId, ToWorker, VERSION},
     edge::guard::SameMachine,
 };
 
@@ -152,7 +152,7 @@ async fn run(
     }
     tracing::info!(worker, session, caller = %caller.name, "worker connected");
     let (say, mut said) = mpsc::channel(OUTBOX);
-    let waiting = Waiting::default();
+    let waiting = HeartbeatQueue::default();
     let open = Command::Open {
         session,
         hello,
@@ -217,7 +217,7 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
 struct Listener<'a> {
     link: &'a Link,
     session: SessionId,
-    waiting: &'a Waiting,
+    waiting: &'a HeartbeatQueue,
     beats: &'a Beats,
     out: &'a Out,
 }
@@ -346,7 +346,11 @@ fn checked(
 }
 
 /// Sends the actor's messages to the worker until the actor ends the session.
-async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out, beats: &Beats) -> Result<(), Status> {
+async fn speak(
+    said: &mut mpsc::Receiver<ToWorker>,
+    out: &Out,
+    beats: &Beats,
+) -> Result<(), Status> {
     while let Some(say) = said.recv().await {
         for say in beats.hear(say) {
             send(out, message(say)?).await?;
@@ -358,10 +362,10 @@ async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out, beats: &Beats) -> Resu
 }
 
 /// Converts a message of the actor to its wire form.
-fn message(say: Say) -> Result<To, Status> {
+fn message(say: ToWorker) -> Result<To, Status> {
     Ok(match say {
-        Say::Lease(lease) => To::Lease((*lease).into()),
-        Say::Acknowledge {
+        ToWorker::Lease(lease) => To::Lease((*lease).into()),
+        ToWorker::Acknowledge {
             lease,
             index,
             accepted,
@@ -372,20 +376,20 @@ fn message(say: Say) -> Result<To, Status> {
             accepted,
             reason,
         }),
-        Say::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
+        ToWorker::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
             leases: leases.into_iter().map(Into::into).collect(),
             ttl_ms,
         }),
-        Say::Revoke { lease, reason } => To::Revoke(wire::Revoke {
+        ToWorker::Revoke { lease, reason } => To::Revoke(wire::Revoke {
             lease: Some(lease.into()),
             reason,
         }),
-        Say::Trim { lease, hi } => To::Trim(wire::Trim {
+        ToWorker::Trim { lease, hi } => To::Trim(wire::Trim {
             lease: Some(lease.into()),
             hi,
         }),
-        Say::Drain => To::Drain(wire::Drain {}),
-        Say::Replaced => {
+        ToWorker::Drain => To::Drain(wire::Drain {}),
+        ToWorker::Replaced => {
             return Err(Status::aborted(
                 "a newer session of this worker id took over; if that is another worker, give each its own id",
             ));

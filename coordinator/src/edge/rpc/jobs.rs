@@ -1,17 +1,16 @@
 //! Service `Jobs`: the requests of clients.
 
-use std::{pin::Pin, sync::Arc, time::Duration};
+use std::{pin::Pin, sync::Arc};
 
 use futures::{Stream, TryStreamExt};
-use picofarm_catalog::{AuditQuery, EventQuery, JobQuery, Sight};
+use picofarm_catalog::{AuditQuery, EventQuery};
 use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
     ids::JobId,
-    model::{Act, JobSpec, JobState, StageSpec, bounds},
+    model::{Act, JobState, bounds},
     wire::{self, jobs_server::Jobs},
 };
-use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
@@ -19,24 +18,19 @@ use tonic::{Request, Response, Status};
 use super::{
     link::{Link, account, broken, caller, invalid, refused},
     look,
+    requests::{draft, filter, job_id, listing},
+    watch::watch_while_allowed,
 };
 use crate::{
     actor::{Command, Submitted},
     auth::{Caller, Quotas},
     core::VERSION,
-    memory::{Account, Charge},
+    memory::Account,
     submission::Draft,
 };
 
-/// Shortest interval between two reports to a watcher.
-const DEBOUNCE: Duration = Duration::from_millis(250);
-/// Longest interval between two reads of a watched job.
-const LOOK: Duration = Duration::from_secs(5);
 /// Default and largest number of events in one answer: some 4 MB with the longest messages.
 const EVENTS: u32 = 1_000;
-/// Default number of jobs in one answer; the constant below is the largest.
-const JOBS: u32 = 100;
-const MOST_JOBS: u32 = 1_000;
 /// Memory of a line of history or of the audit log, or of a job in a list, while it is read and
 /// sent: three times the size of all but the longest few.
 const LINE: u64 = 8 << 10;
@@ -106,75 +100,6 @@ impl JobsService {
         let submitted = submissions.submit(&draft, by, most, request.again).await;
         submitted.map_err(refused)
     }
-}
-
-fn wrong(field: &str, what: &str) -> Status {
-    Status::invalid_argument(format!("{field}: {what}"))
-}
-
-/// Reads the text by which a list is filtered; empty means no filter.
-fn filter(text: String, field: &str) -> Result<Option<String>, Status> {
-    if text.is_empty() {
-        return Ok(None);
-    }
-    let checked = bounds::name(&text, bounds::NAME_BYTES);
-    checked.map_err(|what| wrong(field, &what))?;
-    Ok(Some(text))
-}
-
-/// Reads the query of a list.
-fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Status> {
-    let state = match wire::JobState::try_from(request.state) {
-        Ok(wire::JobState::Unspecified) => None,
-        Ok(state) => Some(state.try_into().map_err(invalid)?),
-        Err(_) => return Err(wrong("state", "is no state of a job")),
-    };
-    let before = match request.page_token.as_str() {
-        "" => None,
-        token => Some(token.parse().map_err(|_| {
-            wrong(
-                "page_token",
-                "expected next_page_token of an earlier answer",
-            )
-        })?),
-    };
-    Ok(JobQuery {
-        sight,
-        before,
-        limit: match request.page_size {
-            0 => JOBS,
-            n => n.min(MOST_JOBS),
-        },
-        state,
-        user: filter(request.user, "user")?,
-        find: filter(request.find, "find")?,
-    })
-}
-
-fn draft(
-    wire: wire::JobSpec,
-    bytes: usize,
-    quotas: &Quotas,
-    by: &Caller,
-    charged: (Account, Charge),
-) -> Result<Draft, Status> {
-    let spec = JobSpec::try_from(wire).map_err(invalid)?;
-    spec.check_submitted().map_err(|e| invalid(e.into()))?;
-    by.may_submit(&spec, quotas.max_priority)
-        .map_err(|e| invalid(e.into()))?;
-    let most = quotas.tasks_per_job;
-    let tasks: u64 = spec.stages.iter().map(StageSpec::tasks).sum();
-    if tasks > most {
-        return Err(Status::resource_exhausted(format!(
-            "the job's {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
-        )));
-    }
-    Ok(Draft::new(spec, bytes).charged(charged))
-}
-
-fn job_id(text: &str) -> Result<JobId, Status> {
-    text.parse()
-        .map_err(|e| Status::invalid_argument(bounds::message(&format!("job_id: {e}"))))
 }
 
 #[tonic::async_trait]
@@ -438,7 +363,7 @@ impl Jobs for JobsService {
         let charge = account(&request)
             .charge("the list", WORKER * u64::from(workers))
             .await?;
-        let look = self.link.ask(Command::Look).await?;
+        let look = self.link.ask(Command::FarmSnapshot).await?;
         let answer = Response::new(wire::ListWorkersResponse {
             coordinator: self.link.name.to_string(),
             workers: look.workers.into_iter().map(Into::into).collect(),
@@ -476,67 +401,5 @@ impl Jobs for JobsService {
         Ok(Response::new(wire::ListAuditResponse {
             entries: lines.into_iter().map(Into::into).collect(),
         }))
-    }
-}
-
-/// A message to a watcher, with its charge.
-type Watched = Result<(wire::WatchJobResponse, Charge), Status>;
-
-/// Watches until the caller's token is revoked.
-async fn watch_while_allowed(
-    link: Link,
-    caller: Caller,
-    account: Account,
-    id: JobId,
-    sender: mpsc::Sender<Watched>,
-) {
-    let revoked = tokio::select! {
-        () = watch(link, account, id, sender.clone()) => return,
-        status = caller.revoked() => status,
-    };
-    let _ = sender.send(Err(revoked)).await;
-}
-
-/// Reports at once and after each change, until the job ends or nobody listens.
-async fn watch(mut link: Link, account: Account, id: JobId, sender: mpsc::Sender<Watched>) {
-    let mut last = None;
-    loop {
-        link.revision.mark_unchanged();
-        let status = match link.status(&account, id).await {
-            Ok(status) => status,
-            Err(error) => {
-                let _ = sender.send(Err(error)).await;
-                return;
-            }
-        };
-        let over = status.state != JobState::Active;
-        if last.as_ref() != Some(&status) {
-            let job = Some(status.clone().into());
-            let response = wire::WatchJobResponse { job };
-            // The charge covers this response, and the last one, with which it is compared.
-            let bytes = 2 * response.encoded_len() as u64;
-            let charged = account.charge("the job's status", bytes).await;
-            let over = charged.is_err();
-            let heard = charged.map(|charge| (response, charge));
-            if sender.send(heard).await.is_err() || over {
-                return;
-            }
-            last = Some(status);
-        }
-        if over {
-            return;
-        }
-        tokio::select! {
-            () = tokio::time::sleep(DEBOUNCE) => {}
-            () = sender.closed() => return,
-            () = link.stop.cancelled() => return,
-        }
-        tokio::select! {
-            changed = link.revision.changed() => if changed.is_err() { return },
-            // Another coordinator may have changed the job.
-            () = tokio::time::sleep(LOOK) => {}
-            () = sender.closed() => return,
-            () = link.stop.cancelled() => return,
-        }
     }
 }

@@ -12,7 +12,7 @@ use super::link::Link;
 use crate::{
     actor::Command,
     auth::Caller,
-    core::JobLook,
+    core::JobSnapshot,
     explain::{self, JobFacts, TaskFacts},
     memory::Account,
 };
@@ -47,7 +47,7 @@ pub(super) async fn explain(
         )));
     }
     let look = link
-        .ask(|reply| Command::LookAt {
+        .ask(|reply| Command::JobSnapshot {
             job,
             stage: task.map(|_| stage),
             task,
@@ -57,7 +57,7 @@ pub(super) async fn explain(
     let here = StageRef { job, stage };
     let sight = by.sight(link.visibility);
     let now_ms = link.clock.now_ms();
-    let JobLook {
+    let JobSnapshot {
         candidates,
         shared,
         suspects,
@@ -192,7 +192,7 @@ async fn maker(
         let Some(spec) = record.job.spec.stages.get(stage.stage as usize) else {
             return Ok(Vec::new());
         };
-        let set = ResultSet::of(spec);
+        let set = ResultSet::of_stage(spec);
         let others = catalog.jobs_at(&set.store, &set.dataset).await?;
         let others = others.into_iter().filter(|o| sight.sees(&Owner::from(o)));
         let mut alike = Vec::new();

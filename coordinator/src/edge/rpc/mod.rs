@@ -5,7 +5,9 @@ mod farm;
 mod jobs;
 mod link;
 mod look;
+mod requests;
 mod rights;
+mod watch;
 
 pub(crate) use farm::FarmService;
 pub(crate) use jobs::JobsService;

@@ -7,7 +7,7 @@ use tonic::Status;
 use super::link::{Link, broken, no_such_job};
 use crate::{
     actor::{Command, Reply},
-    auth::{Caller, not_yours},
+    auth::{Caller, not_owner},
 };
 
 impl Link {
@@ -47,7 +47,7 @@ impl Link {
         if !caller.sight(self.visibility).sees(&owner) {
             return Err(no_such_job(job));
         }
-        Err(Status::permission_denied(not_yours(&job, &owner)))
+        Err(Status::permission_denied(not_owner(&job, &owner)))
     }
 
     /// Sends a command about a job to the actor, if the caller may change the job, and records it.

@@ -110,7 +110,7 @@ fn calls_are_counted_by_method_and_unknown_paths_share_a_line() {
 #[test]
 fn what_fails_without_a_report_was_lost_with_its_worker() {
     let job = JobId::from_uuid(Uuid::from_u128(1));
-    let event = |kind| NewEvent::of(job, 0, kind, String::new());
+    let event = |kind| NewEvent::new(job, 0, kind, String::new());
     let output = |adopted| Output {
         stage: StageRef { job, stage: 0 },
         task: 0,
@@ -142,7 +142,7 @@ fn what_fails_without_a_report_was_lost_with_its_worker() {
         let reason = String::new();
         (
             1,
-            Say::Acknowledge {
+            ToWorker::Acknowledge {
                 lease,
                 index: 0,
                 accepted,

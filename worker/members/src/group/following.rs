@@ -8,27 +8,29 @@ use picofarm_model::{
 };
 use tracing::info;
 
-use super::{ASK, MOST, Members, Role, Waited, failed};
-use crate::{link::Heard, message::Message};
+use super::{ASK, MOST, Members, Role, WaitResult, failed};
+use crate::{link::LinkEvent, message::Message};
 
 impl Members<'_> {
     /// On another process, waits for a message of the leading one.
-    pub(super) fn said(&mut self) -> Waited {
+    pub(super) fn next_message(&mut self) -> WaitResult {
         let Role::Follows { link, said } = &mut self.role else {
-            return Waited::Lost;
+            return WaitResult::Lost;
         };
         if let Some((message, payload)) = said.take() {
-            return Waited::Said(message, payload);
+            return WaitResult::Message(message, payload);
         }
         loop {
-            match self.heard.recv_timeout(ASK) {
+            match self.events.recv_timeout(ASK) {
                 Ok((id, _)) if id != link.id => {}
-                Ok((_, Heard::Said(message, payload))) => return Waited::Said(message, payload),
-                Ok((_, Heard::Lost)) => {
-                    self.role = Role::None;
-                    return Waited::Lost;
+                Ok((_, LinkEvent::Message(message, payload))) => {
+                    return WaitResult::Message(message, payload);
                 }
-                Err(RecvTimeoutError::Timeout) if (self.stopped)() => return Waited::Stop,
+                Ok((_, LinkEvent::Lost)) => {
+                    self.role = Role::None;
+                    return WaitResult::Lost;
+                }
+                Err(RecvTimeoutError::Timeout) if (self.stopped)() => return WaitResult::Stop,
                 Err(_) => {}
             }
         }
@@ -44,10 +46,10 @@ impl Members<'_> {
     /// On another process, handles a message of the leading one. Returns `None` to wait for the
     /// next message.
     pub(super) fn follow(&mut self, member: &mut dyn Member) -> Result<Option<Next>, ModelError> {
-        let (message, payload) = match self.said() {
-            Waited::Said(message, payload) => (message, payload),
-            Waited::Lost => return Ok(None),
-            Waited::Stop => return Ok(Some(Next::Stop)),
+        let (message, payload) = match self.next_message() {
+            WaitResult::Message(message, payload) => (message, payload),
+            WaitResult::Lost => return Ok(None),
+            WaitResult::Stop => return Ok(Some(Next::Stop)),
         };
         let answer = |role: &Role, message: Message, payload: &[u8]| {
             if let Role::Follows { link, .. } = role {

@@ -12,9 +12,9 @@ use picofarm_model::{
 };
 use tracing::info;
 
-use super::{ASK, Members, Role, Waited, failed};
+use super::{ASK, Members, Role, WaitResult, failed};
 use crate::{
-    link::{Heard, Link},
+    link::{Link, LinkEvent},
     message::{Address, Message},
 };
 
@@ -69,7 +69,7 @@ impl Members<'_> {
     /// agree anew first.
     pub(super) fn lead_on(&mut self) -> bool {
         self.greet();
-        self.note();
+        self.record_events();
         let Role::Leads(leads) = &mut self.role else {
             return false;
         };
@@ -90,24 +90,24 @@ impl Members<'_> {
     }
 
     /// On the leading process, records incoming messages.
-    pub(super) fn note(&mut self) {
-        while let Ok((id, heard)) = self.heard.try_recv() {
-            self.noted(id, heard);
+    pub(super) fn record_events(&mut self) {
+        while let Ok((id, heard)) = self.events.try_recv() {
+            self.record_event(id, heard);
         }
     }
 
-    pub(super) fn noted(&mut self, id: u64, heard: Heard) {
+    pub(super) fn record_event(&mut self, id: u64, heard: LinkEvent) {
         let Role::Leads(leads) = &mut self.role else {
             return;
         };
         match heard {
-            Heard::Lost => {
+            LinkEvent::Lost => {
                 let before = leads.others.len();
                 leads.others.retain(|other| other.link.id != id);
                 leads.coming.retain(|other| other.link.id != id);
                 leads.lost |= leads.others.len() < before;
             }
-            Heard::Said(message, payload) => {
+            LinkEvent::Message(message, payload) => {
                 let failed = matches!(&message, Message::Failed { generation } if *generation == self.generation);
                 leads.lost |= failed;
                 let mut all = leads.others.iter_mut().chain(&mut leads.coming);
@@ -119,20 +119,20 @@ impl Members<'_> {
     }
 
     /// On the leading process, waits for the next message of a link.
-    pub(super) fn answer_of(&mut self, id: u64) -> Waited {
+    pub(super) fn next_message_of(&mut self, id: u64) -> WaitResult {
         loop {
             let Role::Leads(leads) = &mut self.role else {
-                return Waited::Lost;
+                return WaitResult::Lost;
             };
             let Some(other) = leads.others.iter_mut().find(|other| other.link.id == id) else {
-                return Waited::Lost;
+                return WaitResult::Lost;
             };
             if let Some((message, payload)) = other.said.pop_front() {
-                return Waited::Said(message, payload);
+                return WaitResult::Message(message, payload);
             }
-            match self.heard.recv_timeout(ASK) {
-                Ok((from, heard)) => self.noted(from, heard),
-                Err(RecvTimeoutError::Timeout) if (self.stopped)() => return Waited::Stop,
+            match self.events.recv_timeout(ASK) {
+                Ok((from, heard)) => self.record_event(from, heard),
+                Err(RecvTimeoutError::Timeout) if (self.stopped)() => return WaitResult::Stop,
                 Err(_) => {}
             }
         }
@@ -144,7 +144,7 @@ impl Members<'_> {
         self.mesh = None;
         self.breaker.break_off();
         self.greet();
-        self.note();
+        self.record_events();
         let Role::Leads(leads) = &mut self.role else {
             return Ok(None);
         };
@@ -169,12 +169,12 @@ impl Members<'_> {
         let mut stand = Vec::new();
         for id in ids {
             loop {
-                match self.answer_of(id) {
-                    Waited::Said(Message::Stands(at), _) => stand.push((id, at)),
+                match self.next_message_of(id) {
+                    WaitResult::Message(Message::Stands(at), _) => stand.push((id, at)),
                     // A message of the previous agreement.
-                    Waited::Said(..) => continue,
-                    Waited::Lost => {}
-                    Waited::Stop => return Ok(Some(Next::Stop)),
+                    WaitResult::Message(..) => continue,
+                    WaitResult::Lost => {}
+                    WaitResult::Stop => return Ok(Some(Next::Stop)),
                 }
                 break;
             }
@@ -183,10 +183,10 @@ impl Members<'_> {
         if let Some((id, at)) = furthest
             && *at > member.standing()
         {
-            let state = match self.state_of(*id) {
-                Waited::Said(_, state) => state,
-                Waited::Lost => return Ok(None),
-                Waited::Stop => return Ok(Some(Next::Stop)),
+            let state = match self.request_state(*id) {
+                WaitResult::Message(_, state) => state,
+                WaitResult::Lost => return Ok(None),
+                WaitResult::Stop => return Ok(Some(Next::Stop)),
             };
             member.become_state(&state)?;
         }
@@ -209,17 +209,19 @@ impl Members<'_> {
         leads.others.iter().find(|other| other.link.id == id)
     }
 
-    fn state_of(&mut self, id: u64) -> Waited {
+    fn request_state(&mut self, id: u64) -> WaitResult {
         let asked = self
             .other(id)
             .is_some_and(|other| other.link.say(&Message::SendState, &[]));
         if !asked {
-            return Waited::Lost;
+            return WaitResult::Lost;
         }
         loop {
-            match self.answer_of(id) {
-                Waited::Said(Message::State, state) => return Waited::Said(Message::State, state),
-                Waited::Said(..) => {}
+            match self.next_message_of(id) {
+                WaitResult::Message(Message::State, state) => {
+                    return WaitResult::Message(Message::State, state);
+                }
+                WaitResult::Message(..) => {}
                 other => return other,
             }
         }
@@ -253,16 +255,20 @@ impl Members<'_> {
         };
         for id in ids {
             loop {
-                match self.answer_of(id) {
-                    Waited::Said(Message::Formed { generation: of }, _) if of == generation => {
+                match self.next_message_of(id) {
+                    WaitResult::Message(Message::Formed { generation: of }, _)
+                        if of == generation =>
+                    {
                         break;
                     }
-                    Waited::Said(Message::Failed { generation: of }, _) if of == generation => {
+                    WaitResult::Message(Message::Failed { generation: of }, _)
+                        if of == generation =>
+                    {
                         return Ok(None);
                     }
-                    Waited::Said(..) => {}
-                    Waited::Lost => return Ok(None),
-                    Waited::Stop => return Ok(Some(Next::Stop)),
+                    WaitResult::Message(..) => {}
+                    WaitResult::Lost => return Ok(None),
+                    WaitResult::Stop => return Ok(Some(Next::Stop)),
                 }
             }
         }

@@ -16,7 +16,7 @@ const PROBE: Duration = Duration::from_secs(3);
 
 /// A reason why a connection failed.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Trouble {
+pub enum ConnectionFailure {
     /// No answer. This may be temporary.
     Down(String),
     /// The server and this program do not trust or understand each other, so a setting must be
@@ -26,30 +26,30 @@ pub enum Trouble {
 
 impl Target {
     /// Diagnoses a failed connection or call.
-    pub async fn trouble(
+    pub async fn diagnose(
         &self,
         error: &(dyn std::error::Error + Send + Sync + 'static),
-    ) -> Trouble {
+    ) -> ConnectionFailure {
         if let Some(error) = rustls_error(error) {
-            return Trouble::Mismatch(self.tls_trouble(error));
+            return ConnectionFailure::Mismatch(self.describe_tls_error(error));
         }
         // A client certificate is refused after the handshake, and its alert is lost in the
         // connection's background task.
         if self.uri.scheme_str() == Some("https")
             && let Some(error) = self.handshake_error().await
         {
-            return Trouble::Mismatch(self.tls_trouble(&error));
+            return ConnectionFailure::Mismatch(self.describe_tls_error(&error));
         }
         if self.uri.scheme_str() == Some("http") && self.speaks_tls().await {
-            return Trouble::Mismatch(format!(
+            return ConnectionFailure::Mismatch(format!(
                 "{} speaks TLS: use https:// in place of http://, and --ca FILE with its certificate authority",
                 self.uri
             ));
         }
-        Trouble::Down(causes(error))
+        ConnectionFailure::Down(causes(error))
     }
 
-    fn tls_trouble(&self, error: &rustls::Error) -> String {
+    fn describe_tls_error(&self, error: &rustls::Error) -> String {
         let uri = &self.uri;
         let host = uri.host().unwrap_or_default();
         let by = match &self.access.ca {
@@ -183,7 +183,7 @@ pub(crate) fn causes(error: &(dyn std::error::Error + 'static)) -> String {
     text
 }
 
-/// Returns whether a call failed because of its connection, so that [`Target::trouble`] can
+/// Returns whether a call failed because of its connection, so that [`Target::diagnose`] can
 /// diagnose it.
 pub fn lost_connection(status: &Status) -> bool {
     status.source().is_some()

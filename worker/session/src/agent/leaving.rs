@@ -43,7 +43,7 @@ impl Agent {
     /// Ends a worker that has been idle for too long.
     pub(super) fn idle(&mut self, now: Instant) {
         let connected = matches!(self.link, Link::Up { .. });
-        if self.assignments.in_hand().is_some() || self.leaving.is_some() || !connected {
+        if self.assignments.current().is_some() || self.leaving.is_some() || !connected {
             self.idle_since = None;
             return;
         }
@@ -76,7 +76,7 @@ impl Agent {
             .is_some_and(|left| left <= FINISH_WITHIN);
         let saves = self
             .assignments
-            .in_hand()
+            .current()
             .is_some_and(|hand| hand.task.spec.task.resumes());
         let stop_at = match haste {
             Haste::Finish if saves => now,
@@ -85,7 +85,7 @@ impl Agent {
             Haste::Stop => now,
         };
         info!(
-            running = self.assignments.in_hand().is_some(),
+            running = self.assignments.current().is_some(),
             nearly_done,
             ?haste,
             "shutting down"
@@ -111,7 +111,7 @@ impl Agent {
 
     /// Estimates the remaining time of the running task from its progress so far.
     fn remaining(&self, now: Instant) -> Option<Duration> {
-        let since = self.assignments.in_hand()?.since;
+        let since = self.assignments.current()?.since;
         let fraction = self.control.as_ref()?.fraction();
         let left = (now - since).as_secs_f64() * f64::from((1.0 - fraction) / fraction);
         Duration::try_from_secs_f64(left).ok()
@@ -122,7 +122,7 @@ impl Agent {
         let Some(leaving) = &mut self.leaving else {
             return false;
         };
-        let running = self.assignments.in_hand().is_some();
+        let running = self.assignments.current().is_some();
         if running && now < leaving.give_up {
             if let Some(control) = &self.control
                 && now >= leaving.stop_at

@@ -101,7 +101,7 @@ impl Assignments {
             withdrawal: false,
         });
         let progress = self
-            .in_hand
+            .current
             .iter()
             .filter(|t| leases.contains(&t.lease))
             .map(|t| TaskProgress {

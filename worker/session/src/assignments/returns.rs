@@ -37,11 +37,11 @@ impl Assignments {
 
     /// Gives back every lease with remaining or running tasks.
     pub(crate) fn release_all(&mut self, reason: &str) {
-        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
+        let current = self.current.as_ref().map(|t| t.lease);
         let open: Vec<_> = self
             .leases
             .iter()
-            .filter(|h| h.next < h.hi || Some(h.lease) == in_hand)
+            .filter(|h| h.next < h.hi || Some(h.lease) == current)
             .map(|h| h.lease)
             .collect();
         for lease in open {
@@ -52,11 +52,11 @@ impl Assignments {
     /// Gives back every lease with remaining tasks, except that of the running task; its remaining
     /// tasks are given back when this ends.
     pub(crate) fn release_waiting(&mut self, reason: &str) {
-        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
+        let current = self.current.as_ref().map(|t| t.lease);
         let open: Vec<_> = self
             .leases
             .iter()
-            .filter(|h| h.next < h.hi && Some(h.lease) != in_hand)
+            .filter(|h| h.next < h.hi && Some(h.lease) != current)
             .map(|h| h.lease)
             .collect();
         for lease in open {

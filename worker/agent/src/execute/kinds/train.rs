@@ -300,7 +300,7 @@ impl<'a> TrainingRun<'a> {
         let published =
             stores.patiently(control, async || models.publish(new.clone(), force).await)?;
         if let Some(members) = &mut members {
-            members.over();
+            members.announce_end();
         }
         stores.wait(control, models.delete_checkpoints(name, key))?;
         control.at(1.0);

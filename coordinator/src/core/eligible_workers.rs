@@ -9,9 +9,9 @@ const REASONS: usize = 3;
 
 /// The connected workers with regard to a job before it is recorded.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(crate) struct Fits {
+pub(crate) struct EligibleWorkers {
     /// Workers with regard to each stage.
-    pub stages: Vec<Fit>,
+    pub stages: Vec<StageWorkers>,
     /// Workers connected to this coordinator.
     pub here: u32,
     /// Workers connected to other coordinators.
@@ -20,7 +20,7 @@ pub(crate) struct Fits {
 
 /// The connected workers with regard to one stage.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(crate) struct Fit {
+pub(crate) struct StageWorkers {
     /// Number of workers that can run the stage's tasks.
     pub able: u32,
     /// Total CPU cores of these workers.
@@ -31,10 +31,10 @@ pub(crate) struct Fit {
 
 impl Core {
     /// Compares the requirements of a job's stages with the connected workers.
-    pub(crate) fn fits(&self, spec: &JobSpec) -> Fits {
+    pub(crate) fn eligible_workers(&self, spec: &JobSpec) -> EligibleWorkers {
         let stages = spec.stages.iter().enumerate().map(|(position, stage)| {
             let known = spec.known(position);
-            let mut fit = Fit::default();
+            let mut fit = StageWorkers::default();
             for worker in self.workers.values().filter(|worker| !worker.drains) {
                 match placement::may_run(stage, &known, &worker.abilities) {
                     Ok(()) => {
@@ -49,7 +49,7 @@ impl Core {
             }
             fit
         });
-        Fits {
+        EligibleWorkers {
             stages: stages.collect(),
             here: self.workers.count(),
             elsewhere: self.peers.workers(),

@@ -15,7 +15,7 @@ use super::{
 
 /// A snapshot of the instance's knowledge.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Look {
+pub(crate) struct FarmSnapshot {
     /// Active jobs, in the order in which they get workers.
     pub jobs: Vec<JobId>,
     /// Tasks that could be leased now if there were workers: unclaimed ones and those claimed by
@@ -31,7 +31,7 @@ pub(crate) struct Look {
 
 /// A snapshot of the instance's knowledge with regard to one job.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(crate) struct JobLook {
+pub(crate) struct JobSnapshot {
     /// Whether each worker of this instance may run the job's tasks, and its current work.
     pub candidates: Vec<Candidate>,
     /// Tasks that wait only because workers run them for other jobs with the same outputs.
@@ -48,7 +48,7 @@ pub(crate) struct JobLook {
 
 impl Core {
     /// Returns the current state.
-    pub(crate) fn look(&self, now_ms: i64) -> Look {
+    pub(crate) fn farm_snapshot(&self, now_ms: i64) -> FarmSnapshot {
         let mut stages: Vec<StageRef> = self.stages.keys().copied().collect();
         stages.sort_by_cached_key(|id| self.rank(*id));
         let mut jobs: Vec<JobId> = Vec::new();
@@ -69,12 +69,12 @@ impl Core {
                 .unwrap_or_default(),
             cores: worker.abilities.cores,
             leases: u32::try_from(worker.leases.len()).unwrap_or(u32::MAX),
-            tasks: self.tasks_of(worker),
+            tasks: self.unfinished_tasks(worker),
             since_ms: worker.since_ms,
             quarantined: worker.quarantined,
-            note: self.note(*id, worker, now_ms),
+            note: self.worker_note(*id, worker, now_ms),
         });
-        Look {
+        FarmSnapshot {
             jobs,
             ready: self.ready_now(now_ms),
             workers: workers.collect(),
@@ -92,7 +92,7 @@ impl Core {
     }
 
     /// Returns why a worker gets no tasks, or when it ends.
-    fn note(&self, id: WorkerId, worker: &WorkerEntry, now_ms: i64) -> String {
+    fn worker_note(&self, id: WorkerId, worker: &WorkerEntry, now_ms: i64) -> String {
         if let Some(ms) = self.silent_ms(worker, now_ms) {
             return format!(
                 "not heard of for {}: frozen, suspended or overloaded",
@@ -113,7 +113,7 @@ impl Core {
             .map_or_else(String::new, |at| format!("ends in {}", span(at - now_ms)))
     }
 
-    fn tasks_of(&self, worker: &WorkerEntry) -> u64 {
+    fn unfinished_tasks(&self, worker: &WorkerEntry) -> u64 {
         let ranges = worker.leases.iter().filter_map(|id| {
             let stage = self.leases.stage_of(*id)?;
             self.stages.get(&stage)?.held.leased_range(*id)
@@ -132,13 +132,13 @@ impl Core {
 
     /// Returns the state with regard to a stage and to one of its tasks. For a job as a whole, the
     /// stage is the first one with waiting tasks.
-    pub(crate) fn look_at(
+    pub(crate) fn job_snapshot(
         &self,
         job: JobId,
         stage: Option<u32>,
         task: Option<u64>,
         now_ms: i64,
-    ) -> JobLook {
+    ) -> JobSnapshot {
         let waits = |e: &StageEntry| e.waits(now_ms);
         let first = |is: &dyn Fn(&StageEntry) -> bool| {
             let mut of_job = self.stages.iter().filter(|(id, _)| id.job == job);
@@ -150,9 +150,9 @@ impl Core {
             stage: stage.unwrap_or(0),
         };
         let Some(entry) = self.stages.get(&here) else {
-            return JobLook {
+            return JobSnapshot {
                 elsewhere: self.peers.workers(),
-                ..JobLook::default()
+                ..JobSnapshot::default()
             };
         };
         let candidates: Vec<Candidate> = self
@@ -187,17 +187,17 @@ impl Core {
         first.sort_by_cached_key(|id| self.rank(*id));
         let mut ahead: Vec<JobId> = first.into_iter().map(|id| id.job).collect();
         ahead.dedup();
-        JobLook {
+        JobSnapshot {
             candidates,
             shared: self.waits_for_others(here),
             suspects: self.ready(here, now_ms).suspects,
             ahead,
             elsewhere: self.peers.workers(),
-            running: task.and_then(|task| self.runs(entry, task)),
+            running: task.and_then(|task| self.running_on(entry, task)),
         }
     }
 
-    fn runs(&self, entry: &StageEntry, task: u64) -> Option<RunningOn> {
+    fn running_on(&self, entry: &StageEntry, task: u64) -> Option<RunningOn> {
         entry.held.leased().find_map(|(range, lease)| {
             let progress = self.leases.progress(range.id, task)?;
             Some(RunningOn {
@@ -210,7 +210,7 @@ impl Core {
     }
 
     /// Returns the number of history lines that wait to be written.
-    pub(crate) fn noted(&self) -> usize {
+    pub(crate) fn new_events(&self) -> usize {
         self.outcome.events()
     }
 }

@@ -8,7 +8,7 @@ use picofarm_proto::model::StageSpec;
 
 /// The state of a recorded result in its store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Found {
+pub enum ResultState {
     /// The reported result.
     Equal,
     /// Nothing, or only a part.
@@ -24,16 +24,16 @@ pub enum Found {
 }
 
 /// Reads stores. The caller bounds the waiting time and the concurrency.
-pub trait Stored: fmt::Debug + Send + Sync + 'static {
+pub trait ResultReader: fmt::Debug + Send + Sync + 'static {
     /// Checks whether results of `stage`'s tasks exist in its store as reported. Each is given by
     /// its task and the SHA-256 of its manifest. The answers have the same order.
     ///
     /// # Errors
     /// Returns why this cannot be determined here, in words that follow "because". The store may be
     /// out of bounds or unreadable, or the kind of stage stores nothing to check.
-    fn look<'a>(
+    fn check<'a>(
         &'a self,
         stage: &'a StageSpec,
         results: &'a [(u64, [u8; 32])],
-    ) -> BoxFuture<'a, Result<Vec<Found>, String>>;
+    ) -> BoxFuture<'a, Result<Vec<ResultState>, String>>;
 }

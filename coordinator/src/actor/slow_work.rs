@@ -8,7 +8,7 @@ use picofarm_proto::{
 use crate::core::{Reported, SessionId};
 
 /// Work too slow for the actor. Each result comes back as a command.
-pub(crate) trait Aside: Send + Sync {
+pub(crate) trait SlowWork: Send + Sync {
     /// Reads a job that the actor does not know yet and sends [`super::Command::Learn`].
     fn learn(&self, job: JobId);
     /// Checks against the store whether a report or the recorded result is right and sends
@@ -18,7 +18,7 @@ pub(crate) trait Aside: Send + Sync {
     /// [`super::Command::Judged`].
     fn replace(&self, session: SessionId, report: &Finished, dispute: Dispute);
     /// Returns whether any store can be checked.
-    fn looks(&self) -> bool;
+    fn can_check_stores(&self) -> bool;
     /// Checks reported results against their store and sends [`super::Command::Verified`].
     fn verify(&self, store: String, reports: Vec<Reported>);
 }

@@ -14,7 +14,7 @@ use tokio::{
     time::{Instant, timeout_at},
 };
 
-use super::stored::{Found, Stored};
+use super::result_reader::{ResultReader, ResultState};
 
 /// Longest time that a plan or submission waits for stores.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -32,8 +32,8 @@ const STORES: usize = 1_024;
 
 /// The stores that this coordinator may read.
 #[derive(Debug, Clone)]
-pub(crate) struct Stores {
-    reader: Option<Arc<dyn Stored>>,
+pub(crate) struct StoreChecks {
+    reader: Option<Arc<dyn ResultReader>>,
     all: Arc<Semaphore>,
     each: Arc<Mutex<HashMap<String, Store>>>,
 }
@@ -45,17 +45,17 @@ struct Store {
 }
 
 /// Returns the time at which a report stops waiting for its store and is committed as unverified.
-pub(crate) fn soon() -> Instant {
+pub(crate) fn report_deadline() -> Instant {
     Instant::now() + REPORT_PATIENCE
 }
 
 /// Returns the time at which a plan stops waiting for stores.
-pub(crate) fn deadline() -> Instant {
+pub(crate) fn plan_deadline() -> Instant {
     Instant::now() + PATIENCE
 }
 
-impl Stores {
-    pub(crate) fn new(reader: Option<Arc<dyn Stored>>) -> Self {
+impl StoreChecks {
+    pub(crate) fn new(reader: Option<Arc<dyn ResultReader>>) -> Self {
         Self {
             reader,
             all: Arc::new(Semaphore::new(TOGETHER)),
@@ -70,19 +70,19 @@ impl Stores {
 
     /// Checks recorded outputs of a stage. Returns the answers by task, and the reason if some are
     /// missing.
-    pub(crate) async fn look(
+    pub(crate) async fn check(
         &self,
         stage: &StageSpec,
         place: &str,
         outputs: &[Recorded],
         until: Instant,
-    ) -> (BTreeMap<u64, Found>, Option<String>) {
+    ) -> (BTreeMap<u64, ResultState>, Option<String>) {
         let mut found = BTreeMap::new();
         if outputs.is_empty() {
             return (found, None);
         }
         let Some(reader) = &self.reader else {
-            return (found, Some(UNTOLD.into()));
+            return (found, Some(NO_READER.into()));
         };
         let store = self.store(place);
         if store.silent_until.is_some_and(|at| Instant::now() < at) {
@@ -94,7 +94,7 @@ impl Stores {
             let _mine = store.lane.acquire().await.expect("never closed");
             for batch in outputs.chunks(BATCH) {
                 let questions: Vec<_> = batch.iter().map(|o| (o.task, o.manifest)).collect();
-                let answers = reader.look(stage, &questions).await?;
+                let answers = reader.check(stage, &questions).await?;
                 found.extend(batch.iter().map(|o| o.task).zip(answers));
             }
             Ok(())
@@ -137,4 +137,4 @@ impl Stores {
 }
 
 /// Reason given by a coordinator without access to any store.
-const UNTOLD: &str = "this coordinator looks into no stores (--check-stores none)";
+const NO_READER: &str = "this coordinator looks into no stores (--check-stores none)";
