@@ -12,7 +12,9 @@ use picofarm_proto::{
     key::{TaskKey, derived_key},
     model::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
+use picofarm_results::*;
 use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
+use picofarm_store::*;
 use serde_json::json;
 use sha2::Digest;
 use tempfile::TempDir;

@@ -7,8 +7,8 @@
 //! would never end.
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile,
-    Provenance, Quantity, Subsets,
+    Dataset, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile, Provenance,
+    Quantity, Subsets,
 };
 use picofarm_proto::{
     key::{TaskKey, derived_key},
@@ -17,6 +17,7 @@ use picofarm_proto::{
     },
     trace,
 };
+use picofarm_store::StorageError;
 use picofarm_transient::sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
@@ -259,7 +260,7 @@ pub(in crate::execute) fn source_manifest(
     let looked = async {
         match source.manifest(index).await {
             Ok(manifest) => Ok(Ok(manifest)),
-            Err(error @ DatasetError::NotPublished { .. }) => Ok(Err(error)),
+            Err(error @ StorageError::NotPublished { .. }) => Ok(Err(error)),
             Err(error) => Err(error),
         }
     };
