@@ -5,14 +5,12 @@ pub mod options;
 use std::{path::Path, time::Instant};
 
 use picofarm_dataset::{RenderArray, RenderGroup, write_render_group};
-use picofarm_store::StorageError;
-use picofarm_transient::{
-    Gate,
-    sensor::{
-        Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
-        sense as measure,
-    },
+use picofarm_sensor::{
+    Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
+    sense as measure,
 };
+use picofarm_store::StorageError;
+use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
 
 use crate::{

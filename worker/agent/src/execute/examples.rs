@@ -15,8 +15,8 @@ use picofarm_proto::{
     split::{Rank, SplitRecord},
 };
 use picofarm_results::{Predictions, SplitUsed};
+use picofarm_sensor::{Multiplex, PS_PER_M, Sensing, Sensor, SensorError};
 use picofarm_store::{StorageError, sha256_hex};
-use picofarm_transient::sensor::{Multiplex, PS_PER_M, Sensing, Sensor, SensorError};
 use tokio::runtime::Handle;
 
 use super::{Control, TaskError, output::Stores, reprocess::quantity};

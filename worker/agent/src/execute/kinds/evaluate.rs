@@ -14,8 +14,8 @@ use picofarm_proto::{
     model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
 };
 use picofarm_results::{Evaluation, Models, ShardName, SplitUsed, Verdict};
+use picofarm_sensor::Sensor;
 use picofarm_store::sha256_hex;
-use picofarm_transient::sensor::Sensor;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha2::{Digest, Sha256};

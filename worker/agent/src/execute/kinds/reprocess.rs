@@ -17,10 +17,10 @@ use picofarm_proto::{
     },
     trace,
 };
-use picofarm_store::StorageError;
-use picofarm_transient::sensor::{
+use picofarm_sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
+use picofarm_store::StorageError;
 use serde_json::json;
 use tokio::runtime::Handle;
 use tracing::debug_span;

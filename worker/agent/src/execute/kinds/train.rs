@@ -30,8 +30,8 @@ use picofarm_proto::{
 use picofarm_results::{
     Lineage, Measurement, ModelManifest, Models, NewModel, Published, TrainingSpeed, TrialEnd,
 };
+use picofarm_sensor::SENSOR_VERSION;
 use picofarm_store::StorageError;
-use picofarm_transient::sensor::SENSOR_VERSION;
 use tracing::{debug, info, warn};
 
 mod along;
