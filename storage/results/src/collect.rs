@@ -12,7 +12,7 @@ use crate::models::Models;
 ///
 /// # Errors
 /// Those of [`Dataset::collect`].
-pub async fn collect(
+pub async fn collect_garbage(
     dataset: &Dataset,
     grace: Duration,
     delete: bool,

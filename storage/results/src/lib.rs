@@ -11,7 +11,7 @@ mod reports;
 mod verdict;
 
 pub use checkpoints::{Checkpoint, Checkpoints, Pieces};
-pub use collect::collect;
+pub use collect::collect_garbage;
 pub use held::{Held, Holdings};
 pub use models::{
     Dependents, DepthsUsed, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest,

@@ -175,7 +175,7 @@ async fn look(simulated: &Simulated, output: Output) -> Result<Vec<Row>> {
 
     let away = simulated.orphan()?;
     let watch = Watch::start();
-    let found = dataset.collect(Duration::ZERO, false).await;
+    let found = picofarm_results::collect_garbage(&dataset, Duration::ZERO, false).await;
     let (found, kept) = (found.map_err(failed)?, simulated.adopt(&away));
     note(
         "gc --dry-run",

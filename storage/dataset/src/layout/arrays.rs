@@ -214,6 +214,7 @@ impl Layout {
         codecs
     }
 
+    /// Returns the fill value in its metadata.
     pub fn fill_value(&self) -> Value {
         match self.element {
             Element::F32 if self.fill_nan => json!("NaN"),

@@ -212,12 +212,13 @@ impl SceneRecord<'_> {
 
 impl Spot {
     /// Returns the spot as a row of the `spots` array.
-    pub(crate) fn row(&self) -> [f32; 7] {
+    pub fn row(&self) -> [f32; 7] {
         let ([x, y, z], [nx, ny, nz]) = (self.position, self.normal);
         [x, y, z, nx, ny, nz, self.path_m]
     }
 
-    pub(crate) fn from_row(row: &[f32]) -> Option<Self> {
+    /// Parses a row of the `spots` array; `None` if the beam meets nothing.
+    pub fn from_row(row: &[f32]) -> Option<Self> {
         (!row[0].is_nan()).then(|| Self {
             position: [row[0], row[1], row[2]],
             normal: [row[3], row[4], row[5]],

@@ -186,7 +186,10 @@ impl Dataset {
     }
 
     /// Returns an array that every data set has.
-    pub(crate) fn array(&self, quantity: Quantity) -> &ArrayCodec {
+    ///
+    /// # Panics
+    /// If `quantity` is a transient of a subset that the data set lacks.
+    pub fn array(&self, quantity: Quantity) -> &ArrayCodec {
         self.array_of(quantity)
             .expect("only transients of subsets may be missing")
     }
@@ -200,6 +203,7 @@ impl Dataset {
         })
     }
 
+    /// Returns the path of an object, given by its key relative to the data set.
     pub fn path(&self, key: &str) -> Path {
         objects::path_of(&self.prefix, key)
     }

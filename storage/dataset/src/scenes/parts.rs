@@ -27,6 +27,7 @@ pub struct PartName {
 }
 
 impl PartName {
+    /// Returns its key relative to the data set.
     pub fn key(&self) -> String {
         let (index, of) = self.part;
         format!(

@@ -71,6 +71,7 @@ impl Dataset {
     }
 }
 
+/// Compares stored metadata with the expected ones. Returns their fault, if they differ.
 pub fn metadata_fault(bytes: &[u8], expected: &Value) -> Option<Fault> {
     let stored: Value = match serde_json::from_slice(bytes) {
         Ok(stored) => stored,

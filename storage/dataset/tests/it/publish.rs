@@ -266,6 +266,7 @@ async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
             object,
             bytes,
             scene: None,
+            cause: OrphanCause::Write,
         },
     ] = &leftovers[..]
     else {

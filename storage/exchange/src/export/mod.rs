@@ -191,7 +191,7 @@ impl<'a> Exporter<'a> {
             ExportFormat::Sb3d => {
                 let scene = self.scenes[k];
                 let folder = format!("{scene:06}");
-                for (name, bytes) in self.source.sb3d_files(scene).await? {
+                for (name, bytes) in sb3d::scene_files(self.source, scene).await? {
                     self.out.put(&format!("{folder}/{name}"), bytes).await?;
                 }
                 let manifest = self.source.manifest(scene).await?;
@@ -199,7 +199,7 @@ impl<'a> Exporter<'a> {
                 self.note(&manifest, &format!("{folder}/"));
             }
             ExportFormat::Hdf5 => {
-                let scene = self.source.plain(self.scenes[k]).await?;
+                let scene = plain::decode(self.source, self.scenes[k]).await?;
                 let name = format!("{:06}.h5", self.scenes[k]);
                 self.out
                     .put(&name, hdf5_file(&scene, self.source.spec())?.into())
@@ -210,7 +210,7 @@ impl<'a> Exporter<'a> {
                 let name = format!("scenes-{k:06}.tar");
                 let mut tar = webdataset::Tar::new();
                 for scene in &self.scenes[of(TAR)] {
-                    let scene = self.source.plain(*scene).await?;
+                    let scene = plain::decode(self.source, *scene).await?;
                     tar.add(&scene, self.source.spec())?;
                     self.note(&scene.manifest, &name);
                 }

@@ -66,72 +66,88 @@ pub(super) fn about(quantity: Quantity) -> &'static str {
     }
 }
 
-impl Dataset {
-    /// Decodes all arrays of a scene. Arrays that the scene's source did not have are omitted, and
-    /// its unknown values for spots are NaN.
-    pub(super) async fn plain(&self, scene: u64) -> Result<PlainScene, StorageError> {
-        let manifest = self.manifest(scene).await?;
-        let spec = *self.spec();
-        let (h, w, s) = (
-            spec.height as usize,
-            spec.width as usize,
-            spec.spots as usize,
-        );
-        let bins = spec.gate.bins as usize;
-        let (mut arrays, missing) = (Vec::new(), manifest.missing());
-        let lacks = |name: &str| missing.iter().any(|m| m == name);
-        for quantity in spec.quantities() {
-            if lacks(quantity.name()) {
-                continue;
-            }
-            let (shape, values) = match quantity {
-                q if q.is_transient() => {
-                    let values = self.read_histogram(scene, q).await?;
-                    (vec![h, w, bins], Values::F32(values))
-                }
-                Quantity::Normal => (vec![h, w, 3], Values::F32(self.read_normal(scene).await?)),
-                Quantity::Visibility => (
-                    vec![s, h, w],
-                    Values::U8(self.read_visibility(scene).await?),
-                ),
-                Quantity::TwoBouncePath => (
-                    vec![s, h, w],
-                    Values::F32(self.read(scene, quantity).await?),
-                ),
-                Quantity::Rgb => (vec![h, w, 3], Values::U8(self.read(scene, quantity).await?)),
-                Quantity::Specular => (vec![h, w], Values::U8(self.read(scene, quantity).await?)),
-                Quantity::Label => (vec![h, w], Values::U16(self.read(scene, quantity).await?)),
-                Quantity::Instance => (vec![h, w], Values::U32(self.read(scene, quantity).await?)),
-                Quantity::Spots => {
-                    let mut rows = self.read::<f32>(scene, quantity).await?;
-                    for row in rows.chunks_exact_mut(7) {
-                        if lacks("spots.normal") {
-                            row[3..6].fill(f32::NAN);
-                        }
-                        if lacks("spots.path") {
-                            row[6] = f32::NAN;
-                        }
-                    }
-                    (vec![s, 7], Values::F32(rows))
-                }
-                Quantity::Intrinsics => (vec![4], Values::F32(self.read(scene, quantity).await?)),
-                Quantity::Camera => (vec![4, 4], Values::F32(self.read(scene, quantity).await?)),
-                Quantity::Laser => (vec![3], Values::F32(self.read(scene, quantity).await?)),
-                Quantity::Scale => (vec![], Values::F32(self.read(scene, quantity).await?)),
-                _ => (vec![h, w], Values::F32(self.read(scene, quantity).await?)),
-            };
-            let (name, about) = (quantity.name(), about(quantity));
-            let name = match quantity {
-                Quantity::Scale => "photons_per_unit",
-                _ => name,
-            };
-            arrays.push(Plain {
-                name,
-                shape,
-                values,
-                about,
-            });
+/// Decodes all arrays of a scene of a data set. Arrays that the scene's source did not have are omitted, and
+/// its unknown values for spots are NaN.
+pub(super) async fn decode(dataset: &Dataset, scene: u64) -> Result<PlainScene, StorageError> {
+    let manifest = dataset.manifest(scene).await?;
+    let spec = *dataset.spec();
+    let (h, w, s) = (
+        spec.height as usize,
+        spec.width as usize,
+        spec.spots as usize,
+    );
+    let bins = spec.gate.bins as usize;
+    let (mut arrays, missing) = (Vec::new(), manifest.missing());
+    let lacks = |name: &str| missing.iter().any(|m| m == name);
+    for quantity in spec.quantities() {
+        if lacks(quantity.name()) {
+            continue;
         }
-        Ok(PlainScene { manifest, arrays })
+        let (shape, values) = match quantity {
+            q if q.is_transient() => {
+                let values = dataset.read_histogram(scene, q).await?;
+                (vec![h, w, bins], Values::F32(values))
+            }
+            Quantity::Normal => (
+                vec![h, w, 3],
+                Values::F32(dataset.read_normal(scene).await?),
+            ),
+            Quantity::Visibility => (
+                vec![s, h, w],
+                Values::U8(dataset.read_visibility(scene).await?),
+            ),
+            Quantity::TwoBouncePath => (
+                vec![s, h, w],
+                Values::F32(dataset.read(scene, quantity).await?),
+            ),
+            Quantity::Rgb => (
+                vec![h, w, 3],
+                Values::U8(dataset.read(scene, quantity).await?),
+            ),
+            Quantity::Specular => (vec![h, w], Values::U8(dataset.read(scene, quantity).await?)),
+            Quantity::Label => (
+                vec![h, w],
+                Values::U16(dataset.read(scene, quantity).await?),
+            ),
+            Quantity::Instance => (
+                vec![h, w],
+                Values::U32(dataset.read(scene, quantity).await?),
+            ),
+            Quantity::Spots => {
+                let mut rows = dataset.read::<f32>(scene, quantity).await?;
+                for row in rows.chunks_exact_mut(7) {
+                    if lacks("spots.normal") {
+                        row[3..6].fill(f32::NAN);
+                    }
+                    if lacks("spots.path") {
+                        row[6] = f32::NAN;
+                    }
+                }
+                (vec![s, 7], Values::F32(rows))
+            }
+            Quantity::Intrinsics => (vec![4], Values::F32(dataset.read(scene, quantity).await?)),
+            Quantity::Camera => (
+                vec![4, 4],
+                Values::F32(dataset.read(scene, quantity).await?),
+            ),
+            Quantity::Laser => (vec![3], Values::F32(dataset.read(scene, quantity).await?)),
+            Quantity::Scale => (vec![], Values::F32(dataset.read(scene, quantity).await?)),
+            _ => (
+                vec![h, w],
+                Values::F32(dataset.read(scene, quantity).await?),
+            ),
+        };
+        let (name, about) = (quantity.name(), about(quantity));
+        let name = match quantity {
+            Quantity::Scale => "photons_per_unit",
+            _ => name,
+        };
+        arrays.push(Plain {
+            name,
+            shape,
+            values,
+            about,
+        });
     }
+    Ok(PlainScene { manifest, arrays })
 }

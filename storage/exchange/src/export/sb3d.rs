@@ -85,86 +85,84 @@ impl Aside {
     }
 }
 
-impl Dataset {
-    /// Returns a scene's files in the layout of the paper's release, for a separate folder. The
-    /// last one contains the data that the others do not have, and marks the folder as complete.
-    pub(super) async fn sb3d_files(
-        &self,
-        scene: u64,
-    ) -> Result<Vec<(String, Bytes)>, StorageError> {
-        let spec = self.spec();
-        let mut out = Out::default();
-        let manifest = self.manifest(scene).await?;
-        check_known(scene, &manifest.missing())?;
-        let mut factor = None;
-        let histograms = [
-            Quantity::Transient,
-            Quantity::Transient25,
-            Quantity::Transient4,
-        ];
-        for quantity in histograms
-            .into_iter()
-            .filter(|q| spec.quantities().contains(q))
-        {
-            let spots = match quantity {
-                Quantity::Transient => spec.spots as usize,
-                subset => subset.spots_of_100().len(),
-            };
-            let h = self.read_histogram(scene, quantity).await?;
-            // Fewer spots give less light, so the histogram of all spots is the brightest.
-            let factor = *factor.get_or_insert_with(|| factor_of(&h));
-            let halves: Vec<f16> = h.par_iter().map(|h| f16::from_f32(h * factor)).collect();
-            drop(h);
-            let size = (spec.gate.bins as usize, spec.pixels());
-            out.put(
-                &format!("lidar_{spots}.exr"),
-                image(size, Samples::Half(halves))?,
-            );
-        }
-        let (w, h) = (spec.width as usize, spec.height as usize);
-        let depth: Vec<f32> = self.read(scene, Quantity::Depth).await?;
-        out.put("depth.exr", image((w, h), Samples::Float(depth))?);
-        let specular: Vec<u8> = self.read(scene, Quantity::Specular).await?;
-        out.put("specular_mask.png", grey(w, h, &specular)?);
-        let lit: Vec<f32> = self
-            .read_visibility(scene)
-            .await?
-            .into_iter()
-            .map(f32::from)
-            .collect();
-        let lit = npy::write("<f4", &[spec.spots as usize, h, w], &lit);
-        out.put("shadows_v1.npz", zipped("shadows.npy", &lit)?);
-        let spots = self.read_spots(scene).await?;
-        let positions: Vec<f32> = spots
-            .iter()
-            .flat_map(|s| s.map_or([f32::NAN; 3], |s| s.position))
-            .collect();
-        out.put(
-            "lights_camera_frame.npy",
-            npy::write("<f4", &[spots.len(), 3], &positions),
-        );
-        let i = self.read_intrinsics(scene).await?;
-        let camera: Vec<f32> = self.read(scene, Quantity::Camera).await?;
-        let laser: Vec<f32> = self.read(scene, Quantity::Laser).await?;
-        let mut pose = [[0.0; 4]; 4];
-        pose.as_flattened_mut().copy_from_slice(&camera);
-        let aside = Aside {
-            format: Aside::FORMAT.into(),
-            factor: factor.expect("every data set has a transient"),
-            gate: spec.gate,
-            intrinsics: [i.fx, i.fy, i.cx, i.cy],
-            camera: pose,
-            laser: [laser[0], laser[1], laser[2]],
-            spots: spots.iter().map(|s| s.map(|s| s.row())).collect(),
-            photons_per_unit: manifest.scale,
-            missing: manifest.missing(),
-            task_key: manifest.provenance.task_key,
+/// Returns a scene's files in the layout of the paper's release, for a separate folder. The
+/// last one contains the data that the others do not have, and marks the folder as complete.
+pub(super) async fn scene_files(
+    dataset: &Dataset,
+    scene: u64,
+) -> Result<Vec<(String, Bytes)>, StorageError> {
+    let spec = dataset.spec();
+    let mut out = Out::default();
+    let manifest = dataset.manifest(scene).await?;
+    check_known(scene, &manifest.missing())?;
+    let mut factor = None;
+    let histograms = [
+        Quantity::Transient,
+        Quantity::Transient25,
+        Quantity::Transient4,
+    ];
+    for quantity in histograms
+        .into_iter()
+        .filter(|q| spec.quantities().contains(q))
+    {
+        let spots = match quantity {
+            Quantity::Transient => spec.spots as usize,
+            subset => subset.spots_of_100().len(),
         };
-        let mut text = serde_json::to_vec_pretty(&aside).expect("plain data");
-        text.push(b'\n');
-        out.put(ASIDE, text);
-        Ok(out.0)
+        let h = dataset.read_histogram(scene, quantity).await?;
+        // Fewer spots give less light, so the histogram of all spots is the brightest.
+        let factor = *factor.get_or_insert_with(|| factor_of(&h));
+        let halves: Vec<f16> = h.par_iter().map(|h| f16::from_f32(h * factor)).collect();
+        drop(h);
+        let size = (spec.gate.bins as usize, spec.pixels());
+        out.put(
+            &format!("lidar_{spots}.exr"),
+            image(size, Samples::Half(halves))?,
+        );
     }
+    let (w, h) = (spec.width as usize, spec.height as usize);
+    let depth: Vec<f32> = dataset.read(scene, Quantity::Depth).await?;
+    out.put("depth.exr", image((w, h), Samples::Float(depth))?);
+    let specular: Vec<u8> = dataset.read(scene, Quantity::Specular).await?;
+    out.put("specular_mask.png", grey(w, h, &specular)?);
+    let lit: Vec<f32> = dataset
+        .read_visibility(scene)
+        .await?
+        .into_iter()
+        .map(f32::from)
+        .collect();
+    let lit = npy::write("<f4", &[spec.spots as usize, h, w], &lit);
+    out.put("shadows_v1.npz", zipped("shadows.npy", &lit)?);
+    let spots = dataset.read_spots(scene).await?;
+    let positions: Vec<f32> = spots
+        .iter()
+        .flat_map(|s| s.map_or([f32::NAN; 3], |s| s.position))
+        .collect();
+    out.put(
+        "lights_camera_frame.npy",
+        npy::write("<f4", &[spots.len(), 3], &positions),
+    );
+    let i = dataset.read_intrinsics(scene).await?;
+    let camera: Vec<f32> = dataset.read(scene, Quantity::Camera).await?;
+    let laser: Vec<f32> = dataset.read(scene, Quantity::Laser).await?;
+    let mut pose = [[0.0; 4]; 4];
+    pose.as_flattened_mut().copy_from_slice(&camera);
+    let aside = Aside {
+        format: Aside::FORMAT.into(),
+        factor: factor.expect("every data set has a transient"),
+        gate: spec.gate,
+        intrinsics: [i.fx, i.fy, i.cx, i.cy],
+        camera: pose,
+        laser: [laser[0], laser[1], laser[2]],
+        spots: spots.iter().map(|s| s.map(|s| s.row())).collect(),
+        photons_per_unit: manifest.scale,
+        missing: manifest.missing(),
+        task_key: manifest.provenance.task_key,
+    };
+    let mut text = serde_json::to_vec_pretty(&aside).expect("plain data");
+    text.push(b'\n');
+    out.put(ASIDE, text);
+    Ok(out.0)
 }
 
 #[derive(Default)]

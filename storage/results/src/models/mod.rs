@@ -5,7 +5,7 @@
 //! A model is published like a scene: objects first, in a folder named after their content, then
 //! `manifest.json`, create-only. Killed trainings with other settings under the same name leave
 //! objects in other folders and checkpoints under other keys. They do not interfere, and
-//! [`crate::collect`] eventually deletes them.
+//! [`crate::collect_garbage`] eventually deletes them.
 
 mod call;
 mod checkpoint;

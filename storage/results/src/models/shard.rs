@@ -5,9 +5,9 @@
 use bytes::Bytes;
 
 use super::Models;
-use picofarm_dataset::{pack, unpack};
 use picofarm_store::StorageError;
 use picofarm_store::objects;
+use picofarm_store::packed::{pack, unpack};
 
 /// The folder of the shards.
 pub(super) const FOLDER: &str = "shards";

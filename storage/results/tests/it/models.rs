@@ -309,15 +309,15 @@ async fn collection_takes_what_nobody_needs_and_leaves_the_rest() {
         .await
         .unwrap();
     std::fs::write(dir.path().join("models/m/notes.txt"), b"mine").unwrap();
-    let young = dataset.collect(MIN_GRACE, true).await.unwrap();
+    let young = collect_garbage(&dataset, MIN_GRACE, true).await.unwrap();
     assert_eq!(young.orphans, []);
-    let found = dataset.collect(NOW, false).await.unwrap();
+    let found = collect_garbage(&dataset, NOW, false).await.unwrap();
     assert_eq!(found.orphans.len(), 4);
     assert_eq!(
         found
             .orphans
             .iter()
-            .filter(|o| o.why().starts_with("checkpoint"))
+            .filter(|o| o.cause == OrphanCause::Checkpoint)
             .count(),
         2
     );
@@ -325,15 +325,18 @@ async fn collection_takes_what_nobody_needs_and_leaves_the_rest() {
         found
             .orphans
             .iter()
-            .filter(|o| o.why().contains("its model"))
+            .filter(|o| o.cause == OrphanCause::Model)
             .count(),
         2
     );
-    dataset.collect(NOW, true).await.unwrap();
+    collect_garbage(&dataset, NOW, true).await.unwrap();
     assert!(models.finished("m", "k").await.unwrap().is_some());
     assert_eq!(models.checkpoints("m").await.unwrap(), []);
     assert!(dir.path().join("models/m/notes.txt").exists());
-    assert_eq!(dataset.collect(NOW, true).await.unwrap().orphans, []);
+    assert_eq!(
+        collect_garbage(&dataset, NOW, true).await.unwrap().orphans,
+        []
+    );
 }
 
 #[tokio::test]
