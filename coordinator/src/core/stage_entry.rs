@@ -163,8 +163,8 @@ impl StageEntry {
         self.exceptions.insert(exception.task, exception);
     }
 
-    /// Takes back one failure of this kind that was charged to a task, unless the task was given up.
-    /// Returns the changed record.
+    /// Takes back one failure of this kind that was charged to a task, unless the task was given
+    /// up. Returns the changed record.
     pub(super) fn refund(&mut self, task: u64, kind: FailureKind) -> Option<Exception> {
         let exception = self.exceptions.get_mut(&task).filter(|e| !e.dead)?;
         let count = match kind {

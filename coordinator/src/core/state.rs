@@ -53,7 +53,8 @@ pub(crate) struct Core {
 
 impl Core {
     /// Restores the state from the catalog. Live leases get a new period, so that workers that
-    /// reconnect keep them. `timings` contains the known timing of each result set of an active job.
+    /// reconnect keep them. `timings` contains the known timing of each result set of an active
+    /// job.
     pub(crate) fn load(
         snapshot: Snapshot,
         timings: &HashMap<ResultSet, Timing>,

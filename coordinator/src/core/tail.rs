@@ -177,8 +177,8 @@ impl Core {
         true
     }
 
-    /// Returns the second run that a worker runs under this lease, with the range of the first run, if
-    /// that range still has the task to do.
+    /// Returns the second run that a worker runs under this lease, with the range of the first run,
+    /// if that range still has the task to do.
     pub(super) fn second_run(
         &self,
         worker: WorkerId,

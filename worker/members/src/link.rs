@@ -44,8 +44,8 @@ pub struct Link {
 }
 
 impl Link {
-    /// Opens a link. Its events are sent to `events`. If the other process is lost, `breaker` aborts
-    /// the current all-reduce.
+    /// Opens a link. Its events are sent to `events`. If the other process is lost, `breaker`
+    /// aborts the current all-reduce.
     pub fn open(
         id: u64,
         stream: TcpStream,

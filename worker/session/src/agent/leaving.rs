@@ -1,5 +1,5 @@
-//! Ends the worker: it gives back its leases, lets a task finish or save its progress, and waits for
-//! acknowledgements.
+//! Ends the worker: it gives back its leases, lets a task finish or save its progress, and waits
+//! for acknowledgements.
 
 use std::time::{Duration, Instant};
 
