@@ -1,41 +1,32 @@
 //! The coordinator plans jobs, places their tasks on workers, leases ranges of them, and commits
-//! the results. [`serve`] runs one. The decisions are pure ([`plan`], [`place`], [`transition`],
-//! [`budget`], [`explain`]).
+//! the results. [`serve`] runs one.
+//!
+//! The folders import one way, each from those listed before it:
+//!
+//! | folder | responsibility |
+//! | --- | --- |
+//! | `core` | the state in memory and all decisions; pure |
+//! | `memory` | bounds on the memory that callers can make the coordinator use |
+//! | `observe` | metrics, health, the audit log, trace spans |
+//! | `auth` | callers, their credentials and rights |
+//! | `explain` | why a task does not run, and why it ran again; pure |
+//! | `actor` | owns the core, and commits its decisions to the catalog |
+//! | `submission` | plans and records jobs outside the actor |
+//! | `edge` | connections, gRPC services, HTTP pages, start and stop |
+//!
+//! `auth` is a folder of its own and not a part of `edge`, because a submission depends on the
+//! rights of its caller. `tests/it/layers.rs` checks the order.
 
 mod actor;
-mod audit;
 pub mod auth;
-pub mod budget;
-mod clock;
-mod connections;
 mod core;
-pub mod explain;
-mod forget;
-mod health;
-mod http;
-mod lanes;
-#[cfg(test)]
-mod laws;
+mod edge;
+mod explain;
 mod memory;
-mod metrics;
-pub mod place;
-pub mod plan;
-mod rpc;
-mod server;
-mod sessions;
-pub mod stage;
-mod stored;
+mod observe;
 mod submission;
-mod timed;
-mod trace;
-pub mod transition;
 
-pub use budget::Backoff;
-pub use clock::Clock;
-pub use connections::Connections;
+pub use core::{Backoff, Clock, VERSION};
+pub use edge::{Connections, CoordinatorConfig, CoordinatorError, Running, serve};
 pub use memory::MemoryBounds;
-pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
-pub use stored::{Found, Stored};
-
-/// Version of this program. Workers must have the same.
-pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+pub use submission::{ResultReader, ResultState};

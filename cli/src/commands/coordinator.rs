@@ -6,7 +6,7 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use picofarm_agent::Memory;
 use picofarm_coordinator::{
-    Connections, CoordinatorConfig, CoordinatorError, MemoryBounds, Running, Stored,
+    Connections, CoordinatorConfig, CoordinatorError, MemoryBounds, ResultReader, Running,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
@@ -159,7 +159,7 @@ impl Coordinator {
         }
         config.http = http;
         config.forget_after = forget_after;
-        config.stored = stored.map(|reader| Arc::new(reader) as Arc<dyn Stored>);
+        config.result_reader = stored.map(|reader| Arc::new(reader) as Arc<dyn ResultReader>);
         let stop = CancellationToken::new();
         let running = serve(config, stop.clone())
             .await

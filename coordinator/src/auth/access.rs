@@ -21,3 +21,13 @@ impl Access {
         self.tokens.is_some() || self.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some())
     }
 }
+
+/// The header with the answer to whether credentials are accepted: `yes` or `no`. The message
+/// contains the reason.
+pub const ACCEPTED: &str = "picofarm-accepted";
+
+/// The scheme before the SHA-256 of a token in the header `authorization`, to ask whether the token
+/// is accepted.
+pub const BY_DIGEST: &str = "Sha256";
+/// The scheme before the name in a client certificate, to ask whether the certificate is accepted.
+pub const BY_CERTIFICATE: &str = "Certificate";

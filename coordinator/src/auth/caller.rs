@@ -11,6 +11,7 @@ use super::{
     tokens::Entry,
     trust::Trust,
 };
+use crate::observe::audit::ANYONE;
 
 /// The caller of a request: known by a token or a client certificate, or anyone if no
 /// authentication is required.
@@ -29,9 +30,6 @@ pub struct Caller {
     /// The data that the caller is checked against; `None` if no authentication is required.
     pub(super) trust: Option<watch::Receiver<Trust>>,
 }
-
-/// The name of callers if no authentication is required.
-pub(crate) const ANYONE: &str = "anyone";
 
 impl Caller {
     pub(super) fn anyone() -> Self {
@@ -58,7 +56,7 @@ impl Caller {
         let expired = async {
             match self.until {
                 Some(until) => {
-                    until.over().await;
+                    until.passed().await;
                     self.expired(until)
                 }
                 None => std::future::pending().await,

@@ -51,7 +51,7 @@ impl Expiry {
     }
 
     /// Waits until access has ended. The clock is read every half minute, because it may be set.
-    pub(super) async fn over(self) {
+    pub(super) async fn passed(self) {
         while let Ok(left) = self.0.duration_since(SystemTime::now()) {
             if left.is_zero() {
                 return;

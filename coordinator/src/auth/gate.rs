@@ -21,26 +21,26 @@ use super::{
     expiry::Expiry,
     roles::Role,
     tokens::{Entry, TokenError, Tokens},
-    trust::{GRACE, Judge, Reader, Source, Trouble, Trust, Verdict, too_slow},
+    trust::{CredentialFile, FileTrouble, FileVerdict, GRACE, Judge, Reader, Trust, too_slow},
 };
-use crate::{
+use crate::observe::{
     audit::{Audit, COORDINATOR},
     health::Health,
 };
 
 /// Interval between checks of the token file.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Identifies callers by their credentials.
 #[derive(Clone)]
 pub(crate) struct Gate {
-    asks: Asks,
+    required: RequiredCredentials,
     trust: watch::Receiver<Trust>,
 }
 
 /// The credentials that callers must present.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Asks {
+enum RequiredCredentials {
     /// None.
     Nothing,
     /// A token, or a certificate that the token file names.
@@ -66,15 +66,15 @@ impl Gate {
             None => Tokens::default(),
         };
         let (judge, trust) = Judge::new(Trust::new(tokens), health);
-        let asks = match &access.tokens {
+        let required = match &access.tokens {
             Some(path) => {
                 tokio::spawn(follow(path.clone(), judge.clone(), audit.clone(), stop));
-                Asks::Token
+                RequiredCredentials::Token
             }
-            None if access.authenticates() => Asks::Certificate,
-            None => Asks::Nothing,
+            None if access.authenticates() => RequiredCredentials::Certificate,
+            None => RequiredCredentials::Nothing,
         };
-        Ok((Self { asks, trust }, judge))
+        Ok((Self { required, trust }, judge))
     }
 
     /// Identifies the caller, on a connection that began when the client certificate authorities
@@ -88,14 +88,16 @@ impl Gate {
         certificate: Option<&Described>,
         authorities: u64,
     ) -> Result<Caller, Status> {
-        if self.asks == Asks::Nothing {
+        if self.required == RequiredCredentials::Nothing {
             return Ok(Caller::anyone());
         }
         let now = self.trust.borrow();
         now.judge_connection(authorities)?;
-        let mut caller = match self.asks {
-            Asks::Nothing | Asks::Certificate => by_certificate_alone(certificate)?,
-            Asks::Token => {
+        let mut caller = match self.required {
+            RequiredCredentials::Nothing | RequiredCredentials::Certificate => {
+                by_certificate_alone(certificate)?
+            }
+            RequiredCredentials::Token => {
                 let entry = entry(&now.tokens, token, certificate)?;
                 Caller {
                     name: entry.name.as_str().into(),
@@ -119,19 +121,23 @@ impl Gate {
 
     /// Returns whether the token with this SHA-256 is accepted now, and why.
     pub(crate) fn accepts_digest(&self, digest: &[u8]) -> (bool, String) {
-        match self.asks {
-            Asks::Nothing => (true, "it asks nobody for a token".into()),
-            Asks::Certificate => (false, "it takes client certificates and no tokens".into()),
-            Asks::Token => self.accepts(|tokens| tokens.by_digest(digest)),
+        match self.required {
+            RequiredCredentials::Nothing => (true, "it asks nobody for a token".into()),
+            RequiredCredentials::Certificate => {
+                (false, "it takes client certificates and no tokens".into())
+            }
+            RequiredCredentials::Token => self.accepts(|tokens| tokens.by_digest(digest)),
         }
     }
 
     /// Returns whether a client certificate with this name is accepted now, and why.
     pub(crate) fn accepts_certificate(&self, name: &str) -> (bool, String) {
-        match self.asks {
-            Asks::Nothing => (true, "it asks nobody for a certificate".into()),
-            Asks::Certificate => (true, "it takes every certificate of its --client-ca".into()),
-            Asks::Token => self.accepts(|tokens| {
+        match self.required {
+            RequiredCredentials::Nothing => (true, "it asks nobody for a certificate".into()),
+            RequiredCredentials::Certificate => {
+                (true, "it takes every certificate of its --client-ca".into())
+            }
+            RequiredCredentials::Token => self.accepts(|tokens| {
                 let mut entries = tokens.entries().iter();
                 entries.find(|e| e.certificate.as_deref() == Some(name))
             }),
@@ -200,10 +206,10 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
 /// that a mistake in an editor does not stop the farm. After [`GRACE`] every caller is refused
 /// until the file can be used again.
 async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationToken) {
-    let (mut reader, mut trouble) = (Reader::default(), Trouble::default());
+    let (mut reader, mut trouble) = (Reader::default(), FileTrouble::default());
     loop {
         tokio::select! {
-            () = tokio::time::sleep(LOOK) => {}
+            () = tokio::time::sleep(CHECK_INTERVAL) => {}
             () = stop.cancelled() => return,
         }
         let file = path.clone();
@@ -213,8 +219,8 @@ async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationTok
         };
         let why = read.as_ref().err().cloned();
         match trouble.judge(why.as_deref(), Instant::now()) {
-            Verdict::Same => {}
-            Verdict::Warn => {
+            FileVerdict::Same => {}
+            FileVerdict::Warn => {
                 let complaint = why.clone().unwrap_or_default();
                 tracing::error!(
                     "{complaint}; every caller is refused unless this is repaired within {} s",
@@ -222,14 +228,14 @@ async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationTok
                 );
                 audit.note(COORDINATOR, Act::Tokens, Outcome::Failed, &complaint);
             }
-            Verdict::Close => {
+            FileVerdict::Close => {
                 let complaint = why.clone().unwrap_or_default();
                 tracing::error!("{complaint}; every caller is refused until this is repaired");
                 let line = format!("every caller is refused: {complaint}");
                 audit.note(COORDINATOR, Act::Tokens, Outcome::Failed, &line);
-                judge.fault(Source::Tokens, why.clone());
+                judge.fault(CredentialFile::Tokens, why.clone());
             }
-            Verdict::Reopen => {
+            FileVerdict::Reopen => {
                 tracing::info!(file = %path.display(), "the token file can be read again");
                 let line = "the token file can be read again";
                 audit.note(COORDINATOR, Act::Tokens, Outcome::Done, line);
@@ -246,7 +252,7 @@ async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationTok
             changed
         });
         // This comes after the new list is in force, so that the old one admits nobody.
-        judge.fault(Source::Tokens, None);
+        judge.fault(CredentialFile::Tokens, None);
         if !what.is_empty() {
             tracing::info!(file = %path.display(), "the token file was read again");
             audit.note(COORDINATOR, Act::Tokens, Outcome::Done, &what);

@@ -81,7 +81,11 @@ impl WorkerIds {
     ///
     /// # Errors
     /// Returns PERMISSION_DENIED if the id belongs to another caller.
-    pub(crate) fn take(self: &Arc<Self>, id: WorkerId, caller: &Arc<str>) -> Result<Held, Status> {
+    pub(crate) fn take(
+        self: &Arc<Self>,
+        id: WorkerId,
+        caller: &Arc<str>,
+    ) -> Result<ClaimedWorkerId, Status> {
         let mut ids = self.0.lock().expect("no panic while locked");
         let now = Instant::now();
         if let Some(owned) = ids.get(&id)
@@ -109,7 +113,7 @@ impl WorkerIds {
         });
         owned.caller = Arc::clone(caller);
         owned.sessions += 1;
-        Ok(Held {
+        Ok(ClaimedWorkerId {
             ids: Arc::clone(self),
             id,
         })
@@ -118,12 +122,12 @@ impl WorkerIds {
 
 /// A worker id in use.
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct ClaimedWorkerId {
     ids: Arc<WorkerIds>,
     id: WorkerId,
 }
 
-impl Drop for Held {
+impl Drop for ClaimedWorkerId {
     fn drop(&mut self) {
         let mut ids = self.ids.0.lock().expect("no panic while locked");
         if let Some(owned) = ids.get_mut(&self.id) {

@@ -142,7 +142,7 @@ impl Caller {
 }
 
 /// Returns the reason why a caller may not change a visible job.
-pub(crate) fn not_yours(job: &JobId, owner: &Owner) -> String {
+pub(crate) fn not_owner(job: &JobId, owner: &Owner) -> String {
     let maintainers = match owner.project.as_str() {
         "" => String::new(),
         project => format!(", a maintainer of project {project:?}"),

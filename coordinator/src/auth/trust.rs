@@ -14,7 +14,7 @@ use tokio::{sync::watch, task::JoinHandle};
 use tonic::Status;
 
 use super::tokens::{Entry, Tokens};
-use crate::health::Health;
+use crate::observe::health::Health;
 
 /// Time for which a file may be unusable before every caller is refused. Editors and `kubectl`
 /// replace files in several steps.
@@ -22,14 +22,14 @@ pub(crate) const GRACE: Duration = Duration::from_secs(5);
 
 /// A file that callers are checked against.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Source {
+pub(crate) enum CredentialFile {
     /// The token file.
     Tokens,
     /// The client certificate authorities.
     Authorities,
 }
 
-impl Source {
+impl CredentialFile {
     fn name(self) -> &'static str {
         match self {
             Self::Tokens => "the token file",
@@ -60,7 +60,7 @@ impl Trust {
     /// Refuses every caller while a file cannot be used, and connections from before a change of
     /// the authorities.
     pub(super) fn judge_connection(&self, authorities: u64) -> Result<(), Status> {
-        let sources = [Source::Tokens, Source::Authorities];
+        let sources = [CredentialFile::Tokens, CredentialFile::Authorities];
         if let Some(source) = sources.into_iter().find(|s| self.faults[*s as usize]) {
             return Err(Status::unavailable(format!(
                 "this coordinator cannot use {}, so it refuses every caller until it can; its log has the reason",
@@ -110,7 +110,7 @@ impl Judge {
     }
 
     /// Records that a file is unusable (`Some`, with the reason), or usable again.
-    pub(crate) fn fault(&self, source: Source, why: Option<String>) {
+    pub(crate) fn fault(&self, source: CredentialFile, why: Option<String>) {
         let closed = why.is_some();
         self.health.access(source.name(), why);
         self.trust.send_if_modified(|trust| {
@@ -122,7 +122,7 @@ impl Judge {
 
 /// Follows one file and reports when it has been unusable for too long.
 #[derive(Debug, Default)]
-pub(crate) struct Trouble {
+pub(crate) struct FileTrouble {
     since: Option<Instant>,
     /// The last logged reason.
     said: String,
@@ -132,7 +132,7 @@ pub(crate) struct Trouble {
 
 /// The consequence of a check of a file.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum FileVerdict {
     /// No change.
     Same,
     /// The file cannot be used, but the grace period has not passed.
@@ -143,18 +143,18 @@ pub(crate) enum Verdict {
     Reopen,
 }
 
-impl Trouble {
+impl FileTrouble {
     /// Returns whether the last check found the file usable.
     pub(crate) fn is_over(&self) -> bool {
         self.since.is_none()
     }
 
     /// Evaluates a check at `now`; `why` is the reason why the file cannot be used.
-    pub(crate) fn judge(&mut self, why: Option<&str>, now: Instant) -> Verdict {
+    pub(crate) fn judge(&mut self, why: Option<&str>, now: Instant) -> FileVerdict {
         let Some(why) = why else {
             return match std::mem::take(self).closed {
-                true => Verdict::Reopen,
-                false => Verdict::Same,
+                true => FileVerdict::Reopen,
+                false => FileVerdict::Same,
             };
         };
         let since = *self.since.get_or_insert(now);
@@ -162,13 +162,13 @@ impl Trouble {
         why.clone_into(&mut self.said);
         if now - since >= GRACE {
             return match std::mem::replace(&mut self.closed, true) && !new {
-                true => Verdict::Same,
-                false => Verdict::Close,
+                true => FileVerdict::Same,
+                false => FileVerdict::Close,
             };
         }
         match new {
-            true => Verdict::Warn,
-            false => Verdict::Same,
+            true => FileVerdict::Warn,
+            false => FileVerdict::Same,
         }
     }
 }
@@ -221,22 +221,22 @@ mod tests {
 
     #[test]
     fn a_file_may_be_unusable_for_a_moment_and_not_for_longer() {
-        let mut trouble = Trouble::default();
+        let mut trouble = FileTrouble::default();
         let start = Instant::now();
         let mut look =
             |why: Option<&str>, at: u64| trouble.judge(why, start + Duration::from_secs(at));
-        assert_eq!(look(None, 0), Verdict::Same);
-        assert_eq!(look(Some("half written"), 1), Verdict::Warn);
-        assert_eq!(look(Some("half written"), 2), Verdict::Same);
-        assert_eq!(look(None, 3), Verdict::Same);
-        assert_eq!(look(Some("no such file"), 10), Verdict::Warn);
+        assert_eq!(look(None, 0), FileVerdict::Same);
+        assert_eq!(look(Some("half written"), 1), FileVerdict::Warn);
+        assert_eq!(look(Some("half written"), 2), FileVerdict::Same);
+        assert_eq!(look(None, 3), FileVerdict::Same);
+        assert_eq!(look(Some("no such file"), 10), FileVerdict::Warn);
         // Another reason does not restart the grace period.
-        assert_eq!(look(Some("not permitted"), 13), Verdict::Warn);
-        assert_eq!(look(Some("not permitted"), 15), Verdict::Close);
-        assert_eq!(look(Some("not permitted"), 16), Verdict::Same);
-        assert_eq!(look(Some("no such file"), 17), Verdict::Close);
-        assert_eq!(look(None, 18), Verdict::Reopen);
-        assert_eq!(look(None, 19), Verdict::Same);
+        assert_eq!(look(Some("not permitted"), 13), FileVerdict::Warn);
+        assert_eq!(look(Some("not permitted"), 15), FileVerdict::Close);
+        assert_eq!(look(Some("not permitted"), 16), FileVerdict::Same);
+        assert_eq!(look(Some("no such file"), 17), FileVerdict::Close);
+        assert_eq!(look(None, 18), FileVerdict::Reopen);
+        assert_eq!(look(None, 19), FileVerdict::Same);
     }
 
     #[tokio::test]
@@ -255,14 +255,14 @@ mod tests {
     fn nobody_is_let_in_while_a_file_cannot_be_used() {
         let (judge, trust) = Judge::new(Trust::default(), Arc::default());
         assert!(trust.borrow().judge(None, 0).is_ok());
-        judge.fault(Source::Tokens, Some("gone".into()));
+        judge.fault(CredentialFile::Tokens, Some("gone".into()));
         let refused = trust.borrow().judge(None, 0).unwrap_err();
         assert_eq!(refused.code(), tonic::Code::Unavailable);
         assert!(refused.message().contains("the token file"), "{refused}");
         let unready = judge.health.ready().unwrap_err();
         assert!(unready.what.contains("the token file"), "{unready}");
         assert_eq!(unready.detail.as_deref(), Some("gone"));
-        judge.fault(Source::Tokens, None);
+        judge.fault(CredentialFile::Tokens, None);
         assert!(trust.borrow().judge(None, 0).is_ok());
         judge.change(|trust| {
             trust.authorities += 1;

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use picofarm_proto::{ids::WorkerId, model::FailureKind};
 
-use crate::budget::Backoff;
+use super::budget::Backoff;
 
 /// A worker is excluded after this many different tasks in a row failed on it.
 const TASKS: usize = 3;
@@ -17,10 +17,10 @@ const LONGER: u32 = 4;
 
 /// The workers on which tasks of one stage failed.
 #[derive(Debug, Default)]
-pub(super) struct Blocklist(BTreeMap<WorkerId, Row>);
+pub(super) struct Blocklist(BTreeMap<WorkerId, WorkerFailures>);
 
 #[derive(Debug, Default)]
-struct Row {
+struct WorkerFailures {
     /// The failed tasks, with the kind of failure charged to each.
     tasks: BTreeMap<u64, FailureKind>,
     tries: u32,
@@ -42,7 +42,7 @@ impl Blocklist {
     ) {
         let row = self.0.entry(worker).or_default();
         if row.last_ms.max(row.until_ms) + i64::from(AVOID_MS) < now_ms {
-            *row = Row::default();
+            *row = WorkerFailures::default();
         }
         // Further tasks are not needed for the decision.
         if row.tasks.len() < TASKS {

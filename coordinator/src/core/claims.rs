@@ -9,8 +9,10 @@ use picofarm_proto::{
     model::EventKind,
 };
 
-use super::{About, Core, ready::Ready};
-use crate::{place, transition::RangeEvent};
+use super::{
+    history::EventDetails, placement, ready::Ready, stage_entry::StageEntry, state::Core,
+    transition::RangeEvent,
+};
 
 /// Leases claimed for each lease wanted now, so that short tasks do not cost a transaction
 /// each.
@@ -24,19 +26,15 @@ impl Core {
     /// for more. Jobs of lower priority get the remaining capacity. Tasks that cannot run now, or
     /// on none of the asking workers, keep no worker from other jobs.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
-        let mut hungry = Hungry::new(
-            self.workers
-                .iter()
-                .filter(|(_, worker)| worker.hungry())
-                .map(|(id, worker)| Asks {
-                    id: *id,
-                    credits: worker.credits,
-                    empty_handed: worker.leases.is_empty(),
-                    ends: worker.ends_ms.is_some(),
-                }),
-        );
+        let mut asking =
+            AskingWorkers::new(self.workers.asking().map(|(id, worker)| AskingWorker {
+                id: *id,
+                credits: worker.credits,
+                empty_handed: worker.leases.is_empty(),
+                ends: worker.ends_ms.is_some(),
+            }));
         // Usually all workers are busy, so that nothing needs to be searched.
-        if hungry.credits == 0 {
+        if asking.credits == 0 {
             return Vec::new();
         }
         let mut ranked: Vec<StageRef> = self
@@ -50,31 +48,31 @@ impl Core {
         for level in ranked.chunk_by(|a, b| self.priority(*a) == self.priority(*b)) {
             let mut demands: Vec<Demand> = level.iter().map(|id| Demand::new(*id)).collect();
             let mut taken = true;
-            while taken && hungry.credits > 0 {
+            while taken && asking.credits > 0 {
                 taken = false;
                 for demand in &mut demands {
-                    taken |= self.give_one(demand, &mut hungry, now_ms);
+                    taken |= self.give_one(demand, &mut asking, now_ms);
                 }
             }
             wants.extend(demands.iter().filter_map(|d| self.want(d, now_ms)));
-            if hungry.credits == 0 {
+            if asking.credits == 0 {
                 break;
             }
         }
         wants
     }
 
-    /// Gives a stage one more lease, for the next hungry worker that may run it. Returns `false` if
+    /// Gives a stage one more lease, for the next asking worker that may run it. Returns `false` if
     /// no worker may run it or no task is left.
-    fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
+    fn give_one(&self, demand: &mut Demand, asking: &mut AskingWorkers, now_ms: i64) -> bool {
         let id = demand.stage;
-        let job = &self.stages[&id].job;
+        let job = self.stages[&id].job();
         let most = job.spec.limits.max_workers;
-        while hungry.credits > 0
-            && let Some(worker) = hungry.workers.get_mut(demand.next)
+        while asking.credits > 0
+            && let Some(worker) = asking.workers.get_mut(demand.next)
         {
             let joins = most > 0 && !self.load.works(job.id, worker.id);
-            let joined = hungry.joined.get(&job.id);
+            let joined = asking.joined.get(&job.id);
             let room = !joins
                 || joined.is_none_or(|all| {
                     all.contains(&worker.id) || (all.len() as u64) < self.load.room(job.id, most)
@@ -96,7 +94,7 @@ impl Core {
                 ready.suspects = ready.suspects.saturating_sub(supply.size);
             } else if !ready.unknown {
                 if ready.is_none() {
-                    demand.next = hungry.workers.len();
+                    demand.next = asking.workers.len();
                 } else {
                     demand.next += 1;
                 }
@@ -105,9 +103,9 @@ impl Core {
             demand.leases += 1;
             demand.suspects |= worker.empty_handed;
             worker.credits -= 1;
-            hungry.credits -= 1;
+            asking.credits -= 1;
             if joins {
-                hungry.joined.entry(job.id).or_default().insert(worker.id);
+                asking.joined.entry(job.id).or_default().insert(worker.id);
             }
             return true;
         }
@@ -116,7 +114,7 @@ impl Core {
 
     fn supply(&self, id: StageRef, now_ms: i64) -> Supply {
         let entry = &self.stages[&id];
-        let size = match entry.spec(id).task.resumes() {
+        let size = match entry.spec().task.resumes() {
             true => 1,
             false => self.lease_size(entry, self.able(id, now_ms), u64::MAX, now_ms),
         };
@@ -141,7 +139,7 @@ impl Core {
             stage: demand.stage,
             tasks: AHEAD * needed,
             now_ms,
-            force: entry.spec(demand.stage).force,
+            force: entry.spec().force,
             suspects: demand.suspects,
         })
     }
@@ -149,7 +147,7 @@ impl Core {
     /// Returns the number of tasks in the next lease of a stage, at most `in_range`.
     pub(super) fn lease_size(
         &self,
-        entry: &super::StageEntry,
+        entry: &StageEntry,
         able: u64,
         in_range: u64,
         now_ms: i64,
@@ -160,12 +158,12 @@ impl Core {
             true => u64::MAX / 2,
             false => claimable.known(),
         };
-        let (plain, suspects) = entry.stage.ready(now_ms, &[]);
-        place::lease_size(
-            self.sets[entry.set].timing.mean(),
+        let (plain, suspects) = entry.held.ready(now_ms, &[]);
+        placement::lease_size(
+            self.stages.mean_seconds(entry),
             (plain + suspects).saturating_add(free),
             in_range,
-            able * u64::from(self.instances),
+            able * u64::from(self.peers.instances()),
         )
     }
 
@@ -174,29 +172,23 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&stage) else {
             return;
         };
-        entry.free = Some(claim.left);
+        entry.set_free(claim.left);
         if claim.owned.ranges.is_empty() {
-            entry.ask_at_ms = now_ms + ASK_AGAIN_MS;
+            entry.ask_not_before(now_ms + ASK_AGAIN_MS);
         }
         self.receive(claim.owned, now_ms);
         for run in claim.existing {
             let entry = self.stages.get_mut(&stage).expect("looked up above");
             // Every run is contained in one claimed range, because runs end where claimed ranges
             // end.
-            let Some(range) = entry.stage.pending_at(run.lo).cloned() else {
+            let Some(range) = entry.held.pending_at(run.lo).cloned() else {
                 continue;
             };
-            entry
-                .stage
-                .apply(
-                    &range,
-                    &RangeEvent::Settle { run },
-                    &mut Self::range_id(&mut self.make_id),
-                    &mut self.changes,
-                )
+            self.outcome
+                .apply(&mut entry.held, &range, &RangeEvent::Settle { run })
                 .expect("pending tasks can be settled");
-            let about = About::message("the outputs exist already").tasks(run.lo, run.hi);
-            self.event(now_ms, stage, EventKind::Reused, about);
+            let about = EventDetails::message("the outputs exist already").tasks(run.lo, run.hi);
+            self.outcome.event(now_ms, stage, EventKind::Reused, about);
             self.perhaps_over(stage, now_ms);
         }
     }
@@ -206,7 +198,7 @@ impl Core {
     pub(crate) fn receive(&mut self, owned: Owned, now_ms: i64) {
         for exception in owned.exceptions {
             if let Some(entry) = self.stages.get_mut(&exception.stage) {
-                entry.note(exception);
+                entry.note_exception(exception);
             }
         }
         for range in owned.ranges {
@@ -215,15 +207,15 @@ impl Core {
             match self.stages.get_mut(&range.stage) {
                 Some(entry) => {
                     if let RangeState::Leased(lease) = &range.state {
-                        self.leases.insert(id, range.stage);
-                        self.load.begun(id, &entry.job, lease.worker);
+                        self.leases.begin(id, range.stage);
+                        self.load.lease_begun(id, entry.job(), lease.worker);
                     }
-                    entry.stage.receive(range, &mut self.changes);
+                    entry.held.receive(range, self.outcome.changes());
                     self.renew(id, now_ms);
                 }
                 // The job is no longer active, so the range goes back as it would have when the job
                 // ended.
-                None => give_back(&range, &mut self.changes),
+                None => give_back(&range, self.outcome.changes()),
             }
         }
     }
@@ -235,16 +227,16 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&range.stage) else {
             return;
         };
-        let mut ended = entry.stage.outdated_by(range);
+        let mut ended = entry.held.outdated_by(range);
         // The same range, now without its worker or with another one.
         let pending = matches!(range.state, RangeState::Pending { .. });
-        let same = entry.stage.leased_range(range.id);
+        let same = entry.held.leased_range(range.id);
         let same = same.filter(|old| pending || old.epoch != range.epoch);
         ended.extend(same.map(|old| old.id));
         for id in ended {
             tracing::info!(range = %id, "this lease ended at another coordinator");
             if let Some(entry) = self.stages.get_mut(&range.stage) {
-                entry.stage.forget(id);
+                entry.held.forget(id);
             }
             self.lease_over(id);
         }
@@ -253,19 +245,19 @@ impl Core {
     /// Gives back the pending tasks that no worker took, so that other instances may claim them.
     pub(crate) fn give_back(&mut self) {
         for entry in self.stages.values_mut() {
-            let before = self.changes.free.len();
-            entry.stage.give_pending(&mut self.changes);
-            if self.changes.free.len() > before {
-                entry.free = None;
+            let before = self.outcome.changes().free.len();
+            entry.held.give_pending(self.outcome.changes());
+            if self.outcome.changes().free.len() > before {
+                entry.ask_again();
             }
         }
     }
 
     /// Applies the catalog's news. Returns the active jobs that this instance does not know yet.
-    pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
-        self.sick.tidy(now_ms);
-        self.instances = news.instances.max(1);
-        self.elsewhere = news.workers.saturating_sub(self.connected());
+    pub(crate) fn apply_news(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
+        self.failing_workers.tidy(now_ms);
+        let workers = news.workers.saturating_sub(self.workers.count());
+        self.peers.record(news.instances, workers, news.shared);
         let over: Vec<JobId> = self
             .stages
             .keys()
@@ -276,27 +268,24 @@ impl Core {
             self.drop_job(job, "the job was stopped");
         }
         let mut held = BTreeSet::new();
-        for (id, entry) in &mut self.stages {
-            entry.free = Some(news.free.get(id).copied().unwrap_or_default());
+        for (id, entry) in self.stages.iter_mut() {
+            entry.set_free(news.free.get(id).copied().unwrap_or_default());
             let paused = news.active.get(&id.job).copied().unwrap_or(false);
-            if paused && !entry.job.paused {
+            if entry.set_paused(paused) {
                 held.insert(id.job);
             }
-            entry.job.paused = paused;
         }
-        self.load.hear_elsewhere(news.busy);
-        self.shared_elsewhere = news.shared;
+        self.load.record_elsewhere(news.busy);
         if let Some(leased) = &news.leased {
             let lost: Vec<_> = self
                 .leases
                 .iter()
                 .filter(|(range, _)| !leased.contains(range))
-                .map(|(range, stage)| (*range, *stage))
                 .collect();
             for (range, stage) in lost {
                 tracing::info!(%range, "a worker has taken this lease along to another coordinator");
                 if let Some(entry) = self.stages.get_mut(&stage) {
-                    entry.stage.forget(range);
+                    entry.held.forget(range);
                 }
                 self.lease_over(range);
                 // Our last task may have been reported while this one still seemed to be leased,
@@ -317,15 +306,15 @@ impl Core {
 }
 
 /// The workers that ask for leases.
-struct Hungry {
-    workers: Vec<Asks>,
+struct AskingWorkers {
+    workers: Vec<AskingWorker>,
     /// Total number of leases that the workers ask for.
     credits: u64,
     /// Workers that would join the workers of a job with a limit.
     joined: HashMap<JobId, BTreeSet<WorkerId>>,
 }
 
-struct Asks {
+struct AskingWorker {
     id: WorkerId,
     credits: u32,
     empty_handed: bool,
@@ -333,9 +322,9 @@ struct Asks {
     ends: bool,
 }
 
-impl Hungry {
-    fn new(workers: impl Iterator<Item = Asks>) -> Self {
-        let workers: Vec<Asks> = workers.collect();
+impl AskingWorkers {
+    fn new(workers: impl Iterator<Item = AskingWorker>) -> Self {
+        let workers: Vec<AskingWorker> = workers.collect();
         Self {
             credits: workers.iter().map(|w| u64::from(w.credits)).sum(),
             workers,
@@ -379,7 +368,7 @@ fn give_back(range: &Range, changes: &mut Changes) {
     let mut minted = Vec::new();
     let pieces = match range.state {
         RangeState::Leased(_) => {
-            crate::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
+            super::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
                 let id = picofarm_proto::ids::RangeId::from_uuid(uuid::Uuid::now_v7());
                 minted.push(id);
                 id

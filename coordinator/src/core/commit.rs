@@ -8,8 +8,10 @@ use picofarm_proto::{
     model::{EventKind, Finished},
 };
 
-use super::{About, Core, Say, SessionId, StageEntry, stores::store_of};
-use crate::transition::RangeEvent;
+use super::{
+    history::EventDetails, message::SessionId, stage_entry::StageEntry, state::Core,
+    store_faults::store_of, transition::RangeEvent,
+};
 
 /// The recorded result of a reported task, which is looked up before [`Core::finished`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,12 +22,12 @@ impl Core {
     /// key.
     pub(crate) fn stage_of(&self, report: &Finished) -> Option<StageRef> {
         let fits =
-            |entry: &StageEntry| task_key(&self.sets[entry.set].key, report.index) == report.key;
-        if let Some(double) = self.doubles.get(&report.lease.range) {
-            return fits(self.stages.get(&double.stage)?).then_some(double.stage);
+            |entry: &StageEntry| task_key(self.stages.key_of(entry), report.index) == report.key;
+        if let Some(run) = self.second_runs.get(report.lease.range) {
+            return fits(self.stages.get(&run.stage)?).then_some(run.stage);
         }
-        if let Some(id) = self.leases.get(&report.lease.range) {
-            return fits(&self.stages[id]).then_some(*id);
+        if let Some(id) = self.leases.stage_of(report.lease.range) {
+            return fits(&self.stages[&id]).then_some(id);
         }
         self.stages
             .iter()
@@ -44,14 +46,15 @@ impl Core {
         checked: bool,
         now_ms: i64,
     ) {
-        let Some(worker) = self.sessions.get(&session).copied() else {
+        let Some(worker) = self.workers.id_of(session) else {
             return;
         };
         let verdict = self.commit(session, report, (hint, checked), now_ms);
         if let Err(reason) = &verdict {
             tracing::info!(%worker, range = %report.lease.range, task = report.index, reason, "report refused");
         }
-        self.acknowledge(session, report.lease, report.index, verdict);
+        self.outcome
+            .acknowledge(session, report.lease, report.index, verdict);
     }
 
     /// Adds a warning about a reported task to the history.
@@ -65,10 +68,12 @@ impl Core {
         let Some(stage) = self.stage_of(report) else {
             return;
         };
-        let name = self.session_name(session);
+        let name = self.workers.session_name(session);
         tracing::error!(job = %stage.job, worker = name, "{message}");
-        let about = About::message(message).task(report.index).worker(name);
-        self.event(now_ms, stage, EventKind::Alarm, about);
+        let about = EventDetails::message(message)
+            .task(report.index)
+            .worker(name);
+        self.outcome.event(now_ms, stage, EventKind::Alarm, about);
     }
 
     fn commit(
@@ -84,17 +89,17 @@ impl Core {
         let id = self.stage_of(report).ok_or(
             "the task key names no task of an active job: it has ended, or the worker's renderer or settings differ",
         )?;
-        let set = self.stages[&id].set;
-        let known = known.or_else(|| self.fresh.get(&(set, report.index)).copied());
-        let double = self
-            .sessions
-            .get(&session)
-            .and_then(|worker| self.doubled(*worker, report.lease))
-            .filter(|(double, _)| double.task == report.index)
+        let set = self.stages[&id].set();
+        let known = known.or_else(|| self.outcome.new_output(set, report.index));
+        let second = self
+            .workers
+            .id_of(session)
+            .and_then(|worker| self.second_run(worker, report.lease))
+            .filter(|(run, _)| run.task == report.index)
             .map(|(_, range)| range.clone());
-        let live = match double {
+        let live = match second {
             Some(range) => {
-                self.drop_double(session, report.lease);
+                self.drop_second_run(session, report.lease);
                 Ok(range)
             }
             None => self
@@ -116,7 +121,7 @@ impl Core {
                     hex_of(&known),
                     report.manifest_sha256
                 );
-                self.undecided(&range, session, report.index, &message, now_ms);
+                self.rerun_undecided(&range, session, report.index, &message, now_ms);
                 Err(message)
             }
             (live, Some(known)) => {
@@ -138,15 +143,15 @@ impl Core {
                             true => EventKind::Reused,
                             false => EventKind::Committed,
                         };
-                        let about = About::message("the same result as before")
+                        let about = EventDetails::message("the same result as before")
                             .task(report.index)
-                            .worker(self.session_name(session))
+                            .worker(self.workers.session_name(session))
                             .seconds(report.seconds);
-                        self.event(now_ms, id, kind, about);
+                        self.outcome.event(now_ms, id, kind, about);
                     }
                     return Ok(());
                 }
-                let name = self.session_name(session);
+                let name = self.workers.session_name(session);
                 let message = format!(
                     "task {} has two different results: manifest {} is recorded, and {} was reported now; the recorded one stands",
                     report.index,
@@ -154,10 +159,10 @@ impl Core {
                     report.manifest_sha256
                 );
                 tracing::error!(job = %id.job, worker = name, "{message}");
-                let about = About::message(message.clone())
+                let about = EventDetails::message(message.clone())
                     .task(report.index)
                     .worker(name);
-                self.event(now_ms, id, EventKind::Alarm, about);
+                self.outcome.event(now_ms, id, EventKind::Alarm, about);
                 Err(message)
             }
             (Err(reason), None) => Err(reason),
@@ -174,19 +179,18 @@ impl Core {
         now_ms: i64,
     ) {
         let task = report.index;
-        let set = self.stages[&id].set;
-        self.away.mended((id, task));
-        if let (Some(worker), Some(entry)) = (self.sessions.get(&session), self.stages.get_mut(&id))
-        {
-            entry.blocklist.succeeded(*worker);
-            self.sick.succeeded(*worker);
-            let task = &entry.spec(id).task;
+        let set = self.stages[&id].set();
+        self.store_faults.mended((id, task));
+        let worker = self.workers.id_of(session);
+        if let (Some(worker), Some(entry)) = (worker, self.stages.get_mut(&id)) {
+            entry.blocklist.succeeded(worker);
+            self.failing_workers.succeeded(worker);
+            let task = &entry.spec().task;
             if !report.adopted {
-                self.away.worked(store_of(task), *worker);
+                self.store_faults.worked(store_of(task), worker);
             }
         }
-        self.fresh.insert((set, task), manifest);
-        self.changes.outputs.push(Output {
+        let output = Output {
             stage: id,
             task,
             manifest,
@@ -195,24 +199,22 @@ impl Core {
             epoch: range.epoch,
             adopted: report.adopted,
             checked,
-        });
-        if !checked && let Some(worker) = self.sessions.get(&session) {
-            self.doubts.unverified(set, task, *worker);
+        };
+        self.outcome.record_output(set, output);
+        if !checked && let Some(worker) = worker {
+            self.doubts.unverified(set, task, worker);
         }
         let kind = if report.adopted {
             EventKind::Reused
         } else {
-            let timing = &mut self.sets[set].timing;
-            timing.tasks += 1;
-            timing.seconds += report.seconds;
-            timing.bytes += report.bytes as f64;
+            self.stages.add_time(set, report.seconds, report.bytes);
             EventKind::Committed
         };
-        let about = About::default()
+        let about = EventDetails::default()
             .task(task)
-            .worker(self.session_name(session))
+            .worker(self.workers.session_name(session))
             .seconds(report.seconds);
-        self.event(now_ms, id, kind, about);
+        self.outcome.event(now_ms, id, kind, about);
         self.mark(
             range,
             &RangeEvent::Finish {
@@ -233,11 +235,11 @@ impl Core {
             && holder.session != by
             && self.range(range.id).is_none()
         {
-            let revoke = Say::Revoke {
-                lease: range.lease(),
-                reason: "its last task was finished by another worker".into(),
-            };
-            self.say.push((holder.session, revoke));
+            self.outcome.revoke(
+                holder.session,
+                range.lease(),
+                "its last task was finished by another worker",
+            );
         }
     }
 }

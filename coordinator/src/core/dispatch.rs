@@ -9,10 +9,9 @@ use picofarm_proto::{
     model::{EventKind, Lease},
 };
 
-use super::{About, Core, Say, stores::store_of};
-use crate::{
-    explain::{Barred, span},
-    transition::RangeEvent,
+use super::{
+    candidate::NotEligible, history::EventDetails, message::ToWorker, state::Core,
+    store_faults::store_of, transition::RangeEvent, words::span,
 };
 
 /// The other workers that may run a stage.
@@ -29,7 +28,7 @@ pub(super) enum Others {
 impl Core {
     /// Grants all claimed tasks that can be granted now.
     pub(crate) fn dispatch(&mut self, now_ms: i64) {
-        self.end_doubles();
+        self.end_second_runs();
         let waiting: Vec<StageRef> = self
             .stages
             .iter()
@@ -39,13 +38,8 @@ impl Core {
         for stage in &waiting {
             self.explain_waiting(*stage, now_ms);
         }
-        let hungry: Vec<WorkerId> = self
-            .workers
-            .iter()
-            .filter(|(_, w)| w.hungry())
-            .map(|(id, _)| *id)
-            .collect();
-        if hungry.is_empty() {
+        let asking: Vec<WorkerId> = self.workers.asking().map(|(id, _)| *id).collect();
+        if asking.is_empty() {
             return;
         }
         let mut waiting: Vec<(StageRef, u64)> = waiting
@@ -58,30 +52,30 @@ impl Core {
         let mut granted = true;
         while granted {
             granted = false;
-            for worker in &hungry {
+            for worker in &asking {
                 waiting.sort_by_cached_key(|(stage, _)| self.rank(*stage));
                 granted |= waiting
                     .iter()
                     .any(|(stage, able)| self.grant(*stage, *worker, *able, now_ms));
             }
         }
-        self.help(&hungry, now_ms);
+        self.help(&asking, now_ms);
     }
 
     /// Returns the precedence of a stage: higher priority first, then the user with the fewest
     /// leases, then the job with the fewest leases, then the earlier submission.
     pub(super) fn rank(&self, id: StageRef) -> impl Ord + use<> {
-        let job = &self.stages[&id].job;
+        let job = self.stages[&id].job();
         (
             Reverse(job.spec.priority),
-            self.load.of_user(&job.user),
-            self.load.of_job(job.id),
+            self.load.leases_of_user(&job.user),
+            self.load.leases_of_job(job.id),
             id,
         )
     }
 
     pub(super) fn priority(&self, id: StageRef) -> i32 {
-        self.stages[&id].job.spec.priority
+        self.stages[&id].job_spec().priority
     }
 
     /// Checks whether a connected worker may run a stage's tasks now.
@@ -93,35 +87,35 @@ impl Core {
         id: StageRef,
         worker: WorkerId,
         now_ms: i64,
-    ) -> Result<(), Barred> {
+    ) -> Result<(), NotEligible> {
         if let Some(why) = self.doubts.blocked(worker) {
             return Err(why.into());
         }
         let entry = &self.stages[&id];
-        entry.suits(id, &self.workers[&worker].abilities)?;
-        let store = store_of(&entry.spec(id).task);
-        self.away.may_use(store, worker, now_ms)?;
-        let most = entry.job.spec.limits.max_workers;
+        entry.suits(&self.workers[&worker].abilities)?;
+        let store = store_of(&entry.spec().task);
+        self.store_faults.may_use(store, worker, now_ms)?;
+        let most = entry.job_spec().limits.max_workers;
         if most > 0 && !self.load.may_join(id.job, worker, most) {
-            return Err(Barred::from(format!(
+            return Err(NotEligible::from(format!(
                 "limits.max_workers = {most}, and so many work on the job"
             )));
         }
         if let Err((needs, left)) = self.has_time(id, worker, now_ms) {
-            return Err(Barred::from(format!(
+            return Err(NotEligible::from(format!(
                 "a task is taken to need {}, and the worker ends in {}",
                 span(needs),
                 span(left)
             )));
         }
-        if let Some(ms) = self.sick.rests(worker, now_ms) {
-            return Err(Barred::from(format!(
+        if let Some(ms) = self.failing_workers.rests(worker, now_ms) {
+            return Err(NotEligible::from(format!(
                 "it failed, or gave back, one lease after another; it gets no tasks for another {}",
                 span(ms)
             )));
         }
-        if self.sick.is_try(worker) && !self.workers[&worker].leases.is_empty() {
-            return Err(Barred::from(
+        if self.failing_workers.is_try(worker) && !self.workers[&worker].leases.is_empty() {
+            return Err(NotEligible::from(
                 "it failed, or gave back, one lease after another; one task is trying it now",
             ));
         }
@@ -130,7 +124,7 @@ impl Core {
                 "tasks of the stage failed on it one after another; one task is trying it now"
                     .into(),
             ),
-            Some(ms) => Err(Barred::from(format!(
+            Some(ms) => Err(NotEligible::from(format!(
                 "tasks of the stage failed on it one after another; it is passed over for another {}",
                 span(ms)
             ))),
@@ -154,7 +148,7 @@ impl Core {
         let mut leases = self.workers.get(&worker)?.leases.iter();
         left.or_else(|| {
             leases
-                .any(|lease| self.leases.get(lease) == Some(&id))
+                .any(|lease| self.leases.stage_of(*lease) == Some(id))
                 .then_some(0)
         })
     }
@@ -166,8 +160,8 @@ impl Core {
             **worker != than
                 && !w.drains
                 && now_ms - w.heard_ms <= i64::from(self.settings.lease_ms)
-                && self.sick.rests(**worker, now_ms).is_none()
-                && entry.suits(id, &w.abilities).is_ok()
+                && self.failing_workers.rests(**worker, now_ms).is_none()
+                && entry.suits(&w.abilities).is_ok()
                 && self.has_time(id, **worker, now_ms).is_ok()
         });
         let mut found = Others::None;
@@ -185,53 +179,50 @@ impl Core {
     pub(super) fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let who = &self.workers[&worker];
-        if !who.hungry() || self.may_run(id, worker, now_ms).is_err() {
+        if !who.wants_leases() || self.may_run(id, worker, now_ms).is_err() {
             return false;
         }
         // A suspect range runs alone on its worker, so that a crash affects no other lease.
-        let others = self.not_for(id, worker, now_ms);
+        let others = self.excluded_tasks(id, worker, now_ms);
         let suspects = who.leases.is_empty();
-        let Some((range, run)) = entry.stage.front(now_ms, suspects, &others) else {
+        let Some((range, run)) = entry.held.front(now_ms, suspects, &others) else {
             return false;
         };
         let range = range.clone();
-        let store = store_of(&entry.spec(id).task).to_owned();
+        let store = store_of(&entry.spec().task).to_owned();
         // A task that may run for days must not delay others, and a try has a single task.
-        let alone = self.away.is_try(&store, worker)
-            || entry.spec(id).task.resumes()
+        let alone = self.store_faults.is_try(&store, worker)
+            || entry.spec().task.resumes()
             || entry.blocklist.doubts(worker)
-            || self.sick.is_try(worker);
+            || self.failing_workers.is_try(worker);
         let count = match alone {
             true => 1,
             false => self
                 .lease_size(entry, able, run.hi - run.lo, now_ms)
                 .min(self.most_that_fit(id, worker, now_ms)),
         };
+        let key = *self.stages.key_of(entry);
         let entry = self.stages.get_mut(&id).expect("looked up above");
         let who = self.workers.get_mut(&worker).expect("looked up above");
-        let granted = entry
-            .stage
-            .apply(
-                &range,
-                &RangeEvent::Grant {
-                    at: run.lo,
-                    count,
-                    worker,
-                    incarnation: who.incarnation,
-                    until_ms: now_ms + i64::from(self.settings.lease_ms),
-                },
-                &mut Self::range_id(&mut self.make_id),
-                &mut self.changes,
-            )
+        let grant = RangeEvent::Grant {
+            at: run.lo,
+            count,
+            worker,
+            incarnation: who.incarnation,
+            until_ms: now_ms + i64::from(self.settings.lease_ms),
+        };
+        let granted = self
+            .outcome
+            .apply(&mut entry.held, &range, &grant)
             .expect("a pending range can be granted")
             .expect("a grant leaves a leased range");
         debug_assert!(matches!(granted.state, RangeState::Leased(_)));
         who.credits -= 1;
         who.leases.insert(granted.id);
         who.quarantined = granted.crashes > 0;
-        self.leases.insert(granted.id, id);
-        self.away.begun(&store, worker, granted.id);
-        self.load.begun(granted.id, &entry.job, worker);
+        self.leases.begin(granted.id, id);
+        self.store_faults.lease_begun(&store, worker, granted.id);
+        self.load.lease_begun(granted.id, entry.job(), worker);
         let lease = Lease {
             lease: granted.lease(),
             job: id.job,
@@ -239,16 +230,17 @@ impl Core {
             hi: granted.hi,
             skip: Vec::new(),
             ttl_ms: self.settings.lease_ms,
-            stage: entry.spec(id).only(granted.lo, granted.hi),
+            stage: entry.spec().only(granted.lo, granted.hi),
             ordinal: id.stage,
-            key: self.sets[entry.set].key,
+            key,
             traceparent: String::new(),
         };
-        self.say.push((who.session, Say::Lease(Box::new(lease))));
-        let about = About::message(format!("tasks {}..{}", granted.lo, granted.hi))
+        self.outcome
+            .send(who.session, ToWorker::Lease(Box::new(lease)));
+        let about = EventDetails::message(format!("tasks {}..{}", granted.lo, granted.hi))
             .tasks(granted.lo, granted.hi)
             .worker(who.name.clone());
-        self.event(now_ms, id, EventKind::Leased, about);
+        self.outcome.event(now_ms, id, EventKind::Leased, about);
         true
     }
 
@@ -264,25 +256,25 @@ impl Core {
         let mut reasons = self
             .workers
             .values()
-            .map(|w| (&w.name, entry.suits(id, &w.abilities)));
+            .map(|w| (&w.name, entry.suits(&w.abilities)));
         let Some((name, Err(reason))) = reasons.next() else {
             return;
         };
         if reasons.any(|(_, verdict)| verdict.is_ok()) {
             return;
         }
-        if entry.waiting.as_deref() == Some(&*reason) {
+        let name = name.clone();
+        let entry = self.stages.get_mut(&id).expect("looked up above");
+        if !entry.waits_because(&reason) {
             return;
         }
-        let name = name.clone();
         tracing::warn!(job = %id.job, worker = name, "no connected worker may run this job: {reason}");
-        self.stages.get_mut(&id).expect("looked up above").waiting = Some(reason.clone());
         let message = format!("no connected worker may run this job: {reason}");
-        self.event(
+        self.outcome.event(
             now_ms,
             id,
             EventKind::Waiting,
-            About::message(message).worker(name),
+            EventDetails::message(message).worker(name),
         );
     }
 }

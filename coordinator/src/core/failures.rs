@@ -6,9 +6,14 @@ use picofarm_proto::{
     model::{EventKind, FailureKind},
 };
 
-use super::{About, Core, Say, SessionId, dispatch::Others, sick::Trouble, stores::store_of};
-use crate::{
+use super::{
     budget::{self, Attempt, Verdict},
+    dispatch::Others,
+    failing_workers::Trouble,
+    history::EventDetails,
+    message::SessionId,
+    state::Core,
+    store_faults::store_of,
     transition::RangeEvent,
 };
 
@@ -55,10 +60,10 @@ impl Core {
             ),
             _ => message.to_owned(),
         };
-        let about = About::message(about)
+        let about = EventDetails::message(about)
             .task(task)
-            .worker(self.name_of(worker));
-        self.event(now_ms, range.stage, event, about);
+            .worker(self.workers.name(worker));
+        self.outcome.event(now_ms, range.stage, event, about);
         counts
     }
 
@@ -79,11 +84,12 @@ impl Core {
         if verdict.retry_at_ms.is_none() {
             let why = verdict.exception.map(|e| e.last_error).unwrap_or_default();
             let worker = match &range.state {
-                RangeState::Leased(lease) => self.name_of(lease.worker),
+                RangeState::Leased(lease) => self.workers.name(lease.worker),
                 _ => String::new(),
             };
-            let about = About::message(why).task(task).worker(worker);
-            self.event(now_ms, range.stage, EventKind::Dead, about);
+            let about = EventDetails::message(why).task(task).worker(worker);
+            self.outcome
+                .event(now_ms, range.stage, EventKind::Dead, about);
         }
     }
 
@@ -99,26 +105,24 @@ impl Core {
         };
         self.charge(range, task, attempt, now_ms);
         let worker = match &range.state {
-            RangeState::Leased(lease) => self.name_of(lease.worker),
+            RangeState::Leased(lease) => self.workers.name(lease.worker),
             _ => String::new(),
         };
-        let about = About::message(message).task(task).worker(worker);
-        self.event(now_ms, range.stage, EventKind::Released, about);
+        let about = EventDetails::message(message).task(task).worker(worker);
+        self.outcome
+            .event(now_ms, range.stage, EventKind::Released, about);
     }
 
     /// Returns how long a task has run under a lease, as far as is known, milliseconds.
     fn attempt_ms(&self, range: RangeId, task: u64, now_ms: i64) -> u64 {
-        let progress = self.progress.get(&range).and_then(|tasks| tasks.get(&task));
+        let progress = self.leases.progress(range, task);
         progress.map_or(0, |p| (now_ms - p.since_ms).max(0).unsigned_abs())
     }
 
     /// Returns whether a resumable task made progress under this lease.
     fn came_further(&self, range: &Range, task: u64) -> bool {
-        let resumes = self.stages[&range.stage].spec(range.stage).task.resumes();
-        let progress = self
-            .progress
-            .get(&range.id)
-            .and_then(|tasks| tasks.get(&task));
+        let resumes = self.stages[&range.stage].spec().task.resumes();
+        let progress = self.leases.progress(range.id, task);
         resumes && progress.is_some_and(|p| p.first.is_some_and(|first| p.fraction > first))
     }
 
@@ -145,8 +149,9 @@ impl Core {
             // The object is at fault. It is replaced or becomes available again.
             FailureKind::Damaged => false,
             FailureKind::Store => {
-                let store = store_of(&entry.spec(id).task).to_owned();
-                self.away.failed(&store, worker, message, &backoff, now_ms);
+                let store = store_of(&entry.spec().task).to_owned();
+                self.store_faults
+                    .failed(&store, worker, message, &backoff, now_ms);
                 self.blame(worker, Trouble::Store(store), others, now_ms);
                 false
             }
@@ -172,7 +177,8 @@ impl Core {
     ) {
         let backoff = self.settings.backoff;
         let others = others == Others::Good;
-        self.sick.failed(worker, trouble, others, &backoff, now_ms);
+        self.failing_workers
+            .failed(worker, trouble, others, &backoff, now_ms);
     }
 
     /// Moves the charges of a stage's tasks on a worker to the worker. Tasks that were given up
@@ -180,17 +186,9 @@ impl Core {
     fn take_charges_back(&mut self, id: StageRef, worker: WorkerId) {
         let entry = self.stages.get_mut(&id).expect("a lease has a stage");
         for (task, kind) in entry.blocklist.take_charged(worker) {
-            let Some(exception) = entry.exceptions.get_mut(&task).filter(|e| !e.dead) else {
-                continue;
-            };
-            let count = match kind {
-                FailureKind::Crash => &mut exception.crashes,
-                _ => &mut exception.failures,
-            };
-            *count = count.saturating_sub(1);
-            self.changes
-                .exceptions
-                .insert((id, task), exception.clone());
+            if let Some(exception) = entry.refund(task, kind) {
+                self.outcome.record_exception(exception);
+            }
         }
     }
 
@@ -201,31 +199,29 @@ impl Core {
             .get_mut(&range.stage)
             .expect("a lease has a stage");
         let mut backoff = self.settings.backoff;
-        if attempt.kind == FailureKind::Crash && entry.spec(range.stage).task.resumes() {
+        if attempt.kind == FailureKind::Crash && entry.spec().task.resumes() {
             // The task continues from its saved progress, so repeated losses of workers do not mean
             // that it never ends.
             backoff.most_ms = backoff.first_ms;
         }
         let mut verdict = budget::charge(
-            entry.exceptions.get(&task),
+            entry.exception(task),
             budget::fresh(range.stage, task),
             attempt,
-            &entry.job.spec.limits,
+            &entry.job_spec().limits,
             &backoff,
             now_ms,
         );
         if attempt.kind == FailureKind::Damaged {
             let wait = self
-                .away
+                .store_faults
                 .damaged((range.stage, task), &self.settings.backoff);
             verdict.retry_at_ms = Some(now_ms + wait);
         }
         let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
         if let Some(exception) = &verdict.exception {
-            self.changes
-                .exceptions
-                .insert((range.stage, task), exception.clone());
-            entry.note(exception.clone());
+            self.outcome.record_exception(exception.clone());
+            entry.note_exception(exception.clone());
         }
         self.mark(
             range,
@@ -246,11 +242,8 @@ impl Core {
         if let RangeState::Leased(lease) = &range.state
             && let Some(entry) = self.workers.get(&lease.worker)
         {
-            let revoke = Say::Revoke {
-                lease: range.lease(),
-                reason: why.to_owned(),
-            };
-            self.say.push((entry.session, revoke));
+            self.outcome
+                .revoke(entry.session, range.lease(), why.to_owned());
         }
         self.close(&range, false);
     }
@@ -258,16 +251,16 @@ impl Core {
     /// Takes back the leases that a session's worker would not be given now: those of a stage that
     /// fails on it, or all if every task fails.
     pub(super) fn take_back_all(&mut self, session: SessionId, stage: StageRef, now_ms: i64) {
-        let Some(worker) = self.sessions.get(&session).copied() else {
+        let Some(worker) = self.workers.id_of(session) else {
             return;
         };
-        let rests = self.sick.rests(worker, now_ms).is_some();
+        let rests = self.failing_workers.rests(worker, now_ms).is_some();
         if !rests && self.passed_over(stage, worker, now_ms).is_none() {
             return;
         }
         let leases: Vec<RangeId> = self.workers[&worker].leases.iter().copied().collect();
         for id in leases {
-            if rests || self.leases.get(&id) == Some(&stage) {
+            if rests || self.leases.stage_of(id) == Some(stage) {
                 self.take_back(id, "one task after another fails on this worker");
             }
         }

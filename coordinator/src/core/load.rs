@@ -24,9 +24,9 @@ struct JobLoad {
 
 impl Load {
     /// Adds a lease that has begun.
-    pub(super) fn begun(&mut self, lease: RangeId, job: &Job, worker: WorkerId) {
+    pub(super) fn lease_begun(&mut self, lease: RangeId, job: &Job, worker: WorkerId) {
         // A known lease may have moved to another worker.
-        self.over(lease);
+        self.lease_over(lease);
         self.leases.insert(lease, (job.id, worker));
         let load = self.jobs.entry(job.id).or_default();
         load.user.clone_from(&job.user);
@@ -36,7 +36,7 @@ impl Load {
     }
 
     /// Removes a lease that has ended.
-    pub(super) fn over(&mut self, lease: RangeId) {
+    pub(super) fn lease_over(&mut self, lease: RangeId) {
         let Some((job, worker)) = self.leases.remove(&lease) else {
             return;
         };
@@ -58,17 +58,17 @@ impl Load {
     }
 
     /// Records the workers of other instances, by job.
-    pub(super) fn hear_elsewhere(&mut self, workers: BTreeMap<JobId, u32>) {
+    pub(super) fn record_elsewhere(&mut self, workers: BTreeMap<JobId, u32>) {
         self.elsewhere = workers;
     }
 
     /// Returns the number of leases of a user's jobs.
-    pub(super) fn of_user(&self, user: &str) -> u32 {
+    pub(super) fn leases_of_user(&self, user: &str) -> u32 {
         self.users.get(user).copied().unwrap_or(0)
     }
 
     /// Returns the number of leases of a job.
-    pub(super) fn of_job(&self, job: JobId) -> u32 {
+    pub(super) fn leases_of_job(&self, job: JobId) -> u32 {
         self.jobs.get(&job).map_or(0, |load| load.leases)
     }
 
@@ -121,12 +121,12 @@ mod tests {
         let lease = RangeId::from_uuid(Uuid::from_u128(2));
         let worker = |n| WorkerId::from_uuid(Uuid::from_u128(n));
         let mut load = Load::default();
-        load.begun(lease, &job, worker(3));
-        load.begun(lease, &job, worker(4));
-        assert_eq!((load.of_job(id), load.of_user("ada")), (1, 1));
+        load.lease_begun(lease, &job, worker(3));
+        load.lease_begun(lease, &job, worker(4));
+        assert_eq!((load.leases_of_job(id), load.leases_of_user("ada")), (1, 1));
         assert!(load.may_join(id, worker(4), 1) && !load.may_join(id, worker(3), 1));
-        load.over(lease);
-        assert_eq!((load.of_job(id), load.of_user("ada")), (0, 0));
+        load.lease_over(lease);
+        assert_eq!((load.leases_of_job(id), load.leases_of_user("ada")), (0, 0));
         assert!(load.jobs.is_empty() && load.users.is_empty());
     }
 }

@@ -2,38 +2,35 @@
 
 use picofarm_proto::model::{EventKind, TaskLog};
 
-use super::{About, Core, Progress, SessionId};
+use super::{history::EventDetails, message::SessionId, state::Core};
 
 impl Core {
     /// Records log lines of a task that this session's worker runs, within the task's allowance.
     /// Drops them if the lease is not the worker's own or not live. No answer is sent.
     pub(crate) fn logged(&mut self, session: SessionId, log: &TaskLog, now_ms: i64) {
         // A task that runs twice has one allowance.
-        let double = self
-            .sessions
-            .get(&session)
-            .and_then(|worker| self.doubled(*worker, log.lease))
-            .filter(|(double, _)| double.task == log.index)
+        let second = self
+            .workers
+            .id_of(session)
+            .and_then(|worker| self.second_run(worker, log.lease))
+            .filter(|(run, _)| run.task == log.index)
             .map(|(_, range)| range);
         let held = || self.held_to_do(session, log.lease, log.index, now_ms).ok();
-        let Some(range) = double.or_else(held) else {
+        let Some(range) = second.or_else(held) else {
             return;
         };
         let (range, stage) = (range.id, range.stage);
-        let worker = self.session_name(session);
+        let worker = self.workers.session_name(session);
         for line in &log.lines {
-            let in_hand = self.progress.entry(range).or_default();
-            let task = in_hand
-                .entry(log.index)
-                .or_insert_with(|| Progress::since(now_ms));
+            let task = self.leases.progress_mut(range, log.index, now_ms);
             if !task.log.take(line.text.len()) {
                 return;
             }
-            let about = About::message(format!("{}: {}", line.level, line.text))
+            let about = EventDetails::message(format!("{}: {}", line.level, line.text))
                 .task(log.index)
                 .worker(&*worker);
             let at_ms = now_ms - i64::from(line.ago_ms);
-            self.event(at_ms, stage, EventKind::Log, about);
+            self.outcome.event(at_ms, stage, EventKind::Log, about);
         }
     }
 }

@@ -5,7 +5,7 @@
 use picofarm_catalog::{Free, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};
 
-use super::{Core, StageEntry};
+use super::{stage_entry::StageEntry, state::Core};
 
 /// Tasks of a stage that can be granted now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -52,10 +52,10 @@ impl Ready {
 impl StageEntry {
     /// Returns the unclaimed tasks that can be claimed now.
     pub(super) fn claimable(&self, now_ms: i64) -> Ready {
-        if self.job.paused || now_ms < self.ask_at_ms {
+        if self.is_paused() || now_ms < self.ask_at_ms() {
             return Ready::default();
         }
-        let Some(free) = self.free else {
+        let Some(free) = self.free() else {
             return Ready {
                 unknown: true,
                 ..Ready::default()
@@ -71,29 +71,29 @@ impl StageEntry {
 
     /// Returns whether the stage has, or may have, tasks that can be granted to some worker now.
     pub(super) fn waits(&self, now_ms: i64) -> bool {
-        !self.job.paused && (self.stage.is_due(now_ms) || !self.claimable(now_ms).is_none())
+        !self.is_paused() && (self.held.is_due(now_ms) || !self.claimable(now_ms).is_none())
     }
 
     /// Returns whether the stage has, or may have, tasks that nobody runs yet.
     pub(super) fn has_pending(&self) -> bool {
         let nothing = |free: Free| free.ready + free.suspects + free.later == 0;
-        !self.job.paused && (self.stage.pending_tasks() > 0 || !self.free.is_some_and(nothing))
+        !self.is_paused() && (self.held.pending_tasks() > 0 || !self.free().is_some_and(nothing))
     }
 }
 
 impl Core {
     /// Returns the claimed tasks of a stage that can be granted now.
     pub(super) fn ready_here(&self, id: StageRef, now_ms: i64) -> Ready {
-        self.ready_but(id, &self.done_for_others(id), now_ms)
+        self.ready_but(id, &self.tasks_of_other_jobs(id), now_ms)
     }
 
     /// Like `ready_here`, without the tasks in `except`.
     fn ready_but(&self, id: StageRef, except: &[Run], now_ms: i64) -> Ready {
         let entry = &self.stages[&id];
-        if entry.job.paused || !entry.stage.is_due(now_ms) {
+        if entry.is_paused() || !entry.held.is_due(now_ms) {
             return Ready::default();
         }
-        let (plain, suspects) = entry.stage.ready(now_ms, except);
+        let (plain, suspects) = entry.held.ready(now_ms, except);
         Ready {
             plain,
             suspects,
@@ -120,7 +120,7 @@ impl Core {
         if who.quarantined || who.drains || self.may_run(id, worker, now_ms).is_err() {
             return Ready::default();
         }
-        let here = self.ready_but(id, &self.not_for(id, worker, now_ms), now_ms);
+        let here = self.ready_but(id, &self.excluded_tasks(id, worker, now_ms), now_ms);
         let claimable = self.stages[&id].claimable(now_ms);
         here.and(claimable).to_worker(who.leases.is_empty())
     }

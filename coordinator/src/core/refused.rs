@@ -4,12 +4,14 @@
 
 use picofarm_catalog::{Changes, Culprit, Mark, NewEvent, Range, RangeState, Row, Run};
 use picofarm_proto::{
-    ids::{LeaseRef, RangeId, StageRef, WorkerId},
+    ids::{LeaseRef, StageRef, WorkerId},
     model::{EventKind, bounds},
 };
 
-use super::{Core, Say, SessionId};
-use crate::budget::fresh;
+use super::{
+    message::{SessionId, ToWorker},
+    state::Core,
+};
 
 impl Core {
     /// Removes rejected rows from the changes that [`Core::take`] returned. If `again`, their
@@ -17,7 +19,7 @@ impl Core {
     pub(crate) fn refused(
         &mut self,
         changes: &mut Changes,
-        say: &mut [(SessionId, Say)],
+        say: &mut [(SessionId, ToWorker)],
         culprits: &[Culprit],
         again: bool,
         now_ms: i64,
@@ -38,9 +40,8 @@ impl Core {
                     if again {
                         changes.exceptions.remove(&(*stage, *task));
                     }
-                    let entry = self.stages.get_mut(stage);
-                    if let Some(known) = entry.and_then(|e| e.exceptions.get_mut(task)) {
-                        known.last_error = said;
+                    if let Some(entry) = self.stages.get_mut(stage) {
+                        entry.set_last_error(*task, said);
                     }
                 }
             }
@@ -67,11 +68,8 @@ impl Core {
         if again {
             changes.workers.remove(&id);
         }
-        self.names.insert(id, id.to_string());
+        self.workers.rename(id, &id.to_string());
         if let Some(worker) = changes.workers.get_mut(&id) {
-            worker.name = id.to_string();
-        }
-        if let Some(worker) = self.workers.get_mut(&id) {
             worker.name = id.to_string();
         }
     }
@@ -80,7 +78,7 @@ impl Core {
     fn give_up(
         &mut self,
         changes: &mut Changes,
-        say: &mut [(SessionId, Say)],
+        say: &mut [(SessionId, ToWorker)],
         (stage, task): (StageRef, u64),
         why: &str,
         now_ms: i64,
@@ -88,7 +86,7 @@ impl Core {
         let why = format!("the result cannot be recorded: {why}");
         if let Some(lease) = self.undo(changes, stage, task) {
             for (_, say) in say.iter_mut() {
-                if let Say::Acknowledge {
+                if let ToWorker::Acknowledge {
                     lease: of,
                     index,
                     accepted,
@@ -104,11 +102,7 @@ impl Core {
         let Some(entry) = self.stages.get_mut(&stage) else {
             return;
         };
-        let exception = entry.exceptions.entry(task).or_insert(fresh(stage, task));
-        exception.failures += 1;
-        exception.dead = true;
-        exception.last_error.clone_from(&why);
-        let exception = exception.clone();
+        let exception = entry.give_up(task, &why);
         changes.exceptions.insert((stage, task), exception);
         let worker = unsay(&mut changes.events, stage, task);
         changes.events.push(NewEvent {
@@ -118,9 +112,9 @@ impl Core {
                 hi: task + 1,
             }),
             worker,
-            ..NewEvent::of(stage.job, now_ms, EventKind::Dead, why)
+            ..NewEvent::new(stage.job, now_ms, EventKind::Dead, why)
         });
-        if entry.stage.is_empty() {
+        if entry.held.is_empty() {
             changes.perhaps_over.insert(stage, now_ms);
         }
     }
@@ -141,7 +135,7 @@ impl Core {
         let range = all.find(|range| of_stage(range) && done(range))?.clone();
         if let RangeState::Leased(_) = range.state {
             let entry = self.stages.get_mut(&stage)?;
-            if let Some(left) = entry.stage.leave(range.id, task) {
+            if let Some(left) = entry.held.leave(range.id, task) {
                 changes.put(left);
             }
         } else {
@@ -170,7 +164,7 @@ impl Core {
 
     /// Writes a range under a new id.
     fn give_new(&mut self, changes: &mut Changes, mut range: Range) {
-        range.id = RangeId::from_uuid((self.make_id)());
+        range.id = self.outcome.new_range_id();
         changes.minted.insert(range.id);
         changes.give(range);
     }

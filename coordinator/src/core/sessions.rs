@@ -1,36 +1,38 @@
 //! Connects and disconnects workers. A worker has one session; a newer one replaces the older one.
 
 use picofarm_catalog::{Range, Worker};
-use picofarm_proto::{ids::LeaseRef, model::WorkerHello};
+use picofarm_proto::{
+    ids::{LeaseRef, WorkerId},
+    model::WorkerHello,
+};
 
-use super::{Core, Say, SessionId, WorkerEntry};
+use super::{
+    message::{SessionId, ToWorker},
+    state::Core,
+    workers::WorkerEntry,
+};
 
 impl Core {
     /// Connects a worker. Leases that it still has stay live. Leases that it does not know become
     /// pending again. Leases of an earlier process of the worker are lost.
     pub(crate) fn hello(&mut self, session: SessionId, hello: WorkerHello, now_ms: i64) {
         let id = hello.id;
-        if let Some(old) = self.workers.remove(&id) {
-            self.sessions.remove(&old.session);
-            self.say.push((old.session, Say::Replaced));
+        if let Some(old) = self.workers.replace(id, &hello.name) {
+            self.outcome.send(old, ToWorker::Replaced);
         }
-        self.names.insert(id, hello.name.clone());
-        self.doubles.retain(|_, double| double.worker != id);
+        self.second_runs.remove_worker(id);
         self.refund(id, hello.incarnation);
         self.doubts.restarted(id, hello.incarnation);
-        self.changes.workers.insert(
+        self.outcome.record_worker(Worker {
             id,
-            Worker {
-                id,
-                incarnation: hello.incarnation,
-                name: hello.name.clone(),
-                last_seen_ms: now_ms,
-            },
-        );
+            incarnation: hello.incarnation,
+            name: hello.name.clone(),
+            last_seen_ms: now_ms,
+        });
         let mut mine = Vec::new();
         let mut former = Vec::new();
         for entry in self.stages.values() {
-            for (range, lease) in entry.stage.leased().filter(|(_, l)| l.worker == id) {
+            for (range, lease) in entry.held.leased().filter(|(_, l)| l.worker == id) {
                 if lease.incarnation == hello.incarnation {
                     mine.push(range.clone());
                 } else {
@@ -45,8 +47,7 @@ impl Core {
         for range in &former {
             self.lost(range, &why, now_ms);
         }
-        self.sessions.insert(session, id);
-        self.workers.insert(
+        self.workers.connect(
             id,
             WorkerEntry {
                 session,
@@ -55,7 +56,7 @@ impl Core {
                 version: hello.version,
                 since_ms: now_ms,
                 heard_ms: now_ms,
-                ends_ms: super::ends::at(hello.ends_in_ms, now_ms),
+                ends_ms: super::time_left::end_time(hello.ends_in_ms, now_ms),
                 abilities: hello.abilities,
                 credits: 0,
                 leases: Default::default(),
@@ -63,20 +64,23 @@ impl Core {
                 drains: false,
             },
         );
-        self.keep_held(session, &hello.held, mine, now_ms);
+        self.keep_held((session, id), &hello.held, mine, now_ms);
     }
 
-    fn keep_held(&mut self, session: SessionId, held: &[LeaseRef], mine: Vec<Range>, now_ms: i64) {
-        let worker = self.sessions[&session];
+    fn keep_held(
+        &mut self,
+        (session, worker): (SessionId, WorkerId),
+        held: &[LeaseRef],
+        mine: Vec<Range>,
+        now_ms: i64,
+    ) {
         for lease in held {
             if !mine.iter().any(|range| range.lease() == *lease) {
-                let revoke = Say::Revoke {
-                    lease: *lease,
-                    reason:
-                        "the lease is no longer live: it ran out, was cancelled, or is finished"
-                            .into(),
-                };
-                self.say.push((session, revoke));
+                self.outcome.revoke(
+                    session,
+                    *lease,
+                    "the lease is no longer live: it ran out, was cancelled, or is finished",
+                );
             }
         }
         for range in mine {
@@ -97,9 +101,7 @@ impl Core {
 
     /// Sets how many more leases a worker can take; 0 withdraws its request.
     pub(crate) fn credit(&mut self, session: SessionId, leases: u32) {
-        if let Some(worker) = self.sessions.get(&session)
-            && let Some(entry) = self.workers.get_mut(worker)
-        {
+        if let Some(entry) = self.workers.of_session_mut(session) {
             entry.credits = match leases {
                 0 => 0,
                 n => entry.credits.saturating_add(n),
@@ -111,10 +113,10 @@ impl Core {
     /// number.
     pub(crate) fn drain(&mut self, worker: &str) -> u32 {
         let mut count = 0;
-        for (id, entry) in &mut self.workers {
+        for (id, entry) in self.workers.iter_mut() {
             if entry.name == worker || id.to_string() == worker {
                 entry.drains = true;
-                self.say.push((entry.session, Say::Drain));
+                self.outcome.send(entry.session, ToWorker::Drain);
                 count += 1;
             }
         }
@@ -124,26 +126,20 @@ impl Core {
     /// Ends a session. Leases that were not returned stay live for a moment, because the worker may
     /// reconnect. If its process died, its tasks need not wait for the end of the lease.
     pub(crate) fn closed(&mut self, session: SessionId, now_ms: i64) {
-        let Some(worker) = self.sessions.remove(&session) else {
-            return;
-        };
-        if let Some(entry) = self.workers.remove(&worker) {
+        if let Some((worker, entry)) = self.workers.disconnect(session) {
             let until_ms = now_ms + i64::from(self.settings.reconnect_ms);
             // After a stall of this coordinator, the worker may still be waiting before it
             // reconnects.
-            let until_ms = until_ms.max(self.graced_until_ms);
+            let until_ms = until_ms.max(self.leases.graced_until_ms());
             for range in &entry.leases {
                 self.set_until(*range, |until| until.min(until_ms));
             }
-            self.changes.workers.insert(
-                worker,
-                Worker {
-                    id: worker,
-                    incarnation: entry.incarnation,
-                    name: entry.name,
-                    last_seen_ms: now_ms,
-                },
-            );
+            self.outcome.record_worker(Worker {
+                id: worker,
+                incarnation: entry.incarnation,
+                name: entry.name,
+                last_seen_ms: now_ms,
+            });
         }
     }
 }

@@ -10,19 +10,19 @@
 use picofarm_catalog::{Mark, Run};
 use picofarm_proto::ids::StageRef;
 
-use super::Core;
+use super::state::Core;
 
 impl Core {
     /// Returns the tasks of a stage that workers run for other stages with the same outputs, as
     /// ascending, disjoint runs. Returns none for a stage that does not reuse existing outputs.
-    pub(super) fn done_for_others(&self, id: StageRef) -> Vec<Run> {
+    pub(super) fn tasks_of_other_jobs(&self, id: StageRef) -> Vec<Run> {
         let entry = &self.stages[&id];
-        let sharing = &self.sets[entry.set].stages;
-        if sharing.len() < 2 || entry.spec(id).force {
+        let sharing = self.stages.sharing(entry);
+        if sharing.len() < 2 || entry.spec().force {
             return Vec::new();
         }
         let others = || sharing.iter().filter(|other| **other != id);
-        let here = others().flat_map(|other| self.stages[other].stage.leased());
+        let here = others().flat_map(|other| self.stages[other].held.leased());
         let here = here.filter_map(|(range, lease)| {
             // A lease is worked through in order.
             let first = lease.marks.iter().position(|m| *m == Mark::Todo)?;
@@ -31,21 +31,21 @@ impl Core {
                 hi: range.hi,
             })
         });
-        let elsewhere = others().filter_map(|other| self.shared_elsewhere.get(other));
-        let mut runs: Vec<Run> = here.chain(elsewhere.flatten().copied()).collect();
+        let elsewhere = others().flat_map(|other| self.peers.tasks(other));
+        let mut runs: Vec<Run> = here.chain(elsewhere.copied()).collect();
         in_order(&mut runs);
         runs
     }
 
     /// Returns how many tasks of a stage wait only because they run for other stages.
     pub(super) fn waits_for_others(&self, id: StageRef) -> u64 {
-        let runs = self.done_for_others(id);
+        let runs = self.tasks_of_other_jobs(id);
         let among = |task: u64| {
             let before = runs.partition_point(|run| run.lo <= task);
             before > 0 && task < runs[before - 1].hi
         };
         // Some of another instance's tasks may be in this instance's own leases.
-        let own = self.stages[&id].stage.leased().map(|(range, _)| {
+        let own = self.stages[&id].held.leased().map(|(range, _)| {
             let both = (range.lo..range.hi).filter(|t| range.has_to_do(*t) && among(*t));
             both.count() as u64
         });

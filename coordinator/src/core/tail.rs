@@ -12,47 +12,38 @@ use picofarm_proto::{
     model::{EventKind, Lease},
 };
 
-use super::{About, Core, Say, SessionId};
-use crate::transition::RangeEvent;
+use super::{
+    history::EventDetails,
+    message::{SessionId, ToWorker},
+    second_runs::SecondRun,
+    state::Core,
+    transition::RangeEvent,
+};
 
-/// Interval at which idle workers are considered, milliseconds.
-const LOOK_MS: i64 = 200;
 /// A task is doubled when it has taken this multiple of the mean of its stage.
 const SLOW: f64 = 3.0;
-
-/// A task that runs a second time. It is not a range: the catalog does not know it, and it
-/// disappears with its instance.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Double {
-    /// The lease of the first run.
-    pub of: LeaseRef,
-    pub stage: StageRef,
-    pub task: u64,
-    pub worker: WorkerId,
-}
 
 impl Core {
     /// Gives idle workers a part of other workers' leases. Call it when all pending tasks have been
     /// granted. It searches only a few times a second, because it visits every lease.
-    pub(super) fn help(&mut self, hungry: &[WorkerId], now_ms: i64) {
+    pub(super) fn help(&mut self, asking: &[WorkerId], now_ms: i64) {
         // A worker that asks for leases ahead of time is not idle.
         let idle = |worker: &&WorkerId| {
             let who = &self.workers[*worker];
-            who.hungry() && who.leases.is_empty()
+            who.wants_leases() && who.leases.is_empty()
         };
-        let mut idle: Vec<WorkerId> = hungry.iter().filter(idle).copied().collect();
-        if idle.is_empty() || now_ms < self.help_at_ms {
+        let mut idle: Vec<WorkerId> = asking.iter().filter(idle).copied().collect();
+        if idle.is_empty() || !self.second_runs.is_due(now_ms) {
             return;
         }
-        self.help_at_ms = now_ms + LOOK_MS;
         let mut stages: Vec<StageRef> = self
             .stages
             .iter()
             // Tasks that wait after a failure do not prevent help.
-            .filter(|(_, e)| !e.job.paused && !e.waits(now_ms) && e.stage.leased_tasks() > 0)
+            .filter(|(_, e)| !e.is_paused() && !e.waits(now_ms) && e.held.leased_tasks() > 0)
             // Half the work of a resumable task would be wasted, and the task has saved its
             // progress.
-            .filter(|(id, e)| !e.spec(**id).task.resumes())
+            .filter(|(_, e)| !e.spec().task.resumes())
             .map(|(id, _)| *id)
             .collect();
         stages.sort_by_cached_key(|id| self.rank(*id));
@@ -66,7 +57,7 @@ impl Core {
                     // The tasks cut off are pending now, and this worker is the first to get them.
                     let able = self.able(stage, now_ms);
                     self.grant(stage, worker, able, now_ms);
-                } else if !self.double(stage, worker, now_ms) {
+                } else if !self.run_twice(stage, worker, now_ms) {
                     others.push(worker);
                     break;
                 }
@@ -80,11 +71,11 @@ impl Core {
     /// remainder is long enough.
     fn trim(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
-        let Some(mean) = self.sets[entry.set].timing.mean() else {
+        let Some(mean) = self.stages.mean_seconds(entry) else {
             return false;
         };
         let longest = entry
-            .stage
+            .held
             .leased()
             .filter(|(range, lease)| range.crashes == 0 && lease.worker != idle)
             .map(|(range, lease)| {
@@ -111,49 +102,45 @@ impl Core {
         }
         let (range, holder) = (range.clone(), lease.worker);
         if let Some(entry) = self.workers.get(&holder) {
-            let trim = Say::Trim {
+            let trim = ToWorker::Trim {
                 lease: range.lease(),
                 hi: at,
             };
-            self.say.push((entry.session, trim));
+            self.outcome.send(entry.session, trim);
         }
-        let about = About::message("an idle worker takes the rest over")
+        let about = EventDetails::message("an idle worker takes the rest over")
             .tasks(at, range.hi)
-            .worker(self.name_of(holder));
-        self.event(now_ms, id, EventKind::Released, about);
+            .worker(self.workers.name(holder));
+        self.outcome.event(now_ms, id, EventKind::Released, about);
         self.mark(&range, &RangeEvent::Trim { at });
         true
     }
 
     /// Runs the slowest task of a stage a second time, if it is slow and runs only once.
-    fn double(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
+    fn run_twice(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
-        let Some(mean) = self.sets[entry.set].timing.mean() else {
+        let Some(mean) = self.stages.mean_seconds(entry) else {
             return false;
         };
         let slow_ms = i64::from(self.settings.slow_ms).max((SLOW * mean * 1000.0) as i64);
-        let doubled = |of: LeaseRef, task: u64| {
-            let mut doubles = self.doubles.values();
-            doubles.any(|d| d.of == of && d.task == task)
-        };
         let slowest = entry
-            .stage
+            .held
             .leased()
             .filter(|(range, lease)| range.crashes == 0 && lease.worker != idle)
             .filter_map(|(range, _)| {
-                let tasks = self.progress.get(&range.id)?;
-                let mut tasks = tasks.iter().filter(|(task, p)| {
-                    now_ms - p.since_ms >= slow_ms && !doubled(range.lease(), **task)
+                let mut tasks = self.leases.running(range.id).filter(|(task, p)| {
+                    now_ms - p.since_ms >= slow_ms
+                        && !self.second_runs.contains(range.lease(), *task)
                 });
                 let (task, progress) = tasks.next()?;
-                Some((progress.since_ms, range.lease(), *task))
+                Some((progress.since_ms, range.lease(), task))
             })
             .min();
-        let Some((since_ms, of, task)) = slowest else {
+        let Some((since_ms, first, task)) = slowest else {
             return false;
         };
         let lease = LeaseRef {
-            range: RangeId::from_uuid((self.make_id)()),
+            range: self.outcome.new_range_id(),
             epoch: Epoch(0),
         };
         let entry = &self.stages[&id];
@@ -164,92 +151,93 @@ impl Core {
             hi: task + 1,
             skip: Vec::new(),
             ttl_ms: self.settings.lease_ms,
-            stage: entry.spec(id).only(task, task + 1),
+            stage: entry.spec().only(task, task + 1),
             ordinal: id.stage,
-            key: self.sets[entry.set].key,
+            key: *self.stages.key_of(entry),
             traceparent: String::new(),
         };
-        let double = Double {
-            of,
+        let second = SecondRun {
+            first,
             stage: id,
             task,
             worker: idle,
         };
-        self.doubles.insert(lease.range, double);
-        let who = self.workers.get_mut(&idle).expect("it is hungry");
+        self.second_runs.insert(lease.range, second);
+        let who = self.workers.get_mut(&idle).expect("it is asking");
         who.credits -= 1;
         who.leases.insert(lease.range);
         let (session, name) = (who.session, who.name.clone());
-        self.say.push((session, Say::Lease(Box::new(grant))));
+        self.outcome.send(session, ToWorker::Lease(Box::new(grant)));
         let seconds = (now_ms - since_ms) / 1000;
         let message = format!(
             "a second time, as the first has taken {seconds} s and others took {mean:.1} s"
         );
-        let about = About::message(message).task(task).worker(name);
-        self.event(now_ms, id, EventKind::Leased, about);
+        let about = EventDetails::message(message).task(task).worker(name);
+        self.outcome.event(now_ms, id, EventKind::Leased, about);
         true
     }
 
-    /// Returns the double that a worker runs under this lease, with the range of the first run, if
-    /// that range still has the task to do.
-    pub(super) fn doubled(&self, worker: WorkerId, lease: LeaseRef) -> Option<(Double, &Range)> {
-        let double = self.doubles.get(&lease.range)?;
-        if lease.epoch != Epoch(0) || double.worker != worker {
+    /// Returns the second run that a worker runs under this lease, with the range of the first run,
+    /// if that range still has the task to do.
+    pub(super) fn second_run(
+        &self,
+        worker: WorkerId,
+        lease: LeaseRef,
+    ) -> Option<(SecondRun, &Range)> {
+        let run = self.second_runs.get(lease.range)?;
+        if lease.epoch != Epoch(0) || run.worker != worker {
             return None;
         }
-        let (range, state) = self.stages.get(&double.stage)?.stage.lease(double.of)?;
-        let at = usize::try_from(double.task.checked_sub(range.lo)?).ok()?;
-        (state.marks.get(at) == Some(&Mark::Todo)).then_some((*double, range))
+        let (range, state) = self.stages.get(&run.stage)?.held.lease(run.first)?;
+        let at = usize::try_from(run.task.checked_sub(range.lo)?).ok()?;
+        (state.marks.get(at) == Some(&Mark::Todo)).then_some((*run, range))
     }
 
-    /// Forgets doubles of tasks that are no longer to be done, and tells their workers. Also
-    /// forgets the doubles of disconnected workers.
-    pub(super) fn end_doubles(&mut self) {
+    /// Forgets second runs of tasks that are no longer to be done, and tells their workers. Also
+    /// forgets the second runs of disconnected workers.
+    pub(super) fn end_second_runs(&mut self) {
         let over: Vec<(RangeId, WorkerId)> = self
-            .doubles
+            .second_runs
             .iter()
-            .filter(|(id, double)| {
+            .filter(|(id, run)| {
                 let lease = LeaseRef {
-                    range: **id,
+                    range: *id,
                     epoch: Epoch(0),
                 };
-                !self.workers.contains_key(&double.worker)
-                    || self.doubled(double.worker, lease).is_none()
+                self.workers.get(&run.worker).is_none()
+                    || self.second_run(run.worker, lease).is_none()
             })
-            .map(|(id, double)| (*id, double.worker))
+            .map(|(id, run)| (id, run.worker))
             .collect();
         for (id, worker) in over {
-            self.doubles.remove(&id);
+            self.second_runs.remove(id);
             if let Some(entry) = self.workers.get_mut(&worker)
                 && entry.leases.remove(&id)
             {
-                let revoke = Say::Revoke {
+                let revoke = ToWorker::Revoke {
                     lease: LeaseRef {
                         range: id,
                         epoch: Epoch(0),
                     },
                     reason: "the task was finished, or taken back, where it ran first".into(),
                 };
-                self.say.push((entry.session, revoke));
+                self.outcome.send(entry.session, revoke);
             }
         }
     }
 
-    /// Forgets a double that its worker returned or failed. This has no further effect. Returns
-    /// `false` if the lease is not a double.
-    pub(super) fn drop_double(&mut self, session: SessionId, lease: LeaseRef) -> bool {
-        let Some(worker) = self.sessions.get(&session) else {
+    /// Forgets a second run that its worker returned or failed. This has no further effect. Returns
+    /// `false` if the lease is not a second run.
+    pub(super) fn drop_second_run(&mut self, session: SessionId, lease: LeaseRef) -> bool {
+        let Some(worker) = self.workers.id_of(session) else {
             return false;
         };
-        if self
-            .doubles
-            .get(&lease.range)
-            .is_none_or(|d| d.worker != *worker)
-        {
+        let run = self.second_runs.get(lease.range);
+        if run.is_none_or(|run| run.worker != worker) {
             return false;
         }
-        self.doubles.remove(&lease.range);
-        if let Some(entry) = self.workers.get_mut(worker) {
+        self.second_runs.remove(lease.range);
+        if let Some(entry) = self.workers.get_mut(&worker) {
             entry.leases.remove(&lease.range);
         }
         true

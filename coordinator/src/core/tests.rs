@@ -51,7 +51,11 @@ fn jobs_that_want_the_same_outputs_share_the_work() {
         let (a, b) = (lease(0), lease(1));
         assert_eq!((a.job, b.job), (first, second), "either job has a worker");
         assert_eq!((a.lo, b.lo), (0, a.hi), "the second begins after the first");
-        let look = |job| world.instances[0].core.look_at(job, None, None, world.now);
+        let look = |job| {
+            world.instances[0]
+                .core
+                .job_snapshot(job, None, None, world.now)
+        };
         assert_eq!(look(first).shared, b.hi - b.lo);
         assert_eq!(look(second).shared, a.hi - a.lo);
         world.check_shared();
@@ -92,8 +96,8 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
         let mut world = World::on_sqlite(folder.path()).await;
         world.connect(0, 0).await;
         let able = |world: &mut World, able: bool| {
-            let mut workers = world.instances[0].core.workers.values_mut();
-            let kinds = &mut workers.next().unwrap().abilities.kinds;
+            let mut workers = world.instances[0].core.workers.iter_mut();
+            let kinds = &mut workers.next().unwrap().1.abilities.kinds;
             match able {
                 true => kinds.insert("reprocess".into(), "r".into()),
                 false => kinds.remove("reprocess"),
@@ -109,7 +113,7 @@ fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
             }
         }
         let core = &world.instances[0].core;
-        let why = core.look_at(world.jobs[0], None, None, world.now);
+        let why = core.job_snapshot(world.jobs[0], None, None, world.now);
         let why = why.candidates[0]
             .may_run
             .clone()
@@ -259,7 +263,7 @@ fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
             world.act(&Op::Credit(1)).await;
         }
         world.check().await;
-        let held = world.instances[0].core.leases.len();
+        let held = world.instances[0].core.leases.iter().count();
         assert_eq!(
             held,
             world.workers[1].leases.len(),

@@ -3,7 +3,8 @@
 use picofarm_catalog::RangeState;
 use picofarm_proto::model::{Event, EventKind, Made, TaskExplanation, TaskOutput, TaskState};
 
-use super::{TaskFacts, span};
+use super::facts::TaskFacts;
+use crate::core::span;
 
 /// Explains the state of a task and its reason.
 pub fn task(facts: TaskFacts) -> TaskExplanation {

@@ -6,8 +6,8 @@ use picofarm_catalog::{Gone, Recorded, ResultSet, Run};
 use picofarm_proto::model::StageSpec;
 use sha2::{Digest, Sha256};
 
-use super::files::Elsewhere;
-use crate::{plan::Outputs, stored::Found};
+use super::{conflicts::ReusedScenes, result_reader::ResultState};
+use crate::core::plan::Outputs;
 
 /// Up to this many outputs of a stage are all checked. Beyond it, those found before are sampled.
 pub(crate) const ALL: usize = 1_000;
@@ -30,7 +30,7 @@ pub(crate) struct Findings {
     /// The reason why some outputs could not be checked.
     pub why: Option<String>,
     /// Records of other jobs with the same files.
-    pub elsewhere: Elsewhere,
+    pub elsewhere: ReusedScenes,
 }
 
 impl Findings {
@@ -71,7 +71,7 @@ impl Findings {
         };
         let mut words = Vec::new();
         let (recorded, place) = (self.recorded, &set.store);
-        let Elsewhere { scenes, job } = &self.elsewhere;
+        let ReusedScenes { scenes, job } = &self.elsewhere;
         if *scenes > 0 {
             let of = job.map_or_else(|| "an earlier job".into(), |id| format!("job {id}"));
             words.push(format!(
@@ -132,10 +132,10 @@ fn sample(mut from: Vec<usize>, seed: &str) -> Vec<usize> {
 }
 
 /// Returns whether the remaining outputs must be checked too, because one of the sample is missing.
-pub(crate) fn suspicious(recorded: &[Recorded], found: &BTreeMap<u64, Found>) -> bool {
+pub(crate) fn suspicious(recorded: &[Recorded], found: &BTreeMap<u64, ResultState>) -> bool {
     recorded
         .iter()
-        .any(|o| o.checked && found.get(&o.task).is_some_and(|f| *f != Found::Equal))
+        .any(|o| o.checked && found.get(&o.task).is_some_and(|f| *f != ResultState::Equal))
 }
 
 /// Reason why results in a folder missing from this machine cannot be checked.
@@ -144,7 +144,7 @@ pub(super) const NO_FOLDER: &str = "the coordinator's machine has no such folder
 /// Derives the findings from the store's answers by task.
 pub(crate) fn judge(
     recorded: &[Recorded],
-    found: &BTreeMap<u64, Found>,
+    found: &BTreeMap<u64, ResultState>,
     why: Option<String>,
 ) -> Findings {
     let mut findings = Findings {
@@ -152,7 +152,7 @@ pub(crate) fn judge(
         why,
         ..Findings::default()
     };
-    let absent = |f: &Found| matches!(f, Found::NoFolder | Found::NoStore);
+    let absent = |f: &ResultState| matches!(f, ResultState::NoFolder | ResultState::NoStore);
     if findings.why.is_none()
         && recorded
             .iter()
@@ -163,12 +163,14 @@ pub(crate) fn judge(
     for output in recorded {
         match found.get(&output.task) {
             // The output was found in this folder before.
-            Some(Found::NoFolder | Found::NoStore) if output.checked => findings.gone.push(*output),
-            Some(Found::NoFolder | Found::NoStore) => findings.unseen += 1,
-            Some(Found::Gone) => findings.gone.push(*output),
-            Some(Found::Differs) => findings.differ.push(*output),
+            Some(ResultState::NoFolder | ResultState::NoStore) if output.checked => {
+                findings.gone.push(*output)
+            }
+            Some(ResultState::NoFolder | ResultState::NoStore) => findings.unseen += 1,
+            Some(ResultState::Gone) => findings.gone.push(*output),
+            Some(ResultState::Differs) => findings.differ.push(*output),
             None if !output.checked => findings.unseen += 1,
-            Some(Found::Equal) | None => match findings.counts.last_mut() {
+            Some(ResultState::Equal) | None => match findings.counts.last_mut() {
                 Some(run) if run.hi == output.task => run.hi += 1,
                 _ => findings.counts.push(Run {
                     lo: output.task,
@@ -209,7 +211,8 @@ mod tests {
     #[test]
     fn without_the_folder_only_results_that_were_found_in_it_are_gone() {
         let outputs = recorded(3, |task| task < 2);
-        let found: BTreeMap<u64, Found> = (0..3).map(|task| (task, Found::NoFolder)).collect();
+        let found: BTreeMap<u64, ResultState> =
+            (0..3).map(|task| (task, ResultState::NoFolder)).collect();
         let findings = judge(&outputs, &found, None);
         assert_eq!((findings.gone.len(), findings.unseen), (2, 1));
         assert!(
@@ -241,8 +244,8 @@ mod tests {
             all in prop::collection::vec((any::<bool>(), prop::option::of(0..3u8)), 0..50),
         ) {
             let outputs = recorded(all.len() as u64, |task| all[task as usize].0);
-            let of = |n| [Found::Equal, Found::Gone, Found::Differs][usize::from(n)];
-            let found: BTreeMap<u64, Found> = (0u64..)
+            let of = |n| [ResultState::Equal, ResultState::Gone, ResultState::Differs][usize::from(n)];
+            let found: BTreeMap<u64, ResultState> = (0u64..)
                 .zip(&all)
                 .filter_map(|(task, (_, found))| Some((task, of((*found)?))))
                 .collect();
@@ -252,7 +255,7 @@ mod tests {
             prop_assert_eq!(counts + lost + findings.unseen, outputs.len() as u64);
             for run in &findings.counts {
                 for task in run.lo..run.hi {
-                    let seen = found.get(&task) == Some(&Found::Equal);
+                    let seen = found.get(&task) == Some(&ResultState::Equal);
                     prop_assert!(seen || (outputs[task as usize].checked && !found.contains_key(&task)));
                 }
             }

@@ -6,10 +6,7 @@ use picofarm_catalog::{Job, ResultSet, Timing};
 use picofarm_proto::model::{Estimate, JobPlan, JobSpec, StageSpec, TaskSpec};
 use picofarm_settings::Budget;
 
-use crate::{
-    core::{Fit, Fits},
-    plan::changes,
-};
+use crate::core::{EligibleWorkers, StageWorkers, plan::changes};
 
 /// Earlier stages with speeds to be looked up, for each stage of a plan.
 pub(super) const SIMILAR: usize = 3;
@@ -39,8 +36,11 @@ pub(super) fn similar<'a>(stage: &StageSpec, recent: &'a [Job]) -> Vec<&'a Stage
     let stages = recent.iter().flat_map(|job| &job.spec.stages);
     let mut found: Vec<(usize, &StageSpec)> = Vec::new();
     for other in stages.filter(same_kind) {
-        let set = ResultSet::of(other);
-        if found.iter().all(|(_, seen)| ResultSet::of(seen) != set) {
+        let set = ResultSet::of_stage(other);
+        if found
+            .iter()
+            .all(|(_, seen)| ResultSet::of_stage(seen) != set)
+        {
             found.push((changes(other, stage).len(), other));
         }
     }
@@ -79,7 +79,7 @@ type Estimates = (Option<Estimate>, Option<Estimate>, bool);
 /// Estimates a stage from the timings of similar stages, most similar first.
 pub(super) fn estimate(
     stage: &StageSpec,
-    fit: &Fit,
+    fit: &StageWorkers,
     measured: &[(&StageSpec, Timing)],
 ) -> Estimates {
     let timed = measured.iter().find(|(_, timing)| timing.tasks > 0);
@@ -112,7 +112,7 @@ pub(super) fn estimate(
 }
 
 /// Returns why no worker can run a stage; `None` if one can.
-fn unplaceable(fit: &Fit, fits: &Fits) -> Option<String> {
+fn unplaceable(fit: &StageWorkers, fits: &EligibleWorkers) -> Option<String> {
     if fit.able > 0 {
         return None;
     }
@@ -143,7 +143,7 @@ fn unplaceable(fit: &Fit, fits: &Fits) -> Option<String> {
 }
 
 /// Returns the warnings of a plan. Stages with the same warning share a line.
-pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &Fits) -> Vec<String> {
+pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &EligibleWorkers) -> Vec<String> {
     const NAMED: usize = 3;
     let mut warnings: Vec<(String, Vec<&str>)> = Vec::new();
     let mut add = |what: String, name| match warnings.iter_mut().find(|(known, _)| *known == what) {
@@ -194,14 +194,14 @@ mod tests {
         .unwrap()
     }
 
-    fn fits(able: u32, refusals: &[&str], here: u32, elsewhere: u32) -> Fits {
+    fn fits(able: u32, refusals: &[&str], here: u32, elsewhere: u32) -> EligibleWorkers {
         let refusals = refusals.iter().map(|&why| why.to_owned()).collect();
-        let fit = Fit {
+        let fit = StageWorkers {
             able,
             cores: 4 * able,
             refusals,
         };
-        Fits {
+        EligibleWorkers {
             stages: vec![fit],
             here,
             elsewhere,
@@ -210,7 +210,7 @@ mod tests {
 
     #[test]
     fn a_measured_speed_is_scaled_by_pixels_and_paths_with_a_wider_range() {
-        let fit = Fit::default();
+        let fit = StageWorkers::default();
         let timing = Timing {
             tasks: 10,
             seconds: 40.0,

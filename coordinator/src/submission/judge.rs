@@ -6,14 +6,13 @@ use picofarm_proto::{
     model::{Finished, StageSpec},
 };
 
-use super::{Submissions, look};
+use super::{result_reader::ResultState, service::Submissions, store_checks::plan_deadline};
 use crate::{
-    actor::{Aside, Command, Dispute, Ruling},
+    actor::{Command, Dispute, Ruling, SlowWork},
     core::{Reported, SessionId},
-    stored::Found,
 };
 
-impl Aside for Submissions {
+impl SlowWork for Submissions {
     fn learn(&self, job: JobId) {
         let it = self.clone();
         tokio::spawn(async move {
@@ -50,7 +49,7 @@ impl Aside for Submissions {
         });
     }
 
-    fn looks(&self) -> bool {
+    fn can_check_stores(&self) -> bool {
         self.stores.any()
     }
 
@@ -77,7 +76,7 @@ impl Submissions {
         let read = self.lanes.read(move || async move {
             let record = catalog.job(stage.job).await.ok()??;
             let spec = record.job.spec.stages.get(stage.stage as usize)?;
-            Some(ResultSet::of(spec))
+            Some(ResultSet::of_stage(spec))
         });
         let gone = Gone {
             set: read.await?,
@@ -103,7 +102,7 @@ impl Submissions {
         let read = self.lanes.read(move || async move {
             let record = catalog.job(stage.job).await.ok()??;
             let spec = record.job.spec.stages.get(stage.stage as usize)?;
-            Some((spec.clone(), ResultSet::of(spec)))
+            Some((spec.clone(), ResultSet::of_stage(spec)))
         });
         let (spec, set) = read.await?;
         if !self.holds(&spec, &set, report.index, manifest).await? {
@@ -145,12 +144,12 @@ impl Submissions {
         let outputs = [output];
         let asked = self
             .stores
-            .look(spec, &set.store, &outputs, look::deadline());
+            .check(spec, &set.store, &outputs, plan_deadline());
         let (found, _) = asked.await;
         match found.get(&task)? {
-            Found::Equal => Some(true),
-            Found::Gone | Found::Differs => Some(false),
-            Found::NoFolder | Found::NoStore => None,
+            ResultState::Equal => Some(true),
+            ResultState::Gone | ResultState::Differs => Some(false),
+            ResultState::NoFolder | ResultState::NoStore => None,
         }
     }
 }

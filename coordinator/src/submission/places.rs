@@ -30,7 +30,7 @@ pub(super) fn written(
 }
 
 /// Returns others' places `near` the place `mine`, each with whether `by` may write there.
-pub(super) fn of_others<'a>(
+pub(super) fn owned_by_others<'a>(
     mine: &OwnedPlace,
     near: &'a [OwnedPlace],
     by: &Caller,

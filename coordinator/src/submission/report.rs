@@ -3,8 +3,8 @@
 use picofarm_catalog::Job;
 use picofarm_proto::{ids::JobId, model::JobPlan};
 
-use super::{Draft, check::Findings};
-use crate::plan;
+use super::{check::Findings, draft::Draft};
+use crate::core::plan;
 
 /// Creates the plan from the findings for each stage, the job with this spec, and recent jobs. If
 /// that job is done and `stands`, the submission returns it and nothing runs.

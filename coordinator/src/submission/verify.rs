@@ -7,38 +7,20 @@
 //! that it sees another disk, and commits the results as unverified.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap},
-    sync::{Arc, Mutex},
+    collections::{BTreeMap, HashMap},
+    sync::Arc,
     time::Duration,
 };
 
 use picofarm_catalog::Recorded;
-use picofarm_proto::{
-    ids::{StageRef, WorkerId},
-    model::JobSpec,
-};
+use picofarm_proto::{ids::StageRef, model::JobSpec};
 
-use super::{Submissions, look};
-use crate::{actor::Verdict, core::Reported, stored::Found};
+use super::{result_reader::ResultState, service::Submissions, store_checks::report_deadline};
+use crate::{actor::StoreCheck, core::Reported};
 
 /// Delay before a missing result is looked up again, because a network file system may show it
 /// late.
 const AGAIN: Duration = Duration::from_millis(500);
-/// Most stores remembered.
-const STORES: usize = 1_024;
-
-/// Evidence of whether this coordinator sees the stores of its workers.
-pub(super) type Evidence = Arc<Mutex<HashMap<String, Seen>>>;
-
-/// This coordinator's evidence about a store.
-#[derive(Debug, Default)]
-pub(super) struct Seen {
-    /// A result that was found in the store.
-    witness: Option<(Arc<JobSpec>, StageRef, Recorded)>,
-    /// Workers with missing results, before the first result was found.
-    doubted: BTreeSet<WorkerId>,
-}
-
 impl Submissions {
     /// Checks reported results against the store. Also returns whether the store turned out not to
     /// be the workers' one.
@@ -46,7 +28,7 @@ impl Submissions {
         &self,
         store: &str,
         reports: Vec<Reported>,
-    ) -> (Vec<(Reported, Verdict)>, bool) {
+    ) -> (Vec<(Reported, StoreCheck)>, bool) {
         // Two reports of one task are checked separately.
         let mut questions: BTreeMap<(StageRef, usize), Vec<Reported>> = BTreeMap::new();
         let mut seen = HashMap::new();
@@ -61,37 +43,39 @@ impl Submissions {
             let mut found = self.find(store, &reports).await;
             if found
                 .iter()
-                .any(|f| matches!(f, Some(Found::Gone | Found::Differs)))
+                .any(|f| matches!(f, Some(ResultState::Gone | ResultState::Differs)))
             {
                 tokio::time::sleep(AGAIN).await;
                 found = self.find(store, &reports).await;
             }
             for (reported, found) in reports.into_iter().zip(found) {
                 let verdict = match found {
-                    Some(Found::Equal) => {
-                        self.seen(store, |seen| {
+                    Some(ResultState::Equal) => {
+                        self.evidence.with(store, |seen| {
                             seen.witness = Some(witness(&reported));
                             seen.doubted.clear();
                         });
-                        Verdict::Held
+                        StoreCheck::Held
                     }
-                    Some(Found::NoStore) if reported.here => {
+                    Some(ResultState::NoStore) if reported.here => {
                         self.missing(store, &reported, "holds no such result").await
                     }
-                    None | Some(Found::NoFolder | Found::NoStore) => Verdict::Unknown,
-                    Some(Found::Gone) => {
+                    None | Some(ResultState::NoFolder | ResultState::NoStore) => {
+                        StoreCheck::Unknown
+                    }
+                    Some(ResultState::Gone) => {
                         self.missing(store, &reported, "holds no such result").await
                     }
-                    Some(Found::Differs) => {
+                    Some(ResultState::Differs) => {
                         self.missing(store, &reported, "holds another result").await
                     }
                 };
                 let looked = match found {
-                    Some(Found::Gone | Found::Differs) => true,
-                    Some(Found::NoStore) => reported.here,
+                    Some(ResultState::Gone | ResultState::Differs) => true,
+                    Some(ResultState::NoStore) => reported.here,
                     _ => false,
                 };
-                blind |= verdict == Verdict::Unknown && looked;
+                blind |= verdict == StoreCheck::Unknown && looked;
                 verdicts.push((reported, verdict));
             }
         }
@@ -99,7 +83,7 @@ impl Submissions {
     }
 
     /// Returns the store's answer to each report; `None` if the store could not be checked.
-    async fn find(&self, store: &str, reports: &[Reported]) -> Vec<Option<Found>> {
+    async fn find(&self, store: &str, reports: &[Reported]) -> Vec<Option<ResultState>> {
         let Some(first) = reports.first() else {
             return Vec::new();
         };
@@ -107,7 +91,10 @@ impl Submissions {
             return vec![None; reports.len()];
         };
         let results: Vec<Recorded> = reports.iter().map(|r| witness(r).2).collect();
-        let (found, why) = self.stores.look(stage, store, &results, look::soon()).await;
+        let (found, why) = self
+            .stores
+            .check(stage, store, &results, report_deadline())
+            .await;
         if let Some(why) = why {
             tracing::debug!(store, why, "reported results are not verified");
         }
@@ -118,22 +105,22 @@ impl Submissions {
     }
 
     /// Returns the verdict on a result that the store does not contain as reported.
-    async fn missing(&self, store: &str, reported: &Reported, what: &str) -> Verdict {
-        let witness = self.seen(store, |seen| seen.witness.clone());
+    async fn missing(&self, store: &str, reported: &Reported, what: &str) -> StoreCheck {
+        let witness = self.evidence.with(store, |seen| seen.witness.clone());
         let sure = match witness {
             Some((job, stage, result)) => {
                 let found = match job.stages.get(stage.stage as usize) {
                     Some(spec) => {
                         self.stores
-                            .look(spec, store, &[result], look::soon())
+                            .check(spec, store, &[result], report_deadline())
                             .await
                             .0
                     }
                     None => BTreeMap::new(),
                 };
-                found.get(&result.task) == Some(&Found::Equal)
+                found.get(&result.task) == Some(&ResultState::Equal)
             }
-            None => self.seen(store, |seen| {
+            None => self.evidence.with(store, |seen| {
                 seen.doubted.insert(reported.worker);
                 seen.doubted.len() < 2
             }),
@@ -144,33 +131,13 @@ impl Submissions {
                 "what workers report is not there as this coordinator sees it: results are not verified. Mount the store \
                  here, or start the coordinator with --check-stores none"
             );
-            return Verdict::Unknown;
+            return StoreCheck::Unknown;
         }
-        Verdict::Contradicted(format!(
+        StoreCheck::Contradicted(format!(
             "task {} was reported as done with manifest {}, but {store} {what} as the coordinator sees it. The worker may \
              write to another disk (is the store mounted there?), or it does not tell the truth",
             reported.report.index, reported.report.manifest_sha256
         ))
-    }
-
-    /// Returns why the store's content is no evidence: none of the workers' results were found.
-    pub(super) fn sees_another_disk(&self, store: &str) -> Option<String> {
-        let blind = self.seen(store, |seen| {
-            seen.witness.is_none() && seen.doubted.len() >= 2
-        });
-        blind.then(|| {
-            "the coordinator finds none of what workers report there, and may see another disk (mount the store there, or \
-             start it with --check-stores none)"
-                .to_owned()
-        })
-    }
-
-    fn seen<T>(&self, store: &str, with: impl FnOnce(&mut Seen) -> T) -> T {
-        let mut evidence = self.evidence.lock().expect("no panic while locked");
-        if evidence.len() > STORES {
-            evidence.clear();
-        }
-        with(evidence.entry(store.to_owned()).or_default())
     }
 }
 

@@ -3,6 +3,7 @@
 mod connections;
 mod farm;
 mod hostile_messages;
+mod layers;
 mod open_files;
 mod protocol_model;
 mod rights;

@@ -30,7 +30,7 @@ pub struct NewEvent {
 
 impl NewEvent {
     /// Returns an event that concerns a job as a whole.
-    pub fn of(job: JobId, at_ms: i64, kind: EventKind, message: String) -> Self {
+    pub fn new(job: JobId, at_ms: i64, kind: EventKind, message: String) -> Self {
         Self {
             at_ms,
             job,
@@ -52,7 +52,7 @@ impl NewEvent {
         if counts.pending > 0 {
             message += &format!(", {} not begun because they need those", counts.pending);
         }
-        Self::of(job, at_ms, EventKind::Ended, message)
+        Self::new(job, at_ms, EventKind::Ended, message)
     }
 }
 

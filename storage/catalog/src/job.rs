@@ -66,7 +66,7 @@ impl Job {
                     .collect(),
                 tolerate_dead: stage.tolerate_dead,
                 force: stage.force,
-                set: ResultSet::of(stage),
+                set: ResultSet::of_stage(stage),
                 tasks: stage.tasks(),
             })
             .collect()
@@ -122,7 +122,7 @@ pub struct ResultSet {
 impl ResultSet {
     /// Returns the result set that a stage writes. A stage that does not write a data set gets a
     /// place that no data set can have.
-    pub fn of(stage: &StageSpec) -> Self {
+    pub fn of_stage(stage: &StageSpec) -> Self {
         let results = stage.task.results();
         Self {
             store: results.store.to_owned(),

@@ -184,7 +184,7 @@ pub trait Catalog: Rights {
     async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError>;
 
     /// Returns the number of a user's active jobs.
-    async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError>;
+    async fn unfinished_jobs(&self, user: &str) -> Result<u64, CatalogError>;
 
     /// Makes the dead tasks of an active or failed job pending again, with full retry budgets.
     /// Returns their number.

@@ -290,7 +290,7 @@ macro_rules! job_queries {
                         let stage = ordinal as u32;
                         settled.opened.push(StageRef { job: id, stage });
                         if !nodes[ordinal].needs.is_empty() {
-                            let event = NewEvent::of(id, at_ms, EventKind::Opened, String::new());
+                            let event = NewEvent::new(id, at_ms, EventKind::Opened, String::new());
                             events.push(NewEvent { stage: Some(stage), ..event });
                         }
                     }
@@ -385,7 +385,7 @@ macro_rules! job_queries {
             }
 
             /// Returns the number of a user's active jobs.
-            pub(crate) async fn jobs_of(c: &mut Connection, user: &str) -> Result<u64> {
+            pub(crate) async fn unfinished_jobs(c: &mut Connection, user: &str) -> Result<u64> {
                 let row = sqlx::query("SELECT count(*) AS jobs FROM job WHERE username = $1 AND state = 0")
                     .bind(user)
                     .fetch_one(c)

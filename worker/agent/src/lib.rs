@@ -17,8 +17,8 @@ pub use execute::{
 };
 pub use execute::{export, reconstruct, repair, reprocess, split};
 pub use picofarm_session::{
-    Access, AccessError, AgentConfig, AgentError, Bearer, Control, Executor, Memory, MemoryLimit,
-    Output, StorePrefixes, Summary, Target, Task, TaskError, Trouble, cores, lost_connection,
-    memory_mib, run_with, task_logs,
+    Access, AccessError, AgentConfig, AgentError, Bearer, ConnectionFailure, Control, Executor,
+    Memory, MemoryLimit, Output, StorePrefixes, Summary, Target, Task, TaskError, cores,
+    lost_connection, memory_mib, run_with, task_logs,
 };
 pub use run::run;

@@ -27,9 +27,9 @@ const SILENCE: Duration = Duration::from_secs(20);
 
 /// An event of a link.
 #[derive(Debug)]
-pub enum Heard {
+pub enum LinkEvent {
     /// A message, and the bytes after it.
-    Said(Message, Vec<u8>),
+    Message(Message, Vec<u8>),
     /// The other process is lost.
     Lost,
 }
@@ -44,12 +44,12 @@ pub struct Link {
 }
 
 impl Link {
-    /// Opens a link. Its events are sent to `heard`. If the other process is lost, `breaker` aborts
-    /// the current all-reduce.
+    /// Opens a link. Its events are sent to `events`. If the other process is lost, `breaker`
+    /// aborts the current all-reduce.
     pub fn open(
         id: u64,
         stream: TcpStream,
-        heard: Sender<(u64, Heard)>,
+        events: Sender<(u64, LinkEvent)>,
         breaker: Arc<Breaker>,
     ) -> io::Result<Self> {
         stream.set_read_timeout(Some(SILENCE))?;
@@ -74,7 +74,10 @@ impl Link {
                             if matches!(message, Message::Where | Message::Failed { .. }) {
                                 breaker.break_off();
                             }
-                            if heard.send((id, Heard::Said(message, payload))).is_err() {
+                            if events
+                                .send((id, LinkEvent::Message(message, payload)))
+                                .is_err()
+                            {
                                 return;
                             }
                         }
@@ -83,7 +86,7 @@ impl Link {
                                 debug!(%error, "a process of the training is lost");
                             }
                             breaker.break_off();
-                            let _ = heard.send((id, Heard::Lost));
+                            let _ = events.send((id, LinkEvent::Lost));
                             return;
                         }
                     }

@@ -148,7 +148,7 @@ impl Mesh {
     ) -> io::Result<Part> {
         let (n, len) = (self.len(), part.len);
         let slice = |rank: usize| slice(len, rank, n);
-        let head = Head::of(step, &part);
+        let head = Head::new(step, &part);
         // Receives this process's slice from all others.
         let found = self.with_all(
             breaker,
@@ -313,7 +313,7 @@ struct Head {
 }
 
 impl Head {
-    fn of(step: u64, part: &Part) -> Self {
+    fn new(step: u64, part: &Part) -> Self {
         let blocks = part.blocks.as_slice().iter();
         Self {
             step,
@@ -439,7 +439,7 @@ mod tests {
         };
         part.blocks.push(block, &mut |a, b| add_values(a, &b));
         let mut bytes = Vec::new();
-        Head::of(3, &part).write(&mut bytes).unwrap();
+        Head::new(3, &part).write(&mut bytes).unwrap();
         let read = |step, len| Head::read(&mut &bytes[..], step, len);
         assert_eq!(read(3, 7).unwrap().blocks, [(2, 2)]);
         let refused = |step, len| read(step, len).err().unwrap().to_string();

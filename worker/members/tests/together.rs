@@ -92,7 +92,7 @@ fn process(
     if ended != Ended::Finished {
         return (ended, None);
     }
-    members.over();
+    members.announce_end();
     (ended, Some(training.finish()))
 }
 
@@ -435,7 +435,7 @@ fn scenes_are_read_by_whoever_has_them_and_no_more() {
                 .unwrap()
                 == Ended::Finished
             {
-                members.over();
+                members.announce_end();
             }
             counted.1.load(Ordering::SeqCst)
         };

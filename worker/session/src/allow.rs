@@ -11,7 +11,7 @@ use crate::AgentError;
 /// The places where tasks may write output and read input. Without any prefix, all places are
 /// allowed.
 #[derive(Debug, Clone, Default)]
-pub struct StorePrefixes(Vec<Place>);
+pub struct StorePrefixes(Vec<StorePath>);
 
 /// Returns an opener for this machine's files inside the operator's prefixes.
 pub fn opener(prefixes: &StorePrefixes) -> Opener {
@@ -24,7 +24,7 @@ pub fn opener(prefixes: &StorePrefixes) -> Opener {
 
 /// A place in a store, compared by path components.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct StorePath {
     /// Scheme and host; empty for this machine's files.
     store: String,
     parts: Vec<String>,
@@ -34,8 +34,8 @@ impl StorePrefixes {
     /// # Errors
     /// An unusable prefix.
     pub fn new(prefixes: &[String]) -> Result<Self, AgentError> {
-        let place = |prefix: &String| {
-            Place::of(prefix).map_err(|why| AgentError::Config {
+        let parse = |prefix: &String| {
+            StorePath::parse(prefix).map_err(|why| AgentError::Config {
                 field: "store_prefix",
                 what: format!(
                     "{prefix:?} {why}; expected an absolute path or a URL such as s3://bucket/folder"
@@ -44,7 +44,7 @@ impl StorePrefixes {
         };
         prefixes
             .iter()
-            .map(place)
+            .map(parse)
             .collect::<Result<_, _>>()
             .map(Self)
     }
@@ -74,11 +74,11 @@ impl StorePrefixes {
 
     /// Returns whether a path or URL is inside one of the prefixes.
     pub fn hold(&self, text: &str) -> bool {
-        Place::of(text).is_ok_and(|place| self.0.iter().any(|prefix| place.lies_in(prefix)))
+        StorePath::parse(text).is_ok_and(|place| self.0.iter().any(|prefix| place.lies_in(prefix)))
     }
 
     fn allowed(&self, field: &str, text: &str) -> Result<(), String> {
-        let place = Place::of(text).map_err(|why| format!("{field}: {text:?} {why}"))?;
+        let place = StorePath::parse(text).map_err(|why| format!("{field}: {text:?} {why}"))?;
         if self.0.iter().any(|prefix| place.lies_in(prefix)) {
             return Ok(());
         }
@@ -94,8 +94,8 @@ fn below(store: &str, folder: &str) -> String {
     format!("{}/{folder}", store.trim_end_matches('/'))
 }
 
-impl Place {
-    fn of(text: &str) -> Result<Self, String> {
+impl StorePath {
+    fn parse(text: &str) -> Result<Self, String> {
         let (store, path) = match text.split_once("://") {
             Some(("file", path)) if path.contains('%') => {
                 return Err("has a part that is not plain".into());

@@ -1,68 +1,37 @@
 //! The worker's leases, its running task, and its unacknowledged reports. Pure: the time is passed
 //! in, and messages to send are returned. See the parent module for the reasoning.
 
+mod heartbeats;
+mod held;
+mod returns;
+
 use std::{
-    collections::{BTreeSet, VecDeque},
+    collections::VecDeque,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use picofarm_proto::{
-    ids::{JobId, LeaseRef},
+    ids::LeaseRef,
     key::StageKey,
-    model::{Failure, FailureKind, Finished, Lease, StageSpec, TaskAt, TaskProgress},
+    model::{Failure, FailureKind, Finished, Lease},
 };
 
-use crate::executor::{Output, Task, TaskError};
 use crate::{
+    executor::{Output, Task, TaskError},
     message::{Outgoing, Report},
     outbox::Outbox,
 };
+use heartbeats::Beat;
+use held::HeldLease;
 
 /// The worker asks for another lease when its remaining work will take at most this time. Thus
 /// short tasks do not wait for the coordinator, and long ones are not hoarded.
 const AHEAD: Duration = Duration::from_secs(2);
 
-/// A lease and its remaining tasks.
-#[derive(Debug)]
-struct Held {
-    lease: LeaseRef,
-    job: JobId,
-    spec: Arc<StageSpec>,
-    stage: StageKey,
-    traceparent: String,
-    next: u64,
-    hi: u64,
-    skip: BTreeSet<u64>,
-    /// Start of its current lifetime: when the renewing heartbeat was sent, or when the lease was
-    /// received. It is adjusted for suspends of the machine.
-    renewed_at: Instant,
-    ttl: Duration,
-}
-
-impl Held {
-    /// Returns the time after which none of its tasks may be started: after two thirds of its
-    /// lifetime.
-    fn fence(&self) -> Instant {
-        self.renewed_at + self.ttl * 2 / 3
-    }
-
-    /// Returns the time at which it expires unless it is renewed.
-    fn end(&self) -> Instant {
-        self.renewed_at + self.ttl
-    }
-
-    /// Advances `next` to a task that must be run, or to `hi`.
-    fn pass_skipped(&mut self) {
-        while self.next < self.hi && self.skip.contains(&self.next) {
-            self.next += 1;
-        }
-    }
-}
-
 /// The running task.
 #[derive(Debug)]
-pub(crate) struct InHand {
+pub(crate) struct CurrentTask {
     /// Its lease.
     pub(crate) lease: LeaseRef,
     /// The task itself.
@@ -73,22 +42,11 @@ pub(crate) struct InHand {
     pub(crate) since: Instant,
 }
 
-/// An unanswered heartbeat.
-#[derive(Debug)]
-struct Beat {
-    sent: Instant,
-    /// Duration of suspends since it was sent.
-    slept: Duration,
-    leases: Vec<LeaseRef>,
-    /// Whether it was sent right after all credit was withdrawn.
-    withdrawal: bool,
-}
-
 /// The worker's assignments.
 #[derive(Debug)]
 pub(crate) struct Assignments {
-    leases: Vec<Held>,
-    in_hand: Option<InHand>,
+    leases: Vec<HeldLease>,
+    current: Option<CurrentTask>,
     outbox: Outbox,
     /// Unanswered heartbeats of this connection, oldest first. Each answer belongs to the oldest.
     beats: VecDeque<Beat>,
@@ -109,7 +67,7 @@ impl Assignments {
     pub(crate) fn new() -> Self {
         Self {
             leases: Vec::new(),
-            in_hand: None,
+            current: None,
             outbox: Outbox::default(),
             beats: VecDeque::new(),
             asked: false,
@@ -127,8 +85,8 @@ impl Assignments {
     }
 
     /// Returns the running task.
-    pub(crate) fn in_hand(&self) -> Option<&InHand> {
-        self.in_hand.as_ref()
+    pub(crate) fn current(&self) -> Option<&CurrentTask> {
+        self.current.as_ref()
     }
 
     /// Returns the number of unacknowledged reports.
@@ -148,25 +106,6 @@ impl Assignments {
         self.asked = false;
     }
 
-    /// Handles a suspend of the machine. The monotonic clock does not count this time, so leases
-    /// are older than it indicates. By that clock they may seem to be renewed in time although
-    /// other workers already have them.
-    pub(crate) fn suspended(&mut self, long: Duration) {
-        for held in &mut self.leases {
-            // If the clock began later than that, the lease is made as old as possible; its zero
-            // lifetime then puts it past the fence.
-            match held.renewed_at.checked_sub(long) {
-                Some(before) => held.renewed_at = before,
-                None => held.ttl = Duration::ZERO,
-            }
-        }
-        for beat in &mut self.beats {
-            beat.slept += long;
-        }
-        // Its end is a wall-clock time.
-        self.ends_at = self.ends_at.map(|at| at.checked_sub(long).unwrap_or(at));
-    }
-
     /// Sets the time at which the worker must end.
     pub(crate) fn must_end(&mut self, at: Instant) {
         self.ends_at = Some(at);
@@ -183,18 +122,13 @@ impl Assignments {
         Some(u64::try_from(left.as_millis()).unwrap_or(u64::MAX).max(1))
     }
 
-    /// Returns when the oldest unanswered heartbeat was sent.
-    pub(crate) fn silent_since(&self) -> Option<Instant> {
-        self.beats.front().map(|b| b.sent)
-    }
-
     /// Adds a received lease. Returns `false` if the worker already has it.
     pub(crate) fn granted(&mut self, now: Instant, lease: Lease) -> bool {
         self.asked = false;
         if self.leases.iter().any(|h| h.lease == lease.lease) {
             return false;
         }
-        self.leases.push(Held {
+        self.leases.push(HeldLease {
             lease: lease.lease,
             job: lease.job,
             stage: lease.key,
@@ -216,49 +150,6 @@ impl Assignments {
         true
     }
 
-    /// Returns an unusable lease to the coordinator.
-    pub(crate) fn unusable(&mut self, lease: Option<LeaseRef>, why: &str) {
-        self.asked = false;
-        if let Some(lease) = lease {
-            self.outbox.push(Report::Release {
-                lease,
-                reason: format!("the worker cannot use this lease: {why}"),
-            });
-        }
-    }
-
-    /// Handles the answer to the oldest unanswered heartbeat: the leases `named` are renewed.
-    /// Returns the leases that the heartbeat listed and the answer does not. These are lost, and
-    /// only a task already running continues.
-    pub(crate) fn renewed(
-        &mut self,
-        now: Instant,
-        named: &[LeaseRef],
-        ttl: Duration,
-    ) -> Vec<LeaseRef> {
-        let beat = self.beats.pop_front();
-        if beat.as_ref().is_some_and(|b| b.withdrawal) {
-            // Messages keep their order, so every lease granted before the withdrawal has arrived.
-            self.asked = false;
-        }
-        // `None` if that time is before the clock's start; then nothing is renewed.
-        let begun = beat
-            .as_ref()
-            .map_or(Some(now), |b| b.sent.checked_sub(b.slept));
-        for held in &mut self.leases {
-            if let Some(begun) = begun
-                && named.contains(&held.lease)
-            {
-                held.renewed_at = held.renewed_at.max(begun);
-                held.ttl = ttl;
-            }
-        }
-        let mut lost = beat.map(|b| b.leases).unwrap_or_default();
-        lost.retain(|l| !named.contains(l) && self.leases.iter().any(|h| h.lease == *l));
-        self.leases.retain(|h| !lost.contains(&h.lease));
-        lost
-    }
-
     /// Handles a revoked lease. Returns `true` if the running task belongs to it and must stop.
     /// This is the case only if the lease was still live, because then its work is not wanted. A
     /// lease that had already expired is merely lost.
@@ -268,7 +159,7 @@ impl Assignments {
             .iter()
             .any(|h| h.lease == lease && now < h.end());
         self.leases.retain(|h| h.lease != lease);
-        live && self.in_hand.as_ref().is_some_and(|t| t.lease == lease)
+        live && self.current.as_ref().is_some_and(|t| t.lease == lease)
     }
 
     /// Handles a lease with tasks from `hi` on moved to another worker.
@@ -289,7 +180,7 @@ impl Assignments {
 
     /// Takes the next task that may be started, if none is running.
     pub(crate) fn begin(&mut self, now: Instant) -> Option<Task> {
-        if self.in_hand.is_some() || self.draining || self.paused(now) {
+        if self.current.is_some() || self.draining || self.paused(now) {
             return None;
         }
         let held = self
@@ -304,7 +195,7 @@ impl Assignments {
         };
         held.next += 1;
         held.pass_skipped();
-        self.in_hand = Some(InHand {
+        self.current = Some(CurrentTask {
             lease: held.lease,
             task: task.clone(),
             traceparent: held.traceparent.clone(),
@@ -315,7 +206,7 @@ impl Assignments {
 
     /// Records the running task's own span in a trace.
     pub(crate) fn traced(&mut self, traceparent: String) {
-        if let Some(hand) = &mut self.in_hand {
+        if let Some(hand) = &mut self.current {
             hand.traceparent = traceparent;
         }
     }
@@ -323,9 +214,13 @@ impl Assignments {
     /// Handles the end of the running task. Its report goes to the outbox: every finished task,
     /// even if its lease is lost (the output is valid anyway), and failures only if the worker
     /// still has the lease.
-    pub(crate) fn ended(&mut self, now: Instant, result: &Result<Output, TaskError>) -> InHand {
+    pub(crate) fn ended(
+        &mut self,
+        now: Instant,
+        result: &Result<Output, TaskError>,
+    ) -> CurrentTask {
         let hand = self
-            .in_hand
+            .current
             .take()
             .expect("only the task in hand can end: the runner runs one at a time");
         let held = self.leases.iter().any(|h| h.lease == hand.lease);
@@ -362,17 +257,6 @@ impl Assignments {
         hand
     }
 
-    /// Gives back every lease with remaining tasks, and accepts no work until `until`.
-    pub(crate) fn pause(&mut self, until: Instant, reason: &str) {
-        self.paused_until = Some(until);
-        self.release_all(reason);
-    }
-
-    /// Returns the end of the current pause.
-    pub(crate) fn paused_until(&self) -> Option<Instant> {
-        self.paused_until
-    }
-
     fn paused(&mut self, now: Instant) -> bool {
         if self.paused_until.is_some_and(|until| now >= until) {
             self.paused_until = None;
@@ -380,57 +264,15 @@ impl Assignments {
         self.paused_until.is_some()
     }
 
-    /// From now on, no task is started and no lease requested.
-    pub(crate) fn drain(&mut self) {
-        self.draining = true;
-    }
-
-    /// Gives back every lease with remaining or running tasks.
-    pub(crate) fn release_all(&mut self, reason: &str) {
-        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
-        let open: Vec<_> = self
-            .leases
-            .iter()
-            .filter(|h| h.next < h.hi || Some(h.lease) == in_hand)
-            .map(|h| h.lease)
-            .collect();
-        for lease in open {
-            self.release(lease, reason);
-        }
-    }
-
-    /// Gives back every lease with remaining tasks, except that of the running task; its remaining
-    /// tasks are given back when this ends.
-    pub(crate) fn release_waiting(&mut self, reason: &str) {
-        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
-        let open: Vec<_> = self
-            .leases
-            .iter()
-            .filter(|h| h.next < h.hi && Some(h.lease) != in_hand)
-            .map(|h| h.lease)
-            .collect();
-        for lease in open {
-            self.release(lease, reason);
-        }
-    }
-
-    fn release(&mut self, lease: LeaseRef, reason: &str) {
-        self.leases.retain(|h| h.lease != lease);
-        self.outbox.push(Report::Release {
-            lease,
-            reason: reason.to_owned(),
-        });
-    }
-
     /// Returns whether to ask for a lease: none is in transit, and the work is finished or soon
     /// will be. After a stage of short tasks, a task of another stage may take days. Therefore no
     /// lease is requested while the worker has tasks of another stage.
     fn wants(&self) -> bool {
         let waiting: u64 = self.leases.iter().map(|h| h.hi - h.next).sum();
-        let left = waiting + u64::from(self.in_hand.is_some());
+        let left = waiting + u64::from(self.current.is_some());
         let ahead = self.leases.iter().filter(|h| h.next < h.hi);
-        let in_hand = self.in_hand.iter().map(|hand| hand.task.stage);
-        let mut stages = ahead.map(|h| h.stage).chain(in_hand);
+        let current = self.current.iter().map(|hand| hand.task.stage);
+        let mut stages = ahead.map(|h| h.stage).chain(current);
         let soon_over = self.pace.is_some_and(|(stage, pace)| {
             if stages.any(|other| other != stage) {
                 return false;
@@ -457,56 +299,16 @@ impl Assignments {
         messages
     }
 
-    /// Withdraws a request for a lease. Returns the zero credit and a heartbeat; the answer to this
-    /// heartbeat proves that no lease is in transit.
-    pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Vec<Outgoing> {
-        if !self.asked {
-            return Vec::new();
-        }
-        let heartbeat = self.heartbeat(now, fraction, at);
-        if let Some(beat) = self.beats.back_mut() {
-            beat.withdrawal = true;
-        }
-        vec![Outgoing::Credit(0), heartbeat]
-    }
-
     /// Returns whether a lease may be in transit to this worker.
     pub(crate) fn expects_lease(&self) -> bool {
         self.asked
     }
 
-    /// Returns the heartbeat to send now.
-    pub(crate) fn heartbeat(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Outgoing {
-        let leases = self.held();
-        self.beats.push_back(Beat {
-            sent: now,
-            slept: Duration::ZERO,
-            leases: leases.clone(),
-            withdrawal: false,
-        });
-        let progress = self
-            .in_hand
-            .iter()
-            .filter(|t| leases.contains(&t.lease))
-            .map(|t| TaskProgress {
-                lease: t.lease,
-                index: t.task.index,
-                fraction,
-                at: at.clone(),
-            })
-            .collect();
-        Outgoing::Heartbeat {
-            leases,
-            progress,
-            ends_in_ms: self.ends_in_ms(now).unwrap_or(0),
-        }
-    }
-
     /// Drops leases that are finished and have no unacknowledged reports.
     fn tidy(&mut self) {
-        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
+        let current = self.current.as_ref().map(|t| t.lease);
         let outbox = &self.outbox;
         self.leases
-            .retain(|h| h.next < h.hi || Some(h.lease) == in_hand || outbox.mentions(h.lease));
+            .retain(|h| h.next < h.hi || Some(h.lease) == current || outbox.mentions(h.lease));
     }
 }

@@ -179,10 +179,10 @@ proptest! {
                     }
                 }
                 Step::Begin => {
-                    let free = assignments.in_hand().is_none();
+                    let free = assignments.current().is_none();
                     if let Some(task) = assignments.begin(now) {
                         prop_assert!(free, "one at a time");
-                        let lease = assignments.in_hand().unwrap().lease;
+                        let lease = assignments.current().unwrap().lease;
                         prop_assert!(started.insert((lease, task.index)), "twice");
                         prop_assert!(!skipped.contains(&(lease, task.index)), "skipped");
                         let life = renewed.get(&lease).expect("not lost");
@@ -190,7 +190,7 @@ proptest! {
                     }
                 }
                 Step::End(kind) => {
-                    if assignments.in_hand().is_some() {
+                    if assignments.current().is_some() {
                         let hand = assignments.ended(now, &result(kind));
                         if kind > 1 {
                             finished.insert((hand.lease, hand.task.index));
@@ -229,7 +229,7 @@ proptest! {
                 Step::Revoke(k) => {
                     if let Some(lease) = assignments.held().get(k).copied() {
                         let life = renewed.remove(&lease).expect("held leases are not lost");
-                        let mine = assignments.in_hand().is_some_and(|t| t.lease == lease);
+                        let mine = assignments.current().is_some_and(|t| t.lease == lease);
                         prop_assert_eq!(assignments.revoked(now, lease), mine && now + slept - life < TTL);
                     }
                 }

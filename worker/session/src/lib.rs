@@ -19,7 +19,7 @@ mod runner;
 mod session;
 mod suspend;
 
-pub use access::{Access, AccessError, Bearer, Target, Trouble, lost_connection};
+pub use access::{Access, AccessError, Bearer, ConnectionFailure, Target, lost_connection};
 pub use agent::run_with;
 pub use allow::{StorePrefixes, opener};
 pub use backoff::{Backoff, random};

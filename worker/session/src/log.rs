@@ -27,12 +27,15 @@ use tracing_subscriber::{
 
 /// Targets with lines that are forwarded, from INFO upwards. Those of other libraries are not,
 /// because their content is unknown.
-const OURS: [&str; 6] = [
+const OURS: [&str; 9] = [
     "picofarm_agent",
     "picofarm_dataset",
+    "picofarm_exchange",
     "picofarm_model",
+    "picofarm_results",
     "picofarm_scene",
     "picofarm_session",
+    "picofarm_store",
     "picofarm_transient",
 ];
 /// Bytes of a task's allowance reserved for the line with the number of omitted lines.
@@ -69,7 +72,7 @@ impl<S: Subscriber> Layer<S> for Tap {
 
 /// A log line.
 #[derive(Debug)]
-pub(crate) struct Line {
+pub(crate) struct TaskLine {
     at: Instant,
     level: LogLevel,
     text: String,
@@ -77,12 +80,12 @@ pub(crate) struct Line {
 
 /// Collects the lines of one task after another.
 #[derive(Default)]
-pub(crate) struct Collector(Mutex<Kept>);
+pub(crate) struct Collector(Mutex<LogBuffer>);
 
 #[derive(Default)]
-struct Kept {
+struct LogBuffer {
     allowance: LogAllowance,
-    lines: Vec<Line>,
+    lines: Vec<TaskLine>,
     left_out: u64,
 }
 
@@ -94,24 +97,24 @@ impl Collector {
 
     /// Starts a new task.
     pub(crate) fn begin(&self) {
-        let mut kept = Kept::default();
-        let note = kept.allowance.take(NOTE_BYTES);
+        let mut buffer = LogBuffer::default();
+        let note = buffer.allowance.take(NOTE_BYTES);
         debug_assert!(note, "the note is smaller than the allowance");
-        *self.kept() = kept;
+        *self.buffer() = buffer;
     }
 
     /// Returns the lines since the last call.
-    pub(crate) fn take(&self) -> Vec<Line> {
-        std::mem::take(&mut self.kept().lines)
+    pub(crate) fn take(&self) -> Vec<TaskLine> {
+        std::mem::take(&mut self.buffer().lines)
     }
 
     /// Returns the last lines of the task.
-    pub(crate) fn end(&self) -> Vec<Line> {
-        let mut kept = self.kept();
-        let mut lines = std::mem::take(&mut kept.lines);
-        match kept.left_out {
+    pub(crate) fn end(&self) -> Vec<TaskLine> {
+        let mut buffer = self.buffer();
+        let mut lines = std::mem::take(&mut buffer.lines);
+        match buffer.left_out {
             0 => {}
-            n => lines.push(Line {
+            n => lines.push(TaskLine {
                 at: Instant::now(),
                 level: LogLevel::Warn,
                 text: format!("{n} further lines are only in the worker's own log"),
@@ -126,9 +129,9 @@ impl Collector {
         let Text { mut message, rest } = text;
         message.push_str(&rest);
         cut(&mut message);
-        let mut kept = self.kept();
-        if kept.allowance.take(message.len()) {
-            kept.lines.push(Line {
+        let mut buffer = self.buffer();
+        if buffer.allowance.take(message.len()) {
+            buffer.lines.push(TaskLine {
                 at: Instant::now(),
                 level: match *event.metadata().level() {
                     Level::ERROR => LogLevel::Error,
@@ -138,11 +141,11 @@ impl Collector {
                 text: message,
             });
         } else {
-            kept.left_out += 1;
+            buffer.left_out += 1;
         }
     }
 
-    fn kept(&self) -> MutexGuard<'_, Kept> {
+    fn buffer(&self) -> MutexGuard<'_, LogBuffer> {
         self.0.lock().expect("nothing panics while it is locked")
     }
 }
@@ -166,11 +169,11 @@ impl Visit for Text {
 
 /// Lines that have not been sent to a coordinator. Best effort: the oldest are dropped.
 #[derive(Default)]
-pub(crate) struct Unsent(VecDeque<(LeaseRef, u64, Vec<Line>)>);
+pub(crate) struct Unsent(VecDeque<(LeaseRef, u64, Vec<TaskLine>)>);
 
 impl Unsent {
     /// Adds lines of a task.
-    pub(crate) fn push(&mut self, lease: LeaseRef, index: u64, lines: Vec<Line>) {
+    pub(crate) fn push(&mut self, lease: LeaseRef, index: u64, lines: Vec<TaskLine>) {
         if lines.is_empty() {
             return;
         }
@@ -183,7 +186,7 @@ impl Unsent {
     /// Returns the messages to send now.
     pub(crate) fn drain(&mut self, now: Instant) -> impl Iterator<Item = TaskLog> {
         self.0.drain(..).map(move |(lease, index, lines)| {
-            let line = |line: Line| LogLine {
+            let line = |line: TaskLine| LogLine {
                 ago_ms: u32::try_from((now - line.at).as_millis()).unwrap_or(u32::MAX),
                 level: line.level,
                 text: line.text,
@@ -209,8 +212,8 @@ mod tests {
 
     use super::*;
 
-    fn texts(lines: &[Line]) -> Vec<String> {
-        let text = |l: &Line| format!("{}: {}", l.level, l.text);
+    fn texts(lines: &[TaskLine]) -> Vec<String> {
+        let text = |l: &TaskLine| format!("{}: {}", l.level, l.text);
         lines.iter().map(text).collect()
     }
 
@@ -275,7 +278,7 @@ mod tests {
         for task in 0..100 {
             let level = LogLevel::Info;
             let text = String::new();
-            unsent.push(lease, task, vec![Line { at, level, text }]);
+            unsent.push(lease, task, vec![TaskLine { at, level, text }]);
         }
         let tasks: Vec<u64> = unsent.drain(at).map(|log| log.index).collect();
         assert_eq!(tasks, (36..100).collect::<Vec<_>>());

@@ -1,6 +1,8 @@
 //! The memory and cores available to this process. The limits of a container or batch job count,
 //! and not the whole machine's.
 
+mod control_groups;
+
 use std::{
     fmt, fs,
     path::{Path, PathBuf},
@@ -9,9 +11,6 @@ use std::{
 /// Share of the memory that tasks may use. The rest is for the program itself, the store's caches,
 /// and errors of estimates.
 const SHARE: f64 = 0.75;
-/// Control groups of version 1 report about 2^63 if there is no limit; all real limits are below
-/// this.
-const NO_LIMIT: u64 = 1 << 60;
 const MIB: u64 = 1 << 20;
 
 /// The source of a memory limit.
@@ -64,7 +63,7 @@ impl Memory {
     fn below(root: &Path, variable: &dyn Fn(&str) -> Option<String>) -> Option<Self> {
         let all = [machine(root), slurm(variable), address_space(root)];
         let mut found: Vec<Self> = all.into_iter().flatten().collect();
-        found.extend(control_groups(root));
+        found.extend(control_groups::limit(root));
         // The first of equal ones is the machine itself.
         found.into_iter().min_by_key(|memory| memory.bytes)
     }
@@ -184,98 +183,6 @@ fn megabytes(text: &str) -> Option<u64> {
         _ => (text, 1u64 << 20),
     };
     number.parse::<u64>().ok()?.checked_mul(unit)
-}
-
-/// Returns the smallest limit of this process's control groups, of both versions: its own and their
-/// ancestors.
-fn control_groups(root: &Path) -> Option<Memory> {
-    let read = |path: &str| fs::read_to_string(root.join(path)).unwrap_or_default();
-    let (groups, mounts) = (read("proc/self/cgroup"), read("proc/self/mountinfo"));
-    let mut least: Option<Memory> = None;
-    for (mount, file) in [
-        (Mount::find(&mounts, "cgroup2", ""), "memory.max"),
-        (
-            Mount::find(&mounts, "cgroup", "memory"),
-            "memory.limit_in_bytes",
-        ),
-    ] {
-        let Some(mount) = mount else { continue };
-        let mut at = mount.folder(&own(&groups, mount.controller));
-        loop {
-            let below_root = at.strip_prefix("/").unwrap_or(&at);
-            let text = fs::read_to_string(root.join(below_root).join(file));
-            let bytes = text.ok().and_then(|text| text.trim().parse::<u64>().ok());
-            if let Some(bytes) = bytes.filter(|n| *n < NO_LIMIT)
-                && least.as_ref().is_none_or(|least| bytes < least.bytes)
-            {
-                least = Some(Memory {
-                    bytes,
-                    limit: MemoryLimit::ControlGroup(at.clone()),
-                });
-            }
-            if at == mount.point || !at.pop() {
-                break;
-            }
-        }
-    }
-    least
-}
-
-/// Returns the path of this process's control group in a controller's hierarchy; without a name, in
-/// that of version 2.
-fn own(groups: &str, controller: &str) -> String {
-    let found = groups.lines().find_map(|line| {
-        let mut parts = line.splitn(3, ':');
-        let (number, names, path) = (parts.next()?, parts.next()?, parts.next()?);
-        let ours = match controller {
-            "" => number == "0" && names.is_empty(),
-            name => names.split(',').any(|n| n == name),
-        };
-        ours.then(|| path.to_owned())
-    });
-    found.unwrap_or_else(|| "/".into())
-}
-
-/// The mount point of a hierarchy of control groups.
-struct Mount<'a> {
-    controller: &'a str,
-    /// The mounted part of the hierarchy.
-    part: String,
-    point: PathBuf,
-}
-
-impl<'a> Mount<'a> {
-    /// Finds it in `/proc/self/mountinfo` by file system type and option.
-    fn find(mounts: &str, kind: &str, controller: &'a str) -> Option<Self> {
-        mounts.lines().find_map(|line| {
-            let (place, rest) = line.split_once(" - ")?;
-            let mut place = place.split(' ').skip(3);
-            let (part, point) = (place.next()?, place.next()?);
-            let mut rest = rest.split(' ');
-            let (found, options) = (rest.next()?, rest.nth(1)?);
-            let ours = found == kind
-                && (controller.is_empty() || options.split(',').any(|o| o == controller));
-            ours.then(|| Self {
-                controller,
-                part: part.to_owned(),
-                point: PathBuf::from(point),
-            })
-        })
-    }
-
-    /// Returns the folder of a group. A container may only see the hierarchy below its own group,
-    /// and may be given a path outside it. In that case the visible root is its own group.
-    fn folder(&self, group: &str) -> PathBuf {
-        let inside = match &*self.part {
-            "/" => Some(group),
-            part => group.strip_prefix(part),
-        };
-        let inside = inside.unwrap_or("").trim_matches('/');
-        match inside.is_empty() || inside.split('/').any(|p| p == "..") {
-            true => self.point.clone(),
-            false => self.point.join(inside),
-        }
-    }
 }
 
 #[cfg(test)]

@@ -136,7 +136,7 @@ fn begin(means: &Arc<Means>, task: Task, control: Arc<Control>, span: Span) -> R
             let _in = span.enter();
             executor.run(&task, &control)
         }))
-        .unwrap_or_else(|panic| Err(TaskError::Crash(said(panic.as_ref()))));
+        .unwrap_or_else(|panic| Err(TaskError::Crash(panic_message(panic.as_ref()))));
         // The span's time ends here, and not with the answer to the report.
         drop(span);
         // There is no receiver if the task was abandoned and the worker has ended.
@@ -166,7 +166,7 @@ fn wait(running: &Receiver<Ended>, control: &Control, saves: bool) -> Option<End
 }
 
 /// Returns the message of a panic.
-fn said(panic: &(dyn Any + Send)) -> String {
+fn panic_message(panic: &(dyn Any + Send)) -> String {
     let text = panic
         .downcast_ref::<&str>()
         .map(|s| (*s).to_owned())

@@ -33,7 +33,7 @@ use tokio_stream::wrappers::UnboundedReceiverStream;
 use tonic::{Code, Status, Streaming};
 
 use crate::{
-    Access, AgentError, Target, Trouble, lost_connection,
+    Access, AgentError, ConnectionFailure, Target, lost_connection,
     message::{Incoming, Outgoing},
 };
 
@@ -112,11 +112,11 @@ fn target(url: &str, access: &Access) -> Result<Target, AgentError> {
     Ok(target)
 }
 
-impl From<Trouble> for LinkError {
-    fn from(trouble: Trouble) -> Self {
-        match trouble {
-            Trouble::Down(why) => Self::Down(why),
-            Trouble::Mismatch(why) => Self::Mismatch(why),
+impl From<ConnectionFailure> for LinkError {
+    fn from(failure: ConnectionFailure) -> Self {
+        match failure {
+            ConnectionFailure::Down(why) => Self::Down(why),
+            ConnectionFailure::Mismatch(why) => Self::Mismatch(why),
         }
     }
 }
@@ -125,7 +125,7 @@ impl From<Trouble> for LinkError {
 /// diagnosis of the connection.
 async fn failed(target: &Target, status: Status) -> LinkError {
     if lost_connection(&status) {
-        target.trouble(&status).await.into()
+        target.diagnose(&status).await.into()
     } else {
         status.into()
     }
@@ -151,7 +151,7 @@ async fn open_patiently(
 ) -> Result<(Welcome, Box<Session>), LinkError> {
     let channel = match target.endpoint.connect().await {
         Ok(channel) => channel,
-        Err(error) => return Err(target.trouble(&error).await.into()),
+        Err(error) => return Err(target.diagnose(&error).await.into()),
     };
     let mut client = FarmClient::with_interceptor(channel, target.bearer.clone())
         .max_decoding_message_size(MAX_MESSAGE)

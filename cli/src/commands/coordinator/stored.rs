@@ -15,12 +15,14 @@ use std::{
 use futures::future::BoxFuture;
 use object_store::{ObjectStore, path::Path};
 use picofarm_agent::StorePrefixes;
-use picofarm_coordinator::{Found, Stored};
-use picofarm_dataset::{DatasetError, Held, Holdings, PartName, check_identity, open_store};
+use picofarm_coordinator::{ResultReader, ResultState};
+use picofarm_dataset::PartName;
 use picofarm_proto::model::{
     StageSpec,
     kinds::{Manifest, TaskKind},
 };
+use picofarm_results::{Held, Holdings};
+use picofarm_store::{StorageError, check_identity, open_store};
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
 use uuid::Uuid;
@@ -214,7 +216,7 @@ impl Question {
         self,
         holdings: &Holdings,
         thorough: impl Fn(u64) -> bool,
-    ) -> std::result::Result<Vec<Held>, DatasetError> {
+    ) -> std::result::Result<Vec<Held>, StorageError> {
         let mut held = Vec::new();
         match self {
             Self::Scenes(dataset, results) => {
@@ -247,12 +249,12 @@ impl Question {
     }
 }
 
-impl Stored for StoreReader {
-    fn look<'a>(
+impl ResultReader for StoreReader {
+    fn check<'a>(
         &'a self,
         stage: &'a StageSpec,
         results: &'a [(u64, [u8; 32])],
-    ) -> BoxFuture<'a, std::result::Result<Vec<Found>, String>> {
+    ) -> BoxFuture<'a, std::result::Result<Vec<ResultState>, String>> {
         Box::pin(async move {
             let (location, question) = Question::new(stage, results)?;
             let (store, prefix) = self.open(&location)?;
@@ -271,10 +273,10 @@ impl Stored for StoreReader {
                 {
                     let around = folder.parent().unwrap_or(folder);
                     let found = match tokio::fs::try_exists(around).await {
-                        Ok(true) => Found::NoStore,
-                        _ => Found::NoFolder,
+                        Ok(true) => ResultState::NoStore,
+                        _ => ResultState::NoFolder,
                     };
-                    return Ok::<Vec<Found>, DatasetError>(vec![found; count]);
+                    return Ok::<Vec<ResultState>, StorageError>(vec![found; count]);
                 }
                 // If this machine has not mounted the store, all results would seem lost.
                 if let Some(identity) = identity {
@@ -291,9 +293,9 @@ impl Stored for StoreReader {
                     held = question.ask(&holdings, thorough).await?;
                 }
                 let found = held.into_iter().map(|held| match held {
-                    Held::Equal => Found::Equal,
-                    Held::Gone => Found::Gone,
-                    Held::Other => Found::Differs,
+                    Held::Equal => ResultState::Equal,
+                    Held::Gone => ResultState::Gone,
+                    Held::Other => ResultState::Differs,
                 });
                 Ok(found.collect())
             };
@@ -326,7 +328,7 @@ impl Drop for StoreReader {
     }
 }
 
-fn unreadable(error: &DatasetError) -> String {
+fn unreadable(error: &StorageError) -> String {
     format!("this coordinator cannot read it: {error}")
 }
 
@@ -351,13 +353,16 @@ mod tests {
         let reader = StoreReader::below(&[inside.display().to_string()]).unwrap();
         let results = [(0, [0; 32])];
         let at = stage(&format!("file://{}/store", inside.display()));
-        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        assert_eq!(
+            reader.check(&at, &results).await,
+            Ok(vec![ResultState::Gone])
+        );
         for store in [
             "file:///etc",
             "s3://bucket/a",
             "http://169.254.169.254/latest",
         ] {
-            let why = reader.look(&stage(store), &results).await.unwrap_err();
+            let why = reader.check(&stage(store), &results).await.unwrap_err();
             assert!(why.contains("--check-stores"), "{store}: {why}");
         }
         assert!(StoreReader::below(&["relative".into()]).is_err());
@@ -370,9 +375,12 @@ mod tests {
         let place = folder.path().display().to_string();
         let mut at = stage(&place);
         let results = [(0, [0; 32])];
-        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        assert_eq!(
+            reader.check(&at, &results).await,
+            Ok(vec![ResultState::Gone])
+        );
         at.stores.insert(place, Uuid::nil().to_string());
-        let why = reader.look(&at, &results).await.unwrap_err();
+        let why = reader.check(&at, &results).await.unwrap_err();
         assert!(why.contains("no store identity"), "{why}");
     }
 
@@ -382,13 +390,22 @@ mod tests {
         let reader = StoreReader::asked_for(&[]).unwrap().unwrap();
         let results = [(0, [0; 32])];
         let at = stage(&place.path().display().to_string());
-        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        assert_eq!(
+            reader.check(&at, &results).await,
+            Ok(vec![ResultState::Gone])
+        );
         let at = stage(&format!("file://{}/absent", place.path().display()));
-        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::NoStore]));
+        assert_eq!(
+            reader.check(&at, &results).await,
+            Ok(vec![ResultState::NoStore])
+        );
         let at = stage(&format!("file://{}/absent/too", place.path().display()));
-        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::NoFolder]));
+        assert_eq!(
+            reader.check(&at, &results).await,
+            Ok(vec![ResultState::NoFolder])
+        );
         for store in ["s3://bucket/a", "http://169.254.169.254/latest"] {
-            let why = reader.look(&stage(store), &results).await.unwrap_err();
+            let why = reader.check(&stage(store), &results).await.unwrap_err();
             assert!(why.contains("--check-stores"), "{store}: {why}");
         }
         assert!(StoreReader::asked_for(&["none".into()]).unwrap().is_none());
@@ -398,7 +415,7 @@ mod tests {
     async fn a_store_without_credentials_is_said_to_be_unreadable() {
         let reader = StoreReader::anywhere().unwrap();
         let at = stage("ftp://host/a");
-        let why = reader.look(&at, &[(0, [0; 32])]).await.unwrap_err();
+        let why = reader.check(&at, &[(0, [0; 32])]).await.unwrap_err();
         assert!(why.contains("cannot read it"), "{why}");
     }
 }

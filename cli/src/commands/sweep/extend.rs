@@ -15,7 +15,7 @@ use std::{
 };
 
 use super::search::{Outcome, Tried, Values, tpe};
-use picofarm_dataset::TrialRecord;
+use picofarm_results::TrialRecord;
 use picofarm_proto::{
     model::{TaskSpec, Trial},
     show,
@@ -375,7 +375,7 @@ fn described(extended: &Extended, more: &MoreTrials) -> String {
 
 #[cfg(test)]
 mod tests {
-    use picofarm_dataset::TrialEnd;
+    use picofarm_results::TrialEnd;
 
     use super::{super::records::tests::record, *};
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::search::Outcome;
-use picofarm_dataset::{Models, Rung, TrialEnd, TrialRecord};
+use picofarm_results::{Models, Rung, TrialEnd, TrialRecord};
 use picofarm_model::{
     report::trials::{End, Sweep, Tried as Row, Value as Shown, error_name},
     train::Line,

@@ -37,8 +37,7 @@ impl World {
     async fn check_nobody_starves(&self) {
         let instance = &self.instances[0];
         let core = &instance.core;
-        let asks = |(_, w): &(_, &super::super::WorkerEntry)| w.hungry();
-        let hungry: Vec<_> = core.workers.iter().filter(asks).collect();
+        let hungry: Vec<_> = core.workers.asking().collect();
         for job in self.jobs.iter().filter(|_| !hungry.is_empty()) {
             let record = instance.catalog.job(*job).await.unwrap().unwrap();
             for (ordinal, stage) in (0..).zip(&record.stages) {
@@ -66,7 +65,7 @@ impl World {
                         RangeState::Pending { not_before_ms } if not_before_ms <= self.now
                     );
                     let could = able.iter().find(|(worker, entry)| {
-                        let long = core.not_for(id, **worker, self.now);
+                        let long = core.excluded_tasks(id, **worker, self.now);
                         let long = long.iter().any(|run| (run.lo..run.hi).contains(&task));
                         !long && (range.crashes == 0 || entry.leases.is_empty())
                     });

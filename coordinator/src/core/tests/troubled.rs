@@ -9,9 +9,9 @@ use super::{
 
 impl World {
     /// Returns the entry of this worker in the output of `explain`.
-    fn candidate(&self, w: usize) -> crate::explain::Candidate {
+    fn candidate(&self, w: usize) -> crate::core::Candidate {
         let core = &self.instances[0].core;
-        let look = core.look_at(self.jobs[0], None, None, self.now);
+        let look = core.job_snapshot(self.jobs[0], None, None, self.now);
         let name = format!("w{w}");
         let mut candidates = look.candidates.into_iter();
         candidates.find(|c| c.name == name).unwrap()
@@ -58,7 +58,7 @@ fn tasks_that_fail_on_one_worker_alone_are_not_charged_with_it() {
         assert!(why.contains("failed on it one after another"), "{why}");
         let core = &world.instances[0].core;
         let entry = core.stages.values().next().unwrap();
-        let charged = entry.exceptions.values().filter(|e| e.failures > 0);
+        let charged = entry.exceptions().filter(|e| e.failures > 0);
         assert_eq!(charged.count(), 0, "another could run them");
         // The tasks fail there too, so they are charged now.
         for _ in 0..10 {
@@ -68,7 +68,7 @@ fn tasks_that_fail_on_one_worker_alone_are_not_charged_with_it() {
         }
         let core = &world.instances[0].core;
         let entry = core.stages.values().next().unwrap();
-        assert!(entry.exceptions.values().any(|e| e.failures > 0));
+        assert!(entry.exceptions().any(|e| e.failures > 0));
         world.close().await;
     });
 }
@@ -170,10 +170,10 @@ fn a_frozen_worker_is_silent_after_its_lease_too() {
         world.act(&Op::Credit(0)).await;
         world.act(&Op::Pass(SETTINGS.lease_ms as u16 * 3)).await;
         let core = &world.instances[0].core;
-        assert!(core.leases.is_empty(), "its lease has run out");
+        assert_eq!(core.leases.iter().count(), 0, "its lease has run out");
         let silent = Some(i64::from(SETTINGS.lease_ms) * 3);
         assert_eq!(world.candidate(0).silent_ms, silent);
-        let note = &core.look(world.now).workers[0].note;
+        let note = &core.farm_snapshot(world.now).workers[0].note;
         assert!(note.starts_with("not heard of for 3 s"), "{note}");
         world.close().await;
     });

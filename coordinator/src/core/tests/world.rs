@@ -1,6 +1,9 @@
 //! Instances of the core over one catalog, workers that follow instructions, and a model of the
 //! expected result.
 
+mod act;
+mod checks;
+
 use std::{
     collections::{BTreeMap, BTreeSet},
     path::Path,
@@ -21,8 +24,10 @@ use picofarm_proto::{
 use proptest::prelude::*;
 use uuid::Uuid;
 
-use super::super::{Core, OutputHint, Say, Settings, Timings, prepare, stands_for};
-use crate::{budget::Backoff, submission::Draft};
+use crate::{
+    core::{Backoff, Core, OutputHint, Settings, Timings, ToWorker},
+    submission::{Draft, prepare, reuses_job},
+};
 
 pub(super) const TASKS: u64 = 12;
 /// The same value as the actor's.
@@ -223,7 +228,7 @@ impl World {
             .await;
         if latest
             .unwrap()
-            .is_some_and(|job| stands_for(job.state, true))
+            .is_some_and(|job| reuses_job(job.state, true))
         {
             return;
         }
@@ -271,7 +276,7 @@ impl World {
         }
     }
 
-    pub(super) async fn flush(&mut self, h: usize) -> Vec<(u64, Say)> {
+    pub(super) async fn flush(&mut self, h: usize) -> Vec<(u64, ToWorker)> {
         let instance = &mut self.instances[h];
         let (changes, say) = instance.core.take();
         let written = instance.catalog.commit(&changes).await;
@@ -285,11 +290,11 @@ impl World {
                 .iter_mut()
                 .find(|w| w.session == Some((h, *session)));
             match (worker, what) {
-                (Some(worker), Say::Lease(lease)) => {
+                (Some(worker), ToWorker::Lease(lease)) => {
                     self.doubles += u32::from(lease.lease.epoch.0 == 0);
                     worker.leases.insert(0, (**lease).clone());
                 }
-                (_, Say::Trim { .. }) => self.trims += 1,
+                (_, ToWorker::Trim { .. }) => self.trims += 1,
                 _ => {}
             }
         }
@@ -304,7 +309,7 @@ impl World {
         let Some(news) = self.or_reload(h, news).await else {
             return;
         };
-        for job in self.instances[h].core.hear(news, self.now) {
+        for job in self.instances[h].core.apply_news(news, self.now) {
             self.learn(h, job).await;
         }
     }
@@ -367,7 +372,7 @@ impl World {
         let said = self.flush(h).await;
         let accepted = said
             .iter()
-            .any(|(_, s)| matches!(s, Say::Acknowledge { accepted: true, .. }));
+            .any(|(_, s)| matches!(s, ToWorker::Acknowledge { accepted: true, .. }));
         if accepted {
             if lease.ordinal == 1 {
                 let made = |task| self.committed.contains_key(&(0, task));
@@ -419,193 +424,6 @@ impl World {
 
     fn instance(&self, h: u8) -> usize {
         usize::from(h) % self.instances.len()
-    }
-
-    pub(super) async fn act(&mut self, op: &Op) {
-        match op {
-            Op::Credit(w) => {
-                if let Some((h, session)) = self.workers[usize::from(*w)].session {
-                    self.instances[h].core.credit(session, 1);
-                }
-            }
-            Op::Finish(w, l, t) => {
-                if let Some((h, session, lease)) = self.lease_of(*w, *l) {
-                    let index = lease.lo + u64::from(*t) % (lease.hi - lease.lo);
-                    self.finish(h, session, &lease, index).await;
-                }
-            }
-            Op::Fail(w, l, t, kind) => {
-                if let Some((h, session, lease)) = self.lease_of(*w, *l) {
-                    let failure = Failure {
-                        lease: lease.lease,
-                        index: lease.lo + u64::from(*t) % (lease.hi - lease.lo),
-                        kind: *kind,
-                        message: "no".into(),
-                    };
-                    self.instances[h].core.failed(session, &failure, self.now);
-                }
-            }
-            Op::Release(w, l) => {
-                if let Some((h, session, lease)) = self.lease_of(*w, *l) {
-                    let core = &mut self.instances[h].core;
-                    core.released(session, lease.lease, "bye", self.now);
-                }
-            }
-            Op::Beat(w) => {
-                let worker = &self.workers[usize::from(*w)];
-                if let Some((h, session)) = worker.session {
-                    let leases: Vec<_> = worker.leases.iter().map(|l| l.lease).collect();
-                    let progress = worker.leases.iter().take(1).map(|l| TaskProgress {
-                        lease: l.lease,
-                        index: l.lo,
-                        fraction: 0.5,
-                        at: TaskAt::default(),
-                    });
-                    let progress: Vec<_> = progress.collect();
-                    self.instances[h]
-                        .core
-                        .heartbeat(session, &leases, &progress, self.now);
-                }
-            }
-            Op::Drop(w, dies) => {
-                let worker = &mut self.workers[usize::from(*w)];
-                if *dies {
-                    worker.incarnation = 0;
-                    worker.leases.clear();
-                }
-                if let Some((h, session)) = worker.session.take() {
-                    self.instances[h].core.closed(session, self.now);
-                }
-            }
-            Op::Connect(w, h) => self.connect(*w, self.instance(*h)).await,
-            Op::Pass(ms) => self.now += i64::from(*ms),
-            Op::InstanceBeats(h) => self.beat(self.instance(*h)).await,
-            Op::InstanceRestarts(h) => {
-                let h = self.instance(*h);
-                self.flush(h).await;
-                self.reload(h).await;
-            }
-            Op::InstanceIsLost(h) => {
-                let h = self.instance(*h);
-                if let Some(url) = &self.postgres {
-                    testing::lose_instance(url, self.instances[h].id).await;
-                }
-            }
-            Op::Retry => {
-                for job in self.jobs.clone() {
-                    let retried = self.instances[0].catalog.retry(job, self.now).await;
-                    // A job with a later twin stays as it is.
-                    if matches!(retried, Ok(1..)) {
-                        self.instances[0].core.retried(job);
-                        self.learn(0, job).await;
-                    }
-                }
-            }
-            Op::Pause(paused) => {
-                let job = self.jobs[0];
-                self.flush(0).await;
-                let changed = self.instances[0]
-                    .catalog
-                    .pause(job, *paused, "", self.now)
-                    .await;
-                if self.or_reload(0, changed).await == Some(true) {
-                    self.instances[0].core.paused(job, *paused);
-                    self.flush(0).await;
-                }
-            }
-            Op::Cancel => {
-                let job = self.jobs[0];
-                self.flush(0).await;
-                let cancelled = self.instances[0].catalog.cancel(job, "", self.now).await;
-                if self.or_reload(0, cancelled).await == Some(true) {
-                    self.instances[0].core.drop_job(job, "cancelled");
-                }
-            }
-            Op::Grow => self.submit(0, TASKS + 4).await,
-            Op::Ends(w, ms) => {
-                if let Some((h, session)) = self.workers[usize::from(*w)].session {
-                    let core = &mut self.instances[h].core;
-                    core.ends(session, Some(u64::from(*ms)), self.now);
-                }
-            }
-        }
-        for h in 0..self.instances.len() {
-            self.step(h).await;
-        }
-    }
-
-    /// Runs one turn of an instance's actor.
-    async fn step(&mut self, h: usize) {
-        self.instances[h].core.expire(self.now);
-        for _ in 0..ROUNDS {
-            let wants = self.instances[h].core.wants(self.now);
-            let claimed = !wants.is_empty();
-            if claimed {
-                self.flush(h).await;
-                let claims = self.instances[h].catalog.claim(&wants).await;
-                let Some(claims) = self.or_reload(h, claims).await else {
-                    return;
-                };
-                for (want, claim) in wants.iter().zip(claims) {
-                    self.instances[h].core.claimed(want.stage, claim, self.now);
-                }
-            }
-            self.instances[h].core.dispatch(self.now);
-            if !claimed {
-                break;
-            }
-        }
-        self.flush(h).await;
-    }
-
-    /// Checks the laws.
-    pub(super) async fn check(&self) {
-        let catalog = &self.instances[0].catalog;
-        for job in &self.jobs {
-            let record = catalog.job(*job).await.unwrap().unwrap();
-            for (ordinal, stage) in record.stages.iter().enumerate() {
-                let (counts, count) = (stage.counts, record.job.spec.stages[ordinal].tasks());
-                assert_eq!(counts.total, count, "each task stands in one range");
-                let range = (ordinal as u32, 0)..(ordinal as u32, count);
-                let known = self.committed.range(range).count() as u64;
-                assert!(counts.done <= known, "done without an output");
-                if record.job.state == JobState::Done {
-                    assert_eq!(counts.done, count);
-                }
-            }
-        }
-        let mut outputs = BTreeSet::new();
-        for (ordinal, stage) in spec(1).stages.iter().enumerate() {
-            let set = ResultSet::of(stage);
-            let runs = catalog
-                .output_runs(&set, u64::from(u32::MAX))
-                .await
-                .unwrap();
-            outputs.extend(
-                runs.iter()
-                    .flat_map(|r| r.lo..r.hi)
-                    .map(|t| (ordinal as u32, t)),
-            );
-        }
-        let known: BTreeSet<(u32, u64)> = self.committed.keys().copied().collect();
-        assert_eq!(outputs, known, "outputs are exactly what was accepted");
-        self.check_shared();
-    }
-
-    /// Checks that a single instance has no shared output leased for two jobs. Instances do not
-    /// know each other's leases, so the check needs a single one.
-    pub(super) fn check_shared(&self) {
-        if let [instance] = &*self.instances {
-            for set in &instance.core.sets {
-                let mut seen = BTreeSet::new();
-                for stage in &set.stages {
-                    for (range, _) in instance.core.stages[stage].stage.leased() {
-                        let mut to_do = (range.lo..range.hi).filter(|task| range.has_to_do(*task));
-                        assert!(to_do.all(|task| seen.insert(task)), "under way twice");
-                    }
-                }
-            }
-        }
     }
 
     /// Finishes all remaining tasks with honest workers.

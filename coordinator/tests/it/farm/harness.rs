@@ -11,7 +11,8 @@ use std::{
 
 use futures::future::BoxFuture;
 use picofarm_coordinator::{
-    Backoff, Clock, CoordinatorConfig, CoordinatorError, Found, Running, Stored, VERSION, serve,
+    Backoff, Clock, CoordinatorConfig, CoordinatorError, ResultReader, ResultState, Running,
+    VERSION, serve,
 };
 use picofarm_database::CatalogPlace;
 use picofarm_proto::{
@@ -64,12 +65,12 @@ impl FakeStore {
     }
 }
 
-impl Stored for FakeStore {
-    fn look<'a>(
+impl ResultReader for FakeStore {
+    fn check<'a>(
         &'a self,
         _: &'a StageSpec,
         results: &'a [(u64, [u8; 32])],
-    ) -> BoxFuture<'a, Result<Vec<Found>, String>> {
+    ) -> BoxFuture<'a, Result<Vec<ResultState>, String>> {
         Box::pin(async move {
             if self.hangs.load(Ordering::SeqCst) {
                 std::future::pending::<()>().await;
@@ -78,14 +79,14 @@ impl Stored for FakeStore {
                 return Err(why.clone());
             }
             if self.absent.load(Ordering::SeqCst) {
-                return Ok(vec![Found::NoFolder; results.len()]);
+                return Ok(vec![ResultState::NoFolder; results.len()]);
             }
             self.asked.fetch_add(results.len(), Ordering::SeqCst);
             let instead = self.instead.lock().unwrap();
             let of = |(task, reported): &(u64, [u8; 32])| match instead.get(task) {
-                Some(None) => Found::Gone,
-                Some(Some(other)) if other != reported => Found::Differs,
-                _ => Found::Equal,
+                Some(None) => ResultState::Gone,
+                Some(Some(other)) if other != reported => ResultState::Differs,
+                _ => ResultState::Equal,
             };
             Ok(results.iter().map(of).collect())
         })
@@ -140,7 +141,7 @@ impl Farm {
                 move || passed.load(Ordering::SeqCst),
             ),
             http: Some("127.0.0.1:0".parse().unwrap()),
-            stored: Some(Arc::clone(&stored) as Arc<dyn Stored>),
+            result_reader: Some(Arc::clone(&stored) as Arc<dyn ResultReader>),
             ..CoordinatorConfig::new(catalog.clone(), "127.0.0.1:0".parse().unwrap())
         };
         let (running, stop, jobs) = run(&config).await.unwrap();

@@ -95,7 +95,7 @@ fn spec() -> JobSpec {
 /// the first schema. `blob` formats bytes, given in hexadecimal, as a literal of the database.
 fn rows(blob: fn(&str) -> String, id: fn(u128) -> String, no: &str) -> String {
     let spec = SPEC.replace('\'', "''");
-    let set = ResultSet::of(&self::spec().stages[0]);
+    let set = ResultSet::of_stage(&self::spec().stages[0]);
     let key = blob(&hex::encode(set.stage_key.0));
     let manifest = blob(&"07".repeat(32));
     let (job, done, pending) = (id(1), id(2), id(3));
@@ -127,7 +127,7 @@ async fn is_readable(catalog: &dyn Catalog, level: &str) {
         (4, 5),
         "{level}"
     );
-    let set = ResultSet::of(&job.spec.stages[0]);
+    let set = ResultSet::of_stage(&job.spec.stages[0]);
     let recorded = catalog.recorded(&set, 9).await.unwrap();
     assert_eq!(
         (recorded[0].manifest, recorded[0].checked),

@@ -152,7 +152,7 @@ pub(super) async fn cancel(
     let key = writer.job(job).await?;
     let cancelled = job_query::cancel(writer.c, key, now_ms).await?;
     if cancelled {
-        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, why.to_owned());
+        let event = NewEvent::new(job, now_ms, EventKind::Cancelled, why.to_owned());
         insert_events(writer, &[event]).await?;
     }
     Ok(cancelled)
@@ -172,7 +172,7 @@ pub(super) async fn pause(
             true => EventKind::Paused,
             false => EventKind::Resumed,
         };
-        let event = NewEvent::of(job, now_ms, kind, who.to_owned());
+        let event = NewEvent::new(job, now_ms, kind, who.to_owned());
         insert_events(writer, &[event]).await?;
     }
     Ok(changed)
@@ -212,7 +212,7 @@ pub(super) async fn retry(writer: &mut Writer<'_>, job: JobId, now_ms: i64) -> R
                 _ => WriteError::Sql(e),
             })?;
         let message = format!("{retried} dead tasks are pending again");
-        let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
+        let event = NewEvent::new(job, now_ms, EventKind::Retried, message);
         insert_events(writer, &[event]).await?;
         settle(writer, job, now_ms).await?;
     }

@@ -355,9 +355,9 @@ impl Catalog for PostgresCatalog {
         .await
     }
 
-    async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError> {
+    async fn unfinished_jobs(&self, user: &str) -> Result<u64, CatalogError> {
         let mut c = self.reader().await?;
-        job_query::jobs_of(&mut c, user)
+        job_query::unfinished_jobs(&mut c, user)
             .await
             .map_err(|e| self.failed(e))
     }

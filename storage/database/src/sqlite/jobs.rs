@@ -141,7 +141,7 @@ pub(super) async fn cancel(
     let key = keys.job(c, job).await?;
     let cancelled = job_query::cancel(c, key, now_ms).await?;
     if cancelled {
-        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, why.to_owned());
+        let event = NewEvent::new(job, now_ms, EventKind::Cancelled, why.to_owned());
         insert_events(c, keys, &[event]).await?;
     }
     Ok(cancelled)
@@ -162,7 +162,7 @@ pub(super) async fn pause(
             true => EventKind::Paused,
             false => EventKind::Resumed,
         };
-        let event = NewEvent::of(job, now_ms, kind, who.to_owned());
+        let event = NewEvent::new(job, now_ms, kind, who.to_owned());
         insert_events(c, keys, &[event]).await?;
     }
     Ok(changed)
@@ -208,7 +208,7 @@ pub(super) async fn retry(
                 _ => WriteError::Sql(e),
             })?;
         let message = format!("{retried} dead tasks are pending again");
-        let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
+        let event = NewEvent::new(job, now_ms, EventKind::Retried, message);
         insert_events(c, keys, &[event]).await?;
         settle(c, keys, job, now_ms).await?;
     }

@@ -35,7 +35,7 @@ fn job() -> Job {
 }
 
 fn set() -> ResultSet {
-    ResultSet::of(&job().spec.stages[0])
+    ResultSet::of_stage(&job().spec.stages[0])
 }
 
 fn stage() -> StageRef {
@@ -401,7 +401,7 @@ async fn the_same_spec_is_recorded_once(catalog: &dyn Catalog) {
 async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     let event = |kind, tasks| NewEvent {
         tasks,
-        ..NewEvent::of(job().id, 1, kind, "in words".into())
+        ..NewEvent::new(job().id, 1, kind, "in words".into())
     };
     catalog.load().await.unwrap();
     let submitted = [event(EventKind::Submitted, None)];

@@ -197,8 +197,8 @@ async fn a_held_job_gives_nothing_until_it_goes_on(catalog: &dyn Catalog) {
 
 async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
     submitted(catalog).await;
-    assert_eq!(catalog.jobs_of("ada").await.unwrap(), 1);
-    assert_eq!(catalog.jobs_of("eve").await.unwrap(), 0);
+    assert_eq!(catalog.unfinished_jobs("ada").await.unwrap(), 1);
+    assert_eq!(catalog.unfinished_jobs("eve").await.unwrap(), 0);
     let output = Output {
         stage: at(0),
         task: 1,
@@ -216,11 +216,11 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
     catalog.commit(&changes).await.unwrap();
     assert_eq!(catalog.forget(1000).await.unwrap().jobs, 0, "it is active");
     catalog.cancel(job().id, "", 70).await.unwrap();
-    assert_eq!(catalog.jobs_of("ada").await.unwrap(), 0);
+    assert_eq!(catalog.unfinished_jobs("ada").await.unwrap(), 0);
     assert_eq!(catalog.forget(70).await.unwrap().jobs, 0, "it ended then");
     assert_eq!(catalog.forget(71).await.unwrap().jobs, 1);
     assert_eq!(catalog.job(job().id).await.unwrap(), None);
-    let set = ResultSet::of(&job().spec.stages[0]);
+    let set = ResultSet::of_stage(&job().spec.stages[0]);
     assert_eq!(catalog.output_runs(&set, 9).await.unwrap().len(), 1);
     // When the same job's tasks are claimed again, it finds the outputs that were checked in the
     // store, unless it must ignore them.

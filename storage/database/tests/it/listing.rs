@@ -51,7 +51,7 @@ fn range(job: &Job, lo: u64, hi: u64) -> Range {
 
 async fn submit(catalog: &dyn Catalog, job: &Job) {
     let ranges = [range(job, 0, 4), range(job, 4, 9)];
-    let event = NewEvent::of(job.id, 5, EventKind::Submitted, "9 tasks".into());
+    let event = NewEvent::new(job.id, 5, EventKind::Submitted, "9 tasks".into());
     assert!(catalog.submit(job, &ranges, &[event]).await.unwrap());
 }
 
@@ -135,7 +135,7 @@ async fn outputs_leave_with_the_last_job_of_their_result_set_and_not_before() {
         second.spec = first.spec.clone();
         submit(catalog, &first).await;
         submit(catalog, &second).await;
-        let set = ResultSet::of(&first.spec.stages[0]);
+        let set = ResultSet::of_stage(&first.spec.stages[0]);
         let changes = Changes {
             outputs: vec![Output {
                 stage: range(&first, 0, 1).stage,

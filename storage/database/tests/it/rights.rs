@@ -90,7 +90,7 @@ async fn readers_see_what_they_may(catalog: &dyn Catalog) {
         job(4, "eve", "a_bc"),
     ];
     for job in &jobs {
-        let event = NewEvent::of(job.id, 5, EventKind::Submitted, "x".into());
+        let event = NewEvent::new(job.id, 5, EventKind::Submitted, "x".into());
         assert!(catalog.submit(job, &[], &[event]).await.unwrap());
         let owner = catalog.owner(job.id).await.unwrap();
         assert_eq!(owner, Some(Owner::from(job)));

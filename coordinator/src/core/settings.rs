@@ -1,0 +1,29 @@
+//! The core's time limits and its source of ids.
+
+use uuid::Uuid;
+
+use super::budget::Backoff;
+
+/// Version of this program. Workers must have the same.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Generates UUIDs. It is an argument so that the core is deterministic.
+pub(crate) type MakeId = Box<dyn FnMut() -> Uuid + Send + Sync>;
+
+/// The core's time limits.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Settings {
+    /// Duration of a lease, milliseconds.
+    pub lease_ms: u32,
+    /// Time in which a disconnected worker may reconnect before its leases go to others,
+    /// milliseconds.
+    pub reconnect_ms: u32,
+    /// Delays after failures.
+    pub backoff: Backoff,
+    /// The rest of a lease is shared with an idle worker if it takes at least this long,
+    /// milliseconds.
+    pub worth_ms: u32,
+    /// Shortest run time after which an idle worker runs a task a second time, milliseconds. The
+    /// task must also have taken three times the mean of its stage.
+    pub slow_ms: u32,
+}
