@@ -301,7 +301,10 @@ impl Target {
                 CertificateError::UnknownIssuer | CertificateError::BadSignature => format!(
                     "the certificate of {uri} is not signed by {by}; give the coordinator's certificate authority with --ca FILE"
                 ),
-                other => format!("the certificate of {uri} cannot be trusted: {other}"),
+                other => format!(
+                    "the certificate of {uri} cannot be trusted: {other}; use one for servers, with the host as subjectAltName \
+                     and basicConstraints CA:FALSE (docs/security.md)"
+                ),
             },
             rustls::Error::AlertReceived(alert) => match alert {
                 AlertDescription::CertificateRequired => {
