@@ -13,8 +13,17 @@ pages = [pathlib.Path(f) for f in files if f.endswith(".md") and not f.startswit
 # Every file and folder, and every end of their paths: docs may write `kinds/mod.rs` where the folder is clear.
 whole = {"/".join(f.split("/")[:n]) for f in files for n in range(1, f.count("/") + 2)}
 known = {"/".join(p.split("/")[n:]) for p in whole for n in range(p.count("/") + 1)}
-top = "|".join(sorted({re.escape(f.split("/")[0]) for f in files if "/" in f and not f.startswith(".")}))
-ROOTED = re.compile(rf"(?<![\w./:-])(?:{top})/[\w./-]*\w(?![\w*<{{]|/[*<{{])")
+
+
+def rooted(folder):
+    """Returns the pattern of paths that begin with a folder of the repository or of `folder`."""
+    inside = {f.split("/")[0] for f in files if "/" in f}
+    inside |= {f.removeprefix(folder + "/").split("/")[0] for f in files if f.startswith(folder + "/") and "/" in f.removeprefix(folder + "/")}
+    first = "|".join(sorted(re.escape(name) for name in inside if not name.startswith(".")))
+    return re.compile(rf"(?<![\w./:-])(?:{first})/[\w./-]*\w(?![\w*<{{]|/[*<{{])")
+
+
+ROOTED = rooted(".")
 SOURCE = re.compile(r"`((?:[\w.-]+/)*[\w-]+\.(?:rs|sh|py|proto))`")
 
 
@@ -27,9 +36,9 @@ def anchors(page):
     return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in heads}
 
 
-def missing(text):
-    """Returns the paths in `text` that begin with a folder of this repository, or end as its sources do, and do not exist."""
-    return sorted({n for n in (*ROOTED.findall(text), *SOURCE.findall(text)) if n not in known})
+def missing(text, pattern=ROOTED):
+    """Returns the paths in `text` that match `pattern`, or end as sources of this repository do, and do not exist."""
+    return sorted({n for n in (*pattern.findall(text), *SOURCE.findall(text)) if n not in known})
 
 
 wrong = []
@@ -48,7 +57,7 @@ for page in pages:
         elif anchor and anchor not in anchors(target):
             wrong.append(f"{page}: {link}: the page has no such heading")
     code = "\n".join(re.findall(r"^```.*?^```|`[^`\n]*`", page.read_text(), flags=re.M | re.S))
-    wrong += [f"{page}: {name}: there is no such file in the repository" for name in missing(code)]
+    wrong += [f"{page}: {name}: there is no such file in the repository" for name in missing(code, rooted(str(page.parent)))]
 for name in files:
     if not re.search(r"\.(rs|toml|sh|py|example|service|ya?ml)$|(^|/)(run|justfile)$", name):
         continue

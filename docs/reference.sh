@@ -55,7 +55,8 @@ class Command:
 
 def join(lines):
     """Joins the lines of an entry; a list of possible values becomes a sentence."""
-    text, _, values = " ".join(filter(None, lines)).partition(" Possible values: - ")
+    text = " ".join(filter(None, lines)).replace("=]", "]")  # `[env: NAME=]` of a variable that is not set
+    text, _, values = text.partition(" Possible values: - ")
     if values:
         text += ". Possible values: " + re.sub(r" - (?=[a-z0-9.]+: )", "; ", re.sub(r": {2,}", ": ", values))
     return text
