@@ -31,6 +31,7 @@ mod rough;
 mod scale;
 mod stop;
 mod sums;
+mod tuning;
 mod warnings;
 mod wavelengths;
 mod whole_image;
