@@ -51,7 +51,7 @@ fn cases() -> Vec<(Scene, Settings)> {
         ..Strategy::default()
     };
     vec![
-        (everything(8), with(wanted.clone(), gate())),
+        (everything(8), with(wanted, gate())),
         (mirrors(8), with(wanted, gate())),
         (everything(8), with(ellipsoidal, narrow)),
         (
