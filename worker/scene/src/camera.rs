@@ -24,6 +24,15 @@ pub struct Intrinsics {
 impl Intrinsics {
     /// Returns intrinsics with square pixels, a centred principal point and a horizontal field of
     /// view in degrees. 90° at 256×256 gives fx = fy = cx = cy = 128.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_scene::Intrinsics;
+    ///
+    /// let wide = Intrinsics::from_fov(90.0, 8, 8);
+    /// assert!((wide.fx - 4.0).abs() < 1e-5);
+    /// assert_eq!(wide.cx, 4.0);
+    /// ```
     pub fn from_fov(fov_x_deg: f32, width: u32, height: u32) -> Self {
         let fx = if fov_x_deg == 90.0 {
             width as f32 * 0.5
@@ -74,6 +83,15 @@ pub struct Camera {
 
 impl Camera {
     /// Returns a camera at `origin` looking at `target`, with world +y up in the image.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_scene::{Camera, Intrinsics, Vec3};
+    ///
+    /// let target = Vec3::new(0.0, 0.0, 3.0);
+    /// let camera = Camera::look_at(Vec3::ZERO, target, Intrinsics::from_fov(60.0, 8, 8));
+    /// assert_eq!(camera.to_camera(target), target);
+    /// ```
     pub fn look_at(origin: Vec3, target: Vec3, intrinsics: Intrinsics) -> Self {
         let forward = (target - origin).normalized();
         let right = forward.cross(Vec3::new(0.0, 1.0, 0.0)).normalized();

@@ -50,6 +50,16 @@ const PLACES: u64 = u64::MAX;
 
 impl Aim {
     /// Returns the grid of `spots` spots, or `None` if there is no grid of that size.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_scene::{Aim, Camera, Intrinsics, Vec3};
+    ///
+    /// let intrinsics = Intrinsics::from_fov(90.0, 8, 8);
+    /// let camera = Camera::look_at(Vec3::ZERO, Vec3::new(0.0, 0.0, 1.0), intrinsics);
+    /// let laser = Aim::grid(4).expect("a grid of 2×2").laser(&camera);
+    /// assert_eq!(laser.beams.len(), 4);
+    /// ```
     pub fn grid(spots: u32) -> Option<Self> {
         Self::of(&Spots::Grid(spots), 0).ok()
     }

@@ -242,6 +242,14 @@ impl Material {
     /// True for surfaces in the specular mask, at which beams are not spots but fold: bodies of
     /// glass, and rough conductors with α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a
     /// mix. A mix below that scatters enough by its Lambertian part to make a spot.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_scene::Material;
+    ///
+    /// assert!(Material::mirror("mirror", 0.01).is_specular());
+    /// assert!(!Material::diffuse("wall", [0.8; 3]).is_specular());
+    /// ```
     pub fn is_specular(&self) -> bool {
         match self.bsdf {
             Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,

@@ -77,6 +77,17 @@ impl PrimitiveSettings {
 /// # Errors
 /// [`SceneError::Invalid`] for settings out of range, [`SceneError::Exhausted`] if no camera of any
 /// sub-seed has its depth within the bounds of [`PrimitiveRooms::depth_m`].
+///
+/// # Examples
+/// ```
+/// use picofarm_scene::primitive::{PrimitiveSettings, generate};
+///
+/// let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// let scene = generate(3, &room)?;
+/// assert_eq!(scene.laser.beams.len(), 25);
+/// assert!(scene.validate().is_ok());
+/// # Ok::<(), picofarm_scene::SceneError>(())
+/// ```
 pub fn generate(seed: u64, settings: &PrimitiveSettings) -> Result<Scene, SceneError> {
     let aim = settings.check(seed)?;
     for attempt in 0..ATTEMPTS {

@@ -46,6 +46,38 @@ pub struct Settings {
     pub wavelengths_nm: Wavelength,
 }
 
+impl Settings {
+    /// Returns settings without options: all bounces but the analytic one-bounce peaks, whole
+    /// pixels, beams without a width, seed 0.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_transient::{Budget, Gate, Settings};
+    ///
+    /// let gate = Gate { start_m: 1.0, bin_width_m: 0.0384, bins: 637 };
+    /// let settings = Settings {
+    ///     max_bounces: Some(2),
+    ///     ..Settings::new(gate, Budget::Samples(16))
+    /// };
+    /// assert_eq!(settings.fill_factor, 1.0);
+    /// ```
+    pub fn new(gate: Gate, budget: Budget) -> Self {
+        Self {
+            gate,
+            budget,
+            max_bounces: None,
+            one_bounce: false,
+            seed: 0,
+            split: false,
+            groups: vec![],
+            strategy: Strategy::default(),
+            beam: None,
+            fill_factor: whole(),
+            wavelengths_nm: Wavelength::NONE,
+        }
+    }
+}
+
 fn whole() -> f64 {
     1.0
 }

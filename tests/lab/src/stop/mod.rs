@@ -6,7 +6,8 @@
 //! CPU seconds, slope and merit. A negative ERROR prints the share of each path class in the
 //! variance. `json` instead of a number prints the scene for `tests/lab/peers`. If `STOP_TRUTHS` is
 //! a folder, truths are stored there and reused, so that two versions are compared with the same
-//! truth.
+//! truth. `STOP_TUNING` is JSON with numbers of [`Tuning`] that differ from the default, such as
+//! `{"walk":{"spots":8}}`.
 //!
 //! `rooms [ROOMS [PIXELS [ERROR [LIBRARY [FOLDER]]]]]` renders furnished rooms of fresh seeds with
 //! 25 spots to an error, and prints their cost. Without further arguments: 20 rooms at 256×256 with
@@ -22,7 +23,7 @@ mod scenes;
 
 use common::{Quiet, settings};
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Rendered, Settings, plan, render, variance};
+use picofarm_transient::{Budget, Rendered, Settings, Tuning, plan, render_tuned, variance};
 
 const BINS: usize = 637;
 
@@ -41,7 +42,15 @@ fn render_once(scene: &Scene, budget: Budget, seed: u64) -> Rendered {
         split: false,
         ..settings(budget)
     };
-    render(scene, &set, &Quiet).expect("the scene is sound")
+    render_tuned(scene, &set, &tuning(), &Quiet).expect("the scene is sound")
+}
+
+/// Returns the numbers of `STOP_TUNING`, and the default of all others.
+fn tuning() -> Tuning {
+    match std::env::var("STOP_TUNING") {
+        Ok(json) => serde_json::from_str(&json).expect("STOP_TUNING holds numbers of a Tuning"),
+        Err(_) => Tuning::default(),
+    }
 }
 
 /// A mean of renders, and its own squared error by pixel.

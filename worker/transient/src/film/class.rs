@@ -2,7 +2,7 @@
 
 /// The place on the path from the camera at which a contribution was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Place {
+pub(crate) enum PathPlace {
     /// At a vertex that a tile's pixels share.
     Shared,
     /// On a walk from a shared vertex.
@@ -19,7 +19,7 @@ pub(crate) enum Place {
 
 /// The technique that found a contribution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Way {
+pub(crate) enum Connection {
     /// By connecting to a spot.
     Spot,
     /// By aiming at the image of a spot.
@@ -41,7 +41,7 @@ const PLACES: [&str; 6] = [
     "walk from a vertex of one pixel",
     "near-mirror before the gather point",
 ];
-const WAYS: [&str; 5] = [
+const CONNECTIONS: [&str; 5] = [
     "spot",
     "mirror image",
     "lit point",
@@ -50,16 +50,19 @@ const WAYS: [&str; 5] = [
 ];
 
 /// The number of classes.
-pub(crate) const CLASSES: usize = PLACES.len() * WAYS.len();
+pub(crate) const CLASSES: usize = PLACES.len() * CONNECTIONS.len();
 
 /// Returns the index of a class.
 #[inline]
-pub(crate) fn class(place: Place, way: Way) -> usize {
-    place as usize * WAYS.len() + way as usize
+pub(crate) fn class(place: PathPlace, way: Connection) -> usize {
+    place as usize * CONNECTIONS.len() + way as usize
 }
 
 /// Returns the name of a class by its index.
 pub(crate) fn class_name(class: usize) -> String {
-    let (place, way) = (PLACES[class / WAYS.len()], WAYS[class % WAYS.len()]);
+    let (place, way) = (
+        PLACES[class / CONNECTIONS.len()],
+        CONNECTIONS[class % CONNECTIONS.len()],
+    );
     format!("{place}, {way}")
 }

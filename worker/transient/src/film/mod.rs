@@ -2,6 +2,8 @@
 
 pub(crate) mod blocks;
 pub(crate) mod class;
+pub(crate) mod pass_fraction;
+pub(crate) mod region;
 pub(crate) mod sink;
 pub(crate) mod slots;
 pub(crate) mod splat;

@@ -3,17 +3,17 @@
 use picofarm_scene::Vec3;
 
 use crate::film::{
-    class::{Place, Way},
+    class::{Connection, PathPlace},
     slots::Film,
 };
 
 /// Takes what a walk finds: optical path in metres, radiance, spot, bounces of the whole path, and
 /// how it was found.
 pub(crate) trait Sink {
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way);
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Connection);
 
     /// Sets the place of the following contributions.
-    fn at(&mut self, place: Place);
+    fn set_place(&mut self, place: PathPlace);
 
     /// Sets the direction from which the light of the following contributions arrives at a walk's
     /// first vertex.
@@ -28,19 +28,19 @@ pub(crate) struct PixelSink<'a> {
     pub film: &'a Film,
     pub pixel: &'a mut [f32],
     pub factor: f32,
-    pub place: Place,
+    pub place: PathPlace,
 }
 
 impl Sink for PixelSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32, way: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32, way: Connection) {
         let slot = self.film.slot(path_m);
         let spot = self.film.tag(spot, self.place, way);
         self.film.add(self.pixel, slot, self.factor * value, spot);
     }
 
     #[inline]
-    fn at(&mut self, place: Place) {
+    fn set_place(&mut self, place: PathPlace) {
         self.place = place;
     }
 }

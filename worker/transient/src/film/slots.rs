@@ -2,7 +2,7 @@
 
 use crate::{
     api::{Gate, Overflow},
-    film::class::{CLASSES, Place, Way, class},
+    film::class::{CLASSES, Connection, PathPlace, class},
 };
 
 /// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds
@@ -44,7 +44,7 @@ impl Film {
 
     /// Returns the index that a contribution is filed under: its spot, or its class.
     #[inline]
-    pub fn tag(&self, spot: usize, place: Place, way: Way) -> usize {
+    pub fn tag(&self, spot: usize, place: PathPlace, way: Connection) -> usize {
         match self.by_class {
             false => spot,
             true => class(place, way),

@@ -7,13 +7,8 @@ use picofarm_scene::{Beam, Scene, Spot, Vec3};
 use crate::{
     api::{RenderError, Stop, Unstopped},
     scene::{bvh::tree::Stack, fresnel::split, intersection::lift, panes::Crossing, world::World},
+    tuning::BeamTuning,
 };
-
-/// Largest number of turns of a beam before it is dropped.
-const MAX_REFLECTIONS: u32 = 64;
-
-/// Least share of a beam's light for which a reflection by glass is followed.
-const LEAST_BRANCH: f32 = 1.0 / 256.0;
 
 /// Largest distance between a stated spot and the end of its beam, render units.
 const SAME_PLACE: f32 = 1e-3;
@@ -24,49 +19,86 @@ const SAME_PLACE: f32 = 1e-3;
 ///
 /// # Errors
 /// [`RenderError::Scene`] if the scene is invalid.
+///
+/// # Examples
+/// ```
+/// use picofarm_scene::primitive::{PrimitiveSettings, generate};
+///
+/// let scene = generate(3, &PrimitiveSettings::default())?;
+/// let spots = picofarm_transient::trace_spots(&scene)?;
+/// assert_eq!(spots.len(), scene.laser.beams.len());
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
 pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
     scene.validate()?;
     let world = World::new(scene, f64::INFINITY, Stop(&Unstopped))?;
-    Ok(find_spots(&world, &scene.laser.beams))
+    let beams = Beams {
+        world: &world,
+        tuning: BeamTuning::default(),
+    };
+    Ok(beams.spots(&scene.laser.beams))
 }
 
-pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
-    let mut stack = world.bvh.stack();
-    let mut end = |b: &Beam| Some(follow(world, &mut stack, world.laser, b.direction)?.0);
-    beams.iter().map(|b| b.spot.or_else(|| end(b))).collect()
+/// The technique that finds the spots of beams.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Beams<'a> {
+    pub world: &'a World,
+    pub tuning: BeamTuning,
 }
 
-/// Returns the end of a laser ray that starts at `origin`, and the share of its light that glass
-/// transmits to there.
-pub(crate) fn follow(
-    world: &World,
-    stack: &mut Stack,
-    origin: Vec3,
-    direction: Vec3,
-) -> Option<(Spot, f32)> {
-    let mut ray = BeamRay::new(origin, direction);
-    ray.follow(world, stack, &mut vec![], |_| {})
-}
-
-/// Returns the ends of the rays that glass reflects off a laser ray, with their shares of its
-/// light. Only shares of [`LEAST_BRANCH`] or more are followed.
-pub(crate) fn branches(
-    world: &World,
-    stack: &mut Stack,
-    origin: Vec3,
-    direction: Vec3,
-) -> Vec<(Spot, f32)> {
-    if !world.has_glass() && !world.has_bodies() {
-        return vec![];
+impl Beams<'_> {
+    /// Returns the spots of beams in order: the stated one, or the end of the beam.
+    pub fn spots(self, beams: &[Beam]) -> Vec<Option<Spot>> {
+        let mut stack = self.world.bvh.stack();
+        let laser = self.world.laser;
+        let mut end = |b: &Beam| Some(self.follow(&mut stack, laser, b.direction)?.0);
+        beams.iter().map(|b| b.spot.or_else(|| end(b))).collect()
     }
-    let (mut crossings, mut ends) = (vec![], vec![]);
-    let mut left = vec![];
-    BeamRay::new(origin, direction).follow(world, stack, &mut crossings, |b| left.push(b));
-    while let Some(mut ray) = left.pop() {
-        let aside = |b: BeamRay| left.push(b);
-        ends.extend(ray.follow(world, stack, &mut crossings, aside));
+
+    /// Returns the end of a laser ray that starts at `origin`, and the share of its light that
+    /// glass transmits to there.
+    pub fn follow(self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<(Spot, f32)> {
+        let mut ray = BeamRay::new(origin, direction);
+        ray.follow(self, stack, &mut vec![], |_| {})
     }
-    ends
+
+    /// Returns the ends of the rays that glass reflects off a laser ray, with their shares of its
+    /// light. Only shares of [`BeamTuning::least_branch`] or more are followed.
+    pub fn branches(self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Vec<(Spot, f32)> {
+        if !self.world.has_glass() && !self.world.has_bodies() {
+            return vec![];
+        }
+        let (mut crossings, mut ends) = (vec![], vec![]);
+        let mut left = vec![];
+        BeamRay::new(origin, direction).follow(self, stack, &mut crossings, |b| left.push(b));
+        while let Some(mut ray) = left.pop() {
+            let aside = |b: BeamRay| left.push(b);
+            ends.extend(ray.follow(self, stack, &mut crossings, aside));
+        }
+        ends
+    }
+
+    /// Returns the share of a beam's light that glass transmits to its spot: along the beam, or in
+    /// a straight line if the stated spot is elsewhere.
+    pub fn through(self, stack: &mut Stack, direction: Vec3, spot: &Spot) -> f32 {
+        let world = self.world;
+        if !world.has_glass() && !world.has_bodies() {
+            return 1.0;
+        }
+        let p = world.inward(spot.point);
+        match self.ends_at(stack, direction, spot) {
+            Some(through) => through,
+            None => world.glass(stack, world.laser, lift(p, spot.normal)),
+        }
+    }
+
+    /// Returns the share of a beam's light that glass transmits, if the beam ends at `spot`.
+    pub fn ends_at(self, stack: &mut Stack, direction: Vec3, spot: &Spot) -> Option<f32> {
+        let world = self.world;
+        let (found, through) = self.follow(stack, world.laser, direction)?;
+        let apart = world.inward(found.point) - world.inward(spot.point);
+        (apart.length() < SAME_PLACE).then_some(through)
+    }
 }
 
 /// A laser ray in flight.
@@ -119,24 +151,25 @@ impl BeamRay {
     /// it go to `aside`.
     fn follow(
         &mut self,
-        world: &World,
+        beams: Beams<'_>,
         stack: &mut Stack,
         crossings: &mut Vec<Crossing>,
         mut aside: impl FnMut(Self),
     ) -> Option<(Spot, f32)> {
+        let Beams { world, tuning } = beams;
         let mut branch = |ray: Self| {
-            if ray.share >= LEAST_BRANCH {
+            if ray.share >= tuning.least_branch {
                 aside(ray);
             }
         };
-        while self.turns < MAX_REFLECTIONS {
+        while self.turns < tuning.most_turns {
             self.turns += 1;
             let hit = world.ahead(stack, self.start, self.direction, crossings);
             let mut passes = 1.0;
             for c in crossings.iter() {
                 if let Some(panes) = world.panes.as_ref().filter(|_| c.reflects > 0.0) {
-                    let at = panes.point(c.pane, self.start, self.direction);
-                    branch(self.reflected(world, at, passes * c.reflects));
+                    let turn = panes.point(c.pane, self.start, self.direction);
+                    branch(self.reflected(world, turn, passes * c.reflects));
                 }
                 passes *= c.passes;
             }
@@ -186,29 +219,4 @@ impl BeamRay {
         }
         None
     }
-}
-
-/// Returns the share of a beam's light that glass transmits to its spot: along the beam, or in a
-/// straight line if the stated spot is elsewhere.
-pub(crate) fn through(world: &World, stack: &mut Stack, direction: Vec3, spot: &Spot) -> f32 {
-    if !world.has_glass() && !world.has_bodies() {
-        return 1.0;
-    }
-    let p = world.inward(spot.point);
-    match ends_at(world, stack, direction, spot) {
-        Some(through) => through,
-        None => world.glass(stack, world.laser, lift(p, spot.normal)),
-    }
-}
-
-/// Returns the share of a beam's light that glass transmits, if the beam ends at `spot`.
-pub(crate) fn ends_at(
-    world: &World,
-    stack: &mut Stack,
-    direction: Vec3,
-    spot: &Spot,
-) -> Option<f32> {
-    let (found, through) = follow(world, stack, world.laser, direction)?;
-    let apart = world.inward(found.point) - world.inward(spot.point);
-    (apart.length() < SAME_PLACE).then_some(through)
 }

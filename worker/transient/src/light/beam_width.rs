@@ -18,7 +18,7 @@ use crate::{api::BeamWidth, numeric::frame::frame};
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
     /// Its offset from the laser's position where it leaves the laser, metres.
-    pub beside_m: Vec3,
+    pub offset_m: Vec3,
     /// Unit direction.
     pub direction: Vec3,
 }
@@ -27,12 +27,12 @@ pub(crate) struct Ray {
 pub(crate) fn ray(width: &BeamWidth, [a, b]: [f32; 2], direction: Vec3) -> Ray {
     let (u, v) = frame(direction);
     // A diameter to 1/e² is four standard deviations.
-    let (beside, tilt) = (
+    let (offset, tilt) = (
         0.25e-3 * width.diameter_mm as f32,
         0.25e-3 * width.divergence_mrad as f32,
     );
     Ray {
-        beside_m: (u * a + v * b) * beside,
+        offset_m: (u * a + v * b) * offset,
         direction: (direction + (v * a - u * b) * tilt).normalized(),
     }
 }
@@ -98,8 +98,8 @@ mod tests {
             for place in places(width.points) {
                 let ray = ray(&width, place, axis);
                 let along = ray.direction.dot(axis);
-                let at = ray.beside_m + ray.direction * (z / along);
-                let off = at - axis * at.dot(axis);
+                let point = ray.offset_m + ray.direction * (z / along);
+                let off = point - axis * point.dot(axis);
                 square += f64::from(off.dot(off)) / 64.0;
             }
             // Two coordinates, each with a standard deviation of a quarter of the diameter.

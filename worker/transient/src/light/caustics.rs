@@ -8,22 +8,24 @@
 //!
 //! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point
 //!    z;
-//! 2. it is not the case that j = 1, s₁ is on a planar mirror known to [`crate::light::mirror_images`] and
-//!    the spot is Lambertian, because such paths aim at mirror images;
+//! 2. it is not the case that j = 1, s₁ is on a planar mirror known to
+//!    [`crate::light::mirror_images`] and the spot is Lambertian, because such paths aim at mirror
+//!    images;
 //! 3. there is a point p, either z or a later point off near-mirrors, with one of these properties:
 //!    the camera sees p directly; or the event before p (read from the camera) is not specular; or
 //!    the camera sees p via near-mirrors alone, and the last of them is not much smoother than s₁
-//!    ([`pays_below`]).
+//!    ([`CausticTuning::smoother`]).
 //!
-//! Light paths cover that class and nothing else. Let z be the first such p. It is
-//! drawn into the image if the camera sees it, and it is a light vertex ([`crate::light::light_vertices`])
-//! for every other point. A light path continues from z by the surface's own scattering, and ends
+//! Light paths cover that class and nothing else. Let z be the first such p. It is drawn into the
+//! image if the camera sees it, and it is a light vertex ([`crate::light::light_vertices`]) for
+//! every other point. A light path continues from z by the surface's own scattering, and ends
 //! unless it hits a near-mirror, so a caustic that diffuse surfaces see via a near-mirror is
-//! covered as well. [`crate::paths::walk`] leaves out exactly these paths: [`crate::paths::vertex::Vertex::open`]
-//! carries condition 3 along a camera path. A near-mirror that the camera sees connects to z by its
-//! own narrow lobe: many camera paths test many light vertices, so that some of these are within
-//! the lobe. Two kinds of light are left to chance: light that reaches the camera via near-mirrors
-//! alone, and caustics seen in much smoother near-mirrors.
+//! covered as well. [`crate::paths::walk`] leaves out exactly these paths:
+//! [`crate::paths::vertex::Vertex::open`] carries condition 3 along a camera path. A near-mirror
+//! that the camera sees connects to z by its own narrow lobe: many camera paths test many light
+//! vertices, so that some of these are within the lobe. Two kinds of light are left to chance:
+//! light that reaches the camera via near-mirrors alone, and caustics seen in much smoother
+//! near-mirrors.
 //!
 //! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the
 //! spot's own scattering, combined by the balance heuristic.
@@ -32,32 +34,19 @@ use picofarm_scene::Vec3;
 
 use crate::{
     api::Stop,
+    film::{splat::Splat, technique::Technique},
     light::{
         emitters::Emitters,
-        light_context::Surroundings,
+        light_context::LightContext,
         light_vertices::{ALONE, LightVertex, LightVertices},
-        targets::{Drawn, Target, Targets},
+        splat::splat,
+        splat_source::{CHUNK, SplatPass, SplatSource},
+        targets::{AimedPoint, Target, Targets},
     },
     numeric::rng::{Rng, Stream},
-    scene::{bvh::tree::Stack, hit::Hit, intersection::lift, world::World},
+    scene::{bvh::tree::Stack, hit::Hit, intersection::lift, surface::ScatterSample, world::World},
+    tuning::CausticTuning,
 };
-
-/// Number of events before Russian roulette starts.
-const SURE: u32 = 3;
-
-/// Largest ratio by which the near-mirror in which the camera sees a light path's end may be
-/// smoother than the path's first near-mirror. Camera paths sample such light less often the
-/// smoother the first near-mirror is, and connections less often the smoother the other one is. But
-/// connections test thousands of pairs.
-const SMOOTHER: f32 = 16.0;
-
-/// Number of paths of the probe, and the share of the spots' power via near-mirrors from which
-/// light paths pay. In a furnished room with a share of 8·10⁻⁴ to 1.6·10⁻³ (the upper edge of a
-/// mirror on the wall, 2 mm deep), chance found a path that carried 0.7 % of the image's light to
-/// one pixel; light paths cost 2 % of the time there at 64×64 and 10 % at 24×24. With a share of
-/// 1.4·10⁻⁴ no such path was seen.
-const PROBE: u32 = 4096;
-const PAYS: f64 = 3e-4;
 
 /// Near-mirrors as targets of light paths.
 #[derive(Debug)]
@@ -68,13 +57,14 @@ pub(crate) struct Caustics {
     place: Vec<u32>,
     /// The sampler that aims at them.
     targets: Targets,
+    pub tuning: CausticTuning,
 }
 
 const NONE: u32 = u32::MAX;
 
 /// The numbers of light paths of a batch by the way they start.
 #[derive(Debug, Clone, Copy)]
-struct Shares {
+struct PathCounts {
     aimed: u32,
     plain: u32,
 }
@@ -89,16 +79,14 @@ struct Start {
     path_m: f64,
 }
 
-/// Returns the roughness that the first near-mirror of light paths must be below for them to pay,
-/// if the camera sees their end in a near-mirror of roughness `alpha`.
-#[inline]
-pub(crate) fn pays_below(alpha: f32) -> f32 {
-    SMOOTHER * alpha
-}
-
 impl Caustics {
     /// Returns the near-mirrors of a scene; `None` if there are none.
-    pub fn find(world: &World, emitters: &Emitters, stop: Stop) -> Option<Self> {
+    pub fn find(
+        world: &World,
+        emitters: &Emitters,
+        tuning: CausticTuning,
+        stop: Stop,
+    ) -> Option<Self> {
         let narrow = |t: usize| {
             let surface = &world.surfaces[world.surface[t] as usize];
             surface.has_mirror() && world.normals[t] != Vec3::ZERO
@@ -124,12 +112,13 @@ impl Caustics {
             triangles,
             place,
             targets: Targets::new(&all, emitters, stop)?,
+            tuning,
         })
     }
 
-    fn shares(&self, count: u32) -> Shares {
+    fn shares(&self, count: u32) -> PathCounts {
         let plain = if self.targets.any() { count / 4 } else { count };
-        Shares {
+        PathCounts {
             aimed: count - plain,
             plain,
         }
@@ -139,7 +128,7 @@ impl Caustics {
     /// the path may end on. The sum over the batch is an estimate.
     pub fn trace(
         &self,
-        within: &Surroundings<'_>,
+        within: &LightContext<'_>,
         (l, count): (u32, u32),
         rng: &mut Rng,
         stack: &mut Stack,
@@ -158,14 +147,15 @@ impl Caustics {
         } = start;
         let images = within.emitters.columns.strength[spot] > 0.0;
         let alpha = hit.surface.alpha();
-        let aimed_at = images && within.mirrors.of(hit.triangle).is_some();
+        let aimed_at = images && within.mirrors.of_triangle(hit.triangle).is_some();
         // Counts the spot and the first event.
         let (mut bounces, mut ended) = (2, false);
         while bounces < within.max_bounces && path_m < within.gate.end_m() {
-            let Some((w, mut weight, _)) = hit.surface.sample(hit.n, wo, rng) else {
+            let Some(ScatterSample { w, mut weight, .. }) = hit.surface.sample(hit.n, wo, rng)
+            else {
                 return;
             };
-            if ended || bounces > SURE {
+            if ended || bounces > self.tuning.sure {
                 let survive = weight.min(0.95);
                 if rng.uniform() >= survive {
                     return;
@@ -211,7 +201,7 @@ impl Caustics {
     pub fn fill(
         &self,
         vertices: &mut LightVertices,
-        within: &Surroundings<'_>,
+        within: &LightContext<'_>,
         count: u32,
         rng: &mut Rng,
         stack: &mut Stack,
@@ -224,16 +214,16 @@ impl Caustics {
     /// Draws the leg from a spot to a near-mirror.
     fn start(
         &self,
-        within: &Surroundings<'_>,
-        (l, shares): (u32, Shares),
+        within: &LightContext<'_>,
+        (l, shares): (u32, PathCounts),
         rng: &mut Rng,
         stack: &mut Stack,
     ) -> Option<Start> {
         let (world, emitters) = (within.world, within.emitters);
         let spots = emitters.list.len();
         let (spot, mut hit) = if l < shares.aimed {
-            let at = (f64::from(l) + f64::from(rng.uniform())) / f64::from(shares.aimed);
-            let Drawn { spot, target, p } = self.targets.draw(at, || rng.uniform())?;
+            let position = (f64::from(l) + f64::from(rng.uniform())) / f64::from(shares.aimed);
+            let AimedPoint { spot, target, p } = self.targets.draw(position, || rng.uniform())?;
             let t = self.triangles[target];
             let from = emitters.lifted[spot];
             let hit = world.closest(stack, from, p - from)?;
@@ -242,11 +232,11 @@ impl Caustics {
             }
             (spot, hit)
         } else {
-            let at = (l - shares.aimed) as f32 + rng.uniform();
-            let at = at / shares.plain as f32 * spots as f32;
-            let spot = (at as usize).min(spots - 1);
+            let position = (l - shares.aimed) as f32 + rng.uniform();
+            let position = position / shares.plain as f32 * spots as f32;
+            let spot = (position as usize).min(spots - 1);
             let e = &emitters.list[spot];
-            let (w, _, _) = e.surface.sample(e.n, e.back, rng)?;
+            let w = e.surface.sample(e.n, e.back, rng)?.w;
             (spot, world.closest(stack, emitters.lifted[spot], w)?)
         };
         let k = self.place[hit.triangle as usize];
@@ -275,17 +265,36 @@ impl Caustics {
 
     /// Returns whether the spots send enough of their power via near-mirrors for light paths to
     /// pay.
-    pub fn pay(&self, within: &Surroundings<'_>, seed: u64) -> bool {
+    pub fn pay(&self, within: &LightContext<'_>, seed: u64) -> bool {
         let mut stack = within.world.bvh.stack();
         let mut rng = Rng::new(seed, Stream::Caustic, 0, u64::MAX);
         let mut flux = 0.0;
-        for l in 0..PROBE {
+        for l in 0..self.tuning.probe {
             let mut first = None;
-            self.trace(within, (l, PROBE), &mut rng, &mut stack, |z| {
+            self.trace(within, (l, self.tuning.probe), &mut rng, &mut stack, |z| {
                 first.get_or_insert(z.flux);
             });
             flux += first.map_or(0.0, f64::from);
         }
-        flux > PAYS * within.emitters.list.len() as f64
+        flux > self.tuning.pays * within.emitters.list.len() as f64
+    }
+}
+
+impl SplatSource for Caustics {
+    fn splats(&self, pass: &SplatPass<'_>, out: &mut Vec<Splat>) -> u64 {
+        let context = &pass.context;
+        let count = pass.light_paths(self.tuning.paths);
+        let chunk = |stack: &mut Stack, chunk: u32, ends: &mut Vec<Splat>| {
+            let number = u64::from(pass.pass);
+            let mut rng = Rng::new(pass.seed, Stream::Caustic, u64::from(chunk), number);
+            let mut seen = vec![];
+            for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
+                self.trace(context, (l, count), &mut rng, stack, |z| seen.push(z));
+                let image = (context.world, pass.film);
+                let found = seen.drain(..);
+                ends.extend(found.flat_map(|z| splat(image, (&z, Technique::Mirrors), stack)));
+            }
+        };
+        pass.side_by_side(count.div_ceil(CHUNK), out, chunk)
     }
 }

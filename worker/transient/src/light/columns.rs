@@ -84,10 +84,10 @@ impl<'a> Wide for Irradiance<'a> {
             out,
         } = self;
         let count = out.len();
-        let of = |column: &'a Column| &column.groups(first, count)[..count.div_ceil(SIDE)];
-        let (px, py, pz) = (of(&c.px), of(&c.py), of(&c.pz));
-        let (nx, ny, nz) = (of(&c.nx), of(&c.ny), of(&c.nz));
-        let strength = of(&c.strength);
+        let groups_of = |column: &'a Column| &column.groups(first, count)[..count.div_ceil(SIDE)];
+        let (px, py, pz) = (groups_of(&c.px), groups_of(&c.py), groups_of(&c.pz));
+        let (nx, ny, nz) = (groups_of(&c.nx), groups_of(&c.ny), groups_of(&c.nz));
+        let strength = groups_of(&c.strength);
         for group in 0..count.div_ceil(SIDE) {
             let (px, py, pz) = (&px[group], &py[group], &pz[group]);
             let (nx, ny, nz) = (&nx[group], &ny[group], &nz[group]);

@@ -11,64 +11,37 @@
 //! Light paths from the spots cover that class. They walk within the zones, and each of their
 //! vertices may be v: it is drawn into the image if the camera sees it, and it is a light vertex
 //! ([`crate::light::light_vertices`]) for camera vertices that are not near. If the run ends on a
-//! near-mirror, the light paths continue as in [`crate::light::caustics`], to a point z behind it that is
-//! drawn or connected likewise. They do not cover paths without a point as in condition 3 there,
-//! for which [`crate::paths::vertex::Vertex::open`] is not above the near-mirror's roughness. Those are
-//! sampled by connecting v to the near-mirror itself. [`crate::paths::walk`] leaves out the light from a
-//! spot to its own zone, and so do the strata of two bounces if the other surface is very close
-//! ([`CLOSE`]); at larger distances the strata are better than light paths. Energy is carried from
-//! vertex to vertex and never divided by a distance within a zone, so it is conserved at any d.
-//!
-//! If a beam hits an edge exactly, rounding decides on which side of the other wall the spot is.
-//! Such a spot is moved along its own surface ([`clear`]) until it is [`CLEARANCE`] away from the
-//! other one.
+//! near-mirror, the light paths continue as in [`crate::light::caustics`], to a point z behind it
+//! that is drawn or connected likewise. They do not cover paths without a point as in condition 3
+//! there, for which [`crate::paths::vertex::Vertex::open`] is not above the near-mirror's
+//! roughness. Those are sampled by connecting v to the near-mirror itself. [`crate::paths::walk`]
+//! leaves out the light from a spot to its own zone, and so do the strata of two bounces if the
+//! other surface is very close ([`ContactTuning::close`]); at larger distances the strata are
+//! better than light paths. Energy is carried from vertex to vertex and never divided by a distance
+//! within a zone, so it is conserved at any d.
 
 use std::collections::HashSet;
 
 use picofarm_scene::Vec3;
 
 use crate::{
+    film::{splat::Splat, technique::Technique},
     light::{
         clearance::{ABOVE, ROUND, distances},
         emitter::Emitter,
         emitters::Emitters,
-        light_context::Surroundings,
+        light_context::LightContext,
         light_vertices::{ALONE, LightVertex, LightVertices},
+        splat::splat,
+        splat_source::{SplatPass, SplatSource},
     },
-    numeric::rng::Rng,
-    scene::{bvh::tree::Stack, hit::Hit, intersection::lift, stratified::Turns, world::World},
+    numeric::rng::{Rng, Stream},
+    scene::{
+        bvh::tree::Stack, hit::Hit, intersection::lift, stratified::EvenDraws,
+        surface::ScatterSample, world::World,
+    },
+    tuning::ContactTuning,
 };
-
-/// Share of a spot's light that must stay in its zone for the zone to be used.
-const MUCH: f32 = 1.0 / 32.0;
-
-/// A spot gets a zone if a surface is nearer than at most this share of its distance from the
-/// camera. Without a zone, the light of the spot on that surface is sampled by walks that come
-/// close to it, and only by chance if a near-mirror comes before. In rooms with a spot 10 cm from a
-/// box, this was most of the variance.
-const NEAR: f32 = 1.0 / 12.0;
-
-/// Number of spots above which fewer zones are better, because each spot has a small share of the
-/// light. For 25 spots in furnished rooms with as many zones as for 5 spots, error² × CPU time is
-/// 1.05 to 1.3 of its value without those zones. Spots are counted by their places.
-const FEW: f32 = 5.0;
-
-/// Like [`NEAR`], for zones in which light paths also sample light of two bounces.
-const CLOSE: f32 = 1.0 / 64.0;
-
-/// A zone's inner radius in units of the distance to the other surface; its least and greatest
-/// value in units of the distance from the camera; and its least value in render units. Error² ×
-/// CPU time varies by less than a tenth for greatest radii of 1/12 to 1/8.
-const RADIUS: f32 = 8.0;
-const RANGE: (f32, f32) = (1.0 / 64.0, 1.0 / 10.0);
-const LEAST: f32 = 1.0 / 256.0;
-
-/// Outer radius in units of the inner one, so that connections from vertices near the middle to
-/// others have a minimum length.
-const OUTER: f32 = 1.8;
-
-/// Number of vertices of a light path before Russian roulette starts.
-const SURE: u32 = 4;
 
 /// A spot with a zone.
 #[derive(Debug, Clone, Copy)]
@@ -91,33 +64,44 @@ impl Zone {
     }
 }
 
+/// A light path in a zone.
+#[derive(Clone, Copy)]
+pub(crate) struct ZonePath<'a> {
+    /// Index of the zone.
+    pub zone: usize,
+    /// Index of the path among the `draws.count()` paths of the zone.
+    pub index: u32,
+    pub draws: &'a EvenDraws,
+}
+
 /// All zones of a scene.
 #[derive(Debug)]
 pub(crate) struct Contacts {
     zones: Vec<Zone>,
     /// By surface index: whether the surface has no near-mirror.
     plain: Vec<bool>,
+    pub tuning: ContactTuning,
 }
 
 impl Contacts {
     /// Returns the zones of a scene's spots; `None` if no spot is near another surface. Spots on
     /// near-mirrors have no zone.
-    pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
+    pub fn find(world: &World, emitters: &Emitters, tuning: ContactTuning) -> Option<Self> {
         let mut stack = world.bvh.stack();
         let mut zones = vec![];
-        let near =
-            (NEAR * FEW / places(emitters.list.iter().map(|e| e.p)) as f32).clamp(CLOSE, NEAR);
+        let near = (tuning.near * tuning.few / places(emitters.list.iter().map(|e| e.p)) as f32)
+            .clamp(tuning.close, tuning.near);
         for (spot, e) in emitters.list.iter().enumerate() {
             if e.surface.has_mirror() || e.surface.is_black() {
                 continue;
             }
-            if let Some((radius, close)) = radius(world, &mut stack, (e.p, e.n), near) {
+            if let Some((radius, close)) = radius(world, &mut stack, (e.p, e.n), near, &tuning) {
                 let inner2 = radius * radius;
                 zones.push(Zone {
                     spot,
                     centre: e.p,
                     inner2,
-                    outer2: (OUTER * radius).powi(2),
+                    outer2: (tuning.outer * radius).powi(2),
                     two2: if close { inner2 } else { 0.0 },
                 });
             }
@@ -125,6 +109,7 @@ impl Contacts {
         (!zones.is_empty()).then(|| Self {
             zones,
             plain: world.surfaces.iter().map(|s| !s.has_mirror()).collect(),
+            tuning,
         })
     }
 
@@ -186,30 +171,39 @@ impl Contacts {
         y.bounces > 2 || (self.zones.iter().filter(own)).any(|z| z.distance2(y.hit.p) < z.two2)
     }
 
-    /// Traces light path `l` of the `turns.count()` paths in a zone. Calls `each` with every vertex
-    /// that the path may end on.
+    /// Traces a light path in a zone. Calls `each` with every vertex that the path may end on.
     pub fn trace(
         &self,
-        within: &Surroundings<'_>,
-        (zone, l, turns): (usize, u32, &Turns),
+        within: &LightContext<'_>,
+        path: ZonePath<'_>,
         rng: &mut Rng,
         stack: &mut Stack,
-        mut each: impl FnMut(End, LightVertex),
+        mut each: impl FnMut(ZoneEnd, LightVertex),
     ) {
+        let ZonePath {
+            zone,
+            index: l,
+            draws: turns,
+        } = path;
         let world = within.world;
         let spot = self.zones[zone].spot;
         let e: &Emitter = &within.emitters.list[spot];
-        let Some((mut w, mut flux, _)) = turns.direction(l, &e.surface, e.n, e.back, rng) else {
+        let Some(ScatterSample {
+            mut w,
+            weight: mut flux,
+            ..
+        }) = turns.direction(l, &e.surface, e.n, e.back, rng)
+        else {
             return;
         };
         flux /= turns.count();
-        let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
+        let (mut from, mut start, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
         // Whether the path is still within the zones, and whether the vertex before was specular.
         let (mut inside, mut specular) = (true, false);
         // Roughness of the first near-mirror on the path.
         let mut alpha = 0.0;
         for bounces in 2..=within.max_bounces {
-            let Some(mut hit) = world.closest(stack, at, w) else {
+            let Some(mut hit) = world.closest(stack, start, w) else {
                 return;
             };
             let near = match bounces {
@@ -223,10 +217,10 @@ impl Contacts {
                 return;
             }
             let end = match near {
-                true => Some(End::Near),
+                true => Some(ZoneEnd::Near),
                 false if hit.surface.specular() => None,
                 // Behind a near-mirror; other vertices are sampled from the camera's side.
-                false if specular => Some(End::Beyond),
+                false if specular => Some(ZoneEnd::Beyond),
                 false => return,
             };
             inside = near;
@@ -243,10 +237,15 @@ impl Contacts {
                 };
                 each(end, vertex);
             }
-            let Some((next, mut weight, _)) = hit.surface.sample(hit.n, -w, rng) else {
+            let Some(ScatterSample {
+                w: next,
+                mut weight,
+                ..
+            }) = hit.surface.sample(hit.n, -w, rng)
+            else {
                 return;
             };
-            if bounces > SURE {
+            if bounces > self.tuning.sure {
                 let survive = weight.min(0.95);
                 if rng.uniform() >= survive {
                     return;
@@ -258,7 +257,7 @@ impl Contacts {
             if specular && alpha == 0.0 {
                 alpha = hit.surface.alpha();
             }
-            (from, at, w) = (hit.p, lift(hit.p, hit.n), next);
+            (from, start, w) = (hit.p, lift(hit.p, hit.n), next);
         }
     }
 
@@ -267,27 +266,38 @@ impl Contacts {
     pub fn fill(
         &self,
         (near, beyond): (&mut LightVertices, &mut LightVertices),
-        within: &Surroundings<'_>,
+        within: &LightContext<'_>,
         count: u32,
         rng: &mut Rng,
         stack: &mut Stack,
     ) {
         near.clear();
         for zone in 0..self.zones.len() {
-            let turns = Turns::new(count, rng);
+            let turns = EvenDraws::new(count, rng);
             for l in 0..count {
-                self.trace(within, (zone, l, &turns), rng, stack, |end, z| match end {
-                    End::Near => near.push(z),
-                    End::Beyond => beyond.push(z),
-                });
+                self.trace(
+                    within,
+                    ZonePath {
+                        zone,
+                        index: l,
+                        draws: &turns,
+                    },
+                    rng,
+                    stack,
+                    |end, z| match end {
+                        ZoneEnd::Near => near.push(z),
+                        ZoneEnd::Beyond => beyond.push(z),
+                    },
+                );
             }
         }
     }
 }
 
-/// Returns whether there are more than [`FEW`] spots, so that each has a small share of the light.
-pub(crate) fn many(emitters: &Emitters) -> bool {
-    places(emitters.list.iter().map(|e| e.p)) as f32 > FEW
+/// Returns whether there are more than [`ContactTuning::few`] spots, so that each has a small share
+/// of the light.
+pub(crate) fn many(emitters: &Emitters, tuning: &ContactTuning) -> bool {
+    places(emitters.list.iter().map(|e| e.p)) as f32 > tuning.few
 }
 
 /// How many places sources have.
@@ -298,7 +308,7 @@ fn places(sources: impl Iterator<Item = Vec3>) -> usize {
 
 /// The kinds of vertices that a zone's light path may end on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum End {
+pub(crate) enum ZoneEnd {
     /// A near vertex.
     Near,
     /// A vertex on the first surface behind near-mirrors.
@@ -308,16 +318,56 @@ pub(crate) enum End {
 /// Returns the radius of a spot's zone, if it needs one: if surfaces nearer than `near` of its
 /// distance from the camera receive much of its light. Also returns whether one is so close that
 /// the strata of two bounces miss the strip that the spot lights.
-fn radius(world: &World, stack: &mut Stack, place: (Vec3, Vec3), near: f32) -> Option<(f32, bool)> {
+fn radius(
+    world: &World,
+    stack: &mut Stack,
+    place: (Vec3, Vec3),
+    near: f32,
+    tuning: &ContactTuning,
+) -> Option<(f32, bool)> {
     let range = place.0.length();
-    let (least, most) = (RANGE.0 * range, RANGE.1 * range);
-    let all = distances(world, stack, place, most.max(LEAST));
+    let (least, most) = (tuning.least_range * range, tuning.most_range * range);
+    let all = distances(world, stack, place, most.max(tuning.least));
     let nearest = all.iter().flatten().copied().fold(f32::INFINITY, f32::min);
     if nearest >= near * range {
         return None;
     }
-    let radius = (RADIUS * nearest).clamp(least, most).max(LEAST);
+    let radius = (tuning.radius * nearest)
+        .clamp(least, most)
+        .max(tuning.least);
     let above = all[ROUND as usize..].iter().flatten();
     let inside = above.filter(|&&t| t < radius).count();
-    (inside as f32 >= MUCH * ABOVE as f32).then_some((radius, nearest < CLOSE * range))
+    (inside as f32 >= tuning.much * ABOVE as f32)
+        .then_some((radius, nearest < tuning.close * range))
+}
+
+impl SplatSource for Contacts {
+    fn splats(&self, pass: &SplatPass<'_>, out: &mut Vec<Splat>) -> u64 {
+        let context = &pass.context;
+        let (least, most) = (self.tuning.least_paths, self.tuning.most_paths);
+        let share = pass.width * pass.height / self.tuning.pixels_per_path / self.count();
+        let count = (share.clamp(least, most) / pass.fraction.one_in).max(1);
+        let zone = |stack: &mut Stack, zone: u32, ends: &mut Vec<Splat>| {
+            let number = u64::from(pass.pass);
+            let mut rng = Rng::new(pass.seed, Stream::Contact, u64::from(zone), number);
+            let draws = EvenDraws::new(count, &mut rng);
+            let mut seen = vec![];
+            for index in 0..count {
+                let path = ZonePath {
+                    zone: zone as usize,
+                    index,
+                    draws: &draws,
+                };
+                self.trace(context, path, &mut rng, stack, |end, z| {
+                    if end == ZoneEnd::Beyond || self.draws(&z) {
+                        seen.push(z);
+                    }
+                });
+                let image = (context.world, pass.film);
+                let found = seen.drain(..);
+                ends.extend(found.flat_map(|z| splat(image, (&z, Technique::Zone), stack)));
+            }
+        };
+        pass.side_by_side(self.count(), out, zone)
+    }
 }

@@ -3,11 +3,11 @@
 use crate::{
     light::{
         contacts::Contacts,
-        emitters::Emitters,
+        light_context::LightContext,
         light_vertices::{LightVertex, LightVertices, share},
     },
     numeric::rng::Rng,
-    scene::{bvh::tree::Stack, intersection::lift, world::World},
+    scene::{bvh::tree::Stack, intersection::lift, surface::ScatterSample},
 };
 
 impl LightVertices {
@@ -16,11 +16,14 @@ impl LightVertices {
     /// those in a spot's own zone.
     pub fn fill(
         &mut self,
-        (world, emitters, contacts): (&World, &Emitters, Option<&Contacts>),
+        within: &LightContext<'_>,
+        contacts: Option<&Contacts>,
         count: u32,
         rng: &mut Rng,
         stack: &mut Stack,
     ) {
+        let (world, emitters) = (within.world, within.emitters);
+        let tuning = &within.tuning.walk;
         self.clear();
         let spots = emitters.list.len();
         if spots == 0 {
@@ -30,10 +33,10 @@ impl LightVertices {
         let shift = rng.uniform();
         for l in 0..count {
             // Strata over the spots, rotated.
-            let at = (l as f32 + rng.uniform()) / count as f32 + shift;
-            let spot = (((at - at.floor()) * spots as f32) as usize).min(spots - 1);
+            let position = (l as f32 + rng.uniform()) / count as f32 + shift;
+            let spot = (((position - position.floor()) * spots as f32) as usize).min(spots - 1);
             let e = &emitters.list[spot];
-            let Some((w, weight, pdf)) = e.surface.sample(e.n, e.back, rng) else {
+            let Some(ScatterSample { w, weight, pdf }) = e.surface.sample(e.n, e.back, rng) else {
                 continue;
             };
             let Some(mut hit) = world.closest(stack, lift(e.p, e.n), w) else {
@@ -53,7 +56,7 @@ impl LightVertices {
                 hit,
                 back: -w,
                 flux,
-                density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
+                density: share(emitters, tuning.light_weight, pdf) * hit.n.dot(w).abs() / d2,
                 path_m: e.path_m + world.metres(d2.sqrt()),
                 spot,
                 bounces: 2,

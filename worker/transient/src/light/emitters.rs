@@ -6,16 +6,11 @@ use picofarm_scene::{Scene, Spot, Vec3};
 
 use crate::{
     api::{BeamWidth, RenderError},
-    light::{
-        beam::{branches, ends_at, follow, through},
-        beam_width,
-        columns::Columns,
-        emitter::Emitter,
-    },
+    light::{beam::Beams, beam_width, columns::Columns, emitter::Emitter},
     scene::{
         bvh::tree::Stack,
         intersection::lift,
-        lobes::{Lobes, Seen},
+        lobes::{Lobes, ShadingPoint},
         surface::Surface,
         world::World,
     },
@@ -50,7 +45,12 @@ impl Emitters {
         }
     }
 
-    pub fn new(scene: &Scene, world: &World, spots: &[Option<Spot>]) -> Result<Self, RenderError> {
+    pub fn new(
+        scene: &Scene,
+        beam_tracer: Beams<'_>,
+        spots: &[Option<Spot>],
+    ) -> Result<Self, RenderError> {
+        let world = beam_tracer.world;
         let mut stack = world.bvh.stack();
         let mut all = Self::default();
         for (beam, spot) in spots.iter().enumerate() {
@@ -58,7 +58,7 @@ impl Emitters {
             let Some(spot) = spot else {
                 if let Some(direction) = along {
                     let way = (world.laser, direction);
-                    all.push_branches(world, &mut stack, (beam, 1.0), way);
+                    all.push_branches(beam_tracer, &mut stack, (beam, 1.0), way);
                 }
                 continue;
             };
@@ -92,12 +92,12 @@ impl Emitters {
             }
             let surface = world.first_surface[spot.object as usize] + spot.material;
             let direction = along.unwrap_or(spot.arriving);
-            let through = through(world, &mut stack, direction, spot);
+            let through = beam_tracer.through(&mut stack, direction, spot);
             let of_beam = (beam, through);
             let source = Emitter::new(world, &mut stack, of_beam, spot, surface);
             all.push(source);
             let way = (world.laser, direction);
-            all.push_branches(world, &mut stack, (beam, 1.0), way);
+            all.push_branches(beam_tracer, &mut stack, (beam, 1.0), way);
         }
         all.rays.push(0..all.list.len());
         Ok(all)
@@ -109,7 +109,12 @@ impl Emitters {
     /// # Errors
     /// [`RenderError::Invalid`] if the width is unusable, or if a beam does not end at the
     /// spot that the scene states for it.
-    pub fn widened(scene: &Scene, world: &World, width: &BeamWidth) -> Result<Self, RenderError> {
+    pub fn widened(
+        scene: &Scene,
+        beam_tracer: Beams<'_>,
+        width: &BeamWidth,
+    ) -> Result<Self, RenderError> {
+        let world = beam_tracer.world;
         let invalid = |field: String, what: String| Err(RenderError::Invalid { field, what });
         if let Err((field, what)) = width.check() {
             return invalid(format!("beam.{field}"), what);
@@ -118,9 +123,9 @@ impl Emitters {
         let beams = || scene.laser.beams.iter().enumerate();
         for (beam, b) in beams() {
             if let Some(spot) = &b.spot
-                && ends_at(world, &mut stack, b.direction, spot).is_none()
+                && beam_tracer.ends_at(&mut stack, b.direction, spot).is_none()
             {
-                let what = "lies elsewhere than its beam ends, so that it cannot be said where the rays of a wide beam end; \
+                let what = "lies elsewhere than its beam ends, so that it cannot be said where the rays receiver a wide beam end; \
                             drop the spot to have the beam traced, or render without a width";
                 return invalid(format!("laser.beams[{beam}].spot"), what.into());
             }
@@ -130,15 +135,21 @@ impl Emitters {
             let first = all.list.len();
             for (beam, b) in beams() {
                 let ray = beam_width::ray(width, place, b.direction);
-                let start = world.laser + ray.beside_m * world.scale;
+                let start = world.laser + ray.offset_m * world.scale;
                 let share = 1.0 / width.points as f32;
-                if let Some((spot, through)) = follow(world, &mut stack, start, ray.direction) {
+                if let Some((spot, through)) = beam_tracer.follow(&mut stack, start, ray.direction)
+                {
                     let surface = world.first_surface[spot.object as usize] + spot.material;
                     let of_beam = (beam, through / width.points as f32);
                     let source = Emitter::new(world, &mut stack, of_beam, &spot, surface);
                     all.push(source);
                 }
-                all.push_branches(world, &mut stack, (beam, share), (start, ray.direction));
+                all.push_branches(
+                    beam_tracer,
+                    &mut stack,
+                    (beam, share),
+                    (start, ray.direction),
+                );
             }
             all.rays.push(first..all.list.len());
         }
@@ -149,12 +160,13 @@ impl Emitters {
     /// share of the beam's light.
     fn push_branches(
         &mut self,
-        world: &World,
+        beam_tracer: Beams<'_>,
         stack: &mut Stack,
         (beam, share): (usize, f32),
         (origin, direction): (Vec3, Vec3),
     ) {
-        for (spot, of_ray) in branches(world, stack, origin, direction) {
+        let world = beam_tracer.world;
+        for (spot, of_ray) in beam_tracer.branches(stack, origin, direction) {
             let surface = world.first_surface[spot.object as usize] + spot.material;
             let of_beam = (beam, share * of_ray);
             let source = Emitter::new(world, stack, of_beam, &spot, surface);
@@ -176,7 +188,7 @@ impl Emitters {
         // A beam that arrives from behind the spot's normal lights nothing.
         let strength = if e.n.dot(e.back) > 0.0 { strength } else { 0.0 };
         self.columns.push(e.p, e.n, strength);
-        let place = Seen {
+        let place = ShadingPoint {
             p: e.p,
             n: e.n,
             i: e.back,
@@ -195,8 +207,13 @@ impl Emitters {
     /// Writes the unshadowed contribution of every source to a surface point, per unit power: f_s
     /// cos_s f_x cos_x / d². `buffer` is overwritten.
     #[inline]
-    pub fn weights(&self, of: (Seen, &Surface), buffer: &mut Vec<f32>, out: &mut [f32]) {
-        self.weights_of(0..self.list.len(), of, buffer, out);
+    pub fn weights(
+        &self,
+        receiver: (ShadingPoint, &Surface),
+        buffer: &mut Vec<f32>,
+        out: &mut [f32],
+    ) {
+        self.weights_of(0..self.list.len(), receiver, buffer, out);
     }
 
     /// Like [`Emitters::weights`], for the sources of a range; the other entries of `out` do not
@@ -205,11 +222,11 @@ impl Emitters {
     pub fn weights_of(
         &self,
         range: Range<usize>,
-        (place, surface): (Seen, &Surface),
+        (place, surface): (ShadingPoint, &Surface),
         buffer: &mut Vec<f32>,
         out: &mut [f32],
     ) {
-        let Seen { p: x, n, .. } = place;
+        let ShadingPoint { p: x, n, .. } = place;
         let own = &mut out[range.clone()];
         if surface.diffuse() && self.glossy.is_empty() {
             self.columns.irradiance_from(range.start, x, n, own);

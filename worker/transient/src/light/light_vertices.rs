@@ -11,7 +11,7 @@ use crate::{
     light::{columns::Columns, emitters::Emitters},
     scene::{
         hit::Hit,
-        lobes::{Lobes, Seen},
+        lobes::{Lobes, ShadingPoint},
     },
 };
 
@@ -67,7 +67,8 @@ impl LightVertices {
             0.0
         };
         self.columns.push(y.hit.p, y.hit.n, y.flux * lambert);
-        self.lobes.push(&Seen::of(&y.hit, y.back), &y.hit.surface);
+        self.lobes
+            .push(&ShadingPoint::new(&y.hit, y.back), &y.hit.surface);
         self.list.push(y);
     }
 
@@ -91,7 +92,7 @@ impl LightVertices {
             return;
         }
         plain.resize(out.len(), 0.0);
-        let (place, all) = (Seen::of(x, wo), 0..out.len());
+        let (place, all) = (ShadingPoint::new(x, wo), 0..out.len());
         self.lobes.between(all, (&place, &x.surface), out, plain);
         for ((w, y), plain) in out.iter_mut().zip(&self.list).zip(plain) {
             *w *= y.flux * y.density / (y.density + *plain);
@@ -134,9 +135,6 @@ impl LightVertices {
 /// Returns the density per steradian at a spot, times the MIS weight of this technique. Both sides
 /// of the balance heuristic must use it.
 #[inline(always)]
-pub(crate) fn share(emitters: &Emitters, pdf: f32) -> f32 {
-    LIGHT_WEIGHT * pdf / emitters.list.len() as f32
+pub(crate) fn share(emitters: &Emitters, weight: f32, pdf: f32) -> f32 {
+    weight * pdf / emitters.list.len() as f32
 }
-
-/// Light vertices count as this many samples against one BSDF sample.
-pub(crate) const LIGHT_WEIGHT: f32 = 8.0;

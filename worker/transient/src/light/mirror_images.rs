@@ -23,20 +23,8 @@ use crate::{
         rng::Rng,
     },
     scene::world::World,
+    tuning::MirrorTuning,
 };
-
-/// Largest number of planes; a scene with more facets counts as having curved mirrors.
-const MAX_MIRRORS: usize = 8;
-
-/// Planes below this share of the whole mirror area are left to plain sampling.
-const MIN_SHARE: f64 = 0.02;
-
-/// Factor by which the sampled lobe is wider than the real one, so that the tail is sampled too.
-const WIDEN: f32 = 1.2;
-
-/// Margin around the mirror's rectangle within which images still count, in units of the lobe's
-/// width.
-const MARGIN: f32 = 3.0;
 
 /// One planar mirror and the spots' images behind it.
 #[derive(Debug)]
@@ -55,6 +43,7 @@ pub(crate) struct Mirror {
     images: Columns,
     /// Signed distance of each spot from the plane.
     height: Vec<f32>,
+    tuning: MirrorTuning,
 }
 
 /// All planar mirrors of a scene.
@@ -72,7 +61,7 @@ const NONE: u8 = u8::MAX;
 
 /// A sample: the target, the spot and the mirror, and the probability of that choice.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Aim {
+pub(crate) struct ImageAim {
     /// Point on the mirror's plane.
     pub target: Vec3,
     /// Mirror index.
@@ -84,7 +73,7 @@ pub(crate) struct Aim {
 }
 
 /// The linear map between the plane around m₀ and slopes.
-struct Shape {
+struct LobeMap {
     m0: Vec3,
     t: Vec3,
     s: Vec3,
@@ -94,7 +83,7 @@ struct Shape {
 }
 
 impl Mirrors {
-    pub fn find(world: &World, emitters: &Emitters, stop: Stop) -> Self {
+    pub fn find(world: &World, emitters: &Emitters, tuning: MirrorTuning, stop: Stop) -> Self {
         let mut planes: Vec<Plane> = vec![];
         let mut total = 0.0;
         for (i, t) in world.triangles.iter().enumerate() {
@@ -128,8 +117,8 @@ impl Mirrors {
             }
         }
         planes.sort_by(|a, b| b.area.total_cmp(&a.area));
-        planes.retain(|p| p.area >= MIN_SHARE * total);
-        planes.truncate(MAX_MIRRORS);
+        planes.retain(|p| p.area >= tuning.least_share * total);
+        planes.truncate(tuning.most_planes);
         if planes.is_empty() {
             return Self {
                 curved_share: if total > 0.0 { 1.0 } else { 0.0 },
@@ -146,7 +135,7 @@ impl Mirrors {
         Self {
             list: planes
                 .iter()
-                .map(|p| Mirror::new(world, emitters, p))
+                .map(|p| Mirror::new(world, emitters, p, tuning))
                 .collect(),
             of_triangle,
             curved_share: (1.0 - covered / total).max(0.0),
@@ -156,7 +145,7 @@ impl Mirrors {
 
     /// Returns the planar mirror of a triangle.
     #[inline]
-    pub fn of(&self, triangle: u32) -> Option<usize> {
+    pub fn of_triangle(&self, triangle: u32) -> Option<usize> {
         let k = *self.of_triangle.get(triangle as usize)?;
         (k != NONE).then_some(usize::from(k))
     }
@@ -179,7 +168,7 @@ impl Mirrors {
 
     /// Chooses a spot and a mirror by unshadowed contribution at `x`, and a point to aim at; `None`
     /// if no image is in reach. `weights` has room for all choices.
-    pub fn aim(&self, x: Vec3, n: Vec3, rng: &mut Rng, weights: &mut [f32]) -> Option<Aim> {
+    pub fn aim(&self, x: Vec3, n: Vec3, rng: &mut Rng, weights: &mut [f32]) -> Option<ImageAim> {
         let total = self.weights(x, n, weights);
         if total <= 0.0 {
             return None;
@@ -195,7 +184,7 @@ impl Mirrors {
             } else {
                 (-libm::logf(1.0 - u)).sqrt()
             };
-        Some(Aim {
+        Some(ImageAim {
             target: shape.m0 + shape.t * (a * r / shape.jt) + shape.s * (b * r / shape.js),
             mirror,
             spot,
@@ -259,14 +248,14 @@ impl Wide for Weights<'_> {
 /// Returns the entry at which the running sum exceeds `at`, and its weight; never an entry of
 /// weight 0.
 #[inline]
-fn pick(weights: &[f32], at: f32) -> Option<(usize, f32)> {
+fn pick(weights: &[f32], drawn_at: f32) -> Option<(usize, f32)> {
     let mut sum = 0.0;
     let mut last = None;
     for (i, &w) in weights.iter().enumerate() {
         if w > 0.0 {
             sum += w;
             last = Some((i, w));
-            if sum > at {
+            if sum > drawn_at {
                 break;
             }
         }
@@ -283,7 +272,7 @@ struct Plane {
 }
 
 impl Mirror {
-    fn new(world: &World, emitters: &Emitters, plane: &Plane) -> Self {
+    fn new(world: &World, emitters: &Emitters, plane: &Plane, tuning: MirrorTuning) -> Self {
         let n = plane.normal;
         let (u, v) = frame(n);
         let (mut low, mut high) = ([f32::INFINITY; 2], [f32::NEG_INFINITY; 2]);
@@ -315,6 +304,7 @@ impl Mirror {
             two_sided: surface.two_sided(),
             images,
             height,
+            tuning,
         }
     }
 
@@ -349,7 +339,7 @@ impl Mirror {
             let d2 = dx * dx + dy * dy + dz * dz;
             let sum = hx + height[i];
             let t = hx / sum;
-            let margin = MARGIN * 2.0 * self.alpha * t * (1.0 - t) * d2 / sum.abs();
+            let margin = self.tuning.margin * 2.0 * self.alpha * t * (1.0 - t) * d2 / sum.abs();
             let a = ux + t * (self.u.x * dx + self.u.y * dy + self.u.z * dz);
             let b = uv + t * (self.v.x * dx + self.v.y * dy + self.v.z * dz);
             let inside = (side * height[i] > 1e-4)
@@ -387,7 +377,8 @@ impl Mirror {
         let t = hx / (hx + hs);
         let im = &self.images;
         let d = Vec3::new(im.px[spot], im.py[spot], im.pz[spot]) - x;
-        let margin = MARGIN * 2.0 * self.alpha * t * (1.0 - t) * d.dot(d) / (hx + hs).abs();
+        let margin =
+            self.tuning.margin * 2.0 * self.alpha * t * (1.0 - t) * d.dot(d) / (hx + hs).abs();
         let a = self.u.dot(x) + t * self.u.dot(d);
         let b = self.v.dot(x) + t * self.v.dot(d);
         a > self.low[0] - margin
@@ -396,7 +387,7 @@ impl Mirror {
             && b < self.high[1] + margin
     }
 
-    fn shape(&self, x: Vec3, spot: usize) -> Option<Shape> {
+    fn shape(&self, x: Vec3, spot: usize) -> Option<LobeMap> {
         let im = &self.images;
         let d = Vec3::new(im.px[spot], im.py[spot], im.pz[spot]) - x;
         let hx = self.normal.dot(x) - self.offset;
@@ -415,13 +406,13 @@ impl Mirror {
             self.u
         };
         let bend = 1.0 / (share * length) + 1.0 / ((1.0 - share) * length);
-        Some(Shape {
+        Some(LobeMap {
             m0: x + d * share,
             t,
             s: self.normal.cross(t),
             jt: 0.5 * bend * cos,
             js: 0.5 * bend / cos,
-            sigma: WIDEN * self.alpha,
+            sigma: self.tuning.widen * self.alpha,
         })
     }
 }

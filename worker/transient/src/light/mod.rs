@@ -14,4 +14,5 @@ pub(crate) mod light_vertices;
 pub(crate) mod mirror_images;
 pub(crate) mod reflectors;
 pub(crate) mod splat;
+pub(crate) mod splat_source;
 pub(crate) mod targets;

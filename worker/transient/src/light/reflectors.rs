@@ -16,14 +16,8 @@ use picofarm_scene::Vec3;
 use crate::{
     numeric::rng::Rng,
     scene::{hit::Hit, world::World},
+    tuning::ReflectorTuning,
 };
-
-/// The maximum number of triangles. The table of a tile with more would cost more than it gains.
-const MOST: usize = 4096;
-
-/// The number of a tile's gather points that triangles are weighed from. With 1 and 16, error² ×
-/// CPU time is within 3 %.
-const SEEN_FROM: usize = 4;
 
 /// Upper bound of a density. Shares of densities must not be quotients of infinities.
 const MOST_DENSE: f32 = 1e30;
@@ -48,11 +42,12 @@ pub(crate) struct Reflectors {
     list: Vec<Reflector>,
     /// Index into `list` by triangle, or [`NONE`].
     place: Vec<u32>,
+    pub tuning: ReflectorTuning,
 }
 
 impl Reflectors {
     /// Returns the near-mirrors of a scene, or `None` if there are none or too many.
-    pub fn find(world: &World) -> Option<Self> {
+    pub fn find(world: &World, tuning: ReflectorTuning) -> Option<Self> {
         let mut place = vec![NONE; world.triangles.len()];
         let mut list = vec![];
         for (t, &corners) in world.triangles.iter().enumerate() {
@@ -60,7 +55,7 @@ impl Reflectors {
             if !surface.has_mirror() || world.normals[t] == Vec3::ZERO || !world.counts(t) {
                 continue;
             }
-            if list.len() == MOST {
+            if list.len() == tuning.most {
                 return None;
             }
             let found = Reflector::new(t as u32, corners, world.normals[t], surface.two_sided());
@@ -71,7 +66,11 @@ impl Reflectors {
             place[t] = list.len() as u32;
             list.push(found);
         }
-        (!list.is_empty()).then_some(Self { list, place })
+        (!list.is_empty()).then_some(Self {
+            list,
+            place,
+            tuning,
+        })
     }
 }
 
@@ -130,11 +129,11 @@ impl Aiming {
         points: impl ExactSizeIterator<Item = (Vec3, Vec3)>,
     ) -> bool {
         self.clear();
-        let step = (points.len() / SEEN_FROM).max(1);
+        let step = (points.len() / all.tuning.seen_from).max(1);
         let from: Vec<(Vec3, Vec3)> = points
             .skip(step / 2)
             .step_by(step)
-            .take(SEEN_FROM)
+            .take(all.tuning.seen_from)
             .collect();
         let mut sum = 0.0;
         for r in &all.list {
@@ -154,8 +153,8 @@ impl Aiming {
 
     /// Draws a triangle of the scene and a point on it.
     pub fn draw(&self, all: &Reflectors, rng: &mut Rng) -> Option<(u32, Vec3)> {
-        let at = rng.uniform() * self.sums.last()?;
-        let k = self.sums.partition_point(|&s| s <= at);
+        let position = rng.uniform() * self.sums.last()?;
+        let k = self.sums.partition_point(|&s| s <= position);
         let r = all.list.get(k)?;
         let [a, b, c] = r.corners;
         let (s, v) = (rng.uniform().sqrt(), rng.uniform());
@@ -208,6 +207,7 @@ mod tests {
         Reflectors {
             list: list.collect(),
             place: (0..corners.len() as u32).chain([NONE]).collect(),
+            tuning: ReflectorTuning::default(),
         }
     }
 
@@ -235,8 +235,8 @@ mod tests {
             let mut aiming = Aiming::default();
             prop_assume!(aiming.weigh(&all, often, points.into_iter()));
             let mut rng = Rng::new(seed, Stream::Paths, 0, 0);
-            // Seen from a point above each triangle's middle, the density per steradian agrees with
-            // the density per area.
+            // ShadingPoint from a point above each triangle's middle, the density per steradian
+            // agrees with the density per area.
             let mut said = vec![];
             for r in &all.list {
                 let m = hit(r.triangle, r.middle, r.normal);
@@ -279,8 +279,8 @@ mod tests {
         // In the plane of the triangle, the solid angle vanishes.
         assert_eq!(aiming.density(&all, Vec3::new(3.0, 0.0, 0.0), &there), 0.0);
         // Nothing of the triangle is visible from its plane.
-        let beside = [(Vec3::new(PI, 0.0, 0.0), up)];
-        assert!(!aiming.weigh(&all, 1.0, beside.into_iter()));
+        let neighbours = [(Vec3::new(PI, 0.0, 0.0), up)];
+        assert!(!aiming.weigh(&all, 1.0, neighbours.into_iter()));
         assert_eq!(aiming.density(&all, up, &there), 0.0);
         assert!(
             aiming

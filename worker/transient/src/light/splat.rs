@@ -6,9 +6,10 @@ use crate::{
     scene::{bvh::tree::Stack, world::World},
 };
 
-/// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I
-/// at distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit
-/// distance. None where the camera sees nothing of it.
+/// Returns the light that a light vertex sends straight to the camera. As for a spot that the
+/// camera sees, a point of intensity I at distance d and angle θ gives I/(d² cos³θ) over the
+/// pixel's sensitive area on the film at unit distance. Returns `None` if the camera sees nothing
+/// of it.
 pub(crate) fn splat(
     (world, film): (&World, &Film),
     (z, technique): (&LightVertex, Technique),

@@ -37,7 +37,7 @@ pub(crate) struct Targets {
 
 /// A point that was drawn.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Drawn {
+pub(crate) struct AimedPoint {
     /// Emitter index.
     pub spot: usize,
     /// Index among the triangles.
@@ -48,16 +48,16 @@ pub(crate) struct Drawn {
 
 /// Returns the index of the entry of running sums that contains `at` in [0, 1) of their total, and
 /// the position of `at` within it in [0, 1).
-fn pick(sums: &[f64], at: f64) -> Option<(usize, f64)> {
+fn pick(sums: &[f64], position: f64) -> Option<(usize, f64)> {
     let total = *sums.last()?;
     if !(total > 0.0 && total.is_finite()) {
         return None;
     }
-    let at = at * total;
-    let k = sums.partition_point(|&s| s <= at).min(sums.len() - 1);
+    let position = position * total;
+    let k = sums.partition_point(|&s| s <= position).min(sums.len() - 1);
     let before = if k == 0 { 0.0 } else { sums[k - 1] };
     let width = sums[k] - before;
-    (width > 0.0).then(|| (k, ((at - before) / width).clamp(0.0, 1.0)))
+    (width > 0.0).then(|| (k, ((position - before) / width).clamp(0.0, 1.0)))
 }
 
 impl Targets {
@@ -122,18 +122,18 @@ impl Targets {
     /// Returns a spot's row of running sums.
     fn row(&self, spot: usize) -> &[f64] {
         let n = self.triangles.len();
-        let at = if self.rows.len() > n { spot * n } else { 0 };
-        &self.rows[at..at + n]
+        let row_start = if self.rows.len() > n { spot * n } else { 0 };
+        &self.rows[row_start..row_start + n]
     }
 
     /// Draws a spot and a triangle by `at` in [0, 1), and a point on the triangle by two more
     /// numbers.
-    pub fn draw(&self, at: f64, mut uniform: impl FnMut() -> f32) -> Option<Drawn> {
-        let (spot, rest) = pick(&self.spots, at)?;
+    pub fn draw(&self, position: f64, mut uniform: impl FnMut() -> f32) -> Option<AimedPoint> {
+        let (spot, rest) = pick(&self.spots, position)?;
         let (target, _) = pick(self.row(spot), rest)?;
         let [a, b, c] = self.triangles[target].0;
         let (r, v) = (uniform().sqrt(), uniform());
-        Some(Drawn {
+        Some(AimedPoint {
             spot,
             target,
             p: a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v),

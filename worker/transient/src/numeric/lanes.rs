@@ -56,10 +56,10 @@ impl Column {
     }
 
     pub fn push(&mut self, x: f32) {
-        let at = self.len / SIDE;
+        let index = self.len / SIDE;
         // The last number may be the first of a group to read.
-        self.groups.resize(at + 2, [0.0; SIDE]);
-        self.groups[at][self.len % SIDE] = x;
+        self.groups.resize(index + 2, [0.0; SIDE]);
+        self.groups[index][self.len % SIDE] = x;
         self.len += 1;
     }
 
@@ -89,11 +89,11 @@ pub(crate) fn put(out: &mut [f32], group: usize, found: &[f32; SIDE]) {
         Some(whole) => *whole = *found,
         // Avoids a call for a few numbers.
         None => {
-            let (room, mut at) = (out.len(), 0);
+            let (room, mut index) = (out.len(), 0);
             for part in [4, 2, 1] {
                 if room & part != 0 {
-                    out[at..at + part].copy_from_slice(&found[at..at + part]);
-                    at += part;
+                    out[index..index + part].copy_from_slice(&found[index..index + part]);
+                    index += part;
                 }
             }
         }

@@ -9,8 +9,8 @@ pub(crate) fn r2(start: (u32, u32), k: u64) -> (f32, f32) {
     // 1/g and 1/g² in units of 2⁻⁶⁴, g³ = g + 1.
     const STEPS: (u64, u64) = (0xc13f_a9a9_02a6_328f, 0x91e1_0da5_c79e_7b1d);
     let turn = |start: u32, step: u64| {
-        let at = (u64::from(start) << 32).wrapping_add(k.wrapping_mul(step));
-        (at >> 40) as f32 * (1.0 / 16_777_216.0)
+        let position = (u64::from(start) << 32).wrapping_add(k.wrapping_mul(step));
+        (position >> 40) as f32 * (1.0 / 16_777_216.0)
     };
     (turn(start.0, STEPS.0), turn(start.1, STEPS.1))
 }
@@ -55,8 +55,8 @@ fn permuted(turn: u32, digit: u32) -> u32 {
     let first = turn % 3;
     let second = (first + 1 + turn / 3 % 2) % 3;
     let shift = turn / 6 % 4;
-    let of = |bit: u32, image: u32| (digit >> bit & 1) * (image + 1);
-    shift ^ of(0, first) ^ of(1, second)
+    let image_bit = |bit: u32, image: u32| (digit >> bit & 1) * (image + 1);
+    shift ^ image_bit(0, first) ^ image_bit(1, second)
 }
 
 #[cfg(test)]
@@ -112,7 +112,7 @@ mod tests {
         let (mut found, mut stated) = (0.0, 0.0);
         for pixel in 0..PIXELS {
             let phase = place(77, Stream::Place, pixel, 0);
-            let see = |at| f64::from(sees(at, phase));
+            let see = |position| f64::from(sees(position, phase));
             let each: Vec<f64> = (0..passes)
                 .map(|k| see(place(1, Stream::Place, pixel, k)))
                 .collect();
@@ -130,10 +130,11 @@ mod tests {
         let odd = |x: f32| x.rem_euclid(1.0) >= 0.5;
         for times in [1.0f32, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0] {
             for passes in [2, 3, 4, 8, 13] {
-                let stripes =
-                    true_over_stated(passes, |at, phase| f32::from(odd(at.1 * times + phase.1)));
-                let squares = true_over_stated(passes, |at, phase| {
-                    let (x, y) = (at.0 * times + phase.0, at.1 * times + phase.1);
+                let stripes = true_over_stated(passes, |position, phase| {
+                    f32::from(odd(position.1 * times + phase.1))
+                });
+                let squares = true_over_stated(passes, |position, phase| {
+                    let (x, y) = (position.0 * times + phase.0, position.1 * times + phase.1);
                     f32::from(odd(x) != odd(y))
                 });
                 // Random positions give 1. With R₂, stripes that repeat seven times per pixel gave

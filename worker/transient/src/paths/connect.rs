@@ -5,19 +5,19 @@ use std::f32::consts::PI;
 use picofarm_scene::Vec3;
 
 use crate::{
-    film::{class::Way, sink::Sink},
-    light::{caustics, contacts::Contacts, light_vertices, reflectors::Aiming},
+    film::{class::Connection, sink::Sink},
+    light::{contacts::Contacts, light_vertices, reflectors::Aiming},
     numeric::{rng::Rng, systematic::draw},
     paths::{
         scratch::Scratch,
         step::Step,
-        tracer::{ALL, Lights, Walk},
+        tracer::{ALL, LightVertexKind, Tracer},
         vertex::Vertex,
     },
-    scene::{hit::Hit, intersection::lift, lobes::Seen},
+    scene::{hit::Hit, intersection::lift, lobes::ShadingPoint},
 };
 
-impl Walk<'_> {
+impl Tracer<'_> {
     /// Connects a vertex to `count` spots, drawn by unshadowed contribution.
     pub fn connect(
         &self,
@@ -32,9 +32,10 @@ impl Walk<'_> {
         if h.surface.is_black() {
             return;
         }
-        let planar = self.mirrors.of(h.triangle).is_some() && step.is_some();
-        let caustic =
-            self.caustics.is_some() && h.surface.specular() && v.open() > h.surface.alpha();
+        let planar = self.mirrors.of_triangle(h.triangle).is_some() && step.is_some();
+        let caustic = self.caustics.is_some()
+            && h.surface.specular()
+            && v.open(&self.tuning.caustics) > h.surface.alpha();
         if caustic && !planar {
             return;
         }
@@ -45,8 +46,8 @@ impl Walk<'_> {
             images,
             ..
         } = scratch;
-        let of = (Seen::of(h, v.wo), &h.surface);
-        self.emitters.weights(of, plain, weights);
+        let receiver = (ShadingPoint::new(h, v.wo), &h.surface);
+        self.emitters.weights(receiver, plain, weights);
         if caustic {
             for &spot in &self.emitters.glossy {
                 weights[spot] = 0.0;
@@ -65,7 +66,7 @@ impl Walk<'_> {
             if free > 0.0 {
                 let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
                 let value = v.beta * value * free;
-                sink.add(path, value, spot, v.bounce + 1, Way::Spot);
+                sink.add(path, value, spot, v.bounce + 1, Connection::Spot);
             }
         };
         if count == ALL {
@@ -80,7 +81,7 @@ impl Walk<'_> {
     /// sampling, versus aiming (mirrors) or light vertices (other surfaces).
     fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32], images: &mut [f32]) {
         if h.surface.specular() {
-            let Some(mirror) = self.mirrors.of(h.triangle) else {
+            let Some(mirror) = self.mirrors.of_triangle(h.triangle) else {
                 return;
             };
             if step.aims > 0.0 {
@@ -98,6 +99,7 @@ impl Walk<'_> {
         if !self.lights {
             return;
         }
+        let weight = self.tuning.walk.light_weight;
         let back = step.p - h.p;
         let b2 = back.dot(back);
         let plain = step.pdf * h.n.dot(back).abs() / (b2 * b2.sqrt());
@@ -105,7 +107,8 @@ impl Walk<'_> {
         if h.surface.diffuse() {
             // Both are Lambertian: weight = strength · f · cos cos / d², and the light vertex'
             // density is share(cos / π) · cos / d².
-            let light = light_vertices::share(self.emitters, 1.0 / (PI * h.surface.lambertian()));
+            let light =
+                light_vertices::share(self.emitters, weight, 1.0 / (PI * h.surface.lambertian()));
             for (w, &s) in weights.iter_mut().zip(&**strength) {
                 let weighed = *w * plain / (plain + light * *w / s);
                 *w = if s > 0.0 { weighed } else { *w };
@@ -118,7 +121,8 @@ impl Walk<'_> {
                 let d2 = to.dot(to);
                 let dir = to / d2.sqrt();
                 let pdf = e.surface.pdf(e.n, e.back, dir);
-                let light = light_vertices::share(self.emitters, pdf) * h.n.dot(dir).abs() / d2;
+                let light =
+                    light_vertices::share(self.emitters, weight, pdf) * h.n.dot(dir).abs() / d2;
                 *w *= plain / (plain + light);
             }
         }
@@ -166,7 +170,7 @@ impl Walk<'_> {
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
             return;
         };
-        if self.mirrors.of(m.triangle) != Some(aim.mirror) || m.surface.is_black() {
+        if self.mirrors.of_triangle(m.triangle) != Some(aim.mirror) || m.surface.is_black() {
             return;
         }
         let leg = m.p - h.p;
@@ -188,7 +192,7 @@ impl Walk<'_> {
         let plain = h.surface.pdf(h.n, v.wo, w) + self.aims(aiming, h.p, &m);
         let value = v.beta * value * free / (aimed + plain);
         sink.toward(w);
-        sink.add(path, value, aim.spot, v.bounce + 2, Way::Image);
+        sink.add(path, value, aim.spot, v.bounce + 2, Connection::Image);
     }
 
     /// Returns the aims at near-mirrors per steradian from `x` towards `m`, for one direction drawn
@@ -206,7 +210,7 @@ impl Walk<'_> {
         &self,
         rng: &mut Rng,
         v: &Vertex,
-        which: Lights,
+        which: LightVertexKind,
         count: u32,
         scratch: &mut Scratch,
         sink: &mut impl Sink,
@@ -222,19 +226,19 @@ impl Walk<'_> {
             ..
         } = scratch;
         let vertices = match which {
-            Lights::Beyond => caustics,
-            Lights::Contact => contacts,
+            LightVertexKind::Beyond => caustics,
+            LightVertexKind::Contact => contacts,
             _ => vertices,
         };
         let wanted = match which {
-            Lights::All => self.lights,
-            Lights::Glossy => self.lights && vertices.has_gloss(),
-            Lights::Beyond => !vertices.list.is_empty(),
-            Lights::Contact => {
+            LightVertexKind::All => self.lights,
+            LightVertexKind::Glossy => self.lights && vertices.has_gloss(),
+            LightVertexKind::Beyond => !vertices.list.is_empty(),
+            LightVertexKind::Contact => {
                 // Near vertices are reached by walks within the zones, and light paths continue via
                 // near-mirrors.
                 let theirs = |c: &Contacts| match h.surface.specular() {
-                    true => v.open() > h.surface.alpha(),
+                    true => v.open(&self.tuning.caustics) > h.surface.alpha(),
                     false => c.near(self.world, h),
                 };
                 !vertices.list.is_empty() && !self.contacts.is_some_and(theirs)
@@ -243,13 +247,13 @@ impl Walk<'_> {
         if !wanted {
             return;
         }
-        if which == Lights::Glossy {
+        if which == LightVertexKind::Glossy {
             vertices.glossy_weights(h, v.wo, lights);
         } else {
             vertices.weights(h, v.wo, (lights, plain));
         }
-        if which == Lights::Beyond && h.surface.specular() {
-            let below = caustics::pays_below(h.surface.alpha());
+        if which == LightVertexKind::Beyond && h.surface.specular() {
+            let below = self.tuning.caustics.pays_below(h.surface.alpha());
             for (w, y) in lights.iter_mut().zip(&vertices.list) {
                 *w = if y.alpha < below { *w } else { 0.0 };
             }
@@ -261,9 +265,9 @@ impl Walk<'_> {
             }
         }
         let way = match which {
-            Lights::All | Lights::Glossy => Way::Lit,
-            Lights::Beyond => Way::Beyond,
-            Lights::Contact => Way::Zone,
+            LightVertexKind::All | LightVertexKind::Glossy => Connection::Lit,
+            LightVertexKind::Beyond => Connection::Beyond,
+            LightVertexKind::Contact => Connection::Zone,
         };
         draw(lights, count, rng.uniform(), |i, value| {
             let y = &vertices.list[i];

@@ -5,7 +5,7 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Gate,
     light::{
-        caustics::Caustics, contacts::Contacts, emitters::Emitters, light_context::Surroundings,
+        caustics::Caustics, contacts::Contacts, emitters::Emitters, light_context::LightContext,
         mirror_images::Mirrors, reflectors::Reflectors,
     },
     paths::{
@@ -13,17 +13,19 @@ use crate::{
         vertex::Vertex,
     },
     scene::{hit::Hit, world::World},
+    tuning::Tuning,
 };
 
 /// The scene and the settings in which paths are traced.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Walk<'a> {
+pub(crate) struct Tracer<'a> {
     pub world: &'a World,
     pub emitters: &'a Emitters,
     pub mirrors: &'a Mirrors,
     pub gate: &'a Gate,
     /// Longest path in bounces.
     pub max_bounces: u32,
+    pub tuning: &'a Tuning,
     /// Whether walks connect to light vertices.
     pub lights: bool,
     /// Light paths via near-mirrors, if they pay off.
@@ -42,7 +44,7 @@ pub(crate) struct Walk<'a> {
 
 /// Kinds of light vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Lights {
+pub(crate) enum LightVertexKind {
     /// All vertices that spots light directly.
     All,
     /// Directly lit vertices on unshared conductors, for vertices that a tile's shared vertices
@@ -54,26 +56,20 @@ pub(crate) enum Lights {
     Contact,
 }
 
-/// The maximum number of spots that a camera vertex is connected to. This number and those below
-/// were chosen by error² × CPU time on the reference rooms, where the optimum is flat (2, 4 and 12
-/// spots: 7.2, 5.7 and 6.0 on room-diffuse). More connections from one vertex also correlate
-/// neighbouring bins of a pixel, so that errors of sums over bins exceed the estimate from the
-/// bins' own errors.
-pub(crate) const SPOTS: u32 = 4;
-
 /// Connects to every spot.
 pub(crate) const ALL: u32 = u32::MAX;
 
-impl Walk<'_> {
+impl Tracer<'_> {
     /// Returns the part of this walk's state that light paths are traced in.
     #[inline]
-    pub fn surroundings(&self) -> Surroundings<'_> {
-        Surroundings {
+    pub fn surroundings(&self) -> LightContext<'_> {
+        LightContext {
             world: self.world,
             emitters: self.emitters,
             mirrors: self.mirrors,
             gate: self.gate,
             max_bounces: self.max_bounces,
+            tuning: self.tuning,
         }
     }
 

@@ -9,26 +9,22 @@ use crate::{
     film::{blocks::Blocks, slots::Film},
     light::emitters::Emitters,
     numeric::rng::Rng,
-    paths::{scratch::Scratch, tracer::Walk},
+    paths::{scratch::Scratch, tracer::Tracer},
     scene::{
-        centres::Centres, hit::Hit, intersection::lift, lobes::Seen, segments::Segments,
+        centres::Centres, hit::Hit, intersection::lift, lobes::ShadingPoint, segments::Segments,
         world::World,
     },
+    tuning::TwoBounceTuning,
 };
-
-/// Exponent of the strata per side in the pixel width, for narrow pixels. 6×6 strata, versus 4×4,
-/// at 256×256 (8 to 24 passes): error² × CPU time 0.70 to 0.92 in furnished rooms of 1 to 25 spots,
-/// 1.05 with 100.
-const NARROW_PIXELS: f32 = 0.1;
 
 /// Returns the strata per side that go with 16 camera paths, for pixels of this width at unit
 /// distance: eight for a width of 1/32 (64 pixels over 90°). Wider pixels straddle more bins and
 /// get more strata, growing with the square root of the width. In narrower pixels a spot's light
 /// falls into one or two bins, which is no easier to sample, so they get nearly as many strata.
-fn strata(pixel: f32) -> f32 {
+fn strata(pixel: f32, narrow_pixels: f32) -> f32 {
     match pixel * 128.0 {
         wide if wide >= 4.0 => 4.0 * wide.sqrt(),
-        narrow => 8.0 * libm::powf(narrow / 4.0, NARROW_PIXELS),
+        narrow => 8.0 * libm::powf(narrow / 4.0, narrow_pixels),
     }
 }
 
@@ -37,15 +33,22 @@ fn strata(pixel: f32) -> f32 {
 pub(crate) struct Sampling {
     /// Strata per side in an ordinary pixel that go with 16 camera paths, before rounding.
     base: f32,
+    tuning: TwoBounceTuning,
     /// Row-major: the pixel or one of its neighbours shows a mirror or is in a mirror spot's beam.
     /// Decided from the centres alone, hence independent of the samples: no bias.
     pub refined: Vec<bool>,
 }
 
 impl Sampling {
-    pub fn plan(world: &World, emitters: &Emitters, centres: &Centres, stop: Stop) -> Self {
+    pub fn plan(
+        world: &World,
+        emitters: &Emitters,
+        centres: &Centres,
+        tuning: TwoBounceTuning,
+        stop: Stop,
+    ) -> Self {
         let i = world.camera.intrinsics;
-        let base = strata(world.sensitive / i.fx.min(i.fy));
+        let base = strata(world.sensitive / i.fx.min(i.fy), tuning.narrow_pixels);
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
                 h.surface.specular()
@@ -73,18 +76,25 @@ impl Sampling {
                 })
             })
             .collect();
-        Self { base, refined }
+        Self {
+            base,
+            tuning,
+            refined,
+        }
     }
 
     /// Returns the strata per side (even) in ordinary pixels and in those that may see a narrow
     /// lobe.
     ///
     /// They grow with the passes so that neither part of the histogram is much noisier than the
-    /// other. Below eight passes they are those of eight, because they cost little in comparison.
+    /// other. Few passes have those of [`TwoBounceTuning::least_passes`].
     /// `passes` = 0 is a render of two bounces only.
     pub fn sides(&self, passes: u32) -> (u32, u32) {
-        let passes = if passes == 0 { 64 } else { passes.max(8) };
-        let side = self.base * libm::powf(passes as f32 / 16.0, 0.4);
+        let passes = match passes {
+            0 => self.tuning.alone_passes,
+            _ => passes.max(self.tuning.least_passes),
+        };
+        let side = self.base * libm::powf(passes as f32 / 16.0, self.tuning.growth);
         let side = 2 * (0.5 * side).round().clamp(1.0, 16.0) as u32;
         (side, (4 * side).min(64))
     }
@@ -111,6 +121,15 @@ impl Sampling {
     }
 }
 
+/// A pixel and its sampling density.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PixelStrata {
+    pub row: u32,
+    pub col: u32,
+    /// Strata per side; even.
+    pub side: u32,
+}
+
 /// Buffers of one thread.
 #[derive(Debug, Default)]
 pub(crate) struct Strata {
@@ -128,18 +147,18 @@ pub(crate) struct Strata {
 }
 
 impl Strata {
-    /// Adds one pixel's two-bounce samples to `blocks` and returns the number of strata. `side` is
-    /// even.
+    /// Adds one pixel's two-bounce samples to `blocks` and returns the number of strata.
     pub fn sample_pixel(
         &mut self,
-        walk: &Walk,
+        tracer: &Tracer,
         film: &Film,
-        (row, col, side): (u32, u32, u32),
+        pixel: PixelStrata,
         rng: &mut Rng,
         scratch: &mut Scratch,
         blocks: &mut Blocks,
     ) -> u32 {
-        let (world, emitters) = (walk.world, walk.emitters);
+        let PixelStrata { row, col, side } = pixel;
+        let (world, emitters) = (tracer.world, tracer.emitters);
         let rays = emitters.rays.len();
         let spots = emitters.rays.iter().map(ExactSizeIterator::len).max();
         let (count, spots) = ((side * side) as usize, spots.unwrap_or(0));
@@ -178,15 +197,15 @@ impl Strata {
                 let own = ray(sample).clone();
                 // Light of the other rays does not count here.
                 all.fill(0.0);
-                let seen = (Seen::of(&h, -h.p / range), &h.surface);
+                let seen = (ShadingPoint::new(&h, -h.p / range), &h.surface);
                 emitters.weights_of(own.clone(), seen, &mut scratch.plain, all);
                 if h.through != 1.0 {
                     all.iter_mut().for_each(|w| *w *= h.through);
                 }
-                if let Some(contacts) = walk.contacts {
+                if let Some(contacts) = tracer.contacts {
                     contacts.leave_out_of_two(world, &h, all);
                 }
-                walk.keep_in_window(h.p, world.metres(range), all);
+                tracer.keep_in_window(h.p, world.metres(range), all);
                 for (out, w) in weights.iter_mut().zip(&all[own]) {
                     *out = w * rays as f32;
                 }
@@ -212,8 +231,8 @@ impl Strata {
                     if let (Some(h), Some(through)) = (&self.hits[sample], through) {
                         let leg = world.metres((e.p - h.p).length());
                         let slot = film.slot(e.path_m + leg + self.range_m[sample]);
-                        let at = sample * spots + k;
-                        self.found[at] = (slot as u32, self.weights[at] * through);
+                        let entry = sample * spots + k;
+                        self.found[entry] = (slot as u32, self.weights[entry] * through);
                     }
                 }
             }
@@ -247,17 +266,20 @@ impl Strata {
 mod tests {
     use crate::paths::two_bounce::Sampling;
     use crate::paths::two_bounce::strata;
+    use crate::tuning::TwoBounceTuning;
 
     #[test]
     fn wide_pixels_have_more_strata_and_narrow_ones_nearly_as_many() {
-        let of = |pixels: f32| strata(2.0 / pixels);
-        assert_eq!((of(16.0), of(64.0)), (16.0, 8.0));
+        let strata_of =
+            |pixels: f32| strata(2.0 / pixels, TwoBounceTuning::default().narrow_pixels);
+        assert_eq!((strata_of(16.0), strata_of(64.0)), (16.0, 8.0));
         // The two laws join without a step.
-        assert!((of(64.1) / 8.0 - 1.0).abs() < 1e-3);
-        let base = of(256.0);
+        assert!((strata_of(64.1) / 8.0 - 1.0).abs() < 1e-3);
+        let base = strata_of(256.0);
         let sides = |n| {
             Sampling {
                 base,
+                tuning: TwoBounceTuning::default(),
                 refined: vec![],
             }
             .sides(n)
@@ -270,6 +292,7 @@ mod tests {
     fn rounds_of_strata_weigh_as_much_as_they_know() {
         let sampling = Sampling {
             base: 4.0,
+            tuning: TwoBounceTuning::default(),
             refined: vec![],
         };
         let one = sampling.joined(0.0, 64);

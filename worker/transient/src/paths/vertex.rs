@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::{light::caustics, scene::hit::Hit};
+use crate::{scene::hit::Hit, tuning::CausticTuning};
 
 /// A vertex of a path from the camera.
 #[derive(Debug, Clone, Copy)]
@@ -55,7 +55,7 @@ impl Vertex {
     /// vertex outside near-mirrors. On a vertex that the camera sees only in near-mirrors, the
     /// light paths end that pay off there.
     #[inline]
-    pub fn open(&self) -> f32 {
+    pub fn open(&self, tuning: &CausticTuning) -> f32 {
         let Sight {
             before,
             by_mirrors,
@@ -66,7 +66,7 @@ impl Vertex {
         } else if before == f32::INFINITY {
             before
         } else if by_mirrors {
-            caustics::pays_below(before)
+            tuning.pays_below(before)
         } else {
             open_before
         }
@@ -74,7 +74,7 @@ impl Vertex {
 
     /// Returns how the camera sees the next vertex.
     #[inline]
-    pub fn next(&self) -> Sight {
+    pub fn next(&self, tuning: &CausticTuning) -> Sight {
         let specular = self.hit.surface.specular();
         Sight {
             before: match specular {
@@ -82,7 +82,7 @@ impl Vertex {
                 false => f32::INFINITY,
             },
             by_mirrors: self.sight.by_mirrors && specular,
-            open_before: self.open(),
+            open_before: self.open(tuning),
         }
     }
 }

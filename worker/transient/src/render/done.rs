@@ -2,18 +2,18 @@
 
 use crate::{
     api::Overflow,
-    film::slots::Film,
+    film::{region::Region, slots::Film},
     render::{
         draws::{Draw, Watched},
-        pooling::{MULTI_REACH, Pool, pool, shut_out},
-        region::Region,
+        pooling::{Pool, pool, shut_out},
         spread::Spread,
     },
+    tuning::ErrorTuning,
 };
 
 /// A finished tile, in render units.
 #[derive(Debug, Default)]
-pub(crate) struct Done {
+pub(crate) struct TileSums {
     /// Σ over passes of the 3+ part, slots by pixel.
     pub sum: Vec<f32>,
     /// Σ over passes of the square of the 3+ part, channel 0.
@@ -71,7 +71,7 @@ pub(crate) fn inside(film: &Film, slots: &[f32]) -> f64 {
     slots[1..film.slots - 1].iter().map(|&v| f64::from(v)).sum()
 }
 
-impl Done {
+impl TileSums {
     pub fn reset(&mut self, film: &Film, region: &Region, split: bool) {
         let pixels = region.pixels();
         let zero = |v: &mut Vec<f32>, n: usize| {
@@ -101,9 +101,9 @@ impl Done {
 
     /// Returns the sum of the two-bounce and 3+ means of any channel's slot of pixel `k`.
     pub fn value(&self, film: &Film, k: usize, channel: usize, slot: usize) -> f64 {
-        let at = k * film.pixel() + channel * film.slots + slot;
+        let index = k * film.pixel() + channel * film.slots + slot;
         let n = f64::from(self.passes.max(1));
-        f64::from(self.two[at]) + f64::from(self.sum[at]) / n
+        f64::from(self.two[index]) + f64::from(self.sum[index]) / n
     }
 
     /// Returns the means and variances of a slot of pixel `k`, channel 0.
@@ -133,7 +133,7 @@ impl Done {
     }
 
     /// Updates the variances to the completed passes.
-    pub fn estimate(&mut self, film: &Film, region: &Region) {
+    pub fn estimate(&mut self, film: &Film, region: &Region, tuning: &ErrorTuning) {
         let n = f64::from(self.passes);
         self.multi_variance.clear();
         for (sum, square) in self
@@ -155,7 +155,14 @@ impl Done {
             out.1 = inside(film, v);
         }
         let (variance, pooling) = (&mut self.multi_variance, &mut self.pooling);
-        pool(variance, region, film.slots, MULTI_REACH, pooling);
+        pool(
+            variance,
+            region,
+            film.slots,
+            tuning.multi_reach,
+            tuning,
+            pooling,
+        );
     }
 
     /// Returns Σ over the gate's slots of both parts' variances in pixel `k`.
@@ -183,7 +190,10 @@ impl Done {
     /// vertices have correlated errors, so this is not the sum of their spreads.
     pub fn multi_energy(&self) -> (f64, Spread) {
         let n = f64::from(self.passes.max(1));
-        (self.all.iter().sum::<f64>() / n, Spread::of(&self.all))
+        (
+            self.all.iter().sum::<f64>() / n,
+            Spread::from_passes(&self.all),
+        )
     }
 
     /// Returns the variance of the tile's energy of two bounces.
@@ -213,7 +223,7 @@ impl Done {
 
     /// Returns the 3+ mean of any channel's slot of pixel `k`.
     pub fn multi(&self, film: &Film, k: usize, channel: usize, slot: usize) -> f64 {
-        let at = k * film.pixel() + channel * film.slots + slot;
-        f64::from(self.sum[at]) / f64::from(self.passes.max(1))
+        let index = k * film.pixel() + channel * film.slots + slot;
+        f64::from(self.sum[index]) / f64::from(self.passes.max(1))
     }
 }

@@ -7,7 +7,7 @@
 //! of these sums are draws of the pixel's error, with all correlations between its bins, and the
 //! median over pixels is taken of them.
 
-use crate::render::{region::Region, stat::Stat};
+use crate::{film::region::Region, render::stat::Stat};
 
 /// The number of sums, each over every eighth pass, and of their independent differences.
 const PHASES: usize = 8;
@@ -34,7 +34,7 @@ pub(crate) struct Phases {
 
 impl Phases {
     /// Returns the weights for this number of passes, or `None` if a phase has no pass.
-    pub fn of(passes: u32) -> Option<Self> {
+    pub fn new(passes: u32) -> Option<Self> {
         if !are_drawn(passes) {
             return None;
         }
@@ -167,7 +167,7 @@ impl Watched {
     /// fewer than eight passes, each draw is the variance `multi_variance` of the pixel of the
     /// region.
     pub fn draws(&self, passes: u32, multi_variance: impl Fn(usize) -> f64) -> Vec<Draw> {
-        let phases = Phases::of(passes);
+        let phases = Phases::new(passes);
         let pixels = self.pixels.iter().enumerate();
         let each = pixels.map(|(place, &k)| {
             let Some(phases) = &phases else {
@@ -203,11 +203,11 @@ pub(crate) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
         let variance = stat.two_variance + stat.multi_variance;
         if let Some(error) = stat.error() {
             stated.push(error);
-            let of = |square: &f64| match variance > 0.0 {
+            let relative = |square: &f64| match variance > 0.0 {
                 true => error * (square / variance).sqrt(),
                 false => 0.0,
             };
-            drawn.extend(draw.iter().map(of));
+            drawn.extend(draw.iter().map(relative));
         }
     }
     let quantile = |list: &mut Vec<f64>| {
@@ -225,13 +225,13 @@ pub(crate) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use crate::film::region::Region;
     use crate::numeric::rng::Rng;
     use crate::numeric::rng::Stream;
     use crate::render::draws::Draw;
     use crate::render::draws::Watched;
     use crate::render::draws::count;
     use crate::render::draws::likely;
-    use crate::render::region::Region;
     use crate::render::stat::Stat;
 
     const SLOTS: usize = 42;
@@ -259,9 +259,9 @@ mod tests {
             }
             let n = f64::from(passes);
             let of_slot = |slot: usize| {
-                let at = || all.iter().map(|v| f64::from(v[slot]));
-                let mean = at().sum::<f64>() / n;
-                at().map(|x| (x - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))
+                let at_slot = || all.iter().map(|v| f64::from(v[slot]));
+                let mean = at_slot().sum::<f64>() / n;
+                at_slot().map(|x| (x - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))
             };
             variances.push((1..SLOTS - 1).map(of_slot).sum());
         }
@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn which_pixels_are_watched_does_not_depend_on_the_tile() {
-        let of = |rows: u32, cols: u32| {
+        let count_of = |rows: u32, cols: u32| {
             let part = |row, col| Region {
                 row,
                 col,
@@ -338,6 +338,9 @@ mod tests {
                 .map(|(r, c)| count(&part(r * rows, c * cols)))
                 .sum::<usize>()
         };
-        assert_eq!((of(36, 36), of(4, 6), of(1, 1)), (144, 144, 144));
+        assert_eq!(
+            (count_of(36, 36), count_of(4, 6), count_of(1, 1)),
+            (144, 144, 144)
+        );
     }
 }

@@ -11,22 +11,13 @@ use crate::{
         image::Image,
         prepare::prepare,
         ready::Ready,
-        rounds::{FIRST_PASSES, MAX_PASSES, Round},
+        rounds::{MAX_PASSES, Round},
         sources::Sources,
         splats::Splats,
-        watch::Watch,
+        watch::RoundProgress,
     },
+    tuning::{ErrorTuning, Tuning},
 };
-
-/// Fraction of the progress that the first round counts for.
-const FIRST_SHARE: f32 = 0.3;
-
-/// The maximum length of a round of a time-bound render, in multiples of all rounds before it,
-/// because each round predicts the time of the next.
-const GROWTH: u32 = 3;
-
-/// Fraction of the remaining time that a round is planned for.
-const TIMED: f64 = 0.85;
 
 /// Renders a scene. Runs on the caller's rayon pool. The result is bit-identical for any number of
 /// threads, and on any machine.
@@ -34,12 +25,67 @@ const TIMED: f64 = 0.85;
 /// # Errors
 /// Returns [`RenderError::Scene`] or [`RenderError::Invalid`] naming the invalid input, and
 /// [`RenderError::Stopped`] if `progress` requests a stop.
+///
+/// # Examples
+/// ```
+/// # use picofarm_scene::primitive::{PrimitiveSettings, generate};
+/// # use picofarm_transient::*;
+/// # struct Quiet;
+/// # impl Progress for Quiet {
+/// #     fn at(&self, _: f32) -> bool {
+/// #         true
+/// #     }
+/// # }
+/// # let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// # let scene = generate(3, &room)?;
+/// # let gate = Gate { start_m: 0.0, bin_width_m: 0.5, bins: 64 };
+/// // Equal inputs give equal bits.
+/// let settings = Settings::new(gate, Budget::Samples(2));
+/// let first = render(&scene, &settings, &Quiet)?;
+/// assert_eq!(first.transient, render(&scene, &settings, &Quiet)?.transient);
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
 pub fn render(
     scene: &Scene,
     settings: &Settings,
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
-    prepare(scene, settings, Stop(progress), |ready| {
+    render_tuned(scene, settings, &Tuning::default(), progress)
+}
+
+/// Renders like [`render`], with other numbers for the techniques. The result has other noise, and
+/// is no result of [`RENDERER_VERSION`](crate::RENDERER_VERSION).
+///
+/// # Errors
+/// Returns the errors of [`render`].
+///
+/// # Examples
+/// ```
+/// # use picofarm_scene::primitive::{PrimitiveSettings, generate};
+/// # use picofarm_transient::*;
+/// # struct Quiet;
+/// # impl Progress for Quiet {
+/// #     fn at(&self, _: f32) -> bool {
+/// #         true
+/// #     }
+/// # }
+/// # let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// # let scene = generate(3, &room)?;
+/// # let gate = Gate { start_m: 0.0, bin_width_m: 0.5, bins: 64 };
+/// let settings = Settings::new(gate, Budget::Samples(2));
+/// let mut tuning = Tuning::default();
+/// tuning.walk.spots = 8;
+/// let rendered = render_tuned(&scene, &settings, &tuning, &Quiet)?;
+/// assert_ne!(rendered.transient, render(&scene, &settings, &Quiet)?.transient);
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
+pub fn render_tuned(
+    scene: &Scene,
+    settings: &Settings,
+    tuning: &Tuning,
+    progress: &dyn Progress,
+) -> Result<Rendered, RenderError> {
+    prepare(scene, settings, tuning, Stop(progress), |ready| {
         whole(ready, None, progress)
     })
 }
@@ -55,15 +101,39 @@ pub fn render(
 ///
 /// # Errors
 /// Returns the errors of [`render`].
+///
+/// # Examples
+/// ```
+/// # use picofarm_scene::primitive::{PrimitiveSettings, generate};
+/// # use picofarm_transient::*;
+/// # struct Quiet;
+/// # impl Progress for Quiet {
+/// #     fn at(&self, _: f32) -> bool {
+/// #         true
+/// #     }
+/// # }
+/// # let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// # let scene = generate(3, &room)?;
+/// # let gate = Gate { start_m: 0.0, bin_width_m: 0.5, bins: 64 };
+/// // No time is left after the first round, so only that one is made.
+/// let settings = Settings::new(gate, Budget::Error(0.001));
+/// let rendered = render_within(&scene, &settings, &|| 0.0, &Quiet)?;
+/// assert_eq!(rendered.error.samples, 2);
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
 pub fn render_within(
     scene: &Scene,
     settings: &Settings,
     left: &dyn Fn() -> f64,
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
-    prepare(scene, settings, Stop(progress), |ready| {
-        whole(ready, Some(left), progress)
-    })
+    prepare(
+        scene,
+        settings,
+        &Tuning::default(),
+        Stop(progress),
+        |ready| whole(ready, Some(left), progress),
+    )
 }
 
 /// Forecasts a [`render`] from a few small tiles of the image instead of all of it. Runs on the
@@ -71,16 +141,41 @@ pub fn render_within(
 ///
 /// # Errors
 /// Returns the errors of [`render`].
+///
+/// # Examples
+/// ```
+/// # use picofarm_scene::primitive::{PrimitiveSettings, generate};
+/// # use picofarm_transient::*;
+/// # struct Quiet;
+/// # impl Progress for Quiet {
+/// #     fn at(&self, _: f32) -> bool {
+/// #         true
+/// #     }
+/// # }
+/// # let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// # let scene = generate(3, &room)?;
+/// # let gate = Gate { start_m: 0.0, bin_width_m: 0.5, bins: 64 };
+/// let forecast = plan(&scene, &Settings::new(gate, Budget::Samples(4)))?;
+/// assert_eq!(forecast.passes, 4);
+/// assert!(!forecast.plan.strategies.is_empty());
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
 pub fn plan(scene: &Scene, settings: &Settings) -> Result<Forecast, RenderError> {
-    prepare(scene, settings, Stop(&Unstopped), |ready| {
-        let plan = ready.plan(ready.first_passes());
-        let rays = ready.seen_rays();
-        let forecast = forecast::forecast(&ready.frame, &settings.budget, plan, rays)?;
-        Ok(Forecast {
-            warnings: ready.foreseen(),
-            ..forecast
-        })
-    })
+    prepare(
+        scene,
+        settings,
+        &Tuning::default(),
+        Stop(&Unstopped),
+        |ready| {
+            let plan = ready.plan(ready.first_passes());
+            let rays = ready.seen_rays();
+            let forecast = forecast::forecast(&ready.frame, &settings.budget, plan, rays)?;
+            Ok(Forecast {
+                warnings: ready.foreseen(),
+                ..forecast
+            })
+        },
+    )
 }
 
 fn whole(
@@ -89,13 +184,14 @@ fn whole(
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
     let (frame, stop) = (&ready.frame, Stop(progress));
+    let tuning = &frame.tuning().rounds;
     // Allocated before anything that takes long, so that a lack of memory is reported at once.
     let mut image = Image::new(frame)?;
-    let mut splats = Sources::of(frame).map(|sources| (sources, Splats::new(frame)));
+    let mut splats = Sources::new(frame).map(|sources| (sources, Splats::new(frame)));
     let seen = ready.seen(stop)?;
     let walks = ready.walks();
     let passes = match left {
-        Some(_) => ready.first_passes().min(FIRST_PASSES),
+        Some(_) => ready.first_passes().min(tuning.first_passes),
         None => ready.first_passes(),
     };
     let budget = ready.settings.budget;
@@ -107,11 +203,11 @@ fn whole(
     let error = loop {
         let began = left.map(|left| left());
         let until = match budget {
-            _ if left.is_some() && walks && done == 0.0 => FIRST_SHARE,
-            Budget::Error(_) if walks && done == 0.0 => FIRST_SHARE,
+            _ if left.is_some() && walks && done == 0.0 => tuning.first_share,
+            Budget::Error(_) if walks && done == 0.0 => tuning.first_share,
             _ => 1.0,
         };
-        let watch = Watch::new(progress, done, until);
+        let watch = RoundProgress::new(progress, done, until);
         rays += image.round(frame, 0..image.tiles(), wave, &watch)?;
         done = until;
         let errors = match &mut splats {
@@ -139,8 +235,8 @@ fn whole(
                 Budget::Error(_) => MAX_PASSES - spent,
                 Budget::Samples(n) => n - spent,
             };
-            let next = in_time((began, left()), wave.passes);
-            let next = next.min(GROWTH * spent).min(most);
+            let next = in_time((began, left()), wave.passes, tuning.timed);
+            let next = next.min(tuning.growth * spent).min(most);
             if next == 0 {
                 break error;
             }
@@ -156,7 +252,13 @@ fn whole(
         };
         let target = target as f32;
         let strata_cost = |n| image.strata_cost(frame.sampling, n);
-        wave = further(&errors, (frame.sampling, &strata_cost), target, stop)?;
+        wave = further(
+            &errors,
+            (frame.sampling, &strata_cost),
+            target,
+            &frame.tuning().error,
+            stop,
+        )?;
     };
     let plan = ready.plan(passes);
     let splats = splats.map(|(_, splats)| splats);
@@ -165,10 +267,10 @@ fn whole(
 
 /// Returns the passes that fit into the remaining time, if `round` passes took it from `began` to
 /// `left`.
-fn in_time((began, left): (f64, f64), round: u32) -> u32 {
+fn in_time((began, left): (f64, f64), round: u32, timed: f64) -> u32 {
     let each = (began - left).max(1e-6) / f64::from(round.max(1));
     // The cast saturates.
-    (TIMED * left / each) as u32
+    (timed * left / each) as u32
 }
 
 /// Returns the round that the median error of the image needs to reach `target`: passes, and a new
@@ -180,6 +282,7 @@ fn further(
     errors: &Errors,
     (sampling, strata_cost): (&Sampling, &dyn Fn(u32) -> u32),
     target: f32,
+    tuning: &ErrorTuning,
     stop: Stop,
 ) -> Result<Round, RenderError> {
     let spent = errors.samples;
@@ -192,7 +295,7 @@ fn further(
             false => sampling.joined(errors.two_unit, n - spent),
         };
         let range = ((spent + 1).min(MAX_PASSES), MAX_PASSES);
-        passes_for(&errors.stats, spent, target, range, unit) - spent
+        passes_for(&errors.stats, spent, target, range, unit, tuning) - spent
     };
     let (alone, again) = (passes(false), passes(true));
     stop.check()?;

@@ -7,15 +7,8 @@ use crate::{
         spread::Spread,
         stat::{Stat, quantile, relative_median, sorted},
     },
+    tuning::ErrorTuning,
 };
-
-/// The exponent with which error² × passes of the 3+ part rises with the passes in the median over
-/// pixels, stated or true. After few passes, most pixels have not yet received rare bright paths.
-/// From 4 to 64 passes the exponent was 0.08 to 0.16 in rooms of 1 to 100 spots. The rise is
-/// extrapolated up to `RISES` times the passes: with 4 times, one class of rooms ended at 8.5 %
-/// with a target of 10 %; without a bound, at 7.4 %.
-const RISE: f64 = 0.13;
-const RISES: f64 = 2.0;
 
 /// The errors of a whole image.
 #[derive(Debug, Clone)]
@@ -59,9 +52,15 @@ impl Errors {
 }
 
 /// Returns the median standard error after `n` passes, for pixels with sums `stats` after `passes`.
-pub(crate) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u32) -> f64) -> f64 {
+pub(crate) fn median_after(
+    stats: &[Stat],
+    passes: u32,
+    n: u32,
+    two: &impl Fn(u32) -> f64,
+    tuning: &ErrorTuning,
+) -> f64 {
     let more = f64::from(n) / f64::from(passes);
-    let scale = libm::pow(more.min(RISES), RISE) / more;
+    let scale = libm::pow(more.min(tuning.most_rise), tuning.rise) / more;
     let then = stats.iter().map(|s| {
         // The result of `sorted` after n passes: the present variance is subtracted from the
         // measured norm.
@@ -88,8 +87,9 @@ pub(crate) fn passes_for(
     target: f32,
     (least, most): (u32, u32),
     two: impl Fn(u32) -> f64,
+    tuning: &ErrorTuning,
 ) -> u32 {
-    let enough = |n| median_after(stats, passes, n, &two) <= f64::from(target);
+    let enough = |n| median_after(stats, passes, n, &two, tuning) <= f64::from(target);
     let (mut below, mut n) = (least, least);
     while n < most && !enough(n) {
         below = n + 1;
@@ -109,23 +109,22 @@ pub(crate) fn passes_for(
 mod tests {
     use proptest::prelude::*;
 
+    use crate::film::region::Region;
     use crate::render::error::median_after;
     use crate::render::error::passes_for;
-    use crate::render::pooling::FLOOR;
-    use crate::render::pooling::OWN;
     use crate::render::pooling::Pool;
     use crate::render::pooling::pool;
-    use crate::render::region::Region;
     use crate::render::stat::Stat;
+    use crate::tuning::ErrorTuning;
 
     /// The definition, one bin at a time.
-    fn plain(v: &[f32], (rows, cols, slots): (usize, usize, usize), reach: usize) -> Vec<f32> {
+    fn plain(v: &[f32], rows: usize, cols: usize, slots: usize, reach: usize) -> Vec<f32> {
         let near =
             |k: usize, n: usize, reach: usize| k.saturating_sub(reach)..(k + reach + 1).min(n);
         let mean = |all: Vec<f32>| all.iter().sum::<f32>() / all.len() as f32;
         let bins = |row: usize, col: usize, slot: usize| {
             let pixel = &v[(row * cols + col) * slots..][..slots];
-            let floor = FLOOR * pixel.iter().sum::<f32>() / slots as f32;
+            let floor = ErrorTuning::default().floor * pixel.iter().sum::<f32>() / slots as f32;
             mean(pixel[near(slot, slots, reach)].to_vec()) + floor
         };
         let along_rows = |row: usize, col: usize, slot: usize| {
@@ -138,7 +137,7 @@ mod tests {
                     .map(|r| along_rows(r, col, slot))
                     .collect(),
             );
-            pooled + OWN * (v[k] - pooled)
+            pooled + ErrorTuning::default().own * (v[k] - pooled)
         });
         each.collect()
     }
@@ -157,9 +156,10 @@ mod tests {
             };
             let stats: Vec<Stat> = pixels.iter().map(stat).collect();
             let two = |n: u32| f64::from(n).powf(-1.2);
+            let tuning = ErrorTuning::default();
             let least = passes + 1;
-            let n = passes_for(&stats, passes, target, (least, 1 << 16), two);
-            let after = |n| median_after(&stats, passes, n, &two);
+            let n = passes_for(&stats, passes, target, (least, 1 << 16), two, &tuning);
+            let after = |n| median_after(&stats, passes, n, &two, &tuning);
             let target = f64::from(target);
             prop_assert!(after(n) <= target || n == 1 << 16);
             prop_assert!(n == least || after(n - 1) > target);
@@ -174,8 +174,9 @@ mod tests {
             let region = Region { row: 0, col: 0, rows: rows as u32, cols: cols as u32 };
             let before = &values[..rows * cols * slots];
             let mut after = before.to_vec();
-            pool(&mut after, &region, slots, reach, &mut Pool::default());
-            let expected = plain(before, (rows, cols, slots), reach);
+            let tuning = ErrorTuning::default();
+            pool(&mut after, &region, slots, reach, &tuning, &mut Pool::default());
+            let expected = plain(before, rows, cols, slots, reach);
             for (a, b) in after.iter().zip(&expected) {
                 prop_assert!((a - b).abs() < 1e-6, "{a} instead of {b}");
             }

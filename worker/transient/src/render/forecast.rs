@@ -7,27 +7,21 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     api::{Budget, Plan, RenderError, Stop, Unstopped},
-    film::{slots::Film, splat::Splat},
+    film::{pass_fraction::PassFraction, region::Region, slots::Film, splat::Splat},
     render::{
-        done::Done,
+        done::TileSums,
         draws::{Draw, joined, likely},
         error::{median_after, passes_for},
         frame::{Frame, unit},
         image::tile_side,
         layer::Layer,
-        region::Region,
-        rounds::{FIRST_PASSES, MAX_PASSES, TWO_PASSES},
+        rounds::MAX_PASSES,
         sources::Sources,
         stat::{Stat, relative_median},
-        thin::Thin,
-        tile::{Order, TileRenderer},
-        watch::Watch,
+        tile::{PassRange, TileRenderer},
+        watch::RoundProgress,
     },
 };
-
-/// The number of sampled tiles along each side of the image, and their passes.
-const TILES: u32 = 3;
-const PASSES: u32 = 8;
 
 /// The forecast of a render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -55,12 +49,12 @@ pub(crate) fn forecast(
     plan: Plan,
     rays: u64,
 ) -> Result<Forecast, RenderError> {
-    let walks = frame.walk.max_bounces >= 3 && !frame.walk.emitters.list.is_empty();
+    let walks = frame.tracer.max_bounces >= 3 && !frame.tracer.emitters.list.is_empty();
     let side = |n: u32| f64::from(frame.sampling.sides(n).0);
     let all = f64::from(frame.width) * f64::from(frame.height);
     if !walks {
         let mut found = look(frame, 0);
-        let drawn_rays = drawn(frame, &mut found, TWO_PASSES)?;
+        let drawn_rays = drawn(frame, &mut found, frame.tuning().rounds.alone_passes)?;
         let rays = rays + (found.rays * all) as u64;
         return Ok(Forecast {
             plan,
@@ -70,28 +64,60 @@ pub(crate) fn forecast(
                 let likely = likely(&stats, &found.draws(), 0.5);
                 (likely * relative_median(stats.into_iter())) as f32
             },
-            rays: rays + drawn_rays * u64::from(TWO_PASSES),
+            rays: rays + drawn_rays * u64::from(frame.tuning().rounds.alone_passes),
             warnings: vec![],
         });
     }
-    let (one, mut found) = (look(frame, 1), look(frame, PASSES));
-    let drawn_rays = drawn(frame, &mut found, PASSES)?;
+    let (one, mut found) = (
+        look(frame, 1),
+        look(frame, frame.tuning().rounds.forecast_passes),
+    );
+    let drawn_rays = drawn(frame, &mut found, frame.tuning().rounds.forecast_passes)?;
+    let error_tuning = &frame.tuning().error;
     let two = |n: u32| frame.sampling.variance(n);
     let stats = found.stats();
     let likely = likely(&stats, &found.draws(), 0.5);
     let (passes, error) = match *budget {
-        Budget::Samples(n) => (n, median_after(&stats, PASSES, n, &two)),
+        Budget::Samples(n) => (
+            n,
+            median_after(
+                &stats,
+                frame.tuning().rounds.forecast_passes,
+                n,
+                &two,
+                error_tuning,
+            ),
+        ),
         Budget::Error(target) => {
             let target = (target / likely) as f32;
-            let range = (FIRST_PASSES, MAX_PASSES);
-            let n = passes_for(&stats, PASSES, target, range, two);
-            (n, median_after(&stats, PASSES, n, &two))
+            let range = (frame.tuning().rounds.first_passes, MAX_PASSES);
+            let n = passes_for(
+                &stats,
+                frame.tuning().rounds.forecast_passes,
+                target,
+                range,
+                two,
+                error_tuning,
+            );
+            (
+                n,
+                median_after(
+                    &stats,
+                    frame.tuning().rounds.forecast_passes,
+                    n,
+                    &two,
+                    error_tuning,
+                ),
+            )
         }
     };
     // Rays of a pixel: two bounces take a constant times side², and all passes take the same
     // number.
-    let (s1, s8) = (side(1).powi(2), side(PASSES).powi(2));
-    let eight = f64::from(PASSES);
+    let (s1, s8) = (
+        side(1).powi(2),
+        side(frame.tuning().rounds.forecast_passes).powi(2),
+    );
+    let eight = f64::from(frame.tuning().rounds.forecast_passes);
     let of_two = ((eight * one.rays - found.rays) / (eight * s1 - s8)).clamp(0.0, found.rays / s8);
     let of_pass = (found.rays - of_two * s8) / eight;
     let of_pixel = of_two * side(passes).powi(2) + of_pass * f64::from(passes);
@@ -106,15 +132,15 @@ pub(crate) fn forecast(
 }
 
 /// The results of the sampled tiles.
-struct Found {
+struct SampledTiles {
     pub regions: Vec<Region>,
-    pub tiles: Vec<Looked>,
+    pub tiles: Vec<SampledTile>,
     /// Rays of one pixel.
     pub rays: f64,
 }
 
 /// The result of one tile.
-struct Looked {
+struct SampledTile {
     /// h by pixel and bin.
     light: Vec<f32>,
     stats: Vec<Stat>,
@@ -123,7 +149,7 @@ struct Looked {
     rays: u64,
 }
 
-impl Found {
+impl SampledTiles {
     pub fn stats(&self) -> Vec<Stat> {
         self.tiles.iter().flat_map(|t| &t.stats).copied().collect()
     }
@@ -146,7 +172,7 @@ pub(crate) fn regions(frame: &Frame) -> Vec<Region> {
     let widest = tile_side(frame);
     let starts = |length: u32| -> Vec<u32> {
         let side = widest.min(length);
-        let count = TILES.min(length / side);
+        let count = frame.tuning().rounds.forecast_tiles.min(length / side);
         let middle = |i| length * (2 * i + 1) / (2 * count);
         (0..count)
             .map(|i| middle(i).saturating_sub(side / 2).min(length - side))
@@ -166,17 +192,17 @@ pub(crate) fn regions(frame: &Frame) -> Vec<Region> {
         .collect()
 }
 
-fn look(frame: &Frame, passes: u32) -> Found {
+fn look(frame: &Frame, passes: u32) -> SampledTiles {
     let regions = regions(frame);
     let pixels: usize = regions.iter().map(Region::pixels).sum();
     // Passes from the far end of the range, because with the render's own passes the result would
     // not be a forecast.
-    let order = Order {
-        first: u32::MAX - PASSES,
+    let order = PassRange {
+        first: u32::MAX - frame.tuning().rounds.forecast_passes,
         count: passes,
         two: true,
     };
-    let found: Vec<Looked> = regions
+    let found: Vec<SampledTile> = regions
         .par_iter()
         .map_init(
             || TileRenderer::new(frame),
@@ -197,7 +223,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
                 let of_two = renderer.done.two_draws();
                 let draws = renderer.done.draws().into_iter().zip(of_two);
                 let draws = draws.map(|(draw, of_two)| joined(draw, of_two));
-                Looked {
+                SampledTile {
                     light: light.collect(),
                     stats: stats.collect(),
                     draws: pixels.zip(draws).collect(),
@@ -207,7 +233,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
         )
         .collect();
     let rays = found.iter().map(|f| f.rays).sum::<u64>() as f64 / pixels as f64;
-    Found {
+    SampledTiles {
         regions,
         tiles: found,
         rays,
@@ -217,24 +243,27 @@ fn look(frame: &Frame, passes: u32) -> Found {
 /// Adds the light drawn into the image, scaled to its state after `after` passes. Returns the rays
 /// of one pass. Light paths cross tiles, so the sampled tiles receive as little of them as all
 /// others. Therefore fewer light paths are traced than in a pass, and their variance is scaled.
-fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderError> {
-    let Some(sources) = Sources::of(frame) else {
+fn drawn(frame: &Frame, found: &mut SampledTiles, after: u32) -> Result<u64, RenderError> {
+    let Some(sources) = Sources::new(frame) else {
         return Ok(0);
     };
-    let Found { regions, tiles, .. } = found;
+    let SampledTiles { regions, tiles, .. } = found;
     let pixels: usize = regions.iter().map(Region::pixels).sum();
     let whole = frame.width as usize * frame.height as usize;
-    let thin = Thin {
-        of: (whole / pixels.max(1)).max(1) as u32,
+    let thin = PassFraction {
+        one_in: (whole / pixels.max(1)).max(1) as u32,
         regions,
     };
-    let watch = Watch::new(&Unstopped, 0.0, 1.0);
+    let watch = RoundProgress::new(&Unstopped, 0.0, 1.0);
     // The contributions of camera paths alone, and those of fewer light paths.
     let mut layers = [Layer::new(frame), Layer::new(frame)];
     let mut rays = 0;
-    for pass in 0..PASSES {
-        let of = (u32::MAX - PASSES + pass, &watch);
-        let (mut splats, traced) = sources.pass(frame, of, thin);
+    for pass in 0..frame.tuning().rounds.forecast_passes {
+        let number = (
+            u32::MAX - frame.tuning().rounds.forecast_passes + pass,
+            &watch,
+        );
+        let (mut splats, traced) = sources.pass(frame, number, thin);
         rays += traced;
         splats.sort_by_key(|s| (s.technique.is_of_light_paths(), s.pixel, s.slot));
         let kind = |s: &Splat| usize::from(s.technique.is_of_light_paths());
@@ -244,35 +273,41 @@ fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderErro
     }
     let places = places(frame, regions);
     let (bins, unit) = (frame.film.slots - 2, unit(frame));
-    for (layer, of) in layers.iter_mut().zip([1, thin.of]) {
+    for (layer, one_in) in layers.iter_mut().zip([1, thin.one_in]) {
         // Scales the variance of these passes to that after `after` passes.
-        let less = f64::from(PASSES) / f64::from(of) / f64::from(after);
+        let less =
+            f64::from(frame.tuning().rounds.forecast_passes) / f64::from(one_in) / f64::from(after);
         layer.settle(frame)?;
-        layer.each(frame, PASSES, Stop(&Unstopped), |pixel, of| {
-            let Some(&(tile, k)) = places.get(&pixel) else {
-                return;
-            };
-            let tile = &mut tiles[tile];
-            let stat = &mut tile.stats[k];
-            for (bin, mean, _) in of.light() {
-                let (h, mean) = (&mut tile.light[k * bins + bin], mean / unit);
-                stat.norm2 += mean * (mean + 2.0 * f64::from(*h));
-                stat.total += mean;
-                *h += mean as f32;
-            }
-            let scale = 1.0 / (unit * unit);
-            let variance = of.pixel_variance() * scale;
-            stat.norm2 -= (1.0 - less) * variance;
-            stat.multi_variance += less * variance;
-            let draw = tile.draws.iter_mut().find(|(of, _)| *of == k);
-            if let (Some(own), Some((_, draw))) = (of.draw(), draw) {
-                for (square, of_layer) in draw.iter_mut().zip(own) {
-                    *square += less * of_layer * scale;
+        layer.each(
+            frame,
+            frame.tuning().rounds.forecast_passes,
+            Stop(&Unstopped),
+            |pixel, found| {
+                let Some(&(tile, k)) = places.get(&pixel) else {
+                    return;
+                };
+                let tile = &mut tiles[tile];
+                let stat = &mut tile.stats[k];
+                for (bin, mean, _) in found.light() {
+                    let (h, mean) = (&mut tile.light[k * bins + bin], mean / unit);
+                    stat.norm2 += mean * (mean + 2.0 * f64::from(*h));
+                    stat.total += mean;
+                    *h += mean as f32;
                 }
-            }
-        })?;
+                let scale = 1.0 / (unit * unit);
+                let variance = found.pixel_variance() * scale;
+                stat.norm2 -= (1.0 - less) * variance;
+                stat.multi_variance += less * variance;
+                let draw = tile.draws.iter_mut().find(|(pixel, _)| *pixel == k);
+                if let (Some(own), Some((_, draw))) = (found.draw(), draw) {
+                    for (square, of_layer) in draw.iter_mut().zip(own) {
+                        *square += less * of_layer * scale;
+                    }
+                }
+            },
+        )?;
     }
-    Ok(rays * u64::from(thin.of) / u64::from(PASSES))
+    Ok(rays * u64::from(thin.one_in) / u64::from(frame.tuning().rounds.forecast_passes))
 }
 
 /// Returns the tile and the pixel of the tile, by pixel of the image.
@@ -287,7 +322,7 @@ pub(crate) fn places(frame: &Frame, regions: &[Region]) -> HashMap<usize, (usize
 }
 
 /// Returns a pixel's sums in render units, because only their ratios count.
-fn stat(done: &Done, film: &Film, k: usize) -> Stat {
+fn stat(done: &TileSums, film: &Film, k: usize) -> Stat {
     let mut stat = Stat::default();
     for slot in 1..film.slots - 1 {
         let m = done.moments(film, k, slot);

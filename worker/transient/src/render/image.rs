@@ -11,31 +11,20 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     api::RenderError,
+    film::region::Region,
     paths::two_bounce::Sampling,
     render::{
         draws::{self, Draw},
         error::Errors,
         frame::Frame,
         memory::{room, zeros},
-        region::Region,
-        rounds::Round,
+        rounds::{Round, TilePasses},
         spread::Spread,
         stat::Stat,
-        tile::{Order, TileRenderer},
-        watch::Watch,
+        tile::{PassRange, TileRenderer},
+        watch::RoundProgress,
     },
 };
-
-/// Side of a tile in pixels: in a large image, and in a small one or one with many histograms per
-/// pixel. A larger tile cuts fewer of the squares that share vertices at its edges, and takes more
-/// memory.
-const LARGE_TILE: u32 = 32;
-const SMALL_TILE: u32 = 16;
-
-/// The number of pixels from which an image is large, and of channels from which a pixel has many
-/// histograms.
-const LARGE: usize = 1 << 16;
-const MANY: usize = 5;
 
 /// The parts with their standard errors.
 #[derive(Debug)]
@@ -65,7 +54,7 @@ pub(crate) struct Image {
     /// The value that the two-bounce variance is proportional to after these passes, see
     /// [`crate::paths::two_bounce::Sampling::variance`].
     pub two_unit: f64,
-    pub of_tiles: Vec<OfTile>,
+    pub of_tiles: Vec<TileTotals>,
     /// The two-bounce part of each tile, if later rounds need it: index among the slots of all
     /// channels of its pixels, and value.
     pub tile_two: Vec<Vec<(u32, f32)>>,
@@ -80,7 +69,7 @@ pub(crate) struct Image {
 
 /// Sums of a tile beyond its pixels' light.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct OfTile {
+pub(crate) struct TileTotals {
     /// Energy of three bounces and more, and its spread.
     pub multi: f64,
     pub spread: Spread,
@@ -99,10 +88,11 @@ fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
 
 /// Returns the side in pixels of the tiles that an image is rendered in.
 pub(crate) fn tile_side(frame: &Frame) -> u32 {
+    let tuning = &frame.tuning().rounds;
     let pixels = frame.width as usize * frame.height as usize;
-    match pixels >= LARGE && frame.film.channels < MANY {
-        true => LARGE_TILE,
-        false => SMALL_TILE,
+    match pixels >= tuning.large_image && frame.film.channels < tuning.many_histograms {
+        true => tuning.large_tile,
+        false => tuning.small_tile,
     }
 }
 
@@ -151,7 +141,7 @@ impl Image {
             overflow: 0.0,
             passes: 0,
             two_unit: 0.0,
-            of_tiles: vec![OfTile::default(); tiles.len()],
+            of_tiles: vec![TileTotals::default(); tiles.len()],
             tile_two: vec![vec![]; tiles.len()],
             two_rays: 0,
             strata_for: 0,
@@ -180,8 +170,8 @@ impl Image {
     /// Returns the errors of the image so far.
     pub fn errors(&self) -> Errors {
         let tiles = self.tiles.iter().zip(&self.of_tiles);
-        let watched = tiles.flat_map(|(region, of)| {
-            let draws = of.draws.iter().zip(&of.two_draws);
+        let watched = tiles.flat_map(|(region, totals)| {
+            let draws = totals.draws.iter().zip(&totals.two_draws);
             let draws = draws.map(|(draw, two)| draws::joined(*draw, *two));
             draws::watched(region).zip(draws).map(move |(k, draw)| {
                 let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
@@ -204,11 +194,11 @@ impl Image {
         frame: &Frame,
         range: Range<usize>,
         round: Round,
-        watch: &Watch,
+        watch: &RoundProgress,
     ) -> Result<u64, RenderError> {
         let tiles = self.tiles.clone();
         let count = range.len();
-        let order = Order {
+        let order = PassRange {
             first: self.passes,
             count: round.passes,
             two: round.two,
@@ -230,7 +220,12 @@ impl Image {
                 let known = lock(&idle).pop();
                 let mut renderer = known.unwrap_or_else(|| TileRenderer::new(frame));
                 renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
-                lock(&image).join(frame, (t, two, round.more), &renderer.done);
+                let passes = TilePasses {
+                    tile: t,
+                    two_weight: two,
+                    more: round.more,
+                };
+                lock(&image).join(frame, passes, &renderer.done);
                 watch.tiles.fetch_add(1, Ordering::Relaxed);
                 let rays = (renderer.done.rays, renderer.done.two_rays);
                 lock(&idle).push(renderer);
@@ -255,15 +250,18 @@ impl Image {
 
     /// Sums over the tiles, in their order.
     pub fn total(&mut self) {
-        let each = self.of_tiles.iter().map(|of| {
+        let each = self.of_tiles.iter().map(|totals| {
             let two = Spread {
-                variance: of.two_variance,
+                variance: totals.two_variance,
                 of_variance: 0.0,
             };
-            of.spread.plus(two)
+            totals.spread.plus(two)
         });
         self.total_spread = each.fold(Spread::default(), Spread::plus);
-        let outside = self.of_tiles.iter().map(|of| of.overflow.0 + of.overflow.1);
+        let outside = self
+            .of_tiles
+            .iter()
+            .map(|totals| totals.overflow.0 + totals.overflow.1);
         self.overflow = outside.sum();
     }
 }

@@ -1,18 +1,23 @@
 //! Joins a tile's new passes with its earlier ones.
 
 use crate::render::{
-    done::Done,
+    done::TileSums,
     draws::{self, Draw},
     frame::Frame,
     image::Image,
+    rounds::TilePasses,
     spread::joined_variance,
     stat::Stat,
 };
 
 impl Image {
-    /// Joins a tile's new passes with its earlier ones, weighted by passes. `two` is the weight of
-    /// the new two-bounce part, 0 if there is none. `more` is true if more rounds may follow.
-    pub fn join(&mut self, frame: &Frame, (t, two, more): (usize, f64, bool), done: &Done) {
+    /// Joins a tile's new passes with its earlier ones, weighted by passes.
+    pub fn join(&mut self, frame: &Frame, passes: TilePasses, done: &TileSums) {
+        let TilePasses {
+            tile: t,
+            two_weight: two,
+            more,
+        } = passes;
         let (film, region, bins) = (frame.film, self.tiles[t], self.bins);
         let (spent, added) = (f64::from(self.passes), f64::from(done.passes));
         let b = match spent == 0.0 {
@@ -21,7 +26,7 @@ impl Image {
         };
         let (a, stays) = (1.0 - b, 1.0 - two);
         // Converts render units to metres: every path has one 1/d² left over.
-        let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
+        let unit = f64::from(frame.tracer.world.scale) * f64::from(frame.tracer.world.scale);
         let unit2 = unit * unit;
         let blend = |(a, b): (f64, f64), old: f64, x: f64| old * a * a + x * b * b;
         // A single pass gives no error estimate, so its error is assumed to be that of the passes
@@ -39,8 +44,11 @@ impl Image {
             }
         }
         // Joins both parts of a slot, from their previous sum.
-        let joined = |old: f32, at: usize, x: f64| {
-            let (before, after) = (f64::from(before[at]) * unit, f64::from(after[at]) * unit);
+        let joined = |old: f32, index: usize, x: f64| {
+            let (before, after) = (
+                f64::from(before[index]) * unit,
+                f64::from(after[index]) * unit,
+            );
             // A rounding residue is not light.
             let old = (f64::from(old) - before).max(0.0);
             let x = x * unit;
@@ -54,10 +62,10 @@ impl Image {
             let mut difference2 = 0.0;
             for bin in 0..bins {
                 let m = done.moments(film, k, bin + 1);
-                let at = pixel * bins + bin;
+                let index = pixel * bins + bin;
                 let place = k * film.pixel() + bin + 1;
-                let (h, difference) = joined(self.transient[at], place, m.multi);
-                self.transient[at] = h;
+                let (h, difference) = joined(self.transient[index], place, m.multi);
+                self.transient[index] = h;
                 stat.norm2 += f64::from(h) * f64::from(h);
                 stat.total += f64::from(h);
                 difference2 += difference * difference;
@@ -68,26 +76,26 @@ impl Image {
                         (f64::from(old) * a + x * unit * b) as f32
                     };
                     let of_two = (stays, two);
-                    s.two[at] = mean((0.0, 1.0), 0.0, f64::from(after[place]));
-                    let variance = blend(of_two, square(s.two_se[at]), m.two_variance * unit2);
-                    s.two_se[at] = root(variance);
+                    s.two[index] = mean((0.0, 1.0), 0.0, f64::from(after[place]));
+                    let variance = blend(of_two, square(s.two_se[index]), m.two_variance * unit2);
+                    s.two_se[index] = root(variance);
                     let noise = done.two_noise(film, k, bin + 1);
-                    s.two_noise[at] = mean(of_two, s.two_noise[at], noise);
-                    s.multi[at] = mean((a, b), s.multi[at], m.multi);
-                    s.multi_noise[at] = match alone {
-                        true => (f64::from(s.multi_noise[at]) * a.sqrt()) as f32,
-                        false => mean((a, b), s.multi_noise[at], done.noise(film, k, bin + 1)),
+                    s.two_noise[index] = mean(of_two, s.two_noise[index], noise);
+                    s.multi[index] = mean((a, b), s.multi[index], m.multi);
+                    s.multi_noise[index] = match alone {
+                        true => (f64::from(s.multi_noise[index]) * a.sqrt()) as f32,
+                        false => mean((a, b), s.multi_noise[index], done.noise(film, k, bin + 1)),
                     };
-                    let old = square(s.multi_se[at]);
-                    s.multi_se[at] = root(multi(old, m.multi_variance * unit2));
+                    let old = square(s.multi_se[index]);
+                    s.multi_se[index] = root(multi(old, m.multi_variance * unit2));
                 }
             }
             for (g, group) in self.groups.iter_mut().enumerate() {
                 for bin in 0..bins {
-                    let at = pixel * bins + bin;
+                    let index = pixel * bins + bin;
                     let place = k * film.pixel() + (g + 1) * film.slots + bin + 1;
                     let x = done.multi(film, k, g + 1, bin + 1);
-                    group[at] = joined(group[at], place, x).0;
+                    group[index] = joined(group[index], place, x).0;
                 }
             }
             let (two_variance, multi_variance) = done.pixel_variance(k);
@@ -101,14 +109,14 @@ impl Image {
         }
         // Errors of rounds are independent, so on average their squares add up. For few passes,
         // their variance replaces the draws.
-        let of = &mut self.of_tiles[t];
-        of.draws.resize(draws::count(&region), Draw::default());
-        of.two_draws.resize(of.draws.len(), 0.0);
+        let totals = &mut self.of_tiles[t];
+        totals.draws.resize(draws::count(&region), Draw::default());
+        totals.two_draws.resize(totals.draws.len(), 0.0);
         let pixels = draws::watched(&region).map(|k| {
             let (row, col) = (k / region.cols as usize, k % region.cols as usize);
             (region.row as usize + row) * self.width + region.col as usize + col
         });
-        for ((draw, new), pixel) in of.draws.iter_mut().zip(done.draws()).zip(pixels) {
+        for ((draw, new), pixel) in totals.draws.iter_mut().zip(done.draws()).zip(pixels) {
             if draws::are_drawn(done.passes) {
                 for (old, new) in draw.iter_mut().zip(new) {
                     *old = blend((a, b), *old, new * unit2);
@@ -119,18 +127,20 @@ impl Image {
                 *draw = draws::of_variance(self.stats[pixel].multi_variance);
             }
         }
-        for (old, new) in of.two_draws.iter_mut().zip(done.two_draws()) {
+        for (old, new) in totals.two_draws.iter_mut().zip(done.two_draws()) {
             *old = blend((stays, two), *old, new * unit2);
         }
         let (energy, spread) = done.multi_energy();
         let (energy, spread) = (energy * unit, spread.scaled(unit));
-        of.spread = of.spread.joined((spent, of.multi), spread, (added, energy));
-        of.multi = of.multi * a + energy * b;
+        totals.spread = totals
+            .spread
+            .joined((spent, totals.multi), spread, (added, energy));
+        totals.multi = totals.multi * a + energy * b;
         let two_variance = done.two_energy_variance() * unit2;
-        of.two_variance = blend((stays, two), of.two_variance, two_variance);
+        totals.two_variance = blend((stays, two), totals.two_variance, two_variance);
         let outside = done.overflow(film);
-        of.overflow.0 = of.overflow.0 * stays + outside.0 * unit * two;
-        of.overflow.1 = of.overflow.1 * a + outside.1 * unit * b;
+        totals.overflow.0 = totals.overflow.0 * stays + outside.0 * unit * two;
+        totals.overflow.1 = totals.overflow.1 * a + outside.1 * unit * b;
         if two > 0.0 && more {
             self.tile_two[t] = sparse(&after);
         }
@@ -146,8 +156,8 @@ fn sparse(values: &[f32]) -> Vec<(u32, f32)> {
 /// Expands sparse values to all `count` values.
 fn dense(values: &[(u32, f32)], count: usize) -> Vec<f32> {
     let mut all = vec![0.0; count];
-    for &(at, v) in values {
-        all[at as usize] = v;
+    for &(index, v) in values {
+        all[index as usize] = v;
     }
     all
 }

@@ -12,14 +12,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     api::{RenderError, Stop},
-    film::splat::Splat,
+    film::{region::Region, splat::Splat},
     render::{
         draws::{Draw, Phases, Sums, is_watched, of_variance},
         frame::{Frame, unit},
         image::Image,
-        pixel_light::{Found, Moments},
-        pooling::{MULTI_REACH, Pool, pool},
-        region::Region,
+        pixel_light::{Moments, PixelLight},
+        pooling::{Pool, pool},
         sparse::{Sparse, Waiting},
     },
 };
@@ -130,13 +129,13 @@ impl Layer {
         frame: &Frame,
         passes: u32,
         stop: Stop,
-        mut each: impl FnMut(usize, &Found<'_>),
+        mut each: impl FnMut(usize, &PixelLight<'_>),
     ) -> Result<(), RenderError> {
         let slots = frame.film.slots;
         let n = f64::from(passes.max(1));
         let unit = unit(frame);
         let inside = 1..slots as u32 - 1;
-        let phases = Phases::of(passes);
+        let phases = Phases::new(passes);
         let mut own = vec![];
         let (mut variance, mut pooling) = (vec![], Pool::default());
         for (block, sums) in self.0.iter().enumerate() {
@@ -151,7 +150,7 @@ impl Layer {
             variance.resize(region.pixels() * slots, 0.0);
             own.clear();
             for (pixel, of_pixel) in variance.chunks_mut(slots).enumerate() {
-                let (slots, values) = sums.of(pixel);
+                let (slots, values) = sums.pixel(pixel);
                 let mut of_gate = 0.0;
                 for (slot, [sum, square, _]) in slots.iter().zip(values) {
                     let (x, square) = (f64::from(*sum), f64::from(*square));
@@ -163,14 +162,22 @@ impl Layer {
                 }
                 own.push(of_gate);
             }
-            pool(&mut variance, &region, slots, MULTI_REACH, &mut pooling);
+            let tuning = &frame.tuning().error;
+            pool(
+                &mut variance,
+                &region,
+                slots,
+                tuning.multi_reach,
+                tuning,
+                &mut pooling,
+            );
             for (pixel, variance) in variance.chunks(slots).enumerate() {
-                let (slots, values) = sums.of(pixel);
+                let (slots, values) = sums.pixel(pixel);
                 let draw = is_watched(&region, pixel).then(|| match &phases {
-                    Some(phases) => drawn(phases, watched.of(pixel), &inside),
+                    Some(phases) => drawn(phases, watched.pixel(pixel), &inside),
                     None => of_variance(own[pixel]),
                 });
-                let found = Found {
+                let found = PixelLight {
                     slots,
                     values,
                     variance,
@@ -200,15 +207,15 @@ impl Layer {
             let first = (region.row * frame.width) as usize;
             for k in 0..region.pixels() {
                 let pixel = first + k;
-                let (of_groups, values) = sums.groups.of(k);
-                for (at, x) in of_groups.iter().zip(values) {
-                    let (group, slot) = (*at as usize / slots - 1, *at as usize % slots);
+                let (of_groups, values) = sums.groups.pixel(k);
+                for (index, x) in of_groups.iter().zip(values) {
+                    let (group, slot) = (*index as usize / slots - 1, *index as usize % slots);
                     if (1..slots - 1).contains(&slot) {
                         let out = &mut image.groups[group][pixel * bins + slot - 1];
                         *out += (f64::from(*x) * factor) as f32;
                     }
                 }
-                let (of_all, values) = sums.all.of(k);
+                let (of_all, values) = sums.all.pixel(k);
                 let outside: f64 = of_all
                     .iter()
                     .zip(values)
@@ -301,7 +308,7 @@ mod tests {
     const PIXELS: usize = 5;
     const SLOTS: usize = 7;
 
-    fn waiting(pass: u32, (pixel, slot, value): (u32, u32, f32)) -> Waiting {
+    fn waiting(pass: u32, pixel: u32, slot: u32, value: f32) -> Waiting {
         Waiting {
             pixel,
             slot,
@@ -335,7 +342,7 @@ mod tests {
             mut cuts in prop::collection::vec(0usize..80, 0..6),
         ) {
             cuts.sort_unstable();
-            let found: Vec<Waiting> = found.into_iter().map(|w| waiting(0, w)).collect();
+            let found: Vec<Waiting> = found.into_iter().map(|(pixel, slot, value)| waiting(0, pixel, slot, value)).collect();
             let mut every = [[0.0f32; SLOTS]; PIXELS];
             for w in &found {
                 every[w.pixel as usize][w.slot as usize] += w.value;
@@ -344,7 +351,7 @@ mod tests {
             prop_assert!(sums.fits(PIXELS, 0..SLOTS as u32));
             prop_assert_eq!(&sums, &merged(&found, &[]));
             for (pixel, row) in every.iter().enumerate() {
-                let (slots, values) = sums.of(pixel);
+                let (slots, values) = sums.pixel(pixel);
                 let mut of_slot = [0.0f32; SLOTS];
                 for (slot, value) in slots.iter().zip(values) {
                     of_slot[*slot as usize] = *value;
@@ -368,27 +375,27 @@ mod tests {
         for (pass, of_pass) in values.iter().enumerate() {
             let found: Vec<Waiting> = (0u32..)
                 .zip(of_pass)
-                .map(|(slot, &value)| waiting(pass as u32, (2, slot, value)))
+                .map(|(slot, &value)| waiting(pass as u32, 2, slot, value))
                 .collect();
             watched.take(PIXELS, &found, add_phases).unwrap();
         }
-        let phases = Phases::of(passes as u32).unwrap();
-        let draw = drawn(&phases, watched.of(2), &(0..SLOTS as u32));
+        let phases = Phases::new(passes as u32).unwrap();
+        let draw = drawn(&phases, watched.pixel(2), &(0..SLOTS as u32));
         let n = f64::from(passes);
         let variance: f64 = (0..SLOTS)
             .map(|slot| {
-                let at = || values.iter().map(|v| f64::from(v[slot]));
-                let mean = at().sum::<f64>() / n;
-                at().map(|x| (x - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))
+                let index = || values.iter().map(|v| f64::from(v[slot]));
+                let mean = index().sum::<f64>() / n;
+                index().map(|x| (x - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))
             })
             .sum();
         let mean = draw.iter().sum::<f64>() / draw.len() as f64;
         assert!((mean / variance - 1.0).abs() < 1e-5, "{mean} {variance}");
         // Light outside the gate does not count, and a pixel without light has no error.
-        let inside = drawn(&phases, watched.of(2), &(1..SLOTS as u32 - 1));
+        let inside = drawn(&phases, watched.pixel(2), &(1..SLOTS as u32 - 1));
         assert!(inside.iter().sum::<f64>() < draw.iter().sum::<f64>());
         assert_eq!(
-            drawn(&phases, watched.of(0), &(0..SLOTS as u32)),
+            drawn(&phases, watched.pixel(0), &(0..SLOTS as u32)),
             Draw::default()
         );
     }

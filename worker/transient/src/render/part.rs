@@ -17,8 +17,9 @@ use crate::{
     api::{Budget, Progress, RenderError, Rendered, Settings, Stop},
     render::{
         image::Image, prepare::prepare, ready::Ready, rounds::Round, slice::Slice,
-        sources::Sources, splats::Splats, watch::Watch,
+        sources::Sources, splats::Splats, watch::RoundProgress,
     },
+    tuning::Tuning,
 };
 
 /// The maximum number of tile ranges.
@@ -41,8 +42,8 @@ impl PartOf {
     }
 
     fn range(self, tiles: usize) -> Range<usize> {
-        let at = |i: u32| tiles * i as usize / self.of as usize;
-        at(self.index)..at(self.index + 1)
+        let first_tile = |i: u32| tiles * i as usize / self.of as usize;
+        first_tile(self.index)..first_tile(self.index + 1)
     }
 }
 
@@ -51,8 +52,8 @@ impl PartOf {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Part {
     which: PartOf,
-    shape: Shape,
-    found: Found,
+    shape: PartShape,
+    found: PartContent,
     rays: u64,
 }
 
@@ -70,7 +71,7 @@ impl Part {
 
 /// Values that must be equal in all parts of a render.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct Shape {
+struct PartShape {
     width: u32,
     height: u32,
     bins: u32,
@@ -80,8 +81,8 @@ struct Shape {
     seed: u64,
 }
 
-impl Shape {
-    fn of(ready: &Ready) -> Self {
+impl PartShape {
+    fn new(ready: &Ready) -> Self {
         let frame = &ready.frame;
         Self {
             width: frame.width,
@@ -96,7 +97,7 @@ impl Shape {
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-enum Found {
+enum PartContent {
     Tiles(Slice),
     /// `None` if the scene needs no light paths.
     Paths(Option<Splats>),
@@ -122,8 +123,8 @@ fn divisible(settings: &Settings) -> Result<(), RenderError> {
 /// Renders one part of a scene. Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render::driver`], and [`RenderError::Invalid`] if the budget is not a
-/// number of samples or the part does not exist.
+/// Returns the errors of [`render`](crate::render()), and [`RenderError::Invalid`] if the budget is
+/// not a number of samples or the part does not exist.
 pub fn render_part(
     scene: &Scene,
     settings: &Settings,
@@ -138,38 +139,66 @@ pub fn render_part(
         );
         return Err(wrong("part", what));
     }
-    prepare(scene, settings, Stop(progress), |ready| {
-        let frame = &ready.frame;
-        let shape = Shape::of(ready);
-        let watch = Watch::new(progress, 0.0, 1.0);
-        let (found, rays) = if index < of {
-            let mut image = Image::new(frame)?;
-            let range = which.range(image.tiles());
-            let rays = image.round(frame, range.clone(), Round::only(shape.passes), &watch)?;
-            (Found::Tiles(image.take(range)), rays)
-        } else if let Some(sources) = Sources::of(frame) {
-            let mut splats = Splats::new(frame);
-            let passes = ready.splat_passes(shape.passes);
-            let rays = splats.round((frame, &sources), passes, &watch)?;
-            (Found::Paths(Some(splats)), rays)
-        } else {
-            (Found::Paths(None), 0)
-        };
-        Ok(Part {
-            which,
-            shape,
-            found,
-            rays,
-        })
-    })
+    prepare(
+        scene,
+        settings,
+        &Tuning::default(),
+        Stop(progress),
+        |ready| {
+            let frame = &ready.frame;
+            let shape = PartShape::new(ready);
+            let watch = RoundProgress::new(progress, 0.0, 1.0);
+            let (found, rays) = if index < of {
+                let mut image = Image::new(frame)?;
+                let range = which.range(image.tiles());
+                let rays = image.round(frame, range.clone(), Round::only(shape.passes), &watch)?;
+                (PartContent::Tiles(image.take(range)), rays)
+            } else if let Some(sources) = Sources::new(frame) {
+                let mut splats = Splats::new(frame);
+                let passes = ready.splat_passes(shape.passes);
+                let rays = splats.round((frame, &sources), passes, &watch)?;
+                (PartContent::Paths(Some(splats)), rays)
+            } else {
+                (PartContent::Paths(None), 0)
+            };
+            Ok(Part {
+                which,
+                shape,
+                found,
+                rays,
+            })
+        },
+    )
 }
 
-/// Joins all parts of a scene, in any order, into the result of [`crate::render::driver`], bit for bit.
-/// Runs on the caller's rayon pool.
+/// Joins all parts of a scene, in any order, into the result of [`render`](crate::render()), bit
+/// for bit. Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render::driver`], and [`RenderError::Invalid`] naming a part that is
-/// missing, duplicated, or from another scene or other settings.
+/// Returns the errors of [`render`](crate::render()), and [`RenderError::Invalid`] naming a part
+/// that is missing, duplicated, or from another scene or other settings.
+///
+/// # Examples
+/// ```
+/// # use picofarm_scene::primitive::{PrimitiveSettings, generate};
+/// # use picofarm_transient::*;
+/// # struct Quiet;
+/// # impl Progress for Quiet {
+/// #     fn at(&self, _: f32) -> bool {
+/// #         true
+/// #     }
+/// # }
+/// # let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// # let scene = generate(3, &room)?;
+/// # let gate = Gate { start_m: 0.0, bin_width_m: 0.5, bins: 64 };
+/// let settings = Settings::new(gate, Budget::Samples(2));
+/// let parts: Result<Vec<Part>, RenderError> = PartOf::all(2)
+///     .map(|which| render_part(&scene, &settings, which, &Quiet))
+///     .collect();
+/// let joined = join_parts(&scene, &settings, parts?, &Quiet)?;
+/// assert_eq!(joined.transient, render(&scene, &settings, &Quiet)?.transient);
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
 pub fn join_parts(
     scene: &Scene,
     settings: &Settings,
@@ -177,61 +206,67 @@ pub fn join_parts(
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
     divisible(settings)?;
-    prepare(scene, settings, Stop(progress), |ready| {
-        let (frame, stop) = (&ready.frame, Stop(progress));
-        let mut image = Image::new(frame)?;
-        let seen = ready.seen(stop)?;
-        let shape = Shape::of(ready);
-        let (mut splats, mut rays) = (None, 0);
-        let mut there: Vec<bool> = vec![];
-        for part in parts {
-            let PartOf { index, of } = part.which;
-            let name = format!("parts[{index}]");
-            if there.is_empty() && (1..=MAX_RANGES).contains(&of) {
-                there = vec![false; of as usize + 1];
-            }
-            if part.shape != shape || there.len() != of as usize + 1 || index > of {
-                let what =
-                    "is of another scene, other settings or another division; render it again";
-                return Err(wrong(&name, what.into()));
-            }
-            if std::mem::replace(&mut there[index as usize], true) {
-                return Err(wrong(&name, "is there twice".into()));
-            }
-            let taken = match part.found {
-                Found::Tiles(slice) if index < of => {
-                    image.put(part.which.range(image.tiles()), &slice)
+    prepare(
+        scene,
+        settings,
+        &Tuning::default(),
+        Stop(progress),
+        |ready| {
+            let (frame, stop) = (&ready.frame, Stop(progress));
+            let mut image = Image::new(frame)?;
+            let seen = ready.seen(stop)?;
+            let shape = PartShape::new(ready);
+            let (mut splats, mut rays) = (None, 0);
+            let mut there: Vec<bool> = vec![];
+            for part in parts {
+                let PartOf { index, of } = part.which;
+                let name = format!("parts[{index}]");
+                if there.is_empty() && (1..=MAX_RANGES).contains(&of) {
+                    there = vec![false; of as usize + 1];
                 }
-                Found::Paths(None) if index == of => Sources::of(frame).is_none(),
-                Found::Paths(Some(found)) if index == of => {
-                    let fits = Sources::of(frame).is_some() && found.fits(frame);
-                    splats = Some(found);
-                    fits
+                if part.shape != shape || there.len() != of as usize + 1 || index > of {
+                    let what =
+                        "is of another scene, other settings or another division; render it again";
+                    return Err(wrong(&name, what.into()));
                 }
-                _ => false,
+                if std::mem::replace(&mut there[index as usize], true) {
+                    return Err(wrong(&name, "is there twice".into()));
+                }
+                let taken = match part.found {
+                    PartContent::Tiles(slice) if index < of => {
+                        image.put(part.which.range(image.tiles()), &slice)
+                    }
+                    PartContent::Paths(None) if index == of => Sources::new(frame).is_none(),
+                    PartContent::Paths(Some(found)) if index == of => {
+                        let fits = Sources::new(frame).is_some() && found.fits(frame);
+                        splats = Some(found);
+                        fits
+                    }
+                    _ => false,
+                };
+                if !taken {
+                    let what = "does not hold what this part of the scene holds; render it again";
+                    return Err(wrong(&name, what.into()));
+                }
+                rays += part.rays;
+                if !progress.at(index as f32 / (of + 1) as f32) {
+                    return Err(RenderError::Stopped);
+                }
+            }
+            if let Some(missing) = there.iter().position(|&t| !t) {
+                return Err(wrong(&format!("parts[{missing}]"), "is missing".into()));
+            }
+            if there.is_empty() {
+                return Err(wrong("parts", "there are none; render them first".into()));
+            }
+            image.total();
+            let errors = match &splats {
+                None => image.errors(),
+                Some(splats) => splats.errors(frame, &image, stop)?,
             };
-            if !taken {
-                let what = "does not hold what this part of the scene holds; render it again";
-                return Err(wrong(&name, what.into()));
-            }
-            rays += part.rays;
-            if !progress.at(index as f32 / (of + 1) as f32) {
-                return Err(RenderError::Stopped);
-            }
-        }
-        if let Some(missing) = there.iter().position(|&t| !t) {
-            return Err(wrong(&format!("parts[{missing}]"), "is missing".into()));
-        }
-        if there.is_empty() {
-            return Err(wrong("parts", "there are none; render them first".into()));
-        }
-        image.total();
-        let errors = match &splats {
-            None => image.errors(),
-            Some(splats) => splats.errors(frame, &image, stop)?,
-        };
-        let error = errors.estimate();
-        let plan = ready.plan(shape.passes);
-        ready.finish((image, splats), seen, (error, rays), (plan, stop))
-    })
+            let error = errors.estimate();
+            let plan = ready.plan(shape.passes);
+            ready.finish((image, splats), seen, (error, rays), (plan, stop))
+        },
+    )
 }

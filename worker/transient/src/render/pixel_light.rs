@@ -6,7 +6,7 @@ use crate::render::draws::Draw;
 pub(crate) type Moments = [f32; 3];
 
 /// The contributions of light paths to a pixel, over passes, in metres.
-pub(crate) struct Found<'a> {
+pub(crate) struct PixelLight<'a> {
     pub slots: &'a [u32],
     pub values: &'a [Moments],
     /// Variance by slot, in render units.
@@ -21,7 +21,7 @@ pub(crate) struct Found<'a> {
     pub unit: f64,
 }
 
-impl Found<'_> {
+impl PixelLight<'_> {
     /// Returns the bin, the mean, and a draw of the mean's error, for each bin with contributions.
     pub fn light(&self) -> impl Iterator<Item = (usize, f64, f64)> {
         let last = self.variance.len() - 1;

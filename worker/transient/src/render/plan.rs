@@ -12,7 +12,7 @@ use crate::{
 /// Returns the plan that `render` follows.
 pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32) -> Plan {
     let (mut strategies, mut approximations) = (vec![], vec![]);
-    let (walk, sampling) = (&frame.walk, frame.sampling);
+    let (tracer, sampling) = (&frame.tracer, frame.sampling);
     let longest = settings.max_bounces.unwrap_or(u32::MAX);
     if settings.one_bounce {
         strategies.push("one bounce: analytic".into());
@@ -35,7 +35,7 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
                 "{coloured} of {materials} materials state no spectrum: their colour stands for it from 400 to 700 nm, elsewhere they reflect as at the laser's own wavelength"
             ));
         }
-        if walk.world.has_glass() {
+        if tracer.world.has_glass() {
             approximations.push("glass lets every wavelength through alike".into());
         }
     }
@@ -57,7 +57,7 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
             ));
         }
     }
-    if let Some(contacts) = walk.contacts {
+    if let Some(contacts) = tracer.contacts {
         strategies.push(format!(
             "light paths: {} spots close beside other surfaces",
             contacts.spots()
@@ -68,13 +68,13 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
             "three and more: camera paths, connected to spots and to light vertices by contribution"
                 .into(),
         );
-        let mirrors = walk.mirrors;
+        let mirrors = tracer.mirrors;
         let planes = mirrors.list.len();
         if planes > 0 {
             strategies.push(format!("mirror images: {planes} planar mirrors"));
         }
         let curved = mirrors.curved_share > 0.01;
-        if walk.caustics.is_some() {
+        if tracer.caustics.is_some() {
             strategies.push(
                 "light paths: caustics from curved near-mirrors and from several in a row".into(),
             );
@@ -88,24 +88,22 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
                 100.0 * mirrors.curved_share
             ));
         }
-        if planes > 1 && walk.caustics.is_none() {
+        if planes > 1 && tracer.caustics.is_none() {
             approximations.push(
                 "light that meets two near-mirrors in a row on its way from a spot is unbiased but noisy"
                     .into(),
             );
         }
     }
-    if frame.glass.is_some() && longest >= 2 {
-        strategies.push("glass: light and camera paths by what it reflects and refracts".into());
-        approximations.push(
-            "what the camera sees in glass by light that comes from a spot by glass, and spots seen in bodies of glass or by several panes, are blurred over about a pixel"
-                .into(),
-        );
+    if longest >= 2 {
+        for source in frame.sources {
+            source.describe(&mut strategies, &mut approximations);
+        }
     }
-    if walk.world.has_bodies() && settings.one_bounce {
+    if tracer.world.has_bodies() && settings.one_bounce {
         approximations.push("one bounce: spots seen through bodies of glass are left out".into());
     }
-    if walk.window.is_some() {
+    if tracer.window.is_some() {
         if longest >= 3 {
             strategies.push("narrow gate: ellipsoidal connections".into());
         }

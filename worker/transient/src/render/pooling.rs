@@ -1,18 +1,6 @@
 //! Pools variances over neighbouring bins and pixels.
 
-use crate::render::region::Region;
-
-/// The number of bins on either side over which the variance of the 3+ part and of the two-bounce
-/// part is pooled.
-pub(crate) const MULTI_REACH: usize = 3;
-pub(crate) const TWO_REACH: usize = 1;
-
-/// Fraction of a pixel's mean variance added to every bin.
-pub(crate) const FLOOR: f32 = 0.003;
-
-/// Weight of a bin's own sample variance, because edges and peaks differ from their neighbours.
-/// Without it the brightest bins deviate by 1.25 to 1.4 of the stored error.
-pub(crate) const OWN: f32 = 0.5;
+use crate::{film::region::Region, tuning::ErrorTuning};
 
 /// Pools variances in place, half of each, over 3×3 pixels and a few bins, within a region's
 /// `[row][col][slot]`.
@@ -26,6 +14,7 @@ pub(crate) fn pool(
     region: &Region,
     slots: usize,
     reach: usize,
+    tuning: &ErrorTuning,
     rows: &mut Pool,
 ) {
     let (height, width) = (region.rows as usize, region.cols as usize);
@@ -42,7 +31,7 @@ pub(crate) fn pool(
         while done < height && done <= row + 1 {
             let v = &variance[done * size..(done + 1) * size];
             for (out, v) in bins.chunks_mut(slots).zip(v.chunks(slots)) {
-                along_bins(out, v, reach);
+                along_bins(out, v, reach, tuning.floor);
             }
             let smooth = &mut smooth[done % 3];
             for (col, out) in smooth.chunks_mut(slots).enumerate() {
@@ -55,7 +44,7 @@ pub(crate) fn pool(
         mean(&mut bins[..], near.map(|r| &smooth[r % 3][..]));
         let own = &mut variance[row * size..(row + 1) * size];
         for (v, pooled) in own.iter_mut().zip(&*bins) {
-            *v = pooled + OWN * (*v - pooled);
+            *v = pooled + tuning.own * (*v - pooled);
         }
     }
 }
@@ -69,9 +58,9 @@ pub(crate) struct Pool {
 }
 
 /// Writes the means of a pixel's bins and their neighbours, with the floor.
-fn along_bins(out: &mut [f32], v: &[f32], reach: usize) {
+fn along_bins(out: &mut [f32], v: &[f32], reach: usize, floor: f32) {
     let slots = v.len();
-    let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
+    let floor = floor * v.iter().sum::<f32>() / slots as f32;
     let width = 2 * reach + 1;
     let edge = reach.min(slots);
     for k in (0..edge).chain((slots - edge).max(edge)..slots) {

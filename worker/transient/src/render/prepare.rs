@@ -6,25 +6,27 @@ use crate::{
     api::{RenderError, Settings, Stop},
     film::slots::Film,
     light::{
-        beam::find_spots,
+        beam::Beams,
         caustics::Caustics,
         contacts::{self, Contacts},
         emitters::Emitters,
         mirror_images::Mirrors,
         reflectors::Reflectors,
+        splat_source::SplatSource,
     },
     paths::{
         ellipsoid::{
             patches::Patches,
             window::{self, Window},
         },
-        glass::technique::ByGlass,
-        path_reuse::effort::{Effort, NARROW_TILE, WIDE_TILE},
-        tracer::Walk,
+        glass::technique::GlassTechnique,
+        path_reuse::effort::Effort,
+        tracer::Tracer,
         two_bounce::Sampling,
     },
     render::{dark::is_dark, frame::Frame, ready::Ready, settings::check},
     scene::{centres, world::World},
+    tuning::Tuning,
 };
 
 /// The maximum number of point sources, because arrivals store the source in 16 bits.
@@ -34,19 +36,24 @@ const MOST_SPOTS: usize = 1 << 16;
 pub(crate) fn prepare<R>(
     scene: &Scene,
     settings: &Settings,
+    tuning: &Tuning,
     stop: Stop,
     then: impl FnOnce(&Ready) -> Result<R, RenderError>,
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
     let wavelength = settings.wavelengths_nm.nm();
-    let mut world = World::at(scene, wavelength, settings.gate.end_m(), stop)?;
+    let mut world = World::load(scene, wavelength, settings.gate.end_m(), stop)?;
     world.sensitive = settings.fill_factor.sqrt() as f32;
-    let spots = find_spots(&world, &scene.laser.beams);
-    let middles = Emitters::new(scene, &world, &spots)?;
+    let beams = Beams {
+        world: &world,
+        tuning: tuning.beams,
+    };
+    let spots = beams.spots(&scene.laser.beams);
+    let middles = Emitters::new(scene, beams, &spots)?;
     let wide = settings.beam.as_ref();
     let wide = wide
-        .map(|width| Emitters::widened(scene, &world, width))
+        .map(|width| Emitters::widened(scene, beams, width))
         .transpose()?;
     let sources = wide.as_ref().unwrap_or(&middles);
     if sources.list.len() > MOST_SPOTS {
@@ -63,12 +70,12 @@ pub(crate) fn prepare<R>(
     let none = Emitters::none();
     let emitters = if is_dark { &none } else { sources };
     let mirrors = if settings.strategy.mirror_images.unwrap_or(true) {
-        Mirrors::find(&world, emitters, stop)
+        Mirrors::find(&world, emitters, tuning.mirrors, stop)
     } else {
         Mirrors::default()
     };
     let centres = centres::centres(&world, stop)?;
-    let sampling = Sampling::plan(&world, emitters, &centres, stop);
+    let sampling = Sampling::plan(&world, emitters, &centres, tuning.two_bounce, stop);
     stop.check()?;
     let of_spot = groups_of(settings, sources, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
@@ -87,15 +94,16 @@ pub(crate) fn prepare<R>(
     let strategy = &settings.strategy;
     let narrow = strategy
         .ellipsoidal
-        .unwrap_or_else(|| window::pays(&settings.gate, &world));
-    let patches = narrow.then(|| Patches::new(&world, emitters));
+        .unwrap_or_else(|| window::pays(&settings.gate, &world, &tuning.ellipsoid));
+    let patches = narrow.then(|| Patches::new(&world, emitters, tuning.ellipsoid));
     stop.check()?;
-    let mut walk = Walk {
+    let mut tracer = Tracer {
         world: &world,
         emitters,
         mirrors: &mirrors,
         gate: &settings.gate,
         max_bounces,
+        tuning,
         lights: strategy.light_vertices.unwrap_or(true),
         caustics: None,
         reflectors: None,
@@ -109,36 +117,44 @@ pub(crate) fn prepare<R>(
     };
     let caustics = match strategy.caustics {
         Some(false) => None,
-        wanted => Caustics::find(&world, emitters, stop).filter(|c| {
-            walk.max_bounces >= 3
-                && (wanted.is_some() || c.pay(&walk.surroundings(), settings.seed))
+        wanted => Caustics::find(&world, emitters, tuning.caustics, stop).filter(|c| {
+            tracer.max_bounces >= 3
+                && (wanted.is_some() || c.pay(&tracer.surroundings(), settings.seed))
         }),
     };
     stop.check()?;
-    walk.caustics = caustics.as_ref();
+    tracer.caustics = caustics.as_ref();
     // Few spots light few bins, so the error of the light that pixels share is as large there as
     // that of the light each finds alone. A narrow gate is similar.
-    let many = contacts::many(emitters) && !narrow;
-    let reflectors = many.then(|| Reflectors::find(&world)).flatten();
-    walk.reflectors = reflectors.as_ref();
-    let contacts = match walk.max_bounces {
+    let many = contacts::many(emitters, &tuning.contacts) && !narrow;
+    let reflectors = many
+        .then(|| Reflectors::find(&world, tuning.reflectors))
+        .flatten();
+    tracer.reflectors = reflectors.as_ref();
+    let contacts = match tracer.max_bounces {
         0 | 1 => None,
-        _ => Contacts::find(&world, emitters),
+        _ => Contacts::find(&world, emitters, tuning.contacts),
     };
-    walk.contacts = contacts.as_ref();
-    let glass = ByGlass::find((&walk, &film), &centres, stop)?;
+    tracer.contacts = contacts.as_ref();
+    let glass = GlassTechnique::find((&tracer, &film), &centres, stop)?;
+    let mut splat_sources: Vec<&dyn SplatSource> = vec![];
+    splat_sources.extend(caustics.iter().map(|c| c as &dyn SplatSource));
+    splat_sources.extend(contacts.iter().map(|c| c as &dyn SplatSource));
+    splat_sources.extend(glass.iter().map(|g| g as &dyn SplatSource));
     let frame = Frame {
-        walk,
-        glass: glass.as_ref(),
+        tracer,
+        sources: &splat_sources,
         film: &film,
         sampling: &sampling,
         effort: Effort::new(
-            strategy
-                .path_reuse
-                .unwrap_or(if narrow { NARROW_TILE } else { WIDE_TILE }),
+            tuning,
+            strategy.path_reuse.unwrap_or(match narrow {
+                true => tuning.path_reuse.narrow_tile,
+                false => tuning.path_reuse.wide_tile,
+            }),
             narrow,
             world.has_narrow_lobes(),
-            walk.reflectors.is_some(),
+            tracer.reflectors.is_some(),
         ),
         seed: settings.seed,
         width: scene.camera.intrinsics.width,

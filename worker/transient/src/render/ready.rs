@@ -9,14 +9,7 @@ use crate::{
     },
     light::emitters::Emitters,
     paths::one_bounce,
-    render::{
-        frame::Frame,
-        image::Image,
-        plan::plan as decide,
-        rounds::{FIRST_PASSES, TWO_PASSES},
-        splats::Splats,
-        warn,
-    },
+    render::{frame::Frame, image::Image, plan::plan as decide, splats::Splats, warn},
     scene::centres::Centres,
     truth::{ground_truth, photo},
 };
@@ -42,8 +35,8 @@ pub(crate) struct Ready<'a> {
 impl Ready<'_> {
     /// Returns whether light of three bounces and more must be sampled.
     pub fn walks(&self) -> bool {
-        let walk = &self.frame.walk;
-        walk.max_bounces >= 3 && !walk.emitters.list.is_empty()
+        let tracer = &self.frame.tracer;
+        tracer.max_bounces >= 3 && !tracer.emitters.list.is_empty()
     }
 
     /// Returns the passes of the first round, which is the only one unless an error target is set.
@@ -51,14 +44,18 @@ impl Ready<'_> {
         match self.settings.budget {
             _ if !self.walks() => 0,
             Budget::Samples(n) => n,
-            Budget::Error(_) => FIRST_PASSES,
+            Budget::Error(_) => self.frame.tuning().rounds.first_passes,
         }
     }
 
     /// Returns the passes of light paths for `passes` passes of the image. Two bounces alone need
     /// some as well.
     pub fn splat_passes(&self, passes: u32) -> u32 {
-        if self.walks() { passes } else { TWO_PASSES }
+        if self.walks() {
+            passes
+        } else {
+            self.frame.tuning().rounds.alone_passes
+        }
     }
 
     /// Returns the renderer's decisions for a first round of `passes`.
@@ -78,28 +75,28 @@ impl Ready<'_> {
     /// # Errors
     /// Returns [`RenderError::Stopped`] if the render is stopped.
     pub fn seen(&self, stop: Stop) -> Result<(GroundTruth, u64), RenderError> {
-        let walk = &self.frame.walk;
-        let (beams, of) = (self.spots.len(), (walk.world, self.middles));
+        let tracer = &self.frame.tracer;
+        let (beams, lit_scene) = (self.spots.len(), (tracer.world, self.middles));
         let (mut truth, rays) =
-            ground_truth::ground_truth(self.scene, of, self.centres, beams, stop)?;
-        let (rgb, photo_rays) = photo::photo(walk.world, self.settings.seed, stop)?;
+            ground_truth::ground_truth(self.scene, lit_scene, self.centres, beams, stop)?;
+        let (rgb, photo_rays) = photo::photo(tracer.world, self.settings.seed, stop)?;
         truth.rgb = rgb;
         Ok((truth, self.centres.rays + rays + photo_rays))
     }
 
     /// Returns the approximate number of rays of the ground truth, from some rows of a large image.
     pub fn seen_rays(&self) -> u64 {
-        let walk = &self.frame.walk;
+        let tracer = &self.frame.tracer;
         let step = (self.frame.height as usize / ROWS).max(1);
-        let truth = ground_truth::rays(walk.world, self.middles, self.centres, step);
-        self.centres.rays + truth + photo::rays(walk.world, self.settings.seed, step)
+        let truth = ground_truth::rays(tracer.world, self.middles, self.centres, step);
+        self.centres.rays + truth + photo::rays(tracer.world, self.settings.seed, step)
     }
 
     /// Returns warnings about the scene or gate that are certain before rendering.
     pub fn foreseen(&self) -> Vec<String> {
-        let walk = &self.frame.walk;
+        let tracer = &self.frame.tracer;
         let mut warnings = warn::beams(self.spots);
-        let any = warn::arrivals(walk.world, self.middles, self.centres, |_, _| true);
+        let any = warn::arrivals(tracer.world, self.middles, self.centres, |_, _| true);
         if any.is_none() && !self.middles.list.is_empty() {
             warnings.push("the camera sees no surface".into());
         }
@@ -113,11 +110,11 @@ impl Ready<'_> {
         if inside > 0.0 {
             return None;
         }
-        let walk = &self.frame.walk;
+        let tracer = &self.frame.tracer;
         let pixels = self.centres.hits.len();
         let seen = |beam: usize, pixel: usize| truth.visibility[beam * pixels + pixel] != 0;
-        let lit = warn::arrivals(walk.world, self.middles, self.centres, seen);
-        let any = warn::arrivals(walk.world, self.middles, self.centres, |_, _| true);
+        let lit = warn::arrivals(tracer.world, self.middles, self.centres, seen);
+        let any = warn::arrivals(tracer.world, self.middles, self.centres, |_, _| true);
         let gate = &self.settings.gate;
         Some(warn::empty(gate, self.spots, (lit, any), outside))
     }
@@ -135,7 +132,7 @@ impl Ready<'_> {
         (plan, stop): (Plan, Stop),
     ) -> Result<Rendered, RenderError> {
         let (frame, settings) = (&self.frame, self.settings);
-        let (walk, film) = (&frame.walk, frame.film);
+        let (tracer, film) = (&frame.tracer, frame.film);
         if let Some(splats) = &splats {
             splats.join(frame, &mut image, stop)?;
         }
@@ -143,9 +140,9 @@ impl Ready<'_> {
             energy: image.overflow,
             share: 0.0,
         };
-        if settings.one_bounce && walk.max_bounces >= 1 {
-            let mut stack = walk.world.bvh.stack();
-            let peaks = one_bounce::peaks(walk.world, &mut stack, self.sources);
+        if settings.one_bounce && tracer.max_bounces >= 1 {
+            let mut stack = tracer.world.bvh.stack();
+            let peaks = one_bounce::peaks(tracer.world, &mut stack, self.sources);
             for peak in &peaks {
                 let gate = &settings.gate;
                 if !one_bounce::add(peak, gate, &mut image.transient) {

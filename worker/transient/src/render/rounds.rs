@@ -1,11 +1,7 @@
 //! The rounds of a render and their lengths.
 
-/// The maximum number of passes of [`Budget::Error`].
+/// The maximum number of passes of `Budget::Error`.
 pub(crate) const MAX_PASSES: u32 = 1 << 16;
-
-/// Passes of the first round of [`Budget::Error`], the fewest that give an error estimate. With 4
-/// passes, large images of many spots ended at 6.8 to 8.6 % with a target of 10 %.
-pub(crate) const FIRST_PASSES: u32 = 2;
 
 /// The work of a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,5 +25,13 @@ impl Round {
     }
 }
 
-/// Passes of light paths if no other passes are made.
-pub(crate) const TWO_PASSES: u32 = 64;
+/// New passes over a tile.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct TilePasses {
+    /// Index of the tile.
+    pub tile: usize,
+    /// Weight of the new two-bounce part; 0 if there is none.
+    pub two_weight: f64,
+    /// Whether more rounds may follow.
+    pub more: bool,
+}

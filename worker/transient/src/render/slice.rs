@@ -4,11 +4,13 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use crate::render::{
-    draws,
-    image::{Image, OfTile},
-    region::Region,
-    stat::Stat,
+use crate::{
+    film::region::Region,
+    render::{
+        draws,
+        image::{Image, TileTotals},
+        stat::Stat,
+    },
 };
 
 /// A range of tiles taken out of an image.
@@ -17,7 +19,7 @@ pub(crate) struct Slice {
     /// The planes of [`Image::planes`], pixels in the order of the tiles.
     pub planes: Vec<Vec<f32>>,
     pub stats: Vec<Stat>,
-    pub tiles: Vec<OfTile>,
+    pub tiles: Vec<TileTotals>,
     /// The number of passes over these tiles.
     pub passes: u32,
 }
@@ -77,9 +79,9 @@ impl Image {
         let (runs, bins) = (self.runs(range.clone()), self.bins);
         let pixels: usize = runs.iter().map(|(_, count)| count).sum();
         let mut tiles = self.tiles[range.clone()].iter().zip(&slice.tiles);
-        let watched = tiles.all(|(region, of)| {
+        let watched = tiles.all(|(region, totals)| {
             let count = draws::count(region);
-            of.draws.len() == count && of.two_draws.len() == count
+            totals.draws.len() == count && totals.two_draws.len() == count
         });
         let planes = self.planes();
         if slice.tiles.len() != range.len()

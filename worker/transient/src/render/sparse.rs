@@ -29,7 +29,7 @@ pub(crate) struct Waiting {
 
 impl<V: Copy + Default> Sparse<V> {
     /// Returns the slots and values of a pixel.
-    pub fn of(&self, pixel: usize) -> (&[u32], &[V]) {
+    pub fn pixel(&self, pixel: usize) -> (&[u32], &[V]) {
         match self.starts.get(pixel..pixel + 2) {
             Some(&[start, end]) => {
                 let range = start as usize..end as usize;
@@ -51,7 +51,7 @@ impl<V: Copy + Default> Sparse<V> {
             && self.starts.is_sorted()
             && (self.starts[0], self.starts[pixels] as usize) == (0, count)
             && self.slots.iter().all(|slot| within.contains(slot))
-            && (0..pixels).all(|k| self.of(k).0.is_sorted_by(|a, b| a < b))
+            && (0..pixels).all(|k| self.pixel(k).0.is_sorted_by(|a, b| a < b))
     }
 
     /// Adds contributions, sorted by pixel and slot, to the values of `pixels` pixels. `add`
@@ -73,7 +73,7 @@ impl<V: Copy + Default> Sparse<V> {
         };
         merged.starts.push(0);
         for pixel in 0..pixels {
-            let (slots, values) = self.of(pixel);
+            let (slots, values) = self.pixel(pixel);
             let mut old = slots.iter().copied().zip(values.iter().copied()).peekable();
             loop {
                 let next = groups.peek().filter(|g| g[0].pixel as usize == pixel);

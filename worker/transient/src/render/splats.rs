@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     api::{RenderError, Stop},
-    film::splat::Splat,
+    film::{pass_fraction::PassFraction, splat::Splat},
     render::{
         error::Errors,
         frame::{Frame, unit},
@@ -14,8 +14,7 @@ use crate::{
         layer::Layer,
         sources::Sources,
         spread::Spread,
-        thin::Thin,
-        watch::Watch,
+        watch::RoundProgress,
     },
 };
 
@@ -51,11 +50,11 @@ impl Splats {
         &mut self,
         (frame, sources): (&Frame, &Sources),
         wave: u32,
-        watch: &Watch,
+        watch: &RoundProgress,
     ) -> Result<u64, RenderError> {
         let mut rays = 0;
         for _ in 0..wave {
-            let (all, traced) = sources.pass(frame, (self.passes, watch), Thin::WHOLE);
+            let (all, traced) = sources.pass(frame, (self.passes, watch), PassFraction::WHOLE);
             rays += traced;
             if watch.stopped() {
                 return Err(RenderError::Stopped);
@@ -111,7 +110,7 @@ impl Splats {
                 }
             })?;
         }
-        let own = Spread::of(&self.all).scaled(unit(frame));
+        let own = Spread::from_passes(&self.all).scaled(unit(frame));
         errors.spread = errors.spread.plus(own);
         Ok(errors)
     }

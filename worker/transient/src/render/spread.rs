@@ -12,7 +12,7 @@ pub(crate) struct Spread {
 
 impl Spread {
     /// Returns the spread of the mean of `passes`. The variance of a single pass is its square.
-    pub fn of(passes: &[f64]) -> Self {
+    pub fn from_passes(passes: &[f64]) -> Self {
         let n = passes.len() as f64;
         if passes.len() < 2 {
             let variance = passes.iter().map(|x| x * x).sum();
@@ -60,8 +60,8 @@ impl Spread {
         }
         let difference2 = (mean - other_mean).powi(2);
         // A single pass has no variance of its own.
-        let of = |s: Self, n: f64| if n > 1.0 { s.of_variance } else { 0.0 };
-        let part = |s: Self, k: f64| of(s, k) * (k / (n + m)).powi(4);
+        let excess = |s: Self, n: f64| if n > 1.0 { s.of_variance } else { 0.0 };
+        let part = |s: Self, k: f64| excess(s, k) * (k / (n + m)).powi(4);
         Self {
             variance: joined_variance((n, m), (self.variance, other.variance), difference2),
             of_variance: part(self, n) + part(other, m),

@@ -3,24 +3,23 @@
 //! in any order.
 
 use crate::{
-    film::{blocks::Blocks, slots::Film},
+    film::{blocks::Blocks, region::Region, slots::Film},
     numeric::rng::{Rng, Stream},
     paths::{
         path_reuse::{sharing::Sharing, tile::Tile},
         scratch::Scratch,
-        two_bounce::Strata,
+        two_bounce::{PixelStrata, Strata},
     },
     render::{
-        done::{Done, inside},
+        done::{TileSums, inside},
         frame::Frame,
-        pooling::{TWO_REACH, pool, shut_out},
-        region::Region,
+        pooling::{pool, shut_out},
     },
 };
 
 /// The passes to make: the number of the first one, and the count.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Order {
+pub(crate) struct PassRange {
     pub first: u32,
     pub count: u32,
     /// Whether the two-bounce part is sampled. Otherwise it is empty.
@@ -37,20 +36,20 @@ pub(crate) struct TileRenderer {
     pass: Vec<f32>,
     /// The last pass of even number, if the alternating sum is requested.
     held: Vec<f32>,
-    pub done: Done,
+    pub done: TileSums,
 }
 
 impl TileRenderer {
     pub fn new(frame: &Frame) -> Self {
-        let walk = &frame.walk;
+        let tracer = &frame.tracer;
         Self {
-            scratch: Scratch::new(walk.world, walk.emitters, walk.mirrors),
+            scratch: Scratch::new(tracer.world, tracer.emitters, tracer.mirrors),
             sharing: Sharing::default(),
             blocks: Blocks::new(frame.film),
             strata: Strata::default(),
             pass: vec![],
             held: vec![],
-            done: Done::default(),
+            done: TileSums::default(),
         }
     }
 
@@ -60,7 +59,7 @@ impl TileRenderer {
         &mut self,
         frame: &Frame,
         region: &Region,
-        order: &Order,
+        order: &PassRange,
         go_on: &dyn Fn(f32) -> bool,
     ) -> Option<()> {
         let rays = self.scratch.stack.rays;
@@ -76,7 +75,8 @@ impl TileRenderer {
             }
             self.pass(frame, region, order.first + self.done.passes);
         }
-        self.done.estimate(frame.film, region);
+        self.done
+            .estimate(frame.film, region, &frame.tuning().error);
         self.done.rays = self.scratch.stack.rays - rays;
         Some(())
     }
@@ -86,11 +86,11 @@ impl TileRenderer {
         &mut self,
         frame: &Frame,
         region: &Region,
-        order: &Order,
+        order: &PassRange,
         go_on: &dyn Fn(f32) -> bool,
     ) -> Option<()> {
-        let (walk, film) = (&frame.walk, frame.film);
-        if walk.max_bounces < 2 || walk.emitters.list.is_empty() {
+        let (tracer, film) = (&frame.tracer, frame.film);
+        if tracer.max_bounces < 2 || tracer.emitters.list.is_empty() {
             return Some(());
         }
         let (coarse, fine) = frame.sampling.sides(order.count);
@@ -114,9 +114,9 @@ impl TileRenderer {
             );
             self.blocks.clear();
             let strata = self.strata.sample_pixel(
-                walk,
+                tracer,
                 film,
-                (row, col, side),
+                PixelStrata { row, col, side },
                 &mut rng,
                 &mut self.scratch,
                 &mut self.blocks,
@@ -139,17 +139,25 @@ impl TileRenderer {
             }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
         }
+        let tuning = &frame.tuning().error;
         shut_out(&mut self.done.two_variance, film.slots);
         let variances = self.done.two_variance.chunks(film.slots);
         for (out, v) in self.done.pixel_variance.iter_mut().zip(variances) {
             out.0 = inside(film, v);
         }
-        let Done {
+        let TileSums {
             two_variance,
             pooling,
             ..
         } = &mut self.done;
-        pool(two_variance, region, film.slots, TWO_REACH, pooling);
+        pool(
+            two_variance,
+            region,
+            film.slots,
+            tuning.two_reach,
+            tuning,
+            pooling,
+        );
         Some(())
     }
 
@@ -182,7 +190,7 @@ impl TileRenderer {
                     mirrors: &frame.sampling.refined,
                 };
                 self.sharing.pass(
-                    (&frame.walk, film, &frame.effort),
+                    frame.pass_context(),
                     &tile,
                     &mut self.scratch,
                     &mut self.pass,

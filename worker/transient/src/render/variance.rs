@@ -7,6 +7,8 @@ use crate::{
     api::{RenderError, Settings, Stop, Unstopped},
     film::{
         class::{CLASSES, class_name},
+        pass_fraction::PassFraction,
+        region::Region,
         slots::Film,
         technique::TECHNIQUES,
     },
@@ -19,12 +21,11 @@ use crate::{
         frame::{Frame, unit},
         layer::Layer,
         prepare::prepare,
-        region::Region,
         sources::Sources,
-        thin::Thin,
-        tile::{Order, TileRenderer},
-        watch::Watch,
+        tile::{PassRange, TileRenderer},
+        watch::RoundProgress,
     },
+    tuning::Tuning,
 };
 
 /// The contribution of one class of paths to the part of three bounces and more, or to the light
@@ -47,7 +48,7 @@ pub struct ClassVariance {
 const ALL: usize = CLASSES + TECHNIQUES.len();
 
 /// Sums of one tile's pixels.
-struct Found {
+struct SampledTile {
     pub region: Region,
     /// h by pixel and bin.
     pub light: Vec<f32>,
@@ -61,50 +62,75 @@ struct Found {
 /// pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render::driver`].
+/// Returns the errors of [`render`](crate::render()).
+///
+/// # Examples
+/// ```
+/// # use picofarm_scene::primitive::{PrimitiveSettings, generate};
+/// # use picofarm_transient::*;
+/// # struct Quiet;
+/// # impl Progress for Quiet {
+/// #     fn at(&self, _: f32) -> bool {
+/// #         true
+/// #     }
+/// # }
+/// # let room = PrimitiveSettings { width: 8, height: 8, ..PrimitiveSettings::default() };
+/// # let scene = generate(3, &room)?;
+/// # let gate = Gate { start_m: 0.0, bin_width_m: 0.5, bins: 64 };
+/// let classes = variance(&scene, &Settings::new(gate, Budget::Samples(2)), 2)?;
+/// let sum: f64 = classes.iter().map(|class| class.variance).sum();
+/// assert!((sum - 1.0).abs() < 1e-9);
+/// # Ok::<(), picofarm_transient::RenderError>(())
+/// ```
 pub fn variance(
     scene: &Scene,
     settings: &Settings,
     passes: u32,
 ) -> Result<Vec<ClassVariance>, RenderError> {
-    prepare(scene, settings, Stop(&Unstopped), |ready| {
-        if !ready.walks() {
-            return Ok(vec![]);
-        }
-        let film = Film::by_class(&settings.gate);
-        let by_class = Frame {
-            film: &film,
-            ..ready.frame
-        };
-        let passes = passes.max(2);
-        let mut found: Vec<Found> = regions(&ready.frame)
-            .into_par_iter()
-            .map(|region| look((&ready.frame, &by_class), region, passes))
-            .collect();
-        drawn(&ready.frame, &mut found, passes)?;
-        Ok(shares(ready.frame.film, &found))
-    })
+    prepare(
+        scene,
+        settings,
+        &Tuning::default(),
+        Stop(&Unstopped),
+        |ready| {
+            if !ready.walks() {
+                return Ok(vec![]);
+            }
+            let film = Film::by_class(&settings.gate);
+            let by_class = Frame {
+                film: &film,
+                ..ready.frame
+            };
+            let passes = passes.max(2);
+            let mut found: Vec<SampledTile> = regions(&ready.frame)
+                .into_par_iter()
+                .map(|region| look((&ready.frame, &by_class), region, passes))
+                .collect();
+            drawn(&ready.frame, &mut found, passes)?;
+            Ok(shares(ready.frame.film, &found))
+        },
+    )
 }
 
 /// Adds the light drawn into the image. Light paths cross tiles, so all of them are traced for the
 /// sampled tiles.
-fn drawn(frame: &Frame, found: &mut [Found], passes: u32) -> Result<(), RenderError> {
-    let Some(sources) = Sources::of(frame) else {
+fn drawn(frame: &Frame, found: &mut [SampledTile], passes: u32) -> Result<(), RenderError> {
+    let Some(sources) = Sources::new(frame) else {
         return Ok(());
     };
     let mut layers = TECHNIQUES.map(|_| Layer::new(frame));
-    let watch = Watch::new(&Unstopped, 0.0, 1.0);
+    let watch = RoundProgress::new(&Unstopped, 0.0, 1.0);
     let regions: Vec<Region> = found.iter().map(|f| f.region).collect();
     // The number of light paths equals that of a render, because their variance is measured.
-    let thin = Thin {
+    let thin = PassFraction {
         regions: &regions,
-        ..Thin::WHOLE
+        ..PassFraction::WHOLE
     };
     for pass in 0..passes {
         let (mut splats, _) = sources.pass(frame, (u32::MAX - passes + pass, &watch), thin);
         splats.sort_by_key(|s| (s.technique as usize, s.pixel, s.slot));
-        for of in splats.chunk_by(|a, b| a.technique == b.technique) {
-            layers[of[0].technique as usize].add(frame, of, pass)?;
+        for group in splats.chunk_by(|a, b| a.technique == b.technique) {
+            layers[group[0].technique as usize].add(frame, group, pass)?;
         }
     }
     let bins = frame.film.slots - 2;
@@ -112,25 +138,25 @@ fn drawn(frame: &Frame, found: &mut [Found], passes: u32) -> Result<(), RenderEr
     let unit = unit(frame);
     for (technique, layer) in layers.iter_mut().enumerate() {
         layer.settle(frame)?;
-        layer.each(frame, passes, Stop(&Unstopped), |pixel, of| {
+        layer.each(frame, passes, Stop(&Unstopped), |pixel, pixel_light| {
             let Some(&(tile, k)) = places.get(&pixel) else {
                 return;
             };
-            let Found { light, classes, .. } = &mut found[tile];
+            let SampledTile { light, classes, .. } = &mut found[tile];
             let (energy, variance) = &mut classes[k][CLASSES + technique];
-            for (bin, mean, _) in of.light() {
+            for (bin, mean, _) in pixel_light.light() {
                 light[k * bins + bin] += (mean / unit) as f32;
                 *energy += mean / unit;
             }
-            *variance += of.pixel_variance() / (unit * unit);
+            *variance += pixel_light.pixel_variance() / (unit * unit);
         })?;
     }
     Ok(())
 }
 
-fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> Found {
+fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> SampledTile {
     let first = u32::MAX - passes;
-    let order = Order {
+    let order = PassRange {
         first,
         count: passes,
         two: true,
@@ -146,10 +172,10 @@ fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> Fou
         slots.clone().map(h).collect::<Vec<f32>>()
     });
     let light = light.collect();
-    let (walk, film, side) = (&by_class.walk, by_class.film, by_class.effort.side);
+    let (tracer, film, side) = (&by_class.tracer, by_class.film, by_class.effort.side);
     let size = film.pixel();
     let (mut sum, mut square) = (vec![0.0f32; pixels * size], vec![0.0f32; pixels * size]);
-    let mut scratch = Scratch::new(walk.world, walk.emitters, walk.mirrors);
+    let mut scratch = Scratch::new(tracer.world, tracer.emitters, tracer.mirrors);
     let (mut sharing, mut found) = (Sharing::default(), vec![]);
     for pass in 0..passes {
         for row in (0..region.rows).step_by(side as usize) {
@@ -166,18 +192,13 @@ fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> Fou
                     pass: u64::from(first + pass),
                     mirrors: &by_class.sampling.refined,
                 };
-                sharing.pass(
-                    (walk, film, &by_class.effort),
-                    &tile,
-                    &mut scratch,
-                    &mut found,
-                );
+                sharing.pass(by_class.pass_context(), &tile, &mut scratch, &mut found);
                 for (k, from) in found.chunks(size).enumerate() {
                     let (r, c) = (row + k as u32 / cols, col + k as u32 % cols);
-                    let at = (r * region.cols + c) as usize * size;
+                    let offset = (r * region.cols + c) as usize * size;
                     for (i, &x) in from.iter().enumerate().filter(|(_, x)| **x != 0.0) {
-                        sum[at + i] += x;
-                        square[at + i] += x * x;
+                        sum[offset + i] += x;
+                        square[offset + i] += x * x;
                     }
                 }
             }
@@ -186,25 +207,25 @@ fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> Fou
     let n = f64::from(passes);
     let pixel = |k: usize| {
         let mut classes = [(0.0, 0.0); ALL];
-        for (class, of) in classes.iter_mut().take(CLASSES).enumerate() {
+        for (class, sums) in classes.iter_mut().take(CLASSES).enumerate() {
             let first = k * size + (class + 1) * film.slots;
             let slots = first + 1..first + film.slots - 1;
             for (&x, &x2) in sum[slots.clone()].iter().zip(&square[slots]) {
                 let (x, x2) = (f64::from(x), f64::from(x2));
-                of.0 += x / n;
-                of.1 += (x2 - x * x / n).max(0.0) / (n - 1.0) / n;
+                sums.0 += x / n;
+                sums.1 += (x2 - x * x / n).max(0.0) / (n - 1.0) / n;
             }
         }
         classes
     };
-    Found {
+    SampledTile {
         region,
         light,
         classes: (0..pixels).map(pixel).collect(),
     }
 }
 
-fn shares(film: &Film, found: &[Found]) -> Vec<ClassVariance> {
+fn shares(film: &Film, found: &[SampledTile]) -> Vec<ClassVariance> {
     let bins = film.slots - 2;
     // Relative squared error by pixel: of all classes, and of each.
     let mut pixels: Vec<(f64, [f64; ALL])> = vec![];
@@ -212,17 +233,17 @@ fn shares(film: &Film, found: &[Found]) -> Vec<ClassVariance> {
     for tile in found {
         for (h, classes) in tile.light.chunks(bins).zip(&tile.classes) {
             let norm2: f64 = h.iter().map(|&x| f64::from(x).powi(2)).sum();
-            for (all, of) in energy.iter_mut().zip(classes) {
-                *all += of.0;
+            for (all, class) in energy.iter_mut().zip(classes) {
+                *all += class.0;
             }
             if norm2 > 0.0 {
-                let each = classes.map(|of| of.1 / norm2);
+                let each = classes.map(|class| class.1 / norm2);
                 pixels.push((each.iter().sum(), each));
             }
         }
     }
     pixels.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let of = |range: std::ops::Range<usize>| {
+    let shares_in = |range: std::ops::Range<usize>| {
         let mut sums = [0.0; ALL];
         for (_, each) in &pixels[range] {
             for (sum, x) in sums.iter_mut().zip(each) {
@@ -233,8 +254,8 @@ fn shares(film: &Film, found: &[Found]) -> Vec<ClassVariance> {
         sums.map(|x| x / all)
     };
     let (all, middle) = (
-        of(0..pixels.len()),
-        of(pixels.len() / 4..pixels.len() * 3 / 4),
+        shares_in(0..pixels.len()),
+        shares_in(pixels.len() / 4..pixels.len() * 3 / 4),
     );
     let light = energy.iter().sum::<f64>().max(f64::MIN_POSITIVE);
     let mut classes: Vec<ClassVariance> = (0..ALL)

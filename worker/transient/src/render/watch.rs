@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use crate::api::Progress;
 
 /// Reports the progress of the render to the caller and asks whether to stop.
-pub(crate) struct Watch<'a> {
+pub(crate) struct RoundProgress<'a> {
     pub progress: &'a dyn Progress,
     pub stopped: AtomicBool,
     pub tiles: AtomicUsize,
@@ -13,7 +13,7 @@ pub(crate) struct Watch<'a> {
     pub to: f32,
 }
 
-impl<'a> Watch<'a> {
+impl<'a> RoundProgress<'a> {
     /// Returns a watch over the round that advances the render from fraction `from` to `to`.
     pub fn new(progress: &'a dyn Progress, from: f32, to: f32) -> Self {
         Self {
@@ -38,8 +38,8 @@ impl<'a> Watch<'a> {
     /// Returns false to stop. It is called often, because a tile of many passes takes long.
     pub fn ask(&self, count: usize, share: f32) -> bool {
         let done = self.tiles.load(Ordering::Relaxed);
-        let at = self.from + (self.to - self.from) * (done as f32 + share) / count as f32;
-        if !self.progress.at(at.min(1.0)) {
+        let share_done = self.from + (self.to - self.from) * (done as f32 + share) / count as f32;
+        if !self.progress.at(share_done.min(1.0)) {
             self.stopped.store(true, Ordering::Relaxed);
         }
         !self.stopped.load(Ordering::Relaxed)

@@ -1,10 +1,10 @@
 //! Samples the visible facets of Beckmann's distribution (Heitz and d'Eon, EGSR 2014) without
 //! inverting a distribution function.
 //!
-//! Seen under the angle θ, a facet of slope (x, y)·α, with x towards the direction, has the weight
-//! (a + x)·e^(−x²−y²) if a + x > 0, with a = 1/(α·tan θ). So y is normally distributed. For x, the
-//! pair ±r has the total weight 2a·e^(−r²) if r < a; beyond a only +r counts, with the weight (a +
-//! r)·e^(−r²).
+//! ShadingPoint under the angle θ, a facet of slope (x, y)·α, with x towards the direction, has the
+//! weight (a + x)·e^(−x²−y²) if a + x > 0, with a = 1/(α·tan θ). So y is normally distributed. For
+//! x, the pair ±r has the total weight 2a·e^(−r²) if r < a; beyond a only +r counts, with the
+//! weight (a + r)·e^(−r²).
 
 use crate::numeric::{exponential::exp_minus, rng::Rng};
 
@@ -133,9 +133,9 @@ mod tests {
             }
             let all = moments(f64::from(a), |_| 1.0);
             for (k, found) in sums.into_iter().enumerate() {
-                let of = |x: f64| [x, x * x, (-x * x).exp()][k];
-                let mean = moments(f64::from(a), of) / all;
-                let square = moments(f64::from(a), |x| of(x).powi(2)) / all;
+                let power = |x: f64| [x, x * x, (-x * x).exp()][k];
+                let mean = moments(f64::from(a), power) / all;
+                let square = moments(f64::from(a), |x| power(x).powi(2)) / all;
                 let error = ((square - mean * mean) / f64::from(n)).sqrt();
                 assert!(
                     (found - mean).abs() < 4.0 * error,
@@ -151,9 +151,9 @@ mod tests {
     fn moments(a: f64, f: impl Fn(f64) -> f64) -> f64 {
         let (low, high, steps) = ((-a).max(-9.0), 9.0, 200_000);
         let step = (high - low) / f64::from(steps);
-        let at = |k: i32| low + (f64::from(k) + 0.5) * step;
+        let midpoint = |k: i32| low + (f64::from(k) + 0.5) * step;
         let count = |x: f64| f(x) * (a + x) * (-x * x).exp();
-        (0..steps).map(|k| count(at(k))).sum::<f64>() * step
+        (0..steps).map(|k| count(midpoint(k))).sum::<f64>() * step
     }
 
     #[test]

@@ -10,7 +10,7 @@ use crate::{
     scene::{
         beckmann,
         lobe::{Lobe, beckmann_masking},
-        surface::{Kind, Surface},
+        surface::{Kind, ScatterSample, Surface},
     },
 };
 
@@ -118,28 +118,35 @@ impl Surface {
         if lobe > 0.0 { lobe } else { 0.0 }
     }
 
-    /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none
-    /// leaves.
+    /// Draws a direction for `i`; `None` where none leaves.
     #[inline]
-    pub fn sample(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
+    pub fn sample(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<ScatterSample> {
         if self.diffuse() {
             let (o, c) = cosine(n, rng)?;
-            return Some((o, self.strength * PI, c / PI));
+            return Some(ScatterSample {
+                w: o,
+                weight: self.strength * PI,
+                pdf: c / PI,
+            });
         }
         if !self.is_mixed() {
             return self.sample_conductor(n, i, rng);
         }
         let o = if rng.uniform() < self.share() {
-            self.sample_conductor(n, i, rng)?.0
+            self.sample_conductor(n, i, rng)?.w
         } else {
             cosine(n, rng)?.0
         };
         let pdf = self.pdf(n, i, o);
-        (pdf > 0.0).then(|| (o, self.scatter(n, i, o) / pdf, pdf))
+        (pdf > 0.0).then(|| ScatterSample {
+            w: o,
+            weight: self.scatter(n, i, o) / pdf,
+            pdf,
+        })
     }
 
     #[inline]
-    pub fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
+    pub fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<ScatterSample> {
         let (t, b) = frame(n);
         let ci = n.dot(i);
         // From below the surface no facet is visible, and drawing one would never end.
@@ -168,7 +175,11 @@ impl Surface {
             false => self.leaving(ci) / seen,
         };
         let weight = self.strength * approximated * self.masking(co);
-        Some((o, weight, 0.25 * seen * self.density(n, i + o)))
+        Some(ScatterSample {
+            w: o,
+            weight,
+            pdf: 0.25 * seen * self.density(n, i + o),
+        })
     }
 
     /// Returns the density per steradian with which [`Surface::sample`] draws `o`.

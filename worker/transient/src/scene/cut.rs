@@ -28,15 +28,15 @@ pub(crate) fn cut(triangle: [Corner; 3], scale: f64) -> Option<Vec<[Corner; 3]>>
     }
     let mut pieces = vec![triangle.to_vec()];
     for axis in 0..3 {
-        let mut at = first;
-        while at < far {
-            for plane in [-at, at] {
+        let mut distance = first;
+        while distance < far {
+            for plane in [-distance, distance] {
                 pieces = pieces
                     .into_iter()
                     .flat_map(|p| halves(&p, axis, plane))
                     .collect();
             }
-            at *= FACTOR;
+            distance *= FACTOR;
         }
     }
     let fan = |p: Vec<Corner>| -> Vec<[Corner; 3]> {
@@ -47,22 +47,24 @@ pub(crate) fn cut(triangle: [Corner; 3], scale: f64) -> Option<Vec<[Corner; 3]>>
 
 /// Returns the parts of a convex polygon below and above a plane across an axis.
 fn halves(polygon: &[Corner], axis: usize, plane: f64) -> Vec<Vec<Corner>> {
-    let at = |c: &Corner| c.0[axis];
-    let above = polygon.iter().any(|c| at(c) > plane);
-    let below = polygon.iter().any(|c| at(c) < plane);
+    let coordinate = |c: &Corner| c.0[axis];
+    let above = polygon.iter().any(|c| coordinate(c) > plane);
+    let below = polygon.iter().any(|c| coordinate(c) < plane);
     if !(above && below) {
         return vec![polygon.to_vec()];
     }
     let (mut low, mut high) = (vec![], vec![]);
     for (k, a) in polygon.iter().enumerate() {
         let b = &polygon[(k + 1) % polygon.len()];
-        if at(a) <= plane {
+        if coordinate(a) <= plane {
             low.push(*a);
         }
-        if at(a) >= plane {
+        if coordinate(a) >= plane {
             high.push(*a);
         }
-        if (at(a) < plane && at(b) > plane) || (at(a) > plane && at(b) < plane) {
+        if (coordinate(a) < plane && coordinate(b) > plane)
+            || (coordinate(a) > plane && coordinate(b) < plane)
+        {
             let meet = meet(a, b, axis, plane);
             low.push(meet);
             high.push(meet);
@@ -149,24 +151,40 @@ mod tests {
 /// hundred bytes.
 const MOST_PIECES: usize = 1 << 22;
 
+/// The width of a scene.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Extent {
+    /// Largest distance from the camera that camera and light reach, metres.
+    pub reach: f64,
+    /// Largest distance of any vertex from the camera, metres.
+    pub widest: f64,
+    /// Render units per metre.
+    pub scale: f32,
+}
+
 /// The triangles after those that are far too wide have been cut.
 #[derive(Default)]
-pub(crate) struct Cut {
+pub(crate) struct CutTriangles {
     pub points: Vec<[Point; 3]>,
     pub uv: Vec<[[f32; 2]; 3]>,
     pub normals: Vec<Vec3>,
     /// Index of the triangle that each piece was cut from.
-    pub of: Vec<usize>,
+    pub source: Vec<usize>,
 }
 
-impl Cut {
+impl CutTriangles {
     /// Cuts all triangles. `uv` is empty without texture coordinates.
-    pub fn of(
+    pub fn new(
         points: &[[Point; 3]],
         uv: &[[[f32; 2]; 3]],
-        (reach, widest, scale): (f64, f64, f32),
+        extent: &Extent,
         stop: Stop,
     ) -> Result<Self, RenderError> {
+        let Extent {
+            reach,
+            widest,
+            scale,
+        } = *extent;
         let mut cut = Self::default();
         for (k, t) in points.iter().enumerate() {
             if k % 1024 == 0 {
@@ -202,7 +220,7 @@ impl Cut {
                 self.uv.push(piece.map(|c| c.1.map(|x| x as f32)));
             }
             self.normals.push(normal.unwrap_or_default());
-            self.of.push(k);
+            self.source.push(k);
         }
     }
 }

@@ -50,8 +50,8 @@ pub(crate) fn reach(
     };
     let mut starts = vec![];
     for k in 0..ACROSS * ACROSS {
-        let at = |k: u32, length: u32| (k as f32 + 0.5) / ACROSS as f32 * length as f32;
-        let (x, y) = (at(k % ACROSS, i.width), at(k / ACROSS, i.height));
+        let middle = |k: u32, length: u32| (k as f32 + 0.5) / ACROSS as f32 * length as f32;
+        let (x, y) = (middle(k % ACROSS, i.width), middle(k / ACROSS, i.height));
         starts.push(([0.0; 3], wide(scene.camera.ray(x, y))));
     }
     for beam in scene.laser.beams.iter().take(BEAMS) {
@@ -87,15 +87,15 @@ impl Probe<'_> {
     /// Follows light from a point. Returns true if the distance reached is enough.
     fn walk(&mut self, mut from: Point, mut direction: Point) -> bool {
         for _ in 0..=BOUNCES {
-            let Some((k, at)) = self.first(from, direction) else {
+            let Some((k, point)) = self.first(from, direction) else {
                 return false;
             };
-            if largest(at) > self.horizon {
+            if largest(point) > self.horizon {
                 return false;
             }
             let t = &self.triangles[k];
             let all = t.iter().fold(0.0f64, |a, &p| a.max(largest(p)));
-            let until = all.min(BEYOND * largest(at)).min(self.horizon);
+            let until = all.min(BEYOND * largest(point)).min(self.horizon);
             self.found = self.found.max(until);
             if self.found > self.enough {
                 return true;
@@ -108,9 +108,9 @@ impl Probe<'_> {
                 false => d,
             };
             // Moves off the surface by more than the rounding of f64.
-            let off = 1e-9 * largest(at).max(largest(from)) / dot(n, n).sqrt();
+            let off = 1e-9 * largest(point).max(largest(from)) / dot(n, n).sqrt();
             let off = if side > 0.0 { -off } else { off };
-            from = std::array::from_fn(|a| at[a] + off * n[a]);
+            from = std::array::from_fn(|a| point[a] + off * n[a]);
         }
         false
     }
@@ -150,7 +150,7 @@ impl Probe<'_> {
                 best = (t, k);
             }
         }
-        let at = || std::array::from_fn(|a| from[a] + best.0 * d[a]);
-        (best.1 != usize::MAX).then(|| (best.1, at()))
+        let point = || std::array::from_fn(|a| from[a] + best.0 * d[a]);
+        (best.1 != usize::MAX).then(|| (best.1, point()))
     }
 }

@@ -66,11 +66,11 @@ fn needle_point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
         dot(d, cross(b, a)),
     ];
     let sum = all[0] + all[1] + all[2];
-    let at = |k: usize| {
+    let coordinate = |k: usize| {
         let each = all.iter().zip(&corners);
         (each.map(|(share, v)| share * v[k]).sum::<f64>() / sum) as f32
     };
-    Vec3::new(at(0), at(1), at(2))
+    Vec3::new(coordinate(0), coordinate(1), coordinate(2))
 }
 
 /// Returns a point moved off its surface by a few units in the last place, along `n` (Wächter and

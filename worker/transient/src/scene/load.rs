@@ -7,7 +7,7 @@ use crate::{
     numeric::double::{Point, wide},
     scene::{
         bvh::{normal::normal, tree::Bvh},
-        cut::Cut,
+        cut::{CutTriangles, Extent},
         extent,
         fresnel::Body,
         panes::Panes,
@@ -29,14 +29,14 @@ impl World {
     /// Returns [`RenderError::Invalid`] if the scene is too wide or too small to be represented in
     /// f32.
     pub fn new(scene: &Scene, horizon_m: f64, stop: Stop) -> Result<Self, RenderError> {
-        Self::at(scene, None, horizon_m, stop)
+        Self::load(scene, None, horizon_m, stop)
     }
 
     /// The same at a wavelength, nanometres; without one, at that of the scene's reflectances.
     ///
     /// # Errors
     /// Those of [`World::new`].
-    pub fn at(
+    pub fn load(
         scene: &Scene,
         wavelength_nm: Option<f64>,
         horizon_m: f64,
@@ -66,7 +66,7 @@ impl World {
                 surfaces.push(match wavelength_nm {
                     None => Surface::new(m),
                     Some(nm) => {
-                        let (surface, of_texels) = spectra::at(m, nm);
+                        let (surface, of_texels) = spectra::surface_at(m, nm);
                         texels.push(of_texels);
                         surface
                     }
@@ -125,12 +125,17 @@ impl World {
         let scale = scale_for(reach);
         let mut normals = None;
         if reach < widest {
-            let cut = Cut::of(&points, &uv, (reach, widest, scale), stop)?;
-            let of = |all: &[u32]| cut.of.iter().map(|&k| all[k]).collect();
-            (surface, object) = (of(&surface), of(&object));
+            let width = Extent {
+                reach,
+                widest,
+                scale,
+            };
+            let cut = CutTriangles::new(&points, &uv, &width, stop)?;
+            let of_pieces = |all: &[u32]| cut.source.iter().map(|&k| all[k]).collect();
+            (surface, object) = (of_pieces(&surface), of_pieces(&object));
             (points, uv, normals) = (cut.points, cut.uv, Some(cut.normals));
-            let cut = Cut::of(&panes, &[], (reach, widest, scale), stop)?;
-            glass = cut.of.iter().map(|&k| glass[k]).collect();
+            let cut = CutTriangles::new(&panes, &[], &width, stop)?;
+            glass = cut.source.iter().map(|&k| glass[k]).collect();
             panes = cut.points;
         }
         let unit = |p: Point| Vec3::from(p.map(|x| (x * f64::from(scale)) as f32));

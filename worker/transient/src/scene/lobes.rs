@@ -24,16 +24,16 @@ fn array(v: Vec3) -> [f32; 3] {
 
 /// A surface point, its normal and its fixed direction.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Seen {
+pub(crate) struct ShadingPoint {
     pub p: Vec3,
     pub n: Vec3,
     pub i: Vec3,
 }
 
-impl Seen {
+impl ShadingPoint {
     /// Creates the point of a hit with the fixed direction `i`.
     #[inline]
-    pub fn of(h: &Hit, i: Vec3) -> Self {
+    pub fn new(h: &Hit, i: Vec3) -> Self {
         Self { p: h.p, n: h.n, i }
     }
 }
@@ -71,7 +71,7 @@ impl Lobes {
         self.any_beckmann = false;
     }
 
-    pub fn push(&mut self, place: &Seen, surface: &Surface) {
+    pub fn push(&mut self, place: &ShadingPoint, surface: &Surface) {
         for (columns, v) in [
             (&mut self.p, place.p),
             (&mut self.n, place.n),
@@ -108,7 +108,7 @@ impl Lobes {
     pub fn between(
         &self,
         range: Range<usize>,
-        (place, surface): (&Seen, &Surface),
+        (place, surface): (&ShadingPoint, &Surface),
         value: &mut [f32],
         pdf: &mut [f32],
     ) {
@@ -152,31 +152,37 @@ struct Groups<'a> {
 
 impl<'a> Groups<'a> {
     #[inline(always)]
-    fn of(lobes: &'a Lobes, first: usize, count: usize) -> Self {
+    fn new(lobes: &'a Lobes, first: usize, count: usize) -> Self {
         let groups = count.div_ceil(SIDE);
-        let of = |column: &'a Column| &column.groups(first, count)[..groups];
-        let each = |columns: &'a [Column; 3]| [of(&columns[0]), of(&columns[1]), of(&columns[2])];
+        let groups_of = |column: &'a Column| &column.groups(first, count)[..groups];
+        let each = |columns: &'a [Column; 3]| {
+            [
+                groups_of(&columns[0]),
+                groups_of(&columns[1]),
+                groups_of(&columns[2]),
+            ]
+        };
         Self {
             p: each(&lobes.p),
             n: each(&lobes.n),
             i: each(&lobes.i),
-            conductor: of(&lobes.conductor),
-            lambertian: of(&lobes.lambertian),
-            alpha2: of(&lobes.alpha2),
-            conductor_pdf: of(&lobes.conductor_pdf),
-            lambertian_pdf: of(&lobes.lambertian_pdf),
-            beckmann: of(&lobes.beckmann),
+            conductor: groups_of(&lobes.conductor),
+            lambertian: groups_of(&lobes.lambertian),
+            alpha2: groups_of(&lobes.alpha2),
+            conductor_pdf: groups_of(&lobes.conductor_pdf),
+            lambertian_pdf: groups_of(&lobes.lambertian_pdf),
+            beckmann: groups_of(&lobes.beckmann),
         }
     }
 
     #[inline(always)]
     fn group(&self, k: usize) -> Group<'a> {
-        let of =
+        let groups_of =
             |columns: &[&'a [[f32; SIDE]]; 3]| [&columns[0][k], &columns[1][k], &columns[2][k]];
         Group {
-            p: of(&self.p),
-            n: of(&self.n),
-            i: of(&self.i),
+            p: groups_of(&self.p),
+            n: groups_of(&self.n),
+            i: groups_of(&self.i),
             conductor: &self.conductor[k],
             lambertian: &self.lambertian[k],
             alpha2: &self.alpha2[k],
@@ -202,7 +208,7 @@ impl Group<'_> {
 }
 
 #[inline(always)]
-fn at(columns: &[&[f32; SIDE]; 3], k: usize) -> [f32; 3] {
+fn lane(columns: &[&[f32; SIDE]; 3], k: usize) -> [f32; 3] {
     [columns[0][k], columns[1][k], columns[2][k]]
 }
 
@@ -231,18 +237,20 @@ impl Toward<'_> {
     #[inline(always)]
     fn all<const BECKMANN: bool>(self) {
         let count = self.value.len();
-        let groups = Groups::of(self.lobes, 0, count);
+        let groups = Groups::new(self.lobes, 0, count);
         let (q, nq) = (array(self.q), array(self.nq));
         for group in 0..count.div_ceil(SIDE) {
             let c = groups.group(group);
             let (mut value, mut pdf) = ([0.0; SIDE], [0.0; SIDE]);
             for k in 0..SIDE {
-                let p = at(&c.p, k);
+                let p = lane(&c.p, k);
                 let to = [q[0] - p[0], q[1] - p[1], q[2] - p[2]];
                 let d2 = dot(to, to);
                 let scale = 1.0 / d2.sqrt();
                 let w = [to[0] * scale, to[1] * scale, to[2] * scale];
-                let (f, density) = c.lobe(k).scatter::<BECKMANN>(at(&c.n, k), at(&c.i, k), w);
+                let (f, density) = c
+                    .lobe(k)
+                    .scatter::<BECKMANN>(lane(&c.n, k), lane(&c.i, k), w);
                 let turn = dot(nq, w).abs() * (scale * scale);
                 // Points at the same position have no direction between them.
                 value[k] = if f > 0.0 { f * turn } else { 0.0 };
@@ -258,7 +266,7 @@ impl Toward<'_> {
 struct Between<'a> {
     lobes: &'a Lobes,
     range: Range<usize>,
-    place: Seen,
+    place: ShadingPoint,
     lobe: Lobe,
     value: &'a mut [f32],
     pdf: &'a mut [f32],
@@ -280,23 +288,23 @@ impl Between<'_> {
     #[inline(always)]
     fn all<const BECKMANN: bool>(self) {
         let count = self.range.len();
-        let groups = Groups::of(self.lobes, self.range.start, count);
+        let groups = Groups::new(self.lobes, self.range.start, count);
         let (out, out_pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
-        let Seen { p: x, n, i } = self.place;
+        let ShadingPoint { p: x, n, i } = self.place;
         let (x, n, i, lobe) = (array(x), array(n), array(i), self.lobe);
         for group in 0..count.div_ceil(SIDE) {
             let c = groups.group(group);
             let (mut value, mut pdf) = ([0.0; SIDE], [0.0; SIDE]);
             for k in 0..SIDE {
-                let p = at(&c.p, k);
+                let p = lane(&c.p, k);
                 let to = [p[0] - x[0], p[1] - x[1], p[2] - x[2]];
                 let d2 = dot(to, to);
                 let scale = 1.0 / d2.sqrt();
                 let w = [to[0] * scale, to[1] * scale, to[2] * scale];
                 let (here, density) = lobe.scatter::<BECKMANN>(n, i, w);
                 let back = [-w[0], -w[1], -w[2]];
-                let ny = at(&c.n, k);
-                let (there, _) = c.lobe(k).scatter::<BECKMANN>(ny, at(&c.i, k), back);
+                let ny = lane(&c.n, k);
+                let (there, _) = c.lobe(k).scatter::<BECKMANN>(ny, lane(&c.i, k), back);
                 let less = scale * scale;
                 let (f, turn) = (here * there, dot(ny, w).abs() * less);
                 // Points at the same position have no direction between them.
@@ -367,7 +375,7 @@ mod tests {
         ) {
             let mut lobes = Lobes::default();
             for (p, n, i, s) in &all {
-                lobes.push(&Seen { p: *p * 3.0, n: *n, i: *i }, s);
+                lobes.push(&ShadingPoint { p: *p * 3.0, n: *n, i: *i }, s);
             }
             let (mut value, mut pdf) = (vec![0.0; all.len()], vec![0.0; all.len()]);
             lobes.toward((x, n), &mut value, &mut pdf);
@@ -378,7 +386,7 @@ mod tests {
                 prop_assert!(near(value[k], s.scatter(*np, *ip, w) * turn));
                 prop_assert!(near(pdf[k], s.pdf(*np, *ip, w) * turn));
             }
-            let place = Seen { p: x, n, i };
+            let place = ShadingPoint { p: x, n, i };
             lobes.between(0..all.len(), (&place, &own), &mut value, &mut pdf);
             for (k, (p, np, ip, s)) in all.iter().enumerate() {
                 let to = *p * 3.0 - x;
@@ -402,7 +410,7 @@ mod tests {
             ..Material::diffuse("any", [0.5; 3])
         });
         for i in [n, -n, Vec3::new(1.0, 0.0, 0.0)] {
-            let seen = Seen { p, n, i };
+            let seen = ShadingPoint { p, n, i };
             let mut lobes = Lobes::default();
             lobes.push(&seen, &rough);
             let above = n * 2.0;
@@ -410,8 +418,8 @@ mod tests {
                 let (mut value, mut pdf) = ([1.0], [1.0]);
                 lobes.toward((q, n), &mut value, &mut pdf);
                 assert_eq!((value, pdf), ([0.0], [0.0]), "{i:?} {q:?}");
-                let at = Seen { p: q, n: -n, i: -n };
-                lobes.between(0..1, (&at, &rough), &mut value, &mut pdf);
+                let point = ShadingPoint { p: q, n: -n, i: -n };
+                lobes.between(0..1, (&point, &rough), &mut value, &mut pdf);
                 assert_eq!(value, [0.0], "{i:?} {q:?}");
                 assert!(pdf[0].is_finite());
             }

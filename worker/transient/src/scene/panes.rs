@@ -1,7 +1,8 @@
-//! Thin glass. It is not a surface: light passes straight through it, and a straight segment
-//! between two points carries the share of light that the panes on it transmit. So every technique
-//! of the renderer stays the same, with that share as the visibility, and the sampling densities do
-//! not change. Light that glass reflects has techniques of its own: [`crate::paths::glass::technique`].
+//! PassFraction glass. It is not a surface: light passes straight through it, and a straight
+//! segment between two points carries the share of light that the panes on it transmit. So every
+//! technique of the renderer stays the same, with that share as the visibility, and the sampling
+//! densities do not change. Light that glass reflects has techniques of its own:
+//! [`crate::paths::glass::technique`].
 //!
 //! The panes have a hierarchy of their own, separate from that of the surfaces, so that scenes
 //! without glass have no extra cost.
@@ -265,16 +266,20 @@ impl Panes {
     ) {
         let length = way.length();
         let mut met = std::mem::take(&mut stack.met);
-        self.bvh.all(stack, (a, way, 1.0), &mut met);
+        self.bvh.all(stack, a, way, 1.0, &mut met);
         let mut last = f32::NEG_INFINITY;
         for &(t, id) in &met {
-            let at = t * length;
-            if at - last < SAME {
+            let distance = t * length;
+            if distance - last < SAME {
                 continue;
             }
-            last = at;
-            let at = id as usize;
-            each(&self.glass[at], id, self.normals[at].dot(way) / length);
+            last = distance;
+            let pane_index = id as usize;
+            each(
+                &self.glass[pane_index],
+                id,
+                self.normals[pane_index].dot(way) / length,
+            );
         }
         stack.met = met;
     }

@@ -8,7 +8,7 @@ use crate::scene::{bvh::tree::Stack, world::World};
 #[derive(Debug, Default)]
 pub(crate) struct Segments {
     ends: Vec<Vec3>,
-    of: Vec<usize>,
+    indices: Vec<usize>,
     blocked: Vec<bool>,
     through: Vec<Option<f32>>,
     /// The segments that no surface occludes and their ends, if there is glass.
@@ -18,13 +18,13 @@ pub(crate) struct Segments {
 impl Segments {
     pub fn clear(&mut self) {
         self.ends.clear();
-        self.of.clear();
+        self.indices.clear();
     }
 
-    /// Adds a segment that ends at `end`. `of` is the caller's index for it.
-    pub fn push(&mut self, of: usize, end: Vec3) {
+    /// Adds a segment that ends at `end`. `index` is the caller's index for it.
+    pub fn push(&mut self, index: usize, end: Vec3) {
         self.ends.push(end);
-        self.of.push(of);
+        self.indices.push(index);
     }
 
     /// Tests with one bundle of rays from `from` whether a surface occludes each segment, and with
@@ -56,6 +56,9 @@ impl Segments {
     /// Returns the caller's index of each segment and the fraction of light that passes, or `None`
     /// if a surface occludes it.
     pub fn found(&self) -> impl Iterator<Item = (usize, Option<f32>)> {
-        self.of.iter().copied().zip(self.through.iter().copied())
+        self.indices
+            .iter()
+            .copied()
+            .zip(self.through.iter().copied())
     }
 }

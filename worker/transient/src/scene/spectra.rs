@@ -24,14 +24,18 @@ impl Texels {
 }
 
 /// A material's surface at a wavelength, nanometres, and what a texel does to it.
-pub(crate) fn at(m: &Material, nm: f64) -> (Surface, Option<Texels>) {
-    let at = m.at(nm as f32);
+pub(crate) fn surface_at(m: &Material, nm: f64) -> (Surface, Option<Texels>) {
+    let reflectances = m.at(nm as f32);
     let texels = m.texture.is_some().then(|| Texels {
-        shares: at.texel,
-        most: 1.0 / at.lambertian.max(at.conductor).max(f32::MIN_POSITIVE),
+        shares: reflectances.texel,
+        most: 1.0
+            / reflectances
+                .lambertian
+                .max(reflectances.conductor)
+                .max(f32::MIN_POSITIVE),
     });
     let there = Material {
-        bsdf: with(m.bsdf, (at.lambertian, at.conductor)),
+        bsdf: with(m.bsdf, (reflectances.lambertian, reflectances.conductor)),
         ..m.clone()
     };
     (Surface::new(&there), texels)

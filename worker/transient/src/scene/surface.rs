@@ -2,7 +2,7 @@
 
 use std::f32::consts::PI;
 
-use picofarm_scene::{Bsdf, Distribution, Material};
+use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
 
 /// The scattering models of the renderer. A new model is a variant here, its density, pdf and
 /// sampling in this file, and a variant of [`Bsdf`]. The rest of the renderer queries the
@@ -26,6 +26,17 @@ const GGX: u8 = 4;
 /// to evaluate light sampled for one pixel at the others; below it, sharing costs more than it
 /// gains (measured at 0.12 and 0.2).
 const SHARED_ALPHA: f32 = 0.15;
+
+/// A direction drawn by a surface's scattering.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ScatterSample {
+    /// Unit direction.
+    pub w: Vec3,
+    /// f·cos over the density.
+    pub weight: f32,
+    /// Density per steradian.
+    pub pdf: f32,
+}
 
 /// A material's scattering, ready for use. Sixteen bytes: every hit carries one.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,7 +63,7 @@ impl Surface {
             Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => false,
         };
         let flag = |set: bool, flag: u8| if set { flag } else { 0 };
-        let of = |kind, strength, alpha, base| Self {
+        let surface = |kind, strength, alpha, base| Self {
             kind,
             flags: flag(m.two_sided, TWO_SIDED)
                 | flag(
@@ -65,10 +76,10 @@ impl Surface {
             base,
         };
         match m.bsdf {
-            Bsdf::Diffuse { reflectance } => of(Kind::Lambertian, reflectance / PI, 0.0, 0.0),
+            Bsdf::Diffuse { reflectance } => surface(Kind::Lambertian, reflectance / PI, 0.0, 0.0),
             Bsdf::RoughConductor {
                 alpha, reflectance, ..
-            } => of(Kind::Conductor, reflectance, alpha, 0.0),
+            } => surface(Kind::Conductor, reflectance, alpha, 0.0),
             Bsdf::Mixed {
                 reflectance,
                 alpha,
@@ -80,17 +91,17 @@ impl Surface {
                 let base = (1.0 - weight) * reflectance / PI;
                 // A mix has two parts that scatter; with one such part the surface is pure.
                 if base == 0.0 {
-                    of(Kind::Conductor, strength, alpha, 0.0)
+                    surface(Kind::Conductor, strength, alpha, 0.0)
                 } else if strength == 0.0 {
-                    of(Kind::Lambertian, base, 0.0, 0.0)
+                    surface(Kind::Lambertian, base, 0.0, 0.0)
                 } else {
-                    of(Kind::Mixed, strength, alpha, base)
+                    surface(Kind::Mixed, strength, alpha, base)
                 }
             }
-            // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see
-            // `by_glass`).
+            // PassFraction glass is no surface (see `glass`); what bodies of glass do is no
+            // scattering (see `by_glass`).
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
-                of(Kind::Lambertian, 0.0, 0.0, 0.0)
+                surface(Kind::Lambertian, 0.0, 0.0, 0.0)
             }
         }
     }

@@ -56,7 +56,7 @@ pub(crate) struct World {
     pub camera: Camera,
     /// Side of the sensitive square in the middle of each pixel, as a fraction of the pixel's side.
     pub sensitive: f32,
-    /// Thin glass. Its triangles are not among `triangles`.
+    /// PassFraction glass. Its triangles are not among `triangles`.
     pub panes: Option<Panes>,
     /// Glass bodies by surface index; empty if there are none.
     pub bodies: Vec<Option<Body>>,
@@ -241,7 +241,7 @@ impl World {
     }
 
     /// Returns a point of a triangle as a hit seen from `from`.
-    pub fn on(&self, triangle: u32, p: Vec3, from: Vec3) -> Hit {
+    pub fn hit_on(&self, triangle: u32, p: Vec3, from: Vec3) -> Hit {
         let front = self.normals[triangle as usize].dot(from - p) >= 0.0;
         self.hit(triangle, p, front)
     }
@@ -278,8 +278,8 @@ impl World {
         let texture = self.textures.get(self.surface[i] as usize)?.as_ref()?;
         let [u, v, w] = self.barycentric(triangle, p);
         let [a, b, c] = self.uv[i];
-        let at = |k: usize| a[k] * u + b[k] * v + c[k] * w;
-        Some(texture.at([at(0), at(1)]))
+        let mixed = |k: usize| a[k] * u + b[k] * v + c[k] * w;
+        Some(texture.at([mixed(0), mixed(1)]))
     }
 
     /// Returns the barycentric coordinates of a point of a triangle.

@@ -17,7 +17,7 @@ use picofarm_transient::{
 
 /// Returns a scene with a mirror, a glossy surface, a mix, a texture, curved objects and four
 /// spots.
-fn everything(size: u32) -> Scene {
+pub(crate) fn everything(size: u32) -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let mix = Material {
         bsdf: Bsdf::Mixed {

@@ -30,6 +30,7 @@ mod rough;
 mod scale;
 mod stop;
 mod sums;
+mod tuning;
 mod warnings;
 mod wavelengths;
 mod whole_image;

@@ -3,20 +3,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::{light::emitters::Emitters, scene::world::World};
-
-/// Target number of patches; a scene of many small separate parts has more.
-const COUNT: f32 = 3000.0;
-
-/// Largest number of successive halvings of a triangle.
-const HALVINGS: u32 = 24;
-
-/// Number of pieces from which triangles stay whole, because long needles would produce millions.
-/// Larger pieces only make sampling less efficient.
-const MOST: usize = 1 << 17;
-
-/// Cosine above which triangles of a patch count as coplanar.
-const FLAT: f32 = 0.98;
+use crate::{light::emitters::Emitters, scene::world::World, tuning::EllipsoidTuning};
 
 /// Marks a link to a piece or patch instead of a halving.
 const LEAF: u32 = 1 << 31;
@@ -43,6 +30,7 @@ pub(crate) struct Piece {
 /// Neighbouring pieces, in columns by patch.
 #[derive(Debug, Default)]
 pub(crate) struct Patches {
+    pub tuning: EllipsoidTuning,
     /// Link of every triangle.
     of_triangle: Vec<u32>,
     halvings: Vec<Halving>,
@@ -66,8 +54,11 @@ pub(crate) struct Patches {
 
 impl Patches {
     /// Cuts a scene's surfaces. Surfaces without a Lambertian part are left out.
-    pub fn new(world: &World, emitters: &Emitters) -> Self {
-        let mut all = Self::default();
+    pub fn new(world: &World, emitters: &Emitters, tuning: EllipsoidTuning) -> Self {
+        let mut all = Self {
+            tuning,
+            ..Self::default()
+        };
         let areas: Vec<f32> = (0..world.triangles.len())
             .map(|t| {
                 let surface = &world.surfaces[world.surface[t] as usize];
@@ -79,11 +70,17 @@ impl Patches {
             })
             .collect();
         let total: f64 = areas.iter().map(|&a| f64::from(a)).sum();
-        let size = (total as f32 / COUNT).sqrt() * 1.5;
+        let size = (total as f32 / tuning.patches).sqrt() * 1.5;
         let mut cut = vec![];
         for (t, &area) in areas.iter().enumerate() {
             let link = if area > 0.0 {
-                all.halve(t as u32, world.triangles[t], size, HALVINGS, &mut cut)
+                all.halve(
+                    t as u32,
+                    world.triangles[t],
+                    size,
+                    tuning.halvings,
+                    &mut cut,
+                )
             } else {
                 NONE
             };
@@ -121,7 +118,7 @@ impl Patches {
         let length = |k: usize| (corners[(k + 1) % 3] - corners[k]).length();
         let edge = (1..3).fold(0, |a, k| if length(k) > length(a) { k } else { a });
         let next = (edge + 1) % 3;
-        if length(edge) <= size || left == 0 || cut.len() >= MOST {
+        if length(edge) <= size || left == 0 || cut.len() >= self.tuning.most_pieces {
             cut.push(Piece {
                 triangle,
                 corners,
@@ -129,7 +126,7 @@ impl Patches {
             });
             return LEAF | (cut.len() as u32 - 1);
         }
-        let at = self.halvings.len();
+        let index = self.halvings.len();
         self.halvings.push(Halving {
             edge: edge as u8,
             halves: [NONE; 2],
@@ -139,9 +136,9 @@ impl Patches {
             let mut corners = corners;
             corners[moved] = middle;
             let link = self.halve(triangle, corners, size, left - 1, cut);
-            self.halvings[at].halves[half] = link;
+            self.halvings[index].halves[half] = link;
         }
-        at as u32
+        index as u32
     }
 
     /// Makes a patch of the pieces in `order` if they are close together, otherwise recurses into
@@ -179,8 +176,9 @@ impl Patches {
             let piece = &cut[k as usize];
             let t = piece.triangle as usize;
             let cos = world.normals[t].dot(front);
-            flat &= cos.abs() > FLAT;
-            one_sided &= cos > FLAT && !world.surfaces[world.surface[t] as usize].two_sided();
+            flat &= cos.abs() > self.tuning.flat;
+            one_sided &=
+                cos > self.tuning.flat && !world.surfaces[world.surface[t] as usize].two_sided();
             area += piece.upto;
             patch_of[k as usize] = patch;
             self.pieces.push(Piece {
@@ -240,7 +238,7 @@ impl Patches {
     /// Returns the patch at the point of a triangle with these barycentric coordinates; `None` if
     /// the triangle is in no patch.
     #[inline]
-    pub(crate) fn at(&self, triangle: u32, mut coordinates: [f32; 3]) -> Option<usize> {
+    pub(crate) fn patch_at(&self, triangle: u32, mut coordinates: [f32; 3]) -> Option<usize> {
         let mut link = self.of_triangle[triangle as usize];
         while link & LEAF == 0 {
             let h = &self.halvings[link as usize];
@@ -270,7 +268,7 @@ mod tests {
     fn bare(triangles: &[[Vec3; 3]], size: f32) -> (Patches, Vec<Piece>) {
         let (mut all, mut cut) = (Patches::default(), vec![]);
         for (t, &corners) in triangles.iter().enumerate() {
-            let link = all.halve(t as u32, corners, size, HALVINGS, &mut cut);
+            let link = all.halve(t as u32, corners, size, all.tuning.halvings, &mut cut);
             all.of_triangle.push(link);
         }
         (all, cut)
@@ -292,9 +290,9 @@ mod tests {
         for (k, piece) in cut.iter().enumerate() {
             let [p, q, r] = piece.corners;
             for (u, v) in [(0.3, 0.3), (0.8, 0.1), (0.1, 0.8), (0.05, 0.05)] {
-                let at = p * u + q * v + r * (1.0 - u - v);
-                let part = |s: Vec3, t: Vec3| n.dot((s - at).cross(t - at)) / n.dot(n);
-                let found = all.at(0, [part(b, c), part(c, a), part(a, b)]);
+                let point = p * u + q * v + r * (1.0 - u - v);
+                let part = |s: Vec3, t: Vec3| n.dot((s - point).cross(t - point)) / n.dot(n);
+                let found = all.patch_at(0, [part(b, c), part(c, a), part(a, b)]);
                 assert_eq!(found, Some(k));
             }
         }
@@ -306,6 +304,6 @@ mod tests {
             of_triangle: vec![NONE],
             ..Patches::default()
         };
-        assert_eq!(all.at(0, [0.2, 0.3, 0.5]), None);
+        assert_eq!(all.patch_at(0, [0.2, 0.3, 0.5]), None);
     }
 }

@@ -3,21 +3,14 @@
 use picofarm_scene::Vec3;
 
 use crate::{
-    api::Gate,
     numeric::rng::Rng,
     paths::{
         ellipsoid::{patches::Patches, window::Window},
+        tracer::Tracer,
         vertex::Vertex,
     },
     scene::{hit::Hit, world::World},
 };
-
-/// Number of gather points that represent a tile for its shells.
-const STANDINS: usize = 8;
-
-/// Largest difference between a path via a patch and the path via its centre, in radii of the
-/// patch. It is at most 2, and less if the patch is seen at an angle.
-const SWELL: f32 = 1.2;
 
 /// The shells of one tile.
 #[derive(Debug, Default)]
@@ -43,10 +36,12 @@ impl Shells {
     /// Computes the shells for a tile's gather points.
     pub fn lay(
         &mut self,
-        (world, patches, gate): (&World, &Patches, &Gate),
+        tracer: &Tracer,
+        patches: &Patches,
         gathers: &[(Vertex, usize)],
         count: u32,
     ) {
+        let (world, gate) = (tracer.world, tracer.gate);
         let scale = f64::from(world.scale);
         self.points.clear();
         self.points.extend(
@@ -101,12 +96,12 @@ impl Shells {
         let [cx, cy, cz] = patches.centre.each_ref().map(|c| &c[..count]);
         let [nx, ny, nz] = patches.normal.each_ref().map(|c| &c[..count]);
         let radius = &patches.radius[..count];
-        let standins = STANDINS.min(gathers.len());
+        let standins = patches.tuning.stand_ins.min(gathers.len());
         for s in 0..standins {
-            let at = (2 * s + 1) * gathers.len() / (2 * standins);
-            let (x, length) = self.points[at];
-            let n = gathers[at].0.hit.n;
-            let lambert = if gathers[at].0.hit.surface.diffuse() {
+            let index = (2 * s + 1) * gathers.len() / (2 * standins);
+            let (x, length) = self.points[index];
+            let n = gathers[index].0.hit.n;
+            let lambert = if gathers[index].0.hit.surface.diffuse() {
                 1.0
             } else {
                 0.0
@@ -129,7 +124,7 @@ impl Shells {
             }
         }
         for (k, &radius) in radius.iter().enumerate() {
-            let more = SWELL * radius + 0.125 * (self.far[k] - self.near[k]) + 1e-6;
+            let more = patches.tuning.swell * radius + 0.125 * (self.far[k] - self.near[k]) + 1e-6;
             self.near[k] -= more;
             self.far[k] += more;
             if patches.one_sided[k] {
@@ -143,11 +138,11 @@ impl Shells {
     pub fn draw(
         &self,
         (world, patches): (&World, &Patches),
-        at: f64,
+        position: f64,
         rng: &mut Rng,
     ) -> Option<Hit> {
         let (_, total) = *self.chosen.last()?;
-        let k = self.chosen.partition_point(|c| c.1 <= at * total);
+        let k = self.chosen.partition_point(|c| c.1 <= position * total);
         let patch = self.chosen[k.min(self.chosen.len() - 1)].0 as usize;
         let range = patches.first[patch] as usize..patches.first[patch + 1] as usize;
         let pieces = &patches.pieces[range];
@@ -157,7 +152,7 @@ impl Shells {
         let [a, b, c] = piece.corners;
         let (r, v) = (rng.uniform().sqrt(), rng.uniform());
         let p = a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v);
-        let hit = world.on(piece.triangle, p, self.towards);
+        let hit = world.hit_on(piece.triangle, p, self.towards);
         (!hit.surface.is_black()).then_some(hit)
     }
 
@@ -167,7 +162,7 @@ impl Shells {
         if h.n.dot(self.towards - h.p) <= 0.0 {
             return 0.0;
         }
-        let patch = patches.at(h.triangle, world.barycentric(h.triangle, h.p));
+        let patch = patches.patch_at(h.triangle, world.barycentric(h.triangle, h.p));
         patch.map_or(0.0, |k| self.density[k])
     }
 

@@ -10,24 +10,25 @@ use picofarm_scene::Vec3;
 use crate::{
     numeric::{frame::frame, rng::Rng},
     scene::hit::Hit,
+    tuning::GlassTuning,
 };
 
 /// The largest number of spheres; the largest sum of the squared diagonals of two boxes, relative
 /// to that of the box that they divide; and the number of slices of a box that the cuts are chosen
 /// from.
 const MOST: usize = 16;
-const PAYS: f32 = 0.7;
 const SLICES: usize = 16;
-
-/// Share of directions drawn within cones.
-const SHARE: f32 = 0.5;
 
 /// Least square of a cone's sine, so that directions on its edge are distinguishable.
 const NARROW: f32 = 1e-4;
 
 /// Bounding spheres of all glass except panes in which spots and lit points have images.
 #[derive(Debug, Default)]
-pub(crate) struct Aim(Vec<Sphere>);
+pub(crate) struct AimSpheres {
+    spheres: Vec<Sphere>,
+    /// Share of directions drawn within cones.
+    share: f32,
+}
 
 #[derive(Debug, Clone, Copy)]
 struct Sphere {
@@ -50,6 +51,8 @@ pub(crate) struct Cones {
     count: usize,
     /// Sum of the cones' sizes.
     total: f32,
+    /// Share of directions drawn within cones.
+    share: f32,
 }
 
 /// A box, empty at first.
@@ -62,7 +65,7 @@ impl Bounds {
         Self([Vec3::new(far, far, far), Vec3::new(-far, -far, -far)])
     };
 
-    fn of<'a>(all: impl IntoIterator<Item = &'a Vec3>) -> Self {
+    fn around<'a>(all: impl IntoIterator<Item = &'a Vec3>) -> Self {
         let each = all.into_iter().map(|&p| Self([p, p]));
         each.fold(Self::EMPTY, Self::and)
     }
@@ -84,7 +87,7 @@ impl Bounds {
 
 /// Returns the bounding sphere of some triangles around the middle of their box.
 fn around(all: &[[Vec3; 3]]) -> Sphere {
-    let [low, high] = Bounds::of(all.iter().flatten()).0;
+    let [low, high] = Bounds::around(all.iter().flatten()).0;
     let centre = (low + high) * 0.5;
     let square = |p: &Vec3| (*p - centre).dot(*p - centre);
     let radius2 = all.iter().flatten().map(square).fold(0.0, f32::max);
@@ -96,26 +99,27 @@ fn around(all: &[[Vec3; 3]]) -> Sphere {
 
 /// Divides triangles in two by the cut with the least sum of the squared diagonals of both boxes,
 /// among a few planes across each axis. Returns the triangles undivided as an error if no cut pays.
-fn divided(all: Vec<[Vec3; 3]>) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
+fn divided(all: Vec<[Vec3; 3]>, pays: f32) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
     let coordinate = |p: Vec3, axis: usize| [p.x, p.y, p.z][axis];
     let middle = |t: &[Vec3; 3]| (t[0] + t[1] + t[2]) / 3.0;
     let middles: Vec<Vec3> = all.iter().map(middle).collect();
-    let [low, high] = Bounds::of(&middles).0;
+    let [low, high] = Bounds::around(&middles).0;
     let slice = |p: Vec3, axis: usize| {
         let (from, to) = (coordinate(low, axis), coordinate(high, axis));
-        let at = (coordinate(p, axis) - from) / (to - from) * SLICES as f32;
+        let position = (coordinate(p, axis) - from) / (to - from) * SLICES as f32;
         // The cast saturates, and maps NaN to 0.
-        (at as usize).min(SLICES - 1)
+        (position as usize).min(SLICES - 1)
     };
-    let mut best = (PAYS * Bounds::of(all.iter().flatten()).square(), 0, 0);
+    let mut best = (pays * Bounds::around(all.iter().flatten()).square(), 0, 0);
     for axis in 0..3 {
         let mut slices = [Bounds::EMPTY; SLICES];
         for (t, &p) in all.iter().zip(&middles) {
-            let of = &mut slices[slice(p, axis)];
-            *of = of.and(Bounds::of(t));
+            let bounds = &mut slices[slice(p, axis)];
+            *bounds = bounds.and(Bounds::around(t));
         }
         for cut in 1..SLICES {
-            let join = |of: &[Bounds]| of.iter().fold(Bounds::EMPTY, |all, &one| all.and(one));
+            let join =
+                |boxes: &[Bounds]| boxes.iter().fold(Bounds::EMPTY, |all, &one| all.and(one));
             let sum = join(&slices[..cut]).square() + join(&slices[cut..]).square();
             if sum < best.0 {
                 best = (sum, axis, cut);
@@ -133,9 +137,9 @@ fn divided(all: Vec<[Vec3; 3]>) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
     Ok(two)
 }
 
-impl Aim {
+impl AimSpheres {
     /// Builds the spheres of some triangles.
-    pub fn at(all: Vec<[Vec3; 3]>) -> Self {
+    pub fn new(all: Vec<[Vec3; 3]>, tuning: &GlassTuning) -> Self {
         if all.is_empty() {
             return Self::default();
         }
@@ -143,12 +147,19 @@ impl Aim {
         let mut open = vec![all];
         while let Some(next) = open.pop() {
             let enough = open.len() + done.len() + 1 >= MOST;
-            match if enough { Err(next) } else { divided(next) } {
+            match if enough {
+                Err(next)
+            } else {
+                divided(next, tuning.cut_pays)
+            } {
                 Ok(two) => open.extend(two),
                 Err(one) => done.push(around(&one)),
             }
         }
-        Self(done)
+        Self {
+            spheres: done,
+            share: tuning.aimed,
+        }
     }
 
     /// Returns the cones from a surface point; `None` if there are none, or if the surface scatters
@@ -158,8 +169,9 @@ impl Aim {
             list: [Cone::default(); MOST],
             count: 0,
             total: 0.0,
+            share: self.share,
         };
-        for s in &self.0 {
+        for s in &self.spheres {
             let to = s.centre - h.p;
             let d2 = to.dot(to);
             let square = (s.radius * s.radius / d2).max(NARROW);
@@ -184,13 +196,13 @@ impl Cones {
     /// Draws a direction for light that leaves a surface toward `back`. Returns the direction,
     /// f·cos over the combined density, and f·cos over the density of the surface's own scattering.
     pub fn sample(&self, h: &Hit, back: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
-        let w = match rng.uniform() < SHARE {
+        let w = match rng.uniform() < self.share {
             true => self.within(rng),
-            false => h.surface.sample(h.n, back, rng)?.0,
+            false => h.surface.sample(h.n, back, rng)?.w,
         };
         let own = h.surface.pdf(h.n, back, w);
         let value = h.surface.scatter(h.n, back, w);
-        let density = SHARE * self.density(w) + (1.0 - SHARE) * own;
+        let density = self.share * self.density(w) + (1.0 - self.share) * own;
         (own > 0.0 && value > 0.0).then(|| (w, value / density, value / own))
     }
 
@@ -220,18 +232,19 @@ impl Cones {
 
 #[cfg(test)]
 mod tests {
+    use crate::tuning::GlassTuning;
     use std::f32::consts::PI;
 
     use picofarm_scene::Vec3;
 
     use crate::numeric::rng::Rng;
     use crate::numeric::rng::Stream;
-    use crate::paths::glass::aim::Aim;
+    use crate::paths::glass::aim::AimSpheres;
     use crate::paths::glass::aim::Cones;
 
     /// Returns a tetrahedron of a size at a place.
-    fn solid(at: Vec3, size: f32) -> Vec<[Vec3; 3]> {
-        let corner = |x, y, z| at + Vec3::new(x, y, z) * size;
+    fn solid(position: Vec3, size: f32) -> Vec<[Vec3; 3]> {
+        let corner = |x, y, z| position + Vec3::new(x, y, z) * size;
         let all = [
             corner(1.0, 1.0, 1.0),
             corner(1.0, -1.0, -1.0),
@@ -244,16 +257,16 @@ mod tests {
 
     #[test]
     fn bodies_far_apart_get_spheres_of_their_own_and_one_body_a_single_one() {
-        assert_eq!(Aim::at(vec![]).0.len(), 0);
-        assert_eq!(Aim::at(solid(Vec3::ZERO, 1.0)).0.len(), 1);
-        let at = |k: usize| Vec3::new(5.0 * k as f32, 0.0, (k % 3) as f32);
-        let several = |count: usize| (0..count).flat_map(|k| solid(at(k), 0.3)).collect();
-        assert_eq!(Aim::at(several(3)).0.len(), 3);
-        let many = Aim::at(several(40));
-        assert!(many.0.len() <= crate::paths::glass::aim::MOST);
+        assert_eq!(spheres(vec![]).spheres.len(), 0);
+        assert_eq!(spheres(solid(Vec3::ZERO, 1.0)).spheres.len(), 1);
+        let position = |k: usize| Vec3::new(5.0 * k as f32, 0.0, (k % 3) as f32);
+        let several = |count: usize| (0..count).flat_map(|k| solid(position(k), 0.3)).collect();
+        assert_eq!(spheres(several(3)).spheres.len(), 3);
+        let many = spheres(several(40));
+        assert!(many.spheres.len() <= crate::paths::glass::aim::MOST);
         for p in several(40).iter().flatten() {
             let holds = many
-                .0
+                .spheres
                 .iter()
                 .any(|s| (*p - s.centre).length() < s.radius * 1.0001);
             assert!(holds, "{p:?}");
@@ -262,10 +275,10 @@ mod tests {
 
     #[test]
     fn directions_are_drawn_with_the_density_that_is_said() {
-        let aim = Aim::at(
+        let aim = spheres(
             [Vec3::new(0.5, 0.0, 2.0), Vec3::new(-1.0, 1.0, 1.5)]
                 .into_iter()
-                .flat_map(|at| solid(at, 0.3))
+                .flat_map(|position| solid(position, 0.3))
                 .collect(),
         );
         let cones = cones(&aim);
@@ -296,7 +309,11 @@ mod tests {
         );
     }
 
-    fn cones(aim: &Aim) -> Cones {
+    fn spheres(all: Vec<[Vec3; 3]>) -> AimSpheres {
+        AimSpheres::new(all, &GlassTuning::default())
+    }
+
+    fn cones(aim: &AimSpheres) -> Cones {
         let hit = crate::scene::hit::Hit {
             p: Vec3::ZERO,
             n: Vec3::new(0.0, 0.0, 1.0),

@@ -4,26 +4,28 @@ use crate::{
     numeric::rng::Rng,
     paths::glass::{
         images::Images,
-        point::{Carried, Point},
+        point::{PathState, Point},
         ray::{Ray, follow},
     },
     scene::{bvh::tree::Stack, panes::Crossing, world::World},
+    tuning::GlassTuning,
 };
 
 /// Follows a ray to the next point of a path.
 pub(crate) fn arrive(
     (world, images): (&World, &Images),
-    path: &Carried,
+    path: &PathState,
     (ray, seek): (Ray, f32),
+    tuning: &GlassTuning,
     rng: &mut Rng,
     tools: (&mut Stack, &mut Vec<Crossing>),
 ) -> Option<Point> {
-    let (ray, hit) = follow(world, ray, seek, rng, tools)?;
+    let (ray, hit) = follow(world, ray, seek, tuning, rng, tools)?;
     let once = ray.last.filter(|_| ray.turns == 1);
     Some(Point {
         hit,
         back: -ray.w,
-        path: Carried {
+        path: PathState {
             weight: path.weight * ray.weight,
             length_m: path.length_m + ray.length_m,
             bounces: path.bounces + 1 + ray.reflections,

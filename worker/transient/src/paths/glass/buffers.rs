@@ -2,7 +2,7 @@
 
 use crate::{
     light::light_vertices::LightVertices,
-    paths::{glass::lit_points::Lit, scratch::Scratch, tracer::Walk},
+    paths::{glass::lit_points::LitPoints, scratch::Scratch, tracer::Tracer},
     scene::{bvh::tree::Stack, panes::Crossing},
 };
 
@@ -13,17 +13,17 @@ pub(crate) struct Buffers {
     pub crossings: Vec<Crossing>,
     pub lights: Vec<f32>,
     pub vertices: LightVertices,
-    pub lit: Lit,
+    pub lit: LitPoints,
 }
 
 impl Buffers {
-    pub fn new(walk: &Walk) -> Self {
+    pub fn new(tracer: &Tracer) -> Self {
         Self {
-            scratch: Scratch::new(walk.world, walk.emitters, walk.mirrors),
+            scratch: Scratch::new(tracer.world, tracer.emitters, tracer.mirrors),
             crossings: vec![],
             lights: vec![],
             vertices: LightVertices::default(),
-            lit: Lit::default(),
+            lit: LitPoints::default(),
         }
     }
 

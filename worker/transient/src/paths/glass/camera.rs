@@ -9,47 +9,49 @@ use crate::{
         glass::{
             arrive::arrive,
             buffers::Buffers,
-            contribution::{Found, add},
-            lit_points::Lit,
+            contribution::{Contribution, add},
+            lit_points::LitPoints,
             photons::Photons,
-            point::{Carried, Point},
+            point::{PathState, Point},
             ray::Ray,
             straight::straight,
-            technique::ByGlass,
+            technique::GlassTechnique,
         },
-        tracer::Walk,
+        tracer::Tracer,
     },
 };
 
-/// Least probability of choosing a pane's reflection before the first turn.
-const SEEK: f32 = 0.5;
+/// A point of the film that a camera path starts at.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CameraView<'a> {
+    pub film: &'a Film,
+    /// Row-major pixel.
+    pub pixel: u32,
+    /// Direction of the ray through that point; any length.
+    pub ray: Vec3,
+}
 
-/// Largest number of images that the first point, and any other point, is connected to.
-const IMAGES: (u32, u32) = (4, 1);
-
-/// The same for points lit by spots.
-const LIT: (u32, u32) = (2, 1);
-const LIGHTS: u32 = 1;
-
-impl ByGlass {
+impl GlassTechnique<'_> {
     /// Traces a camera path through a point of the film. Adds the light from connections to the
     /// spots, their images and the current light vertices, and from the photons.
     pub fn look(
         &self,
-        (walk, film, photons): (&Walk, &Film, &Photons),
-        (pixel, ray): (u32, Vec3),
+        view: &CameraView<'_>,
+        photons: &Photons,
         rng: &mut Rng,
         buffers: &mut Buffers,
         out: &mut Vec<Splat>,
     ) {
-        let (world, origin) = (walk.world, Vec3::ZERO);
+        let CameraView { film, pixel, ray } = *view;
+        let tracer = &self.tracer;
+        let (world, origin) = (tracer.world, Vec3::ZERO);
         let chance = self.chance(pixel);
         if chance < 1.0 && rng.uniform() >= chance {
             return;
         }
         let mut left = 1.0;
         let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
-        let mut path = Carried {
+        let mut path = PathState {
             weight: 1.0 / chance,
             length_m: 0.0,
             bounces: 0,
@@ -57,9 +59,16 @@ impl ByGlass {
         // Whether any leg was turned, and whether all legs were.
         let (mut turned, mut all) = (false, true);
         loop {
-            let seek = if turned { 0.0 } else { SEEK };
+            let seek = if turned { 0.0 } else { self.tuning.seek };
             let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
-            let Some(point) = arrive((world, &self.images), &path, (ray, seek), rng, tools) else {
+            let Some(point) = arrive(
+                (world, &self.images),
+                &path,
+                (ray, seek),
+                &self.tuning,
+                rng,
+                tools,
+            ) else {
                 return;
             };
             let first = path.bounces == 0;
@@ -71,41 +80,50 @@ impl ByGlass {
             if first && turned {
                 // The spots themselves are points of light if possible.
                 let spots = !(point.shows && self.points_of_light());
-                let limits = (walk.max_bounces, world, spots);
-                photons.around(limits, &point, |found| add(film, (pixel, found), out));
+                photons.around(tracer, spots, &point, |found| {
+                    add(film, (pixel, found), out)
+                });
             }
             let there = &point.path;
-            if there.bounces + 1 > walk.max_bounces
-                || there.length_m + walk.shortest_m >= walk.gate.end_m()
+            if there.bounces + 1 > tracer.max_bounces
+                || there.length_m + tracer.shortest_m >= tracer.gate.end_m()
             {
                 return;
             }
             // From here, straight legs alone lead to a spot. If a pane's reflection led here from
             // another point, the image of this point covers these paths.
-            let by_image = !first && point.imaged && Lit::may_hold(walk, &point.hit);
+            let by_image = !first && point.imaged && LitPoints::may_hold(tracer, &point.hit);
             if point.turns > 0 && !by_image {
-                straight((walk, film), (&point, pixel), first, rng, buffers, out);
+                straight((tracer, film), (&point, pixel), first, rng, buffers, out);
             }
-            if self.images.any() && there.bounces + 2 <= walk.max_bounces {
-                let count = if first { IMAGES.0 } else { IMAGES.1 };
+            if self.images.any() && there.bounces + 2 <= tracer.max_bounces {
+                let count = if first {
+                    self.tuning.first_images
+                } else {
+                    self.tuning.images
+                };
                 self.images
-                    .connect(walk, &point, count, rng, buffers, |found| {
+                    .connect(tracer, &point, count, rng, buffers, |found| {
                         add(film, (pixel, found), out);
                     });
                 let lit = std::mem::take(&mut buffers.lit);
-                let count = if first { LIT.0 } else { LIT.1 };
-                let of = (walk, &lit);
+                let count = if first {
+                    self.tuning.first_lit
+                } else {
+                    self.tuning.lit
+                };
+                let lit_scene = (tracer, &lit);
                 self.images
-                    .connect_lit(of, &point, count, rng, buffers, |found| {
+                    .connect_lit(lit_scene, &point, count, rng, buffers, |found| {
                         add(film, (pixel, found), out);
                     });
                 buffers.lit = lit;
             }
             if all {
-                join((walk, film), (&point, pixel), rng, buffers, out);
+                join((tracer, film), (&point, pixel), rng, buffers, out);
             }
             let on_leg = there.weight / path.weight;
-            let Some(next) = point.seek(&self.aim, left * on_leg, rng) else {
+            let Some(next) = point.seek(&self.aim, &self.tuning, left * on_leg, rng) else {
                 return;
             };
             (path, ray, left) = next;
@@ -115,13 +133,13 @@ impl ByGlass {
 
 /// Connects a point of a camera path to light vertices.
 fn join(
-    (walk, film): (&Walk, &Film),
+    (tracer, film): (&Tracer, &Film),
     (point, pixel): (&Point, u32),
     rng: &mut Rng,
     buffers: &mut Buffers,
     out: &mut Vec<Splat>,
 ) {
-    let (world, h, path) = (walk.world, &point.hit, &point.path);
+    let (world, h, path) = (tracer.world, &point.hit, &point.path);
     let Buffers {
         scratch,
         lights,
@@ -132,24 +150,29 @@ fn join(
         return;
     }
     vertices.weights(h, point.back, (lights, &mut scratch.plain));
-    draw(lights, LIGHTS, rng.uniform(), |i, value| {
-        let y = &vertices.list[i];
-        let bounces = path.bounces + y.bounces;
-        if bounces > walk.max_bounces {
-            return;
-        }
-        let free = world.free(&mut scratch.stack, h.p, h.n, y.hit.p, y.hit.n);
-        if free > 0.0 {
-            let to = y.hit.p - h.p;
-            let leg = world.metres(to.length()) * f64::from(point.medium);
-            let found = Found {
-                value: path.weight * value * free,
-                path_m: path.length_m + leg + y.path_m,
-                spot: y.spot,
-                bounces,
-                technique: Technique::Vertex,
-            };
-            add(film, (pixel, found), out);
-        }
-    });
+    draw(
+        lights,
+        tracer.tuning.glass.light_vertices,
+        rng.uniform(),
+        |i, value| {
+            let y = &vertices.list[i];
+            let bounces = path.bounces + y.bounces;
+            if bounces > tracer.max_bounces {
+                return;
+            }
+            let free = world.free(&mut scratch.stack, h.p, h.n, y.hit.p, y.hit.n);
+            if free > 0.0 {
+                let to = y.hit.p - h.p;
+                let leg = world.metres(to.length()) * f64::from(point.medium);
+                let found = Contribution {
+                    value: path.weight * value * free,
+                    path_m: path.length_m + leg + y.path_m,
+                    spot: y.spot,
+                    bounces,
+                    technique: Technique::Vertex,
+                };
+                add(film, (pixel, found), out);
+            }
+        },
+    );
 }

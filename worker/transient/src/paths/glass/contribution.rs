@@ -4,7 +4,7 @@ use crate::film::{slots::Film, splat::Splat, technique::Technique};
 
 /// A contribution of a camera path.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Found {
+pub(crate) struct Contribution {
     /// Radiance.
     pub value: f32,
     /// Optical path, metres.
@@ -16,7 +16,7 @@ pub(crate) struct Found {
 }
 
 /// Adds what was found.
-pub(crate) fn add(film: &Film, (pixel, found): (u32, Found), out: &mut Vec<Splat>) {
+pub(crate) fn add(film: &Film, (pixel, found): (u32, Contribution), out: &mut Vec<Splat>) {
     out.push(Splat {
         pixel,
         slot: film.slot(found.path_m) as u32,

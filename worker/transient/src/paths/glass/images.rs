@@ -11,20 +11,14 @@ use crate::{
     film::{slots::Film, splat::Splat, technique::Technique},
     numeric::{frame::frame, rng::Rng, systematic::draw},
     paths::{
-        glass::{buffers::Buffers, contribution::Found, lit_points::Lit, point::Point},
-        tracer::Walk,
+        glass::{
+            buffers::Buffers, contribution::Contribution, lit_points::LitPoints, point::Point,
+        },
+        tracer::Tracer,
     },
     scene::{hit::Hit, intersection::lift, panes::Panes, world::World},
+    tuning::GlassTuning,
 };
-
-/// Largest number of planes, by area, that points are connected by, and the least share of the
-/// whole area for such a plane. Light reflected by other planes is left to light paths.
-const MOST: usize = 8;
-const LEAST: f32 = 0.02;
-
-/// Largest number of planes that panes are compared with, because curved glass has one for each
-/// facet.
-const MOST_KNOWN: usize = 4096;
 
 /// Largest distance of a pane from its plane, render units, and least cosine between the normals of
 /// both.
@@ -33,11 +27,6 @@ const ALIKE: f32 = 0.999_999;
 
 /// Least distance from a plane for a point to be on one of its sides, render units.
 const OFF: f32 = 1e-4;
-
-/// Number of lit points that are considered for one connection, in all planes together, and its
-/// least and greatest value for one plane.
-const LOOKED_AT: usize = 64;
-const OF_ONE: (usize, usize) = (4, 32);
 
 /// Panes in one plane.
 #[derive(Debug)]
@@ -70,7 +59,7 @@ const NONE: u32 = u32::MAX;
 
 impl Images {
     /// Returns the planes of all panes. The result is unusable after a stop.
-    pub fn find(world: &World, stop: Stop) -> Self {
+    pub fn find(world: &World, tuning: GlassTuning, stop: Stop) -> Self {
         let Some(panes) = &world.panes else {
             return Self::default();
         };
@@ -91,7 +80,7 @@ impl Images {
             });
             let k = match known {
                 Some(k) => k,
-                None if planes.len() < MOST_KNOWN => {
+                None if planes.len() < tuning.most_known => {
                     planes.push((Plane::new(normal, normal.dot(a), pane), vec![]));
                     planes.len() - 1
                 }
@@ -104,8 +93,10 @@ impl Images {
         }
         let whole: f32 = planes.iter().map(|(p, _)| p.area).sum();
         planes.sort_by(|a, b| b.0.area.total_cmp(&a.0.area));
-        let large = planes.iter().filter(|(p, _)| p.area >= LEAST * whole);
-        let kept = large.count().min(MOST);
+        let large = planes
+            .iter()
+            .filter(|(p, _)| p.area >= tuning.least_share * whole);
+        let kept = large.count().min(tuning.most_planes);
         let mut of_pane = vec![NONE; panes.triangles().count()];
         for (k, (_, all)) in planes.iter().enumerate() {
             for &pane in all {
@@ -139,11 +130,11 @@ impl Images {
     /// ([`crate::paths::one_bounce`]). The result is unusable after a stop.
     pub fn seen(
         &self,
-        (walk, film): (&Walk, &Film),
+        (tracer, film): (&Tracer, &Film),
         buffers: &mut Buffers,
         stop: Stop,
     ) -> Vec<Splat> {
-        let (world, mut seen) = (walk.world, vec![]);
+        let (world, mut seen) = (tracer.world, vec![]);
         let Some(panes) = &world.panes else {
             return seen;
         };
@@ -153,7 +144,7 @@ impl Images {
             if stop.asked() {
                 break;
             }
-            for (spot, e) in walk.emitters.list.iter().enumerate() {
+            for (spot, e) in tracer.emitters.list.iter().enumerate() {
                 let place = (e.p, e.n);
                 let Some(way) = self.way((world, panes), k, (Vec3::ZERO, 1.0), place, buffers)
                 else {
@@ -184,30 +175,30 @@ impl Images {
     /// contributions.
     pub fn connect(
         &self,
-        walk: &Walk,
+        tracer: &Tracer,
         point: &Point,
         count: u32,
         rng: &mut Rng,
         buffers: &mut Buffers,
-        mut each: impl FnMut(Found),
+        mut each: impl FnMut(Contribution),
     ) {
-        let (world, emitters) = (walk.world, walk.emitters);
+        let (world, emitters) = (tracer.world, tracer.emitters);
         let Some(panes) = &world.panes else { return };
         let spots = emitters.list.len();
         let mut weights = std::mem::take(&mut buffers.lights);
         weights.clear();
         for plane in &self.planes[..self.kept] {
-            let of = (&point.hit, point.back);
+            let receiver = (&point.hit, point.back);
             let each = emitters.list.iter();
-            weights.extend(each.map(|e| plane.weight(panes, of, e.p, |w| e.intensity(w))));
+            weights.extend(each.map(|e| plane.weight(panes, receiver, e.p, |w| e.intensity(w))));
         }
         draw(&weights, count, rng.uniform(), |k, value| {
             let (plane, spot) = (k / spots, k % spots);
             // `value` is this image's weight over its probability.
-            let of = self.light((walk, panes), (plane, spot), point, buffers);
-            if let Some((share, found)) = of {
+            let light = self.light((tracer, panes), (plane, spot), point, buffers);
+            if let Some((share, found)) = light {
                 let value = point.path.weight * value * share;
-                each(Found { value, ..found });
+                each(Contribution { value, ..found });
             }
         });
         buffers.lights = weights;
@@ -217,16 +208,16 @@ impl Images {
     /// ratios.
     fn light(
         &self,
-        (walk, panes): (&Walk, &Panes),
+        (tracer, panes): (&Tracer, &Panes),
         (plane, spot): (usize, usize),
         point: &Point,
         buffers: &mut Buffers,
-    ) -> Option<(f32, Found)> {
-        let (world, path) = (walk.world, &point.path);
-        let e = &walk.emitters.list[spot];
+    ) -> Option<(f32, Contribution)> {
+        let (world, path) = (tracer.world, &point.path);
+        let e = &tracer.emitters.list[spot];
         let from = (lift(point.hit.p, point.hit.n), point.medium);
         let way = self.way((world, panes), plane, from, (e.p, e.n), buffers)?;
-        let found = Found {
+        let found = Contribution {
             value: 0.0,
             path_m: path.length_m + way.length_m + e.path_m,
             spot,
@@ -241,29 +232,32 @@ impl Images {
     /// contributions.
     pub fn connect_lit(
         &self,
-        (walk, lit): (&Walk, &Lit),
+        (tracer, lit): (&Tracer, &LitPoints),
         point: &Point,
         count: u32,
         rng: &mut Rng,
         buffers: &mut Buffers,
-        mut each: impl FnMut(Found),
+        mut each: impl FnMut(Contribution),
     ) {
-        let world = walk.world;
+        let world = tracer.world;
         let (Some(panes), all) = (&world.panes, lit.list.len()) else {
             return;
         };
         if all == 0 || self.kept == 0 {
             return;
         }
-        let some = (LOOKED_AT / self.kept).clamp(OF_ONE.0, OF_ONE.1).min(all);
+        let tuning = &tracer.tuning.glass;
+        let some = (tuning.looked_at / self.kept)
+            .clamp(tuning.least_looked_at, tuning.most_looked_at)
+            .min(all);
         let first = ((rng.uniform() * all as f32) as usize).min(all - 1);
-        let of = |k: usize| &lit.list[(first + k) % all];
+        let lit_point = |k: usize| &lit.list[(first + k) % all];
         let mut weights = std::mem::take(&mut buffers.lights);
         weights.clear();
         let h = &point.hit;
         for plane in &self.planes[..self.kept] {
             for k in 0..some {
-                let y = of(k);
+                let y = lit_point(k);
                 let sends = |back: Vec3| y.sum * y.hit.n.dot(back).max(0.0);
                 let weight = plane.weight(panes, (h, point.back), y.hit.p, sends);
                 weights.push(weight);
@@ -271,7 +265,7 @@ impl Images {
         }
         let scale = all as f32 / some as f32;
         draw(&weights, count, rng.uniform(), |k, value| {
-            let (plane, y) = (k / some, of(k % some));
+            let (plane, y) = (k / some, lit_point(k % some));
             let place = (y.hit.p, y.hit.n);
             let from = (lift(h.p, h.n), point.medium);
             let Some(way) = self.way((world, panes), plane, from, place, buffers) else {
@@ -279,14 +273,14 @@ impl Images {
             };
             let factor = point.path.weight * value * scale * way.share / y.sum;
             for a in &y.arrivals {
-                let found = Found {
+                let found = Contribution {
                     value: factor * a.value,
                     path_m: point.path.length_m + way.length_m + a.path_m,
                     spot: a.spot,
                     bounces: point.path.bounces + 1 + a.bounces,
                     technique: Technique::LitImage,
                 };
-                if found.bounces <= walk.max_bounces {
+                if found.bounces <= tracer.max_bounces {
                     each(found);
                 }
             }
@@ -303,7 +297,7 @@ impl Images {
         (from, medium): (Vec3, f32),
         (p, n): (Vec3, Vec3),
         buffers: &mut Buffers,
-    ) -> Option<Way> {
+    ) -> Option<PanePath> {
         let plane = &self.planes[k];
         // Computed from the start of the ray, because the ray hits the pane there.
         let q = plane.between(from, p)?;
@@ -335,7 +329,7 @@ impl Images {
         let free = passes * reflects * world.free(stack, q, side, p, n);
         let cos = plane.normal.dot(w).abs();
         let length = to.length() + (p - q).length();
-        (free > 0.0).then(|| Way {
+        (free > 0.0).then(|| PanePath {
             share: free / panes.weight(plane.pane, cos),
             free,
             back: (q - p).normalized(),
@@ -345,7 +339,7 @@ impl Images {
 }
 
 /// A free path via a pane.
-struct Way {
+struct PanePath {
     /// Transmitted and reflected share of the light, relative to the reflectance that weights
     /// assume.
     share: f32,
@@ -394,8 +388,8 @@ impl Plane {
         let image = spot - self.normal * (2.0 * b);
         let q = x + (image - x) * (a / (a + b));
         let within = |k: usize, axis: Vec3| {
-            let at = axis.dot(q);
-            at > self.low[k] - OFF && at < self.high[k] + OFF
+            let coordinate = axis.dot(q);
+            coordinate > self.low[k] - OFF && coordinate < self.high[k] + OFF
         };
         (within(0, self.u) && within(1, self.v)).then_some(q)
     }

@@ -7,33 +7,30 @@ use crate::{
         glass::{
             arrive::arrive,
             buffers::Buffers,
-            lit_points::Lit,
-            point::Carried,
-            ray::{Ray, Shares, pick},
-            technique::ByGlass,
+            lit_points::LitPoints,
+            point::PathState,
+            ray::{Ray, StraightShares, pick},
+            technique::GlassTechnique,
         },
-        tracer::Walk,
+        tracer::Tracer,
     },
     scene::hit::Hit,
 };
 
-/// Number of vertices of a path before Russian roulette starts.
-const SURE: u32 = 3;
-
-impl ByGlass {
+impl GlassTechnique<'_> {
     /// Draws the light vertices and lit points that camera paths are connected to. The light
     /// vertices come from `count` light paths.
-    pub fn lay(&self, walk: &Walk, count: u32, rng: &mut Rng, buffers: &mut Buffers) {
+    pub fn lay(&self, tracer: &Tracer, count: u32, rng: &mut Rng, buffers: &mut Buffers) {
         let mut vertices = std::mem::take(&mut buffers.vertices);
         vertices.clear();
         for l in 0..count {
-            self.trace(walk, (l, count), rng, buffers, |z, _| vertices.push(z));
+            self.trace(tracer, (l, count), rng, buffers, |z, _| vertices.push(z));
         }
         buffers.vertices = vertices;
-        Lit::prepare(walk, rng, &mut buffers.scratch);
+        LitPoints::prepare(tracer, rng, &mut buffers.scratch);
         if self.images.any() {
-            let of = (walk, &self.areas);
-            buffers.lit.lay(of, rng, &mut buffers.scratch);
+            let surfaces = (tracer, &self.areas);
+            buffers.lit.lay(surfaces, rng, &mut buffers.scratch);
         }
     }
 
@@ -41,21 +38,28 @@ impl ByGlass {
     /// path, and whether glass turned all legs up to there. The sum over the batch is an estimate.
     pub fn trace(
         &self,
-        walk: &Walk,
+        tracer: &Tracer,
         (l, count): (u32, u32),
         rng: &mut Rng,
         buffers: &mut Buffers,
         mut each: impl FnMut(LightVertex, bool),
     ) {
-        let world = walk.world;
-        let Some(start) = self.start(walk, (l, count), rng, buffers) else {
+        let world = tracer.world;
+        let Some(start) = self.start(tracer, (l, count), rng, buffers) else {
             return;
         };
         let (spot, imaged, mut path, mut ray) = start;
         let mut all = true;
         for vertex in 0.. {
             let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
-            let Some(point) = arrive((world, &self.images), &path, (ray, 0.0), rng, tools) else {
+            let Some(point) = arrive(
+                (world, &self.images),
+                &path,
+                (ray, 0.0),
+                &self.tuning,
+                rng,
+                tools,
+            ) else {
                 return;
             };
             // Camera paths cover this path by the image.
@@ -64,8 +68,8 @@ impl ByGlass {
             }
             let there = &point.path;
             if point.hit.surface.is_black()
-                || there.bounces > walk.max_bounces
-                || there.length_m >= walk.gate.end_m()
+                || there.bounces > tracer.max_bounces
+                || there.length_m >= tracer.gate.end_m()
             {
                 return;
             }
@@ -81,7 +85,7 @@ impl ByGlass {
                 bounces: there.bounces,
             };
             each(z, all);
-            let survive = |weight: f32| match vertex < SURE {
+            let survive = |weight: f32| match vertex < self.tuning.sure {
                 true => 1.0,
                 false => weight.min(0.95),
             };
@@ -96,26 +100,26 @@ impl ByGlass {
     /// has an image in the pane that turned the leg, the flux, and the ray there.
     pub fn start(
         &self,
-        walk: &Walk,
+        tracer: &Tracer,
         (l, count): (u32, u32),
         rng: &mut Rng,
         buffers: &mut Buffers,
-    ) -> Option<(usize, bool, Carried, Ray)> {
-        let (world, emitters) = (walk.world, walk.emitters);
+    ) -> Option<(usize, bool, PathState, Ray)> {
+        let (world, emitters) = (tracer.world, tracer.emitters);
         let spots = emitters.list.len();
         let plain = if self.targets.any() { count / 4 } else { count };
         let aimed = count - plain;
         let stack = &mut buffers.scratch.stack;
         let (spot, w, target) = if l < aimed {
-            let at = (f64::from(l) + f64::from(rng.uniform())) / f64::from(aimed);
-            let drawn = self.targets.draw(at, || rng.uniform())?;
+            let position = (f64::from(l) + f64::from(rng.uniform())) / f64::from(aimed);
+            let drawn = self.targets.draw(position, || rng.uniform())?;
             let to = drawn.p - emitters.lifted[drawn.spot];
             (drawn.spot, to.normalized(), Some(drawn.target as u32))
         } else {
-            let at = ((l - aimed) as f32 + rng.uniform()) / plain as f32;
-            let spot = ((at * spots as f32) as usize).min(spots - 1);
+            let position = ((l - aimed) as f32 + rng.uniform()) / plain as f32;
+            let spot = ((position * spots as f32) as usize).min(spots - 1);
             let e = &emitters.list[spot];
-            (spot, e.surface.sample(e.n, e.back, rng)?.0, None)
+            (spot, e.surface.sample(e.n, e.back, rng)?.w, None)
         };
         let e = &emitters.list[spot];
         let intensity = e.intensity(w);
@@ -125,9 +129,9 @@ impl ByGlass {
         let from = emitters.lifted[spot];
         let hit = world.ahead(stack, from, w, &mut buffers.crossings);
         let body = hit.as_ref().and_then(|h| world.body(h.triangle));
-        // Shares of the light that are turned in this direction: by each pane, and by a body behind
-        // the panes.
-        let shares = Shares::of(&buffers.crossings, hit.as_ref());
+        // StraightShares of the light that are turned in this direction: by each pane, and by a
+        // body behind the panes.
+        let shares = StraightShares::new(&buffers.crossings, hit.as_ref());
         let straight = if body.is_some() { shares.straight } else { 0.0 };
         let total = shares.reflected + straight;
         if total <= 0.0 {
@@ -186,10 +190,10 @@ impl ByGlass {
         let mut ray = Ray::new(e.p, from, w, (medium, false));
         match (pane, hit, body) {
             (Some(pane), ..) => ray.reflect_at(world, pane),
-            (None, Some(hit), Some(body)) => ray.turn_at(world, &hit, body, rng),
+            (None, Some(hit), Some(body)) => ray.turn_at(world, &hit, body, &self.tuning, rng),
             _ => return None,
         }
-        let path = Carried {
+        let path = PathState {
             weight: flux,
             length_m: e.path_m,
             bounces: 1,

@@ -12,22 +12,20 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Stop,
     film::{
-        class::{Place, Way},
+        class::{Connection, PathPlace},
         sink::Sink,
     },
     numeric::rng::Rng,
     paths::{
         path_reuse::sharing::Sharing,
         scratch::Scratch,
-        tracer::Walk,
+        tracer::Tracer,
         vertex::{Sight, Vertex},
     },
-    scene::{hit::Hit, intersection::lift, lobes::Seen, stratified::Turns, world::World},
+    scene::{
+        hit::Hit, intersection::lift, lobes::ShadingPoint, stratified::EvenDraws, world::World,
+    },
 };
-
-/// Largest number of points, and the number of light vertices that their walks are connected to.
-const POINTS: u32 = 128;
-const LIGHT_VERTICES: u32 = 64;
 
 /// Light that arrives at a point and is scattered there.
 #[derive(Debug, Clone, Copy)]
@@ -53,7 +51,7 @@ pub(crate) struct LitPoint {
 
 /// The lit points of one stream.
 #[derive(Debug, Default)]
-pub(crate) struct Lit {
+pub(crate) struct LitPoints {
     pub list: Vec<LitPoint>,
 }
 
@@ -62,7 +60,7 @@ pub(crate) struct Lit {
 pub(crate) struct Areas(Vec<f64>);
 
 impl Areas {
-    pub fn of(world: &World, stop: Stop) -> Self {
+    pub fn new(world: &World, stop: Stop) -> Self {
         let mut sum = 0.0;
         let each = world.triangles.iter().enumerate().map(|(k, [a, b, c])| {
             let surface = &world.surfaces[world.surface[k] as usize];
@@ -82,15 +80,15 @@ impl Areas {
     }
 
     /// Draws a point of a surface, on one of its sides.
-    fn draw(&self, world: &World, at: f64, rng: &mut Rng) -> Option<Hit> {
-        let at = at * self.whole();
-        let k = self.0.partition_point(|&s| s <= at);
+    fn draw(&self, world: &World, position: f64, rng: &mut Rng) -> Option<Hit> {
+        let position = position * self.whole();
+        let k = self.0.partition_point(|&s| s <= position);
         let [a, b, c] = *world.triangles.get(k)?;
         let (r, v) = (rng.uniform().sqrt(), rng.uniform());
         let p = a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v);
         let n = world.normals[k];
         let side = if rng.uniform() < 0.5 { n } else { -n };
-        Some(world.on(k as u32, p, p + side))
+        Some(world.hit_on(k as u32, p, p + side))
     }
 }
 
@@ -98,7 +96,7 @@ impl Areas {
 struct Arrivals<'a>(&'a mut Vec<Arrival>);
 
 impl Sink for Arrivals<'_> {
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, _: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, _: Connection) {
         self.0.push(Arrival {
             path_m,
             value,
@@ -107,55 +105,65 @@ impl Sink for Arrivals<'_> {
         });
     }
 
-    fn at(&mut self, _: Place) {}
+    fn set_place(&mut self, _: PathPlace) {}
 }
 
-impl Lit {
+impl LitPoints {
     /// Returns whether a point may be a lit point: it is on a Lambertian surface, and not near a
     /// spot with a zone.
-    pub fn may_hold(walk: &Walk, hit: &Hit) -> bool {
-        let near = walk.contacts.is_some_and(|c| c.near(walk.world, hit));
+    pub fn may_hold(tracer: &Tracer, hit: &Hit) -> bool {
+        let near = tracer.contacts.is_some_and(|c| c.near(tracer.world, hit));
         hit.surface.diffuse() && !hit.surface.is_black() && !near
     }
 
     /// Draws the light vertices that walks are connected to.
-    pub fn prepare(walk: &Walk, rng: &mut Rng, scratch: &mut Scratch) {
-        Sharing::draw_lights(walk, POINTS, rng, scratch);
-        if walk.lights {
-            let of = (walk.world, walk.emitters, walk.contacts);
+    pub fn prepare(tracer: &Tracer, rng: &mut Rng, scratch: &mut Scratch) {
+        Sharing::draw_lights(tracer, tracer.tuning.glass.lit_points, rng, scratch);
+        if tracer.lights {
             let Scratch {
                 vertices, stack, ..
             } = scratch;
-            vertices.fill(of, LIGHT_VERTICES, rng, stack);
+            vertices.fill(
+                &tracer.surroundings(),
+                tracer.contacts,
+                tracer.tuning.glass.lit_light_vertices,
+                rng,
+                stack,
+            );
         }
     }
 
     /// Redraws the points.
-    pub fn lay(&mut self, (walk, areas): (&Walk, &Areas), rng: &mut Rng, scratch: &mut Scratch) {
-        let (world, emitters) = (walk.world, walk.emitters);
+    pub fn lay(
+        &mut self,
+        (tracer, areas): (&Tracer, &Areas),
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+    ) {
+        let (world, emitters) = (tracer.world, tracer.emitters);
         let spots = emitters.list.len();
         self.list.clear();
-        let walk = Walk {
+        let tracer = Tracer {
             window: None,
-            ..*walk
+            ..*tracer
         };
-        let half = POINTS / 2;
-        let turns = Turns::new(half, rng);
-        for j in 0..POINTS {
+        let half = tracer.tuning.glass.lit_points / 2;
+        let turns = EvenDraws::new(half, rng);
+        for j in 0..tracer.tuning.glass.lit_points {
             let hit = if j < half {
                 let e = &emitters.list[turns.choice(j, spots)];
                 let drawn = turns.direction(j, &e.surface, e.n, e.back, rng);
-                drawn.and_then(|(w, ..)| world.closest(&mut scratch.stack, lift(e.p, e.n), w))
+                drawn.and_then(|drawn| world.closest(&mut scratch.stack, lift(e.p, e.n), drawn.w))
             } else {
-                let at = (f64::from(j - half) + f64::from(rng.uniform())) / f64::from(half);
-                areas.draw(world, at, rng)
+                let position = (f64::from(j - half) + f64::from(rng.uniform())) / f64::from(half);
+                areas.draw(world, position, rng)
             };
             let Some(hit) = hit else { continue };
-            if Self::may_hold(&walk, &hit) {
+            if Self::may_hold(&tracer, &hit) {
                 let even = 0.5 * f64::from(half) / areas.whole();
                 let density = (half as f32 / spots as f32, even as f32);
                 self.list
-                    .extend(LitPoint::new(&walk, hit, density, rng, scratch));
+                    .extend(LitPoint::new(&tracer, hit, density, rng, scratch));
             }
         }
     }
@@ -165,13 +173,13 @@ impl LitPoint {
     /// Creates a point that was drawn with the sum of two densities per area: `by_spot` times each
     /// spot's own, and `even`.
     fn new(
-        walk: &Walk,
+        tracer: &Tracer,
         hit: Hit,
         (by_spot, even): (f32, f32),
         rng: &mut Rng,
         scratch: &mut Scratch,
     ) -> Option<Self> {
-        let (world, emitters) = (walk.world, walk.emitters);
+        let (world, emitters) = (tracer.world, tracer.emitters);
         let mut arrivals = vec![];
         let Scratch {
             stack,
@@ -179,7 +187,11 @@ impl LitPoint {
             plain,
             ..
         } = &mut *scratch;
-        emitters.weights((Seen::of(&hit, hit.n), &hit.surface), plain, weights);
+        emitters.weights(
+            (ShadingPoint::new(&hit, hit.n), &hit.surface),
+            plain,
+            weights,
+        );
         let mut density = even;
         for (spot, (e, &weight)) in emitters.list.iter().zip(weights.iter()).enumerate() {
             let to = hit.p - e.p;
@@ -210,8 +222,8 @@ impl LitPoint {
             bounce: 1,
             sight: Sight::ELSEWHERE,
         };
-        let on = (vertex, crate::paths::tracer::SPOTS);
-        walk.run(rng, on, scratch, &mut Arrivals(&mut arrivals));
+        let on = (vertex, tracer.tuning.walk.spots);
+        tracer.run(rng, on, scratch, &mut Arrivals(&mut arrivals));
         for a in &mut arrivals {
             a.value /= density;
         }

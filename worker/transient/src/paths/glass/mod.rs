@@ -10,7 +10,7 @@
 //! 1. Paths whose last leg is straight, or turned by the reflection of one planar pane alone, are
 //!    camera paths. They are connected to the spots and to their [`images`]. If straight legs alone
 //!    lead from a spot to a Lambertian point, and a pane's reflection leads from there to the next
-//!    point, the path is connected to that point's image instead ([`lit`]).
+//!    point, the path is connected to that point's image instead ([`lit_points`]).
 //! 2. The others are light paths. Read from the camera, the first straight leg joins the two: if it
 //!    is the camera's own leg, the light path is drawn into the image; otherwise camera paths with
 //!    only turned legs are connected to the light path's vertices.
@@ -40,5 +40,6 @@ pub(crate) mod lit_points;
 pub(crate) mod photons;
 pub(crate) mod point;
 pub(crate) mod ray;
+pub(crate) mod splats;
 pub(crate) mod straight;
 pub(crate) mod technique;

@@ -14,14 +14,13 @@ use crate::{
         emitters::Emitters,
         light_vertices::{ALONE, LightVertex},
     },
-    paths::glass::{contribution::Found, point::Point},
+    paths::{
+        glass::{contribution::Contribution, point::Point},
+        tracer::Tracer,
+    },
     scene::{hit::Hit, world::World},
+    tuning::GlassTuning,
 };
-
-/// Photons on another surface are skipped: those further than this share of the radius off the
-/// point's plane, or with less than this cosine between both normals.
-const FLAT: f32 = 0.25;
-const ALIKE: f32 = 0.7;
 
 /// Least cosine of the viewing direction on a surface.
 const GRAZING: f32 = 1e-3;
@@ -35,11 +34,17 @@ pub(crate) struct Photons {
     cell: f32,
     /// Radius for a camera path of length 1.
     spread: f32,
+    tuning: GlassTuning,
 }
 
 impl Photons {
     /// Creates the photons of the spots, and those in `found` from light paths.
-    pub fn new(world: &World, emitters: &Emitters, found: Vec<LightVertex>) -> Self {
+    pub fn new(
+        world: &World,
+        emitters: &Emitters,
+        found: Vec<LightVertex>,
+        tuning: GlassTuning,
+    ) -> Self {
         let i = &world.camera.intrinsics;
         // The disc has the area of a pixel at unit distance.
         let spread = (world.sensitive * world.sensitive / (PI * i.fx * i.fy)).sqrt();
@@ -65,6 +70,7 @@ impl Photons {
             all: vec![],
             cell,
             spread,
+            tuning,
         };
         let all = spots.chain(found).map(|z| (photons.cell_of(z.hit.p), z));
         photons.all = all.collect();
@@ -82,10 +88,12 @@ impl Photons {
     /// lies behind the first bounce alone.
     pub(crate) fn around(
         &self,
-        (max_bounces, world, spots): (u32, &World, bool),
+        tracer: &Tracer,
+        spots: bool,
         point: &Point,
-        mut each: impl FnMut(Found),
+        mut each: impl FnMut(Contribution),
     ) {
+        let (world, max_bounces) = (tracer.world, tracer.max_bounces);
         let (h, path) = (&point.hit, &point.path);
         let length = path.length_m as f32 * world.scale;
         let radius = (self.spread * length).min(self.cell);
@@ -104,15 +112,15 @@ impl Photons {
                     let to = z.hit.p - h.p;
                     let bounces = path.bounces - 1 + z.bounces;
                     if to.dot(to) >= radius * radius
-                        || h.n.dot(to).abs() > FLAT * radius
-                        || h.n.dot(z.hit.n) < ALIKE
+                        || h.n.dot(to).abs() > self.tuning.photon_flat * radius
+                        || h.n.dot(z.hit.n) < self.tuning.photon_alike
                         || !(2..=max_bounces).contains(&bounces)
                         || (z.bounces == 1 && !spots)
                     {
                         continue;
                     }
                     let f = z.hit.surface.scatter(h.n, z.back, point.back) / cos;
-                    let found = Found {
+                    let found = Contribution {
                         value: path.weight * z.flux * f / (PI * radius * radius),
                         path_m: path.length_m + z.path_m,
                         spot: z.spot,

@@ -4,18 +4,14 @@ use picofarm_scene::Vec3;
 
 use crate::{
     numeric::rng::Rng,
-    paths::glass::{aim::Aim, ray::Ray},
-    scene::{hit::Hit, intersection::lift},
+    paths::glass::{aim::AimSpheres, ray::Ray},
+    scene::{hit::Hit, intersection::lift, surface::ScatterSample},
+    tuning::GlassTuning,
 };
-
-/// Factor from a path's weight to the probability that a camera path continues, and the largest
-/// probability.
-const STAY: f32 = 1.5;
-const MOST_STAY: f32 = 0.95;
 
 /// The state of a path.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Carried {
+pub(crate) struct PathState {
     /// The remaining radiance or flux.
     pub weight: f32,
     /// Optical path, metres.
@@ -30,7 +26,7 @@ pub(crate) struct Point {
     /// Unit direction back along the path.
     pub back: Vec3,
     /// The path up to here, including the bounce here.
-    pub path: Carried,
+    pub path: PathState,
     /// Index of refraction of the medium around the point.
     pub medium: f32,
     /// Number of turns by glass on the leg that led here.
@@ -44,9 +40,9 @@ pub(crate) struct Point {
 impl Point {
     /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive`
     /// says with which chance a step of a weight does.
-    pub fn scatter(&self, survive: impl Fn(f32) -> f32, rng: &mut Rng) -> Option<(Carried, Ray)> {
+    pub fn scatter(&self, survive: impl Fn(f32) -> f32, rng: &mut Rng) -> Option<(PathState, Ray)> {
         let h = &self.hit;
-        let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
+        let ScatterSample { w, weight, .. } = h.surface.sample(h.n, self.back, rng)?;
         let chance = survive(weight);
         if chance < 1.0 && rng.uniform() >= chance {
             return None;
@@ -57,16 +53,22 @@ impl Point {
     /// Radiance goes on by the surface's scattering or to where glass is. What the path carries
     /// then, the ray, and what is left of `left`: what it would carry by scattering alone, since
     /// how narrow the cones are says nothing of what lies in them. Roulette goes by that.
-    pub fn seek(&self, aim: &Aim, left: f32, rng: &mut Rng) -> Option<(Carried, Ray, f32)> {
+    pub fn seek(
+        &self,
+        aim: &AimSpheres,
+        tuning: &GlassTuning,
+        left: f32,
+        rng: &mut Rng,
+    ) -> Option<(PathState, Ray, f32)> {
         let h = &self.hit;
         let (w, weight, own) = match aim.from(h) {
             Some(cones) => cones.sample(h, self.back, rng)?,
             None => {
-                let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
+                let ScatterSample { w, weight, .. } = h.surface.sample(h.n, self.back, rng)?;
                 (w, weight, weight)
             }
         };
-        let chance = (STAY * left * own).min(MOST_STAY);
+        let chance = (tuning.survival * left * own).min(tuning.most_survival);
         if rng.uniform() >= chance {
             return None;
         }
@@ -74,9 +76,9 @@ impl Point {
         Some((path, ray, left * own / chance))
     }
 
-    pub fn onward(&self, (w, weight): (Vec3, f32), radiance: bool) -> (Carried, Ray) {
+    pub fn onward(&self, (w, weight): (Vec3, f32), radiance: bool) -> (PathState, Ray) {
         let h = &self.hit;
-        let path = Carried {
+        let path = PathState {
             weight: self.path.weight * weight,
             ..self.path
         };

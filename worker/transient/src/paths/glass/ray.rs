@@ -12,22 +12,14 @@ use crate::{
         panes::Crossing,
         world::World,
     },
+    tuning::GlassTuning,
 };
-
-/// Least probability of choosing a body's reflection, if it reflects at all.
-const REFLECT: f32 = 0.1;
-
-/// Number of turns of one leg before Russian roulette starts for rays that lost light, and the
-/// largest number of turns. Roulette must not end rays under repeated total reflection, because the
-/// few survivors would have a large weight.
-const SURE_TURNS: u32 = 4;
-const MOST_TURNS: u32 = 400;
 
 /// A ray on a leg.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
     /// Position, and the same position lifted off the surface there.
-    pub at: Vec3,
+    pub position: Vec3,
     pub from: Vec3,
     /// Unit direction.
     pub w: Vec3,
@@ -46,9 +38,9 @@ pub(crate) struct Ray {
 }
 
 impl Ray {
-    pub fn new(at: Vec3, from: Vec3, w: Vec3, (medium, radiance): (f32, bool)) -> Self {
+    pub fn new(position: Vec3, from: Vec3, w: Vec3, (medium, radiance): (f32, bool)) -> Self {
         Self {
-            at,
+            position,
             from,
             w,
             medium,
@@ -62,8 +54,8 @@ impl Ray {
     }
 
     pub fn advance(&mut self, world: &World, p: Vec3) {
-        self.length_m += world.metres((p - self.at).length()) * f64::from(self.medium);
-        self.at = p;
+        self.length_m += world.metres((p - self.position).length()) * f64::from(self.medium);
+        self.position = p;
     }
 
     pub fn reflect_at(&mut self, world: &World, pane: u32) {
@@ -77,7 +69,14 @@ impl Ray {
         self.last = Some(pane);
     }
 
-    pub fn turn_at(&mut self, world: &World, hit: &Hit, body: Body, rng: &mut Rng) {
+    pub fn turn_at(
+        &mut self,
+        world: &World,
+        hit: &Hit,
+        body: Body,
+        tuning: &GlassTuning,
+        rng: &mut Rng,
+    ) {
         self.advance(world, hit.p);
         let outside = hit.n.dot(world.normals[hit.triangle as usize]) > 0.0;
         let (from, to) = match outside {
@@ -87,7 +86,7 @@ impl Ray {
         let split = split(self.w, hit.n, (from, to));
         self.turns += 1;
         let chance = match split.reflects > 0.0 {
-            true => split.reflects.max(REFLECT),
+            true => split.reflects.max(tuning.reflect),
             false => 0.0,
         };
         if rng.uniform() < chance {
@@ -108,15 +107,15 @@ impl Ray {
     }
 }
 
-/// Shares of the light along a straight segment.
-pub(crate) struct Shares {
+/// StraightShares of the light along a straight segment.
+pub(crate) struct StraightShares {
     pub reflected: f32,
     /// Share that passes all panes, if there is a surface behind them.
     pub straight: f32,
 }
 
-impl Shares {
-    pub fn of(crossings: &[Crossing], hit: Option<&Hit>) -> Self {
+impl StraightShares {
+    pub fn new(crossings: &[Crossing], hit: Option<&Hit>) -> Self {
         let (mut reflected, mut reach) = (0.0, 1.0);
         for c in crossings {
             reflected += reach * c.reflects;
@@ -152,11 +151,12 @@ pub(crate) fn follow(
     world: &World,
     mut ray: Ray,
     seek: f32,
+    tuning: &GlassTuning,
     rng: &mut Rng,
     (stack, crossings): (&mut Stack, &mut Vec<Crossing>),
 ) -> Option<(Ray, Hit)> {
-    for turn in 0..MOST_TURNS {
-        if turn >= SURE_TURNS && ray.weight < 1.0 {
+    for turn in 0..tuning.most_turns {
+        if turn >= tuning.sure_turns && ray.weight < 1.0 {
             if rng.uniform() >= ray.weight {
                 return None;
             }
@@ -164,7 +164,7 @@ pub(crate) fn follow(
         }
         let hit = world.ahead(stack, ray.from, ray.w, crossings);
         let body = hit.as_ref().and_then(|h| world.body(h.triangle));
-        let shares = Shares::of(crossings, hit.as_ref());
+        let shares = StraightShares::new(crossings, hit.as_ref());
         let total = shares.reflected + shares.straight;
         if total <= 0.0 || ray.weight == 0.0 {
             return None;
@@ -186,7 +186,7 @@ pub(crate) fn follow(
             ray.advance(world, hit.p);
             return Some((ray, hit));
         };
-        ray.turn_at(world, &hit, body, rng);
+        ray.turn_at(world, &hit, body, tuning, rng);
     }
     None
 }

@@ -2,7 +2,7 @@
 
 use crate::{
     film::{
-        class::{Place, Way},
+        class::{Connection, PathPlace},
         sink::Sink,
         slots::Film,
         splat::Splat,
@@ -13,17 +13,13 @@ use crate::{
     paths::{
         glass::{
             buffers::Buffers,
-            contribution::{Found, add},
+            contribution::{Contribution, add},
             point::Point,
         },
-        tracer::{ALL, Walk},
+        tracer::{ALL, Tracer},
         vertex::{Sight, Vertex},
     },
 };
-
-/// Largest number of spots that a vertex after the first is connected to, and of light vertices
-/// that any vertex is connected to.
-const SPOTS: u32 = 6;
 
 /// The sink for a walk's splats. Straight legs stay in one medium, so the index of that medium
 /// scales the length of the walk's legs.
@@ -38,9 +34,9 @@ struct Splats<'a> {
 }
 
 impl Sink for Splats<'_> {
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, _: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, _: Connection) {
         let to_spot = self.emitters.list[spot].path_m;
-        let found = Found {
+        let found = Contribution {
             value,
             path_m: self.before_m + (path_m - to_spot) * self.medium + to_spot,
             spot,
@@ -50,13 +46,13 @@ impl Sink for Splats<'_> {
         add(self.film, (self.pixel, found), self.out);
     }
 
-    fn at(&mut self, _: Place) {}
+    fn set_place(&mut self, _: PathPlace) {}
 }
 
 /// Connects a point of a camera path to the spots and continues the walk from it, with straight
 /// legs alone.
 pub(crate) fn straight(
-    (walk, film): (&Walk, &Film),
+    (tracer, film): (&Tracer, &Film),
     (point, pixel): (&Point, u32),
     first: bool,
     rng: &mut Rng,
@@ -65,7 +61,7 @@ pub(crate) fn straight(
 ) {
     let mut sink = Splats {
         film,
-        emitters: walk.emitters,
+        emitters: tracer.emitters,
         pixel,
         before_m: point.path.length_m,
         medium: f64::from(point.medium),
@@ -82,20 +78,19 @@ pub(crate) fn straight(
         sight: Sight::ELSEWHERE,
     };
     // Zones leave light near a spot to light paths, which do not cover paths via glass.
-    let near = walk.contacts.is_some_and(|c| c.near(walk.world, &hit));
-    let walk = Walk {
-        contacts: walk.contacts.filter(|_| !near),
+    let near = tracer.contacts.is_some_and(|c| c.near(tracer.world, &hit));
+    let tracer = Tracer {
+        contacts: tracer.contacts.filter(|_| !near),
         // The window applies to whole paths.
         window: None,
-        ..*walk
+        ..*tracer
     };
-    let count = if first { ALL } else { SPOTS };
+    let count = if first {
+        ALL
+    } else {
+        tracer.tuning.glass.spots
+    };
     let scratch = &mut buffers.scratch;
-    walk.connect(rng, &vertex, None, count, scratch, &mut sink);
-    walk.run(
-        rng,
-        (vertex, crate::paths::tracer::SPOTS),
-        scratch,
-        &mut sink,
-    );
+    tracer.connect(rng, &vertex, None, count, scratch, &mut sink);
+    tracer.run(rng, (vertex, tracer.tuning.walk.spots), scratch, &mut sink);
 }

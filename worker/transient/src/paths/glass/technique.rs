@@ -7,25 +7,17 @@ use crate::{
     film::{slots::Film, splat::Splat},
     light::targets::{Target, Targets},
     paths::{
-        glass::{aim::Aim, buffers::Buffers, images::Images, lit_points::Areas},
-        tracer::Walk,
+        glass::{aim::AimSpheres, buffers::Buffers, images::Images, lit_points::Areas},
+        tracer::Tracer,
     },
     scene::{bvh::tree::Stack, centres::Centres, world::World},
+    tuning::GlassTuning,
 };
-
-/// Probability of a camera path in a pixel that sees no glass: its least value, and the factor on
-/// the share of glass, weighted by reflectance, in the area of all surfaces. A small area of glass
-/// contributes little.
-const ELSEWHERE: f32 = 0.125;
-const BY_AREA: f32 = 100.0;
-
-/// Weight of panes in which spots have images as targets of light paths, as a share of the weight
-/// of other panes.
-const IMAGED: f32 = 0.1;
 
 /// Glass as a target of light paths.
 #[derive(Debug)]
-pub(crate) struct ByGlass {
+pub(crate) struct GlassTechnique<'a> {
+    pub tracer: Tracer<'a>,
     pub targets: Targets,
     /// Index among the targets by pane, and by triangle; [`NONE`] if it is not a target.
     pub of_pane: Vec<u32>,
@@ -34,8 +26,8 @@ pub(crate) struct ByGlass {
     /// The splats that each pass draws of the spots that the camera sees in planar panes.
     pub seen: Vec<Splat>,
     /// The glass that camera paths aim at.
-    pub aim: Aim,
-    /// Surface areas, for sampling the points of [`Lit`].
+    pub aim: AimSpheres,
+    /// Surface areas, for sampling lit points.
     pub areas: Areas,
     /// By row-major pixel: whether the pixel or one of its neighbours sees glass.
     pub sees: Vec<bool>,
@@ -43,6 +35,7 @@ pub(crate) struct ByGlass {
     pub elsewhere: f32,
     /// Index of refraction around the camera.
     pub around: f32,
+    pub tuning: GlassTuning,
 }
 
 const NONE: u32 = u32::MAX;
@@ -50,18 +43,19 @@ const NONE: u32 = u32::MAX;
 /// Index of refraction outside of all bodies.
 const AIR: f32 = 1.0;
 
-impl ByGlass {
+impl<'a> GlassTechnique<'a> {
     /// Returns the glass of a scene that turns light; `None` if there is none.
     ///
     /// # Errors
     /// [`RenderError::Stopped`] if the render was stopped.
     pub fn find(
-        (walk, film): (&Walk, &Film),
+        (tracer, film): (&Tracer<'a>, &Film),
         centres: &Centres,
         stop: Stop,
     ) -> Result<Option<Self>, RenderError> {
-        let (world, emitters) = (walk.world, walk.emitters);
-        let images = Images::find(world, stop);
+        let (world, emitters) = (tracer.world, tracer.emitters);
+        let tuning = tracer.tuning.glass;
+        let images = Images::find(world, tuning, stop);
         let area = |[a, b, c]: [Vec3; 3]| 0.5 * (b - a).cross(c - a).length();
         let mut glass = 0.0;
         let (mut all, mut aimed_at) = (vec![], vec![]);
@@ -71,7 +65,11 @@ impl ByGlass {
             let panes = world.panes.as_ref().expect("there is a pane");
             let share = panes.reflectance(k);
             // Such panes are targets only for light with further turns after the pane.
-            let rest = if images.has(k as u32) { IMAGED } else { 1.0 };
+            let rest = if images.has(k as u32) {
+                tuning.imaged
+            } else {
+                1.0
+            };
             of_pane.push(NONE);
             glass += share * area(corners);
             if share > 0.0 && normal != Vec3::ZERO {
@@ -104,30 +102,32 @@ impl ByGlass {
                 }
             }
         }
-        if all.is_empty() || emitters.list.is_empty() || walk.max_bounces < 2 {
+        if all.is_empty() || emitters.list.is_empty() || tracer.max_bounces < 2 {
             return Ok(None);
         }
-        let areas = Areas::of(world, stop);
+        let areas = Areas::new(world, stop);
         let targets = Targets::new(&all, emitters, stop);
         stop.check()?;
         let mut stack = world.bvh.stack();
         let around = world.medium(&mut stack, Vec3::ZERO, world.camera.forward);
         let seen = match around == AIR {
-            true => images.seen((walk, film), &mut Buffers::new(walk), stop),
+            true => images.seen((tracer, film), &mut Buffers::new(tracer), stop),
             false => vec![],
         };
         stop.check()?;
         Ok(targets.map(|targets| Self {
+            tracer: *tracer,
             seen,
             targets,
-            elsewhere: (BY_AREA * glass / areas.whole() as f32).clamp(ELSEWHERE, 1.0),
+            elsewhere: (tuning.by_area * glass / areas.whole() as f32).clamp(tuning.elsewhere, 1.0),
             areas,
             images,
-            aim: Aim::at(aimed_at),
+            aim: AimSpheres::new(aimed_at, &tuning),
             of_pane,
             of_triangle,
             sees: sees(world, centres, &mut stack),
             around,
+            tuning,
         }))
     }
 

@@ -4,7 +4,7 @@ use picofarm_scene::Vec3;
 
 use crate::{
     film::{
-        class::{Place, Way},
+        class::{Connection, PathPlace},
         sink::Sink,
         slots::Film,
     },
@@ -56,7 +56,7 @@ pub(crate) struct ArrivalSink<'a> {
     pub per_metre: f64,
     pub factor: f32,
     pub film: &'a Film,
-    pub place: Place,
+    pub place: PathPlace,
     /// The guide by which it was drawn at a rough vertex.
     pub guide: Option<Guide>,
     /// The factor from the value as drawn to the value for the vertex.
@@ -68,7 +68,7 @@ pub(crate) struct ArrivalSink<'a> {
 
 impl Sink for ArrivalSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Connection) {
         let spot = self.film.tag(spot, self.place, way);
         let list = &mut *self.list;
         list.bins
@@ -94,7 +94,7 @@ impl Sink for ArrivalSink<'_> {
     }
 
     #[inline]
-    fn at(&mut self, place: Place) {
+    fn set_place(&mut self, place: PathPlace) {
         self.place = place;
     }
 }

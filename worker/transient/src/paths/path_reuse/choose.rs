@@ -2,19 +2,15 @@
 
 use crate::{
     numeric::{rng::Rng, systematic::draw},
-    paths::{path_reuse::sharing::Sharing, scratch::Scratch, tracer::Walk},
+    paths::{path_reuse::sharing::Sharing, scratch::Scratch, tracer::Tracer},
 };
-
-/// The constant added to the direct light of a candidate, in means of that light over all
-/// candidates, because the light of walks is not predicted. 0.3 and 2 give the same medians.
-const REST: f32 = 1.0;
 
 impl Sharing {
     /// Selects `kept` of the candidates. `drawn` are the numbers of candidates drawn from the
     /// gather points and from the spots.
     pub(crate) fn choose(
         &mut self,
-        walk: &Walk,
+        tracer: &Tracer,
         (kept, drawn): (u32, (u32, u32)),
         rng: &mut Rng,
         scratch: &mut Scratch,
@@ -23,15 +19,20 @@ impl Sharing {
             return;
         }
         let c = &mut self.candidates;
-        c.look_at(&self.gathers);
-        c.lit.resize(walk.emitters.list.len(), 0.0);
+        let tuning = &tracer.tuning.path_reuse;
+        c.look_at(&self.gathers, tuning.candidate_points);
+        c.lit.resize(tracer.emitters.list.len(), 0.0);
         c.worth.clear();
         for y in &self.shared {
-            let worth = c.direct(walk, y, (&self.gathers, drawn), rng, scratch);
+            let worth = c.direct(tracer, y, (&self.gathers, drawn), rng, scratch);
             c.worth.push(worth);
         }
         let mean = c.worth.iter().sum::<f32>() / c.worth.len() as f32;
-        let rest = if mean > 0.0 { REST * mean } else { 1.0 };
+        let rest = if mean > 0.0 {
+            tuning.candidate_rest * mean
+        } else {
+            1.0
+        };
         for w in &mut c.worth {
             *w += rest;
         }

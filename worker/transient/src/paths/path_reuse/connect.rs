@@ -1,12 +1,11 @@
 //! The weights of the gather points for light from each shared vertex.
 
 use crate::{
-    film::slots::Film,
     numeric::rng::Rng,
     paths::{
-        path_reuse::{effort::Effort, sharing::Sharing},
+        path_reuse::{effort::PassContext, light_up::LitVertex, sharing::Sharing},
         scratch::Scratch,
-        tracer::Walk,
+        tracer::Tracer,
     },
     scene::intersection::lift,
 };
@@ -20,38 +19,43 @@ impl Sharing {
     /// weighed.
     pub(crate) fn connect(
         &mut self,
-        (walk, film, effort): (&Walk, &Film, &Effort),
+        context: PassContext<'_>,
         drawn: (u32, u32),
         rng: &mut Rng,
         scratch: &mut Scratch,
     ) {
+        let PassContext { tracer, film, .. } = context;
         let count = self.gathers.len();
         self.weight.clear();
         self.offset.clear();
         self.weight.resize(count * self.shared.len(), 0.0);
         self.offset.resize(count * self.shared.len(), 0.0);
-        self.lengths.lay((walk, film), &self.gathers);
+        self.lengths.lay((tracer, film), &self.gathers);
         let share = drawn.0 as f32 / count as f32;
-        let of = (walk, film, effort);
-        for at in 0..self.shared.len() {
+        for index in 0..self.shared.len() {
+            let vertex = |density| LitVertex {
+                shared: index,
+                from_spots: drawn.1,
+                density,
+            };
             let first = self.arrivals.fill_up();
-            self.shared[at].first = first;
-            self.shared[at].end = first;
-            if walk.window.is_some() {
-                self.light_up(of, (at, drawn.1, None), rng, scratch);
-                if self.shared[at].end == first {
+            self.shared[index].first = first;
+            self.shared[index].end = first;
+            if tracer.window.is_some() {
+                self.light_up(context, vertex(None), rng, scratch);
+                if self.shared[index].end == first {
                     continue;
                 }
             }
-            let density = share * self.weigh(walk, at, scratch);
-            let row = at * count..(at + 1) * count;
-            if walk.window.is_none() {
+            let density = share * self.weigh(tracer, index, scratch);
+            let row = index * count..(index + 1) * count;
+            if tracer.window.is_none() {
                 if self.weight[row.clone()].iter().all(|&w| w == 0.0) {
                     continue;
                 }
-                self.light_up(of, (at, drawn.1, Some(density)), rng, scratch);
+                self.light_up(context, vertex(Some(density)), rng, scratch);
             }
-            let y = &self.shared[at];
+            let y = &self.shared[index];
             let density = density + y.light;
             let inverse = if density > 0.0 {
                 y.counts / density
@@ -67,11 +71,11 @@ impl Sharing {
 
     /// Writes the weight of each gather point for light that a shared vertex sends to it. Returns
     /// the density of drawing the vertex from one of them.
-    pub fn weigh(&mut self, walk: &Walk, at: usize, scratch: &mut Scratch) -> f32 {
+    pub fn weigh(&mut self, tracer: &Tracer, index: usize, scratch: &mut Scratch) -> f32 {
         let count = self.gathers.len();
-        let y = &self.shared[at];
-        let weight = &mut self.weight[at * count..(at + 1) * count];
-        let offset = &mut self.offset[at * count..(at + 1) * count];
+        let y = &self.shared[index];
+        let weight = &mut self.weight[index * count..(index + 1) * count];
+        let offset = &mut self.offset[index * count..(index + 1) * count];
         let h = &y.hit;
         self.columns.irradiance(h.p, h.n, weight);
         for &i in &self.glossy {
@@ -87,7 +91,7 @@ impl Sharing {
             }
         }
         let from = lift(h.p, h.n);
-        self.segments.trace(walk.world, &mut scratch.stack, from);
+        self.segments.trace(tracer.world, &mut scratch.stack, from);
         for (i, through) in self.segments.found() {
             if through.is_none() {
                 weight[i] = 0.0;
@@ -112,7 +116,7 @@ impl Sharing {
         for &(i, value) in &self.apart {
             weight[i] = value;
         }
-        if walk.world.has_glass() {
+        if tracer.world.has_glass() {
             for (i, through) in self.segments.found() {
                 weight[i] *= through.unwrap_or(0.0);
             }

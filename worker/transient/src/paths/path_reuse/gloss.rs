@@ -76,10 +76,10 @@ impl Gloss {
         if cos.is_nan() || cos <= 0.0 {
             return;
         }
-        let of = |column: &'a [f32]| column[y.first..][..count].as_chunks::<GROUP>().0;
-        let (x, y, z) = (of(&self.x), of(&self.y), of(&self.z));
-        let (cosines, conductor) = (of(&self.cos), of(&self.conductor));
-        let lambertian = of(&self.lambertian);
+        let groups_of = |column: &'a [f32]| column[y.first..][..count].as_chunks::<GROUP>().0;
+        let (x, y, z) = (groups_of(&self.x), groups_of(&self.y), groups_of(&self.z));
+        let (cosines, conductor) = (groups_of(&self.cos), groups_of(&self.conductor));
+        let lambertian = groups_of(&self.lambertian);
         let leaving = surface.leaving(cos);
         let (out, _) = out.as_chunks_mut::<GROUP>();
         // The conductor's scattering of each arrival; one loop per kind of conductor.

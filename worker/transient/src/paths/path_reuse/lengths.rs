@@ -8,7 +8,7 @@ use crate::{
     film::slots::Film,
     light::columns::Columns,
     numeric::lanes::{self, Wide, widest},
-    paths::{tracer::Walk, vertex::Vertex},
+    paths::{tracer::Tracer, vertex::Vertex},
 };
 
 /// How the gather points weigh light from a direction, as columns.
@@ -24,9 +24,9 @@ pub(crate) struct Lengths {
 }
 
 impl Lengths {
-    pub fn lay(&mut self, (walk, film): (&Walk, &Film), gathers: &[(Vertex, usize)]) {
+    pub fn lay(&mut self, (tracer, film): (&Tracer, &Film), gathers: &[(Vertex, usize)]) {
         let per_metre = 1.0 / film.gate.bin_width_m;
-        self.per_unit = walk.world.metres(1.0) * per_metre;
+        self.per_unit = tracer.world.metres(1.0) * per_metre;
         self.factor.clear();
         self.bins.clear();
         for (v, _) in gathers {

@@ -4,26 +4,18 @@ use std::f32::consts::PI;
 
 use crate::{
     film::{
-        class::{Place, Way},
+        class::{Connection, PathPlace},
         sink::Sink,
-        slots::Film,
     },
     numeric::{rng::Rng, systematic::draw},
     paths::{
-        path_reuse::{arrivals::ArrivalSink, effort::Effort, shared::Guide, sharing::Sharing},
+        path_reuse::{arrivals::ArrivalSink, effort::PassContext, shared::Guide, sharing::Sharing},
         scratch::Scratch,
-        tracer::Walk,
+        tracer::Tracer,
         vertex::{Sight, Vertex},
     },
-    scene::{hit::Hit, intersection::lift, lobes::Seen},
+    scene::{hit::Hit, intersection::lift, lobes::ShadingPoint},
 };
-
-/// The maximum number of spots for which the light at a rough vertex is carried to the pixels. They
-/// are drawn by contribution.
-const ROUGH_SPOTS: usize = 32;
-
-/// The minimum and maximum number of walks from a shared vertex, on average.
-const WALKS: (f32, f32) = (0.2, 6.0);
 
 /// Selects the spots that a vertex carries light from. A rough vertex weighs each arrival for each
 /// pixel, so if there are many spots, some are drawn by contribution (systematic sampling), each
@@ -36,11 +28,13 @@ struct Carry {
 }
 
 impl Carry {
-    /// `lit` are the visible spots, with the fraction of their light that glass transmits.
-    fn new(rough: bool, lit: &[(usize, f32)], weights: &[f32], rng: &mut Rng) -> Self {
+    /// At most about `most` spots are carried; all without that number. `lit` are the visible
+    /// spots, with the fraction of their light that glass transmits.
+    fn new(most: Option<usize>, lit: &[(usize, f32)], weights: &[f32], rng: &mut Rng) -> Self {
+        let most = most.unwrap_or(usize::MAX);
         let total: f32 = lit.iter().map(|&(spot, _)| weights[spot]).sum();
-        let step = total / ROUGH_SPOTS as f32;
-        let drawn = rough && lit.len() > ROUGH_SPOTS && step > 1e-30 && step.is_finite();
+        let step = total / most as f32;
+        let drawn = lit.len() > most && step > 1e-30 && step.is_finite();
         Self {
             step: if drawn { step } else { 0.0 },
             sum: 0.0,
@@ -63,6 +57,17 @@ impl Carry {
     }
 }
 
+/// A shared vertex whose arrivals are looked for.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LitVertex {
+    /// Index among the shared vertices.
+    pub shared: usize,
+    /// The number of candidates drawn from spots.
+    pub from_spots: u32,
+    /// The density of drawing this vertex from gather points, if they have been weighed.
+    pub density: Option<f32>,
+}
+
 impl Sharing {
     /// Finds the light that arrives at a shared vertex: from all spots directly, from beyond by
     /// walks. `drawn` is the number of candidates drawn from spots, `density` the density of
@@ -74,32 +79,43 @@ impl Sharing {
     /// scattering to a gather point drawn by the same weights.
     pub(crate) fn light_up(
         &mut self,
-        (walk, film, effort): (&Walk, &Film, &Effort),
-        (at, drawn, density): (usize, u32, Option<f32>),
+        context: PassContext<'_>,
+        vertex: LitVertex,
         rng: &mut Rng,
         scratch: &mut Scratch,
     ) {
-        let emitters = walk.emitters;
+        let PassContext {
+            tracer,
+            film,
+            effort,
+        } = context;
+        let LitVertex {
+            shared: index,
+            from_spots: drawn,
+            density,
+        } = vertex;
+        let tuning = &tracer.tuning.path_reuse;
+        let emitters = tracer.emitters;
         let per_metre = 1.0 / film.gate.bin_width_m;
         let (count, total) = (self.gathers.len(), self.shared.len());
         let (nearest, bounce) = (self.nearest_m, self.lowest + 1);
-        let row = &self.weight[at * count..(at + 1) * count];
-        let y = &mut self.shared[at];
+        let row = &self.weight[index * count..(index + 1) * count];
+        let y = &mut self.shared[index];
         let h = &y.hit;
-        let window = walk
+        let window = tracer
             .window
-            .map(|w| self.shells.window(walk.world, &w, h.p, nearest));
-        let walk = &Walk { window, ..*walk };
-        if !walk.in_time(h.p, nearest) {
+            .map(|w| self.shells.window(tracer.world, &w, h.p, nearest));
+        let tracer = &Tracer { window, ..*tracer };
+        if !tracer.in_time(h.p, nearest) {
             return;
         }
         let to = y.rough.and_then(|_| {
             let u = rng.uniform();
-            let mut at = (u * count as f32) as usize;
+            let mut gather = (u * count as f32) as usize;
             if density.is_some() {
-                draw(row, 1, u, |i, _| at = i);
+                draw(row, 1, u, |i, _| gather = i);
             }
-            let to = self.gathers[at.min(count - 1)].0.hit.p - h.p;
+            let to = self.gathers[gather.min(count - 1)].0.hit.p - h.p;
             (h.n.dot(to) > 0.0).then(|| to.normalized())
         });
         let guide = to.zip(y.rough).map(|(to, surface)| Guide {
@@ -114,7 +130,7 @@ impl Sharing {
             per_metre,
             factor: 1.0,
             film,
-            place: Place::Shared,
+            place: PathPlace::Shared,
             guide,
             share: 1.0,
             from: h.n,
@@ -134,22 +150,23 @@ impl Sharing {
         };
         let walk_on = |often: f32, rng: &mut Rng, sink: &mut ArrivalSink, scratch: &mut Scratch| {
             sink.factor = 1.0 / often;
-            sink.at(Place::Walk);
+            sink.set_place(PathPlace::Walk);
             for _ in 0..(often + rng.uniform()) as u32 {
                 sink.left = false;
-                walk.run(rng, (vertex, effort.spots.0), scratch, sink);
+                tracer.run(rng, (vertex, effort.spots.0), scratch, sink);
             }
         };
         if density.is_none() {
             walk_on(1.0, rng, &mut sink, scratch);
             sink.factor = 1.0;
-            sink.at(Place::Shared);
+            sink.set_place(PathPlace::Shared);
             sink.left = false;
         }
-        let of = (Seen::of(h, wo), &seen_as);
-        emitters.weights(of, &mut scratch.plain, &mut scratch.weights);
-        walk.leave_to_zones(h, &mut scratch.weights);
-        if sink.list.bins.len() == y.first && !walk.any_in_window(h.p, nearest, &scratch.weights) {
+        let receiver = (ShadingPoint::new(h, wo), &seen_as);
+        emitters.weights(receiver, &mut scratch.plain, &mut scratch.weights);
+        tracer.leave_to_zones(h, &mut scratch.weights);
+        if sink.list.bins.len() == y.first && !tracer.any_in_window(h.p, nearest, &scratch.weights)
+        {
             return;
         }
         self.segments.clear();
@@ -159,11 +176,12 @@ impl Sharing {
             }
         }
         let from = lift(h.p, h.n);
-        self.segments.trace(walk.world, &mut scratch.stack, from);
+        self.segments.trace(tracer.world, &mut scratch.stack, from);
         let lit = self.segments.found();
         let lit = lit.filter_map(|(spot, through)| Some((spot, through?)));
         let lit: Vec<(usize, f32)> = lit.collect();
-        let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
+        let most = y.rough.map(|_| tuning.rough_spots);
+        let mut carry = Carry::new(most, &lit, &scratch.weights, rng);
         // The densities do not depend on glass in between.
         for (spot, through) in lit {
             let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
@@ -177,23 +195,28 @@ impl Sharing {
                 let out = to / d;
                 e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
             };
-            let path = nearest + walk.world.metres(d) + e.path_m;
+            let path = nearest + tracer.world.metres(d) + e.path_m;
             let carried = carry.share(w) * through;
-            if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
+            if carried > 0.0 && tracer.window.is_none_or(|w| w.holds(path)) {
                 let back = to * (-1.0 / d);
                 sink.toward(back);
-                sink.add(path, carried, spot, bounce + 1, Way::Spot);
+                sink.add(path, carried, spot, bounce + 1, Connection::Spot);
             }
         }
         y.light = from_spots * drawn as f32 / emitters.list.len() as f32;
-        if let Some(patches) = walk.patches {
-            y.light += self.shells.density((walk.world, patches), h);
+        if let Some(patches) = tracer.patches {
+            y.light += self.shells.density((tracer.world, patches), h);
         }
         if let Some(density) = density {
             let square: f32 = row.iter().map(|w| w * w).sum();
             let taken = y.counts * square.sqrt() / (density + y.light);
             let often = effort.walks * taken * total as f32 / (count as f32).sqrt();
-            walk_on(often.clamp(WALKS.0, WALKS.1), rng, &mut sink, scratch);
+            walk_on(
+                often.clamp(tuning.least_walks, tuning.most_walks),
+                rng,
+                &mut sink,
+                scratch,
+            );
         }
         y.end = sink.list.bins.len();
     }
@@ -208,21 +231,22 @@ mod tests {
     #[test]
     fn each_spot_is_carried_with_its_own_weight_on_average() {
         const SPOTS: usize = 100;
+        const MOST: usize = 32;
         let weights: Vec<f32> = (0..SPOTS).map(|k| (1 + k * k % 17) as f32).collect();
         let lit = (0..SPOTS).filter(|k| k % 4 != 1).map(|k| (k, 1.0));
         let lit: Vec<(usize, f32)> = lit.collect();
-        assert!(lit.len() > crate::paths::path_reuse::light_up::ROUGH_SPOTS);
+        assert!(lit.len() > MOST);
         let mut rng = Rng::new(1, Stream::Paths, 2, 3);
         let (mut sums, n) = ([0.0f64; SPOTS], 20_000);
         for _ in 0..n {
-            let mut carry = Carry::new(true, &lit, &weights, &mut rng);
+            let mut carry = Carry::new(Some(MOST), &lit, &weights, &mut rng);
             let mut carried = 0;
             for &(spot, _) in &lit {
                 let share = carry.share(weights[spot]);
                 carried += u32::from(share > 0.0);
                 sums[spot] += f64::from(share) / f64::from(n);
             }
-            assert!(carried <= crate::paths::path_reuse::light_up::ROUGH_SPOTS as u32 + 1);
+            assert!(carried <= MOST as u32 + 1);
         }
         for &(spot, _) in &lit {
             let miss = sums[spot] / f64::from(weights[spot]) - 1.0;

@@ -2,7 +2,7 @@
 
 use crate::{
     film::{
-        class::{Place, Way},
+        class::{Connection, PathPlace},
         sink::PixelSink,
         slots::Film,
     },
@@ -11,23 +11,16 @@ use crate::{
     paths::{
         path_reuse::sharing::Sharing,
         scratch::Scratch,
-        tracer::{Lights, Walk},
+        tracer::{LightVertexKind, Tracer},
         vertex::Vertex,
     },
     scene::intersection::lift,
 };
 
-/// The maximum number of light vertices beyond near-mirrors that a gather point is connected to.
-const BEYOND: u32 = 2;
-
-/// Light paths per pass in all zones near spots, and the minimum and maximum in one zone.
-const ALL_ZONES: u32 = 64;
-const ZONE_PATHS: (u32, u32) = (4, 16);
-
 impl Sharing {
     /// Draws the light vertices of this pass: those beyond near-mirrors by `count` paths, and those
     /// in the zones of spots close to other surfaces.
-    pub(crate) fn draw_lights(walk: &Walk, count: u32, rng: &mut Rng, scratch: &mut Scratch) {
+    pub(crate) fn draw_lights(tracer: &Tracer, count: u32, rng: &mut Rng, scratch: &mut Scratch) {
         let Scratch {
             caustics: beyond,
             contacts: near,
@@ -36,21 +29,22 @@ impl Sharing {
         } = scratch;
         beyond.clear();
         near.clear();
-        let within = walk.surroundings();
-        if let Some(caustics) = walk.caustics {
+        let within = tracer.surroundings();
+        if let Some(caustics) = tracer.caustics {
             caustics.fill(beyond, &within, count, rng, stack);
         }
-        if let Some(contacts) = walk.contacts {
-            let (least, most) = ZONE_PATHS;
-            let count = (ALL_ZONES / contacts.count()).clamp(least, most);
+        if let Some(contacts) = tracer.contacts {
+            let tuning = &contacts.tuning;
+            let (least, most) = (tuning.least_tile_paths, tuning.most_tile_paths);
+            let count = (tuning.tile_paths / contacts.count()).clamp(least, most);
             contacts.fill((near, beyond), &within, count, rng, stack);
         }
     }
 
-    /// Connects the gather points to the light vertices of [`draw_lights`].
+    /// Connects the gather points to the light vertices of [`Sharing::draw_lights`].
     pub(crate) fn connect_lights(
         &mut self,
-        (walk, film): (&Walk, &Film),
+        (tracer, film): (&Tracer, &Film),
         rng: &mut Rng,
         scratch: &mut Scratch,
         pixels: &mut [f32],
@@ -62,13 +56,20 @@ impl Sharing {
                     film,
                     pixel: &mut pixels[k * size..(k + 1) * size],
                     factor: 1.0,
-                    place: Place::Gather,
+                    place: PathPlace::Gather,
                 };
-                walk.light(rng, v, Lights::Beyond, BEYOND, scratch, &mut sink);
+                tracer.light(
+                    rng,
+                    v,
+                    LightVertexKind::Beyond,
+                    tracer.tuning.path_reuse.beyond,
+                    scratch,
+                    &mut sink,
+                );
             }
         }
-        if let Some(contacts) = walk.contacts {
-            self.connect_near((walk, film, contacts), scratch, pixels);
+        if let Some(contacts) = tracer.contacts {
+            self.connect_near((tracer, film), contacts, scratch, pixels);
         }
     }
 
@@ -76,7 +77,8 @@ impl Sharing {
     /// one narrow bundle of rays each.
     pub fn connect_near(
         &mut self,
-        (walk, film, contacts): (&Walk, &Film, &Contacts),
+        (tracer, film): (&Tracer, &Film),
+        contacts: &Contacts,
         scratch: &mut Scratch,
         pixels: &mut [f32],
     ) {
@@ -86,7 +88,7 @@ impl Sharing {
             stack,
             ..
         } = scratch;
-        let far = |v: &Vertex| !contacts.near(walk.world, &v.hit);
+        let far = |v: &Vertex| !contacts.near(tracer.world, &v.hit);
         let far: Vec<bool> = self.gathers.iter().map(|(v, _)| far(v)).collect();
         self.weight.clear();
         self.weight.resize(self.gathers.len(), 0.0);
@@ -99,21 +101,21 @@ impl Sharing {
                 let w = to / d2.sqrt();
                 let value = v.hit.surface.scatter(v.hit.n, v.wo, w)
                     * y.hit.surface.scatter(y.hit.n, y.back, -w);
-                if value > 0.0 && bounces <= walk.max_bounces {
+                if value > 0.0 && bounces <= tracer.max_bounces {
                     self.weight[i] = v.beta * y.flux * value / d2;
                     self.segments.push(i, lift(v.hit.p, v.hit.n));
                 }
             }
             let from = lift(y.hit.p, y.hit.n);
-            self.segments.trace(walk.world, stack, from);
+            self.segments.trace(tracer.world, stack, from);
             for (i, through) in self.segments.found() {
                 let Some(through) = through else { continue };
                 let (v, k) = &self.gathers[i];
-                let leg = walk.world.metres((y.hit.p - v.hit.p).length());
+                let leg = tracer.world.metres((y.hit.p - v.hit.p).length());
                 let path = v.length_m + leg + y.path_m;
-                if walk.window.is_none_or(|w| w.holds(path)) {
+                if tracer.window.is_none_or(|w| w.holds(path)) {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
-                    let spot = film.tag(y.spot, Place::Gather, Way::Zone);
+                    let spot = film.tag(y.spot, PathPlace::Gather, Connection::Zone);
                     film.add(pixel, film.slot(path), self.weight[i] * through, spot);
                 }
             }

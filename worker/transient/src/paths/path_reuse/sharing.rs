@@ -11,7 +11,7 @@ use crate::{
         vertex::Vertex,
     },
     scene::{
-        lobes::{Lobes, Seen},
+        lobes::{Lobes, ShadingPoint},
         segments::Segments,
     },
 };
@@ -63,7 +63,7 @@ impl Sharing {
             let diffuse = v.hit.surface.diffuse();
             if !diffuse {
                 self.glossy.push(i);
-                let place = Seen::of(&v.hit, v.wo);
+                let place = ShadingPoint::new(&v.hit, v.wo);
                 self.lobes.push(&place, &v.hit.surface);
             }
             self.columns

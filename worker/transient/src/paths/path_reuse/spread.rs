@@ -7,29 +7,29 @@ use crate::{
     numeric::lanes::{SIDE, Wide, widest},
     paths::{
         path_reuse::{shared::Shared, sharing::Sharing},
-        tracer::Walk,
+        tracer::Tracer,
         vertex::Vertex,
     },
 };
 
 impl Sharing {
     /// Carries the arrivals to the pixels.
-    pub(crate) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+    pub(crate) fn spread(&self, (tracer, film): (&Tracer, &Film), pixels: &mut [f32]) {
         widest(Spread {
             sharing: self,
-            walk,
+            tracer,
             film,
             pixels,
         });
     }
 
     #[inline(always)]
-    pub fn spread_wide(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+    pub fn spread_wide(&self, (tracer, film): (&Tracer, &Film), pixels: &mut [f32]) {
         let count = self.gathers.len();
         let size = film.pixel();
         let last = film.slots as f32 - 1.0;
         let lowest = self.lowest;
-        let bounded = walk.max_bounces < u32::MAX;
+        let bounded = tracer.max_bounces < u32::MAX;
         // Every second arrival is summed here. An addition that waits for the previous one in the
         // same slot takes several times as long.
         let mut second = vec![0.0f32; film.slots];
@@ -90,7 +90,7 @@ impl Sharing {
                 let each = a.bins[y.first..y.end].iter().zip(values).zip(rest);
                 // The order is the same as above, so groups of spots do not change a bit.
                 for (k, ((&b, &value), (&spot, &bounces))) in each.enumerate() {
-                    if u32::from(bounces) + deeper > walk.max_bounces {
+                    if u32::from(bounces) + deeper > tracer.max_bounces {
                         continue;
                     }
                     let slot = floor(b + offset, last) as usize;
@@ -114,7 +114,7 @@ impl Sharing {
 /// Arguments of [`Sharing::spread`].
 struct Spread<'a> {
     pub sharing: &'a Sharing,
-    pub walk: &'a Walk<'a>,
+    pub tracer: &'a Tracer<'a>,
     pub film: &'a Film,
     pub pixels: &'a mut [f32],
 }
@@ -124,8 +124,8 @@ impl Wide for Spread<'_> {
 
     #[inline(always)]
     fn run(self) {
-        let of = (self.walk, self.film);
-        self.sharing.spread_wide(of, self.pixels);
+        let target = (self.tracer, self.film);
+        self.sharing.spread_wide(target, self.pixels);
     }
 }
 

@@ -3,6 +3,7 @@
 use picofarm_scene::{Bsdf, Distribution, Material};
 
 use super::*;
+
 use crate::numeric::{frame::frame, rng::Stream};
 
 const ALPHAS: [f32; 5] = [0.001, 0.01, 0.1, 0.4, 1.0];
@@ -62,7 +63,7 @@ fn albedo(s: &Surface, angle: f32, count: u32) -> f64 {
     let (n, i) = normal_and_incident(angle);
     let mut rng = Rng::new(1, Stream::Paths, 0, 0);
     let draws = (0..count).filter_map(|_| s.sample(n, i, &mut rng));
-    draws.map(|(_, w, _)| f64::from(w)).sum::<f64>() / f64::from(count)
+    draws.map(|drawn| f64::from(drawn.weight)).sum::<f64>() / f64::from(count)
 }
 
 #[test]
@@ -77,7 +78,12 @@ fn sampling_weights_agree_with_density() {
             let (n, i) = normal_and_incident(angle);
             let mut rng = Rng::new(1, Stream::Paths, 0, 0);
             for _ in 0..4000 {
-                if let Some((o, w, pdf)) = s.sample(n, i, &mut rng) {
+                if let Some(ScatterSample {
+                    w: o,
+                    weight: w,
+                    pdf,
+                }) = s.sample(n, i, &mut rng)
+                {
                     let expected = s.scatter(n, i, o) / pdf;
                     assert!((w - expected).abs() < 2e-2 * w, "{s:?} {w} {expected}");
                     assert!((s.pdf(n, i, o) - pdf).abs() <= 1e-2 * pdf, "{s:?}");
@@ -164,7 +170,12 @@ fn the_narrowest_lobe_at_the_flattest_angle_stays_finite() {
             let i = Vec3::new(1.0, 0.0, cos).normalized();
             let mut rng = Rng::new(3, Stream::Paths, 1, 2);
             for _ in 0..2000 {
-                if let Some((o, w, pdf)) = s.sample(n, i, &mut rng) {
+                if let Some(ScatterSample {
+                    w: o,
+                    weight: w,
+                    pdf,
+                }) = s.sample(n, i, &mut rng)
+                {
                     assert!(
                         w.is_finite() && pdf.is_finite() && w >= 0.0,
                         "{s:?} {w} {pdf}"

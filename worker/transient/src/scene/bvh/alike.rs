@@ -24,7 +24,7 @@ const LEAST: f32 = 1e-12;
 pub(crate) struct Group {
     pub bounds: Aabb,
     /// The indices of the boxes.
-    pub of: Vec<u32>,
+    pub members: Vec<u32>,
 }
 
 /// Returns groups of boxes in the order of their first members; `None` if no more than [`FEW`]
@@ -46,15 +46,15 @@ pub(crate) fn groups(boxes: &[Aabb]) -> Option<Vec<Group>> {
     let mut groups: Vec<Group> = vec![];
     let mut place = vec![usize::MAX; count.len()];
     for (k, &group) in group_of.iter().enumerate() {
-        let at = place[group];
-        if count[group] > FEW && at != usize::MAX {
-            groups[at].bounds = groups[at].bounds.union(&boxes[k]);
-            groups[at].of.push(k as u32);
+        let position = place[group];
+        if count[group] > FEW && position != usize::MAX {
+            groups[position].bounds = groups[position].bounds.union(&boxes[k]);
+            groups[position].members.push(k as u32);
         } else {
             place[group] = groups.len();
             groups.push(Group {
                 bounds: boxes[k],
-                of: vec![k as u32],
+                members: vec![k as u32],
             });
         }
     }
@@ -74,7 +74,7 @@ fn key(b: &Aabb) -> [i64; 7] {
     [x, y, z, u, v, w, i64::from(size.to_bits())]
 }
 
-/// Turns a tree over groups into one over their members.
+/// EvenDraws a tree over groups into one over their members.
 pub(crate) fn expand(tree: &mut Bvh2, groups: &[Group], boxes: &[Aabb]) {
     let held = std::mem::take(&mut tree.primitive_indices);
     for n in 0..tree.nodes.len() {
@@ -82,7 +82,7 @@ pub(crate) fn expand(tree: &mut Bvh2, groups: &[Group], boxes: &[Aabb]) {
         if node.prim_count > 0 {
             debug_assert_eq!(node.prim_count, 1, "a leaf is a group");
             let group = &groups[held[node.first_index as usize] as usize];
-            halve(tree, n, &group.of, boxes);
+            halve(tree, n, &group.members, boxes);
         }
     }
 }
@@ -109,9 +109,9 @@ fn halve(tree: &mut Bvh2, n: usize, members: &[u32], boxes: &[Aabb]) {
     while let Some((n, from, to)) = open.pop() {
         let part = &members[from..to];
         if let &[one] = part {
-            let at = tree.primitive_indices.len() as u32;
+            let position = tree.primitive_indices.len() as u32;
             tree.primitive_indices.push(one);
-            tree.nodes[n] = Bvh2Node::new(boxes[one as usize], 1, at);
+            tree.nodes[n] = Bvh2Node::new(boxes[one as usize], 1, position);
             continue;
         }
         let first = tree.nodes.len();
@@ -180,6 +180,6 @@ mod tests {
         assert!(groups(&[boxes[0]; 8]).is_none());
         let many = groups(&[boxes[0]; 9]).unwrap();
         assert_eq!(many.len(), 1);
-        assert_eq!(many[0].of, [0, 1, 2, 3, 4, 5, 6, 7, 8]);
+        assert_eq!(many[0].members, [0, 1, 2, 3, 4, 5, 6, 7, 8]);
     }
 }

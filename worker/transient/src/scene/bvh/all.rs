@@ -15,7 +15,9 @@ impl Bvh {
     pub(crate) fn all(
         &self,
         stack: &mut Stack,
-        (origin, direction, limit): (Vec3, Vec3, f32),
+        origin: Vec3,
+        direction: Vec3,
+        limit: f32,
         out: &mut Vec<(f32, u32)>,
     ) {
         out.clear();
@@ -56,10 +58,14 @@ impl Bvh {
             }
             for pack in &self.packs[packs(current)] {
                 for lane in 0..8 {
-                    let at = |v: usize, k: usize| pack.vertex[3 * v + k][lane] - o[k];
+                    let component = |v: usize, k: usize| pack.vertex[3 * v + k][lane] - o[k];
                     let corner = |v: usize| {
-                        let z = at(v, kz);
-                        [at(v, kx) - shear[0] * z, at(v, ky) - shear[1] * z, z]
+                        let z = component(v, kz);
+                        [
+                            component(v, kx) - shear[0] * z,
+                            component(v, ky) - shear[1] * z,
+                            z,
+                        ]
                     };
                     let [a, b, c] = [corner(0), corner(1), corner(2)];
                     let u = c[0] * b[1] - c[1] * b[0];

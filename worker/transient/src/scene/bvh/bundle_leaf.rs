@@ -13,7 +13,7 @@ impl Rays {
     /// Returns a mask of the rays in `of` that hit box `i` of a node, by the single ray's slab test
     /// with a lane per ray.
     #[inline(always)]
-    pub(crate) fn meet<W: Lanes>(&self, bounds: &[[f32; 8]; 6], i: usize, of: u64) -> u64 {
+    pub(crate) fn meet<W: Lanes>(&self, bounds: &[[f32; 8]; 6], i: usize, ray_mask: u64) -> u64 {
         let (ox, oy, oz) = (self.o.x, self.o.y, self.o.z);
         let low = [
             W::splat(bounds[0][i] - ox),
@@ -28,7 +28,7 @@ impl Rays {
         let slack = W::splat(1.0 + 4.0 * f32::EPSILON);
         let mut met = 0;
         for k in (0..self.count).step_by(W::N) {
-            let lanes = of >> k & (u64::MAX >> (64 - W::N));
+            let lanes = ray_mask >> k & (u64::MAX >> (64 - W::N));
             if lanes == 0 {
                 continue;
             }
@@ -53,14 +53,14 @@ impl Rays {
 
     /// Returns a mask of the rays in `of` that hit a triangle of a leaf.
     #[inline(always)]
-    pub(crate) fn leaf<E: Lanes, W: Lanes>(&self, bvh: &Bvh, leaf: u32, of: u64) -> u64 {
+    pub(crate) fn leaf<E: Lanes, W: Lanes>(&self, bvh: &Bvh, leaf: u32, ray_mask: u64) -> u64 {
         let range = packs(leaf);
         let last = range.end - 1;
         let mut hit = 0;
         for p in range {
             let pack = &bvh.packs[p];
             let fill = if p == last { last_fill(leaf) } else { 8 };
-            let left = of & !hit;
+            let left = ray_mask & !hit;
             // Choose the cheaper order: a register of triangles per ray, or a register of rays per
             // triangle.
             if left.count_ones() as usize <= fill * self.count.div_ceil(W::N) {
@@ -73,7 +73,7 @@ impl Rays {
     }
 
     #[inline(always)]
-    fn by_ray<E: Lanes>(&self, pack: &Pack, mut of: u64) -> u64 {
+    fn by_ray<E: Lanes>(&self, pack: &Pack, mut ray_mask: u64) -> u64 {
         let [kx, ky, kz] = self.axes;
         let o = [
             E::splat(self.o[kx]),
@@ -87,9 +87,9 @@ impl Rays {
             }
         }
         let mut hit = 0;
-        while of != 0 {
-            let k = of.trailing_zeros() as usize & (MOST - 1);
-            of &= of - 1;
+        while ray_mask != 0 {
+            let k = ray_mask.trailing_zeros() as usize & (MOST - 1);
+            ray_mask &= ray_mask - 1;
             let shear = [
                 E::splat(self.shear[0][k]),
                 E::splat(self.shear[1][k]),
@@ -117,7 +117,7 @@ impl Rays {
     }
 
     #[inline(always)]
-    fn by_triangle<W: Lanes>(&self, pack: &Pack, fill: usize, of: u64) -> u64 {
+    fn by_triangle<W: Lanes>(&self, pack: &Pack, fill: usize, ray_mask: u64) -> u64 {
         let mut hit = 0;
         for lane in 0..fill {
             let mut vertices = [[W::splat(0.0); 3]; 3];
@@ -127,7 +127,7 @@ impl Rays {
                 }
             }
             for k in (0..self.count).step_by(W::N) {
-                let lanes = (of & !hit) >> k & (u64::MAX >> (64 - W::N));
+                let lanes = (ray_mask & !hit) >> k & (u64::MAX >> (64 - W::N));
                 if lanes == 0 {
                     continue;
                 }

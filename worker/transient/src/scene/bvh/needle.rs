@@ -3,10 +3,10 @@
 //! The barycentric coordinates of a hit are quotients of differences of products. Their relative
 //! error grows with the ratio of a triangle's length to its width, and so does the error of t. For
 //! a strip of 1 mm × 3 m the error is some tenths of a millimetre, many times the distance by which
-//! [`crate::scene::intersection::lift`] moves a point off its surface. A ray that starts or ends on a needle
-//! would hit that needle, or its neighbour in the same plane. So t of needles is computed in f64,
-//! from the same vertices. The test whether the ray passes inside the edges is the same as for all
-//! triangles, so that no ray slips between two that share an edge.
+//! [`crate::scene::intersection::lift`] moves a point off its surface. A ray that starts or ends on
+//! a needle would hit that needle, or its neighbour in the same plane. So t of needles is computed
+//! in f64, from the same vertices. The test whether the ray passes inside the edges is the same as
+//! for all triangles, so that no ray slips between two that share an edge.
 
 use picofarm_scene::Vec3;
 
@@ -83,11 +83,11 @@ impl Pack {
     /// plane.
     #[cold]
     pub(crate) fn exactly(&self, lane: usize, o: Vec3, d: Vec3) -> f32 {
-        let at = |v: usize| {
+        let corner = |v: usize| {
             let [x, y, z] = [0, 1, 2].map(|k| self.vertex[3 * v + k][lane]);
             Vec3::new(x, y, z)
         };
-        along(&[at(0), at(1), at(2)], o, d)
+        along(&[corner(0), corner(1), corner(2)], o, d)
     }
 }
 

@@ -9,7 +9,7 @@ pub(crate) struct Node {
 }
 
 /// Eight triangles: vertex components a.xyz, b.xyz, c.xyz. Unused lanes are NaN, so they are never
-/// hit. The highest bit of an index marks a needle ([`needle`]).
+/// hit. The highest bit of an index marks a needle ([`crate::scene::bvh::needle`]).
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Pack {

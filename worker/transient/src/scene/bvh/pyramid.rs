@@ -86,11 +86,11 @@ impl Pyramid {
         let depth = far + far * MARGIN;
 
         let sign = if rays.negative { -1.0 } else { 1.0 };
-        let at = |i: usize| [rays.d[kx][i], rays.d[ky][i], rays.d[kz][i] * sign];
+        let direction = |i: usize| [rays.d[kx][i], rays.d[ky][i], rays.d[kz][i] * sign];
         let (a, b, c) = (
-            at(0),
-            at(rays.count / 2 - 1 + rays.count % 2),
-            at(rays.count - 1),
+            direction(0),
+            direction(rays.count / 2 - 1 + rays.count % 2),
+            direction(rays.count - 1),
         );
         let e = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
         let f = [c[0] - a[0], c[1] - a[1], c[2] - a[2]];

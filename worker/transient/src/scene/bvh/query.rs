@@ -22,6 +22,18 @@ impl Bvh {
     /// Returns the nearest triangle that `origin + t · direction` hits with 0 < t ≤ `limit`, as (t,
     /// index); among triangles at equal t the lowest index. Returns `None` for rays that are not
     /// finite.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_scene::Vec3;
+    /// use picofarm_transient::Bvh;
+    ///
+    /// let triangle = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)].map(|(x, y)| Vec3::new(x, y, 2.0));
+    /// let bvh = Bvh::build(&[triangle]);
+    /// let (origin, forward) = (Vec3::new(0.25, 0.25, 0.0), Vec3::new(0.0, 0.0, 1.0));
+    /// let hit = bvh.closest(&mut bvh.stack(), origin, forward, f32::INFINITY);
+    /// assert_eq!(hit, Some((2.0, 0)));
+    /// ```
     #[inline]
     pub fn closest(
         &self,
@@ -44,6 +56,18 @@ impl Bvh {
 
     /// Returns whether a triangle is hit with 0 < t ≤ `limit`. Rays that are not finite count as
     /// blocked.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_scene::Vec3;
+    /// use picofarm_transient::Bvh;
+    ///
+    /// let triangle = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)].map(|(x, y)| Vec3::new(x, y, 2.0));
+    /// let bvh = Bvh::build(&[triangle]);
+    /// let (from, to) = (Vec3::new(0.25, 0.25, 0.0), Vec3::new(0.25, 0.25, 4.0));
+    /// assert!(bvh.occluded(&mut bvh.stack(), from, to - from, 1.0));
+    /// assert!(!bvh.occluded(&mut bvh.stack(), from, to - from, 0.25));
+    /// ```
     #[inline]
     pub fn occluded(&self, stack: &mut Stack, origin: Vec3, direction: Vec3, limit: f32) -> bool {
         stack.rays += 1;

@@ -3,7 +3,7 @@
 //! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and
 //! touch no memory except by unaligned loads and stores of one whole register, from and to slices
 //! that are checked to be that long; a prefetch may name any address. The functions `*_avx2` are
-//! called only through a [`Bvh`](super::Bvh) with the kernel AVX2 or AVX-512, those `*_avx512` only
+//! called only through a [`crate::Bvh`] with the kernel AVX2 or AVX-512, those `*_avx512` only
 //! through one with the kernel AVX-512; `build` and `with_kernel` set these only if [`available`]
 //! returns true. Features are enabled for these functions alone; everything below is inlined into
 //! them. Nothing below may be a closure that is not inlined: closures do not inherit features,

@@ -71,7 +71,7 @@ pub(crate) fn traverse<L: Lanes, const ANY: bool>(
     let (mut best, mut id) = (limit, EMPTY);
     let mut depth = 0;
     let mut current = root;
-    'walk: loop {
+    'tracer: loop {
         while current & LEAF == 0 {
             let node = &bvh.nodes[current as usize];
             let plane = |k: usize, a: usize| L::load(&node.bounds[k]).sub(ov[a]).mul(iv[a]);
@@ -144,11 +144,20 @@ pub(crate) fn traverse<L: Lanes, const ANY: bool>(
         }
         if current & LEAF != 0 {
             for pack in &bvh.packs[packs(current)] {
-                let at = |v: usize, k: usize| L::load(&pack.vertex[3 * v + k]).sub(ov[k]);
-                let (az, bz, cz) = (at(0, kz), at(1, kz), at(2, kz));
-                let (ax, ay) = (at(0, kx).sub(sx.mul(az)), at(0, ky).sub(sy.mul(az)));
-                let (bx, by) = (at(1, kx).sub(sx.mul(bz)), at(1, ky).sub(sy.mul(bz)));
-                let (cx, cy) = (at(2, kx).sub(sx.mul(cz)), at(2, ky).sub(sy.mul(cz)));
+                let component = |v: usize, k: usize| L::load(&pack.vertex[3 * v + k]).sub(ov[k]);
+                let (az, bz, cz) = (component(0, kz), component(1, kz), component(2, kz));
+                let (ax, ay) = (
+                    component(0, kx).sub(sx.mul(az)),
+                    component(0, ky).sub(sy.mul(az)),
+                );
+                let (bx, by) = (
+                    component(1, kx).sub(sx.mul(bz)),
+                    component(1, ky).sub(sy.mul(bz)),
+                );
+                let (cx, cy) = (
+                    component(2, kx).sub(sx.mul(cz)),
+                    component(2, ky).sub(sy.mul(cz)),
+                );
                 let u = cx.mul(by).sub(cy.mul(bx));
                 let v = ax.mul(cy).sub(ay.mul(cx));
                 let w = bx.mul(ay).sub(by.mul(ax));
@@ -195,7 +204,7 @@ pub(crate) fn traverse<L: Lanes, const ANY: bool>(
         }
         loop {
             if depth == 0 {
-                break 'walk;
+                break 'tracer;
             }
             depth -= 1;
             if stack[depth].1 <= best {

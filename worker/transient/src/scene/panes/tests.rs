@@ -1,6 +1,7 @@
 use proptest::prelude::*;
 
 use super::*;
+
 use crate::api::Unstopped;
 
 fn pane(ior: f32, transmittance: f32, face: bool) -> Material {
@@ -119,10 +120,10 @@ proptest! {
 
 #[test]
 fn an_edge_between_two_triangles_is_met_once() {
-    let at = |x: f32, y: f32| Vec3::new(x, y, 1.0);
+    let point = |x: f32, y: f32| Vec3::new(x, y, 1.0);
     let square = [
-        [at(-1.0, -1.0), at(1.0, -1.0), at(1.0, 1.0)],
-        [at(-1.0, -1.0), at(1.0, 1.0), at(-1.0, 1.0)],
+        [point(-1.0, -1.0), point(1.0, -1.0), point(1.0, 1.0)],
+        [point(-1.0, -1.0), point(1.0, 1.0), point(-1.0, 1.0)],
     ];
     let glass = pane(1.0, 0.5, false);
     let panes = built(&square, &[glass.clone(), glass]);
@@ -130,16 +131,16 @@ fn an_edge_between_two_triangles_is_met_once() {
     // Along the diagonal, including the corners of the square.
     for k in -8i16..=8 {
         let x = 0.125 * f32::from(k);
-        let through = panes.through(&mut stack, Vec3::ZERO, at(x, x) * 2.0);
+        let through = panes.through(&mut stack, Vec3::ZERO, point(x, x) * 2.0);
         assert_eq!(through, 0.5, "{x}");
     }
-    assert_eq!(panes.through(&mut stack, Vec3::ZERO, at(1.5, 0.0)), 1.0);
+    assert_eq!(panes.through(&mut stack, Vec3::ZERO, point(1.5, 0.0)), 1.0);
     assert_eq!(
-        panes.through(&mut stack, Vec3::ZERO, at(0.0, 0.5) * 0.9),
+        panes.through(&mut stack, Vec3::ZERO, point(0.0, 0.5) * 0.9),
         1.0
     );
     assert_eq!(
-        panes.tint(&mut stack, Vec3::ZERO, at(0.2, 0.1) * 2.0),
+        panes.tint(&mut stack, Vec3::ZERO, point(0.2, 0.1) * 2.0),
         [0.5, 0.25, 0.0]
     );
 }

@@ -8,6 +8,7 @@ use picofarm_scene::{
 use proptest::prelude::*;
 
 use super::*;
+
 use crate::{
     api::{Stop, Unstopped},
     numeric::frame::frame,

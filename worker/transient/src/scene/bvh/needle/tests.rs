@@ -2,6 +2,7 @@ use picofarm_scene::Vec3;
 use proptest::prelude::*;
 
 use super::{along, is_needle};
+
 use crate::scene::{
     bvh::{nodes::Kernel, normal::normal, tree::Bvh},
     intersection::{lift, point},
