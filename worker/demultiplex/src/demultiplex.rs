@@ -10,9 +10,11 @@ use crate::{
     geometry::{Rays, Source, normals, places},
     light::Light,
     matching,
+    mirrors::Mirrors,
     planes::{Judge, Slants},
     shadows::shadows,
     sweep::{Known, Volume, sweep},
+    unmix::Unmix,
 };
 
 /// Half width of the neighbourhood that a normal follows from, pixels.
@@ -44,8 +46,10 @@ pub struct Demultiplexed {
     pub ground: Vec<Ground>,
     /// Albedo relative to the median pixel's.
     pub albedo: Vec<f32>,
-    /// 1 where a mirror is seen; `None`: this version does not look for mirrors.
+    /// 1 where a mirror is seen: probabilities of a half and more.
     pub mirror: Option<Vec<u8>>,
+    /// Probability that a mirror is seen.
+    pub mirror_probability: Vec<f32>,
 }
 
 impl Demultiplexed {
@@ -132,6 +136,7 @@ fn take_apart(
     let edges = matching::edges(&rays, &intensity);
     let (mut depth, mut confidence, mut near) = (Vec::new(), Vec::new(), Vec::new());
     let mut lit: Vec<f32> = Vec::new();
+    let mut mirror = vec![0.0; rays.len()];
     let mut found = None;
     for round in 0..settings.rounds.max(1) {
         let known = Known {
@@ -150,7 +155,22 @@ fn take_apart(
             None => {
                 let first = first_depth(&rays, &volume, &edges, settings);
                 let mut slants = judge.planes(&first);
-                fill(&rays, &log, &sources, settings.weak_score, &mut slants);
+                fill(&rays, &log, &sources, &volume.bound, settings, &mut slants);
+                let unmix = Unmix {
+                    rays: &rays,
+                    histogram: &histogram,
+                    bins,
+                };
+                unmix.apply(&mut slants);
+                let mirrors = Mirrors {
+                    rays: &rays,
+                    histogram: &histogram,
+                    gate,
+                    sources: &sources,
+                    bound: &volume.bound,
+                    settings,
+                };
+                mirror = mirrors.find(&judge.room(&slants), &mut slants);
                 finish(&rays, &slants)
             }
         };
@@ -194,7 +214,8 @@ fn take_apart(
         lit: all,
         ground,
         albedo: relative(albedo),
-        mirror: None,
+        mirror: Some(mirror.iter().map(|m| u8::from(*m >= 0.5)).collect()),
+        mirror_probability: mirror,
     })
 }
 

@@ -12,12 +12,14 @@ mod fill;
 mod geometry;
 mod light;
 mod matching;
+mod mirrors;
 mod peaks;
 mod planes;
 pub mod score;
 mod settings;
 mod shadows;
 mod sweep;
+mod unmix;
 
 pub use capture::{Capture, Place, Spot};
 pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
@@ -27,4 +29,4 @@ pub use settings::Settings;
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-1";
+pub const VERSION: &str = "demultiplex-2";

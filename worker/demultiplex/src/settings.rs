@@ -36,6 +36,17 @@ pub struct Settings {
     pub plane_reach: usize,
     /// Scores below this count as nothing: such a pixel takes its neighbours' surface.
     pub weak_score: f32,
+    /// Share of a pixel's light by which its first light counts as come.
+    pub early_share: f32,
+    /// Bins by which light may come too early: a pixel's own width spreads its first light.
+    pub early_bins: f32,
+    /// Cost of a surface so far away that light comes too early.
+    pub early_cost: f32,
+    /// Metres beyond the farthest possible range over which that cost grows to its full.
+    pub early_slack_m: f32,
+    /// Usual distance from a surface to the farthest possible range, metres: where no neighbour's
+    /// surface is possible.
+    pub early_gap_m: f32,
     /// Rounds depth → shadows → depth.
     pub rounds: u32,
 }
@@ -56,7 +67,12 @@ impl Default for Settings {
             leap_cost: 1.5,
             plane_rounds: 3,
             plane_reach: 3,
-            weak_score: 0.5,
+            weak_score: 0.4,
+            early_share: 0.01,
+            early_bins: 1.5,
+            early_cost: 0.5,
+            early_slack_m: 0.2,
+            early_gap_m: 0.1,
             rounds: 1,
         }
     }
