@@ -1,0 +1,34 @@
+//! The sensor model: stored transients in, photon counts out. It consists of functions on arrays,
+//! independent of jobs, stores and files.
+//!
+//! The steps for each pixel, in this order (the model of the "Sensor model" section of the method's
+//! appendix A.5):
+//!
+//! 1. rate = scale · (h ⊛ pulse ⊛ jitter) + dark, photons per bin;
+//! 2. pile-up, if requested: at most one photon per pulse is detected;
+//! 3. counts = Poisson(rate);
+//! 4. adjacent bins are summed.
+//!
+//! Light that the convolution moves out of the gate is dropped and counted. Every random number
+//! depends only on (seed, scene, pixel, bin), so neither the number of threads nor the order of the
+//! pixels changes the result.
+
+mod alias;
+mod bins;
+mod chain;
+mod convolve;
+mod draw;
+mod kernel;
+mod scale;
+mod sense;
+mod spots;
+
+pub use bins::{Rebinned, crop, intensity, rebin, rebin_counts, rebin_errors};
+pub use draw::{Draws, binomial, poisson};
+pub use kernel::Kernel;
+pub use picofarm_settings::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
+pub use sense::{Dropped, Histograms, Sensed, Sensing, Values, narrow, sense};
+pub use spots::{Multiplex, SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
+
+/// Version of the sensed values. Change it whenever any output bit may change.
+pub const SENSOR_VERSION: &str = "sensor-2";
