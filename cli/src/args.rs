@@ -23,7 +23,7 @@ pub use data::{
     BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
     SensorArgs,
 };
-pub use demultiplex::{Demultiplex, PlacesArg};
+pub use demultiplex::{Demultiplex, PlacesArg, ShadowsArg};
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind, ListedState};

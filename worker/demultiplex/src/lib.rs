@@ -9,7 +9,10 @@ mod capture;
 mod demultiplex;
 mod error;
 mod fill;
+mod forest;
 mod geometry;
+mod learned;
+pub mod learning;
 mod light;
 mod matching;
 mod mirrors;
@@ -25,8 +28,8 @@ pub use capture::{Capture, Place, Spot};
 pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
 pub use error::DemultiplexError;
 pub use score::{DepthScore, MaskScore, Truth};
-pub use settings::Settings;
+pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-2";
+pub const VERSION: &str = "demultiplex-3";

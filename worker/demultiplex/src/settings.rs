@@ -2,6 +2,17 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How shadows are judged.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Shading {
+    /// By a few rules: geometry, and a logistic regression with 20 numbers over light.
+    #[default]
+    Physics,
+    /// By boosted trees over what the physics knows, learnt from rendered rooms.
+    Learned,
+}
+
 /// How a capture is taken apart. The defaults were chosen on furnished rooms with seeds from 92001
 /// on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -49,6 +60,8 @@ pub struct Settings {
     pub early_gap_m: f32,
     /// Rounds depth → shadows → depth.
     pub rounds: u32,
+    /// How shadows are judged.
+    pub shadows: Shading,
 }
 
 impl Default for Settings {
@@ -74,6 +87,7 @@ impl Default for Settings {
             early_slack_m: 0.2,
             early_gap_m: 0.1,
             rounds: 1,
+            shadows: Shading::Physics,
         }
     }
 }
