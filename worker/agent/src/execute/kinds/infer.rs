@@ -10,15 +10,14 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use picofarm_dataset::{
-    Dataset, DatasetError, ENCODER_VERSION, Models, Predicted, PredictionManifest, Predictions,
-    Verdict,
-};
+use picofarm_dataset::{Dataset, ENCODER_VERSION};
 use picofarm_model::{
     Device, Model, ModelError, masks,
     scene::{Scene, Scenes},
 };
 use picofarm_proto::model::{InferTask, TaskSpec};
+use picofarm_results::{Models, Predicted, PredictionManifest, Predictions, Verdict};
+use picofarm_store::StorageError;
 use tracing::{info, warn};
 
 mod agreement;
@@ -144,7 +143,7 @@ fn finished(
 ) -> Result<Option<PredictionManifest>, TaskError> {
     let looked = async {
         match predictions.finished(ours.scene, &ours.task_key).await {
-            Err(error @ DatasetError::Damaged { .. }) => {
+            Err(error @ StorageError::Damaged { .. }) => {
                 warn!(%error, "what was predicted is damaged; it is predicted again and put back");
                 Ok(None)
             }
