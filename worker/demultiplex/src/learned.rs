@@ -56,10 +56,6 @@ pub const FEATURES: [&str; 36] = [
     "behind around",
     "brightness",
 ];
-/// Features that the second forest sees in addition: log odds of the first one, their mean over
-/// small and wide neighbourhoods, over all spots, and over a wide median.
-pub const AROUND: usize = 5;
-
 /// What the features are made of.
 pub struct Scene<'a> {
     pub rays: &'a Rays,
@@ -151,7 +147,8 @@ impl Scene<'_> {
         out
     }
 
-    /// What the first forest says around the pairs of a source, `[feature][pixel]`.
+    /// What the first forest says around the pairs of a source, `[feature][pixel]`: its log odds,
+    /// their means over a small and a wide neighbourhood, the share of lit spots, and a median.
     pub fn around(&self, i: usize, odds: &[Vec<f32>]) -> Vec<Vec<f32>> {
         let own: Vec<f32> = odds[i].iter().map(|o| o.clamp(-5.0, 5.0)).collect();
         let mean = |reach: usize, stride: usize| -> Vec<f32> {

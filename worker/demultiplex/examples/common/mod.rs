@@ -73,6 +73,7 @@ impl Room {
     /// Generates and renders the furnished room of a seed, or reads it from the cache.
     pub fn new(seed: u64, kind: &Kind) -> Self {
         let settings = furnished::FurnishedSettings {
+            assets: kind.assets.clone(),
             spots: Spots::Grid(kind.spots),
             width: kind.side,
             height: kind.side,
