@@ -15,6 +15,9 @@ pub struct Demultiplex {
     /// one-bounce return
     #[arg(long, value_enum, default_value_t = PlacesArg::Given)]
     pub places: PlacesArg,
+    /// How shadows are judged: by a few rules, or by trees that were learnt from rendered rooms
+    #[arg(long, value_enum, default_value_t = ShadowsArg::Physics)]
+    pub shadows: ShadowsArg,
     /// Threads [default: all cores]
     #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
@@ -24,4 +27,10 @@ pub struct Demultiplex {
 pub enum PlacesArg {
     Given,
     Returns,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ShadowsArg {
+    Physics,
+    Learned,
 }

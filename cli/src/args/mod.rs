@@ -28,7 +28,7 @@ pub use data::{
     DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, SensorArgs,
 };
 pub use dataset::Dataset;
-pub use demultiplex::{Demultiplex, PlacesArg};
+pub use demultiplex::{Demultiplex, PlacesArg, ShadowsArg};
 pub use farm::{Coordinator, Demo, Http, Traces, Up, Worker, Workers};
 pub use guard::{Audit, Guard, Token};
 pub use input::SceneInput;

@@ -7,13 +7,13 @@ use std::time::Instant;
 
 use picofarm_dataset::{RenderArray, write_render_group};
 use picofarm_demultiplex::{
-    Demultiplexed, DepthScore, MaskScore, Settings, VERSION, demultiplex, score,
+    Demultiplexed, DepthScore, MaskScore, Settings, Shading, VERSION, demultiplex, score,
 };
 use serde_json::{Map, json};
 
 use self::read::Flash;
 use crate::{
-    args::Demultiplex,
+    args::{Demultiplex, ShadowsArg},
     error::{CliError, Code, Result},
     output::{
         Output, duration,
@@ -52,6 +52,7 @@ struct Made {
     attributes: Map<String, serde_json::Value>,
     depth: Option<DepthScore>,
     masks: Option<MaskScore>,
+    mirrors: Option<f64>,
     spots: usize,
     placed: usize,
     seconds: f64,
@@ -59,7 +60,13 @@ struct Made {
 
 fn make(args: Demultiplex) -> Result<Made> {
     let flash = Flash::read(&args.render, args.places)?;
-    let settings = Settings::default();
+    let settings = Settings {
+        shadows: match args.shadows {
+            ShadowsArg::Physics => Shading::Physics,
+            ShadowsArg::Learned => Shading::Learned,
+        },
+        ..Settings::default()
+    };
     let start = Instant::now();
     let found = demultiplex(&flash.capture(), &settings)
         .map_err(|e| CliError::input(format!("{}: {e}", args.render.display())))?;
@@ -67,6 +74,7 @@ fn make(args: Demultiplex) -> Result<Made> {
     let truth = flash.truth();
     let depth = truth.as_ref().map(|t| score::depth(&found.depth_m, t));
     let masks = truth.as_ref().and_then(|t| score::masks(&found, t));
+    let mirrors = truth.as_ref().and_then(|t| score::mirrors(&found, t));
     let attributes = json!({
         "demultiplexed": args.render.file_name().map(|n| n.to_string_lossy()),
         "scene": flash.attributes.get("scene"),
@@ -78,11 +86,12 @@ fn make(args: Demultiplex) -> Result<Made> {
         "depth": "z-depth, metres",
         "lit": "probability that the spot of each beam lights what a pixel sees",
         "ground": "what lit rests on: 0 = light, 1 = geometry alone, 2 = other spots' light comes at the same time",
+        "mirror": "probability that a pixel sees a mirror; its depth is then the mirror's own",
         "albedo": "relative to the median pixel's",
         "confidence": "0 to 1: how well the histogram speaks for the depth",
         "settings": settings,
         "version": VERSION,
-        "scores": {"depth": depth, "masks": masks},
+        "scores": {"depth": depth, "masks": masks, "mirrors_iou": mirrors},
     });
     let attributes = attributes
         .as_object()
@@ -98,6 +107,7 @@ fn make(args: Demultiplex) -> Result<Made> {
         attributes,
         depth,
         masks,
+        mirrors,
         seconds,
     })
 }
@@ -131,6 +141,7 @@ fn write(
         image("depth", &found.depth_m),
         image("confidence", &found.confidence),
         image("albedo", &found.albedo),
+        image("mirror", &found.mirror_probability),
         by_spot("lit", &found.lit),
         by_spot("ground", &ground),
     ];
@@ -165,6 +176,9 @@ fn summary(made: &Made) -> String {
             "  masks: IoU {:.3} over all pairs ({:.3} for \"all lit\"), {:.3} over those that can carry light\n",
             m.iou, m.all_lit_iou, m.iou_carrying
         );
+    }
+    if let Some(iou) = made.mirrors {
+        text += &format!("  mirrors: IoU {iou:.3}\n");
     }
     text
 }

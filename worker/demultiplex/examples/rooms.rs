@@ -1,98 +1,40 @@
-//! The method's figures on furnished rooms that nothing was tuned on, a line each and their mean:
-//! depth, masks from its own depth, masks from the true depth, seconds. Rooms are parametric, of
-//! seeds 91001 and on; nothing is read or written.
+//! The method's figures on furnished rooms that nothing was tuned on, a line each, their mean, and
+//! the worst: depth, masks from its own depth, masks from the true depth, mirrors, seconds.
 //!
-//! In the environment, `ROOMS` (20), `FIRST` (91001), `SIDE` (128 pixels), `SPOTS` (25), `ERROR`
-//! (0.1, of the renders), and `RETURNS` takes the spots' places from their own one-bounce returns.
+//! In the environment, `ROOMS` (20), `FIRST` (91001, the first seed), `SIDE` (128 pixels), `SPOTS`
+//! (25), `ERROR` (0.1, of the renders), `ASSETS` (parametric, or sweethome3d from the folder
+//! `ASSETS_DIR`), `CACHE` (a folder that keeps rendered rooms), `SHADOWS` (physics, or
+//! learned), and `RETURNS` takes the spots' places from their own one-bounce returns.
 
-use std::{env, time::Instant};
+#[path = "common/mod.rs"]
+mod common;
 
-use picofarm_demultiplex::{
-    Capture, Demultiplexed, Place, Settings, Spot, Truth, demultiplex, score, shadows_at,
-};
-use picofarm_scene::{AssetLibrary, furnished};
-use picofarm_settings::Spots;
-use picofarm_transient::{self as transient, Budget, Gate, Progress, Strategy, Wavelength};
+use std::time::Instant;
 
-struct Unstopped;
-
-impl Progress for Unstopped {
-    fn at(&self, _: f32) -> bool {
-        true
-    }
-}
-
-fn number(name: &str, usual: f64) -> f64 {
-    let text = env::var(name).ok();
-    text.map_or(usual, |text| {
-        text.parse()
-            .unwrap_or_else(|_| panic!("{name}={text:?} is no number"))
-    })
-}
+use common::{Kind, Room, variable};
+use picofarm_demultiplex::{Demultiplexed, Settings, Shading, demultiplex, score, shadows_at};
 
 /// Depth MAE, mirrors' MAE (NaN without any), median; IoU and IoU over carrying pairs from its own
-/// depth; the same from the true depth; IoU of "all lit"; seconds.
-type Row = [f64; 9];
+/// depth; the same from the true depth; IoU of "all lit"; IoU of mirrors; seconds.
+type Row = [f64; 10];
 
-fn room(seed: u64) -> Row {
-    let side = number("SIDE", 128.0) as u32;
-    let settings = furnished::FurnishedSettings {
-        spots: Spots::Grid(number("SPOTS", 25.0) as u32),
-        width: side,
-        height: side,
-        ..Default::default()
-    };
-    let library = AssetLibrary::parametric();
-    let scene = furnished::generate(seed, &settings, &library).expect("a room");
-    let settings = transient::Settings {
-        gate: Gate {
-            start_m: 1.0,
-            bin_width_m: 0.0384,
-            bins: 637,
+fn scores(room: &Room) -> Row {
+    let capture = room.capture();
+    let truth = room.truth();
+    let settings = Settings {
+        shadows: match variable("SHADOWS", "physics".to_owned()).as_str() {
+            "physics" => Shading::Physics,
+            "learned" => Shading::Learned,
+            other => panic!("SHADOWS={other:?}: expected physics or learned"),
         },
-        budget: Budget::Error(number("ERROR", 0.1)),
-        max_bounces: None,
-        one_bounce: true,
-        seed,
-        split: false,
-        groups: Vec::new(),
-        strategy: Strategy::default(),
-        beam: None,
-        fill_factor: 1.0,
-        wavelengths_nm: Wavelength::NONE,
-    };
-    let rendered = transient::render(&scene, &settings, &Unstopped).expect("a render");
-    let returns = env::var_os("RETURNS").is_some();
-    let spots: Vec<Spot> = scene
-        .laser
-        .beams
-        .iter()
-        .zip(&rendered.spots)
-        .map(|(beam, spot)| Spot {
-            direction: beam.direction,
-            place: spot.filter(|_| !returns).map(|s| Place {
-                point: s.point,
-                path_m: s.path_m,
-            }),
-        })
-        .collect();
-    let capture = Capture {
-        histogram: &rendered.transient,
-        gate: settings.gate,
-        camera: &scene.camera,
-        laser: scene.laser.origin,
-        spots: &spots,
-    };
-    let truth = Truth {
-        depth_m: &rendered.truth.depth,
-        specular: &rendered.truth.specular,
-        visibility: &rendered.truth.visibility,
+        ..Settings::default()
     };
     let start = Instant::now();
-    let own = demultiplex(&capture, &Settings::default()).expect("a capture");
+    let own = demultiplex(&capture, &settings).expect("a capture");
     let seconds = start.elapsed().as_secs_f64();
-    let at_truth = shadows_at(&capture, truth.depth_m, &Settings::default()).expect("a capture");
+    let at_truth = shadows_at(&capture, truth.depth_m, &settings).expect("a capture");
     let depth = score::depth(&own.depth_m, &truth);
+    let mirrors = score::mirrors(&own, &truth);
     let masks = |found: &Demultiplexed| score::masks(found, &truth).expect("masks of all spots");
     let (own, at_truth) = (masks(&own), masks(&at_truth));
     [
@@ -104,6 +46,7 @@ fn room(seed: u64) -> Row {
         at_truth.iou,
         at_truth.iou_carrying,
         own.all_lit_iou,
+        mirrors.unwrap_or(f64::NAN),
         seconds,
     ]
 }
@@ -118,34 +61,39 @@ fn show(name: &str, row: &Row) {
         truth,
         truth_carrying,
         all_lit,
+        mirror_iou,
         seconds,
     ] = row;
     println!(
-        "| {name} | {mae:.4} | {mirrors:.3} | {:.1} | {own:.3} ({own_carrying:.3}) | {truth:.3} ({truth_carrying:.3}) | {all_lit:.3} | {seconds:.1} |",
+        "| {name} | {mae:.4} | {mirrors:.3} | {:.1} | {own:.3} ({own_carrying:.3}) | {truth:.3} ({truth_carrying:.3}) | {all_lit:.3} | {mirror_iou:.3} | {seconds:.1} |",
         median * 1e3
     );
 }
 
 fn main() {
-    let first = number("FIRST", 91001.0) as u64;
-    let count = number("ROOMS", 20.0) as u64;
+    let kind = Kind::of_environment();
+    let (first, count) = (variable("FIRST", 91001), variable("ROOMS", 20u64));
     println!(
-        "| room | depth MAE, m | mirrors, m | median, mm | IoU from own depth (pairs that carry light) | from true depth | \"all lit\" | seconds |"
+        "| room | depth MAE, m | mirrors, m | median, mm | IoU from own depth (pairs that carry light) | from true depth | \"all lit\" | mirrors IoU | seconds |"
     );
-    println!("| --- | --- | --- | --- | --- | --- | --- | --- |");
+    println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- |");
     let mut rows = Vec::new();
     for seed in first..first + count {
-        let row = room(seed);
+        let row = scores(&Room::new(seed, &kind));
         show(&seed.to_string(), &row);
         rows.push(row);
     }
-    let mean = |k: usize| {
-        let all: Vec<f64> = rows
-            .iter()
-            .map(|r| r[k])
-            .filter(|x| x.is_finite())
-            .collect();
-        all.iter().sum::<f64>() / all.len() as f64
+    let known = |k: usize| -> Vec<f64> {
+        let all = rows.iter().map(|r| r[k]);
+        all.filter(|x| x.is_finite()).collect()
     };
-    show("mean", &std::array::from_fn(mean));
+    show(
+        "mean",
+        &std::array::from_fn(|k| known(k).iter().sum::<f64>() / known(k).len() as f64),
+    );
+    let worst = |k: usize| match k {
+        0..=2 | 9 => known(k).into_iter().fold(f64::NAN, f64::max),
+        _ => known(k).into_iter().fold(f64::NAN, f64::min),
+    };
+    show("worst of each", &std::array::from_fn(worst));
 }

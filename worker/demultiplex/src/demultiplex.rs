@@ -5,14 +5,17 @@ use picofarm_scene::Vec3;
 use picofarm_settings::Gate;
 
 use crate::{
-    Capture, DemultiplexError, Ground, Place, Settings,
+    Capture, DemultiplexError, Ground, Place, Settings, Shading,
     fill::fill,
     geometry::{Rays, Source, normals, places},
+    learned::{Scene, log_odds},
     light::Light,
     matching,
+    mirrors::Mirrors,
     planes::{Judge, Slants},
     shadows::shadows,
     sweep::{Known, Volume, sweep},
+    unmix::Unmix,
 };
 
 /// Half width of the neighbourhood that a normal follows from, pixels.
@@ -44,8 +47,10 @@ pub struct Demultiplexed {
     pub ground: Vec<Ground>,
     /// Albedo relative to the median pixel's.
     pub albedo: Vec<f32>,
-    /// 1 where a mirror is seen; `None`: this version does not look for mirrors.
+    /// 1 where a mirror is seen: probabilities of a half and more.
     pub mirror: Option<Vec<u8>>,
+    /// Probability that a mirror is seen.
+    pub mirror_probability: Vec<f32>,
 }
 
 impl Demultiplexed {
@@ -63,7 +68,7 @@ pub fn demultiplex(
     capture: &Capture,
     settings: &Settings,
 ) -> Result<Demultiplexed, DemultiplexError> {
-    take_apart(capture, settings, None)
+    take_apart(capture, settings, None, &mut |_| {})
 }
 
 /// The same where z-depths are known already, metres, `[row][column]`: only shadows and albedo are
@@ -81,13 +86,15 @@ pub fn shadows_at(
         let what = format!("expected {pixels} finite values, one for each pixel");
         return Err(DemultiplexError::invalid("depth_m", what));
     }
-    take_apart(capture, settings, Some(depth_m))
+    take_apart(capture, settings, Some(depth_m), &mut |_| {})
 }
 
-fn take_apart(
+/// The method; `watch` sees what shadows are judged by.
+pub fn take_apart(
     capture: &Capture,
     settings: &Settings,
     known_depth: Option<&[f32]>,
+    watch: &mut dyn FnMut(&Scene),
 ) -> Result<Demultiplexed, DemultiplexError> {
     capture.check()?;
     let camera = capture.camera;
@@ -132,25 +139,44 @@ fn take_apart(
     let edges = matching::edges(&rays, &intensity);
     let (mut depth, mut confidence, mut near) = (Vec::new(), Vec::new(), Vec::new());
     let mut lit: Vec<f32> = Vec::new();
-    let mut found = None;
+    let mut mirror = vec![0.0; rays.len()];
+    let pixels = rays.len();
+    let mut all = vec![0.0; capture.spots.len() * pixels];
+    let mut ground = vec![Ground::Geometry; capture.spots.len() * pixels];
+    let mut found_albedo = Vec::new();
     for round in 0..settings.rounds.max(1) {
         let known = Known {
             normals: &near,
             lit: &lit,
         };
-        let volume = sweep(&histogram, gate, &rays, &sources, known, settings);
-        let judge = Judge {
-            rays: &rays,
-            volume: &volume,
-            log: &log,
-            settings,
-        };
         (depth, confidence) = match known_depth {
             Some(known) => (known.to_vec(), vec![1.0; rays.len()]),
             None => {
+                let volume = sweep(&histogram, gate, &rays, &sources, known, settings);
+                let judge = Judge {
+                    rays: &rays,
+                    volume: &volume,
+                    log: &log,
+                    settings,
+                };
                 let first = first_depth(&rays, &volume, &edges, settings);
                 let mut slants = judge.planes(&first);
-                fill(&rays, &log, &sources, settings.weak_score, &mut slants);
+                fill(&rays, &log, &sources, &volume.bound, settings, &mut slants);
+                let unmix = Unmix {
+                    rays: &rays,
+                    histogram: &histogram,
+                    bins,
+                };
+                unmix.apply(&mut slants);
+                let mirrors = Mirrors {
+                    rays: &rays,
+                    histogram: &histogram,
+                    gate,
+                    sources: &sources,
+                    bound: &volume.bound,
+                    settings,
+                };
+                mirror = mirrors.find(&judge.room(&slants), &mut slants);
                 finish(&rays, &slants)
             }
         };
@@ -167,23 +193,43 @@ fn take_apart(
         };
         let range: Vec<f32> = (0..rays.len()).map(|p| depth[p] * rays.slant[p]).collect();
         let (shares, albedo) = light.shares(&range, &near);
-        let shadows = shadows(&rays, &depth, &sources, &shares);
+        let judged = shadows(&rays, &depth, &sources, &shares);
+        let scene = Scene {
+            rays: &rays,
+            depth: &depth,
+            confidence: &confidence,
+            mirror: &mirror,
+            albedo: &albedo,
+            log: &log,
+            sources: &sources,
+            normals: &near,
+            shares: &shares,
+            judged: &judged,
+        };
+        let odds = match settings.shadows {
+            Shading::Physics => None,
+            Shading::Learned => Some(log_odds(&scene)),
+        };
+        let chance = |i: usize, p: usize| {
+            let odds = odds.as_ref().map_or(&judged[i].smooth, |odds| &odds[i]);
+            1.0 / (1.0 + libm::expf(-odds[p]))
+        };
+        let n = sources.len();
         if round + 1 < settings.rounds {
-            let n = sources.len();
             lit = (0..rays.len() * n)
-                .map(|q| (shadows.lit[(q % n) * rays.len() + q / n]).max(0.1))
+                .map(|q| chance(q % n, q / n).max(0.1))
                 .collect();
+            continue;
         }
-        found = Some((shadows, albedo));
-    }
-    let (shadows, albedo) = found.expect("there is at least one round");
-    let pixels = rays.len();
-    let mut all = vec![0.0; capture.spots.len() * pixels];
-    let mut ground = vec![Ground::Geometry; capture.spots.len() * pixels];
-    for (i, s) in sources.iter().enumerate() {
-        all[s.beam * pixels..][..pixels].copy_from_slice(&shadows.lit[i * pixels..][..pixels]);
-        ground[s.beam * pixels..][..pixels]
-            .copy_from_slice(&shadows.ground[i * pixels..][..pixels]);
+        watch(&scene);
+        for (i, (s, judged)) in sources.iter().zip(&judged).enumerate() {
+            let part = s.beam * pixels..(s.beam + 1) * pixels;
+            for (p, out) in all[part.clone()].iter_mut().enumerate() {
+                *out = chance(i, p);
+            }
+            ground[part].copy_from_slice(&judged.ground);
+        }
+        found_albedo = albedo;
     }
     let world = |n: &Vec3| camera.right * n.x + camera.down * n.y + camera.forward * n.z;
     Ok(Demultiplexed {
@@ -193,8 +239,9 @@ fn take_apart(
         normals: near.iter().map(world).collect(),
         lit: all,
         ground,
-        albedo: relative(albedo),
-        mirror: None,
+        albedo: relative(found_albedo),
+        mirror: Some(mirror.iter().map(|m| u8::from(*m >= 0.5)).collect()),
+        mirror_probability: mirror,
     })
 }
 

@@ -7,12 +7,15 @@ use std::{
 };
 
 use crate::{
-    geometry::{Rays, Source},
+    Settings,
+    geometry::{Rays, Source, depth_of},
     planes::Slants,
 };
 
 /// Cost of a step to a neighbour, in addition to the change of log intensity.
 const STEP: f32 = 0.02;
+/// Cost of a step to a pixel where the surface is too far away for its first light.
+const LATE: f32 = 0.1;
 /// Least score of a pixel that a spot answers for.
 const SURE: f32 = 1.0;
 
@@ -34,8 +37,17 @@ impl Ord for Cost {
 }
 
 /// Sets pixels of a spot to the spot's depth, which its one-bounce return states, and gives every
-/// pixel whose score is below `weak` the plane of the nearest other one.
-pub fn fill(rays: &Rays, log: &[f32], sources: &[Source], weak: f32, slants: &mut Slants) {
+/// pixel with a weak score the plane of the nearest other one that is not too far away for its
+/// first light; where there is none, a surface a little before the farthest possible range.
+pub fn fill(
+    rays: &Rays,
+    log: &[f32],
+    sources: &[Source],
+    bound: &[f32],
+    settings: &Settings,
+    slants: &mut Slants,
+) {
+    let weak = settings.weak_score;
     for s in sources {
         let Some(p) = rays.pixel_of(s.point) else {
             continue;
@@ -67,7 +79,10 @@ pub fn fill(rays: &Rays, log: &[f32], sources: &[Source], weak: f32, slants: &mu
             (row + 1 < rays.height).then(|| p + rays.width),
         ];
         for q in near.into_iter().flatten() {
-            let next = c + STEP + (log[q] - log[p]).abs();
+            let z = depth_of(&slants.plane[from[p]], rays.film(q));
+            let beyond = z * rays.slant[q] - bound[q];
+            let late = LATE * (beyond / settings.early_slack_m).clamp(0.0, 1.0);
+            let next = c + STEP + (log[q] - log[p]).abs() + late;
             if slants.score[q] < weak && next < cost[q] {
                 cost[q] = next;
                 from[q] = from[p];
@@ -77,4 +92,11 @@ pub fn fill(rays: &Rays, log: &[f32], sources: &[Source], weak: f32, slants: &mu
     }
     let planes: Vec<_> = from.iter().map(|p| slants.plane[*p]).collect();
     slants.plane = planes;
+    for (p, from) in from.iter().enumerate() {
+        let range = slants.depth(rays, p) * rays.slant[p];
+        if *from != p && range > bound[p] + 0.5 * settings.early_slack_m {
+            let range = (bound[p] - settings.early_gap_m).max(settings.nearest_m);
+            slants.plane[p] = [0.0, 0.0, rays.slant[p] / range];
+        }
+    }
 }

@@ -1,6 +1,6 @@
 //! One flash taken apart by physics: from a multiplexed histogram, in which the light of all spots
-//! is added up, to the depth of each pixel and to which spots light it. Nothing is learnt; every
-//! two-bounce time follows from geometry.
+//! is added up, to the depth of each pixel and to which spots light it. Every two-bounce
+//! time follows from geometry. Nothing is learnt but, on request, the judgement of shadows.
 //!
 //! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or
 //! files.
@@ -9,22 +9,27 @@ mod capture;
 mod demultiplex;
 mod error;
 mod fill;
+mod forest;
 mod geometry;
+mod learned;
+pub mod learning;
 mod light;
 mod matching;
+mod mirrors;
 mod peaks;
 mod planes;
 pub mod score;
 mod settings;
 mod shadows;
 mod sweep;
+mod unmix;
 
 pub use capture::{Capture, Place, Spot};
 pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
 pub use error::DemultiplexError;
 pub use score::{DepthScore, MaskScore, Truth};
-pub use settings::Settings;
+pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-1";
+pub const VERSION: &str = "demultiplex-3";

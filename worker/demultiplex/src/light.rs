@@ -17,6 +17,8 @@ const KERNEL: usize = 8;
 const SWEEPS: usize = 25;
 /// Shares greater than this say no more.
 const MOST: f32 = 1e6;
+/// The most that counts of a bin over what full light brings.
+const WIDE: f32 = 8.0;
 /// Cosines from which on light by two bounces can be seen.
 pub const CARRIES: f32 = 0.02;
 
@@ -37,6 +39,14 @@ pub struct Share {
     pub clear: f32,
     /// Cosine at the spot, and at what the pixel sees.
     pub cosines: [f32; 2],
+    /// Bins about its time, over the background and over what full light brings.
+    pub window: [f32; 5],
+    /// What all spots together leave of its bins, likewise.
+    pub left: f32,
+    /// Slow background in its bin, likewise.
+    pub slow: f32,
+    /// Share of the pixel's peaks that no spot explains.
+    pub unexplained: f32,
 }
 
 /// All pixels and spots: `[pixel][source]`.
@@ -106,6 +116,13 @@ impl Light<'_> {
                 share.pooled = (share.pooled / full).min(MOST);
                 share.bound = (share.bound / full).min(MOST);
                 share.clear = (share.clear * full).min(MOST);
+                for value in share
+                    .window
+                    .iter_mut()
+                    .chain([&mut share.left, &mut share.slow])
+                {
+                    *value = (*value / full).clamp(-WIDE, WIDE);
+                }
             }
         }
         (shares, albedo)
@@ -165,7 +182,36 @@ impl Light<'_> {
                 full: expected,
             }));
         }
+        let peaks: f32 = w.rest.iter().map(|r| r.min(w.peaks.top)).sum();
+        self.windows(w, x, shares);
         solve(w, shares);
+        let left: f32 = w.rest.iter().map(|r| r.clamp(0.0, w.peaks.top)).sum();
+        let unexplained = if peaks > 0.0 { left / peaks } else { 0.0 };
+        for (share, r) in shares.iter_mut().zip(&w.returns) {
+            share.unexplained = unexplained;
+            if let Some(r) = r {
+                let rest = r.kernel.iter().zip(&w.rest[r.first..]);
+                share.left = rest.map(|(k, rest)| k * rest).sum::<f32>() / r.full;
+            }
+        }
+    }
+
+    /// Bins about the times of all spots, before any light is shared out.
+    fn windows(&self, w: &Worker, x: Vec3, shares: &mut [Share]) {
+        let per_bin = 1.0 / self.gate.bin_width_m as f32;
+        for (source, share) in self.sources.iter().zip(shares) {
+            if share.expected <= 0.0 {
+                continue;
+            }
+            let time = (source.path(x) - self.gate.start_m as f32) * per_bin;
+            for (n, value) in share.window.iter_mut().enumerate() {
+                let bin = time as i64 + n as i64 - 2;
+                let rest = usize::try_from(bin).ok().and_then(|b| w.rest.get(b));
+                *value = rest.copied().unwrap_or(0.0) / share.expected;
+            }
+            let slow = w.peaks.slow.get(time.max(0.0) as usize);
+            share.slow = slow.copied().unwrap_or(0.0) / share.expected;
+        }
     }
 
     /// How far the seen point moves over a third of a pixel to the right and down.

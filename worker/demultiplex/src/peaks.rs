@@ -11,6 +11,8 @@ pub struct Peaks {
     pub top: f32,
     /// How much a bin stands out: log((h + floor)/(slow + floor)) within limits.
     pub out: Vec<f32>,
+    /// The first bin with light.
+    pub first: usize,
     sorted: Vec<f32>,
     wide: Vec<f32>,
 }
@@ -26,6 +28,17 @@ impl Peaks {
                 true if *x > *s => libm::logf((x + floor) / (s + floor)).min(settings.most_out),
                 _ => 0.0,
             }));
+    }
+
+    /// The first bin by which a share of all light has come.
+    pub fn earliest(&mut self, h: &[f32], share: f32) {
+        let total: f32 = h.iter().map(|x| x.min(self.top)).sum();
+        let mut sum = 0.0;
+        let first = h.iter().position(|x| {
+            sum += x.min(self.top);
+            sum > share * total
+        });
+        self.first = first.unwrap_or(h.len());
     }
 
     /// Background and strong bin alone.

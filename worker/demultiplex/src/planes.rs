@@ -58,7 +58,9 @@ impl Judge<'_> {
                 weight += w;
             }
         }
-        sum / weight
+        let range = depth_of(plane, rays.film(p)) * rays.slant[p];
+        let beyond = (range - self.volume.bound[p]) / self.settings.early_slack_m;
+        sum / weight - self.settings.early_cost * beyond.clamp(0.0, 1.0)
     }
 
     /// The plane across the view at a z-depth.
@@ -162,7 +164,7 @@ impl Judge<'_> {
     }
 
     /// Planes to which many pixels belong, the greatest first.
-    fn room(&self, slants: &Slants) -> Vec<Plane> {
+    pub fn room(&self, slants: &Slants) -> Vec<Plane> {
         const MOST: usize = 12;
         let rays = self.rays;
         let stride = (rays.width / 32).max(1);

@@ -88,3 +88,14 @@ pub fn masks(found: &Demultiplexed, truth: &Truth) -> Option<MaskScore> {
         all_lit_iou: pairs().filter(|(_, b, _)| *b).count() as f64 / all,
     })
 }
+
+/// Intersection over union of pixels that see mirrors. Returns `None` if the truth has none or is
+/// unknown.
+pub fn mirrors(found: &Demultiplexed, truth: &Truth) -> Option<f64> {
+    let known = truth.specular.iter().any(|s| *s != 0);
+    let said = |p: usize| found.mirror.as_ref().is_some_and(|m| m[p] != 0);
+    let pairs = || (0..truth.specular.len()).map(|p| (said(p), truth.specular[p] != 0));
+    let both = pairs().filter(|(a, b)| *a && *b).count();
+    let either = pairs().filter(|(a, b)| *a || *b).count();
+    known.then(|| both as f64 / either as f64)
+}

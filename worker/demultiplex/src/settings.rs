@@ -2,6 +2,17 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How shadows are judged.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Shading {
+    /// By a few rules: geometry, and a logistic regression with 20 numbers over light.
+    #[default]
+    Physics,
+    /// By boosted trees over what the physics knows, learnt from rendered rooms.
+    Learned,
+}
+
 /// How a capture is taken apart. The defaults were chosen on furnished rooms with seeds from 92001
 /// on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -36,8 +47,21 @@ pub struct Settings {
     pub plane_reach: usize,
     /// Scores below this count as nothing: such a pixel takes its neighbours' surface.
     pub weak_score: f32,
+    /// Share of a pixel's light by which its first light counts as come.
+    pub early_share: f32,
+    /// Bins by which light may come too early: a pixel's own width spreads its first light.
+    pub early_bins: f32,
+    /// Cost of a surface so far away that light comes too early.
+    pub early_cost: f32,
+    /// Metres beyond the farthest possible range over which that cost grows to its full.
+    pub early_slack_m: f32,
+    /// Usual distance from a surface to the farthest possible range, metres: where no neighbour's
+    /// surface is possible.
+    pub early_gap_m: f32,
     /// Rounds depth → shadows → depth.
     pub rounds: u32,
+    /// How shadows are judged.
+    pub shadows: Shading,
 }
 
 impl Default for Settings {
@@ -56,8 +80,14 @@ impl Default for Settings {
             leap_cost: 1.5,
             plane_rounds: 3,
             plane_reach: 3,
-            weak_score: 0.5,
+            weak_score: 0.4,
+            early_share: 0.01,
+            early_bins: 1.5,
+            early_cost: 0.5,
+            early_slack_m: 0.2,
+            early_gap_m: 0.1,
             rounds: 1,
+            shadows: Shading::Physics,
         }
     }
 }

@@ -49,25 +49,42 @@ pub struct Way {
     pub little: f32,
     /// Share of steps outside of the image.
     pub outside: f32,
+    /// The most that a step is behind the visible surface, as a share of its depth; negative where
+    /// all are before it.
+    pub deepest: f32,
+    /// The least distance from a step to the surface behind it along the view, likewise.
+    pub clearance: f32,
+    /// Where the first step behind is: 0 at the spot, 1 at the pixel; 2 where none is.
+    pub first: f32,
 }
 
 /// Follows a segment through a depth map. Both ends are left out: the surfaces there are no
 /// obstacles.
 pub fn way(rays: &Rays, depth: &[f32], from: Vec3, to: Vec3) -> Way {
-    let mut way = Way::default();
+    let mut way = Way {
+        deepest: -1.0,
+        clearance: 1.0,
+        first: 2.0,
+        ..Way::default()
+    };
     let share = 1.0 / STEPS as f32;
     for n in 0..STEPS {
         let t = 0.04 + 0.92 * n as f32 / (STEPS - 1) as f32;
         let q = from * (1.0 - t) + to * t;
-        match farthest(rays, depth, q) {
-            None => way.outside += share,
-            Some(z) if q.z - z > BEHIND * z => {
-                way.behind += share;
-                if q.z - z < THIN_M {
-                    way.little += share;
-                }
+        let Some(z) = farthest(rays, depth, q) else {
+            way.outside += share;
+            continue;
+        };
+        let deep = (q.z - z) / z;
+        way.deepest = way.deepest.max(deep);
+        if deep > BEHIND {
+            way.behind += share;
+            way.first = way.first.min(t);
+            if q.z - z < THIN_M {
+                way.little += share;
             }
-            Some(_) => {}
+        } else {
+            way.clearance = way.clearance.min(-deep);
         }
     }
     way
@@ -95,34 +112,39 @@ fn farthest(rays: &Rays, depth: &[f32], q: Vec3) -> Option<f32> {
     Some(z.max(depth[bottom + u0]).max(depth[bottom + u1]))
 }
 
-/// Probability of being lit and its ground: `[source][pixel]`.
-pub struct Shadows {
-    pub lit: Vec<f32>,
+/// All pixels of a source, judged one by one: `[pixel]`.
+#[derive(Debug, Clone, Default)]
+pub struct Judged {
+    pub way: Vec<Way>,
+    /// Log odds of being lit.
+    pub logit: Vec<f32>,
+    /// The same, smoothed over each surface.
+    pub smooth: Vec<f32>,
     pub ground: Vec<Ground>,
 }
 
-/// Judges all pairs.
-pub fn shadows(rays: &Rays, depth: &[f32], sources: &[Source], shares: &[Share]) -> Shadows {
-    let (n, pixels) = (sources.len(), rays.len());
-    let mut lit = vec![0.0; n * pixels];
-    let mut ground = vec![Ground::Light; n * pixels];
-    lit.par_chunks_mut(pixels)
-        .zip(ground.par_chunks_mut(pixels))
-        .enumerate()
-        .for_each(|(i, (lit, ground))| {
-            let mut logit = vec![0.0f32; pixels];
-            for p in 0..pixels {
-                let x = rays.unit[p] * (depth[p] * rays.slant[p]);
-                let way = way(rays, depth, sources[i].point, x);
-                let share = &shares[p * n + i];
-                (logit[p], ground[p]) = judge(share, &way);
-            }
-            let smooth = spread(rays, depth, &logit);
-            for (lit, l) in lit.iter_mut().zip(smooth) {
-                *lit = 1.0 / (1.0 + libm::expf(-l));
-            }
-        });
-    Shadows { lit, ground }
+/// Judges all pairs: `[source]`.
+pub fn shadows(rays: &Rays, depth: &[f32], sources: &[Source], shares: &[Share]) -> Vec<Judged> {
+    let n = sources.len();
+    let of = |i: usize| {
+        let mut judged = Judged::default();
+        for p in 0..rays.len() {
+            let x = rays.unit[p] * (depth[p] * rays.slant[p]);
+            let way = way(rays, depth, sources[i].point, x);
+            let (logit, ground) = judge(&shares[p * n + i], &way);
+            judged.way.push(way);
+            judged.logit.push(logit);
+            judged.ground.push(ground);
+        }
+        judged.smooth = spread(rays, depth, &judged.logit);
+        judged
+    };
+    (0..n).into_par_iter().map(of).collect()
+}
+
+/// Whether two pixels may be of one surface.
+pub fn alike(depth: &[f32], p: usize, q: usize) -> bool {
+    (depth[q] - depth[p]).abs() < 0.05 * depth[p]
 }
 
 /// Log odds of being lit. The numbers are a logistic regression's over the pairs of six furnished
@@ -179,7 +201,7 @@ fn spread(rays: &Rays, depth: &[f32], logit: &[f32]) -> Vec<f32> {
                 for u in column.saturating_sub(1)..(column + 2).min(width) {
                     let q = v * width + u;
                     let w = if q == p { 2.0 } else { 1.0 };
-                    if (depth[q] - depth[p]).abs() < 0.05 * depth[p] {
+                    if alike(depth, p, q) {
                         sum += w * logit[q];
                         weight += w;
                     }

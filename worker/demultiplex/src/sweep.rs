@@ -56,6 +56,8 @@ pub struct Volume {
     pub ranges: Ranges,
     /// Scores.
     pub score: Vec<f32>,
+    /// The greatest range of each pixel at which no light comes too early, metres.
+    pub bound: Vec<f32>,
 }
 
 impl Volume {
@@ -105,19 +107,28 @@ pub fn sweep(
     let reach = reach(gate, settings);
     let full = settings.full_score * (sources.len() as f32 / 16.0).min(1.0);
     let mut score = vec![0.0f32; rays.len() * ranges.count];
+    let mut bound = vec![0.0f32; rays.len()];
     score
         .par_chunks_mut(ranges.count * rays.width)
+        .zip(bound.par_chunks_mut(rays.width))
         .enumerate()
-        .for_each_init(Worker::default, |worker, (row, out)| {
-            for (column, out) in out.chunks_mut(ranges.count).enumerate() {
+        .for_each_init(Worker::default, |worker, (row, (out, bound))| {
+            let columns = out.chunks_mut(ranges.count).zip(bound);
+            for (column, (out, bound)) in columns.enumerate() {
                 let p = row * rays.width + column;
                 let h = &histogram[p * bins..][..bins];
                 worker.peaks.find(h, reach, sources.len(), settings);
                 worker.pixel(p, gate, rays, sources, known, ranges);
                 level(&worker.sum, full, out);
+                worker.peaks.earliest(h, settings.early_share);
+                *bound = worker.bound(ranges, settings.early_bins);
             }
         });
-    Volume { ranges, score }
+    Volume {
+        ranges,
+        score,
+        bound,
+    }
 }
 
 /// Half width of the background's opening in bins.
@@ -133,9 +144,27 @@ struct Worker {
     taken: Vec<u64>,
     sum: Vec<f32>,
     times: Vec<f32>,
+    /// The earliest time of any spot's light, for each range.
+    least: Vec<f32>,
 }
 
 impl Worker {
+    /// The greatest range from which no light comes before it can: every path of any number of
+    /// bounces leads by way of a spot to what the pixel sees, so that none is shorter than the
+    /// least two-bounce path.
+    fn bound(&self, ranges: Ranges, margin: f32) -> f32 {
+        let latest = self.peaks.first as f32 + margin;
+        let late = self.least.iter().position(|t| *t > latest);
+        match late {
+            Some(k) if k > 0 => {
+                let (a, b) = (self.least[k - 1], self.least[k]);
+                ranges.at(k as f32 - 1.0 + ((latest - a) / (b - a)).clamp(0.0, 1.0))
+            }
+            Some(_) => ranges.at(0.0),
+            None => f32::INFINITY,
+        }
+    }
+
     fn pixel(
         &mut self,
         p: usize,
@@ -152,19 +181,21 @@ impl Worker {
         self.sum.clear();
         self.sum.resize(ranges.count, 0.0);
         self.times.resize(ranges.count, 0.0);
+        self.least.clear();
+        self.least.resize(ranges.count, f32::INFINITY);
         let ray = rays.unit[p];
         let normal = known.normals.get(p).copied().unwrap_or(Vec3::ZERO);
         let (start, per_bin) = (gate.start_m as f32, 1.0 / gate.bin_width_m as f32);
         for (i, s) in sources.iter().enumerate() {
             let lit = known.lit.get(p * sources.len() + i).copied().unwrap_or(1.0);
-            if lit <= 0.0 {
-                continue;
-            }
             let along = 2.0 * ray.dot(s.point);
             for (k, t) in self.times.iter_mut().enumerate() {
                 let r = ranges.first_m + k as f32 * ranges.step_m;
                 let way = (r * r - along * r + s.square).max(0.0).sqrt();
                 *t = (s.path_m + r + way - start) * per_bin - 0.5;
+            }
+            for (least, t) in self.least.iter_mut().zip(&self.times) {
+                *least = least.min(*t);
             }
             // Cosines' signs are affine in the range.
             let (spot_a, spot_b) = (s.normal.dot(ray), s.normal.dot(s.point));

@@ -2,9 +2,12 @@
 
 use crate::common;
 
-use common::{Plate, Room, grid, scattered};
-use picofarm_demultiplex::{Demultiplexed, Ground, Settings, demultiplex, shadows_at};
+use common::{Plate, Room, Shape, grid, scattered};
+use picofarm_demultiplex::{
+    Capture, Demultiplexed, Ground, Settings, Shading, Truth, demultiplex, score, shadows_at,
+};
 use picofarm_scene::Vec3;
+use picofarm_sensor::{Draws, poisson};
 use picofarm_settings::Gate;
 
 const SIDE: u32 = 48;
@@ -153,12 +156,144 @@ fn two_spots_that_collide_everywhere_are_mostly_reported_as_ambiguous() {
     );
 }
 
+fn learned() -> Settings {
+    Settings {
+        shadows: Shading::Learned,
+        ..Settings::default()
+    }
+}
+
 #[test]
 fn threads_change_no_byte() {
     let room = occluded(SIDE);
+    let beams = room.beams(true);
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-        pool.build().unwrap().install(|| apart(&room, true))
+        let run = || demultiplex(&room.capture(&beams), &learned());
+        pool.build().unwrap().install(run).expect("a room")
     };
     assert_eq!(on(1), on(4));
+    assert_eq!(on(1), on(3));
+}
+
+const GATE: Gate = Gate {
+    start_m: 1.0,
+    bin_width_m: 0.0384,
+    bins: 640,
+};
+
+#[test]
+fn a_mirror_is_found_and_has_its_own_depth() {
+    let shape = Shape {
+        size: 1.0,
+        mirror: Some([-0.9, -0.8, 0.3, 0.35]),
+    };
+    let places = scattered(36);
+    let room = |shape| Room::shaped(64, &places, None, GATE, Vec3::ZERO, shape, |_, _| true);
+    let seen = |places: &[[f32; 2]], room: &Room| -> Vec<[f32; 2]> {
+        let on = |p: &&[f32; 2]| {
+            let (column, row) = ((p[0] * 64.0) as usize, (p[1] * 64.0) as usize);
+            room.mirror[row * 64 + column] == 0
+        };
+        places.iter().filter(on).copied().collect()
+    };
+    let off = seen(&places, &room(shape));
+    let room = Room::shaped(64, &off, None, GATE, Vec3::ZERO, shape, |_, _| true);
+    let found = apart(&room, true);
+    let truth = Truth {
+        depth_m: &room.depth,
+        specular: &room.mirror,
+        visibility: &[],
+    };
+    let iou = score::mirrors(&found, &truth).expect("there is a mirror");
+    assert!(iou > 0.75, "mirrors: IoU {iou}");
+    let said = found.mirror.as_ref().expect("mirrors are looked for");
+    let both = |p: &usize| said[*p] != 0 && room.mirror[*p] != 0;
+    for p in (0..room.depth.len()).filter(both) {
+        let off = (found.depth_m[p] - room.depth[p]).abs();
+        assert!(off < 0.06, "pixel {p}: {} m, {off} m off", found.depth_m[p]);
+    }
+}
+
+#[test]
+fn a_room_without_mirrors_has_none() {
+    let room = Room::new(64, &grid(5), None);
+    let found = apart(&room, true);
+    assert!(found.mirror.unwrap().iter().all(|m| *m == 0));
+}
+
+#[test]
+fn no_depth_is_farther_than_the_first_light_allows() {
+    let room = occluded(64);
+    let found = apart(&room, true);
+    let bins = room.gate.bins as usize;
+    let slant = |p: usize| {
+        let (column, row) = ((p % 64) as f32 + 0.5, (p / 64) as f32 + 0.5);
+        room.camera.ray(column, row)
+    };
+    let mut late = 0;
+    for p in 0..room.depth.len() {
+        let h = &room.histogram[p * bins..][..bins];
+        let Some(first) = h.iter().position(|x| *x > 0.0) else {
+            continue;
+        };
+        let x = slant(p) * (found.depth_m[p] / slant(p).z);
+        let path = |s: &picofarm_demultiplex::Place| s.path_m + (x - s.point).length() + x.length();
+        let earliest = room.spots.iter().map(path).fold(f32::INFINITY, f32::min);
+        let end = room.gate.start_m as f32 + (first + 1) as f32 * room.gate.bin_width_m as f32;
+        late += u32::from(earliest > end + 0.2);
+    }
+    assert!(late * 200 < room.depth.len() as u32, "{late} pixels");
+}
+
+/// 16 spots and 375 bins of 32 ps, as a laboratory's single-photon camera has them, with counted
+/// photons.
+#[test]
+fn the_laboratorys_form_works_with_photon_noise() {
+    let gate = Gate {
+        start_m: 0.9,
+        bin_width_m: 0.009_593_36,
+        bins: 375,
+    };
+    let shape = Shape {
+        size: 0.33,
+        mirror: None,
+    };
+    let room = Room::shaped(SIDE, &grid(4), None, gate, Vec3::ZERO, shape, |_, _| true);
+    let mut peaks: Vec<f32> = room
+        .histogram
+        .chunks(375)
+        .map(|h| h.iter().copied().fold(0.0, f32::max))
+        .collect();
+    peaks.sort_by(f32::total_cmp);
+    let scale = 100.0 / f64::from(peaks[peaks.len() / 2]);
+    let counted: Vec<f32> = room
+        .histogram
+        .iter()
+        .enumerate()
+        .map(|(k, rate)| {
+            let mut draws = Draws::new(7, 0, k as u64 / 375, k as u64 % 375);
+            poisson(f64::from(*rate) * scale, &mut draws) as f32
+        })
+        .collect();
+    let beams = room.beams(true);
+    let capture = Capture {
+        histogram: &counted,
+        ..room.capture(&beams)
+    };
+    let found = demultiplex(&capture, &Settings::default()).expect("a room");
+    let [median, most] = errors(&room, &found);
+    assert!(median < 0.006, "median {median} m");
+    assert!(most < 0.06, "95th percentile {most} m");
+}
+
+#[test]
+fn a_capture_without_light_is_taken_apart_in_both_ways() {
+    let mut room = Room::new(8, &grid(2), None);
+    room.histogram.fill(0.0);
+    let beams = room.beams(true);
+    for settings in [Settings::default(), learned()] {
+        let found = demultiplex(&room.capture(&beams), &settings).expect("no error");
+        assert!(found.lit.iter().all(|p| (0.0..=1.0).contains(p)));
+    }
 }

@@ -18,11 +18,37 @@ pub struct Plate {
     pub sides: [f32; 4],
 }
 
+/// The size of a room and what hangs on its far wall.
+#[derive(Clone, Copy)]
+pub struct Shape {
+    /// Factor on all half sizes.
+    pub size: f32,
+    /// Left, top, right, bottom of a mirror.
+    pub mirror: Option<[f32; 4]>,
+}
+
+impl Shape {
+    pub const PLAIN: Self = Self {
+        size: 1.0,
+        mirror: None,
+    };
+
+    /// Whether a point is on the mirror.
+    fn mirrors(&self, x: Vec3) -> bool {
+        self.mirror.is_some_and(|[left, top, right, bottom]| {
+            let far = (x.z - self.size * HALF[2]).abs() < 1e-4;
+            far && x.x > left && x.x < right && x.y > top && x.y < bottom
+        })
+    }
+}
+
 pub struct Room {
     pub camera: Camera,
     pub gate: Gate,
     pub laser: Vec3,
     pub plate: Option<Plate>,
+    /// 1 where a pixel's middle sees the mirror.
+    pub mirror: Vec<u8>,
     pub spots: Vec<Place>,
     pub directions: Vec<Vec3>,
     pub histogram: Vec<f32>,
@@ -34,10 +60,10 @@ pub struct Room {
 }
 
 /// What a ray meets: range along the unit direction, and the normal towards it.
-fn meet(plate: Option<Plate>, from: Vec3, d: Vec3) -> (f32, Vec3) {
+fn meet(plate: Option<Plate>, size: f32, from: Vec3, d: Vec3) -> (f32, Vec3) {
     let (mut best, mut normal) = (f32::INFINITY, Vec3::ZERO);
     for axis in 0..3 {
-        let half = HALF[axis];
+        let half = size * HALF[axis];
         if d[axis].abs() > 1e-9 {
             let side = d[axis].signum();
             let t = (side * half - from[axis]) / d[axis];
@@ -63,11 +89,11 @@ fn meet(plate: Option<Plate>, from: Vec3, d: Vec3) -> (f32, Vec3) {
 }
 
 /// Whether a segment between two surface points is free.
-fn free(plate: Option<Plate>, a: Vec3, b: Vec3) -> bool {
+fn free(plate: Option<Plate>, size: f32, a: Vec3, b: Vec3) -> bool {
     let way = b - a;
     let long = way.length();
     let d = way / long;
-    meet(plate, a + d * 1e-3, d).0 > long - 3e-3
+    meet(plate, size, a + d * 1e-3, d).0 > long - 3e-3
 }
 
 impl Room {
@@ -89,6 +115,21 @@ impl Room {
         laser: Vec3,
         sends: impl Fn(usize, usize) -> bool,
     ) -> Self {
+        Self::shaped(side, places, plate, gate, laser, Shape::PLAIN, sends)
+    }
+
+    /// The same in a room of another shape. No spot may be on the mirror, and no light comes to a
+    /// surface by way of it.
+    pub fn shaped(
+        side: u32,
+        places: &[[f32; 2]],
+        plate: Option<Plate>,
+        gate: Gate,
+        laser: Vec3,
+        shape: Shape,
+        sends: impl Fn(usize, usize) -> bool,
+    ) -> Self {
+        let size = shape.size;
         let camera = Camera {
             intrinsics: Intrinsics::from_fov(90.0, side, side),
             origin: Vec3::ZERO,
@@ -102,7 +143,7 @@ impl Room {
             .iter()
             .map(|[x, y]| {
                 let d = camera.ray(x * side as f32, y * side as f32).normalized();
-                let (r, normal) = meet(plate, Vec3::ZERO, d);
+                let (r, normal) = meet(plate, size, Vec3::ZERO, d);
                 (d * r, normal)
             })
             .collect();
@@ -115,32 +156,42 @@ impl Room {
             .collect();
         let mut histogram = vec![0.0f32; pixels * bins];
         let mut depth = vec![0.0; pixels];
+        let mut mirror = vec![0; pixels];
         let mut lit = vec![0; pixels * places.len()];
         let mut faces = vec![false; pixels * places.len()];
         for p in 0..pixels {
             let (column, row) = ((p % n) as f32, (p / n) as f32);
             let d = camera.ray(column + 0.5, row + 0.5);
-            let (r, normal) = meet(plate, Vec3::ZERO, d.normalized());
+            let (r, normal) = meet(plate, size, Vec3::ZERO, d.normalized());
             let x = d.normalized() * r;
             depth[p] = x.z;
+            mirror[p] = u8::from(shape.mirrors(x));
             for (k, (l, at)) in seen.iter().enumerate() {
                 let way = (x - *l).normalized();
                 let cosines = (at.dot(way), -normal.dot(way));
                 faces[k * pixels + p] = cosines.0.min(cosines.1) > 0.1;
                 let facing = cosines.0.min(cosines.1) > -1e-3;
-                lit[k * pixels + p] = u8::from(facing && free(plate, *l, x));
+                lit[k * pixels + p] = u8::from(facing && free(plate, size, *l, x));
             }
             for part in 0..PARTS * PARTS {
                 let (a, b) = (part % PARTS, part / PARTS);
                 let of = |k: usize| (k as f32 + 0.5) / PARTS as f32;
                 let d = camera.ray(column + of(a), row + of(b)).normalized();
-                let (r, normal) = meet(plate, Vec3::ZERO, d);
-                let x = d * r;
+                let (mut r, mut normal) = meet(plate, size, Vec3::ZERO, d);
+                let mut x = d * r;
+                if shape.mirrors(x) {
+                    let back = Vec3::new(d.x, d.y, -d.z);
+                    let (more, at) = meet(plate, size, x, back);
+                    (r, normal, x) = (r + more, at, x + back * more);
+                }
                 for (k, (l, at)) in seen.iter().enumerate() {
                     let way = x - *l;
                     let long = way.length();
                     let cosines = (at.dot(way) / long, -normal.dot(way) / long);
-                    if cosines.0 <= 1e-4 || cosines.1 <= 1e-4 || !sends(k, p) || !free(plate, *l, x)
+                    if cosines.0 <= 1e-4
+                        || cosines.1 <= 1e-4
+                        || !sends(k, p)
+                        || !free(plate, size, *l, x)
                     {
                         continue;
                     }
@@ -168,6 +219,7 @@ impl Room {
             gate,
             laser,
             plate,
+            mirror,
             spots,
             directions,
             histogram,
