@@ -224,7 +224,7 @@ impl Checkpoints {
 
     async fn all(&self) -> Result<Vec<Checkpoint>, StorageError> {
         let listed = self.store.list(Some(&self.folder)).try_collect().await;
-        Ok(found(
+        Ok(group_objects(
             listed.map_err(|e| self.failed("list", &self.folder, e))?,
         ))
     }
@@ -243,7 +243,7 @@ impl Checkpoints {
 
 /// Returns the checkpoints among the objects, ascending by task and step. The head of each is its
 /// first object.
-pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
+pub(crate) fn group_objects(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
     let mut found: BTreeMap<(String, u64), Vec<(bool, ObjectMeta)>> = BTreeMap::new();
     for object in objects {
         if let Some((key, step, head)) = place(&object) {
@@ -265,7 +265,7 @@ pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
 }
 
 /// Returns the task and step of a checkpoint's object, and whether it is the head.
-pub(crate) fn place(object: &ObjectMeta) -> Option<(String, u64, bool)> {
+pub(crate) fn parse_key(object: &ObjectMeta) -> Option<(String, u64, bool)> {
     let parts: Vec<_> = object.location.parts().collect();
     let [.., folder, training_key, file] = &parts[..] else {
         return None;

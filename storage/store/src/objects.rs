@@ -170,6 +170,26 @@ pub async fn overwrite(
         .map_err(|e| StorageError::store("replace", shown(store, path), e))
 }
 
+/// Overwrites an object with one atomic put, and reads it back.
+///
+/// # Errors
+/// [`StorageError::Damaged`] if the store returns other bytes than those written;
+/// [`StorageError::Store`].
+pub async fn replace(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+) -> Result<(), StorageError> {
+    overwrite(store, path, bytes.clone()).await?;
+    match get(store, path).await? {
+        Some(stored) if stored == bytes => Ok(()),
+        _ => Err(StorageError::Damaged {
+            object: shown(store, path),
+            what: "it was written again, but does not read back as written; check the store".into(),
+        }),
+    }
+}
+
 /// Puts metadata that count more in place of those that `counts_fewer`; what counts as many or more
 /// stays. Of several that put at a time the one that counts most stays, whichever comes last: an
 /// object is replaced only if it is still the one that was looked at. A store that cannot put on

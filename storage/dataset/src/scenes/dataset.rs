@@ -12,11 +12,12 @@ use crate::layout::arrays::Layout;
 use crate::layout::group::{
     METADATA, counts_fewer, create_metadata, is_predictions, is_reconstructions, pretty,
 };
-use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
+use crate::layout::manifest::{FORMAT_VERSION, Manifest, encoder_of};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 use picofarm_store::StorageError;
 use picofarm_store::objects::{self, Rereads};
+use picofarm_store::published::Published;
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -153,6 +154,12 @@ impl Dataset {
     /// Returns the arrays, in the order of their objects in a manifest.
     pub fn arrays(&self) -> &[ArrayCodec] {
         &self.arrays
+    }
+
+    /// Returns the published scenes. Scenes are checked by [`Self::verify`] and restored by
+    /// [`Self::restore`], which also know the data set's specification, its listing and snapshots.
+    pub(crate) fn published_scenes(&self) -> Published<Manifest> {
+        Published::new(self.store.clone(), self.prefix.clone())
     }
 
     /// Returns its path in the store.

@@ -51,6 +51,6 @@ impl Hdf5 {
     }
 }
 
-fn said(error: Error) -> String {
+fn message_of(error: Error) -> String {
     error.to_string()
 }

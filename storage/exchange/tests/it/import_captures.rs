@@ -10,8 +10,6 @@ use crate::files::npy::npy;
 use common::*;
 use picofarm_dataset::*;
 use picofarm_exchange::import::*;
-use picofarm_exchange::*;
-use picofarm_store::*;
 use serde_json::{Value, json};
 
 const SIDE: usize = 32;

@@ -10,8 +10,6 @@ use crate::files::room::Room;
 use common::*;
 use picofarm_dataset::*;
 use picofarm_exchange::import::*;
-use picofarm_exchange::*;
-use picofarm_store::*;
 use serde_json::{Value, json};
 
 /// Writes `room` as scene `folder`, with spots 0, 7, 14, …. Returns its description.

@@ -11,8 +11,6 @@ use crate::files::room::Room;
 use common::*;
 use picofarm_dataset::*;
 use picofarm_exchange::import::*;
-use picofarm_exchange::*;
-use picofarm_store::*;
 use serde_json::{Value, json};
 
 const C: f64 = 299_792_458.0;

@@ -17,7 +17,6 @@ use bytes::Bytes;
 use common::tricky::{Moment, Tricky};
 use futures::{FutureExt, TryStreamExt};
 use object_store::{ObjectStore, ObjectStoreExt, memory::InMemory, path::Path};
-use picofarm_dataset::*;
 use picofarm_results::*;
 use picofarm_store::*;
 use serde_json::json;
