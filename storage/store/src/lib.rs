@@ -57,6 +57,18 @@ use bucket_url::BucketUrl;
 /// and its limit of concurrent requests, so it should be opened once and reused. See also
 /// [`limit_bandwidth`].
 ///
+/// ```
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), picofarm_store::StorageError> {
+/// let folder = tempfile::tempdir().expect("a temporary folder");
+/// let (store, prefix) = picofarm_store::open_store(&folder.path().display().to_string())?;
+/// let key = picofarm_store::objects::path_of(&prefix, "notes/a.txt");
+/// assert!(picofarm_store::objects::create(&*store, &key, "first".into()).await?);
+/// assert!(folder.path().join("notes/a.txt").is_file());
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// [`StorageError::UnsupportedStore`] for other schemes and for paths that cannot be object keys;
 /// [`StorageError::StoreSettings`] names a missing or unusable variable.
@@ -77,6 +89,14 @@ pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), Sto
 }
 
 /// Checks that a location can be parsed. Does not check whether it can be reached.
+///
+/// ```
+/// use picofarm_store::check_location;
+///
+/// assert!(check_location("data/sets").is_ok());
+/// let error = check_location("s3:/bucket/sets").unwrap_err();
+/// assert!(error.to_string().contains("did you mean s3://bucket/sets?"));
+/// ```
 ///
 /// # Errors
 /// [`StorageError::UnsupportedStore`].

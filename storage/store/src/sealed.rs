@@ -19,6 +19,16 @@ pub struct ObjectEntry {
 
 /// Appends to an object's pretty JSON a last member `checksum`: the SHA-256, in hexadecimal, of its
 /// bytes without that member.
+///
+/// ```
+/// use picofarm_store::sealed::{document, seal, unsealed};
+///
+/// let json = document(&serde_json::json!({"epochs": 3}));
+/// let sealed = seal(&json);
+/// assert_eq!(unsealed(&sealed).unwrap(), json);
+/// let changed = String::from_utf8(sealed).unwrap().replace('3', "4");
+/// assert!(unsealed(changed.as_bytes()).is_err());
+/// ```
 pub fn seal(json: &[u8]) -> Vec<u8> {
     let body = json
         .strip_suffix(END)

@@ -23,7 +23,7 @@ pub(super) async fn stage_over(
     stage: StageRef,
     at_ms: i64,
 ) -> Result<Settled> {
-    let key = keys.of(c, stage).await?;
+    let key = keys.stage(c, stage).await?;
     let state: i64 = sqlx::query_scalar("SELECT state FROM job WHERE key = ?")
         .bind(key.job)
         .fetch_one(&mut *c)
@@ -189,7 +189,7 @@ pub(super) async fn retry(
         retried += range.len();
         range.crashes = 0;
         range.state = RangeState::Pending { not_before_ms: 0 };
-        let stage = keys.of(c, range.stage).await?.stage;
+        let stage = keys.stage(c, range.stage).await?.stage;
         give(c, stage, &range).await?;
         sqlx::query("DELETE FROM exception WHERE stage = ? AND task >= ? AND task < ?")
             .bind(stage)

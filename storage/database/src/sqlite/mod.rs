@@ -59,7 +59,7 @@ impl Catalog for SqliteCatalog {
         let instance = InstanceId::from_uuid(Uuid::now_v7());
         // A life begins with a write, so that on a full disk the coordinator does not start, make
         // promises and then fail.
-        self.write(async |c, _| Ok(write::found(c, instance).await?))
+        self.write(async |c, _| Ok(write::record_instance(c, instance).await?))
             .await?;
         let mut c = self.reader().await?;
         let read = async {

@@ -47,7 +47,7 @@ impl SqliteCatalog {
             .await
             .map_err(failed)?;
         let files = || {
-            files::Files::of(path).map_err(|what| CatalogError::Lost {
+            files::Files::open_at(path).map_err(|what| CatalogError::Lost {
                 path: path.to_owned(),
                 what,
             })

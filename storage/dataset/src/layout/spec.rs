@@ -100,6 +100,13 @@ impl Subsets {
 
     /// Returns the subsets of the given sizes.
     ///
+    /// ```
+    /// use picofarm_dataset::Subsets;
+    ///
+    /// assert!(Subsets::of(&[4, 25]).is_ok());
+    /// assert_eq!(Subsets::of(&[9]).unwrap_err(), "9 is not one of 4, 25");
+    /// ```
+    ///
     /// # Errors
     /// A message that names an unknown size.
     pub fn of(sizes: &[u32]) -> Result<Self, String> {

@@ -51,6 +51,35 @@ impl Dataset {
     /// of two that replace an object within the same instant the smaller number may stay, until the
     /// next scene of the larger one is made (published scenes are never touched).
     ///
+    /// ```
+    /// # #[tokio::main(flavor = "current_thread")]
+    /// # async fn main() -> Result<(), picofarm_store::StorageError> {
+    /// use object_store::{memory::InMemory, path::Path};
+    /// use picofarm_dataset::{Dataset, DatasetSpec, Gate, Profile, Subsets, Wavelength};
+    /// use picofarm_store::StorageError;
+    ///
+    /// let store = std::sync::Arc::new(InMemory::new());
+    /// let spec = DatasetSpec {
+    ///     scenes: 2,
+    ///     height: 8,
+    ///     width: 8,
+    ///     spots: 4,
+    ///     subsets: Subsets::NONE,
+    ///     per_spot: false,
+    ///     wavelengths_nm: Wavelength::NONE,
+    ///     two_bounce: false,
+    ///     gate: Gate { start_m: 0.0, bin_width_m: 0.05, bins: 32 },
+    ///     profile: Profile::default(),
+    /// };
+    /// let rooms = Dataset::create_or_open(store.clone(), Path::from("rooms"), &spec).await?;
+    /// assert!(rooms.scenes_present().await?.is_empty());
+    /// let wide = DatasetSpec { width: 16, ..spec };
+    /// let other = Dataset::create_or_open(store, Path::from("rooms"), &wide).await;
+    /// assert!(matches!(other, Err(StorageError::SpecMismatch { .. })));
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
     /// # Errors
     /// [`StorageError::SpecMismatch`] names the first differing field and both values;
     /// [`StorageError::Invalid`]; [`StorageError::Store`].

@@ -81,6 +81,14 @@ impl ExportFormat {
 
     /// Returns the format called `name`.
     ///
+    /// ```
+    /// use picofarm_exchange::ExportFormat;
+    ///
+    /// assert_eq!(ExportFormat::parse("hdf5"), Ok(ExportFormat::Hdf5));
+    /// let error = ExportFormat::parse("h5").unwrap_err();
+    /// assert_eq!(error, "\"h5\" is not one of zarr, sb3d, webdataset, hdf5");
+    /// ```
+    ///
     /// # Errors
     /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {

@@ -95,6 +95,15 @@ impl Source {
     /// scenes in this order. The first scene's files determine the data set's properties. If
     /// `format` is `None`, it is detected.
     ///
+    /// ```
+    /// use picofarm_exchange::import::{ImportOptions, Source};
+    ///
+    /// let folder = tempfile::tempdir()?;
+    /// let error = Source::open(folder.path(), None, ImportOptions::default(), None);
+    /// assert!(error.unwrap_err().to_string().contains("scene.json"));
+    /// # Ok::<(), std::io::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`ImportError::Refused`] if there are no scenes of the format, or scenes of several; if the
     /// first scene's files or the options do not fit the format; [`ImportError::Io`].

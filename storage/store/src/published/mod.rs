@@ -67,6 +67,61 @@ pub trait Manifest: Sized + Send + Sync {
 }
 
 /// The results of one kind in a folder of a store. Cheap to clone.
+///
+/// ```
+/// use bytes::Bytes;
+/// use object_store::{memory::InMemory, path::Path};
+/// use picofarm_store::published::{Manifest, Published};
+/// use picofarm_store::sealed::{document, read_sealed, seal};
+/// use picofarm_store::{ObjectEntry, StorageError, VerifyMode};
+/// use serde::{Deserialize, Serialize};
+///
+/// #[derive(Debug, PartialEq, Serialize, Deserialize)]
+/// struct Picture {
+///     format: u32,
+///     task_key: String,
+///     objects: Vec<ObjectEntry>,
+/// }
+///
+/// impl Manifest for Picture {
+///     type Id = String;
+///
+///     fn parse(bytes: &[u8], _: &String, object: &str) -> Result<Self, StorageError> {
+///         read_sealed(bytes, "a picture's manifest", 1, object)
+///     }
+///     fn to_bytes(&self) -> Vec<u8> {
+///         seal(&document(self))
+///     }
+///     fn objects(&self) -> &[ObjectEntry] {
+///         &self.objects
+///     }
+///     fn task_key(&self) -> &str {
+///         &self.task_key
+///     }
+///     fn taken(&self, place: &str, task_key: &str) -> StorageError {
+///         StorageError::invalid("output", format!("{place} is not by {task_key}"))
+///     }
+/// }
+///
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), StorageError> {
+/// let store = std::sync::Arc::new(InMemory::new());
+/// let pictures: Published<Picture> = Published::new(store, Path::from("pictures"));
+/// let (name, pixels) = ("room".to_owned(), Bytes::from("pixels"));
+/// let manifest = Picture {
+///     format: 1,
+///     task_key: "k".into(),
+///     objects: vec![ObjectEntry::new("room.png", &pixels)],
+/// };
+/// pictures.publish(&name, &manifest, &[pixels]).await?;
+/// assert_eq!(pictures.list().await?, ["room"]);
+/// let finished = pictures.finished(&name, "k", VerifyMode::Full).await?;
+/// assert_eq!(finished, Some(manifest));
+/// pictures.remove(&name).await?;
+/// assert!(pictures.list().await?.is_empty());
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct Published<M> {
     store: Arc<dyn ObjectStore>,
