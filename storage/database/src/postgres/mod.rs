@@ -77,7 +77,8 @@ impl Catalog for PostgresCatalog {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
             instance::try_room(&mut tx).await?;
-            instance::create_instance(&mut tx, instance, former, &self.name, INSTANCE_SECONDS).await?;
+            instance::create_instance(&mut tx, instance, former, &self.name, INSTANCE_SECONDS)
+                .await?;
             let ranges = instance::take_lost(&mut tx, instance).await?;
             let snapshot = Snapshot {
                 instance,

@@ -195,11 +195,17 @@ impl Models {
         if objects::get(&*self.store, &path).await?.as_deref() == Some(&ours[..]) {
             // It was published before; objects damaged since then are restored.
             self.published.restore(&name, &manifest, &bytes).await?;
-        } else if let Err(error) = self.published.publish(&name, &manifest, &bytes).await {
-            return match objects::get(&*self.store, &path).await? {
-                Some(stored) if stored != ours => self.other_bits(&manifest, &stored, exact).await,
-                _ => Err(error),
-            };
+        } else {
+            match self.published.publish(&name, &manifest, &bytes).await {
+                Err(conflict @ StorageError::Conflict { .. }) => {
+                    let stored = objects::get(&*self.store, &path).await?;
+                    let Some(stored) = stored.filter(|stored| *stored != ours) else {
+                        return Err(conflict);
+                    };
+                    return self.other_bits(&manifest, &stored, exact).await;
+                }
+                published => published?,
+            }
         }
         Ok(PublishedModel {
             manifest,
