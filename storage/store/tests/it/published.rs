@@ -276,7 +276,7 @@ async fn every_damaged_object_is_named_and_restored_alone<Id: AnyId>() {
     );
     let examined = results.verify(VerifyMode::Full, &NoSecond, &|_, _| {});
     let problems = examined.await.unwrap().problems;
-    let [manifest, object] = &problems[..] else {
+    let [object, manifest] = &problems[..] else {
         panic!("{problems:?}")
     };
     assert_eq!(manifest.fault, Fault::BadManifest("has a second".into()));
