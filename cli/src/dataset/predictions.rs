@@ -4,6 +4,7 @@ use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_results::{
     ModelUsed, PredictionManifest, PredictionSpec, Predictions, TimesUsed, Verdict,
 };
+use picofarm_store::published::Manifest as _;
 use picofarm_store::{Problem, open_store};
 use serde_json::json;
 

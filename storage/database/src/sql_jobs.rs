@@ -22,14 +22,14 @@ macro_rules! job_queries {
 
             use picofarm_proto::{
                 ids::{JobId, StageRef},
-                model::{EventKind, JobSpec, JobState, StageState, TaskCounts},
+                model::{JobSpec, JobState},
             };
             use sqlx::Row;
 
             use super::query::{exception, stage_of, uint};
             use super::stage_query::{final_stages, nodes};
-            use picofarm_catalog::{Free, Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight, Specs};
-            use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}, sql_jobs::at};
+            use picofarm_catalog::{Free, Holdups, Job, JobRecord, ResultSet, Timing, Sight, Specs};
+            use crate::{seen::seen, sql::{self, bad}, sql_jobs::at};
 
             type Connection = $connection;
             type DbRow = $row;

@@ -246,7 +246,7 @@ impl Checkpoints {
 pub(crate) fn group_objects(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
     let mut found: BTreeMap<(String, u64), Vec<(bool, ObjectMeta)>> = BTreeMap::new();
     for object in objects {
-        if let Some((key, step, head)) = place(&object) {
+        if let Some((key, step, head)) = parse_key(&object) {
             found.entry((key, step)).or_default().push((head, object));
         }
     }

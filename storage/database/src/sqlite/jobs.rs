@@ -11,6 +11,7 @@ use sqlx::SqliteConnection;
 use super::{
     job_query, query, rights_query,
     rows::{give, insert_events, insert_ranges},
+    stage_query,
     writer::{Keys, Result, WriteError},
 };
 use crate::sql::{self, int};
@@ -28,7 +29,7 @@ pub(super) async fn stage_over(
         .bind(key.job)
         .fetch_one(&mut *c)
         .await?;
-    if state != 0 || job_query::is_open(c, key.stage).await? {
+    if state != 0 || stage_query::is_open(c, key.stage).await? {
         return Ok(Settled::default());
     }
     settle(c, keys, stage.job, at_ms).await
@@ -41,7 +42,7 @@ async fn settle(
     at_ms: i64,
 ) -> Result<Settled> {
     let key = keys.job(c, id).await?;
-    let (settled, events) = job_query::settle(c, key, id, at_ms).await?;
+    let (settled, events) = stage_query::settle(c, key, id, at_ms).await?;
     insert_events(c, keys, &events).await?;
     Ok(settled)
 }

@@ -51,8 +51,8 @@ pub(super) fn check(
     // wrong gate.
     let step = step(g) as f64 * g.shape.gate.bin_width_m;
     let peak = all.peak();
-    let clear = all.at(peak) > all.background() * CONTRAST;
-    if peak.abs() > TOLERANCE && all.at(peak) > all.hit() * BETTER && clear {
+    let clear = all.energy_at(peak) > all.background() * CONTRAST;
+    if peak.abs() > TOLERANCE && all.energy_at(peak) > all.hit() * BETTER && clear {
         let expected = format!(
             "two-bounce light at the time of flight that depth and spots predict, within {:.4} m of path",
             TOLERANCE as f64 * step

@@ -4,7 +4,7 @@ use bytes::Bytes;
 use object_store::ObjectStore;
 use object_store::path::Path;
 
-use super::{Manifest, Published, ResultId};
+use super::{Manifest, Published};
 use crate::error::StorageError;
 use crate::objects;
 use crate::sealed::sha256_hex;

@@ -7,6 +7,7 @@ use picofarm_agent::model_version;
 use picofarm_dataset::*;
 use picofarm_proto::model::{JobSpec, PromoteSettings, PromoteTask, StageSpec, TaskSpec};
 use picofarm_results::*;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::*;
 use serde_json::{Value, json};
 

@@ -32,6 +32,7 @@ use picofarm_results::{
 };
 use picofarm_sensor::SENSOR_VERSION;
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use tracing::{debug, info, warn};
 
 mod along;
