@@ -31,7 +31,7 @@ const HEAD: usize = MAGIC.len() + SHA;
 /// Size of a SHA-256 in bytes.
 const SHA: usize = 32;
 /// Number of checkpoints to retain.
-const KEPT: usize = 2;
+const RETAINED: usize = 2;
 /// Maximum number of pieces transferred concurrently; each is in memory meanwhile.
 const AT_ONCE: usize = 4;
 /// Folder of the checkpoints, next to the published objects.
@@ -85,7 +85,7 @@ impl Checkpoints {
         let mut there = self.all().await?;
         there.retain(|checkpoint| checkpoint.step <= step);
         let finished = there.iter().rev().filter(|c| c.finished);
-        let oldest = finished.take(KEPT).last().map_or(step, |c| c.step);
+        let oldest = finished.take(RETAINED).last().map_or(step, |c| c.step);
         for old in there.iter().filter(|c| c.step < oldest) {
             // The head is deleted first, so that an interrupted deletion leaves no seemingly
             // complete checkpoint.

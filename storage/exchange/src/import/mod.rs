@@ -295,8 +295,8 @@ fn detect(
 fn looks_like(format: Format) -> &'static str {
     match format {
         Format::Sb3d => "lidar_4.exr, lidar_25.exr or lidar_100.exr in a folder for each scene",
-        Format::Platonerf => "transforms_train.json beside the folder of .npy captures",
-        Format::BfLidar => "spot_1.mat and so on beside a detector_scan*.mat",
+        Format::Platonerf => "transforms_train.json next to the folder of .npy captures",
+        Format::BfLidar => "spot_1.mat and so on next to a detector_scan*.mat",
         Format::Npy => "scene.json in a folder for each scene",
     }
 }

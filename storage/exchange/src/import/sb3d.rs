@@ -18,7 +18,7 @@ use picofarm_files::Opener;
 use super::check::check;
 use super::files::Files;
 use super::profile::{CheckedFiles, Geometry};
-use super::scene::{ImportedScene, Shape, of_fov};
+use super::scene::{ImportedScene, Shape, intrinsics_from_fov};
 use super::{DepthKind, ImportError, ImportOptions, Item, image};
 use crate::export::{SIDECAR, Sidecar};
 use contents::{depth, histogram, lights, not_more, shadows, specular};
@@ -158,7 +158,7 @@ pub(super) fn read(
     )];
     let intrinsics = match (options.fov_deg, &sidecar) {
         (None, Some(sidecar)) => sidecar.intrinsics(),
-        (fov, _) => of_fov(shape.width, shape.height, fov.unwrap_or(90.0)),
+        (fov, _) => intrinsics_from_fov(shape.width, shape.height, fov.unwrap_or(90.0)),
     };
     let main = lidar(&item.folder, shape.spots);
     let mut transient = histogram(&main, &shape, files, &mut conversions)?;

@@ -150,11 +150,11 @@ pub(super) fn lights(file: &Path, spots: u32, files: &Files) -> Result<Vec<[f32;
         ));
     }
     let all: Vec<[f32; 3]> = array.values.as_chunks::<3>().0.to_vec();
-    Ok(of_grid(spots, n).into_iter().map(|s| all[s]).collect())
+    Ok(grid_indices(spots, n).into_iter().map(|s| all[s]).collect())
 }
 
 /// Returns the indices of the spots among the `n` entries of a file.
-fn of_grid(spots: u32, n: usize) -> Vec<usize> {
+fn grid_indices(spots: u32, n: usize) -> Vec<usize> {
     let some = match (spots, n) {
         (4, GRID) => Quantity::Transient4.spots_of_100(),
         (25, GRID) => Quantity::Transient25.spots_of_100(),
@@ -209,7 +209,7 @@ pub(super) fn shadows(
     let turn = options.visibility == Some(Polarity::Shadow);
     let mut between = 0u64;
     let mut lit = Vec::with_capacity(spots as usize * w * h);
-    for spot in of_grid(spots, n) {
+    for spot in grid_indices(spots, n) {
         let mask = &array.values[spot * w * h * colours..][..w * h * colours];
         lit.extend(mask.chunks_exact(colours).map(|c| {
             let mean = c.iter().sum::<f32>() / colours as f32 / white;
