@@ -12,7 +12,6 @@ use picofarm_proto::{
     key::{TaskKey, derived_key},
     model::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
-use picofarm_results::*;
 use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
 use picofarm_store::*;
 use serde_json::json;
