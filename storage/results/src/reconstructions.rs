@@ -47,7 +47,7 @@ pub struct ReconstructionManifest {
     pub settings: Value,
     /// Its objects. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

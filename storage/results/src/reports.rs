@@ -37,7 +37,7 @@ pub struct ReportManifest {
     pub models: Vec<ReportedModel>,
     /// Its objects, with keys relative to the report's folder. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

@@ -35,7 +35,7 @@ pub struct ModelManifest {
     pub metrics: Value,
     /// Its objects, with keys relative to the model's folder.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
