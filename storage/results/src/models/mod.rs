@@ -192,11 +192,17 @@ impl Models {
         let manifest = manifest.with_objects(entries);
         let bytes: Vec<Bytes> = objects.into_iter().map(|(_, bytes)| bytes).collect();
         let (path, ours) = (self.published.manifest_path(&name), manifest.to_bytes());
-        if objects::get(&*self.store, &path).await?.as_deref() == Some(&ours[..]) {
+        match objects::get(&*self.store, &path).await? {
             // It was published before; objects damaged since then are restored.
-            self.published.restore(&name, &manifest, &bytes).await?;
-        } else {
-            match self.published.publish(&name, &manifest, &bytes).await {
+            Some(stored) if stored == ours => {
+                self.published.restore(&name, &manifest, &bytes).await?;
+            }
+            Some(stored) => {
+                self.published.put_objects(&name, &manifest, &bytes).await?;
+                return self.other_bits(&manifest, &stored, exact).await;
+            }
+            None => match self.published.publish(&name, &manifest, &bytes).await {
+                // Another run may have published it in the meantime.
                 Err(conflict @ StorageError::Conflict { .. }) => {
                     let stored = objects::get(&*self.store, &path).await?;
                     let Some(stored) = stored.filter(|stored| *stored != ours) else {
@@ -205,7 +211,7 @@ impl Models {
                     return self.other_bits(&manifest, &stored, exact).await;
                 }
                 published => published?,
-            }
+            },
         }
         Ok(PublishedModel {
             manifest,

@@ -216,11 +216,24 @@ impl<M: Manifest> Published<M> {
         manifest: &M,
         bytes: &[Bytes],
     ) -> Result<(), StorageError> {
-        let objects = self.with_paths(id, manifest, bytes);
-        create_all(&*self.store, &objects).await?;
+        self.put_objects(id, manifest, bytes).await?;
         let path = self.manifest_path(id);
         objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
-        create_missing(&*self.store, &objects).await
+        create_missing(&*self.store, &self.with_paths(id, manifest, bytes)).await
+    }
+
+    /// Puts the objects of a result that is not published yet, create-only.
+    ///
+    /// # Errors
+    /// [`StorageError::Conflict`] if an object exists with different bytes;
+    /// [`StorageError::Store`].
+    pub async fn put_objects(
+        &self,
+        id: &M::Id,
+        manifest: &M,
+        bytes: &[Bytes],
+    ) -> Result<(), StorageError> {
+        create_all(&*self.store, &self.with_paths(id, manifest, bytes)).await
     }
 
     /// Returns the manifest of a result that the task `task_key` has published, after checking its
