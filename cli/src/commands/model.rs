@@ -16,6 +16,7 @@ use std::{
 use picofarm_proto::show;
 use picofarm_results::{Checkpoint, Evaluation, ModelManifest, Models, Verdict};
 use picofarm_store::open_store;
+use picofarm_store::published::Manifest as _;
 use serde_json::{Value, json};
 
 #[cfg(not(feature = "networks"))]

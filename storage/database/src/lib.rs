@@ -13,6 +13,7 @@ mod sql;
 mod sql_jobs;
 mod sql_listing;
 mod sql_rights;
+mod sql_stages;
 mod sqlite;
 #[cfg(feature = "testing")]
 pub mod testing;

@@ -190,13 +190,13 @@ mod tests {
 
     use super::*;
 
-    struct Place {
+    struct Folder {
         _folder: tempfile::TempDir,
         mine: PathBuf,
         secret: PathBuf,
     }
 
-    fn place() -> Place {
+    fn folder() -> Folder {
         let folder = tempfile::tempdir().unwrap();
         let (mine, other) = (folder.path().join("mine"), folder.path().join("other"));
         std::fs::create_dir_all(mine.join("sub")).unwrap();
@@ -205,7 +205,7 @@ mod tests {
         std::fs::write(mine.join("sub/b"), "b").unwrap();
         let secret = other.join("secret");
         std::fs::write(&secret, "secret").unwrap();
-        Place {
+        Folder {
             _folder: folder,
             mine,
             secret,
@@ -214,7 +214,7 @@ mod tests {
 
     #[test]
     fn what_lies_below_is_opened_however_it_is_named() {
-        let p = place();
+        let p = folder();
         symlink(p.mine.join("a"), p.mine.join("sub/link")).unwrap();
         symlink(p.mine.join("sub"), p.mine.join("folder")).unwrap();
         let files = Opener::anywhere().within([&p.mine]);
@@ -227,7 +227,7 @@ mod tests {
 
     #[test]
     fn no_trick_leads_outside() {
-        let p = place();
+        let p = folder();
         symlink(&p.secret, p.mine.join("file")).unwrap();
         symlink(p.secret.parent().unwrap(), p.mine.join("folder")).unwrap();
         symlink("../other/secret", p.mine.join("relative")).unwrap();
@@ -276,7 +276,7 @@ mod tests {
 
     #[test]
     fn pipes_and_devices_are_neither_waited_for_nor_read() {
-        let p = place();
+        let p = folder();
         let pipe = p.mine.join("pipe");
         let made = std::process::Command::new("mkfifo").arg(&pipe).status();
         assert!(made.unwrap().success());

@@ -31,7 +31,7 @@ const HEAD: usize = MAGIC.len() + SHA;
 /// Size of a SHA-256 in bytes.
 const SHA: usize = 32;
 /// Number of checkpoints to retain.
-const KEPT: usize = 2;
+const RETAINED: usize = 2;
 /// Maximum number of pieces transferred concurrently; each is in memory meanwhile.
 const AT_ONCE: usize = 4;
 /// Folder of the checkpoints, next to the published objects.
@@ -85,7 +85,7 @@ impl Checkpoints {
         let mut there = self.all().await?;
         there.retain(|checkpoint| checkpoint.step <= step);
         let finished = there.iter().rev().filter(|c| c.finished);
-        let oldest = finished.take(KEPT).last().map_or(step, |c| c.step);
+        let oldest = finished.take(RETAINED).last().map_or(step, |c| c.step);
         for old in there.iter().filter(|c| c.step < oldest) {
             // The head is deleted first, so that an interrupted deletion leaves no seemingly
             // complete checkpoint.
@@ -224,7 +224,7 @@ impl Checkpoints {
 
     async fn all(&self) -> Result<Vec<Checkpoint>, StorageError> {
         let listed = self.store.list(Some(&self.folder)).try_collect().await;
-        Ok(found(
+        Ok(group_objects(
             listed.map_err(|e| self.failed("list", &self.folder, e))?,
         ))
     }
@@ -243,10 +243,10 @@ impl Checkpoints {
 
 /// Returns the checkpoints among the objects, ascending by task and step. The head of each is its
 /// first object.
-pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
+pub(crate) fn group_objects(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
     let mut found: BTreeMap<(String, u64), Vec<(bool, ObjectMeta)>> = BTreeMap::new();
     for object in objects {
-        if let Some((key, step, head)) = place(&object) {
+        if let Some((key, step, head)) = parse_key(&object) {
             found.entry((key, step)).or_default().push((head, object));
         }
     }
@@ -265,7 +265,7 @@ pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
 }
 
 /// Returns the task and step of a checkpoint's object, and whether it is the head.
-pub(crate) fn place(object: &ObjectMeta) -> Option<(String, u64, bool)> {
+pub(crate) fn parse_key(object: &ObjectMeta) -> Option<(String, u64, bool)> {
     let parts: Vec<_> = object.location.parts().collect();
     let [.., folder, training_key, file] = &parts[..] else {
         return None;

@@ -15,7 +15,7 @@ use picofarm_dataset::Dataset;
 use picofarm_dataset::Manifest;
 use picofarm_dataset::{PartName, SMALL};
 use picofarm_store::StorageError;
-use picofarm_store::many::CONCURRENCY;
+use picofarm_store::concurrent::CONCURRENCY;
 use picofarm_store::objects;
 use picofarm_store::sealed::ObjectEntry;
 

@@ -15,7 +15,7 @@ pub use collect::collect_garbage;
 pub use held::{Held, Holdings};
 pub use models::{
     Dependents, DepthsUsed, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest,
-    ModelRepair, Models, NewModel, Promoted, Published, Removed, Rung, ShardName, SplitUsed,
+    ModelRepair, Models, NewModel, Promoted, PublishedModel, Removed, Rung, ShardName, SplitUsed,
     TrainingSpeed, TrialEnd, TrialRecord,
 };
 pub use predictions::{

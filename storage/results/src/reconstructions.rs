@@ -10,7 +10,6 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use futures::{StreamExt, TryStreamExt, stream};
 use object_store::ObjectStore;
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
@@ -18,16 +17,11 @@ use serde_json::{Value, json};
 
 use crate::checkpoints::Checkpoints;
 use crate::predictions::SceneUsed;
-use picofarm_dataset::Manifest;
 use picofarm_dataset::{METADATA, pretty};
-use picofarm_store::StorageError;
-use picofarm_store::many::{CONCURRENCY, put_again, put_all};
 use picofarm_store::objects;
-use picofarm_store::published::scenes_in;
-use picofarm_store::put_back::put_back;
-use picofarm_store::sealed::{ObjectEntry, read_sealed, sha256_hex};
-use picofarm_store::verify::{intact, looked_at};
-use picofarm_store::{Fault, Problem, Verification, VerifyMode, Watch};
+use picofarm_store::published::{Manifest, Published};
+use picofarm_store::sealed::{document, read_sealed, same_scene};
+use picofarm_store::{ObjectEntry, StorageError, Verification, VerifyMode, Watch};
 
 /// Format version of these folders and their manifests.
 const FORMAT: u32 = 1;
@@ -53,47 +47,45 @@ pub struct ReconstructionManifest {
     pub settings: Value,
     /// Its objects. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
 
-impl ReconstructionManifest {
-    /// Returns the total size of all objects in bytes.
-    pub fn total_bytes(&self) -> u64 {
-        self.objects.iter().map(|o| o.size).sum()
-    }
+impl Manifest for ReconstructionManifest {
+    type Id = u64;
 
-    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
-    pub fn sha256(&self) -> String {
-        sha256_hex(&self.to_bytes())
-    }
-
-    /// Returns the bytes to store.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = serde_json::to_vec_pretty(self).expect("a manifest has only string keys");
-        bytes.push(b'\n');
-        bytes
-    }
-
-    fn parse(bytes: &[u8], scene: u64, object: &str) -> Result<Self, StorageError> {
+    fn parse(bytes: &[u8], scene: &u64, object: &str) -> Result<Self, StorageError> {
         let manifest: Self = read_sealed(bytes, "a reconstruction's manifest", FORMAT, object)?;
-        if manifest.scene != scene {
-            return Err(StorageError::Damaged {
-                object: object.to_owned(),
-                what: format!("holds scene {}, not {scene}", manifest.scene),
-            });
-        }
+        same_scene(manifest.scene, *scene, object)?;
         Ok(manifest)
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        document(self)
+    }
+
+    fn objects(&self) -> &[ObjectEntry] {
+        &self.objects
+    }
+
+    fn task_key(&self) -> &str {
+        &self.task_key
+    }
+
+    fn taken(&self, place: &str, task_key: &str) -> StorageError {
+        let what = format!(
+            "{place} holds another reconstruction of scene {} (task key {}, this task's is {task_key}): of other measurements or \
+             settings; choose another folder",
+            self.scene, self.task_key
+        );
+        StorageError::invalid("output.dataset", what)
     }
 }
 
 /// Reconstructions in a store. Cheap to clone.
 #[derive(Debug, Clone)]
-pub struct Reconstructions {
-    store: Arc<dyn ObjectStore>,
-    prefix: Path,
-}
+pub struct Reconstructions(Published<ReconstructionManifest>);
 
 impl Reconstructions {
     /// Creates the folder at `prefix`, or opens an existing one.
@@ -138,7 +130,7 @@ impl Reconstructions {
             what: format!("not JSON ({e}), so no Zarr group"),
         })?;
         match found["attributes"]["picofarm"]["reconstructions"].as_u64() {
-            Some(format) if format <= u64::from(FORMAT) => Ok(Self { store, prefix }),
+            Some(format) if format <= u64::from(FORMAT) => Ok(Self(Published::new(store, prefix))),
             Some(format) => Err(StorageError::invalid(
                 shown(),
                 format!(
@@ -154,7 +146,7 @@ impl Reconstructions {
 
     /// Returns their location for messages.
     pub fn place(&self) -> String {
-        self.shown(&self.prefix)
+        self.0.shown(self.0.folder())
     }
 
     /// Returns the scenes with a published reconstruction, ascending.
@@ -162,7 +154,7 @@ impl Reconstructions {
     /// # Errors
     /// [`StorageError::Store`].
     pub async fn scenes_present(&self) -> Result<Vec<u64>, StorageError> {
-        scenes_in(&*self.store, &self.path("manifests")).await
+        self.0.list().await
     }
 
     /// Returns the manifest of a scene's reconstruction.
@@ -170,19 +162,12 @@ impl Reconstructions {
     /// # Errors
     /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Store`].
     pub async fn manifest(&self, scene: u64) -> Result<ReconstructionManifest, StorageError> {
-        let path = self.path(&Manifest::key(scene));
-        match objects::get(&*self.store, &path).await? {
-            Some(bytes) => ReconstructionManifest::parse(&bytes, scene, &self.shown(&path)),
-            None => Err(StorageError::NotPublished {
-                scene,
-                object: self.shown(&path),
-            }),
-        }
+        self.0.scene(scene).await
     }
 
     /// Returns the checkpoints of a reconstruction task.
     pub fn checkpoints_of(&self, task_key: &str) -> Checkpoints {
-        Checkpoints::new(self.store.clone(), &self.prefix, task_key)
+        Checkpoints::new(self.0.store().clone(), self.0.folder(), task_key)
     }
 
     /// Reads one of a scene's objects, by its name in the scene's folder, and checks it against the
@@ -193,14 +178,13 @@ impl Reconstructions {
     pub async fn read(&self, scene: u64, name: &str) -> Result<Bytes, StorageError> {
         let manifest = self.manifest(scene).await?;
         let key = key(scene, name);
-        let path = self.path(&key);
         let Some(entry) = manifest.objects.iter().find(|o| o.key == key) else {
             return Err(StorageError::NotPublished {
                 scene,
-                object: self.shown(&path),
+                object: self.0.shown(&self.0.object_path(&scene, &key)),
             });
         };
-        self.intact(entry).await
+        self.0.read(&scene, entry).await
     }
 
     /// Returns the manifest of a scene that this task has published, after checking the SHA-256 of
@@ -214,18 +198,7 @@ impl Reconstructions {
         scene: u64,
         task_key: &str,
     ) -> Result<Option<ReconstructionManifest>, StorageError> {
-        let manifest = match self.manifest(scene).await {
-            Ok(manifest) => manifest,
-            Err(StorageError::NotPublished { .. }) => return Ok(None),
-            Err(error) => return Err(error),
-        };
-        self.check_owner(&manifest, task_key)?;
-        let objects = manifest.objects.iter();
-        let mut checks =
-            stream::iter(objects.map(|o| self.intact(o))).buffer_unordered(CONCURRENCY);
-        while checks.try_next().await?.is_some() {}
-        drop(checks);
-        Ok(Some(manifest))
+        self.0.finished(&scene, task_key, VerifyMode::Full).await
     }
 
     /// Publishes a scene's reconstruction, or restores its missing or changed objects. `files` are
@@ -242,11 +215,7 @@ impl Reconstructions {
         files: BTreeMap<String, Bytes>,
     ) -> Result<ReconstructionManifest, StorageError> {
         let scene = manifest.scene;
-        let entry = |(name, bytes): (&String, &Bytes)| ObjectEntry {
-            key: key(scene, name),
-            size: bytes.len() as u64,
-            sha256: sha256_hex(bytes),
-        };
+        let entry = |(name, bytes): (&String, &Bytes)| ObjectEntry::new(key(scene, name), bytes);
         let mut ours = ReconstructionManifest {
             format: FORMAT,
             objects: files.iter().map(entry).collect(),
@@ -254,53 +223,9 @@ impl Reconstructions {
             ..manifest
         };
         ours.checksum = Some(ours.sha256());
-        let paths = ours.objects.iter().map(|o| self.path(&o.key));
-        let objects: Vec<(Path, Bytes)> = paths.zip(files.into_values()).collect();
-        let path = self.path(&Manifest::key(scene));
-        let bytes = Bytes::from(ours.to_bytes());
-        let Some(stored) = objects::get(&*self.store, &path).await? else {
-            put_all(&*self.store, &objects).await?;
-            objects::create_or_match(&*self.store, &path, bytes).await?;
-            put_again(&*self.store, &objects).await?;
-            return Ok(ours);
-        };
-        let theirs = ReconstructionManifest::parse(&stored, scene, &self.shown(&path)).ok();
-        let readable = theirs.is_some();
-        if let Some(theirs) = theirs {
-            self.check_owner(&theirs, &ours.task_key)?;
-            if stored != bytes {
-                return Err(StorageError::Diverged {
-                    object: self.shown(&path),
-                    expected: sha256_hex(&stored),
-                    ours: ours.sha256(),
-                });
-            }
-        }
-        put_back(&*self.store, (path, bytes), readable, &objects).await?;
+        let bytes: Vec<Bytes> = files.into_values().collect();
+        self.0.restore(&scene, &ours, &bytes).await?;
         Ok(ours)
-    }
-
-    /// Returns an error if another task has published this reconstruction.
-    fn check_owner(
-        &self,
-        found: &ReconstructionManifest,
-        task_key: &str,
-    ) -> Result<(), StorageError> {
-        if found.task_key == task_key {
-            return Ok(());
-        }
-        let what = format!(
-            "{} holds another reconstruction of scene {} (task key {}, this task's is {task_key}): of other measurements or \
-             settings; choose another folder",
-            self.place(),
-            found.scene,
-            found.task_key
-        );
-        Err(StorageError::invalid("output.dataset", what))
-    }
-
-    async fn intact(&self, object: &ObjectEntry) -> Result<Bytes, StorageError> {
-        intact(&*self.store, &self.path(&object.key), object).await
     }
 
     /// Checks the published reconstructions. `watch` is called with the number of checked scenes
@@ -313,44 +238,7 @@ impl Reconstructions {
         mode: VerifyMode,
         watch: Watch<'_>,
     ) -> Result<Verification, StorageError> {
-        let mut report = Verification::default();
-        let present = self.scenes_present().await?;
-        for scene in &present {
-            let problem = |object: String, fault| Problem {
-                object,
-                scene: Some(*scene),
-                fault,
-            };
-            report.scenes += 1;
-            let manifest = match self.manifest(*scene).await {
-                Ok(manifest) => manifest,
-                Err(StorageError::Damaged { object, what }) => {
-                    report
-                        .problems
-                        .push(problem(object, Fault::BadManifest(what)));
-                    continue;
-                }
-                Err(error) => return Err(error),
-            };
-            for entry in &manifest.objects {
-                let path = self.path(&entry.key);
-                report.objects += 1;
-                report.bytes += entry.size;
-                if let Err(fault) = looked_at(&*self.store, &path, entry, mode).await? {
-                    report.problems.push(problem(self.shown(&path), fault));
-                }
-            }
-            watch(report.scenes, present.len() as u64);
-        }
-        Ok(report)
-    }
-
-    fn path(&self, key: &str) -> Path {
-        objects::path_of(&self.prefix, key)
-    }
-
-    fn shown(&self, path: &Path) -> String {
-        objects::shown(&*self.store, path)
+        self.0.verify(mode, &(), watch).await
     }
 }
 

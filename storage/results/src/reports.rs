@@ -9,24 +9,18 @@ use object_store::ObjectStore;
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 
-use picofarm_store::StorageError;
-use picofarm_store::many::check_size;
-use picofarm_store::objects;
-use picofarm_store::sealed::{ObjectEntry, read_sealed, sha256_hex};
+use picofarm_store::published::{Manifest, Published};
+use picofarm_store::sealed::{document, read_sealed};
+use picofarm_store::{ObjectEntry, StorageError, VerifyMode};
 
 /// The folder of reports in a store. No data set can have this name.
 pub const REPORTS: &str = "reports";
-/// Name of the manifest, which marks a report as published.
-const MANIFEST: &str = "manifest.json";
 /// Format version of report manifests.
 const FORMAT: u32 = 1;
 
 /// The reports of a store.
 #[derive(Debug, Clone)]
-pub struct Reports {
-    store: Arc<dyn ObjectStore>,
-    folder: Path,
-}
+pub struct Reports(Published<ReportManifest>);
 
 /// The contents of a report. It is a pure function of its task, without times or machine names.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -43,7 +37,7 @@ pub struct ReportManifest {
     pub models: Vec<ReportedModel>,
     /// Its objects, with keys relative to the report's folder. Set on publishing.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
@@ -63,41 +57,51 @@ pub struct ReportedModel {
     pub speed: Option<String>,
 }
 
-impl ReportManifest {
-    /// Returns the total size of all objects in bytes.
-    pub fn total_bytes(&self) -> u64 {
-        self.objects.iter().map(|o| o.size).sum()
+impl Manifest for ReportManifest {
+    type Id = String;
+
+    fn parse(bytes: &[u8], name: &String, object: &str) -> Result<Self, StorageError> {
+        let manifest: Self = read_sealed(bytes, "a report's manifest", FORMAT, object)?;
+        match manifest.name == *name {
+            true => Ok(manifest),
+            false => Err(StorageError::Damaged {
+                object: object.to_owned(),
+                what: format!("is that of the report {:?}", manifest.name),
+            }),
+        }
     }
 
-    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
-    pub fn sha256(&self) -> String {
-        sha256_hex(&self.to_bytes())
+    fn to_bytes(&self) -> Vec<u8> {
+        document(self)
     }
 
-    /// Returns the bytes to store.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = serde_json::to_vec_pretty(self).expect("a manifest has only string keys");
-        bytes.push(b'\n');
-        bytes
+    fn objects(&self) -> &[ObjectEntry] {
+        &self.objects
     }
 
-    fn parse(bytes: &[u8], object: &str) -> Result<Self, StorageError> {
-        read_sealed(bytes, "a report's manifest", FORMAT, object)
+    fn task_key(&self) -> &str {
+        &self.task_key
+    }
+
+    fn taken(&self, place: &str, task_key: &str) -> StorageError {
+        let what = format!(
+            "{place} holds a report of other models, evaluations or settings (task key {}, this one's is {task_key}); choose \
+             another name, or delete that folder",
+            self.task_key
+        );
+        StorageError::invalid("report.name", what)
     }
 }
 
 impl Reports {
     /// Returns the reports of the store at `prefix`.
     pub fn new(store: Arc<dyn ObjectStore>, prefix: &Path) -> Self {
-        Self {
-            store,
-            folder: prefix.clone().join(REPORTS),
-        }
+        Self(Published::new(store, prefix.clone().join(REPORTS)))
     }
 
     /// Returns a report's location for messages.
     pub fn place(&self, name: &str) -> String {
-        objects::shown(&*self.store, &self.folder.clone().join(name))
+        self.0.location(&name.to_owned())
     }
 
     /// Returns the manifest of a report that this task has published, after checking the size of
@@ -111,24 +115,8 @@ impl Reports {
         name: &str,
         task_key: &str,
     ) -> Result<Option<ReportManifest>, StorageError> {
-        let path = self.path(name, MANIFEST);
-        let Some(bytes) = objects::get(&*self.store, &path).await? else {
-            return Ok(None);
-        };
-        let manifest = ReportManifest::parse(&bytes, &objects::shown(&*self.store, &path))?;
-        if manifest.task_key != task_key {
-            let what = format!(
-                "{} holds a report of other models, evaluations or settings (task key {}, this one's is {task_key}); choose \
-                 another name, or delete that folder",
-                self.place(name),
-                manifest.task_key
-            );
-            return Err(StorageError::invalid("report.name", what));
-        }
-        for object in &manifest.objects {
-            check_size(&*self.store, self.path(name, &object.key), object.size).await?;
-        }
-        Ok(Some(manifest))
+        let name = name.to_owned();
+        self.0.finished(&name, task_key, VerifyMode::Fast).await
     }
 
     /// Publishes a report: `objects` first, the manifest last. The manifest's format, objects and
@@ -142,11 +130,7 @@ impl Reports {
         manifest: ReportManifest,
         objects: &[(&str, Bytes)],
     ) -> Result<ReportManifest, StorageError> {
-        let entry = |(file, bytes): &(&str, Bytes)| ObjectEntry {
-            key: (*file).to_owned(),
-            size: bytes.len() as u64,
-            sha256: sha256_hex(bytes),
-        };
+        let entry = |(file, bytes): &(&str, Bytes)| ObjectEntry::new(*file, bytes);
         let mut manifest = ReportManifest {
             format: FORMAT,
             objects: objects.iter().map(entry).collect(),
@@ -154,16 +138,8 @@ impl Reports {
             ..manifest
         };
         manifest.checksum = Some(manifest.sha256());
-        for (file, bytes) in objects {
-            let path = self.path(&manifest.name, file);
-            objects::create_or_match(&*self.store, &path, bytes.clone()).await?;
-        }
-        let path = self.path(&manifest.name, MANIFEST);
-        objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
+        let bytes: Vec<Bytes> = objects.iter().map(|(_, bytes)| bytes.clone()).collect();
+        self.0.publish(&manifest.name, &manifest, &bytes).await?;
         Ok(manifest)
-    }
-
-    fn path(&self, name: &str, key: &str) -> Path {
-        objects::path_of(&self.folder.clone().join(name), key)
     }
 }

@@ -64,14 +64,14 @@ impl Verdict {
             false => own > best,
         };
         let answer = answer_name(kind, answer);
-        let beside = format!(
+        let comparison = format!(
             "{figure} {} against {} of {answer}",
             shown(own),
             shown(best)
         );
         match better {
-            true => Self::good(format!("better than every trivial answer: {beside}")),
-            false => Self::doubtful(format!("no better than a trivial answer: {beside}")),
+            true => Self::good(format!("better than every trivial answer: {comparison}")),
+            false => Self::doubtful(format!("no better than a trivial answer: {comparison}")),
         }
     }
 

@@ -166,8 +166,8 @@ impl StorageError {
     /// Returns [`Self::Store`], with a description and a hint for the store's error.
     pub fn store(action: &'static str, object: impl ToString, source: object_store::Error) -> Self {
         let object = object.to_string();
-        let service = Service::of(&object).map(|(service, _)| service);
-        let Failure { account, hint } = Failure::of(&source, service);
+        let service = Service::split_url(&object).map(|(service, _)| service);
+        let Failure { account, hint } = Failure::describe(&source, service);
         Self::Store {
             action,
             object,

@@ -10,7 +10,7 @@ use super::service::Service;
 
 impl Failure {
     /// Describes an error of any store. `service` is given for object stores.
-    pub(crate) fn of(error: &Error, service: Option<Service>) -> Self {
+    pub(crate) fn describe(error: &Error, service: Option<Service>) -> Self {
         let chain = chain(error);
         if let Some(mismatch) = Mismatch::among(&chain) {
             return Self {
@@ -102,7 +102,7 @@ mod tests {
                 source: Box::new(io::Error::from(kind)),
             }),
         };
-        let hint = |kind| Failure::of(&nested(kind), None).hint.unwrap();
+        let hint = |kind| Failure::describe(&nested(kind), None).hint.unwrap();
         assert!(hint(io::ErrorKind::StorageFull).starts_with("the disk is full: free some space"));
         assert!(hint(io::ErrorKind::ReadOnlyFilesystem).contains("mounted read-only"));
     }

@@ -19,6 +19,21 @@ pub async fn names(store: &dyn ObjectStore, prefix: &Path) -> Result<Vec<String>
 /// Checks that everything directly below `prefix` has a name that the task itself uses, so that it
 /// does not write into other data. Hidden names are ignored.
 ///
+/// ```
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), picofarm_store::StorageError> {
+/// use object_store::{memory::InMemory, path::Path};
+/// use picofarm_store::{check_own_folder, objects};
+///
+/// let (store, folder) = (InMemory::new(), Path::from("out"));
+/// objects::create(&store, &Path::from("out/holiday.jpg"), "…".into()).await?;
+/// let own = |name: &str| name.ends_with(".glb");
+/// let error = check_own_folder(&store, &folder, "output", own).await.unwrap_err();
+/// assert!(error.to_string().contains("holiday.jpg"));
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// [`StorageError::Invalid`] at `field` that names a foreign entry; [`StorageError::Store`].
 pub async fn check_own_folder(

@@ -60,7 +60,7 @@ impl Guarded {
 
     /// Returns the answer. If an object is missing, checks first that the store is the expected
     /// one.
-    async fn found<T>(&self, answer: Result<T>) -> Result<T> {
+    async fn confirm_missing<T>(&self, answer: Result<T>) -> Result<T> {
         if let Err(Error::NotFound { .. }) = &answer {
             self.check().await?;
         }
@@ -108,12 +108,12 @@ impl ObjectStore for Guarded {
 
     async fn get_opts(&self, location: &Path, options: GetOptions) -> Result<GetResult> {
         let answer = self.0.store.get_opts(location, options).await;
-        self.found(answer).await
+        self.confirm_missing(answer).await
     }
 
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
         let answer = self.0.store.get_ranges(location, ranges).await;
-        self.found(answer).await
+        self.confirm_missing(answer).await
     }
 
     fn delete_stream(

@@ -6,21 +6,20 @@
 
 mod account;
 mod bandwidth;
+mod bucket_url;
 #[cfg(feature = "clouds")]
 mod clouds;
+pub mod concurrent;
 mod error;
 mod failure;
 pub mod folder;
 mod guard;
 mod identity;
 mod local;
-pub mod many;
 pub mod objects;
 pub mod packed;
-mod place;
 mod probe;
 pub mod published;
-pub mod put_back;
 pub mod sealed;
 mod service;
 #[cfg(feature = "clouds")]
@@ -43,10 +42,10 @@ pub use local::{leftovers, probe_leftovers};
 pub use objects::publish_files;
 pub use probe::{PROBE, PROBE_WITHIN, probe};
 pub use sealed::{ObjectEntry, sha256_hex};
-pub use verify::{Fault, Problem, Verification, VerifyMode, Watch};
+pub use verify::{Fault, Problem, RecordKind, Remedy, Verification, VerifyMode, Watch};
 pub use writable::{Writable, check_writable, local_ground};
 
-use place::Place;
+use bucket_url::BucketUrl;
 
 /// Returns the store, and the prefix in it, for a local path, a `file://` URL,
 /// `s3://bucket/prefix`, `gs://bucket/prefix` (Google) or `az://container/prefix` (Azure). The
@@ -58,11 +57,23 @@ use place::Place;
 /// limit of concurrent requests, so it should be opened once and reused. See also
 /// [`limit_bandwidth`].
 ///
+/// ```
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), picofarm_store::StorageError> {
+/// let folder = tempfile::tempdir().expect("a temporary folder");
+/// let (store, prefix) = picofarm_store::open_store(&folder.path().display().to_string())?;
+/// let key = picofarm_store::objects::path_of(&prefix, "notes/a.txt");
+/// assert!(picofarm_store::objects::create(&*store, &key, "first".into()).await?);
+/// assert!(folder.path().join("notes/a.txt").is_file());
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// [`StorageError::UnsupportedStore`] for other schemes and for paths that cannot be object keys;
 /// [`StorageError::StoreSettings`] names a missing or unusable variable.
 pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), StorageError> {
-    if let Some(place) = Place::parse(url_or_path)? {
+    if let Some(place) = BucketUrl::parse(url_or_path)? {
         #[cfg(feature = "clouds")]
         let store = clouds::connect(&place)?;
         #[cfg(not(feature = "clouds"))]
@@ -79,17 +90,25 @@ pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), Sto
 
 /// Checks that a location can be parsed. Does not check whether it can be reached.
 ///
+/// ```
+/// use picofarm_store::check_location;
+///
+/// assert!(check_location("data/sets").is_ok());
+/// let error = check_location("s3:/bucket/sets").unwrap_err();
+/// assert!(error.to_string().contains("did you mean s3://bucket/sets?"));
+/// ```
+///
 /// # Errors
 /// [`StorageError::UnsupportedStore`].
 pub fn check_location(url_or_path: &str) -> Result<(), StorageError> {
-    match Place::parse(url_or_path)? {
+    match BucketUrl::parse(url_or_path)? {
         Some(_) => Ok(()),
         None => local::local_path(url_or_path).map(drop),
     }
 }
 
 #[cfg(not(feature = "clouds"))]
-fn not_built(place: &Place) -> Result<Arc<dyn ObjectStore>, StorageError> {
+fn not_built(place: &BucketUrl) -> Result<Arc<dyn ObjectStore>, StorageError> {
     let scheme = place.service.scheme();
     Err(StorageError::UnsupportedStore {
         url: format!("{scheme}://{}", place.bucket),

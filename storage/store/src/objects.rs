@@ -103,6 +103,21 @@ pub async fn create(
 }
 
 /// Puts an object create-only. An existing object must have equal bytes.
+///
+/// ```
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), picofarm_store::StorageError> {
+/// use object_store::{memory::InMemory, path::Path};
+/// use picofarm_store::{StorageError, objects};
+///
+/// let (store, key) = (InMemory::new(), Path::from("a"));
+/// objects::create_or_match(&store, &key, "bytes".into()).await?;
+/// objects::create_or_match(&store, &key, "bytes".into()).await?;
+/// let other = objects::create_or_match(&store, &key, "other".into()).await;
+/// assert!(matches!(other, Err(StorageError::Conflict { .. })));
+/// # Ok(())
+/// # }
+/// ```
 pub async fn create_or_match(
     store: &dyn ObjectStore,
     path: &Path,
@@ -145,6 +160,21 @@ pub async fn create_or_match(
 /// Puts files create-only, in order. If the last file refers to the others, a reader that sees it
 /// finds them all. Existing files must have equal bytes. This is for outputs other than data sets.
 ///
+/// ```
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), picofarm_store::StorageError> {
+/// use object_store::{memory::InMemory, path::Path};
+/// use picofarm_store::{objects, publish_files};
+///
+/// let store = InMemory::new();
+/// let files = [("a.txt".to_owned(), "a".into()), ("index.txt".to_owned(), "a.txt".into())];
+/// publish_files(&store, &Path::from("out"), &files).await?;
+/// let index = objects::get(&store, &Path::from("out/index.txt")).await?;
+/// assert_eq!(index.as_deref(), Some(&b"a.txt"[..]));
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// [`StorageError::Conflict`] for different bytes, [`StorageError::Store`].
 pub async fn publish_files(
@@ -168,6 +198,26 @@ pub async fn overwrite(
     put.await
         .map(drop)
         .map_err(|e| StorageError::store("replace", shown(store, path), e))
+}
+
+/// Overwrites an object with one atomic put, and reads it back.
+///
+/// # Errors
+/// [`StorageError::Damaged`] if the store returns other bytes than those written;
+/// [`StorageError::Store`].
+pub async fn replace(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+) -> Result<(), StorageError> {
+    overwrite(store, path, bytes.clone()).await?;
+    match get(store, path).await? {
+        Some(stored) if stored == bytes => Ok(()),
+        _ => Err(StorageError::Damaged {
+            object: shown(store, path),
+            what: "it was written again, but does not read back as written; check the store".into(),
+        }),
+    }
 }
 
 /// Puts metadata that count more in place of those that `counts_fewer`; what counts as many or more

@@ -11,6 +11,16 @@ pub fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
 }
 
 /// Decompresses bytes that state their size, which must be at most `most`.
+///
+/// ```
+/// use picofarm_store::packed::{pack, unpack};
+///
+/// let packed = pack(&[0; 10_000])?;
+/// assert!(packed.len() < 100);
+/// assert_eq!(unpack(&packed, 10_000)?, [0; 10_000]);
+/// assert!(unpack(&packed, 9_999).is_err());
+/// # Ok::<(), std::io::Error>(())
+/// ```
 pub fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
     let invalid = |what: &str| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
     let size = zstd::zstd_safe::get_frame_content_size(packed);

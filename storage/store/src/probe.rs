@@ -35,6 +35,17 @@ enum Finding {
 /// concurrent ones. It leaves no objects, even if the store does not answer `within` this time.
 /// Only puts that a stalled server executes later remain, for a collector of garbage.
 ///
+/// ```
+/// # #[tokio::main(flavor = "current_thread")]
+/// # async fn main() -> Result<(), picofarm_store::StorageError> {
+/// use object_store::{memory::InMemory, path::Path};
+/// use picofarm_store::{PROBE_WITHIN, probe};
+///
+/// probe(&InMemory::new(), &Path::from("sets"), PROBE_WITHIN).await?;
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// [`StorageError::UnsafeStore`] names the violated guarantee; [`StorageError::Store`] if the store
 /// refuses every request (read-only, full, no permission), loses answer after answer, or does not

@@ -19,6 +19,16 @@ pub struct ObjectEntry {
 
 /// Appends to an object's pretty JSON a last member `checksum`: the SHA-256, in hexadecimal, of its
 /// bytes without that member.
+///
+/// ```
+/// use picofarm_store::sealed::{document, seal, unsealed};
+///
+/// let json = document(&serde_json::json!({"epochs": 3}));
+/// let sealed = seal(&json);
+/// assert_eq!(unsealed(&sealed).unwrap(), json);
+/// let changed = String::from_utf8(sealed).unwrap().replace('3', "4");
+/// assert!(unsealed(changed.as_bytes()).is_err());
+/// ```
 pub fn seal(json: &[u8]) -> Vec<u8> {
     let body = json
         .strip_suffix(END)
@@ -131,6 +141,47 @@ const END: &[u8] = b"\n}\n";
 
 fn tail(checksum: &str) -> String {
     format!(",\n  \"checksum\": \"{checksum}\"\n}}\n")
+}
+
+impl ObjectEntry {
+    /// Returns the entry of an object with these bytes.
+    ///
+    /// ```
+    /// use picofarm_store::ObjectEntry;
+    ///
+    /// let entry = ObjectEntry::new("depth/c/0", b"abc");
+    /// assert_eq!(entry.size, 3);
+    /// assert!(entry.sha256.starts_with("ba7816bf"));
+    /// ```
+    pub fn new(key: impl Into<String>, bytes: &[u8]) -> Self {
+        Self {
+            key: key.into(),
+            size: bytes.len() as u64,
+            sha256: sha256_hex(bytes),
+        }
+    }
+}
+
+/// Returns the JSON of a document as it is stored: indented, with a line feed at its end.
+pub fn document(value: &impl Serialize) -> Vec<u8> {
+    let mut bytes = serde_json::to_vec_pretty(value)
+        .expect("a document has only string keys and finite numbers");
+    bytes.push(b'\n');
+    bytes
+}
+
+/// Checks that a manifest is of the expected scene.
+///
+/// # Errors
+/// [`StorageError::Damaged`].
+pub fn same_scene(found: u64, expected: u64, object: &str) -> Result<(), StorageError> {
+    match found == expected {
+        true => Ok(()),
+        false => Err(StorageError::Damaged {
+            object: object.to_owned(),
+            what: format!("holds scene {found}, not {expected}"),
+        }),
+    }
 }
 
 /// Returns the SHA-256 in hexadecimal.

@@ -15,7 +15,7 @@ impl Service {
     const ALL: [Self; 3] = [Self::S3, Self::Gcs, Self::Azure];
 
     /// Parses the scheme of a URL. Returns the service and the rest of the URL.
-    pub(crate) fn of(url: &str) -> Option<(Self, &str)> {
+    pub(crate) fn split_url(url: &str) -> Option<(Self, &str)> {
         let (scheme, rest) = url.split_once("://")?;
         let service = Self::ALL.into_iter().find(|s| s.scheme() == scheme)?;
         Some((service, rest))

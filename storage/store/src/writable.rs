@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use super::{local::local_path, open_store, place::Place, probe};
+use super::{bucket_url::BucketUrl, local::local_path, open_store, probe};
 use crate::error::StorageError;
 
 /// A writable location.
@@ -38,7 +38,7 @@ pub async fn check_writable(location: &str, within: Duration) -> Result<Writable
 /// # Errors
 /// [`StorageError::UnsupportedStore`].
 pub fn local_ground(location: &str) -> Result<Option<PathBuf>, StorageError> {
-    if Place::parse(location)?.is_some() {
+    if BucketUrl::parse(location)?.is_some() {
         return Ok(None);
     }
     let path = local_path(location)?;

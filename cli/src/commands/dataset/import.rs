@@ -5,6 +5,7 @@ use std::{path::Path, sync::Arc, time::Instant};
 use picofarm_dataset::{Dataset, Profile};
 use picofarm_exchange::import::{ImportError, Source, import_scene};
 use picofarm_results::Verdict;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::{PROBE_WITHIN, open_store, probe};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;

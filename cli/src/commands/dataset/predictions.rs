@@ -4,7 +4,8 @@ use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_results::{
     ModelUsed, PredictionManifest, PredictionSpec, Predictions, TimesUsed, Verdict,
 };
-use picofarm_store::{Problem, open_store};
+use picofarm_store::published::Manifest as _;
+use picofarm_store::{Problem, Remedy, open_store};
 use serde_json::json;
 
 use super::{
@@ -175,7 +176,7 @@ pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -
     let report = report.map_err(failed)?;
     let facts = json!({
         "predictions": args.dataset, "fast": args.fast, "scenes": report.scenes, "objects": report.objects,
-        "bytes": report.bytes, "problems": problems_json_by(&report.problems, hint),
+        "bytes": report.bytes, "problems": problems_json_by(&report.problems, remedy),
     });
     if report.is_sound() {
         output.result(&facts, || {
@@ -195,12 +196,12 @@ pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -
     if output.json {
         output.result(&facts, String::new);
     }
-    Err(broken_by(&args.dataset, &report.problems, hint))
+    Err(broken_by(&args.dataset, &report.problems, remedy))
 }
 
 /// Returns how to repair a problem.
-fn hint(problem: &Problem) -> &'static str {
-    match problem.scene {
+fn remedy(problem: &Problem) -> Remedy {
+    let text = match problem.scene {
         Some(_) => {
             "submit its job again with `picofarm job submit FILE --from-stage STAGE`, with its infer stage: what is damaged is \
              predicted again, proved equal, and put back"
@@ -208,5 +209,9 @@ fn hint(problem: &Problem) -> &'static str {
         None => {
             "delete it and the group's own zarr.json, and submit its job again with `picofarm job submit FILE --from-stage STAGE`: both are written anew"
         }
+    };
+    Remedy {
+        text,
+        by_repair: false,
     }
 }

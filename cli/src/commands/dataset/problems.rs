@@ -1,7 +1,7 @@
 //! Formats the problems found by a check as text and as JSON.
 
 use picofarm_proto::show;
-use picofarm_store::{Problem, VerifyMode};
+use picofarm_store::{Problem, Remedy, VerifyMode};
 use serde_json::{Value, json};
 
 use crate::error::{CliError, Code};
@@ -19,20 +19,16 @@ pub fn mode(fast: bool) -> VerifyMode {
 
 /// Returns the problems as an error.
 pub fn broken(place: &str, problems: &[Problem]) -> CliError {
-    broken_by(place, problems, Problem::hint)
+    broken_by(place, problems, Problem::remedy)
 }
 
-/// Like `broken`, with other repair hints.
-pub fn broken_by(
-    place: &str,
-    problems: &[Problem],
-    hint_of: fn(&Problem) -> &'static str,
-) -> CliError {
+/// Like `broken`, with other remedies.
+pub fn broken_by(place: &str, problems: &[Problem], remedy: fn(&Problem) -> Remedy) -> CliError {
     let mut shown = Vec::new();
     let mut last = "";
     for problem in problems.iter().take(SHOWN) {
         let scene = problem.scene.map(|s| format!("scene {s}: "));
-        let hint = hint_of(problem);
+        let hint = remedy(problem).text;
         let how = match hint == last {
             true => String::new(),
             false => format!("\n    hint: {hint}"),
@@ -57,8 +53,7 @@ pub fn broken_by(
             shown.join("\n  ")
         ),
     );
-    let repairable = |p: &Problem| hint_of(p).starts_with("dataset repair");
-    match problems.iter().any(repairable) {
+    match problems.iter().any(|problem| remedy(problem).by_repair) {
         true => error.hint(format!(
             "picofarm dataset repair {} makes the broken scenes again, and only those",
             show::argument(place)
@@ -69,17 +64,17 @@ pub fn broken_by(
 
 /// Returns the problems as JSON.
 pub fn problems_json(problems: &[Problem]) -> Vec<Value> {
-    problems_json_by(problems, Problem::hint)
+    problems_json_by(problems, Problem::remedy)
 }
 
-/// Like `problems_json`, with other repair hints.
-pub fn problems_json_by(problems: &[Problem], hint: fn(&Problem) -> &'static str) -> Vec<Value> {
+/// Like `problems_json`, with other remedies.
+pub fn problems_json_by(problems: &[Problem], remedy: fn(&Problem) -> Remedy) -> Vec<Value> {
     problems
         .iter()
         .map(|p| {
             json!({
                 "object": p.object, "scene": p.scene, "fault": p.fault.kind(), "what": p.fault.to_string(),
-                "hint": hint(p),
+                "hint": remedy(p).text,
             })
         })
         .collect()

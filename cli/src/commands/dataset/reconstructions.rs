@@ -6,7 +6,7 @@ mod report;
 
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_results::{Reconstructions, Verdict};
-use picofarm_store::{Problem, StorageError, Verification, VerifyMode, open_store};
+use picofarm_store::{Problem, Remedy, StorageError, Verification, VerifyMode, open_store};
 use serde_json::{Map, Value, json};
 
 pub use picture::draw;
@@ -145,7 +145,7 @@ pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Outpu
     let report = report.map_err(failed)?;
     let facts = json!({
         "reconstructions": args.dataset, "fast": args.fast, "scenes": report.scenes, "objects": report.objects,
-        "bytes": report.bytes, "problems": problems_json_by(&report.problems, hint),
+        "bytes": report.bytes, "problems": problems_json_by(&report.problems, remedy),
     });
     if output.json || report.is_sound() {
         output.result(&facts, || {
@@ -164,7 +164,7 @@ pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Outpu
     }
     match report.is_sound() {
         true => Ok(()),
-        false => Err(broken_by(&args.dataset, &report.problems, hint)),
+        false => Err(broken_by(&args.dataset, &report.problems, remedy)),
     }
 }
 
@@ -177,12 +177,16 @@ pub async fn check(place: &str, there: &Reconstructions) -> Result<Verification>
     let report = report.map_err(failed)?;
     match report.is_sound() {
         true => Ok(report),
-        false => Err(broken_by(place, &report.problems, hint)),
+        false => Err(broken_by(place, &report.problems, remedy)),
     }
 }
 
 /// Returns how to repair a problem.
-fn hint(_: &Problem) -> &'static str {
-    "submit its job again with `picofarm job submit FILE --from-stage STAGE`, with its reconstruct stage: what is damaged is \
-     made again, proved equal, and put back"
+fn remedy(_: &Problem) -> Remedy {
+    let text = "submit its job again with `picofarm job submit FILE --from-stage STAGE`, with its reconstruct stage: what is damaged is \
+     made again, proved equal, and put back";
+    Remedy {
+        text,
+        by_repair: false,
+    }
 }

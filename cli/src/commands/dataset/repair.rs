@@ -92,7 +92,7 @@ pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Re
     for problem in report.problems {
         match problem.scene {
             Some(scene) => broken.entry(scene).or_default().push(problem),
-            None if problem.repairable() => done.metadata.push(problem),
+            None if problem.remedy().by_repair => done.metadata.push(problem),
             None => done.left.push(problem),
         }
     }
@@ -254,7 +254,10 @@ fn tell(args: &DatasetRepair, done: &Done, seconds: f64, output: Output) -> Resu
     }
     let failed = done.failed.iter();
     let failed = failed.map(|(scene, _, why)| format!("scene {scene}: {why}"));
-    let left = done.left.iter().map(|p| format!("{p}: {}", p.hint()));
+    let left = done
+        .left
+        .iter()
+        .map(|p| format!("{p}: {}", p.remedy().text));
     let lines: Vec<String> = failed.chain(left).take(20).collect();
     Err(CliError::new(
         Code::Damaged,

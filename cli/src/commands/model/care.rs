@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use picofarm_results::{Dependents, ModelCheck, ModelManifest, ModelRepair, Models, Removed};
-use picofarm_store::{Fault, Problem};
+use picofarm_store::{Fault, Problem, RecordKind};
 use serde_json::{Value, json};
 
 use super::{nothing, open};
@@ -107,10 +107,11 @@ fn remedy(problem: &Problem) -> &'static str {
         Fault::BadManifest(_) => {
             "nothing says any more what the model is: remove it (`picofarm model remove --force`) and submit its job again"
         }
-        Fault::BadRecord(_) if problem.object.contains("/sweeps/") => {
-            "delete it; the sweep's job makes the trial again"
-        }
-        Fault::BadRecord(_) => "`picofarm model repair` deletes it: its job makes it again",
+        Fault::BadRecord {
+            kind: RecordKind::Trial,
+            ..
+        } => "delete it; the sweep's job makes the trial again",
+        Fault::BadRecord { .. } => "`picofarm model repair` deletes it: its job makes it again",
         _ => "`picofarm model repair` puts it back if its bytes are found anywhere",
     }
 }

@@ -1,5 +1,6 @@
 //! `picofarm model import`: stores a network that was trained elsewhere as a model.
 
+use picofarm_store::published::Manifest as _;
 use std::path::Path;
 
 use picofarm_agent::{ImportFor, NotImported, imported};

@@ -9,6 +9,7 @@ use picofarm_reconstruct::{
     source::{self, CaptureSettings, Given, Times},
 };
 use picofarm_scene::Scene;
+use picofarm_store::published::Manifest as _;
 use picofarm_transient::{Gate, Rendered, render};
 use serde_json::{Value, json};
 

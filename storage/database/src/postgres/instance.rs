@@ -40,7 +40,7 @@ pub(super) async fn try_room(c: &mut PgConnection) -> Sql<()> {
 }
 
 /// Creates an instance, which inherits the ranges of a former life of the same process.
-pub(super) async fn found(
+pub(super) async fn create_instance(
     c: &mut PgConnection,
     instance: InstanceId,
     former: Option<InstanceId>,

@@ -12,6 +12,7 @@ use sqlx::PgConnection;
 use super::{
     job_query, query, rights_query,
     rows::{give, insert_events, insert_ranges},
+    stage_query,
     writer::{RANGE, Result, WriteError, Writer, ranges},
 };
 use crate::sql::{self, int};
@@ -26,7 +27,7 @@ pub(super) async fn stage_over(
     at_ms: i64,
 ) -> Result<Settled> {
     let keys = writer.keys(stage).await?;
-    if !hold(writer, keys.job).await? || job_query::is_open(writer.c, keys.stage).await? {
+    if !hold(writer, keys.job).await? || stage_query::is_open(writer.c, keys.stage).await? {
         return Ok(Settled::default());
     }
     settle(writer, stage.job, at_ms).await
@@ -43,7 +44,7 @@ async fn hold(writer: &mut Writer<'_>, key: i64) -> Result<bool> {
 
 async fn settle(writer: &mut Writer<'_>, id: JobId, at_ms: i64) -> Result<Settled> {
     let key = writer.job(id).await?;
-    let (settled, events) = job_query::settle(writer.c, key, id, at_ms).await?;
+    let (settled, events) = stage_query::settle(writer.c, key, id, at_ms).await?;
     insert_events(writer, &events).await?;
     Ok(settled)
 }

@@ -12,6 +12,7 @@ mod hints;
 mod instance;
 mod jobs;
 mod migrate;
+mod open;
 mod rights;
 mod rows;
 mod write;
@@ -24,11 +25,7 @@ use picofarm_proto::{
     ids::{InstanceId, JobId, StageRef, WorkerId},
     model::{Event, JobState, TaskCounts},
 };
-use sqlx::{
-    ConnectOptions, Connection, PgPool,
-    pool::PoolConnection,
-    postgres::{PgConnectOptions, PgPoolOptions, PgRow},
-};
+use sqlx::{Connection, PgPool, postgres::PgRow};
 use uuid::Uuid;
 
 use picofarm_catalog::{
@@ -46,6 +43,7 @@ crate::sql_listing::listing_queries!(
     super::PgRow,
     " FOR UPDATE OF result_set SKIP LOCKED"
 );
+crate::sql_stages::stage_queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_rights::rights_queries!(sqlx::PgConnection, super::PgRow);
 
@@ -70,112 +68,6 @@ pub struct PostgresCatalog {
     hints: Hints,
 }
 
-impl PostgresCatalog {
-    /// Connects to the database at `url`
-    /// (`postgres://user:password@host/database?sslmode=verify-full`; missing parts are taken from
-    /// the usual PG variables) and upgrades its schema. `name` describes this coordinator to
-    /// people.
-    ///
-    /// # Errors
-    /// [`CatalogError::Server`] if it cannot be reached, [`CatalogError::Newer`] if a later version
-    /// of the program wrote it.
-    pub async fn open(url: &str, name: &str) -> Result<Self, CatalogError> {
-        let options: PgConnectOptions = url.parse().map_err(|e| errors::bad_url(url, &e))?;
-        let options = options
-            .application_name("picofarm")
-            .disable_statement_logging()
-            .options([
-                // A coordinator that hangs in a transaction must not block the others.
-                ("idle_in_transaction_session_timeout", "30s"),
-                ("lock_timeout", "20s"),
-                // Keepalives detect a server that has disappeared.
-                ("tcp_keepalives_idle", "10"),
-            ]);
-        let place = errors::place(&options);
-        let failed = |e| errors::classify(&place, e);
-        let pool = PgPoolOptions::new()
-            .max_connections(CONNECTIONS)
-            .acquire_timeout(PATIENCE)
-            .connect_with(options.clone())
-            .await;
-        let pool = match pool {
-            Ok(pool) => pool,
-            Err(error) => return Err(errors::unconnected(&place, &options, error).await),
-        };
-        migrate::migrate(&place, &pool).await?;
-        let hints = Hints::new(pool.clone()).await.map_err(failed)?;
-        Ok(Self {
-            name: name.to_owned(),
-            pool,
-            instance: Mutex::new(None),
-            keys: tokio::sync::Mutex::default(),
-            hints,
-            place,
-        })
-    }
-
-    fn failed(&self, error: sqlx::Error) -> CatalogError {
-        errors::classify(&self.place, error)
-    }
-
-    async fn reader(&self) -> Result<PoolConnection<sqlx::Postgres>, CatalogError> {
-        match self.pool.acquire().await {
-            Ok(connection) => Ok(connection),
-            Err(error) => {
-                let options = self.pool.connect_options();
-                Err(errors::unconnected(&self.place, &options, error).await)
-            }
-        }
-    }
-
-    fn instance(&self) -> Result<InstanceId, CatalogError> {
-        self.instance
-            .lock()
-            .expect("no panic while locked")
-            .ok_or(CatalogError::Fenced)
-    }
-
-    /// Runs `work` in one transaction, for a live instance.
-    async fn write<T>(
-        &self,
-        work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
-    ) -> Result<T, CatalogError> {
-        self.transaction(true, work).await
-    }
-
-    /// Like [`Self::write`], but rolls back if `keep` is false.
-    async fn transaction<T>(
-        &self,
-        keep: bool,
-        work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
-    ) -> Result<T, CatalogError> {
-        let instance = self.instance()?;
-        let mut keys = self.keys.lock().await;
-        let result = async {
-            let mut connection = self.pool.acquire().await?;
-            let mut tx = connection.begin().await?;
-            instance::fence(&mut tx, instance).await?;
-            let mut writer = writer::Writer {
-                c: &mut tx,
-                instance: instance.uuid(),
-                keys: &mut keys,
-            };
-            // On an error, dropping the transaction rolls it back.
-            let done = work(&mut writer).await?;
-            match keep {
-                true => tx.commit().await?,
-                false => tx.rollback().await?,
-            }
-            Ok(done)
-        };
-        result.await.map_err(|e| match e {
-            writer::WriteError::Fenced => CatalogError::Fenced,
-            writer::WriteError::Conflict(what) => CatalogError::Conflict(what),
-            writer::WriteError::Sql(e) => self.failed(e),
-        })
-    }
-}
-
 #[async_trait]
 impl Catalog for PostgresCatalog {
     async fn load(&self) -> Result<Snapshot, CatalogError> {
@@ -185,7 +77,8 @@ impl Catalog for PostgresCatalog {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
             instance::try_room(&mut tx).await?;
-            instance::found(&mut tx, instance, former, &self.name, INSTANCE_SECONDS).await?;
+            instance::create_instance(&mut tx, instance, former, &self.name, INSTANCE_SECONDS)
+                .await?;
             let ranges = instance::take_lost(&mut tx, instance).await?;
             let snapshot = Snapshot {
                 instance,

@@ -19,7 +19,7 @@ const NOTADB: i32 = 26;
 /// might expect SQLITE_FULL.
 const IOERR_SHMSIZE: i32 = 4874;
 
-fn said(error: &sqlx::Error) -> String {
+fn message_of(error: &sqlx::Error) -> String {
     error
         .as_database_error()
         .map_or_else(|| error.to_string(), |e| e.message().to_owned())
@@ -42,7 +42,7 @@ pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
     }
     let refused = || CatalogError::Refused {
         place: path.display().to_string(),
-        what: said(&error),
+        what: message_of(&error),
     };
     let code = error
         .as_database_error()

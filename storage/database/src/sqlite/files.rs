@@ -42,7 +42,7 @@ fn log_of(path: &Path) -> PathBuf {
 
 impl Files {
     /// Records the identities of the files that were just opened.
-    pub(super) fn of(path: &Path) -> Result<Self, String> {
+    pub(super) fn open_at(path: &Path) -> Result<Self, String> {
         Ok(Self {
             path: path.to_owned(),
             main: identity(path)?,
@@ -91,7 +91,7 @@ mod tests {
         let path = folder.path().join("c.db");
         std::fs::write(&path, "a").unwrap();
         std::fs::write(log_of(&path), "b").unwrap();
-        let files = Files::of(&path).unwrap();
+        let files = Files::open_at(&path).unwrap();
         assert_eq!(files.check(), Ok(()));
         let away = folder.path().join("away");
         std::fs::rename(&path, &away).unwrap();

@@ -11,6 +11,7 @@ use sqlx::SqliteConnection;
 use super::{
     job_query, query, rights_query,
     rows::{give, insert_events, insert_ranges},
+    stage_query,
     writer::{Keys, Result, WriteError},
 };
 use crate::sql::{self, int};
@@ -23,12 +24,12 @@ pub(super) async fn stage_over(
     stage: StageRef,
     at_ms: i64,
 ) -> Result<Settled> {
-    let key = keys.of(c, stage).await?;
+    let key = keys.stage(c, stage).await?;
     let state: i64 = sqlx::query_scalar("SELECT state FROM job WHERE key = ?")
         .bind(key.job)
         .fetch_one(&mut *c)
         .await?;
-    if state != 0 || job_query::is_open(c, key.stage).await? {
+    if state != 0 || stage_query::is_open(c, key.stage).await? {
         return Ok(Settled::default());
     }
     settle(c, keys, stage.job, at_ms).await
@@ -41,7 +42,7 @@ async fn settle(
     at_ms: i64,
 ) -> Result<Settled> {
     let key = keys.job(c, id).await?;
-    let (settled, events) = job_query::settle(c, key, id, at_ms).await?;
+    let (settled, events) = stage_query::settle(c, key, id, at_ms).await?;
     insert_events(c, keys, &events).await?;
     Ok(settled)
 }
@@ -189,7 +190,7 @@ pub(super) async fn retry(
         retried += range.len();
         range.crashes = 0;
         range.state = RangeState::Pending { not_before_ms: 0 };
-        let stage = keys.of(c, range.stage).await?.stage;
+        let stage = keys.stage(c, range.stage).await?.stage;
         give(c, stage, &range).await?;
         sqlx::query("DELETE FROM exception WHERE stage = ? AND task >= ? AND task < ?")
             .bind(stage)

@@ -20,7 +20,7 @@ pub(super) async fn write_rows(
 ) -> Result<()> {
     insert_outputs(c, keys, &changes.outputs).await?;
     for exception in changes.exceptions.values() {
-        let stage = keys.of(c, exception.stage).await?.stage;
+        let stage = keys.stage(c, exception.stage).await?.stage;
         sqlx::query(
             "INSERT INTO exception (stage, task, failures, crashes, interruptions, longest_ms, dead, last_error) \
              VALUES (?, ?, ?, ?, ?, ?, ?, ?) \
@@ -119,7 +119,7 @@ async fn insert_outputs(
     for chunk in outputs.chunks(ROWS) {
         let mut sets = Vec::with_capacity(chunk.len());
         for output in chunk {
-            sets.push(keys.of(c, output.stage).await?.result_set);
+            sets.push(keys.stage(c, output.stage).await?.result_set);
         }
         let mut insert = QueryBuilder::<Sqlite>::new(
             "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted, checked) ",

@@ -19,7 +19,7 @@ const LOOK_AT: i64 = 256;
 const ROOM: i64 = 256 << 10;
 
 /// Records the instance of the current life.
-pub(super) async fn found(
+pub(super) async fn record_instance(
     c: &mut SqliteConnection,
     instance: InstanceId,
 ) -> std::result::Result<(), sqlx::Error> {
@@ -63,7 +63,7 @@ pub(super) async fn claim(
 ) -> Result<Vec<Claim>> {
     let mut claims = Vec::with_capacity(wants.len());
     for want in wants {
-        let key = keys.of(c, want.stage).await?.stage;
+        let key = keys.stage(c, want.stage).await?.stage;
         let rows = sqlx::query(
             "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
              JOIN job ON job.key = stage.job WHERE stage = ? AND task_range.state = 0 AND owner IS NULL \
@@ -127,11 +127,11 @@ pub(super) async fn changes(
     replace_known(c, changes).await?;
     let mut rows = Vec::with_capacity(changes.ranges.len());
     for range in changes.ranges.values() {
-        rows.push((keys.of(c, range.stage).await?.stage, range));
+        rows.push((keys.stage(c, range.stage).await?.stage, range));
     }
     insert_ranges(c, &rows, true).await?;
     for range in changes.free.values() {
-        let key = keys.of(c, range.stage).await?.stage;
+        let key = keys.stage(c, range.stage).await?.stage;
         give(c, key, range).await?;
     }
     write_rows(c, keys, changes).await?;

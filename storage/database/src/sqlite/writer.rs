@@ -129,7 +129,7 @@ pub(super) struct StageKeys {
 }
 
 impl Keys {
-    pub(super) async fn of(
+    pub(super) async fn stage(
         &mut self,
         c: &mut SqliteConnection,
         stage: StageRef,
@@ -157,6 +157,6 @@ impl Keys {
     }
 
     pub(super) async fn job(&mut self, c: &mut SqliteConnection, job: JobId) -> Result<i64> {
-        Ok(self.of(c, StageRef { job, stage: 0 }).await?.job)
+        Ok(self.stage(c, StageRef { job, stage: 0 }).await?.job)
     }
 }

@@ -35,7 +35,7 @@ impl ChunkCodec {
     /// be in stored order; the codec uses only their number.
     pub fn new(layout: &Layout) -> Self {
         let shape = layout.inner.as_ref().unwrap_or(&layout.object_shape);
-        Self::of_element(
+        Self::for_element(
             &layout.stored_codecs(),
             std::iter::once(1).chain(shape.iter().copied()),
             layout.element,
@@ -43,7 +43,7 @@ impl ChunkCodec {
         )
     }
 
-    fn of_element(
+    fn for_element(
         codecs: &Value,
         shape: impl IntoIterator<Item = u64>,
         element: Element,
@@ -82,7 +82,7 @@ impl ChunkCodec {
 
     /// Returns a codec of other chunks (see `render_group`).
     pub fn plain(codecs: &Value, shape: &[u64], element: Element) -> Self {
-        Self::of_element(codecs, shape.iter().copied(), element, "array")
+        Self::for_element(codecs, shape.iter().copied(), element, "array")
     }
 
     fn from_parts(

@@ -26,7 +26,7 @@ pub(crate) struct Coding {
 
 impl Coding {
     /// Returns the encoding of the transient `quantity` in a data set of the given format.
-    pub fn of(quantity: Quantity, spec: &DatasetSpec, format: u32) -> Self {
+    pub fn new(quantity: Quantity, spec: &DatasetSpec, format: u32) -> Self {
         let of = match quantity {
             Quantity::Transient => "",
             Quantity::TransientSpots => " of each spot alone",

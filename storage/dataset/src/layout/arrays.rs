@@ -37,7 +37,7 @@ impl Quantity {
         use Element::{F32, I16, U8, U16, U32};
         let (h, w) = (u64::from(spec.height), u64::from(spec.width));
         let (n, b) = (u64::from(spec.spots), u64::from(spec.gate.bins));
-        let coding = self.is_transient().then(|| Coding::of(self, spec, format));
+        let coding = self.is_transient().then(|| Coding::new(self, spec, format));
         let coded = || {
             let coding = coding.as_ref().expect("made for every transient");
             (coding.element, coding.attributes.clone())

@@ -10,7 +10,8 @@ use crate::layout::quantity::Quantity;
 use crate::layout::record::Provenance;
 use crate::layout::spec::Profile;
 use picofarm_store::StorageError;
-use picofarm_store::sealed::{ObjectEntry, no_strange_member, sha256_hex, unseal};
+use picofarm_store::published;
+use picofarm_store::sealed::{ObjectEntry, document, no_strange_member, same_scene, unseal};
 
 /// Format version of the layout on disk. Data sets of older formats retain theirs: they can be
 /// read, and scenes can be added.
@@ -77,7 +78,7 @@ impl Manifest {
     /// Returns the manifest with its checksum set.
     pub fn sealed(mut self) -> Self {
         self.checksum = None;
-        self.checksum = Some(sha256_hex(&self.to_bytes()));
+        self.checksum = Some(published::Manifest::sha256(&self));
         self
     }
 
@@ -93,11 +94,6 @@ impl Manifest {
     /// Returns the key of a scene's manifest, relative to the data set.
     pub fn key(scene: u64) -> String {
         format!("manifests/{scene}.json")
-    }
-
-    /// Returns the total size of all objects in bytes.
-    pub fn total_bytes(&self) -> u64 {
-        self.objects.iter().map(|o| o.size).sum()
     }
 
     /// Returns the names of quantities that the scene's source did not have and that are stored as
@@ -121,17 +117,12 @@ impl Manifest {
             other => self.subsets.get(other.name()).map_or(&[], |s| &s.overflow),
         }
     }
+}
 
-    /// Returns the bytes to store.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = serde_json::to_vec_pretty(self)
-            .expect("a manifest has only string keys and finite numbers");
-        bytes.push(b'\n');
-        bytes
-    }
+impl published::Manifest for Manifest {
+    type Id = u64;
 
-    /// Parses the manifest of `scene` stored at `object`.
-    pub(crate) fn parse(bytes: &[u8], scene: u64, object: &str) -> Result<Self, StorageError> {
+    fn parse(bytes: &[u8], scene: &u64, object: &str) -> Result<Self, StorageError> {
         let damaged = |what: String| StorageError::Damaged {
             object: object.to_string(),
             what,
@@ -144,12 +135,7 @@ impl Manifest {
                 manifest.format
             )));
         }
-        if manifest.scene != scene {
-            return Err(damaged(format!(
-                "holds scene {}, not {scene}",
-                manifest.scene
-            )));
-        }
+        same_scene(manifest.scene, *scene, object)?;
         match &manifest.checksum {
             Some(checksum) => drop(unseal(bytes, checksum).map_err(damaged)?),
             // Older programs wrote no checksum. A manifest with a damaged name of the member
@@ -158,4 +144,34 @@ impl Manifest {
         }
         Ok(manifest)
     }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        document(self)
+    }
+
+    fn objects(&self) -> &[ObjectEntry] {
+        &self.objects
+    }
+
+    fn task_key(&self) -> &str {
+        &self.provenance.task_key
+    }
+
+    fn taken(&self, place: &str, task_key: &str) -> StorageError {
+        let what = format!(
+            "{place} holds scene {} of another task (key {}, this task's is {task_key}); choose another folder",
+            self.scene, self.provenance.task_key
+        );
+        StorageError::invalid("output.dataset", what)
+    }
+}
+
+/// Returns the scene of the manifest with this key.
+pub(crate) fn manifest_scene(key: &str) -> Option<u64> {
+    let scene = key
+        .strip_prefix("manifests/")?
+        .strip_suffix(".json")?
+        .parse()
+        .ok()?;
+    (Manifest::key(scene) == key).then_some(scene)
 }

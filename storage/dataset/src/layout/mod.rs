@@ -3,7 +3,6 @@
 pub(crate) mod arrays;
 pub(crate) mod group;
 pub(crate) mod manifest;
-pub(crate) mod published;
 pub(crate) mod quantity;
 pub(crate) mod record;
 pub(crate) mod spec;

@@ -100,6 +100,13 @@ impl Subsets {
 
     /// Returns the subsets of the given sizes.
     ///
+    /// ```
+    /// use picofarm_dataset::Subsets;
+    ///
+    /// assert!(Subsets::of(&[4, 25]).is_ok());
+    /// assert_eq!(Subsets::of(&[9]).unwrap_err(), "9 is not one of 4, 25");
+    /// ```
+    ///
     /// # Errors
     /// A message that names an unknown size.
     pub fn of(sizes: &[u32]) -> Result<Self, String> {
@@ -163,6 +170,16 @@ impl Profile {
 
     /// Returns the profile with this name in job specifications.
     ///
+    /// ```
+    /// use picofarm_dataset::Profile;
+    ///
+    /// let coarse = Profile::parse("coarse")?;
+    /// assert_eq!(coarse, Profile::SqrtU16 { delta: 1.0 });
+    /// assert_eq!(coarse.to_string(), "coarse with delta 1");
+    /// assert_eq!(Profile::default().to_string(), "sqrt-u16 with delta 0.2");
+    /// # Ok::<(), String>(())
+    /// ```
+    ///
     /// # Errors
     /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {
@@ -183,7 +200,7 @@ impl Profile {
 impl std::fmt::Display for Profile {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::SqrtU16 { delta } => write!(f, "sqrt-u16 with delta {delta}"),
+            Self::SqrtU16 { delta } => write!(f, "{} with delta {delta}", self.name()),
             Self::PlainF32 { round: 0.0 } => write!(f, "lossless"),
             Self::PlainF32 { round } => write!(f, "plain-f32 rounded to {round} sigma"),
             Self::CountsU16 => write!(f, "counts-u16"),

@@ -115,7 +115,7 @@ impl Collection {
 }
 
 /// A candidate for deletion.
-enum Found {
+enum Candidate {
     Object(ObjectMeta, Option<u64>, OrphanCause),
     /// An unfinished file of a local store.
     File(PathBuf, u64, OrphanCause),
@@ -188,7 +188,7 @@ impl Dataset {
         &self,
         limit: SystemTime,
         report: &mut Collection,
-    ) -> Result<Vec<Found>, StorageError> {
+    ) -> Result<Vec<Candidate>, StorageError> {
         let failed = |e| StorageError::store("list", self.shown(&self.prefix), e);
         // Published scenes stay published, so their objects need not be remembered until the
         // manifests are listed again.
@@ -224,10 +224,10 @@ impl Dataset {
         parts.retain(old);
         report.young = (all - objects.len() - parts.len()) as u64;
         let scenes = objects.into_iter();
-        let scenes =
-            scenes.map(|(scene, object)| Found::Object(object, Some(scene), OrphanCause::Scene));
+        let scenes = scenes
+            .map(|(scene, object)| Candidate::Object(object, Some(scene), OrphanCause::Scene));
         let parts = parts.into_iter();
-        let parts = parts.map(|object| Found::Object(object, None, OrphanCause::Part));
+        let parts = parts.map(|object| Candidate::Object(object, None, OrphanCause::Part));
         Ok(scenes.chain(parts).collect())
     }
 
@@ -245,7 +245,7 @@ impl Dataset {
         &self,
         limit: SystemTime,
         grace: Duration,
-    ) -> Result<Vec<Found>, StorageError> {
+    ) -> Result<Vec<Candidate>, StorageError> {
         let Some(parent) = self.parent() else {
             return Ok(Vec::new());
         };
@@ -257,11 +257,11 @@ impl Dataset {
         };
         let probes = listed.objects.into_iter().filter(is_probe);
         let mut found: Vec<_> = probes
-            .map(|object| Found::Object(object, None, OrphanCause::Probe))
+            .map(|object| Candidate::Object(object, None, OrphanCause::Probe))
             .collect();
         let folder = |path| objects::folder(&*self.store, path);
         if let (Some(here), Some(parent_folder)) = (folder(&self.prefix), folder(&parent)) {
-            let file = |cause| move |(path, bytes)| Found::File(path, bytes, cause);
+            let file = |cause| move |(path, bytes)| Candidate::File(path, bytes, cause);
             let files = leftovers(&here, grace)?;
             found.extend(files.into_iter().map(file(OrphanCause::Write)));
             let probes = probe_leftovers(&parent_folder, grace)?;
@@ -281,12 +281,12 @@ impl Dataset {
     /// Deletes an orphan, if it still is one. Returns `None` otherwise.
     async fn collect_one(
         &self,
-        found: Found,
+        found: Candidate,
         limit: SystemTime,
         delete: bool,
     ) -> Result<Option<Orphan>, StorageError> {
         let (object, scene, cause) = match found {
-            Found::File(path, bytes, cause) => {
+            Candidate::File(path, bytes, cause) => {
                 if delete {
                     match std::fs::remove_file(&path) {
                         Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
@@ -302,7 +302,7 @@ impl Dataset {
                     cause,
                 }));
             }
-            Found::Object(object, scene, cause) => (object, scene, cause),
+            Candidate::Object(object, scene, cause) => (object, scene, cause),
         };
         let path = &object.location;
         if delete && !self.delete_orphan(path, scene, limit).await? {

@@ -4,7 +4,7 @@ use futures::{StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
 
 use crate::layout::group::METADATA;
-use crate::layout::published::manifest_scene;
+use crate::layout::manifest::manifest_scene;
 use crate::repair::recipe;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::part_scene;

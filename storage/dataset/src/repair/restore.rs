@@ -14,6 +14,7 @@ use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
 use picofarm_store::StorageError;
 use picofarm_store::objects;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::sealed::sha256_hex;
 
 /// Number of objects checked concurrently.
@@ -30,7 +31,7 @@ pub struct Restored {
 
 /// The result of comparing a stored object.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Found {
+enum StoredState {
     Missing,
     Equal,
     Other,
@@ -66,14 +67,14 @@ impl Dataset {
             async move {
                 let stored = objects::get(&*self.store, &path).await?;
                 Ok::<_, StorageError>(match stored {
-                    None => Found::Missing,
-                    Some(stored) if stored == ours => Found::Equal,
-                    Some(_) => Found::Other,
+                    None => StoredState::Missing,
+                    Some(stored) if stored == ours => StoredState::Equal,
+                    Some(_) => StoredState::Other,
                 })
             }
         };
         let looks: Vec<_> = (0..bytes.len()).map(look).collect();
-        let found: Vec<Found> = stream::iter(looks)
+        let found: Vec<StoredState> = stream::iter(looks)
             .buffered(CONCURRENCY)
             .try_collect()
             .await?;
@@ -82,7 +83,7 @@ impl Dataset {
         }
         let mut restored = Restored::default();
         for (at, found) in found.iter().enumerate() {
-            if *found != Found::Equal {
+            if *found != StoredState::Equal {
                 let path = self.path(&manifest.objects[at].key);
                 self.replace(&path, bytes[at].clone()).await?;
                 restored.written.push(self.shown(&path));
@@ -159,12 +160,12 @@ impl Dataset {
 
     /// Without a manifest, checks that the histogram exists, and that all existing objects are
     /// equal.
-    fn check_alike(&self, ours: &Manifest, found: &[Found]) -> Result<(), StorageError> {
+    fn check_alike(&self, ours: &Manifest, found: &[StoredState]) -> Result<(), StorageError> {
         let transient = self.array(Quantity::Transient).layout.key(ours.scene);
         for (object, found) in ours.objects.iter().zip(found) {
             let what = match found {
-                Found::Other => "it is not what the scene comes out as now",
-                Found::Missing if object.key == transient => "it is missing",
+                StoredState::Other => "it is not what the scene comes out as now",
+                StoredState::Missing if object.key == transient => "it is missing",
                 _ => continue,
             };
             return Err(StorageError::Damaged {
@@ -184,15 +185,7 @@ impl Dataset {
         path: &object_store::path::Path,
         bytes: bytes::Bytes,
     ) -> Result<(), StorageError> {
-        objects::overwrite(&*self.store, path, bytes.clone()).await?;
-        match objects::get(&*self.store, path).await? {
-            Some(stored) if stored == bytes => Ok(()),
-            _ => Err(StorageError::Damaged {
-                object: self.shown(path),
-                what: "it was written again, but does not read back as written; check the store"
-                    .into(),
-            }),
-        }
+        objects::replace(&*self.store, path, bytes).await
     }
 }
 

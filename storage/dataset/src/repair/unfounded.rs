@@ -10,6 +10,7 @@ use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
 use picofarm_store::StorageError;
 use picofarm_store::objects;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::sealed::sha256_hex;
 
 /// Maximum total size in bytes of a scene's objects that are checked by SHA-256.

@@ -12,11 +12,12 @@ use crate::layout::arrays::Layout;
 use crate::layout::group::{
     METADATA, counts_fewer, create_metadata, is_predictions, is_reconstructions, pretty,
 };
-use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
+use crate::layout::manifest::{FORMAT_VERSION, Manifest, encoder_of};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 use picofarm_store::StorageError;
 use picofarm_store::objects::{self, Rereads};
+use picofarm_store::published::Published;
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -49,6 +50,35 @@ impl Dataset {
     /// conditional puts only if it is still the one that was looked at. A folder has no such put:
     /// of two that replace an object within the same instant the smaller number may stay, until the
     /// next scene of the larger one is made (published scenes are never touched).
+    ///
+    /// ```
+    /// # #[tokio::main(flavor = "current_thread")]
+    /// # async fn main() -> Result<(), picofarm_store::StorageError> {
+    /// use object_store::{memory::InMemory, path::Path};
+    /// use picofarm_dataset::{Dataset, DatasetSpec, Gate, Profile, Subsets, Wavelength};
+    /// use picofarm_store::StorageError;
+    ///
+    /// let store = std::sync::Arc::new(InMemory::new());
+    /// let spec = DatasetSpec {
+    ///     scenes: 2,
+    ///     height: 8,
+    ///     width: 8,
+    ///     spots: 4,
+    ///     subsets: Subsets::NONE,
+    ///     per_spot: false,
+    ///     wavelengths_nm: Wavelength::NONE,
+    ///     two_bounce: false,
+    ///     gate: Gate { start_m: 0.0, bin_width_m: 0.05, bins: 32 },
+    ///     profile: Profile::default(),
+    /// };
+    /// let rooms = Dataset::create_or_open(store.clone(), Path::from("rooms"), &spec).await?;
+    /// assert!(rooms.scenes_present().await?.is_empty());
+    /// let wide = DatasetSpec { width: 16, ..spec };
+    /// let other = Dataset::create_or_open(store, Path::from("rooms"), &wide).await;
+    /// assert!(matches!(other, Err(StorageError::SpecMismatch { .. })));
+    /// # Ok(())
+    /// # }
+    /// ```
     ///
     /// # Errors
     /// [`StorageError::SpecMismatch`] names the first differing field and both values;
@@ -153,6 +183,12 @@ impl Dataset {
     /// Returns the arrays, in the order of their objects in a manifest.
     pub fn arrays(&self) -> &[ArrayCodec] {
         &self.arrays
+    }
+
+    /// Returns the published scenes. Scenes are checked by [`Self::verify`] and restored by
+    /// [`Self::restore`], which also know the data set's specification, its listing and snapshots.
+    pub(crate) fn published_scenes(&self) -> Published<Manifest> {
+        Published::new(self.store.clone(), self.prefix.clone())
     }
 
     /// Returns its path in the store.

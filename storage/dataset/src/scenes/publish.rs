@@ -9,8 +9,10 @@ use crate::layout::record::{Provenance, SceneRecord};
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::{EncodedScene, encode_scene};
 use picofarm_store::StorageError;
-use picofarm_store::many::{all, check_size, put_again, put_all};
+use picofarm_store::VerifyMode;
+use picofarm_store::concurrent::create_all;
 use picofarm_store::objects;
+use picofarm_store::published::Manifest as _;
 
 impl Dataset {
     /// Encodes a scene on rayon threads. The function is pure and blocking: call it from async code
@@ -55,7 +57,7 @@ impl Dataset {
         let ours = scene.manifest.clone();
         let path = self.path(&Manifest::key(ours.scene));
         if let Some(stored) = objects::get(&*self.store, &path).await? {
-            let stored = Manifest::parse(&stored, ours.scene, &self.shown(&path));
+            let stored = Manifest::parse(&stored, &ours.scene, &self.shown(&path));
             if stored.is_ok_and(|stored| !stored.same_as(&ours)) {
                 return Err(conflict);
             }
@@ -109,36 +111,23 @@ impl Dataset {
 
     async fn publish_once(&self, scene: EncodedScene) -> Result<Manifest, StorageError> {
         let EncodedScene { manifest, bytes } = scene;
-        let paths = manifest.objects.iter().map(|object| self.path(&object.key));
-        let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();
-        put_all(&*self.store, &objects).await?;
-        let path = self.path(&Manifest::key(manifest.scene));
-        let put_manifest =
-            objects::create_or_match(&*self.store, &path, manifest.to_bytes().into());
-        let manifest = match put_manifest.await {
-            Ok(()) => manifest,
-            Err(conflict @ StorageError::Conflict { .. }) => {
-                match self.older_form(&path, &manifest).await? {
-                    Some(stored) => stored,
-                    None => return Err(conflict),
-                }
-            }
+        let (id, published) = (manifest.scene, self.published_scenes());
+        let conflict = match published.publish(&id, &manifest, &bytes).await {
+            Ok(()) => return Ok(manifest),
+            Err(conflict @ StorageError::Conflict { .. }) => conflict,
             Err(error) => return Err(error),
         };
-        put_again(&*self.store, &objects).await?;
-        Ok(manifest)
-    }
-
-    /// Returns the stored manifest if it is equal except for the checksum, which older manifests do
-    /// not have.
-    async fn older_form(
-        &self,
-        path: &Path,
-        ours: &Manifest,
-    ) -> Result<Option<Manifest>, StorageError> {
-        let stored = objects::require(&*self.store, path).await?;
-        let parsed = Manifest::parse(&stored, ours.scene, &self.shown(path));
-        Ok(parsed.ok().filter(|stored| stored.same_as(ours)))
+        // Older manifests have no checksum, but may be equal otherwise.
+        let path = published.manifest_path(&id);
+        let stored = objects::get(&*self.store, &path).await?;
+        let stored = stored.and_then(|s| Manifest::parse(&s, &id, &self.shown(&path)).ok());
+        let Some(stored) = stored.filter(|s| s.checksum.is_none() && s.same_as(&manifest)) else {
+            return Err(conflict);
+        };
+        let paths = manifest.objects.iter().map(|object| self.path(&object.key));
+        let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();
+        create_all(&*self.store, &objects).await?;
+        Ok(stored)
     }
 
     /// Encodes and publishes a scene. Blocks its thread while encoding.
@@ -164,16 +153,12 @@ impl Dataset {
     /// restores it) or has another size; [`StorageError::Store`].
     pub async fn published(&self, scene: u64) -> Result<Option<Manifest>, StorageError> {
         self.check_scene(scene)?;
-        let path = self.path(&Manifest::key(scene));
-        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+        let published = self.published_scenes();
+        let Some(manifest) = published.manifest(&scene).await? else {
             return Ok(None);
         };
-        let manifest = Manifest::parse(&bytes, scene, &self.shown(&path))?;
-        let objects = manifest.objects.iter();
-        let checks: Vec<_> = objects
-            .map(|object| check_size(&*self.store, self.path(&object.key), object.size))
-            .collect();
-        all(checks).await?;
+        let mode = VerifyMode::Fast;
+        published.check_objects(&scene, &manifest, mode).await?;
         Ok(Some(manifest))
     }
 }

@@ -12,7 +12,6 @@ use crate::layout::record::{Intrinsics, Spot};
 use crate::scenes::dataset::{ArrayCodec, Dataset};
 use picofarm_store::StorageError;
 use picofarm_store::objects::{self, Rereads};
-use picofarm_store::published::scenes_in;
 
 /// An element type of stored arrays.
 pub trait Stored: bytemuck::Pod + sealed::Stored {}
@@ -73,14 +72,7 @@ impl Dataset {
 
     async fn manifest_once(&self, scene: u64) -> Result<Manifest, StorageError> {
         self.check_scene(scene)?;
-        let path = self.path(&Manifest::key(scene));
-        match objects::get(&*self.store, &path).await? {
-            Some(bytes) => Manifest::parse(&bytes, scene, &self.shown(&path)),
-            None => Err(StorageError::NotPublished {
-                scene,
-                object: self.shown(&path),
-            }),
-        }
+        self.published_scenes().scene(scene).await
     }
 
     /// Returns the indices of the published scenes, ascending.
@@ -88,7 +80,7 @@ impl Dataset {
     /// # Errors
     /// [`StorageError::Store`].
     pub async fn scenes_present(&self) -> Result<Vec<u64>, StorageError> {
-        let mut scenes = scenes_in(&*self.store, &self.path("manifests")).await?;
+        let mut scenes = self.published_scenes().list().await?;
         scenes.retain(|scene| *scene < self.spec.scenes);
         Ok(scenes)
     }

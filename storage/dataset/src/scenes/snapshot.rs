@@ -18,6 +18,7 @@ use crate::scenes::dataset::Dataset;
 use picofarm_store::StorageError;
 use picofarm_store::Watch;
 use picofarm_store::objects;
+use picofarm_store::published::Manifest as _;
 
 /// Format version of snapshots.
 const FORMAT: u32 = 1;
@@ -297,7 +298,7 @@ impl Dataset {
                         object: self.shown(&path),
                     });
                 };
-                let manifest = Manifest::parse(&bytes, scene, &self.shown(&path))?;
+                let manifest = Manifest::parse(&bytes, &scene, &self.shown(&path))?;
                 Ok((Sha256::digest(&bytes).into(), manifest.missing()))
             }
             .boxed()

@@ -7,6 +7,7 @@ use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 
 /// Number of concurrent requests.
 const CONCURRENCY: usize = 16;

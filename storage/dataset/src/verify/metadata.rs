@@ -9,8 +9,8 @@ use crate::repair::recipe;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::snapshot::Snapshot;
 use crate::scenes::{snapshot, splits};
-use picofarm_store::StorageError;
 use picofarm_store::objects;
+use picofarm_store::{RecordKind, StorageError};
 
 impl Dataset {
     /// Checks that the metadata is as the specification requires.
@@ -64,7 +64,10 @@ impl Dataset {
             report.problems.extend(checked.err().map(|why| Problem {
                 object: self.shown(&path),
                 scene: None,
-                fault: Fault::BadRecord(why),
+                fault: Fault::BadRecord {
+                    kind: RecordKind::Dataset,
+                    why,
+                },
             }));
         }
         Ok(())

@@ -18,6 +18,7 @@ use crate::scenes::dataset::Dataset;
 use crate::scenes::snapshot::Snapshot;
 use picofarm_store::StorageError;
 use picofarm_store::objects;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::sealed::{ObjectEntry, sha256_hex};
 
 pub use metadata::metadata_fault;
@@ -255,7 +256,7 @@ impl Dataset {
         scene: u64,
         object: &str,
     ) -> Result<Manifest, String> {
-        let manifest = match Manifest::parse(bytes, scene, object) {
+        let manifest = match Manifest::parse(bytes, &scene, object) {
             Ok(manifest) => manifest,
             Err(StorageError::Damaged { what, .. }) => return Err(what),
             Err(e) => return Err(e.to_string()),

@@ -13,6 +13,7 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::*;
 use proptest::prelude::*;
 use serde_json::json;

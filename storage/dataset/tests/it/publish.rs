@@ -9,6 +9,7 @@ use common::*;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::*;
 
 #[test]

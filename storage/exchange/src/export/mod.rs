@@ -4,6 +4,7 @@
 //! count as written.
 
 mod card;
+mod destination;
 #[cfg(feature = "formats")]
 mod exr;
 #[cfg(feature = "formats")]
@@ -24,11 +25,11 @@ use picofarm_dataset::Dataset;
 use picofarm_dataset::Manifest;
 use picofarm_dataset::Quantity;
 use picofarm_store::StorageError;
-use picofarm_store::{folder, objects};
+use picofarm_store::objects;
 
 #[cfg(feature = "formats")]
 use hdf5::file as hdf5_file;
-pub(crate) use sb3d::{ASIDE, Aside};
+pub(crate) use sb3d::{SIDECAR, Sidecar};
 #[cfg(not(feature = "formats"))]
 use without_formats::file as hdf5_file;
 
@@ -80,6 +81,14 @@ impl ExportFormat {
 
     /// Returns the format called `name`.
     ///
+    /// ```
+    /// use picofarm_exchange::ExportFormat;
+    ///
+    /// assert_eq!(ExportFormat::parse("hdf5"), Ok(ExportFormat::Hdf5));
+    /// let error = ExportFormat::parse("h5").unwrap_err();
+    /// assert_eq!(error, "\"h5\" is not one of zarr, sb3d, webdataset, hdf5");
+    /// ```
+    ///
     /// # Errors
     /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {
@@ -96,19 +105,19 @@ pub struct Exporter<'a> {
     format: ExportFormat,
     source: &'a Dataset,
     scenes: &'a [u64],
-    out: Out<'a>,
+    out: Output<'a>,
     rows: Vec<Row>,
 }
 
 /// The destination, and a record of the files written.
-struct Out<'a> {
+struct Output<'a> {
     store: &'a dyn ObjectStore,
     prefix: Path,
     done: Exported,
     digest: Sha256,
 }
 
-impl Out<'_> {
+impl Output<'_> {
     async fn put(&mut self, name: &str, bytes: Bytes) -> Result<(), StorageError> {
         self.done.files += 1;
         self.done.bytes += bytes.len() as u64;
@@ -148,7 +157,7 @@ impl<'a> Exporter<'a> {
             format,
             source,
             scenes,
-            out: Out {
+            out: Output {
                 store,
                 prefix,
                 done: Exported::default(),
@@ -170,13 +179,14 @@ impl<'a> Exporter<'a> {
     /// Performs step `k`. Steps must be performed in order.
     ///
     /// # Errors
-    /// [`StorageError::Invalid`] if the destination is a folder of another kind;
+    /// [`StorageError::Invalid`] if the destination has an export in another format, or other data;
     /// [`StorageError::NotPublished`] or [`StorageError::Damaged`] for a faulty object of the
     /// source; [`StorageError::Conflict`] if the destination contains different files;
     /// [`StorageError::Store`].
     pub async fn step(&mut self, k: usize) -> Result<(), StorageError> {
         if k == 0 {
-            self.check_folder().await?;
+            let (store, prefix) = (self.out.store, &self.out.prefix);
+            destination::check(self.format, self.source, store, prefix).await?;
         }
         let of = |each: usize| k * each..self.scenes.len().min((k + 1) * each);
         match self.format {
@@ -218,39 +228,6 @@ impl<'a> Exporter<'a> {
             }
         }
         Ok(())
-    }
-
-    /// Checks that the destination is empty, contains a finished export (with the metadata of every
-    /// export), or an interrupted one of this format.
-    async fn check_folder(&self) -> Result<(), StorageError> {
-        let (store, prefix) = (self.out.store, &self.out.prefix);
-        let names = folder::names(store, prefix).await?;
-        if names.iter().any(|name| name == card::CROISSANT) {
-            return Ok(());
-        }
-        match names.iter().find(|name| !self.writes(name)) {
-            None => Ok(()),
-            Some(name) => Err(folder::foreign(store, prefix, "export.dest", name)),
-        }
-    }
-
-    /// Returns whether an export of this format writes such a name before its Croissant metadata.
-    fn writes(&self, name: &str) -> bool {
-        let scene = |text: &str| text.len() >= 6 && text.bytes().all(|b| b.is_ascii_digit());
-        if name == card::TABLE {
-            return true;
-        }
-        match self.format {
-            ExportFormat::Zarr => packed::writes(self.source, name),
-            ExportFormat::Sb3d => scene(name),
-            ExportFormat::Hdf5 => name.strip_suffix(".h5").is_some_and(scene),
-            ExportFormat::WebDataset => {
-                let number = name.strip_prefix("scenes-");
-                number
-                    .and_then(|n| n.strip_suffix(".tar"))
-                    .is_some_and(scene)
-            }
-        }
     }
 
     fn note(&mut self, manifest: &Manifest, file: &str) {

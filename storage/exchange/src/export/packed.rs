@@ -5,7 +5,7 @@ use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
 use serde_json::{Map, Value, json};
 
-use super::Out;
+use super::Output;
 use picofarm_dataset::ChunkCodec;
 use picofarm_dataset::DatasetSpec;
 use picofarm_dataset::Element;
@@ -41,7 +41,7 @@ pub(super) async fn pack(
     source: &Dataset,
     scenes: &[u64],
     k: usize,
-    out: &mut Out<'_>,
+    out: &mut Output<'_>,
 ) -> Result<Vec<Manifest>, StorageError> {
     let reads = scenes.iter().map(|scene| source.manifest(*scene));
     let manifests: Vec<Manifest> = stream::iter(reads.collect::<Vec<_>>())
@@ -68,17 +68,20 @@ pub(super) async fn pack(
     Ok(manifests)
 }
 
-/// Returns whether packed scenes of a data set use this name, directly below the export's folder.
+/// Names directly below a packed export's folder, other than those of the arrays.
+pub(super) const METADATA_NAMES: [&str; 3] = ["manifests", SOURCE_SCENE, METADATA];
+
+/// Returns whether a packed export of a data set uses this name, directly below its folder.
 pub(super) fn writes(source: &Dataset, name: &str) -> bool {
     let mut arrays = source.arrays().iter();
-    name == "manifests" || arrays.any(|array| array.layout.quantity.name() == name)
+    METADATA_NAMES.contains(&name) || arrays.any(|array| array.layout.quantity.name() == name)
 }
 
 /// Writes the metadata, the root's last: the group exists only once all packs do.
 pub(super) async fn finish(
     source: &Dataset,
     scenes: &[u64],
-    out: &mut Out<'_>,
+    out: &mut Output<'_>,
 ) -> Result<(), StorageError> {
     let spec = DatasetSpec {
         scenes: scenes.len() as u64,
@@ -105,7 +108,7 @@ pub(super) async fn finish(
     out.put(METADATA, pretty(&rename_manifests(&root))).await
 }
 
-async fn put_source_scenes(scenes: &[u64], out: &mut Out<'_>) -> Result<Value, StorageError> {
+async fn put_source_scenes(scenes: &[u64], out: &mut Output<'_>) -> Result<Value, StorageError> {
     let codecs =
         json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}]);
     let n = scenes.len() as u64;

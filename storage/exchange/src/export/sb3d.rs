@@ -39,14 +39,14 @@ pub(super) enum Samples {
 }
 
 /// Name of the file with the data that the layout does not have.
-pub(crate) const ASIDE: &str = "picofarm.json";
+pub(crate) const SIDECAR: &str = "picofarm.json";
 /// The maximum value of the brightest bin.
 const BRIGHTEST: f32 = 32_768.0;
 
 /// The data that the paper's layout does not have.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Aside {
+pub(crate) struct Sidecar {
     /// Always `picofarm-sb3d-1`.
     pub format: String,
     /// The factor of the histograms, a power of two.
@@ -69,7 +69,7 @@ pub(crate) struct Aside {
     pub missing: Vec<String>,
 }
 
-impl Aside {
+impl Sidecar {
     /// The only value of `format`.
     pub const FORMAT: &'static str = "picofarm-sb3d-1";
 
@@ -92,7 +92,7 @@ pub(super) async fn scene_files(
     scene: u64,
 ) -> Result<Vec<(String, Bytes)>, StorageError> {
     let spec = dataset.spec();
-    let mut out = Out::default();
+    let mut out = SceneFiles::default();
     let manifest = dataset.manifest(scene).await?;
     check_known(scene, &manifest.missing())?;
     let mut factor = None;
@@ -147,8 +147,8 @@ pub(super) async fn scene_files(
     let laser: Vec<f32> = dataset.read(scene, Quantity::Laser).await?;
     let mut pose = [[0.0; 4]; 4];
     pose.as_flattened_mut().copy_from_slice(&camera);
-    let aside = Aside {
-        format: Aside::FORMAT.into(),
+    let sidecar = Sidecar {
+        format: Sidecar::FORMAT.into(),
         factor: factor.expect("every data set has a transient"),
         gate: spec.gate,
         intrinsics: [i.fx, i.fy, i.cx, i.cy],
@@ -159,16 +159,16 @@ pub(super) async fn scene_files(
         missing: manifest.missing(),
         task_key: manifest.provenance.task_key,
     };
-    let mut text = serde_json::to_vec_pretty(&aside).expect("plain data");
+    let mut text = serde_json::to_vec_pretty(&sidecar).expect("plain data");
     text.push(b'\n');
-    out.put(ASIDE, text);
+    out.put(SIDECAR, text);
     Ok(out.0)
 }
 
 #[derive(Default)]
-struct Out(Vec<(String, Bytes)>);
+struct SceneFiles(Vec<(String, Bytes)>);
 
-impl Out {
+impl SceneFiles {
     fn put(&mut self, name: &str, bytes: Vec<u8>) {
         self.0.push((name.into(), bytes.into()));
     }

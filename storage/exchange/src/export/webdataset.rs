@@ -33,9 +33,9 @@ impl Tar {
     ) -> Result<(), StorageError> {
         let key = format!("{:06}", scene.manifest.scene);
         self.file(&format!("{key}.npz"), &npz(&scene.arrays)?)?;
-        let aside =
+        let sidecar =
             json!({"scene": scene.manifest.scene, "gate": spec.gate, "manifest": scene.manifest});
-        let text = serde_json::to_vec(&aside).expect("plain data");
+        let text = serde_json::to_vec(&sidecar).expect("plain data");
         self.file(&format!("{key}.json"), &text)
     }
 

@@ -13,8 +13,8 @@ use serde_json::{Value, json};
 use super::ImportError;
 use super::masks;
 use super::profile::{
-    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Reading, TOLERANCE, Which, profile, profile_of,
-    step,
+    BETTER, CONTRAST, CheckedFiles, Geometry, MIN_PAIRS, PairSet, Reading, TOLERANCE, profile,
+    profile_of, step,
 };
 use super::vector::norm;
 use picofarm_dataset::Spot;
@@ -26,18 +26,21 @@ const OFF_SURFACE: f64 = 0.05;
 ///
 /// # Errors
 /// [`ImportError::Refused`], with the interpretation that fits better, if there is one.
-pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, ImportError> {
-    let surface = on_surface(g, blame)?;
+pub(super) fn check(
+    g: &Geometry<'_>,
+    checked_files: &CheckedFiles<'_>,
+) -> Result<Value, ImportError> {
+    let surface = on_surface(g, checked_files)?;
     let own = Reading::default();
     let hint = "see whether the files belong together, or import them as they are with --unchecked";
-    let all = profile(g, own, Which::All);
+    let all = profile(g, own, PairSet::All);
     if all.pairs < MIN_PAIRS {
         let expected = format!(
             "at least {MIN_PAIRS} pairs of a sampled pixel and a spot, with light in the gate"
         );
         let found = format!("{}, too few to check anything", all.pairs);
         return Err(ImportError::refused(
-            blame.histogram,
+            checked_files.histogram,
             "light",
             expected,
             found,
@@ -48,8 +51,8 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
     // wrong gate.
     let step = step(g) as f64 * g.shape.gate.bin_width_m;
     let peak = all.peak();
-    let clear = all.at(peak) > all.background() * CONTRAST;
-    if peak.abs() > TOLERANCE && all.at(peak) > all.hit() * BETTER && clear {
+    let clear = all.energy_at(peak) > all.background() * CONTRAST;
+    if peak.abs() > TOLERANCE && all.energy_at(peak) > all.hit() * BETTER && clear {
         let expected = format!(
             "two-bounce light at the time of flight that depth and spots predict, within {:.4} m of path",
             TOLERANCE as f64 * step
@@ -61,26 +64,26 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
         );
         let hint = format!(
             "the gate may be another one: {}; or import as it is with --unchecked",
-            blame.hint
+            checked_files.hint
         );
         return Err(ImportError::refused(
-            blame.histogram,
+            checked_files.histogram,
             "gate",
             expected,
             found,
             hint,
         ));
     }
-    readings(g, blame, all.excess())?;
-    let lit = profile(g, own, Which::Lit);
-    masks::polarity(g, blame, &lit)?;
-    let separation = masks::order(g, blame, &lit)?;
+    readings(g, checked_files, all.excess())?;
+    let lit = profile(g, own, PairSet::Lit);
+    masks::polarity(g, checked_files, &lit)?;
+    let separation = masks::order(g, checked_files, &lit)?;
     if lit.pairs < MIN_PAIRS {
         let expected =
             format!("at least {MIN_PAIRS} pairs of a sampled pixel and a spot that lights it");
         let found = format!("{}, too few to check anything", lit.pairs);
         return Err(ImportError::refused(
-            blame.visibility,
+            checked_files.visibility,
             "lit pixels",
             expected,
             found,
@@ -94,13 +97,13 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
         );
         let found = format!("{:.2} times", hit / background.max(f64::MIN_POSITIVE));
         return Err(ImportError::refused(
-            blame.histogram,
+            checked_files.histogram,
             "two-bounce light",
             expected,
             found,
             format!(
                 "units, gate, intrinsics or the number of spots may be others: {}; or import as it is with --unchecked",
-                blame.hint
+                checked_files.hint
             ),
         ));
     }
@@ -117,7 +120,7 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
 /// the surroundings.
 fn weakest_spot(g: &Geometry<'_>) -> Option<(usize, f64)> {
     let of = |(mask, spot): (usize, &Option<Spot>)| -> Option<(usize, f64)> {
-        let one = profile_of(g, Reading::default(), Which::Lit, &[(mask, (*spot)?)]);
+        let one = profile_of(g, Reading::default(), PairSet::Lit, &[(mask, (*spot)?)]);
         let contrast = one.hit() / one.background().max(f64::MIN_POSITIVE);
         (one.pairs >= MIN_PAIRS).then_some((mask, contrast))
     };
@@ -131,7 +134,11 @@ fn round(x: f64) -> f64 {
 }
 
 /// Returns an error if another interpretation fits better.
-fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportError> {
+fn readings(
+    g: &Geometry<'_>,
+    checked_files: &CheckedFiles<'_>,
+    own: f64,
+) -> Result<(), ImportError> {
     let depth = Reading {
         other_depth: true,
         ..Reading::default()
@@ -148,7 +155,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
     let others = [
         (
             depth,
-            blame.depth,
+            checked_files.depth,
             "kind of depth",
             if g.of_range {
                 "distances along the rays, as was said"
@@ -164,7 +171,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
         (
             spots(true, false),
-            blame.spots,
+            checked_files.spots,
             "x axis of the spots",
             "x to the right",
             "a better fit with x to the left",
@@ -172,7 +179,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
         (
             spots(false, true),
-            blame.spots,
+            checked_files.spots,
             "y axis of the spots",
             "y downwards",
             "a better fit with y upwards",
@@ -180,7 +187,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
         (
             spots(true, true),
-            blame.spots,
+            checked_files.spots,
             "axes of the spots",
             "x to the right, y downwards",
             "a better fit with both turned round",
@@ -188,7 +195,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
         (
             image(true, false),
-            blame.histogram,
+            checked_files.histogram,
             "columns",
             "the depth image's order",
             "a better fit from right to left",
@@ -196,7 +203,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
         (
             image(false, true),
-            blame.histogram,
+            checked_files.histogram,
             "rows",
             "the depth image's order",
             "a better fit from bottom to top",
@@ -204,7 +211,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
         (
             image(true, true),
-            blame.histogram,
+            checked_files.histogram,
             "rows and columns",
             "the depth image's order",
             "a better fit with both turned round",
@@ -213,7 +220,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
     ];
     let mut best: Option<(f64, &Path, &str, &str, &str, &str)> = None;
     for (reading, file, field, expected, found, hint) in others {
-        let other = profile(g, reading, Which::All);
+        let other = profile(g, reading, PairSet::All);
         let excess = other.excess();
         let beaten = best.as_ref().is_none_or(|(e, ..)| excess > *e);
         if other.pairs >= MIN_PAIRS && excess > own.max(0.0) * BETTER + 1e-6 && beaten {
@@ -239,7 +246,10 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
 /// Returns the distance of the spots from the depth image, as the median of |Δz|/z, where z is
 /// between a pixel's depth and its neighbours'. This requires a laser at the camera, so that the
 /// spots are visible.
-fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, ImportError> {
+fn on_surface(
+    g: &Geometry<'_>,
+    checked_files: &CheckedFiles<'_>,
+) -> Result<Option<f64>, ImportError> {
     if norm(g.laser.map(f64::from)) > 0.02 {
         return Ok(None);
     }
@@ -284,11 +294,11 @@ fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, Import
     if off > OFF_SURFACE {
         let ratio = median(seen.iter().map(|s| s.1).collect());
         return Err(ImportError::refused(
-            blame.spots,
+            checked_files.spots,
             "positions",
             format!(
                 "spots on the surface of {}, in metres",
-                blame.depth.display()
+                checked_files.depth.display()
             ),
             format!(
                 "z of the spots {ratio:.3} times the depth where they project to (median of {})",
@@ -296,7 +306,7 @@ fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, Import
             ),
             format!(
                 "units or axes may be others: {}; or import as they are with --unchecked",
-                blame.hint
+                checked_files.hint
             ),
         ));
     }

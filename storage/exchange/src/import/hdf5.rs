@@ -13,7 +13,7 @@ impl Hdf5 {
     /// # Errors
     /// The library's message.
     pub fn open(path: &Path) -> Result<Self, String> {
-        let opened = File::open_streaming(path).map_err(said)?;
+        let opened = File::open_streaming(path).map_err(message_of)?;
         Ok(Self(Box::new(opened)))
     }
 
@@ -30,7 +30,7 @@ impl Hdf5 {
         let Ok(set) = self.0.dataset(name) else {
             return Ok(None);
         };
-        set.shape().map(Some).map_err(said)
+        set.shape().map(Some).map_err(message_of)
     }
 
     /// Reads a whole array.
@@ -38,7 +38,11 @@ impl Hdf5 {
     /// # Errors
     /// The library's message.
     pub fn all(&self, name: &str) -> Result<Vec<f64>, String> {
-        self.0.dataset(name).map_err(said)?.read_f64().map_err(said)
+        self.0
+            .dataset(name)
+            .map_err(message_of)?
+            .read_f64()
+            .map_err(message_of)
     }
 
     /// Reads `n` rows of the slowest axis, beginning at `first`.
@@ -46,11 +50,11 @@ impl Hdf5 {
     /// # Errors
     /// The library's message.
     pub fn rows(&self, name: &str, first: u64, n: u64) -> Result<Vec<f64>, String> {
-        let set = self.0.dataset(name).map_err(said)?;
-        set.read_f64_rows(first, n).map_err(said)
+        let set = self.0.dataset(name).map_err(message_of)?;
+        set.read_f64_rows(first, n).map_err(message_of)
     }
 }
 
-fn said(error: Error) -> String {
+fn message_of(error: Error) -> String {
     error.to_string()
 }

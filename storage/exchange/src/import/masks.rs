@@ -5,7 +5,7 @@
 use super::ImportError;
 use super::mask_order::Masks;
 use super::profile::{
-    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Profile, Reading, Which, profile,
+    BETTER, CONTRAST, CheckedFiles, Geometry, MIN_PAIRS, PairSet, Profile, Reading, profile,
 };
 
 /// Share of the lit pixels' light by which another order must separate lit from shadow to be
@@ -15,19 +15,19 @@ const CLEAR: f64 = 0.25;
 /// Checks the polarity: masks with the wrong one mark pixels as lit where no light arrives.
 pub(super) fn polarity(
     g: &Geometry<'_>,
-    blame: &Blame<'_>,
+    checked_files: &CheckedFiles<'_>,
     lit: &Profile,
 ) -> Result<(), ImportError> {
     if g.visibility.is_none() {
         return Ok(());
     }
-    let dark = profile(g, Reading::default(), Which::Dark);
+    let dark = profile(g, Reading::default(), PairSet::Dark);
     let clear = dark.hit() > dark.background() * CONTRAST;
     if dark.pairs < MIN_PAIRS || !clear || dark.excess() <= lit.excess().max(0.0) * BETTER {
         return Ok(());
     }
     Err(ImportError::refused(
-        blame.visibility,
+        checked_files.visibility,
         "polarity of the visibility masks",
         "more two-bounce light where a mask says lit",
         format!(
@@ -37,7 +37,7 @@ pub(super) fn polarity(
         ),
         format!(
             "the masks may be the other way round: {}; or import as they are with --unchecked",
-            blame.polarity
+            checked_files.polarity
         ),
     ))
 }
@@ -50,7 +50,7 @@ pub(super) fn polarity(
 /// [`ImportError::Refused`] with the order that fits better.
 pub(super) fn order(
     g: &Geometry<'_>,
-    blame: &Blame<'_>,
+    checked_files: &CheckedFiles<'_>,
     lit: &Profile,
 ) -> Result<Option<f64>, ImportError> {
     let separation = |masks| {
@@ -59,8 +59,8 @@ pub(super) fn order(
             ..Reading::default()
         };
         let (lit, dark) = (
-            profile(g, reading, Which::Lit),
-            profile(g, reading, Which::Dark),
+            profile(g, reading, PairSet::Lit),
+            profile(g, reading, PairSet::Dark),
         );
         let enough = lit.pairs >= MIN_PAIRS && dark.pairs >= MIN_PAIRS;
         enough.then(|| lit.excess() - dark.excess().max(0.0))
@@ -85,7 +85,7 @@ pub(super) fn order(
     match best {
         None => Ok(Some(own)),
         Some((other, words)) => Err(ImportError::refused(
-            blame.visibility,
+            checked_files.visibility,
             "order of the visibility masks",
             "more two-bounce light at the pixels that each spot's mask calls lit than at those in shadow, spots, rows and \
              columns in the histogram's order",

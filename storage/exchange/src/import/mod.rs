@@ -95,6 +95,15 @@ impl Source {
     /// scenes in this order. The first scene's files determine the data set's properties. If
     /// `format` is `None`, it is detected.
     ///
+    /// ```
+    /// use picofarm_exchange::import::{ImportOptions, Source};
+    ///
+    /// let folder = tempfile::tempdir()?;
+    /// let error = Source::open(folder.path(), None, ImportOptions::default(), None);
+    /// assert!(error.unwrap_err().to_string().contains("scene.json"));
+    /// # Ok::<(), std::io::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`ImportError::Refused`] if there are no scenes of the format, or scenes of several; if the
     /// first scene's files or the options do not fit the format; [`ImportError::Io`].
@@ -286,8 +295,8 @@ fn detect(
 fn looks_like(format: Format) -> &'static str {
     match format {
         Format::Sb3d => "lidar_4.exr, lidar_25.exr or lidar_100.exr in a folder for each scene",
-        Format::Platonerf => "transforms_train.json beside the folder of .npy captures",
-        Format::BfLidar => "spot_1.mat and so on beside a detector_scan*.mat",
+        Format::Platonerf => "transforms_train.json next to the folder of .npy captures",
+        Format::BfLidar => "spot_1.mat and so on next to a detector_scan*.mat",
         Format::Npy => "scene.json in a folder for each scene",
     }
 }

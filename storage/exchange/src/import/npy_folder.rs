@@ -14,7 +14,7 @@ use super::check::check;
 use super::files::Files;
 use super::npy::{self, Array};
 use super::paths;
-use super::profile::{Blame, Geometry};
+use super::profile::{CheckedFiles, Geometry};
 use super::scene::{ImportedScene, Shape, clean};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity};
 use about::About;
@@ -299,7 +299,7 @@ fn checked(
         specular: &scene.specular,
     };
     let file = |name: &str| about.folder.join(name);
-    let blame = Blame {
+    let checked_files = CheckedFiles {
         histogram,
         depth: &file(&depth.file),
         spots: &file(&about.is.spots.file),
@@ -307,5 +307,5 @@ fn checked(
         hint: "correct scene.json",
         polarity: "visibility.one_means in scene.json",
     };
-    check(&geometry, &blame)
+    check(&geometry, &checked_files)
 }

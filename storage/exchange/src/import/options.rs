@@ -36,6 +36,13 @@ impl Format {
 
     /// Returns the format called `name`.
     ///
+    /// ```
+    /// use picofarm_exchange::import::Format;
+    ///
+    /// assert_eq!(Format::parse("npy"), Ok(Format::Npy));
+    /// assert!(Format::parse("zip").is_err());
+    /// ```
+    ///
     /// # Errors
     /// A message that lists the valid names.
     pub fn parse(name: &str) -> Result<Self, String> {

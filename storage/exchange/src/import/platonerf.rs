@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use picofarm_files::Opener;
 
 use super::files::Files;
-use super::scene::{ImportedScene, Shape, clean, of_fov};
+use super::scene::{ImportedScene, Shape, clean, intrinsics_from_fov};
 use super::vector::norm;
 use super::{Captures, ImportError, ImportOptions, Item, npy};
 use picofarm_dataset::Intrinsics;
@@ -211,7 +211,7 @@ pub(super) fn read(
                 hint,
             ));
         }
-        let intrinsics = of_fov(shape.width, shape.height, degrees);
+        let intrinsics = intrinsics_from_fov(shape.width, shape.height, degrees);
         let spot = Spotted::find(&camera, frame, &shape, intrinsics, &h);
         if !options.unchecked {
             checks.push(spot.check(&path, &file, &transforms, frame, &camera, &shape)?);
@@ -246,7 +246,7 @@ pub(super) fn read(
         &item.name,
         shape,
         transient,
-        of_fov(shape.width, shape.height, degrees),
+        intrinsics_from_fov(shape.width, shape.height, degrees),
     );
     conversions.push(format!(
         "field of view {degrees}°; gate from {} m in bins of {} m",

@@ -41,7 +41,7 @@ pub(super) struct Geometry<'a> {
 }
 
 /// The files to name if the check fails, and the options to override them.
-pub(super) struct Blame<'a> {
+pub(super) struct CheckedFiles<'a> {
     pub histogram: &'a Path,
     pub depth: &'a Path,
     pub spots: &'a Path,
@@ -69,20 +69,20 @@ pub(super) struct Profile {
 }
 
 impl Profile {
-    pub(super) fn at(&self, shift: isize) -> f64 {
+    pub(super) fn energy_at(&self, shift: isize) -> f64 {
         self.energy[(shift + REACH) as usize] / self.pairs.max(1) as f64
     }
 
     /// Returns the shift with the most energy.
     pub(super) fn peak(&self) -> isize {
         let all = -REACH..=REACH;
-        all.max_by(|a, b| self.at(*a).total_cmp(&self.at(*b)))
+        all.max_by(|a, b| self.energy_at(*a).total_cmp(&self.energy_at(*b)))
             .expect("not empty")
     }
 
     /// Returns the highest energy among the tolerated shifts.
     pub fn hit(&self) -> f64 {
-        let near = (-TOLERANCE..=TOLERANCE).map(|s| self.at(s));
+        let near = (-TOLERANCE..=TOLERANCE).map(|s| self.energy_at(s));
         near.fold(0.0, f64::max)
     }
 
@@ -94,7 +94,7 @@ impl Profile {
     /// Returns the median energy of more distant shifts.
     pub fn background(&self) -> f64 {
         let far = (-REACH..=REACH).filter(|s| s.abs() > 2 * TOLERANCE + 2);
-        let mut far: Vec<f64> = far.map(|s| self.at(s)).collect();
+        let mut far: Vec<f64> = far.map(|s| self.energy_at(s)).collect();
         far.sort_by(f64::total_cmp);
         far[far.len() / 2]
     }
@@ -102,7 +102,7 @@ impl Profile {
 
 /// A selection of pairs of pixel and spot.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) enum Which {
+pub(super) enum PairSet {
     All,
     Lit,
     Dark,
@@ -115,7 +115,7 @@ pub(super) fn step(g: &Geometry<'_>) -> usize {
 }
 
 /// Computes the energy around the predictions in a sample of pixels.
-pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
+pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: PairSet) -> Profile {
     let spots = g.spots.iter().enumerate();
     let spots: Vec<(usize, Spot)> = spots.filter_map(|(i, s)| Some((i, (*s)?))).collect();
     profile_of(g, reading, which, &spots)
@@ -125,7 +125,7 @@ pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profi
 pub(super) fn profile_of(
     g: &Geometry<'_>,
     reading: Reading,
-    which: Which,
+    which: PairSet,
     spots: &[(usize, Spot)],
 ) -> Profile {
     let shape = g.shape;
@@ -168,7 +168,7 @@ pub(super) fn profile_of(
                         .place(index, (row, column), (g.spots.len(), h, w));
                     v[at] == 1
                 });
-                if which != Which::All && lit != (which == Which::Lit) {
+                if which != PairSet::All && lit != (which == PairSet::Lit) {
                     continue;
                 }
                 let mut l = spot.position.map(f64::from);

@@ -282,7 +282,7 @@ pub(super) fn direction(i: Intrinsics, row: usize, column: usize) -> [f64; 3] {
 }
 
 /// Returns the intrinsics of a horizontal field of view, with the axis in the image's centre.
-pub(super) fn of_fov(width: u32, height: u32, degrees: f64) -> Intrinsics {
+pub(super) fn intrinsics_from_fov(width: u32, height: u32, degrees: f64) -> Intrinsics {
     let f = f64::from(width) / 2.0 / libm::tan(degrees.to_radians() / 2.0);
     Intrinsics {
         fx: f as f32,

@@ -267,3 +267,53 @@ async fn an_export_writes_into_no_folder_of_another_kind() {
         assert!(files(&place) == before, "nothing was written");
     }
 }
+
+/// Returns a data set that all formats can express.
+async fn small(folder: &Path) -> (Dataset, Vec<u64>) {
+    let spec = DatasetSpec {
+        scenes: 2,
+        spots: 4,
+        ..spec(Profile::LOSSLESS)
+    };
+    let (store, prefix) = open_store(folder.join("source").to_str().unwrap()).unwrap();
+    let dataset = Dataset::create_or_open(store, prefix, &spec).await.unwrap();
+    for scene in 0..2 {
+        let made = Scene::new(&spec, scene);
+        let record = made.record();
+        dataset
+            .publish(scene, &record, &provenance())
+            .await
+            .unwrap();
+    }
+    (dataset, vec![0, 1])
+}
+
+#[tokio::test]
+async fn an_export_into_a_folder_with_another_format_is_refused_before_anything_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, scenes) = small(folder.path()).await;
+    for finished in [true, false] {
+        for there in ExportFormat::ALL {
+            let to = folder.path().join(format!("{}-{finished}", there.name()));
+            let (store, prefix) = open_store(to.to_str().unwrap()).unwrap();
+            let begun = Exporter::new(there, &dataset, &scenes, &*store, prefix.clone());
+            let mut begun = begun.unwrap();
+            begun.step(0).await.unwrap();
+            if finished {
+                export_as(there, &dataset, &scenes, &to).await;
+            }
+            let before = files(&to);
+            for format in ExportFormat::ALL.into_iter().filter(|f| *f != there) {
+                let export = Exporter::new(format, &dataset, &scenes, &*store, prefix.clone());
+                let error = export.unwrap().step(0).await.unwrap_err().to_string();
+                let named = format!("has an export in the format {:?}", there.name());
+                assert!(
+                    error.starts_with("export.dest: ") && error.contains(&named),
+                    "{format:?} into {there:?}: {error}"
+                );
+                assert_eq!(files(&to), before);
+            }
+            export_as(there, &dataset, &scenes, &to).await;
+        }
+    }
+}

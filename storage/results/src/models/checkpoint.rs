@@ -4,7 +4,7 @@
 use bytes::Bytes;
 
 use super::{Models, check_name};
-use crate::checkpoints::{Checkpoint, Checkpoints, FOLDER, Pieces, found};
+use crate::checkpoints::{Checkpoint, Checkpoints, FOLDER, Pieces, group_objects};
 use picofarm_store::StorageError;
 
 impl Models {
@@ -68,6 +68,6 @@ impl Models {
     /// # Errors
     /// [`StorageError::Store`].
     pub async fn checkpoints(&self, name: &str) -> Result<Vec<Checkpoint>, StorageError> {
-        Ok(found(self.list(&self.path(name, FOLDER)).await?))
+        Ok(group_objects(self.list(&self.path(name, FOLDER)).await?))
     }
 }

@@ -9,9 +9,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime};
 
-use bytes::Bytes;
 use object_store::ObjectMeta;
-use object_store::path::Path;
 
 use super::{Models, key_below, object_folder};
 use picofarm_dataset::{Orphan, OrphanCause};
@@ -65,8 +63,10 @@ impl Models {
                 };
                 if object_folder(&key).is_some()
                     && old(&object)
-                    && !self.names_object(&name, &key).await?
-                    && (!delete || self.delete_object(&name, &key, &object.location).await?)
+                    && match delete {
+                        true => self.published.delete_unlisted(&name, &key).await?,
+                        false => !self.published.lists(&name, &key).await?,
+                    }
                 {
                     found.push(self.orphan(&object, OrphanCause::Model));
                 }
@@ -92,34 +92,6 @@ impl Models {
             }
         }
         Ok(found)
-    }
-
-    /// Deletes an object. Returns `false` if a manifest lists it in the meantime.
-    pub(super) async fn delete_object(
-        &self,
-        name: &str,
-        key: &str,
-        path: &Path,
-    ) -> Result<bool, StorageError> {
-        let Some(bytes): Option<Bytes> = objects::get(&*self.store, path).await? else {
-            return Ok(false);
-        };
-        if self.names_object(name, key).await? {
-            return Ok(false);
-        }
-        self.delete(path).await?;
-        if self.names_object(name, key).await? {
-            objects::create_or_match(&*self.store, path, bytes).await?;
-            return Ok(false);
-        }
-        Ok(true)
-    }
-
-    /// Returns whether the model's manifest lists an object. An unreadable manifest may list any
-    /// object.
-    async fn names_object(&self, name: &str, key: &str) -> Result<bool, StorageError> {
-        let manifest = self.look(name).await?;
-        Ok(manifest.is_some_and(|m| m.objects.iter().any(|object| object.key == key)))
     }
 
     fn orphan(&self, object: &ObjectMeta, cause: OrphanCause) -> Orphan {

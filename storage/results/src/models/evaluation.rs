@@ -45,7 +45,7 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Returns the bytes to store, with their checksum, see `layout::manifest::seal`.
+    /// Returns the bytes to store, with their checksum, see `picofarm_store::sealed::seal`.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut sorted = self.clone();
         sorted.metrics.sort_all_objects();

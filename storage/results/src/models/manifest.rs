@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use picofarm_store::StorageError;
-use picofarm_store::sealed::{ObjectEntry, read_sealed, sha256_hex};
+use picofarm_store::published::Manifest;
+use picofarm_store::sealed::{ObjectEntry, document, read_sealed};
 
 /// Format version of model manifests.
 const FORMAT: u32 = 1;
@@ -34,7 +35,7 @@ pub struct ModelManifest {
     pub metrics: Value,
     /// Its objects, with keys relative to the model's folder.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
@@ -134,7 +135,7 @@ impl ModelManifest {
         self.plan.sort_all_objects();
         self.metrics.sort_all_objects();
         self.checksum = None;
-        self.checksum = Some(sha256_hex(&self.to_bytes()));
+        self.checksum = Some(self.sha256());
         self
     }
 
@@ -143,33 +144,40 @@ impl ModelManifest {
         let named = |object: &&ObjectEntry| object.key.rsplit('/').next() == Some(file);
         self.objects.iter().find(named)
     }
+}
 
-    /// Returns the total size of all objects in bytes.
-    pub fn total_bytes(&self) -> u64 {
-        self.objects.iter().map(|o| o.size).sum()
-    }
+impl Manifest for ModelManifest {
+    type Id = String;
 
-    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
-    pub fn sha256(&self) -> String {
-        sha256_hex(&self.to_bytes())
-    }
-
-    /// Returns the bytes to store.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = serde_json::to_vec_pretty(self)
-            .expect("a manifest has only string keys and finite numbers");
-        bytes.push(b'\n');
-        bytes
-    }
-
-    pub(super) fn parse(bytes: &[u8], name: &str, object: &str) -> Result<Self, StorageError> {
+    fn parse(bytes: &[u8], name: &String, object: &str) -> Result<Self, StorageError> {
         let manifest: Self = read_sealed(bytes, "a model's manifest", FORMAT, object)?;
-        if manifest.name != name {
-            return Err(StorageError::Damaged {
+        match manifest.name == *name {
+            true => Ok(manifest),
+            false => Err(StorageError::Damaged {
                 object: object.to_owned(),
                 what: format!("is that of the model {:?}", manifest.name),
-            });
+            }),
         }
-        Ok(manifest)
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        document(self)
+    }
+
+    fn objects(&self) -> &[ObjectEntry] {
+        &self.objects
+    }
+
+    fn task_key(&self) -> &str {
+        &self.training_key
+    }
+
+    fn taken(&self, place: &str, training_key: &str) -> StorageError {
+        let what = format!(
+            "{place} holds the model of another training (key {}, this one's is {training_key}); choose another name, or delete \
+             that folder if nothing needs it",
+            self.training_key
+        );
+        StorageError::invalid("model", what)
     }
 }

@@ -26,9 +26,9 @@ use futures::TryStreamExt;
 use object_store::path::Path;
 use object_store::{Error, ObjectStore, ObjectStoreExt};
 
-use picofarm_store::StorageError;
 use picofarm_store::objects;
-use picofarm_store::sealed::{ObjectEntry, sha256_hex};
+use picofarm_store::published::{Manifest, Published};
+use picofarm_store::{ObjectEntry, StorageError, VerifyMode, sha256_hex};
 
 pub use evaluation::Evaluation;
 pub use manifest::{DepthsUsed, Lineage, Measurement, ModelManifest, Promoted, SplitUsed};
@@ -49,6 +49,7 @@ const MANIFEST: &str = "manifest.json";
 pub struct Models {
     store: Arc<dyn ObjectStore>,
     folder: Path,
+    published: Published<ModelManifest>,
 }
 
 /// A model to be published.
@@ -62,7 +63,7 @@ pub struct NewModel {
 
 /// A published model.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Published {
+pub struct PublishedModel {
     /// Its stored manifest.
     pub manifest: ModelManifest,
     /// Whether another run of the same training was published first and has different bits (as is
@@ -73,15 +74,17 @@ pub struct Published {
 impl Models {
     /// Returns the models of the store at `prefix`.
     pub fn new(store: Arc<dyn ObjectStore>, prefix: &Path) -> Self {
+        let folder = prefix.clone().join(MODELS);
         Self {
+            published: Published::new(store.clone(), folder.clone()),
             store,
-            folder: prefix.clone().join(MODELS),
+            folder,
         }
     }
 
     /// Returns a model's location for messages.
     pub fn place(&self, name: &str) -> String {
-        objects::shown(&*self.store, &self.folder.clone().join(name))
+        self.published.location(&name.to_owned())
     }
 
     /// Returns the names of the models, ascending, including those still in training.
@@ -110,11 +113,7 @@ impl Models {
     /// # Errors
     /// [`StorageError::Damaged`], [`StorageError::Store`].
     pub async fn look(&self, name: &str) -> Result<Option<ModelManifest>, StorageError> {
-        let path = self.path(name, MANIFEST);
-        let Some(bytes) = objects::get(&*self.store, &path).await? else {
-            return Ok(None);
-        };
-        ModelManifest::parse(&bytes, name, &self.shown(&path)).map(Some)
+        self.published.manifest(&name.to_owned()).await
     }
 
     /// Returns the manifest of a model that must exist.
@@ -160,28 +159,8 @@ impl Models {
         training_key: &str,
     ) -> Result<Option<ModelManifest>, StorageError> {
         check_name(name)?;
-        let Some(manifest) = self.look(name).await? else {
-            return Ok(None);
-        };
-        self.check_owner(&manifest, training_key)?;
-        for object in &manifest.objects {
-            let path = self.path(name, &object.key);
-            let what = match objects::size(&*self.store, &path).await? {
-                // Reading a model is cheap compared with training it.
-                Some(size) if size == object.size => {
-                    let bytes = objects::require(&*self.store, &path).await?;
-                    if sha256_hex(&bytes) == object.sha256 {
-                        continue;
-                    }
-                    "its SHA-256 is not the manifest's".into()
-                }
-                Some(size) => format!("expected {} bytes, found {size}", object.size),
-                None => "the object is missing".into(),
-            };
-            let object = self.shown(&path);
-            return Err(StorageError::Damaged { object, what });
-        }
-        Ok(Some(manifest))
+        let (name, mode) = (name.to_owned(), VerifyMode::Full);
+        self.published.finished(&name, training_key, mode).await
     }
 
     /// Publishes a model: objects first, the manifest last, all create-only. Existing objects with
@@ -192,13 +171,17 @@ impl Models {
     /// # Errors
     /// [`StorageError::Invalid`] for a name of another training, or an invalid name;
     /// [`StorageError::Conflict`] with `exact`, for different bits; [`StorageError::Store`].
-    pub async fn publish(&self, model: NewModel, exact: bool) -> Result<Published, StorageError> {
+    pub async fn publish(
+        &self,
+        model: NewModel,
+        exact: bool,
+    ) -> Result<PublishedModel, StorageError> {
         let NewModel { manifest, objects } = model;
         let name = manifest.name.clone();
         check_name(&name)?;
         let entries: Vec<ObjectEntry> = objects
             .iter()
-            .map(|(file, bytes)| entry(file, bytes))
+            .map(|(file, bytes)| ObjectEntry::new(file, bytes))
             .collect();
         let folder = content(&manifest.training_key, &entries);
         let in_folder = |entry: ObjectEntry| ObjectEntry {
@@ -208,26 +191,29 @@ impl Models {
         let entries = entries.into_iter().map(in_folder).collect();
         let manifest = manifest.with_objects(entries);
         let bytes: Vec<Bytes> = objects.into_iter().map(|(_, bytes)| bytes).collect();
-        let path = self.path(&name, MANIFEST);
-        let ours = manifest.to_bytes();
-        if objects::get(&*self.store, &path).await?.as_deref() == Some(&ours[..]) {
+        let (path, ours) = (self.published.manifest_path(&name), manifest.to_bytes());
+        match objects::get(&*self.store, &path).await? {
             // It was published before; objects damaged since then are restored.
-            self.restore(&manifest, &bytes).await?;
-            return Ok(Published {
-                manifest,
-                adopted: false,
-            });
-        }
-        self.put_objects(&manifest, &bytes).await?;
-        if !objects::create(&*self.store, &path, ours.clone().into()).await? {
-            let stored = objects::require(&*self.store, &path).await?;
-            if stored != ours {
+            Some(stored) if stored == ours => {
+                self.published.restore(&name, &manifest, &bytes).await?;
+            }
+            Some(stored) => {
+                self.published.put_objects(&name, &manifest, &bytes).await?;
                 return self.other_bits(&manifest, &stored, exact).await;
             }
+            None => match self.published.publish(&name, &manifest, &bytes).await {
+                // Another run may have published it in the meantime.
+                Err(conflict @ StorageError::Conflict { .. }) => {
+                    let stored = objects::get(&*self.store, &path).await?;
+                    let Some(stored) = stored.filter(|stored| *stored != ours) else {
+                        return Err(conflict);
+                    };
+                    return self.other_bits(&manifest, &stored, exact).await;
+                }
+                published => published?,
+            },
         }
-        // A collector may have deleted an object before the manifest protected it.
-        self.put_objects(&manifest, &bytes).await?;
-        Ok(Published {
+        Ok(PublishedModel {
             manifest,
             adopted: false,
         })
@@ -239,10 +225,11 @@ impl Models {
         ours: &ModelManifest,
         stored: &[u8],
         exact: bool,
-    ) -> Result<Published, StorageError> {
-        let path = self.path(&ours.name, MANIFEST);
-        let theirs = ModelManifest::parse(stored, &ours.name, &self.shown(&path))?;
-        let same = self.check_owner(&theirs, &ours.training_key);
+    ) -> Result<PublishedModel, StorageError> {
+        let (name, key) = (&ours.name, &ours.training_key);
+        let path = self.published.manifest_path(name);
+        let theirs = ModelManifest::parse(stored, name, &self.shown(&path))?;
+        let same = self.published.check_owner(name, &theirs, key);
         if same.is_ok() && exact {
             return Err(StorageError::Conflict {
                 object: self.shown(&path),
@@ -253,12 +240,12 @@ impl Models {
         // The new objects do not interfere, but they are not needed either.
         let named = |key: &str| theirs.objects.iter().any(|object| object.key == key);
         for object in ours.objects.iter().filter(|object| !named(&object.key)) {
-            self.delete(&self.path(&ours.name, &object.key)).await?;
+            self.delete(&self.path(name, &object.key)).await?;
         }
         same?;
         // Its damaged objects cannot be restored from different bits.
-        self.finished(&ours.name, &ours.training_key).await?;
-        Ok(Published {
+        self.finished(name, key).await?;
+        Ok(PublishedModel {
             manifest: theirs,
             adopted: true,
         })
@@ -289,33 +276,6 @@ impl Models {
         }
     }
 
-    async fn put_objects(
-        &self,
-        manifest: &ModelManifest,
-        bytes: &[Bytes],
-    ) -> Result<(), StorageError> {
-        for (object, bytes) in manifest.objects.iter().zip(bytes) {
-            let path = self.path(&manifest.name, &object.key);
-            if objects::size(&*self.store, &path).await? != Some(object.size) {
-                objects::create_or_match(&*self.store, &path, bytes.clone()).await?;
-            }
-        }
-        Ok(())
-    }
-
-    fn check_owner(&self, found: &ModelManifest, training_key: &str) -> Result<(), StorageError> {
-        if found.training_key == training_key {
-            return Ok(());
-        }
-        let what = format!(
-            "{} holds the model of another training (key {}, this one's is {training_key}); choose another name, or delete \
-             that folder if nothing needs it",
-            self.place(&found.name),
-            found.training_key
-        );
-        Err(StorageError::invalid("model", what))
-    }
-
     async fn delete(&self, path: &Path) -> Result<(), StorageError> {
         match self.store.delete(path).await {
             Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
@@ -339,14 +299,6 @@ impl Models {
 
     fn failed(&self, action: &'static str, path: &Path, error: Error) -> StorageError {
         StorageError::store(action, self.shown(path), error)
-    }
-}
-
-fn entry(file: &str, bytes: &Bytes) -> ObjectEntry {
-    ObjectEntry {
-        key: file.to_owned(),
-        size: bytes.len() as u64,
-        sha256: sha256_hex(bytes),
     }
 }
 

@@ -2,30 +2,19 @@
 //! and the note. An interrupted removal can be continued from the note. Only objects in the note
 //! are deleted, and none that a manifest lists.
 
-use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
-use serde::{Deserialize, Serialize};
 
 use super::{MANIFEST, MODELS, ModelManifest, Models, check_name, speed};
 use crate::predictions::{ModelUsed, PredictionManifest, Predictions, TimesUsed};
 use crate::reports::REPORTS;
 use picofarm_store::StorageError;
 use picofarm_store::objects;
+use picofarm_store::published::{Manifest, Removal};
 
 /// Name of the object with the note.
 pub(super) const REMOVING: &str = "removing.json";
 /// Number of manifests read concurrently.
 const AT_ONCE: usize = 16;
-
-/// The objects to delete.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-struct Note {
-    /// SHA-256 of the manifest; empty if it could not be read.
-    manifest_sha256: String,
-    training_key: String,
-    /// Keys relative to the model.
-    objects: Vec<String>,
-}
 
 /// Objects that depend on a model.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -126,40 +115,21 @@ impl Models {
     /// manifest, and no removal in progress) and `unfinished` is not set; [`StorageError::Store`].
     pub async fn remove(&self, name: &str, unfinished: bool) -> Result<Removed, StorageError> {
         check_name(name)?;
-        let note_path = self.path(name, REMOVING);
-        let mut removed = Removed::default();
-        let note = match objects::get(&*self.store, &note_path).await? {
-            Some(bytes) => self.note_of(&bytes),
-            None => None,
-        };
-        let note = match note {
+        let id = name.to_owned();
+        let note = match self.published.removal(&id).await? {
             Some(note) => note,
             None => {
-                let note = self.note(name, unfinished).await?;
-                let bytes = serde_json::to_vec_pretty(&note).expect("plain data");
-                objects::overwrite(&*self.store, &note_path, Bytes::from(bytes)).await?;
+                let note = self.removal_of(name, unfinished).await?;
+                self.published.begin_removal(&id, &note).await?;
                 note
             }
         };
-        let manifest_path = self.path(name, MANIFEST);
-        if let Some(bytes) = objects::get(&*self.store, &manifest_path).await? {
-            let hash = picofarm_store::sealed::sha256_hex(&bytes);
-            if hash == note.manifest_sha256 {
-                self.remove_one(&manifest_path, &mut removed).await?;
-            }
-        }
-        for key in &note.objects {
-            let path = self.path(name, key);
-            let there = objects::size(&*self.store, &path).await?.is_some();
-            if there
-                && !self.named(name, key).await?
-                && self.delete_object(name, key, &path).await?
-            {
-                removed.deleted.push(self.shown(&path));
-            }
-        }
+        let mut removed = Removed {
+            deleted: self.published.remove_objects(&id, &note).await?,
+            left: Vec::new(),
+        };
         self.remove_records(name, &note, &mut removed).await?;
-        self.delete(&note_path).await?;
+        self.published.end_removal(&id).await?;
         let left = self.list(&self.folder.clone().join(name)).await?;
         removed.left = left.iter().map(|o| self.shown(&o.location)).collect();
         removed.left.sort();
@@ -167,7 +137,7 @@ impl Models {
     }
 
     /// Returns the note of a new removal.
-    async fn note(&self, name: &str, unfinished: bool) -> Result<Note, StorageError> {
+    async fn removal_of(&self, name: &str, unfinished: bool) -> Result<Removal, StorageError> {
         let folder = self.folder.clone().join(name);
         let there = self.list(&folder).await?;
         let keys = there
@@ -181,24 +151,20 @@ impl Models {
             found => Ok(found?),
         };
         match looked {
-            Ok(Some(manifest)) => Ok(Note {
-                manifest_sha256: manifest.sha256(),
-                training_key: manifest.training_key.clone(),
-                objects: manifest.objects.into_iter().map(|o| o.key).collect(),
-            }),
+            Ok(Some(manifest)) => Ok(Removal::of_manifest(&manifest)),
             Err(()) => {
                 // The objects of an unreadable manifest are unknown, so everything under the name
                 // is deleted.
                 let bytes = objects::require(&*self.store, &self.path(name, MANIFEST)).await?;
-                Ok(Note {
+                Ok(Removal {
                     manifest_sha256: picofarm_store::sealed::sha256_hex(&bytes),
-                    training_key: String::new(),
+                    task_key: String::new(),
                     objects: keys,
                 })
             }
-            Ok(None) if unfinished && !there.is_empty() => Ok(Note {
+            Ok(None) if unfinished && !there.is_empty() => Ok(Removal {
                 manifest_sha256: String::new(),
-                training_key: String::new(),
+                task_key: String::new(),
                 objects: keys,
             }),
             Ok(None) => {
@@ -213,29 +179,14 @@ impl Models {
         }
     }
 
-    fn note_of(&self, bytes: &[u8]) -> Option<Note> {
-        // A torn note is written again, because nothing is deleted before the note is complete.
-        serde_json::from_slice(bytes).ok()
-    }
-
-    /// Returns whether the current manifest lists an object, because the same training was run
-    /// again in the meantime.
-    async fn named(&self, name: &str, key: &str) -> Result<bool, StorageError> {
-        match self.look(name).await {
-            Ok(manifest) => Ok(manifest.is_some_and(|m| m.objects.iter().any(|o| o.key == key))),
-            Err(StorageError::Damaged { .. }) => Ok(true),
-            Err(error) => Err(error),
-        }
-    }
-
     /// Deletes the evaluations, checkpoints and speed of the removed model.
     async fn remove_records(
         &self,
         name: &str,
-        note: &Note,
+        note: &Removal,
         removed: &mut Removed,
     ) -> Result<(), StorageError> {
-        let all = note.training_key.is_empty();
+        let all = note.task_key.is_empty();
         // If the same training was run again, it has the same evaluations and speed.
         if self
             .look(name)
@@ -264,7 +215,7 @@ impl Models {
             }
         }
         for checkpoint in self.checkpoints(name).await? {
-            if all || checkpoint.training_key == note.training_key {
+            if all || checkpoint.training_key == note.task_key {
                 for object in &checkpoint.objects {
                     self.remove_one(&object.location, removed).await?;
                 }

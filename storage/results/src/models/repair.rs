@@ -4,11 +4,11 @@
 
 use bytes::Bytes;
 
-use super::{MANIFEST, ModelManifest, Models};
+use super::{ModelManifest, Models};
 use picofarm_store::StorageError;
 use picofarm_store::objects;
 use picofarm_store::sealed::{ObjectEntry, sha256_hex};
-use picofarm_store::{Fault, Problem};
+use picofarm_store::{Fault, Problem, RecordKind};
 
 /// The result of repairing a model.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -46,7 +46,8 @@ impl Models {
                 match self.find_bytes(name, object, made).await? {
                     Some(bytes) => {
                         if !dry {
-                            self.replace(&self.path(name, &object.key), bytes).await?;
+                            let path = self.path(name, &object.key);
+                            objects::replace(&*self.store, &path, bytes).await?;
                         }
                         done.written.push(problem.object);
                     }
@@ -58,7 +59,7 @@ impl Models {
                 .object
                 .strip_prefix(&format!("{}/", self.place(name)));
             match (key, &problem.fault) {
-                (Some(key), Fault::BadRecord(_)) if !key.starts_with("sweeps/") => {
+                (Some(key), Fault::BadRecord { kind, .. }) if *kind == RecordKind::Model => {
                     if !dry {
                         self.delete(&self.path(name, key)).await?;
                     }
@@ -98,38 +99,5 @@ impl Models {
             }
         }
         Ok(None)
-    }
-
-    /// Overwrites an object with one atomic put, and reads it back.
-    pub(super) async fn replace(
-        &self,
-        path: &object_store::path::Path,
-        bytes: Bytes,
-    ) -> Result<(), StorageError> {
-        objects::overwrite(&*self.store, path, bytes.clone()).await?;
-        match objects::get(&*self.store, path).await? {
-            Some(stored) if stored == bytes => Ok(()),
-            _ => Err(StorageError::Damaged {
-                object: self.shown(path),
-                what: "it was written again, but does not read back as written; check the store"
-                    .into(),
-            }),
-        }
-    }
-
-    /// Restores the broken objects of a model with an existing manifest equal to `ours`.
-    pub(super) async fn restore(
-        &self,
-        ours: &ModelManifest,
-        bytes: &[Bytes],
-    ) -> Result<(), StorageError> {
-        debug_assert!(ours.objects.iter().all(|o| o.key != MANIFEST));
-        for (object, bytes) in ours.objects.iter().zip(bytes) {
-            let path = self.path(&ours.name, &object.key);
-            if objects::get(&*self.store, &path).await?.as_ref() != Some(bytes) {
-                self.replace(&path, bytes.clone()).await?;
-            }
-        }
-        Ok(())
     }
 }

@@ -13,8 +13,7 @@ use super::{
 use crate::checkpoints;
 use picofarm_store::StorageError;
 use picofarm_store::objects;
-use picofarm_store::sealed::sha256_hex;
-use picofarm_store::{Fault, Problem};
+use picofarm_store::{Fault, Problem, RecordKind, VerifyMode};
 
 /// The result of checking a model.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -59,40 +58,18 @@ impl Models {
             self.manifest(name).await?;
         }
         let mut check = ModelCheck::default();
-        match self.look(name).await {
-            Ok(manifest) => check.manifest = manifest,
-            Err(StorageError::Damaged { object, what }) => check.problems.push(Problem {
-                object,
-                scene: None,
-                fault: Fault::BadManifest(what),
-            }),
-            Err(error) => return Err(error),
-        }
-        let manifest = check.manifest.clone();
-        for object in manifest.iter().flat_map(|m| &m.objects) {
-            let path = self.path(name, &object.key);
-            check.objects += 1;
-            check.bytes += object.size;
-            let fault = match objects::get(&*self.store, &path).await? {
-                None => Fault::Missing,
-                Some(bytes) if bytes.len() as u64 != object.size => Fault::WrongSize {
-                    expected: object.size,
-                    found: bytes.len() as u64,
-                },
-                Some(bytes) => match sha256_hex(&bytes) {
-                    found if found == object.sha256 => continue,
-                    found => Fault::WrongHash {
-                        expected: object.sha256.clone(),
-                        found,
-                    },
-                },
-            };
-            check.problems.push(Problem {
-                object: self.shown(&path),
-                scene: None,
-                fault,
-            });
-        }
+        let id = name.to_owned();
+        let objects = self
+            .published
+            .verify_one(&id, VerifyMode::Full, &())
+            .await?;
+        (check.objects, check.bytes) = (objects.objects, objects.bytes);
+        check.problems = objects.problems;
+        check.manifest = match self.look(name).await {
+            // The problem is in the report already.
+            Err(StorageError::Damaged { .. }) => None,
+            found => found?,
+        };
         let all: BTreeSet<Path> = there.iter().map(|object| object.location.clone()).collect();
         for object in &there {
             if let Some(key) = key_below(&folder, &object.location) {
@@ -113,7 +90,11 @@ impl Models {
         check: &mut ModelCheck,
     ) -> Result<(), StorageError> {
         let at = self.shown(&object.location);
-        let bad = |what: &str| Some(Fault::BadRecord(what.to_owned()));
+        let bad_record = |kind, why: &str| {
+            let why = why.to_owned();
+            Some(Fault::BadRecord { kind, why })
+        };
+        let bad = |why: &str| bad_record(RecordKind::Model, why);
         let fault = match key.split_once('/') {
             None if key == MANIFEST => None,
             None if key == REMOVING => {
@@ -136,7 +117,7 @@ impl Models {
                     Err(error) => return Err(error),
                 }
             }
-            Some((checkpoints::FOLDER, _)) => match checkpoints::place(object) {
+            Some((checkpoints::FOLDER, _)) => match checkpoints::parse_key(object) {
                 None => Some(Fault::Foreign),
                 Some((key, step, true)) => {
                     check.checkpoints += 1;
@@ -166,8 +147,12 @@ impl Models {
                     true => serde_json::from_slice::<TrialRecord>(&bytes).map(drop),
                     false => serde_json::from_slice::<Rung>(&bytes).map(drop),
                 };
-                said.err()
-                    .and_then(|e| bad(&format!("is not what a trial says of itself: {e}")))
+                said.err().and_then(|e| {
+                    bad_record(
+                        RecordKind::Trial,
+                        &format!("is not the record of a trial: {e}"),
+                    )
+                })
             }
             Some(_) if object_folder(key).is_some() => {
                 let manifest = check.manifest.as_ref();
@@ -190,5 +175,8 @@ impl Models {
 /// Returns a fault if an evaluation is stored under the name or key of another.
 fn misplaced(found: &Evaluation, name: &str, key: &str) -> Option<Fault> {
     let here = found.key == key && found.model == name;
-    (!here).then(|| Fault::BadRecord(format!("is that of {:?}, key {}", found.model, found.key)))
+    (!here).then(|| Fault::BadRecord {
+        kind: RecordKind::Model,
+        why: format!("is that of {:?}, key {}", found.model, found.key),
+    })
 }

@@ -2,14 +2,15 @@
 
 use serde_json::{Value, json};
 
-use super::PredictionSpec;
+use super::{PredictionManifest, PredictionSpec};
 use picofarm_dataset::ChunkCodec;
 use picofarm_dataset::Element;
 use picofarm_dataset::image_codecs;
+use picofarm_store::sealed::ObjectEntry;
 
 /// An array with one object per scene.
 #[derive(Debug)]
-pub(super) struct Plate {
+pub(super) struct PredictedArray {
     pub name: &'static str,
     element: Element,
     /// Shape of one scene, without the scene axis.
@@ -21,17 +22,23 @@ pub(super) struct Plate {
 }
 
 /// Returns the arrays of such predictions, in the order of their objects in a manifest.
-pub(super) fn plates(spec: &PredictionSpec) -> Vec<Plate> {
+pub(super) fn arrays(spec: &PredictionSpec) -> Vec<PredictedArray> {
     let (h, w, n) = (
         u64::from(spec.height),
         u64::from(spec.width),
         spec.spots.len() as u64,
     );
     const IMAGE: &[&str] = &["scene", "row", "column"];
-    let mut plates = Vec::new();
+    let mut arrays = Vec::new();
     if spec.depth {
         let a = json!({"long_name": "z-depth; NaN where nothing is predicted", "units": "m"});
-        plates.push(Plate::new("depth", Element::F32, vec![h, w], IMAGE, a));
+        arrays.push(PredictedArray::new(
+            "depth",
+            Element::F32,
+            vec![h, w],
+            IMAGE,
+            a,
+        ));
     }
     if n > 0 {
         let a = json!({
@@ -41,19 +48,31 @@ pub(super) fn plates(spec: &PredictionSpec) -> Vec<Plate> {
             "scale_factor": 1.0 / 255.0,
         });
         let dimensions = &["scene", "spot", "row", "column"];
-        plates.push(Plate::new("lit", Element::U8, vec![n, h, w], dimensions, a));
+        arrays.push(PredictedArray::new(
+            "lit",
+            Element::U8,
+            vec![n, h, w],
+            dimensions,
+            a,
+        ));
     }
     if spec.specular {
         let a = json!({
             "long_name": "probability that the first surface is a mirror, times 255",
             "scale_factor": 1.0 / 255.0,
         });
-        plates.push(Plate::new("specular", Element::U8, vec![h, w], IMAGE, a));
+        arrays.push(PredictedArray::new(
+            "specular",
+            Element::U8,
+            vec![h, w],
+            IMAGE,
+            a,
+        ));
     }
-    plates
+    arrays
 }
 
-impl Plate {
+impl PredictedArray {
     fn new(
         name: &'static str,
         element: Element,
@@ -79,6 +98,12 @@ impl Plate {
     /// Returns the key of a scene's object, relative to the group.
     pub fn key(&self, scene: u64) -> String {
         format!("{}/c/{scene}{}", self.name, "/0".repeat(self.shape.len()))
+    }
+
+    /// Returns the entry of a scene's object in a manifest.
+    pub fn entry<'a>(&self, manifest: &'a PredictionManifest) -> Option<&'a ObjectEntry> {
+        let key = self.key(manifest.scene);
+        manifest.objects.iter().find(|object| object.key == key)
     }
 
     /// Returns the size of a scene's values in bytes.

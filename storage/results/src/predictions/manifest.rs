@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use picofarm_store::StorageError;
-use picofarm_store::sealed::{ObjectEntry, read_sealed, sha256_hex};
+use picofarm_store::published::Manifest;
+use picofarm_store::sealed::{ObjectEntry, document, read_sealed, same_scene};
 
 /// Format version of groups of predictions and of their manifests.
 pub(super) const FORMAT: u32 = 1;
@@ -38,7 +39,7 @@ pub struct PredictionManifest {
     pub agreement: Value,
     /// Its objects. Set on encoding.
     pub objects: Vec<ObjectEntry>,
-    /// Checksum of the other fields, from `layout::manifest::seal`.
+    /// Checksum of the other fields, from `picofarm_store::sealed::seal`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }
@@ -81,35 +82,38 @@ pub enum TimesUsed {
 impl PredictionManifest {
     pub(super) fn sealed(mut self) -> Self {
         self.checksum = None;
-        self.checksum = Some(sha256_hex(&self.to_bytes()));
+        self.checksum = Some(self.sha256());
         self
     }
+}
 
-    /// Returns the total size of all objects in bytes.
-    pub fn total_bytes(&self) -> u64 {
-        self.objects.iter().map(|o| o.size).sum()
-    }
+impl Manifest for PredictionManifest {
+    type Id = u64;
 
-    /// Returns the SHA-256 of its stored bytes, in hexadecimal.
-    pub fn sha256(&self) -> String {
-        sha256_hex(&self.to_bytes())
-    }
-
-    /// Returns the bytes to store.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = serde_json::to_vec_pretty(self).expect("a manifest has only string keys");
-        bytes.push(b'\n');
-        bytes
-    }
-
-    pub(super) fn parse(bytes: &[u8], scene: u64, object: &str) -> Result<Self, StorageError> {
+    fn parse(bytes: &[u8], scene: &u64, object: &str) -> Result<Self, StorageError> {
         let manifest: Self = read_sealed(bytes, "a manifest of predictions", FORMAT, object)?;
-        if manifest.scene != scene {
-            return Err(StorageError::Damaged {
-                object: object.to_owned(),
-                what: format!("holds scene {}, not {scene}", manifest.scene),
-            });
-        }
+        same_scene(manifest.scene, *scene, object)?;
         Ok(manifest)
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        document(self)
+    }
+
+    fn objects(&self) -> &[ObjectEntry] {
+        &self.objects
+    }
+
+    fn task_key(&self) -> &str {
+        &self.task_key
+    }
+
+    fn taken(&self, place: &str, task_key: &str) -> StorageError {
+        let what = format!(
+            "{place} holds what other models predict of scene {}, or of another form of it (task key {}, this task's is \
+             {task_key}); choose another folder",
+            self.scene, self.task_key
+        );
+        StorageError::invalid("output.dataset", what)
     }
 }

@@ -1,20 +1,13 @@
 //! Checks predictions: metadata, manifests, and the existence and content of each object.
 
-use futures::future::BoxFuture;
-use futures::{FutureExt, StreamExt, TryStreamExt, stream};
+use bytes::Bytes;
 
-use super::{Plate, PredictionManifest, Predictions};
-use picofarm_dataset::METADATA;
-use picofarm_dataset::Manifest;
-use picofarm_dataset::metadata_fault;
-use picofarm_store::StorageError;
-use picofarm_store::objects;
-use picofarm_store::sealed::ObjectEntry;
-use picofarm_store::verify::looked_at;
-use picofarm_store::{Fault, Problem, Verification, VerifyMode, Watch};
-
-/// Number of scenes checked concurrently.
-const SCENES: usize = 4;
+use super::spec::root;
+use super::{PredictionManifest, Predictions};
+use picofarm_dataset::{METADATA, metadata_fault};
+use picofarm_store::published::Examine;
+use picofarm_store::{Fault, ObjectEntry, Problem, Verification, VerifyMode, Watch};
+use picofarm_store::{StorageError, objects};
 
 impl Predictions {
     /// Checks the published predictions. With `complete`, a scene without a manifest is a problem.
@@ -29,12 +22,13 @@ impl Predictions {
         watch: Watch<'_>,
     ) -> Result<Verification, StorageError> {
         let mut report = Verification::default();
-        let arrays = self.plates.iter().map(|plate| {
-            let metadata = plate.metadata(self.spec.scenes);
-            (self.metadata_path(plate), metadata)
+        let arrays = self.arrays.iter().map(|array| {
+            let metadata = array.metadata(self.spec.scenes);
+            (self.metadata_path(array), metadata)
         });
-        for (path, expected) in std::iter::once((self.path(METADATA), self.root())).chain(arrays) {
-            let fault = match objects::get(&*self.store, &path).await? {
+        let root = (self.path(METADATA), root(&self.spec, &self.arrays));
+        for (path, expected) in std::iter::once(root).chain(arrays) {
+            let fault = match objects::get(&**self.published.store(), &path).await? {
                 None => Some(Fault::Missing),
                 Some(bytes) => metadata_fault(&bytes, &expected),
             };
@@ -48,86 +42,38 @@ impl Predictions {
         if complete {
             for scene in (0..self.spec.scenes).filter(|s| present.binary_search(s).is_err()) {
                 report.problems.push(Problem {
-                    object: self.shown(&self.path(&Manifest::key(scene))),
+                    object: self.shown(&self.published.manifest_path(&scene)),
                     scene: Some(scene),
                     fault: Fault::Missing,
                 });
             }
         }
-        let look = |scene: u64| -> BoxFuture<'_, Result<Verification, StorageError>> {
-            self.verify_scene(scene, mode).boxed()
-        };
-        let looks = present.iter().map(|scene| look(*scene));
-        let mut checks = stream::iter(looks).buffered(SCENES);
-        while let Some(found) = checks.try_next().await? {
-            report.scenes += 1;
-            report.objects += found.objects;
-            report.bytes += found.bytes;
-            report.problems.extend(found.problems);
-            watch(report.scenes, present.len() as u64);
-        }
-        drop(checks);
+        let checked = self.published.verify(mode, self, watch).await?;
+        report.problems.extend(checked.problems);
         report.problems.sort_by(|a, b| a.object.cmp(&b.object));
-        Ok(report)
-    }
-
-    async fn verify_scene(
-        &self,
-        scene: u64,
-        mode: VerifyMode,
-    ) -> Result<Verification, StorageError> {
-        let mut report = Verification::default();
-        let problem = |object: String, fault| Problem {
-            object,
-            scene: Some(scene),
-            fault,
-        };
-        let at = self.shown(&self.path(&Manifest::key(scene)));
-        let manifest = match self.manifest(scene).await {
-            Ok(manifest) => manifest,
-            Err(StorageError::Damaged { object, what }) => {
-                let fault = Fault::BadManifest(what);
-                report.problems.push(problem(object, fault));
-                return Ok(report);
-            }
-            Err(error) => return Err(error),
-        };
-        for plate in self.plates.iter() {
-            let Some(entry) = entry(&manifest, plate) else {
-                let what = format!("names no object of {}", plate.name);
-                report
-                    .problems
-                    .push(problem(at.clone(), Fault::BadManifest(what)));
-                continue;
-            };
-            report.objects += 1;
-            report.bytes += entry.size;
-            if let Some(fault) = self.object_fault(entry, plate, mode).await? {
-                let object = self.shown(&self.path(&entry.key));
-                report.problems.push(problem(object, fault));
-            }
-        }
-        Ok(report)
-    }
-
-    async fn object_fault(
-        &self,
-        entry: &ObjectEntry,
-        plate: &Plate,
-        mode: VerifyMode,
-    ) -> Result<Option<Fault>, StorageError> {
-        let path = self.path(&entry.key);
-        let bytes = match looked_at(&*self.store, &path, entry, mode).await? {
-            Err(fault) => return Ok(Some(fault)),
-            Ok(None) => return Ok(None),
-            Ok(Some(bytes)) => bytes,
-        };
-        let decoded = plate.codec.decode(&bytes);
-        Ok(decoded.err().map(|e| Fault::Undecodable(e.to_string())))
+        Ok(Verification {
+            problems: report.problems,
+            ..checked
+        })
     }
 }
 
-fn entry<'a>(manifest: &'a PredictionManifest, plate: &Plate) -> Option<&'a ObjectEntry> {
-    let key = plate.key(manifest.scene);
-    manifest.objects.iter().find(|object| object.key == key)
+impl Examine<PredictionManifest> for Predictions {
+    fn manifest(&self, manifest: &PredictionManifest) -> Option<String> {
+        let mut arrays = self.arrays.iter();
+        let unnamed = arrays.find(|array| array.entry(manifest).is_none())?;
+        Some(format!("names no object of {}", unnamed.name))
+    }
+
+    fn object(
+        &self,
+        manifest: &PredictionManifest,
+        entry: &ObjectEntry,
+        bytes: Option<&Bytes>,
+    ) -> Option<Fault> {
+        let mut arrays = self.arrays.iter();
+        let array = arrays.find(|array| array.key(manifest.scene) == entry.key)?;
+        let decoded = array.codec.decode(bytes?);
+        decoded.err().map(|e| Fault::Undecodable(e.to_string()))
+    }
 }

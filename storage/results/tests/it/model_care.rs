@@ -18,6 +18,7 @@ use common::tricky::{Moment, Tricky};
 use futures::{FutureExt, TryStreamExt};
 use object_store::{ObjectStore, ObjectStoreExt, memory::InMemory, path::Path};
 use picofarm_results::*;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::*;
 use serde_json::json;
 

@@ -10,6 +10,7 @@ use bytes::Bytes;
 use object_store::{ObjectStore, memory::InMemory, path::Path};
 use picofarm_dataset::*;
 use picofarm_results::*;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::*;
 use proptest::prelude::*;
 use serde_json::json;

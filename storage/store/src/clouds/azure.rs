@@ -4,15 +4,18 @@
 use object_store::ClientConfigKey;
 use object_store::azure::{AzureConfigKey, MicrosoftAzure, MicrosoftAzureBuilder};
 
+use super::bucket_url::BucketUrl;
 use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, retries};
-use super::place::Place;
 use crate::error::StorageError;
 
 /// Returns a client of the container, without sending a request.
 ///
 /// # Errors
 /// [`StorageError::StoreSettings`] names the variable; values are not repeated.
-pub(super) fn connect(place: &Place, settings: &Settings) -> Result<MicrosoftAzure, StorageError> {
+pub(super) fn connect(
+    place: &BucketUrl,
+    settings: &Settings,
+) -> Result<MicrosoftAzure, StorageError> {
     choose_cryptography();
     check(place, settings)?;
     let client = AzureConfigKey::Client;
@@ -38,7 +41,7 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<MicrosoftAzu
 }
 
 /// Checks for errors that would otherwise occur late, with messages that name no variable.
-fn check(place: &Place, settings: &Settings) -> Result<(), StorageError> {
+fn check(place: &BucketUrl, settings: &Settings) -> Result<(), StorageError> {
     let wrong = |what: &str| Err(place.settings_error(what));
     if let Some(name) = settings.first(&["AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT"]) {
         settings.check_server(place, name, "https://account.blob.core.windows.net")?;
@@ -70,9 +73,9 @@ mod tests {
     const ACCOUNT: (&str, &str) = ("AZURE_STORAGE_ACCOUNT_NAME", "lidar");
 
     fn connected(variables: &[(&str, &str)]) -> Result<MicrosoftAzure, StorageError> {
-        let place = Place::parse("az://lab/sets").unwrap().unwrap();
+        let place = BucketUrl::parse("az://lab/sets").unwrap().unwrap();
         let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
-        connect(&place, &Settings::of(&place, variables))
+        connect(&place, &Settings::new(&place, variables))
     }
 
     #[test]

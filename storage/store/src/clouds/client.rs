@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use object_store::{BackoffConfig, RetryConfig};
 
-use super::place::Place;
+use super::bucket_url::BucketUrl;
 use crate::error::StorageError;
 
 /// Number of concurrent requests of one opened store.
@@ -44,7 +44,10 @@ pub(super) fn retries() -> RetryConfig {
 pub(super) struct Settings(BTreeMap<String, String>);
 
 impl Settings {
-    pub(super) fn of(place: &Place, variables: impl Iterator<Item = (String, String)>) -> Self {
+    pub(super) fn new(
+        place: &BucketUrl,
+        variables: impl Iterator<Item = (String, String)>,
+    ) -> Self {
         let start = place.service.variables();
         Self(
             variables
@@ -88,7 +91,7 @@ impl Settings {
     /// HTTP.
     pub(super) fn check_server(
         &self,
-        place: &Place,
+        place: &BucketUrl,
         name: &str,
         example: &str,
     ) -> Result<(), StorageError> {

@@ -230,7 +230,7 @@ mod tests {
             store: "S3",
             source: words.into(),
         };
-        let failure = Failure::of(&error, Some(Service::S3));
+        let failure = Failure::describe(&error, Some(Service::S3));
         assert_eq!(
             failure.account,
             "http://127.0.0.1:9 answered 400 InvalidToken: The token is malformed."

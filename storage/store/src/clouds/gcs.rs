@@ -6,8 +6,8 @@ use std::fs::File;
 use object_store::ClientConfigKey;
 use object_store::gcp::{GoogleCloudStorage, GoogleCloudStorageBuilder, GoogleConfigKey};
 
+use super::bucket_url::BucketUrl;
 use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, retries};
-use super::place::Place;
 use crate::error::StorageError;
 
 /// Variables with the path of a credentials file.
@@ -22,7 +22,7 @@ const FILES: [&str; 3] = [
 /// # Errors
 /// [`StorageError::StoreSettings`] names the variable; values are not repeated.
 pub(super) fn connect(
-    place: &Place,
+    place: &BucketUrl,
     settings: &Settings,
 ) -> Result<GoogleCloudStorage, StorageError> {
     choose_cryptography();
@@ -74,9 +74,9 @@ mod tests {
     use super::*;
 
     fn connected(variables: &[(&str, &str)]) -> Result<GoogleCloudStorage, StorageError> {
-        let place = Place::parse("gs://lab/sets").unwrap().unwrap();
+        let place = BucketUrl::parse("gs://lab/sets").unwrap().unwrap();
         let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
-        connect(&place, &Settings::of(&place, variables))
+        connect(&place, &Settings::new(&place, variables))
     }
 
     #[test]

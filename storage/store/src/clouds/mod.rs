@@ -12,7 +12,7 @@ use std::sync::Arc;
 use object_store::ObjectStore;
 use object_store::limit::LimitStore;
 
-use super::place::{self, Place};
+use super::bucket_url::{self, BucketUrl};
 use super::service::Service;
 use super::steady::Steady;
 use crate::error::StorageError;
@@ -25,10 +25,10 @@ use limited::Limited;
 ///
 /// # Errors
 /// [`StorageError::StoreSettings`] names a missing or unusable variable.
-pub(super) fn connect(place: &Place) -> Result<Arc<dyn ObjectStore>, StorageError> {
+pub(super) fn connect(place: &BucketUrl) -> Result<Arc<dyn ObjectStore>, StorageError> {
     let variables = std::env::vars_os()
         .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
-    let settings = Settings::of(place, variables);
+    let settings = Settings::new(place, variables);
     Ok(match place.service {
         Service::S3 => shared(s3::connect(place, &settings)?),
         Service::Gcs => shared(gcs::connect(place, &settings)?),
@@ -56,7 +56,7 @@ impl Service {
     }
 }
 
-impl Place {
+impl BucketUrl {
     /// Returns an error for missing or wrong variables.
     pub(super) fn settings_error(&self, what: impl Into<String>) -> StorageError {
         StorageError::StoreSettings {

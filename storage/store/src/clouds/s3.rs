@@ -4,15 +4,15 @@
 use object_store::ClientConfigKey;
 use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, Checksum, S3ConditionalPut};
 
+use super::bucket_url::BucketUrl;
 use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, retries};
-use super::place::Place;
 use crate::error::StorageError;
 
 /// Returns a client of the bucket, without sending a request.
 ///
 /// # Errors
 /// [`StorageError::StoreSettings`] names the variable; values are not repeated.
-pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, StorageError> {
+pub(super) fn connect(place: &BucketUrl, settings: &Settings) -> Result<AmazonS3, StorageError> {
     choose_cryptography();
     check(place, settings)?;
     let client = AmazonS3ConfigKey::Client;
@@ -43,7 +43,7 @@ pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, St
 }
 
 /// Checks for errors that would otherwise occur late, with messages that name no variable.
-fn check(place: &Place, settings: &Settings) -> Result<(), StorageError> {
+fn check(place: &BucketUrl, settings: &Settings) -> Result<(), StorageError> {
     let wrong = |what: &str| Err(place.settings_error(what));
     let endpoint = settings.first(&["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"]);
     if let Some(name) = endpoint {
@@ -95,13 +95,13 @@ mod tests {
 
     const SECRET: &str = "Very/Secret+Key";
 
-    fn place() -> Place {
-        Place::parse("s3://lab/sets").unwrap().unwrap()
+    fn place() -> BucketUrl {
+        BucketUrl::parse("s3://lab/sets").unwrap().unwrap()
     }
 
     fn connected(variables: &[(&str, &str)]) -> Result<AmazonS3, StorageError> {
         let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
-        connect(&place(), &Settings::of(&place(), variables))
+        connect(&place(), &Settings::new(&place(), variables))
     }
 
     fn error(variables: &[(&str, &str)]) -> String {

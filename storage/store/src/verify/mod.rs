@@ -3,5 +3,5 @@
 pub(crate) mod object;
 pub(crate) mod report;
 
-pub use object::{intact, looked_at};
-pub use report::{Fault, Problem, Verification, VerifyMode, Watch};
+pub use object::{inspect, read_intact};
+pub use report::{Fault, Problem, RecordKind, Remedy, Verification, VerifyMode, Watch};

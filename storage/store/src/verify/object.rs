@@ -14,7 +14,7 @@ use crate::sealed::{ObjectEntry, sha256_hex};
 ///
 /// # Errors
 /// [`StorageError::Store`].
-pub async fn looked_at(
+pub async fn inspect(
     store: &dyn ObjectStore,
     path: &Path,
     entry: &ObjectEntry,
@@ -47,14 +47,14 @@ pub async fn looked_at(
 ///
 /// # Errors
 /// [`StorageError::Damaged`] if it is missing or differs; [`StorageError::Store`].
-pub async fn intact(
+pub async fn read_intact(
     store: &dyn ObjectStore,
     path: &Path,
     entry: &ObjectEntry,
 ) -> Result<Bytes, StorageError> {
     let mut rereads = Rereads::new(store);
     loop {
-        let read = intact_once(store, path, entry).await;
+        let read = read_intact_once(store, path, entry).await;
         match rereads.pause(&read) {
             None => return read,
             Some(pause) => tokio::time::sleep(pause).await,
@@ -62,17 +62,17 @@ pub async fn intact(
     }
 }
 
-async fn intact_once(
+async fn read_intact_once(
     store: &dyn ObjectStore,
     path: &Path,
     entry: &ObjectEntry,
 ) -> Result<Bytes, StorageError> {
     let bytes = objects::require(store, path).await?;
-    match sha256_hex(&bytes) == entry.sha256 {
-        true => Ok(bytes),
-        false => Err(StorageError::Damaged {
-            object: objects::shown(store, path),
-            what: "its SHA-256 is not the manifest's".into(),
-        }),
-    }
+    let what = match bytes.len() as u64 {
+        size if size != entry.size => format!("expected {} bytes, found {size}", entry.size),
+        _ if sha256_hex(&bytes) == entry.sha256 => return Ok(bytes),
+        _ => "its SHA-256 is not the manifest's".into(),
+    };
+    let object = objects::shown(store, path);
+    Err(StorageError::Damaged { object, what })
 }

@@ -39,10 +39,35 @@ pub enum Fault {
     BadMetadata(String),
     /// The manifest is unusable for this reason.
     BadManifest(String),
-    /// A snapshot or recipe is unusable for this reason.
-    BadRecord(String),
+    /// A record is unusable.
+    BadRecord {
+        /// What it belongs to.
+        kind: RecordKind,
+        /// The reason.
+        why: String,
+    },
     /// The key does not belong to this data set.
     Foreign,
+}
+
+/// What a record belongs to, which decides how it is made again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RecordKind {
+    /// A data set's snapshot, recipe or split.
+    Dataset,
+    /// A model's evaluation, checkpoint or speed: the job that made it makes it again.
+    Model,
+    /// A trial of a sweep: its sweep makes it again.
+    Trial,
+}
+
+/// What to do about a problem.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Remedy {
+    /// The instruction for people.
+    pub text: &'static str,
+    /// Whether `picofarm dataset repair` follows it.
+    pub by_repair: bool,
 }
 
 /// An object with a fault.
@@ -92,7 +117,7 @@ impl Fault {
             Self::Undecodable(_) => "undecodable",
             Self::BadMetadata(_) => "bad_metadata",
             Self::BadManifest(_) => "bad_manifest",
-            Self::BadRecord(_) => "bad_record",
+            Self::BadRecord { .. } => "bad_record",
             Self::Foreign => "foreign",
         }
     }
@@ -111,28 +136,31 @@ impl fmt::Display for Fault {
             Self::Undecodable(why) => write!(f, "does not decode: {why}"),
             Self::BadMetadata(why) => write!(f, "unusable metadata: {why}"),
             Self::BadManifest(why) => write!(f, "unusable manifest: {why}"),
-            Self::BadRecord(why) => write!(f, "unusable: {why}"),
+            Self::BadRecord { why, .. } => write!(f, "unusable: {why}"),
             Self::Foreign => write!(f, "does not belong to this data set"),
         }
     }
 }
 
 impl Problem {
-    /// Whether `dataset repair` puts it right.
-    pub fn repairable(&self) -> bool {
-        !matches!(self.fault, Fault::Foreign | Fault::BadRecord(_))
-    }
-
-    /// How it is repaired.
-    pub fn hint(&self) -> &'static str {
-        match (&self.fault, self.scene) {
-            (Fault::Foreign, _) => "move it elsewhere; nothing reads it, nothing here deletes it",
-            (Fault::BadRecord(_), _) => {
-                "nothing depends on it; delete it, and make it anew if it is wanted"
-            }
-            (_, Some(_)) => "dataset repair makes the scene again and replaces what is broken",
-            (_, None) => "dataset repair writes it again",
-        }
+    /// Returns what to do about it, in a data set.
+    pub fn remedy(&self) -> Remedy {
+        let (text, by_repair) = match (&self.fault, self.scene) {
+            (Fault::Foreign, _) => (
+                "move it elsewhere; nothing reads it, nothing here deletes it",
+                false,
+            ),
+            (Fault::BadRecord { .. }, _) => (
+                "nothing depends on it; delete it, and make it anew if it is wanted",
+                false,
+            ),
+            (_, Some(_)) => (
+                "dataset repair makes the scene again and replaces what is broken",
+                true,
+            ),
+            (_, None) => ("dataset repair writes it again", true),
+        };
+        Remedy { text, by_repair }
     }
 }
 

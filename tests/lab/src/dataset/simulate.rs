@@ -13,6 +13,7 @@ use picofarm_dataset::{
     Wavelength,
 };
 use picofarm_store::open_store;
+use picofarm_store::published::Manifest as _;
 
 use picofarm_cli::{
     commands::dataset::failed,

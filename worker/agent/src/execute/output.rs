@@ -17,6 +17,7 @@ use picofarm_proto::{
 use picofarm_results::Verdict;
 use picofarm_scene::Scene;
 use picofarm_session::{Backoff, memory_mib, random};
+use picofarm_store::published::Manifest as _;
 use picofarm_store::{
     PROBE_WITHIN, StorageError, check_identity, check_own_folder, expect_identity, open_store,
     probe,

@@ -11,6 +11,7 @@ use picofarm_dataset::{Dataset, Quantity};
 use picofarm_proto::model::{StageSpec, TaskSpec};
 use picofarm_results::{Predicted, PredictionManifest, Predictions, TimesUsed};
 use picofarm_store::open_store;
+use picofarm_store::published::Manifest as _;
 use serde_json::{Value, json};
 
 use place::*;

@@ -22,6 +22,7 @@ use picofarm_proto::{
 };
 use picofarm_scene::{export, primitive};
 use picofarm_settings::Spots;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::{VerifyMode, identify_store, open_store};
 use sha2::{Digest, Sha256};
 use tempfile::TempDir;

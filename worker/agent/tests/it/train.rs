@@ -2,6 +2,7 @@
 //! for unsuitable inputs. The data are synthetic: nothing is rendered.
 
 use crate::place;
+use picofarm_store::published::Manifest as _;
 
 use std::{path::Path, sync::Arc};
 

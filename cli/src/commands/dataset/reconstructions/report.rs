@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_results::{ReconstructionManifest, Reconstructions, Verdict};
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use serde::Serialize;
 use serde_json::{Value, json};
 

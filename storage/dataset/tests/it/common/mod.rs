@@ -6,6 +6,7 @@
 )]
 
 mod scene;
+#[path = "../../../../store/tests/it/tricky.rs"]
 pub mod tricky;
 
 pub use scene::*;

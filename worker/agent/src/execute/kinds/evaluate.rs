@@ -15,6 +15,7 @@ use picofarm_proto::{
 };
 use picofarm_results::{Evaluation, Models, ShardName, SplitUsed, Verdict};
 use picofarm_sensor::Sensor;
+use picofarm_store::published::Manifest as _;
 use picofarm_store::sha256_hex;
 use serde::{Deserialize, Serialize};
 use serde_json::json;

@@ -13,6 +13,7 @@ use picofarm_exchange::import::{
 use picofarm_files::{FileError, Opener};
 use picofarm_proto::model::{ImportSettings, ImportTask, SpecError, TaskSpec};
 use picofarm_results::Verdict;
+use picofarm_store::published::Manifest as _;
 use tracing::info;
 
 use crate::execute::{

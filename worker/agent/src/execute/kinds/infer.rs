@@ -18,6 +18,7 @@ use picofarm_model::{
 use picofarm_proto::model::{InferTask, TaskSpec};
 use picofarm_results::{Models, Predicted, PredictionManifest, Predictions, Verdict};
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use tracing::{info, warn};
 
 mod agreement;

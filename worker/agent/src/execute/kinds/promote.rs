@@ -4,6 +4,7 @@
 use picofarm_model::metric::Metrics;
 use picofarm_proto::model::PromoteTask;
 use picofarm_results::{ModelManifest, NewModel, Promoted, TrialRecord};
+use picofarm_store::published::Manifest as _;
 use tracing::info;
 
 use crate::execute::{

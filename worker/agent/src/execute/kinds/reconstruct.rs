@@ -31,6 +31,7 @@ use picofarm_reconstruct::{
 };
 use picofarm_results::{ReconstructionManifest, Reconstructions, SceneUsed, Verdict};
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 use tracing::{info, warn};

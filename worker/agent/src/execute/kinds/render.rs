@@ -12,6 +12,7 @@ use picofarm_proto::{
     trace,
 };
 use picofarm_scene::{Camera, Scene};
+use picofarm_store::published::Manifest as _;
 use picofarm_transient::{Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
 use tracing::{debug_span, info, warn};

@@ -20,6 +20,7 @@ use picofarm_results::{
     Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports, TrainingSpeed,
 };
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use serde_json::Value;
 use tokio::runtime::Handle;
 use tracing::warn;

@@ -21,6 +21,7 @@ use picofarm_sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use serde_json::json;
 use tokio::runtime::Handle;
 use tracing::debug_span;

@@ -28,10 +28,11 @@ use picofarm_proto::{
     },
 };
 use picofarm_results::{
-    Lineage, Measurement, ModelManifest, Models, NewModel, Published, TrainingSpeed, TrialEnd,
+    Lineage, Measurement, ModelManifest, Models, NewModel, PublishedModel, TrainingSpeed, TrialEnd,
 };
 use picofarm_sensor::SENSOR_VERSION;
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use tracing::{debug, info, warn};
 
 mod along;
@@ -247,12 +248,12 @@ impl<'a> TrainingRun<'a> {
         force: bool,
         course: Option<&Course<'_>>,
         control: &Control,
-    ) -> Result<Result<Published, Left>, TaskError> {
+    ) -> Result<Result<PublishedModel, Left>, TaskError> {
         let (models, name, key) = (&self.models, &self.task.train.model, &self.key);
         if !force && let Some(manifest) = finished(stores, models, name, key, control)? {
             // The worker that published it may have died before it deleted the checkpoints.
             stores.wait(control, models.delete_checkpoints(name, key))?;
-            return Ok(Ok(Published {
+            return Ok(Ok(PublishedModel {
                 manifest,
                 adopted: true,
             }));
@@ -272,7 +273,7 @@ impl<'a> TrainingRun<'a> {
                 let there = finished(stores, models, name, key, control)?;
                 let missing = "the process that led the training says that the model is kept, but it is not there";
                 return match there {
-                    Some(manifest) => Ok(Ok(Published {
+                    Some(manifest) => Ok(Ok(PublishedModel {
                         manifest,
                         adopted: true,
                     })),

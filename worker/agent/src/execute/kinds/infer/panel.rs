@@ -15,6 +15,7 @@ use picofarm_results::{
     ModelUsed, Models, PinnedDepths, PredictionManifest, PredictionSpec, Predictions, SceneUsed,
     TimesUsed,
 };
+use picofarm_store::published::Manifest as _;
 
 use crate::execute::{
     Control, TaskError,

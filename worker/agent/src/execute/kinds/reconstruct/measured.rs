@@ -9,6 +9,7 @@ use picofarm_reconstruct::{
 use picofarm_results::{Predictions, SceneUsed};
 use picofarm_scene::{Intrinsics, Vec3};
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use serde_json::json;
 
 use super::{

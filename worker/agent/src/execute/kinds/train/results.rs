@@ -3,6 +3,7 @@
 use picofarm_dataset::{DatasetSpec, Manifest, Profile};
 use picofarm_model::train::{Line, Trained};
 use picofarm_results::{Measurement, ModelManifest};
+use picofarm_store::published::Manifest as _;
 use serde_json::{Value, json};
 
 use crate::execute::Output;

@@ -5,6 +5,7 @@
 use picofarm_model::{metric::Metrics, train::Line};
 use picofarm_proto::model::{Domain, Trial};
 use picofarm_results::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
+use picofarm_store::published::Manifest as _;
 use serde_json::Value;
 use tracing::info;
 

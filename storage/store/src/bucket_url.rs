@@ -7,20 +7,20 @@ use crate::error::StorageError;
 
 /// A bucket, and a prefix in it.
 #[derive(Debug, PartialEq)]
-pub(super) struct Place {
+pub(super) struct BucketUrl {
     pub service: Service,
     pub bucket: String,
     pub prefix: Path,
 }
 
-impl Place {
+impl BucketUrl {
     /// Parses a URL. Returns `None` if it does not name an object store.
     ///
     /// # Errors
     /// [`StorageError::UnsupportedStore`] if it does, but is invalid. Parts that may be secret are
     /// not repeated.
     pub(super) fn parse(url: &str) -> Result<Option<Self>, StorageError> {
-        let Some((service, rest)) = Service::of(url) else {
+        let Some((service, rest)) = Service::split_url(url) else {
             return Ok(None);
         };
         let scheme = service.scheme();
@@ -91,14 +91,14 @@ mod tests {
             ("gs://farm_2/sets", Service::Gcs, "farm_2", "sets"),
             ("az://lab/sets/deep", Service::Azure, "lab", "sets/deep"),
         ] {
-            let place = Place::parse(url).unwrap().unwrap();
+            let place = BucketUrl::parse(url).unwrap().unwrap();
             assert_eq!(
                 (place.service, &*place.bucket, place.prefix.as_ref()),
                 (service, bucket, prefix)
             );
         }
-        assert_eq!(Place::parse("/local/s3:/x").unwrap(), None);
-        assert_eq!(Place::parse("file:///gs").unwrap(), None);
+        assert_eq!(BucketUrl::parse("/local/s3:/x").unwrap(), None);
+        assert_eq!(BucketUrl::parse("file:///gs").unwrap(), None);
         for url in [
             "s3://",
             "s3:///x",
@@ -109,7 +109,7 @@ mod tests {
             "gs://Farm/x",
             "az://my.lab/x",
         ] {
-            let text = Place::parse(url).unwrap_err().to_string();
+            let text = BucketUrl::parse(url).unwrap_err().to_string();
             assert!(text.contains(url) && text.contains("prefix"), "{text}");
         }
     }
@@ -127,7 +127,7 @@ mod tests {
                 format!("{scheme}://lab?keyid={SECRET}"),
                 format!("{scheme}://lab#keyid={SECRET}"),
             ] {
-                let text = Place::parse(&url).unwrap_err().to_string();
+                let text = BucketUrl::parse(&url).unwrap_err().to_string();
                 assert!(text.contains(variable), "{text}");
                 assert!(
                     !text.contains("keyid") && !text.contains("Secret+Key"),

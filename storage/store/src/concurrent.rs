@@ -12,7 +12,7 @@ use crate::objects;
 pub const CONCURRENCY: usize = 8;
 
 /// Puts objects create-only, some of them concurrently. Existing objects must have equal bytes.
-pub async fn put_all(
+pub async fn create_all(
     store: &dyn ObjectStore,
     objects: &[(Path, Bytes)],
 ) -> Result<(), StorageError> {
@@ -20,13 +20,13 @@ pub async fn put_all(
         let (path, bytes) = (path.clone(), bytes.clone());
         async move { objects::create_or_match(store, &path, bytes).await }
     };
-    all(objects.iter().map(put).collect()).await
+    run_all(objects.iter().map(put).collect()).await
 }
 
 /// Puts objects again that are missing after the manifest was written. A collector may have deleted
 /// an object before the manifest protected it: one left by a killed worker and found equal, or one
 /// that this process wrote before a long pause.
-pub async fn put_again(
+pub async fn create_missing(
     store: &dyn ObjectStore,
     objects: &[(Path, Bytes)],
 ) -> Result<(), StorageError> {
@@ -39,11 +39,11 @@ pub async fn put_again(
             }
         }
     };
-    all(objects.iter().map(again).collect()).await
+    run_all(objects.iter().map(again).collect()).await
 }
 
 /// Awaits all requests, some of them concurrently. Returns the first error at once.
-pub async fn all(
+pub async fn run_all(
     requests: Vec<impl Future<Output = Result<(), StorageError>>>,
 ) -> Result<(), StorageError> {
     let mut results = stream::iter(requests).buffer_unordered(CONCURRENCY);

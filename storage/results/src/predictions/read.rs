@@ -1,0 +1,136 @@
+//! Reads predictions, and pins their bytes for keys of tasks.
+
+use futures::{FutureExt, StreamExt, TryStreamExt, stream};
+use sha2::{Digest, Sha256};
+
+use super::array::PredictedArray;
+use super::{ModelUsed, Predicted, PredictionManifest, Predictions};
+use picofarm_store::StorageError;
+use picofarm_store::concurrent::CONCURRENCY;
+use picofarm_store::published::Manifest;
+
+/// A pinned list of scenes' depths.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PinnedDepths {
+    /// Hash that pins every byte of the depths, and the order of the scenes, in hexadecimal.
+    pub id: String,
+    /// The model that predicted them; `None` if there are no scenes.
+    pub model: Option<ModelUsed>,
+}
+
+impl Predictions {
+    /// Returns a hash that pins every byte of the depths of these scenes, in order, and the model
+    /// that predicted them. `seen` contains the SHA-256 of the scenes' manifests
+    /// ([`picofarm_dataset::Pinned::manifests`]), which the model's inputs must match. Objects are not
+    /// checked.
+    ///
+    /// # Errors
+    /// [`StorageError::Invalid`] if there are no depths, or if they belong to another scene or to
+    /// several models; [`StorageError::NotPublished`], [`StorageError::Damaged`],
+    /// [`StorageError::Store`].
+    pub async fn pin_depths(
+        &self,
+        scenes: &[u64],
+        seen: &[[u8; 32]],
+    ) -> Result<PinnedDepths, StorageError> {
+        let invalid = |what: String| StorageError::invalid("predictions", what);
+        if !self.spec.depth {
+            return Err(invalid(format!(
+                "{} holds no depths; give its infer stage a \"tof\" model",
+                self.place()
+            )));
+        }
+        let looks = scenes.iter().map(|scene| self.manifest(*scene).boxed());
+        let looks = stream::iter(looks).buffered(CONCURRENCY);
+        let found: Vec<PredictionManifest> = looks.try_collect().await?;
+        let mut hash = Sha256::new();
+        let mut by: Option<ModelUsed> = None;
+        for (manifest, seen) in found.iter().zip(seen) {
+            if manifest.source.manifest_sha256 != hex::encode(seen) {
+                return Err(invalid(format!(
+                    "{} holds what networks predict of scene {} of {:?}, which is not the scene that is read here; name \
+                     predictions of this data set",
+                    self.place(),
+                    manifest.scene,
+                    manifest.source.dataset,
+                )));
+            }
+            let Some(model) = manifest.models.get("tof") else {
+                return Err(invalid(format!(
+                    "{} does not say which model predicts the depth of scene {}",
+                    self.place(),
+                    manifest.scene
+                )));
+            };
+            match &by {
+                Some(other) if other != model => {
+                    return Err(invalid(format!(
+                        "{} holds depths by {:?} and by {:?}; one model must predict all",
+                        self.place(),
+                        other.name,
+                        model.name
+                    )));
+                }
+                Some(_) => {}
+                None => by = Some(model.clone()),
+            }
+            hash.update(manifest.scene.to_le_bytes());
+            hash.update(Sha256::digest(manifest.to_bytes()));
+        }
+        Ok(PinnedDepths {
+            id: hex::encode(hash.finalize()),
+            model: by,
+        })
+    }
+
+    /// Returns the predicted depth of a scene in metres, `[row][column]`, checked against its
+    /// manifest.
+    ///
+    /// # Errors
+    /// Those of [`Self::read`]; [`StorageError::Invalid`] if there are no depths.
+    pub async fn read_depth(&self, scene: u64) -> Result<Vec<f32>, StorageError> {
+        let Some(array) = self.arrays.iter().find(|array| array.name == "depth") else {
+            let what = format!("{} holds no depths", self.place());
+            return Err(StorageError::invalid("predictions", what));
+        };
+        let manifest = self.manifest(scene).await?;
+        let values = self.values(array, &manifest).await?;
+        Ok(bytemuck::pod_collect_to_vec(&values))
+    }
+
+    /// Returns a scene's values of an array, checked against its manifest.
+    async fn values(
+        &self,
+        array: &PredictedArray,
+        manifest: &PredictionManifest,
+    ) -> Result<Vec<u8>, StorageError> {
+        let Some(entry) = array.entry(manifest) else {
+            let path = self.published.manifest_path(&manifest.scene);
+            return Err(StorageError::Damaged {
+                object: self.published.shown(&path),
+                what: format!("names no object of {}", array.name),
+            });
+        };
+        let bytes = self.published.read(&manifest.scene, entry).await?;
+        array.codec.decode(&bytes)
+    }
+
+    /// Returns the predictions of a scene, checked against its manifest.
+    ///
+    /// # Errors
+    /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Codec`],
+    /// [`StorageError::Store`].
+    pub async fn read(&self, scene: u64) -> Result<Predicted, StorageError> {
+        let manifest = self.manifest(scene).await?;
+        let mut predicted = Predicted::default();
+        for array in self.arrays.iter() {
+            let values = self.values(array, &manifest).await?;
+            match array.name {
+                "depth" => predicted.depth_m = bytemuck::pod_collect_to_vec(&values),
+                "lit" => predicted.lit = values,
+                _ => predicted.specular = values,
+            }
+        }
+        Ok(predicted)
+    }
+}
