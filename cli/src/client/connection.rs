@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use picofarm_agent::{Access, Bearer, Target, ConnectionFailure, lost_connection};
+use picofarm_agent::{Access, Bearer, ConnectionFailure, Target, lost_connection};
 use picofarm_coordinator::auth::ACCEPTED;
 use picofarm_proto::wire::{self, jobs_client::JobsClient};
 use tonic::{Code as Grpc, Response, Status, transport::Endpoint};
@@ -177,7 +177,9 @@ async fn no_connection(
     error: &(dyn std::error::Error + Send + Sync + 'static),
 ) -> NoAnswer {
     match tokio::time::timeout(CONNECT, target.diagnose(error)).await {
-        Ok(ConnectionFailure::Mismatch(what)) => NoAnswer::Refused(CliError::new(Code::Coordinator, what)),
+        Ok(ConnectionFailure::Mismatch(what)) => {
+            NoAnswer::Refused(CliError::new(Code::Coordinator, what))
+        }
         Ok(ConnectionFailure::Down(why)) => down(why),
         Err(_) => mute("it did not complete the connection", CONNECT),
     }

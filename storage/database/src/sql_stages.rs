@@ -142,7 +142,7 @@ macro_rules! stage_queries {
                         let stage = ordinal as u32;
                         settled.opened.push(StageRef { job: id, stage });
                         if !nodes[ordinal].needs.is_empty() {
-                            let event = NewEvent::of(id, at_ms, EventKind::Opened, String::new());
+                            let event = NewEvent::new(id, at_ms, EventKind::Opened, String::new());
                             events.push(NewEvent { stage: Some(stage), ..event });
                         }
                     }

@@ -15,11 +15,11 @@ use std::{
 };
 
 use super::search::{Outcome, Tried, Values, tpe};
-use picofarm_results::TrialRecord;
 use picofarm_proto::{
     model::{TaskSpec, Trial},
     show,
 };
+use picofarm_results::TrialRecord;
 use serde_json::{Value, json};
 
 use super::{
