@@ -1,4 +1,4 @@
-//! `picofarm dataset info|show|verify` for predictions of models.
+//! `picofarm dataset info|show|verify` for predictions, by models or by physics.
 
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_dataset::{
@@ -41,11 +41,14 @@ pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()
         .iter()
         .map(|m| (m.scene, Verdict::of_agreement(&m.agreement)));
     let summary = summed(verdicts.filter_map(|(scene, verdict)| Some((scene, verdict?))));
-    let facts =
-        json!({"predictions": place, "spec": spec, "scenes": present.len(), "verdict": summary});
+    let evaluations = there.evaluations().await.map_err(failed)?;
+    let facts = json!({
+        "predictions": place, "spec": spec, "scenes": present.len(), "verdict": summary,
+        "evaluations": evaluations,
+    });
     output.result(&facts, || {
         let mut text = format!(
-            "{place}: what models predict ({}) of {} of {} scenes, {}x{} pixels\n",
+            "{place}: predictions ({}) of {} of {} scenes, {}x{} pixels\n",
             arrays(spec).join(", "),
             present.len(),
             spec.scenes,
@@ -54,6 +57,13 @@ pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()
         );
         if let Some(summary) = &summary {
             text += &format!("{}\n", summary.text);
+        }
+        for e in &evaluations {
+            let verdict = Verdict::of_evaluation(&e.predicts, &e.metrics);
+            text += &format!(
+                "{} on {} {} scenes of {}: {}\n",
+                e.predicts, e.scenes, e.side, e.dataset, verdict.text
+            );
         }
         text
     });

@@ -48,6 +48,7 @@ fn new_model(name: &str, key: &str, builds_on: &[(&str, String)]) -> NewModel {
 
 async fn put_evaluation(models: &Models, model: &ModelManifest) {
     let evaluation = Evaluation {
+        predicts: String::new(),
         key: "e".into(),
         model: model.name.clone(),
         model_sha256: model.sha256(),

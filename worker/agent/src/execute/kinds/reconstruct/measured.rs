@@ -42,8 +42,8 @@ impl Work<'_> {
         let spec = predictions.spec();
         if !spec.depth || spec.spots.is_empty() {
             return Err(TaskError::User(format!(
-                "reconstruct.predictions: {} holds {}; depth and masks are needed: give its infer stage a \"tof\" and a \
-                 \"shadow\" model",
+                "reconstruct.predictions: {} holds {}; depth and masks are needed: name a demultiplex stage, or give its \
+                 infer stage a \"tof\" and a \"shadow\" model",
                 predictions.place(),
                 match (spec.depth, spec.spots.is_empty()) {
                     (true, _) => "no masks of spots",
@@ -57,8 +57,8 @@ impl Work<'_> {
             .map_err(at)?;
         if manifest.source.manifest_sha256 != manifest_sha256(found) {
             return Err(TaskError::User(format!(
-                "reconstruct.predictions: {} holds what networks predict of scene {index} of {:?}, which is not the scene of \
-                 this stage's source, {:?}; name the data set that the infer stage has read",
+                "reconstruct.predictions: {} holds predictions of scene {index} of {:?}, which is not the scene of \
+                 this stage's source, {:?}; name the data set that the predictions were made of",
                 predictions.place(),
                 manifest.source.dataset,
                 self.0.source.dataset,
@@ -219,7 +219,7 @@ async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, DatasetError
     })
 }
 
-/// Returns the images that networks predict. If no network predicts mirrors, there are none: the
+/// Returns the images that are predicted. If no mirrors are predicted, there are none: the
 /// true mirror mask is not used as a substitute.
 fn predicted(
     stores: &Stores,
