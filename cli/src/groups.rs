@@ -1,6 +1,6 @@
 //! `--groups` and `--group`: subsets of the beams with histograms of their own.
 
-use picofarm_transient::sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100};
+use picofarm_sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100};
 
 use crate::error::{CliError, Result};
 

@@ -5,13 +5,11 @@ pub mod options;
 use std::{path::Path, time::Instant};
 
 use picofarm_dataset::{DatasetError, RenderArray, RenderGroup, write_render_group};
-use picofarm_transient::{
-    Gate,
-    sensor::{
-        Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
-        sense as measure,
-    },
+use picofarm_sensor::{
+    Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
+    sense as measure,
 };
+use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
 
 use crate::{

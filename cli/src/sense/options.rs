@@ -1,6 +1,6 @@
 //! A sensor's settings: its file, overridden by the options.
 
-use picofarm_transient::sensor::{DeadTime, Jitter, Pulse, Scale, Sensor};
+use picofarm_sensor::{DeadTime, Jitter, Pulse, Scale, Sensor};
 
 use crate::{
     args::SensorArgs,

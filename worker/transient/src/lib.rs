@@ -27,7 +27,6 @@ mod reflectors;
 mod render;
 mod rng;
 mod segments;
-pub mod sensor;
 mod sink;
 mod spectra;
 mod targets;

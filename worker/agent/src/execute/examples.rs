@@ -14,7 +14,7 @@ use picofarm_proto::{
     model::Histogram,
     split::{Rank, SplitRecord},
 };
-use picofarm_transient::sensor::{Multiplex, PS_PER_M, Sensing, Sensor, SensorError};
+use picofarm_sensor::{Multiplex, PS_PER_M, Sensing, Sensor, SensorError};
 use tokio::runtime::Handle;
 
 use super::{Control, TaskError, output::Stores, reprocess::quantity};

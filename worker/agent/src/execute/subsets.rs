@@ -2,10 +2,8 @@
 //! the data set's arrays.
 
 use picofarm_dataset::{DatasetSpec, Quantity, SubsetRecord};
-use picofarm_transient::{
-    Rendered,
-    sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100},
-};
+use picofarm_sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100};
+use picofarm_transient::Rendered;
 
 /// Returns the groups of beams of the data set's additional transients, one after the other.
 pub(super) fn groups(spec: &DatasetSpec) -> Vec<Vec<u32>> {

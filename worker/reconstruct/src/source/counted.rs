@@ -1,10 +1,8 @@
 //! Captures as counted by a detector: with photon noise and ambient light.
 
+use picofarm_sensor::{Histograms, Values, sense};
 use picofarm_settings::{PS_PER_M, Sensor};
-use picofarm_transient::{
-    Gate,
-    sensor::{Histograms, Values, sense},
-};
+use picofarm_transient::Gate;
 use rayon::prelude::*;
 
 use crate::ReconstructError;

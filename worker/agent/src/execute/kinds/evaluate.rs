@@ -17,7 +17,7 @@ use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
 };
-use picofarm_transient::sensor::Sensor;
+use picofarm_sensor::Sensor;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha2::{Digest, Sha256};

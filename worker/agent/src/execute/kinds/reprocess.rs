@@ -17,7 +17,7 @@ use picofarm_proto::{
     },
     trace,
 };
-use picofarm_transient::sensor::{
+use picofarm_sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
 use serde_json::json;

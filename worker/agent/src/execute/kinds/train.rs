@@ -30,7 +30,7 @@ use picofarm_proto::{
         train::{Normalise, Target},
     },
 };
-use picofarm_transient::sensor::SENSOR_VERSION;
+use picofarm_sensor::SENSOR_VERSION;
 use tracing::{debug, info, warn};
 
 mod along;

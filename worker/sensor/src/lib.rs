@@ -15,9 +15,11 @@
 
 mod alias;
 mod bins;
+mod chain;
 mod convolve;
 mod draw;
 mod kernel;
+mod scale;
 mod sense;
 mod spots;
 

@@ -25,6 +25,14 @@ pub const SPOTS_4_OF_100: [usize; 4] = [22, 27, 72, 77];
 /// # Errors
 /// Returns [`SensorError::Invalid`] if `per_spot` does not divide into `spots`, or a chosen spot is
 /// not among them.
+///
+/// # Examples
+/// ```
+/// // Three spots, two bins each.
+/// let per_spot = [1.0, 2.0, 10.0, 20.0, 100.0, 200.0];
+/// assert_eq!(picofarm_sensor::multiplex(&per_spot, 3, &[0, 2])?, [101.0, 202.0]);
+/// # Ok::<(), picofarm_sensor::SensorError>(())
+/// ```
 pub fn multiplex(
     per_spot: &[f32],
     spots: usize,

@@ -1,6 +1,6 @@
 //! Poisson and binomial draws against their exact probabilities, by chi-square.
 
-use picofarm_transient::sensor::{Draws, binomial, poisson};
+use picofarm_sensor::{Draws, binomial, poisson};
 
 /// Returns the chi-square of `samples` draws against the probabilities of the counts `first..`,
 /// grouped into cells with enough expected draws, converted to a standard normal number (Wilson &

@@ -3,11 +3,11 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::kernel::Kernel;
+use crate::kernel::Kernel;
 
 /// A kernel prepared for histograms of one length, with its work buffers.
 #[derive(Debug, Clone)]
-pub(super) struct Convolver {
+pub(crate) struct Convolver {
     bins: usize,
     /// The taps in reverse order.
     reversed: Vec<f64>,

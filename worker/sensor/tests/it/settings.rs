@@ -1,6 +1,6 @@
 //! Sensor settings as stored in files, and invalid settings.
 
-use picofarm_transient::sensor::{Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, sense};
+use picofarm_sensor::{Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, sense};
 
 const FINE_PS: f64 = 8.0;
 

@@ -25,6 +25,15 @@ pub struct Rebinned<T> {
 /// # Errors
 /// Returns [`SensorError::Invalid`] if `data` is not a whole number of pixels, or `factor` is 0 or
 /// above `bins`.
+///
+/// # Examples
+/// ```
+/// let pixel = [1.0, 2.0, 3.0, 4.0, 5.0];
+/// let sums = picofarm_sensor::rebin(&pixel, 5, 2)?;
+/// assert_eq!(sums.data, [3.0, 7.0]);
+/// assert_eq!(sums.dropped_bins, 1);
+/// # Ok::<(), picofarm_sensor::SensorError>(())
+/// ```
 pub fn rebin(data: &[f32], bins: usize, factor: usize) -> Result<Rebinned<f32>, SensorError> {
     rebinned(data, bins, factor, |group| {
         group.iter().map(|v| f64::from(*v)).sum::<f64>() as f32
@@ -84,7 +93,7 @@ fn rebinned<T: Copy + Send + Sync>(
     })
 }
 
-pub(super) fn check_factor(bins: usize, factor: usize) -> Result<(), SensorError> {
+pub(crate) fn check_factor(bins: usize, factor: usize) -> Result<(), SensorError> {
     if (1..=bins).contains(&factor) {
         return Ok(());
     }
@@ -95,7 +104,7 @@ pub(super) fn check_factor(bins: usize, factor: usize) -> Result<(), SensorError
 }
 
 /// Returns the number of pixels of `values` values.
-pub(super) fn pixels(values: usize, bins: usize) -> Result<usize, SensorError> {
+pub(crate) fn pixels(values: usize, bins: usize) -> Result<usize, SensorError> {
     if bins == 0 {
         return Err(SensorError::new("bins", "expected at least 1, found 0"));
     }
@@ -135,6 +144,13 @@ pub fn crop<T: Copy + Send + Sync>(
 ///
 /// # Errors
 /// Returns [`SensorError::Invalid`] if `data` is not a whole number of pixels.
+///
+/// # Examples
+/// ```
+/// let two_pixels = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+/// assert_eq!(picofarm_sensor::intensity(&two_pixels, 3)?, [6.0, 15.0]);
+/// # Ok::<(), picofarm_sensor::SensorError>(())
+/// ```
 pub fn intensity(data: &[f32], bins: usize) -> Result<Vec<f32>, SensorError> {
     pixels(data.len(), bins)?;
     Ok(data

@@ -11,7 +11,7 @@
 use std::sync::LazyLock;
 
 /// Rates below this value are covered by tables.
-pub(super) const TABLED: f64 = 1024.0;
+pub(crate) const TABLED: f64 = 1024.0;
 /// Steps of the fine, the coarse and the wide tables: 1/16, 4 and 64 photons.
 const PARTS: usize = 16;
 const COARSE: usize = 4;
@@ -121,7 +121,7 @@ static TABLES: LazyLock<Tables> = LazyLock::new(|| Tables {
 });
 
 /// A rate below [`TABLED`], split into parts.
-pub(super) struct Cut {
+pub(crate) struct SplitRate {
     wide: usize,
     coarse: usize,
     fine: usize,
@@ -129,9 +129,10 @@ pub(super) struct Cut {
     pub rest: f64,
 }
 
-impl Cut {
+impl SplitRate {
+    /// Splits a rate of at least 0 and below [`TABLED`].
     #[inline(always)]
-    pub fn of(rate: f64) -> Self {
+    pub fn new(rate: f64) -> Self {
         let parts = (rate * PARTS as f64) as usize;
         let whole = parts / PARTS;
         Self {
@@ -224,7 +225,7 @@ mod tests {
             777.7,
             TABLED - 1e-12,
         ] {
-            let cut = Cut::of(rate);
+            let cut = SplitRate::new(rate);
             assert!((0.0..0.0625).contains(&cut.rest), "{rate}");
             let tabled = (cut.wide * 64 + cut.coarse * 4) as f64 + cut.fine as f64 / 16.0;
             let sum = tabled + cut.rest;

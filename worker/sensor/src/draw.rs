@@ -1,11 +1,11 @@
 //! Random counts: a separate generator for each (seed, scene, pixel, bin), and exact Poisson and
 //! binomial draws.
 
-use super::alias::{Cut, TABLED};
+use crate::alias::{SplitRate, TABLED};
 
 /// The purpose of a stream of numbers.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Purpose {
+pub(crate) enum Purpose {
     Counts = 1,
     Peak = 2,
     Roll = 3,
@@ -23,7 +23,7 @@ const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
 
 /// The key of one pixel's numbers.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct PixelKey(u64);
+pub(crate) struct PixelKey(u64);
 
 impl PixelKey {
     pub fn new(seed: u64, purpose: Purpose, scene: u64, pixel: u64) -> Self {
@@ -75,7 +75,7 @@ impl Draws {
     }
 
     /// Returns a standard normal number (Marsaglia's polar method).
-    pub(super) fn normal(&mut self) -> f64 {
+    pub(crate) fn normal(&mut self) -> f64 {
         loop {
             let (x, y) = (2.0 * self.uniform() - 1.0, 2.0 * self.uniform() - 1.0);
             let r2 = x * x + y * y;
@@ -96,13 +96,22 @@ const LARGE: f64 = 10.0;
 ///
 /// # Panics
 /// Panics if the rate is above 10¹².
+///
+/// # Examples
+/// ```
+/// use picofarm_sensor::{Draws, poisson};
+///
+/// // Seed 1, scene 0, pixel 5, bin 9: the same count on every machine.
+/// let count = poisson(40.0, &mut Draws::new(1, 0, 5, 9));
+/// assert_eq!(count, poisson(40.0, &mut Draws::new(1, 0, 5, 9)));
+/// ```
 #[inline(always)]
 pub fn poisson(rate: f64, draws: &mut Draws) -> u64 {
     if rate.is_nan() || rate <= 0.0 {
         return 0;
     }
     if rate < TABLED {
-        let cut = Cut::of(rate);
+        let cut = SplitRate::new(rate);
         let count = cut.count(|| draws.bits());
         let u = draws.uniform();
         // 1 − rest ≤ exp(−rest): most bins need no exponential.

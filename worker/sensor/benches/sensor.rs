@@ -1,7 +1,7 @@
 //! Measures the speed of the sensor model on one thread, for a scene of 256×256×637:
-//! `cargo bench -p picofarm-transient --bench sensor`.
+//! `cargo bench -p picofarm-sensor --bench sensor`.
 
-use picofarm_transient::sensor::{
+use picofarm_sensor::{
     DeadTime, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values, sense,
 };
 

@@ -1,6 +1,6 @@
 //! The pulse and the jitter on a histogram's bins.
 
-use picofarm_transient::sensor::{Jitter, Kernel, Pulse, Sensor};
+use picofarm_sensor::{Jitter, Kernel, Pulse, Sensor};
 
 const FINE_PS: f64 = 8.0;
 

@@ -30,6 +30,15 @@ impl Kernel {
     /// # Errors
     /// Returns [`SensorError::Invalid`] if a setting or `bin_width_ps` is unusable, or the kernel
     /// would span more than 8192 bins.
+    ///
+    /// # Examples
+    /// ```
+    /// use picofarm_sensor::{Kernel, Sensor};
+    ///
+    /// let kernel = Kernel::new(&Sensor::default(), 100.0)?;
+    /// assert!((kernel.taps.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+    /// # Ok::<(), picofarm_sensor::SensorError>(())
+    /// ```
     pub fn new(sensor: &Sensor, bin_width_ps: f64) -> Result<Self, SensorError> {
         sensor.check()?;
         if !(1e-3..=1e9).contains(&bin_width_ps) {
@@ -38,7 +47,7 @@ impl Kernel {
                 format!("expected 0.001 to 1e9 picoseconds, found {bin_width_ps}"),
             ));
         }
-        let pulse = Shape::of(&sensor.pulse);
+        let pulse = Shape::new(&sensor.pulse);
         let sigma = match sensor.jitter {
             Jitter::Gaussian { fwhm_ps } => gaussian_sigma(fwhm_ps),
             Jitter::Sb3dCompat { .. } => 0.0,
@@ -63,9 +72,9 @@ impl Kernel {
         let most = (MAX_FINE / (span + 2.0)).clamp(1.0, 1001.0);
         let per_bin = 2.0 * ((50.0 * bin_width_ps / narrow).clamp(1.0, most) / 2.0).floor() + 1.0;
         let step = bin_width_ps / per_bin;
-        let mut fine = Fine::of(&pulse, step);
+        let mut fine = FineTaps::new(&pulse, step);
         if sigma > 0.0 {
-            fine = fine.convolve(&Fine::of(&Shape::gaussian(sigma), step));
+            fine = fine.convolve(&FineTaps::new(&Shape::gaussian(sigma), step));
         }
         Ok(fine.binned(per_bin as i64).trimmed())
     }
@@ -78,7 +87,7 @@ impl Kernel {
 }
 
 /// Returns σ of a Gaussian with this full width at half maximum.
-pub(super) fn gaussian_sigma(fwhm: f64) -> f64 {
+pub(crate) fn gaussian_sigma(fwhm: f64) -> f64 {
     fwhm / (2.0 * (2.0 * LN_2).sqrt())
 }
 
@@ -92,7 +101,7 @@ struct Shape {
 }
 
 impl Shape {
-    fn of(pulse: &Pulse) -> Self {
+    fn new(pulse: &Pulse) -> Self {
         match pulse {
             // All energy is at one instant, whatever the step.
             Pulse::None {} => Self {
@@ -165,13 +174,13 @@ impl Shape {
 }
 
 /// Energy by sub-bin; sub-bin i is centred at i steps.
-struct Fine {
+struct FineTaps {
     first: i64,
     energy: Vec<f64>,
 }
 
-impl Fine {
-    fn of(shape: &Shape, step: f64) -> Self {
+impl FineTaps {
+    fn new(shape: &Shape, step: f64) -> Self {
         let first = (shape.start / step - 0.5).floor() as i64;
         let last = (shape.end / step + 0.5).ceil() as i64;
         let edge = |i: i64| (shape.integral)((i as f64 - 0.5) * step);

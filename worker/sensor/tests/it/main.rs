@@ -1,0 +1,10 @@
+//! Tests of the sensor model, in one executable because each one links the whole crate.
+
+mod chain;
+mod common;
+mod detector;
+mod draws;
+mod kernel;
+mod scale;
+mod settings;
+mod spots;
