@@ -1,5 +1,5 @@
-//! One flash as a job: rooms are rendered, taken apart by physics, and reconstructed, with equal
-//! bytes however often workers are killed.
+//! One flash as a job: rooms are rendered, taken apart by physics, evaluated and reconstructed, with
+//! equal bytes however often workers are killed.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
@@ -33,6 +33,19 @@ output = {{ store = {store:?}, dataset = "rooms-3d" }}
     )
 }
 
+/// The stages that compare predictions with the truth.
+const SCORED: &str = r#"
+[[stage]]
+kind = "split"
+source = "rooms"
+split = { fractions = [0.5, 0.25, 0.25] }
+[[stage]]
+name = "errors"
+kind = "evaluate"
+source = "rooms"
+evaluate = { predictions = "apart" }
+"#;
+
 fn submit(farm: &Farm, text: &str) -> String {
     let file = farm.store().with_file_name("job.toml");
     fs::write(&file, text).unwrap();
@@ -47,9 +60,10 @@ fn made(farm: &Farm) -> Vec<std::collections::BTreeMap<String, String>> {
 }
 
 #[test]
-fn flashes_are_taken_apart_and_reconstructed_with_equal_bytes_however_often_workers_are_killed() {
+fn flashes_are_taken_apart_evaluated_and_reconstructed_with_equal_bytes_however_often_workers_are_killed()
+ {
     let farm = Farm::with_lease("flash-struck", 2.0);
-    let id = submit(&farm, &job(&farm.store(), SCENES));
+    let id = submit(&farm, &(job(&farm.store(), SCENES) + SCORED));
     let mut rng = Rng::new(5);
     let mut workers = vec![farm.worker("worker-0"), farm.worker("worker-1")];
     let (mut started, mut kills) = (2, 0);
@@ -63,15 +77,26 @@ fn flashes_are_taken_apart_and_reconstructed_with_equal_bytes_however_often_work
     }
     assert_eq!(farm.until_ended(&id)["state"], "done");
     assert!(kills >= 3, "{kills} kills before it was over");
-    assert_eq!(farm.status(&id)["tasks"]["done"], 3 * SCENES);
+    assert_eq!(farm.status(&id)["tasks"]["done"], 3 * SCENES + 2);
     let alarms = farm.events_of(&id, "alarm");
     assert!(alarms.is_empty(), "{alarms:?}");
 
     let calm = Farm::start("flash-calm");
-    let undisturbed = submit(&calm, &job(&calm.store(), SCENES));
+    let undisturbed = submit(&calm, &(job(&calm.store(), SCENES) + SCORED));
     let _worker = calm.worker("calm");
     assert_eq!(calm.until_ended(&undisturbed)["state"], "done");
     assert_eq!(made(&farm), made(&calm), "after {kills} kills");
+
+    let place = farm.store().join("rooms-apart");
+    let info = farm.json(&["dataset", "info", place.to_str().unwrap()]);
+    let mut found: Vec<&str> = Vec::new();
+    for evaluation in info["evaluations"].as_array().unwrap() {
+        assert_eq!(evaluation["model"], "demultiplex", "{evaluation}");
+        assert_eq!(evaluation["scenes"], SCENES / 4, "{evaluation}");
+        found.push(evaluation["predicts"].as_str().unwrap());
+    }
+    found.sort_unstable();
+    assert_eq!(found, ["shadow", "tof"], "{info}");
 }
 
 #[test]

@@ -50,6 +50,13 @@ pub(super) fn plates(spec: &PredictionSpec) -> Vec<Plate> {
         });
         plates.push(Plate::new("specular", Element::U8, vec![h, w], IMAGE, a));
     }
+    if spec.confidence {
+        let a = json!({
+            "long_name": "how surely the depth is that of the surface, times 255",
+            "scale_factor": 1.0 / 255.0,
+        });
+        plates.push(Plate::new("confidence", Element::U8, vec![h, w], IMAGE, a));
+    }
     plates
 }
 

@@ -1,6 +1,6 @@
 //! Predictions of scenes by models: a separate Zarr v3 group in a store, next to the data set of
 //! the input scenes. It has the same number of scenes, and one object per scene and array: `depth`,
-//! `lit` and `specular`, as far as there are models for them.
+//! `lit`, `specular` and `confidence`, as far as they are predicted.
 //!
 //! A scene's predictions are published like scenes: objects first, `manifests/<scene>.json` last,
 //! all create-only and pure functions of the task.
@@ -48,6 +48,9 @@ pub struct PredictionSpec {
     pub spots: Vec<u32>,
     /// Whether mirrors are predicted.
     pub specular: bool,
+    /// Whether the confidence of the depth is stored.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub confidence: bool,
 }
 
 /// The predictions of one scene, for the group's arrays.
@@ -59,6 +62,8 @@ pub struct Predicted {
     pub lit: Vec<u8>,
     /// Probability times 255 of a mirror: `[row][column]`.
     pub specular: Vec<u8>,
+    /// Confidence of the depth, times 255: `[row][column]`.
+    pub confidence: Vec<u8>,
 }
 
 /// A pinned list of scenes' predictions of a quantity.
@@ -286,6 +291,7 @@ impl Predictions {
             let values: &[u8] = match plate.name {
                 "depth" => bytemuck::cast_slice(&predicted.depth_m),
                 "lit" => &predicted.lit,
+                "confidence" => &predicted.confidence,
                 _ => &predicted.specular,
             };
             if values.len() != plate.bytes() {
@@ -402,6 +408,7 @@ impl Predictions {
             match plate.name {
                 "depth" => predicted.depth_m = bytemuck::pod_collect_to_vec(&values),
                 "lit" => predicted.lit = values,
+                "confidence" => predicted.confidence = values,
                 _ => predicted.specular = values,
             }
         }
@@ -449,6 +456,11 @@ fn difference(
         ("depth", text(&stored.depth), text(&asked.depth)),
         ("spots", text(&stored.spots), text(&asked.spots)),
         ("specular", text(&stored.specular), text(&asked.specular)),
+        (
+            "confidence",
+            text(&stored.confidence),
+            text(&asked.confidence),
+        ),
     ]
     .into_iter()
     .find(|(_, stored, asked)| stored != asked)

@@ -289,6 +289,7 @@ async fn who_builds_on_a_model_is_found() {
         depth: true,
         spots: vec![],
         specular: false,
+        confidence: false,
     };
     for (group, model) in [("seen", "m"), ("others", "n")] {
         let prefix = Path::from("a/store").join(group);

@@ -27,7 +27,7 @@ use crate::execute::{
 };
 
 pub use flash::Flash;
-use flash::{check_gate, numbers, quantity};
+use flash::{byte, check_gate, numbers, quantity};
 
 /// Name of the method in manifests, in place of a model's.
 const METHOD: &str = "demultiplex";
@@ -84,6 +84,7 @@ impl RunTask for DemultiplexTask {
             lit: flash.of_all(spec.spots.len(), &made.lit),
             depth_m: made.depth_m,
             specular: Vec::new(),
+            confidence: made.confidence.iter().map(|c| byte(*c)).collect(),
         };
         manifest.agreement =
             agreement::of(stores, (&dataset, index), &answers, &spec.spots, control)?;
@@ -102,6 +103,7 @@ fn spec(dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec {
         depth: true,
         spots,
         specular: false,
+        confidence: true,
     }
 }
 

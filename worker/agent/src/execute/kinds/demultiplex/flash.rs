@@ -179,9 +179,14 @@ impl Flash {
         let mut all = vec![0; count * pixels];
         for (k, part) in self.which.iter().zip(lit.chunks_exact(pixels)) {
             for (to, p) in all[k * pixels..][..pixels].iter_mut().zip(part) {
-                *to = (p.clamp(0.0, 1.0) * 255.0).round() as u8;
+                *to = byte(*p);
             }
         }
         all
     }
+}
+
+/// Returns a share times 255, rounded.
+pub(super) fn byte(share: f32) -> u8 {
+    (share.clamp(0.0, 1.0) * 255.0).round() as u8
 }
