@@ -107,41 +107,6 @@ fn room(seed: u64) -> [Row; 2] {
     let start = Instant::now();
     let found = demultiplex(&capture, &Method::default()).expect("a capture");
     let seconds = start.elapsed().as_secs_f64();
-    if env::var_os("STATS").is_some() {
-        let mut bins = vec![[0.0f64; 6]; 11];
-        for p in 0..found.depth_m.len() {
-            let z = rendered.truth.depth[p];
-            if z <= 0.0 {
-                continue;
-            }
-            let off = f64::from(found.depth_m[p] - z);
-            let b = &mut bins[(found.confidence[p] * 10.0) as usize];
-            if rendered.truth.specular[p] != 0 {
-                b[3] += 1.0;
-                b[4] += off.abs();
-                if off > 0.1 {
-                    b[5] += 1.0;
-                }
-            } else {
-                b[0] += 1.0;
-                b[1] += off.abs();
-                if off.abs() > 0.1 {
-                    b[2] += 1.0;
-                }
-            }
-        }
-        for (k, b) in bins.iter().enumerate() {
-            println!(
-                "conf {k}: plain {} mae {:.3} over10cm {} | mirror {} mae {:.3} behind {}",
-                b[0],
-                b[1] / b[0].max(1.0),
-                b[2],
-                b[3],
-                b[4] / b[3].max(1.0),
-                b[5]
-            );
-        }
-    }
     let flash = from_flash(&capture, &found, &beams).expect("sizes that fit");
     let truth = from_truth(&scene, &rendered, &Disturbed::default()).expect("a truth");
     [

@@ -62,7 +62,7 @@ pub struct Measured {
 }
 
 /// The confidence below which a pixel is doubtful.
-const SURE: f32 = 0.5;
+const SURE: f32 = 0.8;
 
 impl Measured {
     /// Returns whether a pixel's times may be another surface's.
