@@ -75,7 +75,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     if scene.laser.beams.is_empty() {
         let what = format!("{}: the scene has no laser beam", args.file.display());
         return Err(CliError::input(what).hint(
-            "picofarm scene export --spots 16 gives it beams; see docs/rendering.md for laser_directions",
+            "picofarm scene export --spots 16 gives it beams; see docs/scene-files.md for laser_directions",
         ));
     }
     let networks = match args.spots_from {

@@ -1,6 +1,6 @@
 """Optuna's searches for comparison with cli/search: search_optuna.py; needs optuna.
 
-Prints what TPESampler(multivariate) and RandomSampler find of the functions of cli/search/tests/objectives.rs, with 60
+Prints what TPESampler(multivariate) and RandomSampler find of the functions of cli/search/tests/it/objectives.rs, with 60
 trials in rounds of 6 and 24 seeds: medians of the least values."""
 
 import math

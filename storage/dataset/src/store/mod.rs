@@ -42,8 +42,8 @@ use place::Place;
 ///
 /// Local writes are flushed to the disk before they count, so that after a power failure an
 /// existing manifest has its objects. Other stores need the feature `clouds`, and take location and
-/// credentials from the environment, as documented in docs/stores.md. A store keeps its connections
-/// and its limit of concurrent requests, so it should be opened once and reused. See also
+/// credentials from the environment (docs/credentials.md). A store keeps its connections and its
+/// limit of concurrent requests, so it should be opened once and reused. See also
 /// [`limit_bandwidth`].
 ///
 /// # Errors

@@ -113,7 +113,7 @@ fn masks_in_another_order_of_rows_columns_or_spots_are_refused() {
     }
 }
 
-/// Tests the statements in docs/exchange.md on the errors that the check does not detect.
+/// Tests the statements in docs/import.md on the errors that the check does not detect.
 #[test]
 fn the_check_tells_gates_and_fields_of_view_apart_from_a_small_error_on() {
     let folder = tempfile::tempdir().unwrap();

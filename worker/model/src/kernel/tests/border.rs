@@ -1,5 +1,5 @@
-//! Borders and leaky ReLU have the same bits everywhere (tests/operations.rs compares their values
-//! with burn's operations).
+//! Borders and leaky ReLU have the same bits everywhere. tests/it/operations.rs compares their
+//! values with burn's operations.
 
 use super::*;
 
