@@ -53,7 +53,7 @@ impl RunTask for DemultiplexTask {
         let histogram = quantity(&dataset, self.demultiplex.histogram)?;
         check_gate(&dataset)?;
         let found = source_manifest(stores, &dataset, index, control)?;
-        let mut manifest = self.manifest(index, &found);
+        let mut manifest = manifest(self, index, &found);
         let (store, prefix) = stores.probed(&self.output.store, control)?;
         let prefix = prefix.join(&*self.output.dataset);
         let spec = spec(&dataset, numbers(&dataset, histogram));
@@ -107,36 +107,34 @@ fn spec(dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec {
     }
 }
 
-impl DemultiplexTask {
-    /// Returns the manifest of a scene's predictions, without the list of its objects.
-    fn manifest(&self, scene: u64, found: &Manifest) -> PredictionManifest {
-        let source = SceneUsed {
-            dataset: self.source.dataset.clone(),
-            task_key: found.provenance.task_key.clone(),
-            manifest_sha256: manifest_sha256(found),
-        };
-        let input = DemultiplexSettings {
-            version: String::new(),
-            ..self.demultiplex.clone()
-        };
-        let method = json!([version(), input, Settings::default()]).to_string();
-        let used = ModelUsed {
-            name: METHOD.to_owned(),
-            manifest_sha256: sha256_hex(method.as_bytes()),
-            histogram: self.demultiplex.histogram.name().to_owned(),
-            spots: Vec::new(),
-        };
-        let named = json!([source.manifest_sha256, method]);
-        let key = TaskKey(Sha256::digest(named.to_string()).into());
-        let kinds = ["tof", "shadow"].map(|kind| (kind.to_owned(), used.clone()));
-        PredictionManifest {
-            scene,
-            task_key: key.to_string(),
-            code: version(),
-            source,
-            models: kinds.into(),
-            ..PredictionManifest::default()
-        }
+/// Returns the manifest of a scene's predictions, without the list of its objects.
+fn manifest(task: &DemultiplexTask, scene: u64, found: &Manifest) -> PredictionManifest {
+    let source = SceneUsed {
+        dataset: task.source.dataset.clone(),
+        task_key: found.provenance.task_key.clone(),
+        manifest_sha256: manifest_sha256(found),
+    };
+    let input = DemultiplexSettings {
+        version: String::new(),
+        ..task.demultiplex.clone()
+    };
+    let method = json!([version(), input, Settings::default()]).to_string();
+    let used = ModelUsed {
+        name: METHOD.to_owned(),
+        manifest_sha256: sha256_hex(method.as_bytes()),
+        histogram: task.demultiplex.histogram.name().to_owned(),
+        spots: Vec::new(),
+    };
+    let named = json!([source.manifest_sha256, method]);
+    let key = TaskKey(Sha256::digest(named.to_string()).into());
+    let kinds = ["tof", "shadow"].map(|kind| (kind.to_owned(), used.clone()));
+    PredictionManifest {
+        scene,
+        task_key: key.to_string(),
+        code: version(),
+        source,
+        models: kinds.into(),
+        ..PredictionManifest::default()
     }
 }
 
