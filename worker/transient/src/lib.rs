@@ -2,45 +2,23 @@
 //! not depend on jobs, stores or files.
 
 mod api;
-mod beam;
-mod beam_width;
-mod bsdf;
-mod bvh;
-mod by_glass;
-mod caustic;
-mod contact;
-mod ellipsoid;
-mod emitter;
-mod extent;
 mod film;
-mod fresnel;
-mod glass;
-mod lanes;
-mod light_vertices;
-mod lobes;
-mod mirror_images;
-mod one_bounce;
-mod path_reuse;
-mod photo;
-mod plan;
-mod reflectors;
+mod light;
+mod numeric;
+mod paths;
 mod render;
-mod rng;
-mod segments;
-mod sink;
-mod spectra;
-mod targets;
+mod scene;
 mod truth;
-mod turns;
-mod two_bounce;
-mod vertex;
-mod walk;
-mod world;
 
 pub use api::*;
-pub use beam::trace_spots;
-pub use bvh::{Bvh, Kernel, Stack};
+pub use light::beam::trace_spots;
 pub use render::{
-    ClassVariance, Forecast, Part, PartOf, join_parts, plan, render, render_part, render_within,
-    variance,
+    driver::{plan, render, render_within},
+    forecast::Forecast,
+    part::{Part, PartOf, join_parts, render_part},
+    variance::{ClassVariance, variance},
+};
+pub use scene::bvh::{
+    nodes::Kernel,
+    tree::{Bvh, Stack},
 };

@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::{api::Gate, emitter::Emitters, world::World};
+use crate::{api::Gate, light::emitters::Emitters, scene::world::World};
 
 /// Relative rounding error of sums of lengths in f32.
 const ROUNDING: f64 = 1e-5;
@@ -13,7 +13,7 @@ const ROUNDING: f64 = 1e-5;
 /// there to the camera. A path of `max_bounces` bounces is at most as long as the segment to its
 /// spot plus `max_bounces` diagonals of the scene. Without a bound on the bounces, paths can be
 /// arbitrarily long, so no gate is too late.
-pub(super) fn is_dark(world: &World, emitters: &Emitters, gate: &Gate, max_bounces: u32) -> bool {
+pub(crate) fn is_dark(world: &World, emitters: &Emitters, gate: &Gate, max_bounces: u32) -> bool {
     let each = || emitters.list.iter();
     let first = each().map(|e| e.path_m + world.metres(e.p.length()));
     let first = first.fold(f64::INFINITY, f64::min);

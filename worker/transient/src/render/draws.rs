@@ -7,25 +7,27 @@
 //! of these sums are draws of the pixel's error, with all correlations between its bins, and the
 //! median over pixels is taken of them.
 
-use super::{error::Stat, region::Region};
+use crate::render::{region::Region, stat::Stat};
 
 /// The number of sums, each over every eighth pass, and of their independent differences.
 const PHASES: usize = 8;
 const DRAWS: usize = PHASES - 1;
+
 /// One pixel in this many rows and columns is watched.
 const APART: u32 = 3;
+
 /// The minimum number of watched pixels for an estimate.
 const LEAST: usize = 16;
 
 /// ‖draw of a pixel's error‖² over the bins, for each draw.
-pub(super) type Draw = [f64; DRAWS];
+pub(crate) type Draw = [f64; DRAWS];
 
 /// Sums over every eighth pass.
-pub(super) type Sums = [f32; PHASES];
+pub(crate) type Sums = [f32; PHASES];
 
 /// Converts sums over every eighth pass to draws of the error of the mean over all passes.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Phases {
+pub(crate) struct Phases {
     /// Weight of each phase's sum in a draw.
     weights: [f64; PHASES],
 }
@@ -64,48 +66,48 @@ impl Phases {
 
 /// Returns a draw of the error of two parts that err independently: on average their squares add
 /// up.
-pub(super) fn joined(draw: Draw, other: f64) -> Draw {
+pub(crate) fn joined(draw: Draw, other: f64) -> Draw {
     draw.map(|square| square + other)
 }
 
 /// Returns whether there are enough passes for draws of their own.
-pub(super) fn are_drawn(passes: u32) -> bool {
+pub(crate) fn are_drawn(passes: u32) -> bool {
     passes as usize >= PHASES
 }
 
 /// Returns a draw from a pixel's variance alone.
-pub(super) fn of_variance(variance: f64) -> Draw {
+pub(crate) fn of_variance(variance: f64) -> Draw {
     [variance; DRAWS]
 }
 
 /// The sums of the watched pixels of a tile.
 #[derive(Debug, Default)]
-pub(super) struct Watched {
+pub(crate) struct Watched {
     /// Index of the watched pixel, by pixel of the tile.
-    places: Vec<Option<u32>>,
+    pub places: Vec<Option<u32>>,
     /// The watched pixels.
-    pixels: Vec<usize>,
-    slots: usize,
+    pub pixels: Vec<usize>,
+    pub slots: usize,
     /// `[watched][phase][slot]`: Σ over passes of the 3+ part.
-    sums: Vec<f32>,
+    pub sums: Vec<f32>,
     /// `[watched][slot]`: a draw of the two-bounce part's error.
-    two: Vec<f32>,
+    pub two: Vec<f32>,
 }
 
 /// Returns whether pixel `k` of a region is watched.
-pub(super) fn is_watched(region: &Region, k: usize) -> bool {
+pub(crate) fn is_watched(region: &Region, k: usize) -> bool {
     let chosen = |i: u32| i % APART == APART / 2;
     let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
     chosen(region.row + row) && chosen(region.col + col)
 }
 
 /// Returns the watched pixels of a region.
-pub(super) fn watched(region: &Region) -> impl Iterator<Item = usize> + '_ {
+pub(crate) fn watched(region: &Region) -> impl Iterator<Item = usize> + '_ {
     (0..region.pixels()).filter(|&k| is_watched(region, k))
 }
 
 /// Returns the number of watched pixels of a region.
-pub(super) fn count(region: &Region) -> usize {
+pub(crate) fn count(region: &Region) -> usize {
     watched(region).count()
 }
 
@@ -194,7 +196,7 @@ impl Watched {
 
 /// Returns the ratio of the `q`-quantile of the errors over pixels to that of the standard errors.
 /// `draws` are those of some pixels of `stats`. Returns 1 if too few pixels are watched.
-pub(super) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
+pub(crate) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
     let (mut stated, mut drawn) = (vec![], vec![]);
     for (pixel, draw) in draws {
         let stat = &stats[*pixel];
@@ -223,8 +225,14 @@ pub(super) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{Draw, Region, Stat, Watched, count, likely};
-    use crate::rng::{Rng, Stream};
+    use crate::numeric::rng::Rng;
+    use crate::numeric::rng::Stream;
+    use crate::render::draws::Draw;
+    use crate::render::draws::Watched;
+    use crate::render::draws::count;
+    use crate::render::draws::likely;
+    use crate::render::region::Region;
+    use crate::render::stat::Stat;
 
     const SLOTS: usize = 42;
 

@@ -5,21 +5,24 @@ use std::collections::HashMap;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    FIRST_PASSES, MAX_PASSES,
-    draws::{Draw, joined, likely},
-    error::{Stat, median_after, passes_for, relative_median},
-    image::{Watch, tile_side},
-    layer::Layer,
-    ready::TWO_PASSES,
-    region::Region,
-    splat::{Sources, Thin, unit},
-    tile::{Done, Frame, Order, TileRenderer},
-};
 use crate::{
     api::{Budget, Plan, RenderError, Stop, Unstopped},
-    caustic::Splat,
-    film::Film,
+    film::{slots::Film, splat::Splat},
+    render::{
+        done::Done,
+        draws::{Draw, joined, likely},
+        error::{median_after, passes_for},
+        frame::{Frame, unit},
+        image::tile_side,
+        layer::Layer,
+        region::Region,
+        rounds::{FIRST_PASSES, MAX_PASSES, TWO_PASSES},
+        sources::Sources,
+        stat::{Stat, relative_median},
+        thin::Thin,
+        tile::{Order, TileRenderer},
+        watch::Watch,
+    },
 };
 
 /// The number of sampled tiles along each side of the image, and their passes.
@@ -46,7 +49,7 @@ pub struct Forecast {
 ///
 /// # Errors
 /// Returns [`RenderError::Memory`] if an allocation fails.
-pub(super) fn forecast(
+pub(crate) fn forecast(
     frame: &Frame,
     budget: &Budget,
     plan: Plan,
@@ -104,10 +107,10 @@ pub(super) fn forecast(
 
 /// The results of the sampled tiles.
 struct Found {
-    regions: Vec<Region>,
-    tiles: Vec<Looked>,
+    pub regions: Vec<Region>,
+    pub tiles: Vec<Looked>,
     /// Rays of one pixel.
-    rays: f64,
+    pub rays: f64,
 }
 
 /// The result of one tile.
@@ -121,12 +124,12 @@ struct Looked {
 }
 
 impl Found {
-    fn stats(&self) -> Vec<Stat> {
+    pub fn stats(&self) -> Vec<Stat> {
         self.tiles.iter().flat_map(|t| &t.stats).copied().collect()
     }
 
     /// Returns draws of the errors of some pixels, by their index in all tiles together.
-    fn draws(&self) -> Vec<(usize, Draw)> {
+    pub fn draws(&self) -> Vec<(usize, Draw)> {
         let (mut draws, mut before) = (vec![], 0);
         for tile in &self.tiles {
             draws.extend(tile.draws.iter().map(|&(k, draw)| (before + k, draw)));
@@ -137,7 +140,7 @@ impl Found {
 }
 
 /// Returns the sampled tiles.
-pub(super) fn regions(frame: &Frame) -> Vec<Region> {
+pub(crate) fn regions(frame: &Frame) -> Vec<Region> {
     // The regions are as wide as the image's own tiles, because the error decreases with the number
     // of pixels that share vertices.
     let widest = tile_side(frame);
@@ -273,7 +276,7 @@ fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderErro
 }
 
 /// Returns the tile and the pixel of the tile, by pixel of the image.
-pub(super) fn places(frame: &Frame, regions: &[Region]) -> HashMap<usize, (usize, usize)> {
+pub(crate) fn places(frame: &Frame, regions: &[Region]) -> HashMap<usize, (usize, usize)> {
     let each = regions.iter().enumerate().flat_map(|(tile, r)| {
         (0..r.pixels()).map(move |k| {
             let (row, col) = (r.row + k as u32 / r.cols, r.col + k as u32 % r.cols);

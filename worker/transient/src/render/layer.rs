@@ -10,21 +10,23 @@ use std::ops::Range;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    draws::{Draw, Phases, Sums, is_watched, of_variance},
-    error::{MULTI_REACH, Pool, pool},
-    image::{Image, room},
-    region::Region,
-    splat::unit,
-    tile::Frame,
-};
 use crate::{
     api::{RenderError, Stop},
-    caustic::Splat,
+    film::splat::Splat,
+    render::{
+        draws::{Draw, Phases, Sums, is_watched, of_variance},
+        frame::{Frame, unit},
+        image::Image,
+        pixel_light::{Found, Moments},
+        pooling::{MULTI_REACH, Pool, pool},
+        region::Region,
+        sparse::{Sparse, Waiting},
+    },
 };
 
 /// Rows of pixels per block of sums.
 const ROWS: u32 = 16;
+
 /// A block is merged when its waiting contributions reach `LEAST` plus 1/`SHARE` of the number of
 /// its sums.
 const LEAST: usize = 4096;
@@ -32,93 +34,20 @@ const SHARE: usize = 4;
 
 /// Sums over passes of one part of the image, in render units, by blocks of rows.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct Layer(Vec<Block>);
+pub(crate) struct Layer(Vec<Block>);
 
 /// Sums over some rows.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Block {
     /// Sums of channel 0.
-    all: Sparse<Moments>,
+    pub all: Sparse<Moments>,
     /// Sums of the other channels. Their slots are consecutive by channel, as in
-    /// [`crate::film::Film::pixel`].
-    groups: Sparse<f32>,
+    /// [`crate::film::slots::Film::pixel`].
+    pub groups: Sparse<f32>,
     /// Sums of channel 0 in the watched pixels.
-    watched: Sparse<Sums>,
+    pub watched: Sparse<Sums>,
     #[serde(skip)]
-    waiting: Vec<Waiting>,
-}
-
-/// Σ, Σ of squares, and Σ with alternating sign, over passes.
-type Moments = [f32; 3];
-
-/// Values by pixel and slot.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-struct Sparse<V> {
-    /// Start of each pixel's values, and the end of the last one's; empty if there are no values.
-    starts: Vec<u32>,
-    /// Slots of the values, ascending within a pixel.
-    slots: Vec<u32>,
-    values: Vec<V>,
-}
-
-/// A contribution that has not been added to the sums.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Waiting {
-    /// Pixel within the block.
-    pixel: u32,
-    slot: u32,
-    pass: u32,
-    value: f32,
-    spot: u16,
-}
-
-/// The contributions of light paths to a pixel, over passes, in metres.
-pub(super) struct Found<'a> {
-    slots: &'a [u32],
-    values: &'a [Moments],
-    /// Variance by slot, in render units.
-    variance: &'a [f32],
-    /// Σ over the gate of the variance before pooling, and draws of the error if the pixel is
-    /// watched; both in metres².
-    own: (f64, Option<Draw>),
-    /// Factors from the sums to the mean and to a draw of its error, and from render units to
-    /// metres.
-    mean: (f64, f64),
-    noise: f64,
-    unit: f64,
-}
-
-impl Found<'_> {
-    /// Returns the bin, the mean, and a draw of the mean's error, for each bin with contributions.
-    pub fn light(&self) -> impl Iterator<Item = (usize, f64, f64)> {
-        let last = self.variance.len() - 1;
-        let each = self.slots.iter().zip(self.values);
-        let inside = each.filter(move |(slot, _)| (1..last).contains(&(**slot as usize)));
-        inside.map(|(slot, &[sum, _, alternating])| {
-            let mean = f64::from(sum) * self.mean.0 / self.mean.1;
-            (
-                *slot as usize - 1,
-                mean,
-                f64::from(alternating) * self.noise,
-            )
-        })
-    }
-
-    /// Returns the variance of the mean of each bin of the gate, pooled as in the tiles.
-    pub fn variance(&self) -> impl Iterator<Item = f64> {
-        let inside = &self.variance[1..self.variance.len() - 1];
-        inside.iter().map(|v| f64::from(*v) * self.unit * self.unit)
-    }
-
-    /// Returns Σ over the bins of the gate of their variances before pooling, as the tiles do.
-    pub fn pixel_variance(&self) -> f64 {
-        self.own.0
-    }
-
-    /// Returns draws of the pixel's error, if it is watched.
-    pub fn draw(&self) -> Option<&Draw> {
-        self.own.1.as_ref()
-    }
+    pub waiting: Vec<Waiting>,
 }
 
 /// Returns the rows of a block.
@@ -294,7 +223,7 @@ impl Layer {
 
 impl Block {
     /// Merges the waiting contributions with the sums of their rows.
-    fn merge(&mut self, frame: &Frame, region: &Region) -> Result<(), RenderError> {
+    pub fn merge(&mut self, frame: &Frame, region: &Region) -> Result<(), RenderError> {
         let pixels = region.pixels();
         let film = frame.film;
         let split = frame.split;
@@ -355,86 +284,19 @@ fn drawn(phases: &Phases, (slots, sums): (&[u32], &[Sums]), inside: &Range<u32>)
     draw
 }
 
-impl<V: Copy + Default> Sparse<V> {
-    /// Returns the slots and values of a pixel.
-    fn of(&self, pixel: usize) -> (&[u32], &[V]) {
-        match self.starts.get(pixel..pixel + 2) {
-            Some(&[start, end]) => {
-                let range = start as usize..end as usize;
-                (&self.slots[range.clone()], &self.values[range])
-            }
-            _ => (&[], &[]),
-        }
-    }
-
-    fn fits(&self, pixels: usize, within: Range<u32>) -> bool {
-        let count = self.slots.len();
-        if self.values.len() != count {
-            return false;
-        }
-        if self.starts.is_empty() {
-            return count == 0;
-        }
-        self.starts.len() == pixels + 1
-            && self.starts.is_sorted()
-            && (self.starts[0], self.starts[pixels] as usize) == (0, count)
-            && self.slots.iter().all(|slot| within.contains(slot))
-            && (0..pixels).all(|k| self.of(k).0.is_sorted_by(|a, b| a < b))
-    }
-
-    /// Adds contributions, sorted by pixel and slot, to the values of `pixels` pixels. `add`
-    /// receives all contributions to one slot.
-    fn take(
-        &mut self,
-        pixels: usize,
-        found: &[Waiting],
-        add: impl Fn(&mut V, &[Waiting]),
-    ) -> Result<(), RenderError> {
-        let groups = found.chunk_by(|a, b| (a.pixel, a.slot) == (b.pixel, b.slot));
-        let most = self.slots.len() + groups.clone().count();
-        room::<(u32, V)>(most, "the sums over light paths")?;
-        let mut groups = groups.peekable();
-        let mut merged = Self {
-            starts: Vec::with_capacity(pixels + 1),
-            slots: Vec::with_capacity(most),
-            values: Vec::with_capacity(most),
-        };
-        merged.starts.push(0);
-        for pixel in 0..pixels {
-            let (slots, values) = self.of(pixel);
-            let mut old = slots.iter().copied().zip(values.iter().copied()).peekable();
-            loop {
-                let next = groups.peek().filter(|g| g[0].pixel as usize == pixel);
-                let slot = match (old.peek(), next) {
-                    (None, None) => break,
-                    (Some((a, _)), Some(b)) => (*a).min(b[0].slot),
-                    (Some((a, _)), None) => *a,
-                    (None, Some(b)) => b[0].slot,
-                };
-                let mut value = match old.next_if(|(a, _)| *a == slot) {
-                    Some((_, value)) => value,
-                    None => V::default(),
-                };
-                let new = groups.next_if(|g| g[0].pixel as usize == pixel && g[0].slot == slot);
-                if let Some(new) = new {
-                    add(&mut value, new);
-                }
-                merged.slots.push(slot);
-                merged.values.push(value);
-            }
-            merged.starts.push(merged.slots.len() as u32);
-        }
-        *self = merged;
-        Ok(())
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
-    use super::{Draw, Phases, Sparse, Sums, Waiting, add_phases, drawn};
-    use crate::rng::{Rng, Stream};
+    use crate::numeric::rng::Rng;
+    use crate::numeric::rng::Stream;
+    use crate::render::draws::Draw;
+    use crate::render::draws::Phases;
+    use crate::render::draws::Sums;
+    use crate::render::layer::add_phases;
+    use crate::render::layer::drawn;
+    use crate::render::sparse::Sparse;
+    use crate::render::sparse::Waiting;
 
     const PIXELS: usize = 5;
     const SLOTS: usize = 7;

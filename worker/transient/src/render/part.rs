@@ -13,12 +13,13 @@ use std::ops::Range;
 use picofarm_scene::Scene;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    image::{Image, Round, Slice, Watch},
-    ready::{Ready, prepare},
-    splat::{Sources, Splats},
+use crate::{
+    api::{Budget, Progress, RenderError, Rendered, Settings, Stop},
+    render::{
+        image::Image, prepare::prepare, ready::Ready, rounds::Round, slice::Slice,
+        sources::Sources, splats::Splats, watch::Watch,
+    },
 };
-use crate::api::{Budget, Progress, RenderError, Rendered, Settings, Stop};
 
 /// The maximum number of tile ranges.
 const MAX_RANGES: u32 = 4096;
@@ -121,7 +122,7 @@ fn divisible(settings: &Settings) -> Result<(), RenderError> {
 /// Renders one part of a scene. Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render`], and [`RenderError::Invalid`] if the budget is not a
+/// Returns the errors of [`crate::render::driver`], and [`RenderError::Invalid`] if the budget is not a
 /// number of samples or the part does not exist.
 pub fn render_part(
     scene: &Scene,
@@ -163,11 +164,11 @@ pub fn render_part(
     })
 }
 
-/// Joins all parts of a scene, in any order, into the result of [`crate::render`], bit for bit.
+/// Joins all parts of a scene, in any order, into the result of [`crate::render::driver`], bit for bit.
 /// Runs on the caller's rayon pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render`], and [`RenderError::Invalid`] naming a part that is
+/// Returns the errors of [`crate::render::driver`], and [`RenderError::Invalid`] naming a part that is
 /// missing, duplicated, or from another scene or other settings.
 pub fn join_parts(
     scene: &Scene,

@@ -2,7 +2,7 @@
 
 /// A rectangle of pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Region {
+pub(crate) struct Region {
     pub row: u32,
     pub col: u32,
     pub rows: u32,

@@ -3,21 +3,28 @@
 use picofarm_scene::Scene;
 use rayon::prelude::*;
 
-use super::{
-    forecast::{places, regions},
-    image::Watch,
-    layer::Layer,
-    ready::prepare,
-    region::Region,
-    splat::{Sources, Thin, unit},
-    tile::{Frame, Order, TileRenderer},
-};
 use crate::{
     api::{RenderError, Settings, Stop, Unstopped},
-    film::Film,
-    path_reuse::{Sharing, Tile},
-    sink::{CLASSES, TECHNIQUES, class_name},
-    walk::Scratch,
+    film::{
+        class::{CLASSES, class_name},
+        slots::Film,
+        technique::TECHNIQUES,
+    },
+    paths::{
+        path_reuse::{sharing::Sharing, tile::Tile},
+        scratch::Scratch,
+    },
+    render::{
+        forecast::{places, regions},
+        frame::{Frame, unit},
+        layer::Layer,
+        prepare::prepare,
+        region::Region,
+        sources::Sources,
+        thin::Thin,
+        tile::{Order, TileRenderer},
+        watch::Watch,
+    },
 };
 
 /// The contribution of one class of paths to the part of three bounces and more, or to the light
@@ -41,11 +48,11 @@ const ALL: usize = CLASSES + TECHNIQUES.len();
 
 /// Sums of one tile's pixels.
 struct Found {
-    region: Region,
+    pub region: Region,
     /// h by pixel and bin.
-    light: Vec<f32>,
+    pub light: Vec<f32>,
     /// Energy and variance, by pixel and class.
-    classes: Vec<[(f64, f64); ALL]>,
+    pub classes: Vec<[(f64, f64); ALL]>,
 }
 
 /// Returns the fractions of the classes in the energy and variance of three bounces and more, and
@@ -54,7 +61,7 @@ struct Found {
 /// pool.
 ///
 /// # Errors
-/// Returns the errors of [`crate::render`].
+/// Returns the errors of [`crate::render::driver`].
 pub fn variance(
     scene: &Scene,
     settings: &Settings,

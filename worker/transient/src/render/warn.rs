@@ -5,21 +5,21 @@ use picofarm_scene::{Spot, Vec3};
 
 use crate::{
     api::{ErrorEstimate, Gate},
-    emitter::Emitters,
-    truth::Centres,
-    world::World,
+    light::emitters::Emitters,
+    scene::{centres::Centres, world::World},
 };
 
 /// The uncertainty of the variance from which an error deserves a warning: about that of four equal
 /// bright paths.
 const UNCERTAIN: f32 = 0.5;
+
 /// The error of the whole image below which its uncertainty does not matter.
 const NEGLIGIBLE: f32 = 1e-3;
 
 /// Optical path lengths of two-bounce light, metres, over the spots and the points seen by the
 /// pixels' centres.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Arrivals {
+pub(crate) struct Arrivals {
     /// The shortest path.
     pub first: f64,
     /// The longest path.
@@ -30,7 +30,7 @@ pub(super) struct Arrivals {
 /// no beam hits one. `lit(beam, pixel)` returns whether a spot lights a pixel. No light of three
 /// and more bounces arrives before the first of all pixels and spots, lit or not, because no path
 /// is shorter than a straight one.
-pub(super) fn arrivals(
+pub(crate) fn arrivals(
     world: &World,
     emitters: &Emitters,
     centres: &Centres,
@@ -56,7 +56,7 @@ pub(super) fn arrivals(
 }
 
 /// Returns a warning about beams that hit nothing.
-pub(super) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
+pub(crate) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
     const SHOWN: usize = 8;
     let lost = spots.iter().enumerate().filter(|(_, spot)| spot.is_none());
     let lost: Vec<String> = lost.map(|(beam, _)| beam.to_string()).collect();
@@ -80,7 +80,7 @@ pub(super) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
 }
 
 /// Returns the reason why a gate sees no light, if all light arrives after its end.
-pub(super) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<String> {
+pub(crate) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<String> {
     let end = end(gate);
     let first = arrivals?.first;
     (first >= end).then(|| {
@@ -92,7 +92,7 @@ pub(super) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<St
 
 /// Returns the reason why there is no light in an image. `lit` are the arrivals of pixels that a
 /// spot lights, `any` those of all pixels.
-pub(super) fn empty(
+pub(crate) fn empty(
     gate: &Gate,
     spots: &[Option<Spot>],
     (lit, any): (Option<Arrivals>, Option<Arrivals>),
@@ -133,7 +133,7 @@ pub(super) fn empty(
 
 /// Returns a warning that few bright paths dominate the error of the whole image, with the
 /// resulting uncertainty.
-pub(super) fn tails(error: &ErrorEstimate) -> Option<String> {
+pub(crate) fn tails(error: &ErrorEstimate) -> Option<String> {
     let u = error.total_uncertainty;
     (u > UNCERTAIN && error.total_relative > NEGLIGIBLE).then(|| {
         format!(

@@ -19,6 +19,7 @@ mod hard_geometry;
 mod hard_mirrors;
 mod hard_thin;
 mod hostile;
+mod imports;
 mod independent;
 mod independent_glass;
 mod laws;

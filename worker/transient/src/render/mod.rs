@@ -1,0 +1,33 @@
+//! The driver: a whole render with its rounds, its error estimate and its stopping rule.
+
+pub(crate) mod dark;
+pub(crate) mod done;
+pub(crate) mod draws;
+pub(crate) mod driver;
+pub(crate) mod error;
+pub(crate) mod forecast;
+pub(crate) mod frame;
+pub(crate) mod image;
+pub(crate) mod join;
+pub(crate) mod layer;
+pub(crate) mod memory;
+pub(crate) mod part;
+pub(crate) mod pixel_light;
+pub(crate) mod plan;
+pub(crate) mod pooling;
+pub(crate) mod prepare;
+pub(crate) mod ready;
+pub(crate) mod region;
+pub(crate) mod rounds;
+pub(crate) mod settings;
+pub(crate) mod slice;
+pub(crate) mod sources;
+pub(crate) mod sparse;
+pub(crate) mod splats;
+pub(crate) mod spread;
+pub(crate) mod stat;
+pub(crate) mod thin;
+pub(crate) mod tile;
+pub(crate) mod variance;
+pub(crate) mod warn;
+pub(crate) mod watch;
