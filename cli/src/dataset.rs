@@ -17,8 +17,9 @@ pub mod verify;
 use std::path::{Path, PathBuf};
 
 use picofarm_agent::TaskError;
-use picofarm_dataset::{Dataset, DatasetError, Summary, open_store};
+use picofarm_dataset::{Dataset, Summary};
 use picofarm_figures::scene::{View, flight, sheet};
+use picofarm_store::{StorageError, open_store};
 use serde_json::json;
 
 use crate::{
@@ -190,18 +191,18 @@ pub async fn open(place: &str) -> Result<Dataset> {
     Dataset::open(store, prefix).await.map_err(failed)
 }
 
-pub fn failed(error: DatasetError) -> CliError {
+pub fn failed(error: StorageError) -> CliError {
     let code = match &error {
-        DatasetError::Damaged { .. }
-        | DatasetError::Conflict { .. }
-        | DatasetError::Diverged { .. } => Code::Damaged,
-        DatasetError::Store { .. } | DatasetError::Io { .. } | DatasetError::UnsafeStore { .. } => {
+        StorageError::Damaged { .. }
+        | StorageError::Conflict { .. }
+        | StorageError::Diverged { .. } => Code::Damaged,
+        StorageError::Store { .. } | StorageError::Io { .. } | StorageError::UnsafeStore { .. } => {
             Code::Resource
         }
         _ => Code::Input,
     };
-    let damaged = matches!(error, DatasetError::Damaged { .. });
-    let rootless = matches!(error, DatasetError::NoDataset { .. });
+    let damaged = matches!(error, StorageError::Damaged { .. });
+    let rootless = matches!(error, StorageError::NoDataset { .. });
     let failed = CliError::new(code, error);
     if damaged {
         return failed.hint(

@@ -1,6 +1,6 @@
 //! `picofarm doctor`: checks whether this machine can render and store.
 
-use picofarm_dataset::{PROBE_WITHIN, Writable, check_writable};
+use picofarm_store::{PROBE_WITHIN, Writable, check_writable};
 use serde::Serialize;
 
 use crate::{
@@ -176,7 +176,7 @@ const NONE: u64 = 256 << 20;
 
 /// Reports the free space for results and temporary files.
 fn disk(place: &str) -> Check {
-    let ground = picofarm_dataset::local_ground(place).ok().flatten();
+    let ground = picofarm_store::local_ground(place).ok().flatten();
     let places = ground.into_iter().chain([std::env::temp_dir()]);
     let (mut least, mut details) = (u64::MAX, Vec::new());
     for folder in places {

@@ -66,7 +66,7 @@ pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) ->
         if let Some((source, count)) = stage.task.reads_mut()
             && *count == 0
         {
-            let failed = |e: picofarm_dataset::DatasetError| {
+            let failed = |e: picofarm_store::StorageError| {
                 CliError::input(format!(
                     "{}: stage {:?}: source: {e}",
                     path.display(),
@@ -74,7 +74,7 @@ pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) ->
                 ))
                 .hint("give the number of its scenes as `count`, or make the data set first")
             };
-            let (store, prefix) = picofarm_dataset::open_store(&source.store).map_err(failed)?;
+            let (store, prefix) = picofarm_store::open_store(&source.store).map_err(failed)?;
             let dataset = picofarm_dataset::Dataset::open(store, prefix.join(&*source.dataset));
             *count = dataset.await.map_err(failed)?.spec().scenes;
         }

@@ -148,7 +148,7 @@ fn local_worker() -> Result<()> {
             .transpose()?
     };
     let _last_lines = log(&order.settings.log, traces.as_ref())?;
-    picofarm_dataset::limit_bandwidth(order.settings.bandwidth()?);
+    picofarm_store::limit_bandwidth(order.settings.bandwidth()?);
     let ended = runtime.block_on(local::serve(order));
     if let Some(traces) = traces {
         traces.end();
@@ -163,7 +163,7 @@ async fn run(
     bench: Option<Bench>,
 ) -> Result<()> {
     let settings = &resolved.settings;
-    picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
+    picofarm_store::limit_bandwidth(settings.bandwidth()?);
     match command {
         Command::Demo(args) => demo::demo(args, settings, output).await,
         Command::Up(args) => demo::up(args, settings, output).await,

@@ -13,8 +13,9 @@ use std::{
     path::Path,
 };
 
-use picofarm_dataset::{Checkpoint, Evaluation, ModelManifest, Models, Verdict, open_store};
 use picofarm_proto::show;
+use picofarm_results::{Checkpoint, Evaluation, ModelManifest, Models, Verdict};
+use picofarm_store::open_store;
 use serde_json::{Value, json};
 
 #[cfg(not(feature = "networks"))]

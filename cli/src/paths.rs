@@ -11,7 +11,7 @@ use picofarm_agent::absolute;
 /// # Errors
 /// Returns a message about why the text is not a location.
 pub fn place(text: &str) -> Result<String, String> {
-    picofarm_dataset::check_location(text).map_err(|e| e.to_string())?;
+    picofarm_store::check_location(text).map_err(|e| e.to_string())?;
     let mut parts = text.trim_end_matches('/').split('/');
     let relative = parts.clone().next_back() == Some(".") || parts.any(|part| part == "..");
     match relative && !text.contains("://") {

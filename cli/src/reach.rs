@@ -4,13 +4,12 @@
 
 use std::{collections::BTreeSet, time::Duration};
 
-use picofarm_dataset::{
-    Dataset, DatasetError, check_writable, identify_store, open_store, store_identity,
-};
+use picofarm_dataset::Dataset;
 use picofarm_proto::{
     model::{JobPlan, JobSpec, StageSpec, kinds::Manifest},
     show,
 };
+use picofarm_store::{StorageError, check_writable, identify_store, open_store, store_identity};
 
 use crate::output::Output;
 
@@ -85,7 +84,7 @@ async fn identity_of(place: &str, create: bool) -> Result<Option<String>, String
             true => Some(identify_store(&*store, &prefix).await?),
             false => store_identity(&*store, &prefix).await?,
         };
-        Ok::<_, DatasetError>(identity.map(|identity| identity.to_string()))
+        Ok::<_, StorageError>(identity.map(|identity| identity.to_string()))
     };
     found.await.map_err(|e| e.to_string())
 }
@@ -139,7 +138,7 @@ pub async fn there(spec: &JobSpec, plan: &mut JobPlan) -> Vec<String> {
 async fn scenes_of(
     stage: &StageSpec,
     total: u64,
-) -> Result<Option<(String, [u64; 3])>, DatasetError> {
+) -> Result<Option<(String, [u64; 3])>, StorageError> {
     let results = stage.task.results();
     let Manifest::Scene { dataset } = results.manifest else {
         return Ok(None);

@@ -14,7 +14,6 @@ mod written;
 use std::time::Instant;
 
 use picofarm_agent::{Memory, reconstruct};
-use picofarm_dataset::Verdict;
 use picofarm_figures::Canvas;
 use picofarm_proto::model::{
     kinds::reconstruct::grid_bytes,
@@ -26,6 +25,7 @@ use picofarm_reconstruct::{
     source::{self, CaptureSettings, Disturbed},
     surface,
 };
+use picofarm_results::Verdict;
 use picofarm_scene::{
     Camera, Scene,
     import::{self, ImportOptions},

@@ -4,11 +4,12 @@ pub mod options;
 
 use std::{path::Path, time::Instant};
 
-use picofarm_dataset::{DatasetError, RenderArray, RenderGroup, write_render_group};
+use picofarm_dataset::{RenderArray, RenderGroup, write_render_group};
 use picofarm_sensor::{
     Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
     sense as measure,
 };
+use picofarm_store::StorageError;
 use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
 
@@ -138,9 +139,9 @@ fn read(group: &RenderGroup, name: &str, args: &SceneSense) -> Result<(Vec<u64>,
     group.read(name).map_err(|e| unreadable(args, e))
 }
 
-fn unreadable(args: &SceneSense, error: DatasetError) -> CliError {
+fn unreadable(args: &SceneSense, error: StorageError) -> CliError {
     let code = match &error {
-        DatasetError::Codec { .. } => Code::Damaged,
+        StorageError::Codec { .. } => Code::Damaged,
         _ => Code::Input,
     };
     CliError::new(code, format!("{}: {error}", args.render.display()))

@@ -9,7 +9,7 @@ use figment::{
 };
 use picofarm_agent::Access;
 use picofarm_credentials::Secret;
-use picofarm_dataset::Bandwidth;
+use picofarm_store::Bandwidth;
 use serde::{Deserialize, Serialize};
 
 use crate::{

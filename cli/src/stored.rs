@@ -16,11 +16,13 @@ use futures::future::BoxFuture;
 use object_store::{ObjectStore, path::Path};
 use picofarm_agent::StorePrefixes;
 use picofarm_coordinator::{Found, Stored};
-use picofarm_dataset::{DatasetError, Held, Holdings, PartName, check_identity, open_store};
+use picofarm_dataset::PartName;
 use picofarm_proto::model::{
     StageSpec,
     kinds::{Manifest, TaskKind},
 };
+use picofarm_results::{Held, Holdings};
+use picofarm_store::{StorageError, check_identity, open_store};
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
 use uuid::Uuid;
@@ -214,7 +216,7 @@ impl Question {
         self,
         holdings: &Holdings,
         thorough: impl Fn(u64) -> bool,
-    ) -> std::result::Result<Vec<Held>, DatasetError> {
+    ) -> std::result::Result<Vec<Held>, StorageError> {
         let mut held = Vec::new();
         match self {
             Self::Scenes(dataset, results) => {
@@ -274,7 +276,7 @@ impl Stored for StoreReader {
                         Ok(true) => Found::NoStore,
                         _ => Found::NoFolder,
                     };
-                    return Ok::<Vec<Found>, DatasetError>(vec![found; count]);
+                    return Ok::<Vec<Found>, StorageError>(vec![found; count]);
                 }
                 // If this machine has not mounted the store, all results would seem lost.
                 if let Some(identity) = identity {
@@ -326,7 +328,7 @@ impl Drop for StoreReader {
     }
 }
 
-fn unreadable(error: &DatasetError) -> String {
+fn unreadable(error: &StorageError) -> String {
     format!("this coordinator cannot read it: {error}")
 }
 

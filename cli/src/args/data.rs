@@ -7,8 +7,8 @@ use clap::{Args, ValueEnum};
 use picofarm_proto::model::Histogram;
 
 use picofarm_agent::export::Scenes;
-use picofarm_dataset::ExportFormat;
-use picofarm_dataset::import::{Captures, DepthKind, Format, ImportOptions, Polarity};
+use picofarm_exchange::ExportFormat;
+use picofarm_exchange::import::{Captures, DepthKind, Format, ImportOptions, Polarity};
 
 /// A sensor.
 #[derive(Args, Clone, Default)]

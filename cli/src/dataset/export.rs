@@ -4,7 +4,8 @@
 use std::time::Instant;
 
 use picofarm_agent::export::Scenes;
-use picofarm_dataset::{Exported, Exporter, open_store};
+use picofarm_exchange::{Exported, Exporter};
+use picofarm_store::open_store;
 use serde_json::json;
 
 use super::{failed, open};

@@ -1,6 +1,7 @@
 //! `picofarm dataset gc`: lists or deletes objects that belong to no finished scene.
 
 use picofarm_dataset::{Collection, MIN_GRACE};
+use picofarm_results::collect_garbage;
 use serde_json::{Value, json};
 
 use super::{failed, open};
@@ -21,7 +22,9 @@ pub async fn run(args: &DatasetGc, output: Output) -> Result<()> {
         .hint("give a longer age, or --nothing-runs if no worker runs on this data set"));
     }
     let opened = open(&args.dataset).await?;
-    let found = opened.collect(grace, delete).await.map_err(failed)?;
+    let found = collect_garbage(&opened, grace, delete)
+        .await
+        .map_err(failed)?;
     output.result(&collection_json(&args.dataset, &found, delete), || {
         collected(&args.dataset, &found, delete)
     });

@@ -2,11 +2,10 @@
 
 use std::{path::Path, sync::Arc, time::Instant};
 
-use picofarm_dataset::{
-    Dataset, PROBE_WITHIN, Profile, Verdict,
-    import::{ImportError, Source, import_scene},
-    open_store, probe,
-};
+use picofarm_dataset::{Dataset, Profile};
+use picofarm_exchange::import::{ImportError, Source, import_scene};
+use picofarm_results::Verdict;
+use picofarm_store::{PROBE_WITHIN, open_store, probe};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 

@@ -1,10 +1,10 @@
 //! `picofarm dataset info|show|verify` for predictions, by models or by physics.
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{
-    ModelUsed, PredictionManifest, PredictionSpec, Predictions, Problem, TimesUsed, Verdict,
-    open_store,
+use picofarm_results::{
+    ModelUsed, PredictionManifest, PredictionSpec, Predictions, TimesUsed, Verdict,
 };
+use picofarm_store::{Problem, open_store};
 use serde_json::json;
 
 use super::{

@@ -1,7 +1,7 @@
 //! Formats the problems found by a check as text and as JSON.
 
-use picofarm_dataset::{Problem, VerifyMode};
 use picofarm_proto::show;
+use picofarm_store::{Problem, VerifyMode};
 use serde_json::{Value, json};
 
 use crate::error::{CliError, Code};

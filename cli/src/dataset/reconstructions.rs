@@ -5,9 +5,8 @@ mod picture;
 mod report;
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{
-    DatasetError, Problem, Reconstructions, Verdict, Verification, VerifyMode, open_store,
-};
+use picofarm_results::{Reconstructions, Verdict};
+use picofarm_store::{Problem, StorageError, Verification, VerifyMode, open_store};
 use serde_json::{Map, Value, json};
 
 pub use picture::draw;
@@ -49,7 +48,7 @@ pub async fn find(place: &str) -> Result<Option<Reconstructions>> {
     let (store, prefix) = open_store(place).map_err(failed)?;
     match Reconstructions::open(store, prefix).await {
         Ok(there) => Ok(Some(there)),
-        Err(error @ DatasetError::Store { .. }) => Err(failed(error)),
+        Err(error @ StorageError::Store { .. }) => Err(failed(error)),
         // Other contents of the location are not this function's concern.
         Err(_) => Ok(None),
     }

@@ -7,8 +7,9 @@ use picofarm_agent::{
     Control, TaskError,
     repair::{Hints, Repairer},
 };
-use picofarm_dataset::{Dataset, Problem, Snapshot, VerifyMode};
+use picofarm_dataset::{Dataset, Snapshot};
 use picofarm_proto::model::SourceSettings;
+use picofarm_store::{Problem, VerifyMode};
 use serde_json::json;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;

@@ -134,5 +134,5 @@ fn text(value: &Value) -> String {
 
 /// SHA-256, in hexadecimal.
 fn sha256(bytes: &[u8]) -> String {
-    picofarm_dataset::sha256_hex(bytes)
+    picofarm_store::sha256_hex(bytes)
 }

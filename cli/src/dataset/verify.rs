@@ -1,6 +1,7 @@
 //! `picofarm dataset verify`: finds broken objects and shows how to repair them.
 
-use picofarm_dataset::{Dataset, Snapshot, Verification, VerifyMode, VerifyOptions};
+use picofarm_dataset::{Dataset, Snapshot, VerifyOptions};
+use picofarm_store::{Verification, VerifyMode};
 use serde_json::json;
 
 use super::{

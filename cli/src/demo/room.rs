@@ -17,6 +17,7 @@ use picofarm_reconstruct::{
     render::Renderer, score, source::from_flash, surface,
 };
 use picofarm_scene::Camera;
+use picofarm_store::StorageError;
 use serde_json::{Value, json};
 
 use crate::{
@@ -109,7 +110,7 @@ struct Seen {
 }
 
 impl Seen {
-    async fn read(dataset: &Dataset) -> std::result::Result<Self, picofarm_dataset::DatasetError> {
+    async fn read(dataset: &Dataset) -> std::result::Result<Self, StorageError> {
         let (flash, rgb, depth_m, specular) = futures::try_join!(
             Flash::of(dataset, SCENE, Quantity::Transient, Places::Given),
             dataset.read::<u8>(SCENE, Quantity::Rgb),

@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use picofarm_dataset::{DatasetError, RenderGroup};
+use picofarm_dataset::RenderGroup;
 use picofarm_demultiplex::{Capture, Place, Spot, Truth};
 use picofarm_scene::{self as scene, Camera, Vec3};
+use picofarm_store::StorageError;
 use picofarm_transient::Gate;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
@@ -160,9 +161,9 @@ fn array<T: picofarm_dataset::Stored + Send + Sync>(
     Ok(values)
 }
 
-fn unreadable(folder: &Path, error: DatasetError) -> CliError {
+fn unreadable(folder: &Path, error: StorageError) -> CliError {
     let code = match &error {
-        DatasetError::Codec { .. } => Code::Damaged,
+        StorageError::Codec { .. } => Code::Damaged,
         _ => Code::Input,
     };
     CliError::new(code, format!("{}: {error}", folder.display())).hint(HINT)

@@ -1,9 +1,8 @@
 //! `picofarm model verify|repair|remove`: checks, repairs and removes models.
 
 use bytes::Bytes;
-use picofarm_dataset::{
-    Dependents, Fault, ModelCheck, ModelManifest, ModelRepair, Models, Problem, Removed,
-};
+use picofarm_results::{Dependents, ModelCheck, ModelManifest, ModelRepair, Models, Removed};
+use picofarm_store::{Fault, Problem};
 use serde_json::{Value, json};
 
 use super::{nothing, open};

@@ -3,8 +3,8 @@
 use std::{fs, path::Path, time::SystemTime};
 
 use picofarm_agent::{Control, report::Collector};
-use picofarm_dataset::Models;
 use picofarm_model::report::{Entry, Report, html, json};
+use picofarm_results::Models;
 use serde_json::json;
 use tokio::runtime::Handle;
 

@@ -1,6 +1,6 @@
 //! `picofarm sweep compare`: compares sweeps at equal numbers of epochs spent.
 
-use picofarm_dataset::{TrialEnd, TrialRecord};
+use picofarm_results::{TrialEnd, TrialRecord};
 use serde::Serialize;
 use serde_json::{Map, Value};
 

@@ -14,11 +14,11 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use picofarm_dataset::TrialRecord;
 use picofarm_proto::{
     model::{TaskSpec, Trial},
     show,
 };
+use picofarm_results::TrialRecord;
 use picofarm_search::{Outcome, Tried, Values, tpe};
 use serde_json::{Value, json};
 
@@ -373,7 +373,7 @@ fn described(extended: &Extended, more: &MoreTrials) -> String {
 
 #[cfg(test)]
 mod tests {
-    use picofarm_dataset::TrialEnd;
+    use picofarm_results::TrialEnd;
 
     use super::{super::records::tests::record, *};
 

@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_dataset::{Models, Rung, TrialEnd, TrialRecord};
 use picofarm_model::{
     report::trials::{End, Sweep, Tried as Row, Value as Shown, error_name},
     train::Line,
 };
+use picofarm_results::{Models, Rung, TrialEnd, TrialRecord};
 use picofarm_search::Outcome;
 use serde_json::Value;
 

@@ -3,7 +3,8 @@
 use std::{fs, path::Path};
 
 use futures::executor::block_on;
-use picofarm_dataset::{Dataset, Quantity, open_store};
+use picofarm_dataset::{Dataset, Quantity};
+use picofarm_store::open_store;
 use picofarm_tests::Farm;
 use serde_json::json;
 

@@ -10,9 +10,8 @@ use futures::{StreamExt, TryStreamExt, future::join_all};
 use object_store::{
     Error, GetOptions, GetRange, ObjectStore, ObjectStoreExt, PutMode, PutOptions, path::Path,
 };
-use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Fault, PROBE_WITHIN, Profile, VerifyMode, open_store, probe,
-};
+use picofarm_dataset::{Dataset, DatasetSpec, Profile};
+use picofarm_store::{Fault, PROBE_WITHIN, StorageError, VerifyMode, open_store, probe};
 use picofarm_tests::{Scratch, cloud::Cloud, s3};
 
 #[path = "../../../storage/dataset/tests/it/common/scene.rs"]
@@ -330,7 +329,7 @@ async fn scenes_come_back_and_damage_is_found(at: &At) {
         .await
         .unwrap_err();
     assert!(
-        matches!(conflict, DatasetError::Conflict { .. }),
+        matches!(conflict, StorageError::Conflict { .. }),
         "{conflict}"
     );
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());

@@ -27,12 +27,15 @@ use tracing_subscriber::{
 
 /// Targets with lines that are forwarded, from INFO upwards. Those of other libraries are not,
 /// because their content is unknown.
-const OURS: [&str; 6] = [
+const OURS: [&str; 9] = [
     "picofarm_agent",
     "picofarm_dataset",
+    "picofarm_exchange",
     "picofarm_model",
+    "picofarm_results",
     "picofarm_scene",
     "picofarm_session",
+    "picofarm_store",
     "picofarm_transient",
 ];
 /// Bytes of a task's allowance reserved for the line with the number of omitted lines.

@@ -8,7 +8,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use picofarm_dataset::{Dataset, VerifyMode, VerifyOptions, open_store};
+use picofarm_dataset::{Dataset, VerifyOptions};
+use picofarm_store::{VerifyMode, open_store};
 use serde::Serialize;
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -174,7 +175,7 @@ async fn look(simulated: &Simulated, output: Output) -> Result<Vec<Row>> {
 
     let away = simulated.orphan()?;
     let watch = Watch::start();
-    let found = dataset.collect(Duration::ZERO, false).await;
+    let found = picofarm_results::collect_garbage(&dataset, Duration::ZERO, false).await;
     let (found, kept) = (found.map_err(failed)?, simulated.adopt(&away));
     note(
         "gc --dry-run",
@@ -185,7 +186,7 @@ async fn look(simulated: &Simulated, output: Output) -> Result<Vec<Row>> {
     Ok(rows)
 }
 
-fn sound(problems: &[picofarm_dataset::Problem]) -> Result<()> {
+fn sound(problems: &[picofarm_store::Problem]) -> Result<()> {
     match problems.first() {
         None => Ok(()),
         Some(problem) => Err(CliError::new(

@@ -10,8 +10,9 @@ use std::{
 
 use picofarm_dataset::{
     Dataset, DatasetSpec, Gate, Intrinsics, Manifest, Profile, Provenance, SceneRecord, Subsets,
-    Wavelength, open_store,
+    Wavelength,
 };
+use picofarm_store::open_store;
 
 use picofarm_cli::{
     dataset::failed,

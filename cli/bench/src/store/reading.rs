@@ -11,14 +11,12 @@ use std::{
     time::{Duration, Instant},
 };
 
-use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, Wavelength,
-    open_store,
-};
+use picofarm_dataset::{Dataset, DatasetSpec, Profile, Provenance, Quantity, Subsets, Wavelength};
 use picofarm_model::{
     input::{Normalise, planes_of},
     scene::{Order, Scene},
 };
+use picofarm_store::{StorageError, open_store};
 use serde::Serialize;
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -163,7 +161,7 @@ fn stopped(stop: &CancellationToken) -> Result<()> {
     }
 }
 
-fn failed(e: DatasetError) -> CliError {
+fn failed(e: StorageError) -> CliError {
     CliError::new(Code::Failed, e.to_string())
 }
 
@@ -182,7 +180,7 @@ async fn written(
     samples: &[Sample],
     source: &Dataset,
     folder: &Path,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, StorageError> {
     let spec = DatasetSpec {
         scenes: samples.len() as u64,
         profile: Profile::default(),
@@ -209,7 +207,7 @@ async fn written(
     Ok(dataset)
 }
 
-async fn fetched(spec: &DatasetSpec, folder: &Path) -> Result<(Crop, Fetched), DatasetError> {
+async fn fetched(spec: &DatasetSpec, folder: &Path) -> Result<(Crop, Fetched), StorageError> {
     let (store, prefix) = open_store(&folder.display().to_string())?;
     let counting = Arc::new(Counting::new(store));
     let dataset = Dataset::open(counting.clone(), prefix).await?;
@@ -280,9 +278,9 @@ fn loader(
     let next = AtomicUsize::new(0);
     let total = READS * threads;
     let begin = Mutex::new(());
-    let one = |pool: &rayon::ThreadPool, ready: mpsc::Sender<()>| -> Result<(), DatasetError> {
+    let one = |pool: &rayon::ThreadPool, ready: mpsc::Sender<()>| -> Result<(), StorageError> {
         let (mut buffer, mut scaled) = (Vec::new(), Vec::new());
-        let mut read = |i: usize| -> Result<(), DatasetError> {
+        let mut read = |i: usize| -> Result<(), StorageError> {
             let scene = (i % scenes) as u64;
             match into {
                 Into::Histogram => {
@@ -326,7 +324,7 @@ fn loader(
         let _ = all_ready.recv();
         drop(held);
         let start = Instant::now();
-        let join = |r: std::thread::ScopedJoinHandle<'_, Result<(), DatasetError>>| r.join();
+        let join = |r: std::thread::ScopedJoinHandle<'_, Result<(), StorageError>>| r.join();
         let all = || readers.into_iter().map(join).collect::<Vec<_>>();
         let (results, cpu_s) = cpu::of_process(all);
         let took = start.elapsed().max(Duration::from_millis(1));

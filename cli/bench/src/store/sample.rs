@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use picofarm_dataset::{Dataset, DatasetError, Gate, Quantity, Spot};
+use picofarm_dataset::{Dataset, Gate, Quantity, Spot};
+use picofarm_store::StorageError;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -38,7 +39,7 @@ impl Sample {
     ///
     /// # Errors
     /// Fails if the scene cannot be read.
-    pub async fn read(dataset: &Dataset, scene: u64) -> Result<Self, DatasetError> {
+    pub async fn read(dataset: &Dataset, scene: u64) -> Result<Self, StorageError> {
         let spec = *dataset.spec();
         let depth: Vec<f32> = dataset.read(scene, Quantity::Depth).await?;
         let scale: Vec<f32> = dataset.read(scene, Quantity::Scale).await?;

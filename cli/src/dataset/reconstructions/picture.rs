@@ -3,8 +3,9 @@
 use std::path::Path;
 
 use picofarm_agent::reconstruct::{CELL, STEP, columns, first_row};
-use picofarm_dataset::{DatasetError, Reconstructions};
 use picofarm_figures::{Canvas, TEXT};
+use picofarm_results::Reconstructions;
+use picofarm_store::StorageError;
 
 use super::{figure, metrics};
 use crate::{
@@ -63,7 +64,7 @@ pub async fn draw(place: &str, there: &Reconstructions, rows: usize, path: &Path
 /// Reads the picture of a scene's novel views.
 async fn views(place: &str, there: &Reconstructions, scene: u64) -> Result<Canvas> {
     let bytes = there.read(scene, "views.png").await.map_err(|e| match e {
-        DatasetError::NotPublished { .. } => CliError::input(format!(
+        StorageError::NotPublished { .. } => CliError::input(format!(
             "{place}: scene {scene} has no views.png: its stage had views = 0"
         ))
         .hint("make the reconstructions again in another folder with views = 24 in their stage"),

@@ -7,7 +7,8 @@
 use std::collections::BTreeMap;
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{DatasetError, ReconstructionManifest, Reconstructions, Verdict};
+use picofarm_results::{ReconstructionManifest, Reconstructions, Verdict};
+use picofarm_store::StorageError;
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -276,7 +277,7 @@ async fn extremes(there: &Reconstructions, scenes: &[Scene]) -> Result<Vec<Extre
         let (l1_m, scene) = ranked[at];
         let picture = match there.read(scene, "views.png").await {
             Ok(bytes) => bytes.to_vec(),
-            Err(DatasetError::NotPublished { .. }) => Vec::new(),
+            Err(StorageError::NotPublished { .. }) => Vec::new(),
             Err(e) => return Err(failed(e)),
         };
         extremes.push(Extreme {

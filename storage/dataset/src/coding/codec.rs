@@ -8,14 +8,14 @@ use zarrs::array::codec::CodecChain;
 use zarrs::array::codec::api::{ArrayToBytesCodecTraits, CodecOptions};
 use zarrs::array::{ArrayBytes, DataType, FillValue, data_type};
 
-use crate::error::DatasetError;
 use crate::layout::arrays::{Layout, index_codecs};
 use crate::layout::quantity::Element;
+use picofarm_store::StorageError;
 
 /// The codecs of one kind of chunk. They are deterministic: single-threaded per chunk, and
 /// stateless.
 #[derive(Debug, Clone)]
-pub(crate) struct ChunkCodec {
+pub struct ChunkCodec {
     chain: CodecChain,
     shape: Vec<NonZeroU64>,
     data_type: DataType,
@@ -141,7 +141,7 @@ impl ChunkCodec {
     }
 
     /// Encodes a chunk of native-endian values.
-    pub fn encode(&self, values: &[u8]) -> Result<Vec<u8>, DatasetError> {
+    pub fn encode(&self, values: &[u8]) -> Result<Vec<u8>, StorageError> {
         self.chain
             .encode(
                 ArrayBytes::from(Cow::Borrowed(values)),
@@ -151,13 +151,13 @@ impl ChunkCodec {
                 &CodecOptions::default(),
             )
             .map(Cow::into_owned)
-            .map_err(|e| DatasetError::codec(format!("cannot encode a chunk of {}", self.name), e))
+            .map_err(|e| StorageError::codec(format!("cannot encode a chunk of {}", self.name), e))
     }
 
     /// Decodes a chunk to native-endian values, checking its crc32c and size.
-    pub fn decode(&self, bytes: &[u8]) -> Result<Vec<u8>, DatasetError> {
+    pub fn decode(&self, bytes: &[u8]) -> Result<Vec<u8>, StorageError> {
         let fail =
-            |e: String| DatasetError::codec(format!("cannot decode a chunk of {}", self.name), e);
+            |e: String| StorageError::codec(format!("cannot decode a chunk of {}", self.name), e);
         self.check_announced(bytes).map_err(&fail)?;
         let decoded = self
             .chain

@@ -4,7 +4,7 @@ pub(crate) mod codec;
 pub(crate) mod counts;
 pub(crate) mod profile;
 pub(crate) mod rounding;
-pub(crate) mod shard;
+pub mod shard;
 pub(crate) mod squareroot;
 pub(crate) mod tiles;
 pub(crate) mod transient;

@@ -10,29 +10,35 @@ use std::ops::Range;
 use bytes::Bytes;
 
 use crate::coding::codec::ChunkCodec;
-use crate::error::DatasetError;
+use picofarm_store::StorageError;
 
 /// (offset, size) of an inner chunk; `None` = all fill value.
-pub(crate) type IndexEntry = Option<Range<u64>>;
+pub type IndexEntry = Option<Range<u64>>;
 
 /// Returns the size in bytes of an index of `chunks` entries, including its crc32c.
-pub(crate) fn index_len(chunks: usize) -> usize {
+pub fn index_len(chunks: usize) -> usize {
     chunks * 16 + 4
 }
 
 /// Joins encoded inner chunks, in row-major order, with their index.
-pub(crate) fn assemble(chunks: &[Vec<u8>]) -> Result<Vec<u8>, DatasetError> {
+///
+/// # Errors
+/// [`StorageError::Codec`].
+pub fn assemble(chunks: &[Vec<u8>]) -> Result<Vec<u8>, StorageError> {
     put_together(chunks.iter().map(|chunk| Some(&chunk[..])))
 }
 
 /// Like [`assemble`], with some chunks that are all fill value.
-pub(crate) fn assemble_some(chunks: &[Option<Bytes>]) -> Result<Vec<u8>, DatasetError> {
+///
+/// # Errors
+/// [`StorageError::Codec`].
+pub fn assemble_some(chunks: &[Option<Bytes>]) -> Result<Vec<u8>, StorageError> {
     put_together(chunks.iter().map(|chunk| chunk.as_deref()))
 }
 
 fn put_together<'a>(
     chunks: impl ExactSizeIterator<Item = Option<&'a [u8]>> + Clone,
-) -> Result<Vec<u8>, DatasetError> {
+) -> Result<Vec<u8>, StorageError> {
     let payload: usize = chunks.clone().flatten().map(<[u8]>::len).sum();
     let count = chunks.len();
     let mut shard = Vec::with_capacity(payload + index_len(count));
@@ -51,11 +57,14 @@ fn put_together<'a>(
 }
 
 /// Parses the index from the last [`index_len`] bytes of a shard of `shard_len` bytes.
-pub(crate) fn parse_index(
+///
+/// # Errors
+/// [`StorageError::Codec`] if it is damaged.
+pub fn parse_index(
     tail: &[u8],
     chunks: usize,
     shard_len: u64,
-) -> Result<Vec<IndexEntry>, DatasetError> {
+) -> Result<Vec<IndexEntry>, StorageError> {
     let decoded = ChunkCodec::index(chunks).decode(tail)?;
     let limit = shard_len.saturating_sub(index_len(chunks) as u64);
     decoded
@@ -68,7 +77,7 @@ pub(crate) fn parse_index(
             }
             match offset.checked_add(size) {
                 Some(end) if end <= limit => Ok(Some(offset..end)),
-                _ => Err(DatasetError::codec(
+                _ => Err(StorageError::codec(
                     "cannot read a shard's index",
                     format!("an inner chunk at {offset} of {size} bytes lies outside the shard of {shard_len} bytes"),
                 )),

@@ -4,13 +4,13 @@ use bytes::Bytes;
 
 use crate::coding::codec::ChunkCodec;
 use crate::coding::squareroot::EncodeError;
-use crate::error::DatasetError;
 use crate::layout::manifest::FORMAT_VERSION;
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::ArrayCodec;
 use crate::scenes::encode::encode_transient;
 use crate::scenes::window::Decoding;
+use picofarm_store::StorageError;
 
 /// Encodes transients as in data sets with these properties.
 #[derive(Debug)]
@@ -36,8 +36,8 @@ impl TransientCodec {
     /// Returns a codec of the newest format.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] names the property out of range.
-    pub fn new(spec: &DatasetSpec) -> Result<Self, DatasetError> {
+    /// [`StorageError::Invalid`] names the property out of range.
+    pub fn new(spec: &DatasetSpec) -> Result<Self, StorageError> {
         spec.check()?;
         let layout = Quantity::Transient.layout(spec, FORMAT_VERSION);
         let codec = ChunkCodec::new(&layout);
@@ -50,8 +50,8 @@ impl TransientCodec {
     /// Encodes h, `[row][column][bin]`, on rayon threads.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if the size differs, or a value is negative or not finite.
-    pub fn encode(&self, h: &[f32], scale: f32) -> Result<CodedImage, DatasetError> {
+    /// [`StorageError::Invalid`] if the size differs, or a value is negative or not finite.
+    pub fn encode(&self, h: &[f32], scale: f32) -> Result<CodedImage, StorageError> {
         self.check(h.len())?;
         let coded = encode_transient(&self.spec, &self.array, &[h], scale)?;
         Ok(CodedImage {
@@ -65,9 +65,9 @@ impl TransientCodec {
     /// Decodes into `target`, on rayon threads.
     ///
     /// # Errors
-    /// [`DatasetError::Codec`] if the bytes are damaged; [`DatasetError::Invalid`] if the target
+    /// [`StorageError::Codec`] if the bytes are damaged; [`StorageError::Invalid`] if the target
     /// has another size.
-    pub fn decode(&self, coded: &CodedImage, target: &mut [f32]) -> Result<(), DatasetError> {
+    pub fn decode(&self, coded: &CodedImage, target: &mut [f32]) -> Result<(), StorageError> {
         self.check(target.len())?;
         let decoding = Decoding {
             spec: &self.spec,
@@ -77,19 +77,19 @@ impl TransientCodec {
         };
         match decoding.shard(&coded.shard, target)?.0 {
             true => Ok(()),
-            false => Err(DatasetError::codec(
+            false => Err(StorageError::codec(
                 "cannot decode a transient",
                 "a saturated bin has no exact value",
             )),
         }
     }
 
-    fn check(&self, len: usize) -> Result<(), DatasetError> {
+    fn check(&self, len: usize) -> Result<(), StorageError> {
         let expected = self.spec.transient_len();
         if len == expected {
             return Ok(());
         }
         let what = format!("expected {expected} values, found {len}");
-        Err(DatasetError::invalid("transient", what))
+        Err(StorageError::invalid("transient", what))
     }
 }

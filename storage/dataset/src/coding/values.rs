@@ -7,8 +7,8 @@ use crate::coding::counts;
 use crate::coding::rounding::Rounding;
 use crate::coding::squareroot::{ErrorSums, SATURATED, SquareRoot};
 use crate::coding::tiles::{Part, Run, Tiles};
-use crate::error::DatasetError;
 use crate::layout::spec::Profile;
+use picofarm_store::StorageError;
 
 /// The values of a transient: its planes one after the other.
 pub(crate) struct Source<'a> {
@@ -38,13 +38,13 @@ pub(crate) struct CodedValues {
 /// Encodes a tile.
 ///
 /// # Errors
-/// [`DatasetError::Invalid`] names a value that the profile cannot represent.
+/// [`StorageError::Invalid`] names a value that the profile cannot represent.
 pub(crate) fn code(
     profile: Profile,
     tiles: &Tiles,
     tile: usize,
     source: &Source<'_>,
-) -> Result<CodedValues, DatasetError> {
+) -> Result<CodedValues, StorageError> {
     let mut error = ErrorSums::default();
     let mut overflow = Vec::new();
     let valid = |h: &[f32], at: usize| match h.iter().all(|h| (0.0..=f32::MAX).contains(h)) {
@@ -106,8 +106,8 @@ fn each<T: bytemuck::Pod>(
     tiles: &Tiles,
     tile: usize,
     source: &Source<'_>,
-    mut code: impl FnMut(&[f32], &mut [T], usize) -> Result<(), DatasetError>,
-) -> Result<Vec<T>, DatasetError> {
+    mut code: impl FnMut(&[f32], &mut [T], usize) -> Result<(), StorageError>,
+) -> Result<Vec<T>, StorageError> {
     let mut values = vec![T::zeroed(); tiles.tile_len()];
     let bins = tiles.bins_of(tile);
     for run in tiles.runs(tile) {
@@ -134,22 +134,22 @@ fn saturated<'a>(
         .map(move |(i, (h, _))| ((at + i) as u64, *h))
 }
 
-fn invalid_value(name: &str, h: &[f32], start: usize) -> DatasetError {
+fn invalid_value(name: &str, h: &[f32], start: usize) -> StorageError {
     let at = h
         .iter()
         .position(|h| !(0.0..=f32::MAX).contains(h))
         .unwrap_or(0);
-    DatasetError::invalid(
+    StorageError::invalid(
         format!("record.{name}[{}]", start + at),
         format!("expected a finite value of at least 0, found {}", h[at]),
     )
 }
 
-fn invalid_count(source: &Source<'_>, h: f32, at: usize) -> DatasetError {
+fn invalid_count(source: &Source<'_>, h: f32, at: usize) -> StorageError {
     if !(0.0..=f32::MAX).contains(&h) {
         return invalid_value(source.name, &[h], at);
     }
-    DatasetError::invalid(
+    StorageError::invalid(
         format!("record.{}[{at}]", source.name),
         format!(
             "expected a whole number of photons, found {}; counts-u16 holds counts, other values need sqrt-u16 or lossless",

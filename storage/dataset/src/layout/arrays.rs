@@ -11,8 +11,10 @@ pub const INNER_SIDE: u64 = 32;
 
 /// The layout of one array.
 #[derive(Debug, Clone)]
-pub(crate) struct Layout {
+pub struct Layout {
+    /// The quantity.
     pub quantity: Quantity,
+    /// The type of the stored values.
     pub element: Element,
     /// Shape of one scene, without the scene axis.
     pub shape: Vec<u64>,
@@ -212,6 +214,7 @@ impl Layout {
         codecs
     }
 
+    /// Returns the fill value in its metadata.
     pub fn fill_value(&self) -> Value {
         match self.element {
             Element::F32 if self.fill_nan => json!("NaN"),
@@ -250,7 +253,7 @@ impl Layout {
 }
 
 /// Returns the codecs of images: values as bytes, compressed, with a checksum.
-pub(crate) fn image_codecs(element: Element, shuffle: &str) -> Value {
+pub fn image_codecs(element: Element, shuffle: &str) -> Value {
     let typesize = element.size();
     let bytes = match typesize {
         1 => json!({"name": "bytes"}),
@@ -263,6 +266,6 @@ pub(crate) fn image_codecs(element: Element, shuffle: &str) -> Value {
 }
 
 /// Returns the codecs of a shard's index.
-pub(crate) fn index_codecs() -> Value {
+pub fn index_codecs() -> Value {
     json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}])
 }

@@ -6,21 +6,21 @@ use object_store::ObjectStore;
 use object_store::path::Path;
 use serde_json::{Value, json};
 
-use crate::error::DatasetError;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
 
 /// Name of the metadata objects.
-pub(crate) const METADATA: &str = "zarr.json";
+pub const METADATA: &str = "zarr.json";
 
 /// Formats metadata for storage.
-pub(crate) fn pretty(value: &Value) -> Bytes {
+pub fn pretty(value: &Value) -> Bytes {
     let mut text = serde_json::to_vec_pretty(value).expect("a JSON value can be written");
     text.push(b'\n');
     text.into()
 }
 
 /// Returns whether a group's root belongs to predictions.
-pub(crate) fn is_predictions(root: &Value) -> bool {
+pub fn is_predictions(root: &Value) -> bool {
     root["attributes"]["picofarm"]["predictions"].is_u64()
 }
 
@@ -40,12 +40,12 @@ pub(crate) fn counts_fewer(stored: &[u8], scenes: u64) -> bool {
 /// Writes an array's metadata while its group has no root; `metadata` says what they are for a
 /// number of scenes. What an interrupted creation left is adopted if it differs at most in that
 /// number.
-pub(crate) async fn create_metadata(
+pub async fn create_metadata(
     store: &dyn ObjectStore,
     path: &Path,
     scenes: u64,
     metadata: impl Fn(u64) -> Value,
-) -> Result<(), DatasetError> {
+) -> Result<(), StorageError> {
     let ours = metadata(scenes);
     if objects::create(store, path, pretty(&ours)).await? {
         return Ok(());
@@ -57,7 +57,7 @@ pub(crate) async fn create_metadata(
         stored["shape"][0] = json!(scenes);
     }
     if stored != ours {
-        return Err(DatasetError::Damaged {
+        return Err(StorageError::Damaged {
             object: objects::shown(store, path),
             what: "left by the interrupted creation of another data set; remove it, or use an empty location"
                 .into(),

@@ -60,17 +60,23 @@ const SPOTS_25: [u32; 25] = {
 };
 const SPOTS_4: [u32; 4] = [22, 27, 72, 77];
 
-/// Element type of an array (public only for the sealed trait behind [`crate::Stored`]).
+/// Element type of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Element {
+    /// 32-bit floats.
     F32,
+    /// Unsigned bytes.
     U8,
+    /// Unsigned 16-bit integers.
     U16,
+    /// Signed 16-bit integers.
     I16,
+    /// Unsigned 32-bit integers.
     U32,
 }
 
 impl Element {
+    /// Returns its name in Zarr v3.
     pub fn name(self) -> &'static str {
         match self {
             Self::F32 => "float32",
@@ -81,6 +87,7 @@ impl Element {
         }
     }
 
+    /// Returns its size in bytes.
     pub fn size(self) -> u64 {
         match self {
             Self::U8 => 1,

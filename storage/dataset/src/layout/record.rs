@@ -3,9 +3,9 @@
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::error::DatasetError;
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
+use picofarm_store::StorageError;
 
 /// Pinhole intrinsics in pixels; pixel (u, v) has its centre at (u + 0.5, v + 0.5).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -95,7 +95,7 @@ pub struct Provenance {
 }
 
 impl SceneRecord<'_> {
-    fn check_subsets(&self, spec: &DatasetSpec) -> Result<(), DatasetError> {
+    fn check_subsets(&self, spec: &DatasetSpec) -> Result<(), StorageError> {
         let expected: Vec<Quantity> = spec.quantities();
         let expected: Vec<Quantity> = expected
             .into_iter()
@@ -109,7 +109,7 @@ impl SceneRecord<'_> {
                 names(&expected),
                 names(&found)
             );
-            return Err(DatasetError::invalid("record.subsets", what));
+            return Err(StorageError::invalid("record.subsets", what));
         }
         for subset in self.subsets {
             let planes = spec.planes(subset.quantity);
@@ -117,14 +117,14 @@ impl SceneRecord<'_> {
             if subset.planes.len() != planes || subset.planes.iter().any(|p| p.len() != len) {
                 let what = format!("expected {planes} histograms of {len} values each");
                 let field = format!("record.subsets.{}", subset.quantity.name());
-                return Err(DatasetError::invalid(field, what));
+                return Err(StorageError::invalid(field, what));
             }
         }
         Ok(())
     }
 
     /// Checks that lengths and values fit the specification.
-    pub(crate) fn check(&self, spec: &DatasetSpec) -> Result<(), DatasetError> {
+    pub(crate) fn check(&self, spec: &DatasetSpec) -> Result<(), StorageError> {
         let pixels = spec.pixels();
         let spots = spec.spots as usize;
         let paths = if spec.two_bounce { pixels * spots } else { 0 };
@@ -147,7 +147,7 @@ impl SceneRecord<'_> {
                     "expected {expected} values for {}x{} pixels, {spots} spots and {} bins, found {found}",
                     spec.width, spec.height, spec.gate.bins
                 );
-                return Err(DatasetError::invalid(format!("record.{field}"), what));
+                return Err(StorageError::invalid(format!("record.{field}"), what));
             }
         }
         self.check_subsets(spec)?;
@@ -212,12 +212,13 @@ impl SceneRecord<'_> {
 
 impl Spot {
     /// Returns the spot as a row of the `spots` array.
-    pub(crate) fn row(&self) -> [f32; 7] {
+    pub fn row(&self) -> [f32; 7] {
         let ([x, y, z], [nx, ny, nz]) = (self.position, self.normal);
         [x, y, z, nx, ny, nz, self.path_m]
     }
 
-    pub(crate) fn from_row(row: &[f32]) -> Option<Self> {
+    /// Parses a row of the `spots` array; `None` if the beam meets nothing.
+    pub fn from_row(row: &[f32]) -> Option<Self> {
         (!row[0].is_nan()).then(|| Self {
             position: [row[0], row[1], row[2]],
             normal: [row[3], row[4], row[5]],
@@ -231,10 +232,10 @@ fn check_values<T: Copy + std::fmt::Display>(
     values: &[T],
     valid: impl Fn(T) -> bool,
     expected: &str,
-) -> Result<(), DatasetError> {
+) -> Result<(), StorageError> {
     match values.iter().position(|x| !valid(*x)) {
         None => Ok(()),
-        Some(at) => Err(DatasetError::invalid(
+        Some(at) => Err(StorageError::invalid(
             format!("record.{field}[{at}]"),
             format!("expected {expected}, found {}", values[at]),
         )),

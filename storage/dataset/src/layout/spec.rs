@@ -4,8 +4,8 @@
 pub use picofarm_settings::{Gate, Wavelength};
 use serde::{Deserialize, Serialize};
 
-use crate::error::DatasetError;
 use crate::layout::quantity::Quantity;
+use picofarm_store::StorageError;
 
 /// The encoding of transients.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -195,8 +195,8 @@ impl DatasetSpec {
     /// Checks that all numbers are in range, so that every array's shape and key exist.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] names the field.
-    pub fn check(&self) -> Result<(), DatasetError> {
+    /// [`StorageError::Invalid`] names the field.
+    pub fn check(&self) -> Result<(), StorageError> {
         let sizes = [
             ("spec.scenes", self.scenes, 1 << 32),
             ("spec.height", u64::from(self.height), 1 << 14),
@@ -206,14 +206,14 @@ impl DatasetSpec {
         ];
         for (field, value, max) in sizes {
             if value == 0 || value > max {
-                return Err(DatasetError::invalid(
+                return Err(StorageError::invalid(
                     field,
                     format!("expected 1 to {max}, found {value}"),
                 ));
             }
         }
         if !self.subsets.is_empty() && self.spots != 100 {
-            return Err(DatasetError::invalid(
+            return Err(StorageError::invalid(
                 "spec.subsets",
                 format!(
                     "{:?} are subsets of a grid of 100 spots, found {} spots",
@@ -223,7 +223,7 @@ impl DatasetSpec {
             ));
         }
         if !self.gate.start_m.is_finite() {
-            return Err(DatasetError::invalid(
+            return Err(StorageError::invalid(
                 "spec.gate.start_m",
                 format!(
                     "expected a finite length in metres, found {}",
@@ -232,7 +232,7 @@ impl DatasetSpec {
             ));
         }
         if !(self.gate.bin_width_m.is_finite() && self.gate.bin_width_m > 0.0) {
-            return Err(DatasetError::invalid(
+            return Err(StorageError::invalid(
                 "spec.gate.bin_width_m",
                 format!(
                     "expected a positive length in metres, found {}",
@@ -243,7 +243,7 @@ impl DatasetSpec {
         if let Profile::SqrtU16 { delta } = self.profile {
             let known = [0.0625, 0.125, 0.2, 0.25, 0.5, 1.0, 2.0];
             if !known.contains(&delta) {
-                return Err(DatasetError::invalid(
+                return Err(StorageError::invalid(
                     "spec.profile.delta",
                     format!("expected one of {known:?}, found {delta}"),
                 ));
@@ -252,7 +252,7 @@ impl DatasetSpec {
         if let Profile::PlainF32 { round } = self.profile {
             let known = [0.0, 0.0625, 0.125, 0.25, 0.5, 1.0];
             if !known.contains(&round) {
-                return Err(DatasetError::invalid(
+                return Err(StorageError::invalid(
                     "spec.profile.round",
                     format!("expected one of {known:?}, found {round}"),
                 ));

@@ -9,10 +9,10 @@ use rayon::prelude::*;
 use serde_json::{Map, Value};
 
 use crate::coding::codec::ChunkCodec;
-use crate::error::DatasetError;
 use crate::layout::group::METADATA;
 use crate::render_group::write::{chunk_key, codecs, grid, key_encoding, runs, unravel};
 use crate::scenes::read::Stored;
+use picofarm_store::StorageError;
 
 /// Number of chunks decoded concurrently. It bounds the memory in addition to the array's own.
 const BATCH: u64 = 16;
@@ -36,9 +36,9 @@ impl RenderGroup {
     /// Opens the group in `dir` without changing it.
     ///
     /// # Errors
-    /// [`DatasetError::Io`] if there is none, [`DatasetError::Invalid`] if its metadata cannot be
+    /// [`StorageError::Io`] if there is none, [`StorageError::Invalid`] if its metadata cannot be
     /// read.
-    pub fn open(dir: &Path) -> Result<Self, DatasetError> {
+    pub fn open(dir: &Path) -> Result<Self, StorageError> {
         let path = dir.join(METADATA);
         let mut root = metadata(&path)?;
         let attributes = match root.get_mut("attributes").map(Value::take) {
@@ -70,13 +70,13 @@ impl RenderGroup {
     /// Returns the shape and the values (row-major) of an array.
     ///
     /// # Errors
-    /// [`DatasetError::Io`] if it or one of its chunks is missing, [`DatasetError::Invalid`] if it
-    /// has another type or was not written by `write_render_group`, [`DatasetError::Codec`] if a
+    /// [`StorageError::Io`] if it or one of its chunks is missing, [`StorageError::Invalid`] if it
+    /// has another type or was not written by `write_render_group`, [`StorageError::Codec`] if a
     /// chunk is damaged.
     pub fn read<T: Stored + Send + Sync>(
         &self,
         name: &str,
-    ) -> Result<(Vec<u64>, Vec<T>), DatasetError> {
+    ) -> Result<(Vec<u64>, Vec<T>), StorageError> {
         let folder = self.dir.join(name);
         let path = folder.join(METADATA);
         let metadata = metadata(&path)?;
@@ -113,7 +113,7 @@ impl RenderGroup {
         // All chunks must exist before memory for the announced shape is allocated.
         for at in (0..chunks).map(|at| unravel(at, &grid)) {
             let path = folder.join(chunk_key(&at));
-            fs::metadata(&path).map_err(|e| DatasetError::io("read", &path, e))?;
+            fs::metadata(&path).map_err(|e| StorageError::io("read", &path, e))?;
         }
         let most = chunk.iter().product::<u64>() * size_of::<T>() as u64 + MAX_OVERHEAD;
         let codec = ChunkCodec::plain(&codecs(T::ELEMENT), &chunk, T::ELEMENT);
@@ -126,7 +126,7 @@ impl RenderGroup {
                     let bytes = bounded(&path, most)?;
                     codec
                         .decode(&bytes)
-                        .map_err(|e| DatasetError::codec(path.display().to_string(), e))
+                        .map_err(|e| StorageError::codec(path.display().to_string(), e))
                 })
                 .collect::<Result<Vec<_>, _>>()?;
             for (at, bytes) in (first..).zip(batch) {
@@ -143,18 +143,18 @@ impl RenderGroup {
 }
 
 /// A file of at most so many bytes.
-fn bounded(path: &Path, most: u64) -> Result<Vec<u8>, DatasetError> {
+fn bounded(path: &Path, most: u64) -> Result<Vec<u8>, StorageError> {
     let read = fs::File::open(path).and_then(|file| picofarm_files::read_bounded(file, most));
     read.map_err(|e| match e.kind() {
-        ErrorKind::InvalidData => DatasetError::invalid(path.display().to_string(), e.to_string()),
-        _ => DatasetError::io("read", path, e),
+        ErrorKind::InvalidData => StorageError::invalid(path.display().to_string(), e.to_string()),
+        _ => StorageError::io("read", path, e),
     })
 }
 
-fn metadata(path: &Path) -> Result<Value, DatasetError> {
+fn metadata(path: &Path) -> Result<Value, StorageError> {
     let bytes = bounded(path, MAX_METADATA)?;
     serde_json::from_slice(&bytes).map_err(|e| {
-        DatasetError::invalid(
+        StorageError::invalid(
             path.display().to_string(),
             format!("expected the JSON of a Zarr v3 node: {e}"),
         )
@@ -162,7 +162,7 @@ fn metadata(path: &Path) -> Result<Value, DatasetError> {
 }
 
 /// Parses positive sizes with a product that fits into the address space.
-fn sizes(path: &Path, value: &Value) -> Result<Vec<u64>, DatasetError> {
+fn sizes(path: &Path, value: &Value) -> Result<Vec<u64>, StorageError> {
     let sizes: Option<Vec<u64>> = value
         .as_array()
         .map(|sizes| sizes.iter().filter_map(Value::as_u64).collect());
@@ -175,8 +175,8 @@ fn sizes(path: &Path, value: &Value) -> Result<Vec<u64>, DatasetError> {
         .ok_or_else(|| foreign(path, "positive sizes", value))
 }
 
-fn foreign(path: &Path, expected: &str, found: &Value) -> DatasetError {
-    DatasetError::invalid(
+fn foreign(path: &Path, expected: &str, found: &Value) -> StorageError {
+    StorageError::invalid(
         path.display().to_string(),
         format!("expected {expected} as `picofarm scene render` writes it, found {found}"),
     )

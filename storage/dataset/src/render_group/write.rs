@@ -11,10 +11,10 @@ use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 
 use crate::coding::codec::ChunkCodec;
-use crate::error::DatasetError;
 use crate::layout::group::{METADATA, pretty};
 use crate::layout::quantity::Element;
 use crate::scenes::read::Stored;
+use picofarm_store::StorageError;
 
 /// Number of values of the largest chunk.
 const CHUNK_VALUES: u64 = 1 << 20;
@@ -37,23 +37,23 @@ pub struct RenderArray<'a, T = f32> {
 /// atomic: the group is written to a temporary folder next to `dir` and renamed.
 ///
 /// # Errors
-/// [`DatasetError::Invalid`] for unsuitable arrays, and if `dir` exists and is not empty (nothing
-/// is overwritten); [`DatasetError::Io`].
+/// [`StorageError::Invalid`] for unsuitable arrays, and if `dir` exists and is not empty (nothing
+/// is overwritten); [`StorageError::Io`].
 pub fn write_render_group<T: Stored + Send + Sync>(
     dir: &Path,
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
-) -> Result<(), DatasetError> {
+) -> Result<(), StorageError> {
     check(arrays)?;
-    let dir = std::path::absolute(dir).map_err(|e| DatasetError::io("resolve", dir, e))?;
+    let dir = std::path::absolute(dir).map_err(|e| StorageError::io("resolve", dir, e))?;
     refuse_occupied(&dir)?;
     let (Some(parent), Some(name)) = (dir.parent(), dir.file_name()) else {
-        return Err(DatasetError::invalid(
+        return Err(StorageError::invalid(
             "dir",
             format!("expected a new folder, found {}", dir.display()),
         ));
     };
-    fs::create_dir_all(parent).map_err(|e| DatasetError::io("create", parent, e))?;
+    fs::create_dir_all(parent).map_err(|e| StorageError::io("create", parent, e))?;
     let partial = parent.join(format!(
         ".{}.partial-{}",
         name.display(),
@@ -61,7 +61,7 @@ pub fn write_render_group<T: Stored + Send + Sync>(
     ));
     let written = write_into(&partial, arrays, attributes).and_then(|()| {
         // The rename replaces an empty folder, and fails if it was filled in the meantime.
-        fs::rename(&partial, &dir).map_err(|e| DatasetError::io("create", &dir, e))
+        fs::rename(&partial, &dir).map_err(|e| StorageError::io("create", &dir, e))
     });
     if written.is_err() {
         // The first error is the one to report. Leftovers that cannot be removed remain visible in
@@ -71,10 +71,10 @@ pub fn write_render_group<T: Stored + Send + Sync>(
     written
 }
 
-fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), DatasetError> {
+fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), StorageError> {
     for (i, array) in arrays.iter().enumerate() {
         let invalid = |what: String| {
-            Err(DatasetError::invalid(
+            Err(StorageError::invalid(
                 format!("arrays[{i}] ({})", array.name),
                 what,
             ))
@@ -105,10 +105,10 @@ fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), DatasetError> {
     Ok(())
 }
 
-fn refuse_occupied(dir: &Path) -> Result<(), DatasetError> {
+fn refuse_occupied(dir: &Path) -> Result<(), StorageError> {
     let occupied = |what: &str| {
         let hint = "choose another folder or remove it first";
-        Err(DatasetError::invalid(
+        Err(StorageError::invalid(
             "dir",
             format!(
                 "{} {what}, and nothing is overwritten: {hint}",
@@ -123,7 +123,7 @@ fn refuse_occupied(dir: &Path) -> Result<(), DatasetError> {
         },
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(()),
         Err(e) if e.kind() == std::io::ErrorKind::NotADirectory => occupied("is a file"),
-        Err(e) => Err(DatasetError::io("list", dir, e)),
+        Err(e) => Err(StorageError::io("list", dir, e)),
     }
 }
 
@@ -131,7 +131,7 @@ fn write_into<T: Stored + Send + Sync>(
     dir: &Path,
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
-) -> Result<(), DatasetError> {
+) -> Result<(), StorageError> {
     encode(arrays, attributes, &|key, bytes| {
         write(&dir.join(key), &bytes)
     })
@@ -141,11 +141,11 @@ fn write_into<T: Stored + Send + Sync>(
 /// ascending.
 ///
 /// # Errors
-/// [`DatasetError::Invalid`] for unsuitable arrays.
+/// [`StorageError::Invalid`] for unsuitable arrays.
 pub fn encode_render_group<T: Stored + Send + Sync>(
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
-) -> Result<BTreeMap<String, Bytes>, DatasetError> {
+) -> Result<BTreeMap<String, Bytes>, StorageError> {
     check(arrays)?;
     let objects = Mutex::new(BTreeMap::new());
     encode(arrays, attributes, &|key, bytes| {
@@ -161,8 +161,8 @@ pub fn encode_render_group<T: Stored + Send + Sync>(
 fn encode<T: Stored + Send + Sync>(
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
-    put: &(dyn Fn(String, Bytes) -> Result<(), DatasetError> + Sync),
-) -> Result<(), DatasetError> {
+    put: &(dyn Fn(String, Bytes) -> Result<(), StorageError> + Sync),
+) -> Result<(), StorageError> {
     let mut consolidated = Map::new();
     for array in arrays {
         let chunk = chunk_shape(array.shape);
@@ -232,11 +232,11 @@ pub(crate) fn chunk_key(at: &[u64]) -> String {
     key
 }
 
-fn write(path: &PathBuf, bytes: &[u8]) -> Result<(), DatasetError> {
+fn write(path: &PathBuf, bytes: &[u8]) -> Result<(), StorageError> {
     if let Some(parent) = path.parent() {
-        fs::create_dir_all(parent).map_err(|e| DatasetError::io("create", parent, e))?;
+        fs::create_dir_all(parent).map_err(|e| StorageError::io("create", parent, e))?;
     }
-    fs::write(path, bytes).map_err(|e| DatasetError::io("write", path, e))
+    fs::write(path, bytes).map_err(|e| StorageError::io("write", path, e))
 }
 
 /// Returns the chunk shape: the array's shape, with its longest dimension except the last halved

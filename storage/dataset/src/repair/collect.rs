@@ -26,14 +26,12 @@ use futures::{StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
 use object_store::{Error, ObjectMeta, ObjectStoreExt};
 
-use crate::checkpoints;
-use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
-use crate::models::Models;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::part_scene;
-use crate::store::objects;
-use crate::store::{PROBE, leftovers, probe_leftovers};
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::{PROBE, leftovers, probe_leftovers};
 
 /// The minimum grace period while workers may be writing. It is longer than publishing a scene ever
 /// takes.
@@ -52,23 +50,45 @@ pub struct Orphan {
     /// The scene it would belong to; `None` for parts in transit, models, and objects left by a
     /// killed probe or local write.
     pub scene: Option<u64>,
+    /// The reason why it can be deleted.
+    pub cause: OrphanCause,
+}
+
+/// The reason why an object can be deleted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OrphanCause {
+    /// Its scene has no manifest.
+    Scene,
+    /// It is a part of a scene that was never joined.
+    Part,
+    /// It was left by a killed probe of the store.
+    Probe,
+    /// It is the unfinished file of a killed local write.
+    Write,
+    /// It is a checkpoint of an abandoned training.
+    Checkpoint,
+    /// It is a shard of an evaluation that was never joined.
+    Shard,
+    /// It is a call of the processes of an abandoned training.
+    Call,
+    /// No manifest of its model lists it.
+    Model,
 }
 
 impl Orphan {
-    /// Returns the reason why it can be deleted.
+    /// Returns the reason why it can be deleted, as text.
     pub fn why(&self) -> &'static str {
-        let name = self.object.rsplit('/').next().unwrap_or_default();
-        match self.scene {
-            Some(_) => "its scene has no manifest: left by a killed worker",
-            None if name.starts_with(PROBE) => "left by a killed probe of the store",
-            None if name.contains('#') => "unfinished file of a killed write",
-            None if name.ends_with(".ckpt") || name.ends_with(checkpoints::PART) => {
-                "checkpoint of a training that nobody goes on with"
-            }
-            None if !name.ends_with(".zst") => {
+        match self.cause {
+            OrphanCause::Scene => "its scene has no manifest: left by a killed worker",
+            OrphanCause::Probe => "left by a killed probe of the store",
+            OrphanCause::Write => "unfinished file of a killed write",
+            OrphanCause::Checkpoint => "checkpoint of a training that nobody goes on with",
+            OrphanCause::Model => {
                 "its model has no manifest that names it: left by a killed worker"
             }
-            None => "part of a scene that nobody joined",
+            OrphanCause::Shard => "shard of an evaluation that nobody joined",
+            OrphanCause::Call => "call of a training that nobody goes on with",
+            OrphanCause::Part => "part of a scene that nobody joined",
         }
     }
 }
@@ -96,29 +116,54 @@ impl Collection {
 
 /// A candidate for deletion.
 enum Found {
-    Object(ObjectMeta, Option<u64>),
+    Object(ObjectMeta, Option<u64>, OrphanCause),
     /// An unfinished file of a local store.
-    File(PathBuf, u64),
+    File(PathBuf, u64, OrphanCause),
 }
 
 impl Dataset {
     /// Finds objects that were last written at least `grace` ago and belong neither to a published
     /// scene nor to a scene in a snapshot: objects of scenes without a manifest, parts of scenes
-    /// that were never joined, and leftovers of killed probes and local writes. In the store's
-    /// models, finds abandoned checkpoints and objects not listed in any manifest. Deletes them if
+    /// that were never joined, and leftovers of killed probes and local writes. Deletes them if
     /// `delete` is set. Objects listed in a manifest, and unknown objects, are never touched. With
     /// a period below [`MIN_GRACE`], no worker may be writing to this data set.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] if a snapshot cannot be read, so that its scenes are unknown;
-    /// [`DatasetError::Store`], [`DatasetError::Io`]. Objects deleted before the error stay
+    /// [`StorageError::Damaged`] if a snapshot cannot be read, so that its scenes are unknown;
+    /// [`StorageError::Store`], [`StorageError::Io`]. Objects deleted before the error stay
     /// deleted; the collection can be repeated.
-    pub async fn collect(&self, grace: Duration, delete: bool) -> Result<Collection, DatasetError> {
+    pub async fn collect(&self, grace: Duration, delete: bool) -> Result<Collection, StorageError> {
+        let limit = self.age_limit(grace, delete).await?;
+        self.collect_before(limit, grace, delete).await
+    }
+
+    /// Returns the time `grace` ago. If `delete` is set, it is by the clock that sets the timestamps
+    /// of this store's objects.
+    ///
+    /// # Errors
+    /// [`StorageError::Store`].
+    pub async fn age_limit(
+        &self,
+        grace: Duration,
+        delete: bool,
+    ) -> Result<SystemTime, StorageError> {
         let now = match delete {
             true => self.store_time().await?,
             false => SystemTime::now(),
         };
-        let limit = now.checked_sub(grace).unwrap_or(SystemTime::UNIX_EPOCH);
+        Ok(now.checked_sub(grace).unwrap_or(SystemTime::UNIX_EPOCH))
+    }
+
+    /// Like [`Self::collect`], with the time before which objects are old.
+    ///
+    /// # Errors
+    /// Those of [`Self::collect`].
+    pub async fn collect_before(
+        &self,
+        limit: SystemTime,
+        grace: Duration,
+        delete: bool,
+    ) -> Result<Collection, StorageError> {
         let mut report = Collection::default();
         let mut found = self.unpublished(limit, &mut report).await?;
         found.extend(self.leavings(limit, grace).await?);
@@ -133,12 +178,6 @@ impl Dataset {
                 None => report.published += 1,
             }
         }
-        if let Some(store) = self.parent() {
-            let models = Models::new(self.store.clone(), &store);
-            report
-                .orphans
-                .extend(models.collect(limit, grace, delete).await?);
-        }
         report.orphans.sort_by(|a, b| a.object.cmp(&b.object));
         Ok(report)
     }
@@ -149,8 +188,8 @@ impl Dataset {
         &self,
         limit: SystemTime,
         report: &mut Collection,
-    ) -> Result<Vec<Found>, DatasetError> {
-        let failed = |e| DatasetError::store("list", self.shown(&self.prefix), e);
+    ) -> Result<Vec<Found>, StorageError> {
+        let failed = |e| StorageError::store("list", self.shown(&self.prefix), e);
         // Published scenes stay published, so their objects need not be remembered until the
         // manifests are listed again.
         let seen = self.scenes_present().await?;
@@ -185,13 +224,15 @@ impl Dataset {
         parts.retain(old);
         report.young = (all - objects.len() - parts.len()) as u64;
         let scenes = objects.into_iter();
-        let scenes = scenes.map(|(scene, object)| Found::Object(object, Some(scene)));
-        let parts = parts.into_iter().map(|object| Found::Object(object, None));
+        let scenes =
+            scenes.map(|(scene, object)| Found::Object(object, Some(scene), OrphanCause::Scene));
+        let parts = parts.into_iter();
+        let parts = parts.map(|object| Found::Object(object, None, OrphanCause::Part));
         Ok(scenes.chain(parts).collect())
     }
 
     /// Returns the scenes in any snapshot.
-    async fn pinned(&self) -> Result<BTreeSet<u64>, DatasetError> {
+    async fn pinned(&self) -> Result<BTreeSet<u64>, StorageError> {
         let mut pinned = BTreeSet::new();
         for name in self.snapshots().await? {
             pinned.extend(self.snapshot(&name).await?.scenes());
@@ -204,30 +245,34 @@ impl Dataset {
         &self,
         limit: SystemTime,
         grace: Duration,
-    ) -> Result<Vec<Found>, DatasetError> {
+    ) -> Result<Vec<Found>, StorageError> {
         let Some(parent) = self.parent() else {
             return Ok(Vec::new());
         };
         let listed = self.store.list_with_delimiter(Some(&parent)).await;
-        let listed = listed.map_err(|e| DatasetError::store("list", self.shown(&parent), e))?;
+        let listed = listed.map_err(|e| StorageError::store("list", self.shown(&parent), e))?;
         let is_probe = |object: &ObjectMeta| {
             let name = object.location.filename().unwrap_or_default();
             name.starts_with(PROBE) && SystemTime::from(object.last_modified) <= limit
         };
         let probes = listed.objects.into_iter().filter(is_probe);
-        let mut found: Vec<_> = probes.map(|object| Found::Object(object, None)).collect();
+        let mut found: Vec<_> = probes
+            .map(|object| Found::Object(object, None, OrphanCause::Probe))
+            .collect();
         let folder = |path| objects::folder(&*self.store, path);
-        if let (Some(here), Some(beside)) = (folder(&self.prefix), folder(&parent)) {
+        if let (Some(here), Some(parent_folder)) = (folder(&self.prefix), folder(&parent)) {
+            let file = |cause| move |(path, bytes)| Found::File(path, bytes, cause);
             let files = leftovers(&here, grace)?;
-            let files = files.into_iter().chain(probe_leftovers(&beside, grace)?);
-            found.extend(files.map(|(path, bytes)| Found::File(path, bytes)));
+            found.extend(files.into_iter().map(file(OrphanCause::Write)));
+            let probes = probe_leftovers(&parent_folder, grace)?;
+            found.extend(probes.into_iter().map(file(OrphanCause::Probe)));
         }
         Ok(found)
     }
 
     /// Returns the data set's parent, where stores are probed; `None` if the data set is the root
     /// of its store.
-    fn parent(&self) -> Option<Path> {
+    pub fn parent(&self) -> Option<Path> {
         let parts: Vec<_> = self.prefix.parts().collect();
         let (_, parent) = parts.split_last()?;
         Some(parent.iter().cloned().collect())
@@ -239,13 +284,13 @@ impl Dataset {
         found: Found,
         limit: SystemTime,
         delete: bool,
-    ) -> Result<Option<Orphan>, DatasetError> {
-        let (object, scene) = match found {
-            Found::File(path, bytes) => {
+    ) -> Result<Option<Orphan>, StorageError> {
+        let (object, scene, cause) = match found {
+            Found::File(path, bytes, cause) => {
                 if delete {
                     match std::fs::remove_file(&path) {
                         Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
-                            return Err(DatasetError::io("delete", &path, e));
+                            return Err(StorageError::io("delete", &path, e));
                         }
                         _ => {}
                     }
@@ -254,9 +299,10 @@ impl Dataset {
                     object: path.display().to_string(),
                     bytes,
                     scene: None,
+                    cause,
                 }));
             }
-            Found::Object(object, scene) => (object, scene),
+            Found::Object(object, scene, cause) => (object, scene, cause),
         };
         let path = &object.location;
         if delete && !self.delete_orphan(path, scene, limit).await? {
@@ -266,6 +312,7 @@ impl Dataset {
             object: self.shown(path),
             bytes: object.size,
             scene,
+            cause,
         }))
     }
 
@@ -275,7 +322,7 @@ impl Dataset {
         path: &Path,
         scene: Option<u64>,
         limit: SystemTime,
-    ) -> Result<bool, DatasetError> {
+    ) -> Result<bool, StorageError> {
         let Some(bytes) = self.still_old(path, limit).await? else {
             return Ok(false);
         };
@@ -284,7 +331,7 @@ impl Dataset {
         }
         match self.store.delete(path).await {
             Ok(()) | Err(Error::NotFound { .. }) => {}
-            Err(e) => return Err(DatasetError::store("delete", self.shown(path), e)),
+            Err(e) => return Err(StorageError::store("delete", self.shown(path), e)),
         }
         if self.is_published(scene).await? {
             objects::create_or_match(&*self.store, path, bytes).await?;
@@ -298,8 +345,8 @@ impl Dataset {
         &self,
         path: &Path,
         limit: SystemTime,
-    ) -> Result<Option<Bytes>, DatasetError> {
-        let failed = |e| DatasetError::store("read", self.shown(path), e);
+    ) -> Result<Option<Bytes>, StorageError> {
+        let failed = |e| StorageError::store("read", self.shown(path), e);
         let result = match self.store.get(path).await {
             Ok(result) => result,
             Err(Error::NotFound { .. }) => return Ok(None),
@@ -311,7 +358,7 @@ impl Dataset {
         result.bytes().await.map(Some).map_err(failed)
     }
 
-    async fn is_published(&self, scene: Option<u64>) -> Result<bool, DatasetError> {
+    async fn is_published(&self, scene: Option<u64>) -> Result<bool, StorageError> {
         let Some(scene) = scene else {
             return Ok(false);
         };
@@ -321,15 +368,15 @@ impl Dataset {
 
     /// Returns the time of the clock that sets the timestamps of this store's objects, which may
     /// differ from the local clock.
-    async fn store_time(&self) -> Result<SystemTime, DatasetError> {
+    async fn store_time(&self) -> Result<SystemTime, StorageError> {
         let name = format!("{PROBE}{}-time", uuid::Uuid::new_v4());
         let parent = self.parent().unwrap_or_default();
         let path = parent.join(name);
         objects::create(&*self.store, &path, Bytes::from_static(b"what time is it?")).await?;
         let meta = self.store.head(&path).await;
         let deleted = self.store.delete(&path).await;
-        let meta = meta.map_err(|e| DatasetError::store("look up", self.shown(&path), e))?;
-        deleted.map_err(|e| DatasetError::store("delete", self.shown(&path), e))?;
+        let meta = meta.map_err(|e| StorageError::store("look up", self.shown(&path), e))?;
+        deleted.map_err(|e| StorageError::store("delete", self.shown(&path), e))?;
         Ok(meta.last_modified.into())
     }
 }

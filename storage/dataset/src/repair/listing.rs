@@ -3,16 +3,14 @@
 use futures::{StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
 
-use crate::error::DatasetError;
 use crate::layout::group::METADATA;
 use crate::layout::published::manifest_scene;
+use crate::repair::recipe;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::part_scene;
-use crate::store::identity::IDENTITY;
-use crate::{
-    repair::recipe,
-    scenes::{snapshot, splits},
-};
+use crate::scenes::{snapshot, splits};
+use picofarm_store::IDENTITY;
+use picofarm_store::StorageError;
 
 /// Size of a missing object.
 const ABSENT: u64 = u64::MAX;
@@ -65,7 +63,7 @@ impl Listing {
 
 impl Dataset {
     /// Lists the data set, with its arrays concurrently.
-    pub(crate) async fn listing(&self) -> Result<Listing, DatasetError> {
+    pub(crate) async fn listing(&self) -> Result<Listing, StorageError> {
         let mut listing = Listing {
             sizes: vec![Vec::new(); self.arrays.len()],
             ..Listing::default()
@@ -73,7 +71,7 @@ impl Dataset {
         self.list_manifests(&mut listing).await?;
         let failed = |path: &Path| {
             let shown = self.shown(path);
-            move |e| DatasetError::store("list", shown.clone(), e)
+            move |e| StorageError::store("list", shown.clone(), e)
         };
         let top = self.store.list_with_delimiter(Some(&self.prefix)).await;
         let top = top.map_err(failed(&self.prefix))?;
@@ -90,9 +88,9 @@ impl Dataset {
         Ok(listing)
     }
 
-    async fn list_manifests(&self, listing: &mut Listing) -> Result<(), DatasetError> {
+    async fn list_manifests(&self, listing: &mut Listing) -> Result<(), StorageError> {
         let folder = self.path("manifests");
-        let failed = |e| DatasetError::store("list", self.shown(&folder), e);
+        let failed = |e| StorageError::store("list", self.shown(&folder), e);
         let mut objects = self.store.list(Some(&folder));
         while let Some(object) = objects.next().await {
             let key = self.relative(&object.map_err(failed)?.location);

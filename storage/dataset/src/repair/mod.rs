@@ -1,9 +1,7 @@
 //! Repair of stores: finds orphaned and lost objects, and regenerates them.
 
 pub(crate) mod collect;
-pub(crate) mod held;
 pub(crate) mod listing;
-pub(crate) mod put_back;
 pub(crate) mod recipe;
 pub(crate) mod restore;
 pub(crate) mod root;

@@ -6,11 +6,11 @@ use futures::TryStreamExt;
 use object_store::ObjectStore;
 use serde_json::Value;
 
-use crate::error::DatasetError;
 use crate::layout::group::pretty;
-use crate::layout::manifest::{seal, unseal};
 use crate::scenes::dataset::Dataset;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::sealed::{seal, unseal};
 
 /// Format version of recipes.
 const FORMAT: u64 = 1;
@@ -32,13 +32,13 @@ impl Dataset {
     /// Stores a recipe create-only. Returns `false` if there already is one.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
+    /// [`StorageError::Store`].
     pub async fn create_recipe(
         &self,
         key: &str,
         scene: Option<u64>,
         content: &Value,
-    ) -> Result<bool, DatasetError> {
+    ) -> Result<bool, StorageError> {
         let path = self.path(&recipe_key(key, scene));
         // A recipe for all scenes usually exists already, and a lookup is cheaper than a write.
         if objects::size(&*self.store, &path).await?.is_some() {
@@ -53,15 +53,15 @@ impl Dataset {
     /// Returns the recipe of `scene` under `key`: its own, or the one for all scenes.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`], [`DatasetError::Store`].
-    pub async fn recipe(&self, key: &str, scene: u64) -> Result<Option<Recipe>, DatasetError> {
+    /// [`StorageError::Damaged`], [`StorageError::Store`].
+    pub async fn recipe(&self, key: &str, scene: u64) -> Result<Option<Recipe>, StorageError> {
         for scene in [Some(scene), None] {
             let path = self.path(&recipe_key(key, scene));
             let Some(bytes) = objects::get(&*self.store, &path).await? else {
                 continue;
             };
             let place = self.shown(&path);
-            let content = parse(&bytes).map_err(|what| DatasetError::Damaged {
+            let content = parse(&bytes).map_err(|what| StorageError::Damaged {
                 object: place.clone(),
                 what,
             })?;
@@ -78,10 +78,10 @@ impl Dataset {
     /// Returns the keys of all recipes, ascending.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn recipe_keys(&self) -> Result<Vec<String>, DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn recipe_keys(&self) -> Result<Vec<String>, StorageError> {
         let folder = self.path("recipes");
-        let failed = |e| DatasetError::store("list", self.shown(&folder), e);
+        let failed = |e| StorageError::store("list", self.shown(&folder), e);
         let mut keys = std::collections::BTreeSet::new();
         let mut listed = self.store.list(Some(&folder));
         while let Some(object) = listed.try_next().await.map_err(failed)? {

@@ -7,13 +7,14 @@
 
 use futures::{StreamExt, TryStreamExt, stream};
 
-use crate::error::DatasetError;
 use crate::layout::group::{METADATA, pretty};
-use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::layout::manifest::Manifest;
 use crate::layout::quantity::Quantity;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::sealed::sha256_hex;
 
 /// Number of objects checked concurrently.
 const CONCURRENCY: usize = 4;
@@ -41,14 +42,14 @@ impl Dataset {
     /// hexadecimal) of the scene's manifest in a snapshot.
     ///
     /// # Errors
-    /// [`DatasetError::Diverged`], an alarm, if the scene differs from the manifest (or the
-    /// snapshot); nothing was written. [`DatasetError::Damaged`] if the manifest is broken and
-    /// nothing proves that this is the same scene. [`DatasetError::Store`].
+    /// [`StorageError::Diverged`], an alarm, if the scene differs from the manifest (or the
+    /// snapshot); nothing was written. [`StorageError::Damaged`] if the manifest is broken and
+    /// nothing proves that this is the same scene. [`StorageError::Store`].
     pub async fn restore(
         &self,
         scene: EncodedScene,
         witness: Option<&str>,
-    ) -> Result<Restored, DatasetError> {
+    ) -> Result<Restored, StorageError> {
         let EncodedScene { manifest, bytes } = scene;
         let path = self.path(&Manifest::key(manifest.scene));
         let stored = objects::get(&*self.store, &path).await?;
@@ -64,7 +65,7 @@ impl Dataset {
             let (path, ours) = (self.path(&manifest.objects[at].key), bytes[at].clone());
             async move {
                 let stored = objects::get(&*self.store, &path).await?;
-                Ok::<_, DatasetError>(match stored {
+                Ok::<_, StorageError>(match stored {
                     None => Found::Missing,
                     Some(stored) if stored == ours => Found::Equal,
                     Some(_) => Found::Other,
@@ -103,11 +104,11 @@ impl Dataset {
     /// Returns the full keys written.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] if the root contradicts itself, so that it cannot be relied on:
-    /// see [`restore_root`](crate::restore_root); [`DatasetError::Store`].
-    pub async fn restore_metadata(&self) -> Result<Vec<String>, DatasetError> {
+    /// [`StorageError::Damaged`] if the root contradicts itself, so that it cannot be relied on:
+    /// see [`restore_root`](crate::restore_root); [`StorageError::Store`].
+    pub async fn restore_metadata(&self) -> Result<Vec<String>, StorageError> {
         if !self.root_agrees().await? {
-            return Err(DatasetError::Damaged {
+            return Err(StorageError::Damaged {
                 object: self.shown(&self.path(METADATA)),
                 what: "contradicts itself; nothing was written".into(),
             });
@@ -143,10 +144,10 @@ impl Dataset {
     }
 
     /// Checks that the regenerated objects match the manifest.
-    fn check_equal(&self, stored: &Manifest, ours: &Manifest) -> Result<(), DatasetError> {
+    fn check_equal(&self, stored: &Manifest, ours: &Manifest) -> Result<(), StorageError> {
         for (stored, ours) in stored.objects.iter().zip(&ours.objects) {
             if stored.sha256 != ours.sha256 {
-                return Err(DatasetError::Diverged {
+                return Err(StorageError::Diverged {
                     object: self.shown(&self.path(&stored.key)),
                     expected: stored.sha256.clone(),
                     ours: ours.sha256.clone(),
@@ -158,7 +159,7 @@ impl Dataset {
 
     /// Without a manifest, checks that the histogram exists, and that all existing objects are
     /// equal.
-    fn check_alike(&self, ours: &Manifest, found: &[Found]) -> Result<(), DatasetError> {
+    fn check_alike(&self, ours: &Manifest, found: &[Found]) -> Result<(), StorageError> {
         let transient = self.array(Quantity::Transient).layout.key(ours.scene);
         for (object, found) in ours.objects.iter().zip(found) {
             let what = match found {
@@ -166,7 +167,7 @@ impl Dataset {
                 Found::Missing if object.key == transient => "it is missing",
                 _ => continue,
             };
-            return Err(DatasetError::Damaged {
+            return Err(StorageError::Damaged {
                 object: self.shown(&self.path(&object.key)),
                 what: format!(
                     "{what}, and the scene's manifest is broken or missing too, so that nothing proves what the scene \
@@ -182,11 +183,11 @@ impl Dataset {
         &self,
         path: &object_store::path::Path,
         bytes: bytes::Bytes,
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         objects::overwrite(&*self.store, path, bytes.clone()).await?;
         match objects::get(&*self.store, path).await? {
             Some(stored) if stored == bytes => Ok(()),
-            _ => Err(DatasetError::Damaged {
+            _ => Err(StorageError::Damaged {
                 object: self.shown(path),
                 what: "it was written again, but does not read back as written; check the store"
                     .into(),
@@ -197,7 +198,7 @@ impl Dataset {
 
 /// Returns the manifest's bytes: in the current form, or in the older form if this matches the
 /// witness.
-fn as_witnessed(manifest: &Manifest, witness: Option<&str>) -> Result<Vec<u8>, DatasetError> {
+fn as_witnessed(manifest: &Manifest, witness: Option<&str>) -> Result<Vec<u8>, StorageError> {
     let now = manifest.to_bytes();
     let Some(witness) = witness else {
         return Ok(now);
@@ -209,7 +210,7 @@ fn as_witnessed(manifest: &Manifest, witness: Option<&str>) -> Result<Vec<u8>, D
     let forms = [now, older.to_bytes()];
     let ours = sha256_hex(&forms[0]);
     let found = forms.into_iter().find(|form| sha256_hex(form) == witness);
-    found.ok_or_else(|| DatasetError::Diverged {
+    found.ok_or_else(|| StorageError::Diverged {
         object: Manifest::key(manifest.scene),
         expected: witness.to_owned(),
         ours,

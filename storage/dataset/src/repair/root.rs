@@ -7,13 +7,13 @@ use object_store::ObjectStore;
 use object_store::path::Path;
 use serde_json::Value;
 
-use crate::error::DatasetError;
 use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::FORMAT_VERSION;
 use crate::layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelength};
 use crate::repair::recipe::Recipe;
 use crate::scenes::dataset::{Dataset, root_metadata};
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
 
 /// The objects that remain without the root.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -27,8 +27,8 @@ pub struct Remains {
 /// Examines a data set that cannot be opened.
 ///
 /// # Errors
-/// [`DatasetError::Store`], [`DatasetError::Damaged`].
-pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remains, DatasetError> {
+/// [`StorageError::Store`], [`StorageError::Damaged`].
+pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remains, StorageError> {
     let anything = DatasetSpec {
         scenes: u64::MAX,
         height: 1,
@@ -53,7 +53,7 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
                 found.scene = Some((scene, manifest.provenance.task_key));
                 break;
             }
-            Err(DatasetError::Damaged { .. }) => {}
+            Err(StorageError::Damaged { .. }) => {}
             Err(error) => return Err(error),
         }
     }
@@ -69,8 +69,8 @@ impl Dataset {
     /// properties that it states.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] if it has gone missing; [`DatasetError::Store`].
-    pub async fn root_agrees(&self) -> Result<bool, DatasetError> {
+    /// [`StorageError::Damaged`] if it has gone missing; [`StorageError::Store`].
+    pub async fn root_agrees(&self) -> Result<bool, StorageError> {
         let bytes = objects::require(&*self.store, &self.path(METADATA)).await?;
         let stored: Option<Value> = serde_json::from_slice(&bytes).ok();
         Ok(stored == Some(root_metadata(&self.spec, self.format)))
@@ -82,13 +82,13 @@ impl Dataset {
 /// must be readable.
 ///
 /// # Errors
-/// [`DatasetError::Damaged`] if the arrays do not prove that it is this data set; in that case
-/// nothing is written. [`DatasetError::Store`].
+/// [`StorageError::Damaged`] if the arrays do not prove that it is this data set; in that case
+/// nothing is written. [`StorageError::Store`].
 pub async fn restore_root(
     store: Arc<dyn ObjectStore>,
     prefix: Path,
     spec: &DatasetSpec,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, StorageError> {
     let mut spec = *spec;
     let format = format_of(&store, &prefix, spec).await?;
     let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
@@ -106,14 +106,14 @@ pub async fn restore_root(
             agreed = Some(scenes);
             continue;
         }
-        return Err(DatasetError::Damaged {
+        return Err(StorageError::Damaged {
             object: assumed.shown(&path),
             what: "is not what the recipe of the data set gives, while the root is broken too: nothing was written".into(),
         });
     }
     let root = assumed.path(METADATA);
     let Some(scenes) = agreed.filter(|n| *n > 0) else {
-        return Err(DatasetError::Damaged {
+        return Err(StorageError::Damaged {
             object: assumed.shown(&root),
             what: "is broken, and so are the metadata of every array: nothing says how many scenes there are".into(),
         });
@@ -130,7 +130,7 @@ async fn format_of(
     store: &Arc<dyn ObjectStore>,
     prefix: &Path,
     spec: DatasetSpec,
-) -> Result<u32, DatasetError> {
+) -> Result<u32, StorageError> {
     for format in (1..=FORMAT_VERSION).rev() {
         let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
         let transients = assumed.arrays.iter().map(|array| &array.layout);

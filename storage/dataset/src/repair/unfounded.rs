@@ -5,23 +5,26 @@
 //! are create-only. Equal scenes never reach this code, and a scene with objects that all match its
 //! manifest is not touched.
 
-use crate::error::DatasetError;
-use crate::layout::manifest::{Manifest, sha256_hex};
-use crate::repair::held::SMALL;
+use crate::layout::manifest::Manifest;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::sealed::sha256_hex;
+
+/// Maximum total size in bytes of a scene's objects that are checked by SHA-256.
+pub const SMALL: u64 = 256 << 10;
 
 impl Dataset {
     /// Replaces the stored scene by `scene`, if its manifest contradicts its objects. Returns the
     /// new manifest, or `None` if nothing was written.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
+    /// [`StorageError::Store`].
     pub async fn replace_unfounded(
         &self,
         scene: EncodedScene,
-    ) -> Result<Option<Manifest>, DatasetError> {
+    ) -> Result<Option<Manifest>, StorageError> {
         let EncodedScene { manifest, bytes } = scene;
         let path = self.path(&Manifest::key(manifest.scene));
         let Some(stored) = objects::get(&*self.store, &path).await? else {
@@ -52,13 +55,13 @@ impl Dataset {
     /// pass.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn agrees(&self, manifest: &Manifest) -> Result<bool, DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn agrees(&self, manifest: &Manifest) -> Result<bool, StorageError> {
         Ok(manifest.total_bytes() > SMALL || self.is_founded(manifest).await?)
     }
 
     /// Returns whether every object has the bytes listed in the manifest.
-    async fn is_founded(&self, manifest: &Manifest) -> Result<bool, DatasetError> {
+    async fn is_founded(&self, manifest: &Manifest) -> Result<bool, StorageError> {
         for object in &manifest.objects {
             let there = objects::get(&*self.store, &self.path(&object.key)).await?;
             if there.is_none_or(|bytes| sha256_hex(&bytes) != object.sha256) {

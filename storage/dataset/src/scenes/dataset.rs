@@ -8,7 +8,6 @@ use serde_json::{Map, Value, json};
 
 use crate::coding::codec::ChunkCodec;
 use crate::coding::profile::decode_lines;
-use crate::error::DatasetError;
 use crate::layout::arrays::Layout;
 use crate::layout::group::{
     METADATA, counts_fewer, create_metadata, is_predictions, is_reconstructions, pretty,
@@ -16,7 +15,8 @@ use crate::layout::group::{
 use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
-use crate::store::objects::{self, Rereads};
+use picofarm_store::StorageError;
+use picofarm_store::objects::{self, Rereads};
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -31,8 +31,10 @@ pub struct Dataset {
 
 /// An array and its chunk codec.
 #[derive(Debug)]
-pub(crate) struct ArrayCodec {
+pub struct ArrayCodec {
+    /// Its layout.
     pub layout: Layout,
+    /// The codec of its objects, or of the inner chunks of its shards.
     pub codec: ChunkCodec,
 }
 
@@ -49,13 +51,13 @@ impl Dataset {
     /// next scene of the larger one is made (published scenes are never touched).
     ///
     /// # Errors
-    /// [`DatasetError::SpecMismatch`] names the first differing field and both values;
-    /// [`DatasetError::Invalid`]; [`DatasetError::Store`].
+    /// [`StorageError::SpecMismatch`] names the first differing field and both values;
+    /// [`StorageError::Invalid`]; [`StorageError::Store`].
     pub async fn create_or_open(
         store: Arc<dyn ObjectStore>,
         prefix: Path,
         spec: &DatasetSpec,
-    ) -> Result<Self, DatasetError> {
+    ) -> Result<Self, StorageError> {
         spec.check()?;
         let root = objects::path_of(&prefix, METADATA);
         let (stored, format) = match objects::get(&*store, &root).await? {
@@ -78,7 +80,7 @@ impl Dataset {
             }
         };
         if let Some((field, stored, asked)) = stored.difference(spec) {
-            return Err(DatasetError::SpecMismatch {
+            return Err(StorageError::SpecMismatch {
                 prefix: objects::shown(&*store, &prefix),
                 field: field.into(),
                 stored,
@@ -109,9 +111,9 @@ impl Dataset {
     /// Opens the data set at `prefix`.
     ///
     /// # Errors
-    /// [`DatasetError::NoDataset`], [`DatasetError::Damaged`] if the root is not a picofarm data
-    /// set, [`DatasetError::Store`].
-    pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
+    /// [`StorageError::NoDataset`], [`StorageError::Damaged`] if the root is not a picofarm data
+    /// set, [`StorageError::Store`].
+    pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, StorageError> {
         let mut rereads = Rereads::new(&*store);
         loop {
             let read = Self::open_once(store.clone(), prefix.clone()).await;
@@ -122,10 +124,10 @@ impl Dataset {
         }
     }
 
-    async fn open_once(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
+    async fn open_once(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, StorageError> {
         let root = objects::path_of(&prefix, METADATA);
         let Some(bytes) = objects::get(&*store, &root).await? else {
-            return Err(DatasetError::NoDataset {
+            return Err(StorageError::NoDataset {
                 prefix: objects::shown(&*store, &prefix),
             });
         };
@@ -136,6 +138,21 @@ impl Dataset {
     /// Returns the data set's stored properties.
     pub fn spec(&self) -> &DatasetSpec {
         &self.spec
+    }
+
+    /// Returns the store.
+    pub fn store(&self) -> &Arc<dyn ObjectStore> {
+        &self.store
+    }
+
+    /// Returns the format version of the layout: [`FORMAT_VERSION`] at the time of creation.
+    pub fn format(&self) -> u32 {
+        self.format
+    }
+
+    /// Returns the arrays, in the order of their objects in a manifest.
+    pub fn arrays(&self) -> &[ArrayCodec] {
+        &self.arrays
     }
 
     /// Returns its path in the store.
@@ -169,33 +186,37 @@ impl Dataset {
     }
 
     /// Returns an array that every data set has.
-    pub(crate) fn array(&self, quantity: Quantity) -> &ArrayCodec {
+    ///
+    /// # Panics
+    /// If `quantity` is a transient of a subset that the data set lacks.
+    pub fn array(&self, quantity: Quantity) -> &ArrayCodec {
         self.array_of(quantity)
             .expect("only transients of subsets may be missing")
     }
 
     /// Returns the array of any quantity.
-    pub(crate) fn array_of(&self, quantity: Quantity) -> Result<&ArrayCodec, DatasetError> {
+    pub(crate) fn array_of(&self, quantity: Quantity) -> Result<&ArrayCodec, StorageError> {
         let found = self.arrays.iter().find(|a| a.layout.quantity == quantity);
         found.ok_or_else(|| {
             let what = format!("the data set has no array {}", quantity.name());
-            DatasetError::invalid("quantity", what)
+            StorageError::invalid("quantity", what)
         })
     }
 
-    pub(crate) fn path(&self, key: &str) -> Path {
+    /// Returns the path of an object, given by its key relative to the data set.
+    pub fn path(&self, key: &str) -> Path {
         objects::path_of(&self.prefix, key)
     }
 
     /// Returns the key of a path relative to the prefix.
-    pub(crate) fn relative(&self, path: &Path) -> String {
+    pub fn relative(&self, path: &Path) -> String {
         let parts = path.parts().skip(self.prefix.parts().count());
         let parts: Vec<String> = parts.map(|part| part.as_ref().to_string()).collect();
         parts.join("/")
     }
 
     /// Formats a path for messages.
-    pub(crate) fn shown(&self, path: &Path) -> String {
+    pub fn shown(&self, path: &Path) -> String {
         objects::shown(&*self.store, path)
     }
 
@@ -203,18 +224,18 @@ impl Dataset {
         self.path(&format!("{}/{METADATA}", layout.quantity.name()))
     }
 
-    pub(crate) fn check_scene(&self, scene: u64) -> Result<(), DatasetError> {
+    pub(crate) fn check_scene(&self, scene: u64) -> Result<(), StorageError> {
         if scene < self.spec.scenes {
             return Ok(());
         }
-        Err(DatasetError::SceneOutOfRange {
+        Err(StorageError::SceneOutOfRange {
             scene,
             scenes: self.spec.scenes,
         })
     }
 
     /// Writes an array's metadata before the root exists.
-    async fn create_array_metadata(&self, layout: &Layout) -> Result<(), DatasetError> {
+    async fn create_array_metadata(&self, layout: &Layout) -> Result<(), StorageError> {
         let path = self.metadata_path(layout);
         create_metadata(&*self.store, &path, self.spec.scenes, |n| {
             layout.metadata(n)
@@ -224,7 +245,7 @@ impl Dataset {
 }
 
 /// Returns the root's `zarr.json`: attributes and the consolidated metadata of all arrays.
-pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
+pub fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
     let arrays: Map<String, Value> = spec
         .quantities()
         .into_iter()
@@ -250,8 +271,8 @@ pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
 }
 
 /// Parses the data set's properties and format.
-fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetError> {
-    let damaged = |what: String| DatasetError::Damaged {
+fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), StorageError> {
+    let damaged = |what: String| StorageError::Damaged {
         object: object.to_string(),
         what,
     };
@@ -260,12 +281,12 @@ fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetE
     if is_predictions(&root) {
         let what = "holds what models predict of the scenes of a data set, and is no data set itself; its manifests name the one \
                     that it is about";
-        return Err(DatasetError::invalid(object, what));
+        return Err(StorageError::invalid(object, what));
     }
     if is_reconstructions(&root) {
         let what = "holds reconstructions of the scenes of a data set, and is no data set itself; `dataset info`, \
                     `verify`, `picture` and `report` read it";
-        return Err(DatasetError::invalid(object, what));
+        return Err(StorageError::invalid(object, what));
     }
     let ours = &root["attributes"]["picofarm"];
     let Some(format) = ours["format"].as_u64() else {

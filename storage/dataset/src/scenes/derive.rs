@@ -2,14 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use crate::error::DatasetError;
-use crate::layout::manifest::sha256_hex;
 use crate::layout::quantity::Quantity;
 use crate::layout::record::Provenance;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::{Content, EncodedScene, assemble, intensity};
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::sealed::sha256_hex;
 
 /// All of a published scene except histograms and data computed from them: depth, range, normals,
 /// instances, labels, specular, visibility, two-bounce paths, RGB, spots, intrinsics, pose and
@@ -25,9 +25,9 @@ impl Dataset {
     /// Reads the ground truth of a published scene, and checks each object against its manifest.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`],
-    /// [`DatasetError::Store`].
-    pub async fn read_truth(&self, scene: u64) -> Result<SceneTruth, DatasetError> {
+    /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Codec`],
+    /// [`StorageError::Store`].
+    pub async fn read_truth(&self, scene: u64) -> Result<SceneTruth, StorageError> {
         let manifest = self.manifest(scene).await?;
         let mut arrays = BTreeMap::new();
         for array in self.arrays.iter().filter(|a| is_truth(a.layout.quantity)) {
@@ -35,7 +35,7 @@ impl Dataset {
             let path = self.path(&key);
             let bytes = objects::require(&*self.store, &path).await?;
             if manifest.object(&key).map(|o| &o.sha256) != Some(&sha256_hex(&bytes)) {
-                return Err(DatasetError::Damaged {
+                return Err(StorageError::Damaged {
                     object: self.shown(&path),
                     what: "its SHA-256 is not the manifest's".into(),
                 });
@@ -53,8 +53,8 @@ impl Dataset {
     /// rayon threads encode.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if this data set has another image size, other spots or additional
-    /// transients, or if a value is unusable; [`DatasetError::SceneOutOfRange`].
+    /// [`StorageError::Invalid`] if this data set has another image size, other spots or additional
+    /// transients, or if a value is unusable; [`StorageError::SceneOutOfRange`].
     pub fn encode_derived(
         &self,
         scene: u64,
@@ -62,7 +62,7 @@ impl Dataset {
         transient: &[f32],
         scale: f32,
         provenance: &Provenance,
-    ) -> Result<EncodedScene, DatasetError> {
+    ) -> Result<EncodedScene, StorageError> {
         self.check_scene(scene)?;
         let spec = &self.spec;
         let (ours, theirs) = (
@@ -73,7 +73,7 @@ impl Dataset {
             let what = format!(
                 "expected {ours:?} rows, columns and spots as in the data set, found {theirs:?}"
             );
-            return Err(DatasetError::invalid("truth", what));
+            return Err(StorageError::invalid("truth", what));
         }
         if spec
             .quantities()
@@ -83,20 +83,20 @@ impl Dataset {
             != 1
         {
             let what = "a derived data set has one histogram a scene; found subsets of spots too";
-            return Err(DatasetError::invalid("spec.subsets", what));
+            return Err(StorageError::invalid("spec.subsets", what));
         }
         if spec.two_bounce != truth.spec.two_bounce {
             let what = "one of both has two-bounce paths, the other has not";
-            return Err(DatasetError::invalid("spec.two_bounce", what));
+            return Err(StorageError::invalid("spec.two_bounce", what));
         }
         if transient.len() != spec.transient_len() {
             let (expected, found) = (spec.transient_len(), transient.len());
             let what = format!("expected {expected} values, found {found}");
-            return Err(DatasetError::invalid("transient", what));
+            return Err(StorageError::invalid("transient", what));
         }
         if !(scale.is_normal() && scale > 0.0) {
             let what = format!("expected a positive finite number, found {scale}");
-            return Err(DatasetError::invalid("scale", what));
+            return Err(StorageError::invalid("scale", what));
         }
         let content = Content {
             transient,
@@ -117,15 +117,15 @@ impl SceneTruth {
     /// Returns the ground truth with only the given spots, in the given order.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if a spot does not exist, or none is chosen.
-    pub fn of_spots(mut self, chosen: &[u32]) -> Result<Self, DatasetError> {
+    /// [`StorageError::Invalid`] if a spot does not exist, or none is chosen.
+    pub fn of_spots(mut self, chosen: &[u32]) -> Result<Self, StorageError> {
         let spots = self.spec.spots;
         if chosen.is_empty() || chosen.iter().any(|s| *s >= spots) {
             let what = format!(
                 "expected some of the spots 0 to {}, found {chosen:?}",
                 spots - 1
             );
-            return Err(DatasetError::invalid("spots", what));
+            return Err(StorageError::invalid("spots", what));
         }
         let pixels = self.spec.pixels();
         let packed = &self.arrays[&Quantity::Visibility];

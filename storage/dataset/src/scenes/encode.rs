@@ -10,12 +10,13 @@ use crate::coding::shard;
 use crate::coding::squareroot::ErrorSums;
 use crate::coding::tiles::Tiles;
 use crate::coding::values::{self, Source};
-use crate::error::DatasetError;
-use crate::layout::manifest::{ENCODER_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex};
+use crate::layout::manifest::{ENCODER_VERSION, Manifest, SubsetCoding};
 use crate::layout::quantity::Quantity;
 use crate::layout::record::{Provenance, SceneRecord, SubsetRecord};
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::{ArrayCodec, Dataset};
+use picofarm_store::StorageError;
+use picofarm_store::sealed::{ObjectEntry, sha256_hex};
 
 /// Maximum number of saturated bins in a scene. The few pixels that see a spot saturate; more
 /// indicate a wrong scale.
@@ -35,7 +36,7 @@ pub(crate) fn encode_scene(
     scene: u64,
     record: &SceneRecord<'_>,
     provenance: &Provenance,
-) -> Result<EncodedScene, DatasetError> {
+) -> Result<EncodedScene, StorageError> {
     record.check(&dataset.spec)?;
     let content = Content {
         transient: record.transient,
@@ -61,8 +62,8 @@ pub(crate) fn assemble(
     scene: u64,
     content: &Content<'_>,
     provenance: &Provenance,
-    small: impl Fn(Quantity) -> Result<Vec<u8>, DatasetError>,
-) -> Result<EncodedScene, DatasetError> {
+    small: impl Fn(Quantity) -> Result<Vec<u8>, StorageError>,
+) -> Result<EncodedScene, StorageError> {
     let (spec, arrays) = (&dataset.spec, &dataset.arrays);
     let mut coded = None;
     let mut subsets = BTreeMap::new();
@@ -126,7 +127,7 @@ pub(crate) fn encode_transient(
     array: &ArrayCodec,
     planes: &[&[f32]],
     scale: f32,
-) -> Result<CodedTransient, DatasetError> {
+) -> Result<CodedTransient, StorageError> {
     let tiles = Tiles::new(spec, &array.layout);
     let source = Source {
         name: array.layout.quantity.name(),
@@ -142,7 +143,7 @@ pub(crate) fn encode_transient(
             coded.bytes = array.codec.encode(&coded.bytes)?;
             Ok(coded)
         })
-        .collect::<Result<Vec<_>, DatasetError>>()?;
+        .collect::<Result<Vec<_>, StorageError>>()?;
     let mut error = ErrorSums::default();
     let mut overflow = Vec::new();
     let mut chunks = Vec::with_capacity(coded.len());
@@ -158,7 +159,7 @@ pub(crate) fn encode_transient(
             overflow.len(),
             scale
         );
-        return Err(DatasetError::invalid("record.scale", what));
+        return Err(StorageError::invalid("record.scale", what));
     }
     overflow.sort_unstable_by_key(|(index, _)| *index);
     Ok(CodedTransient {

@@ -7,14 +7,13 @@ use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{Error, ObjectStoreExt};
 
-use crate::error::DatasetError;
 use crate::scenes::dataset::Dataset;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::packed::{pack, unpack};
 
 /// The folder of the parts in a data set.
 const FOLDER: &str = "parts";
-/// zstd level. It is low because each part is read only once.
-const LEVEL: i32 = 1;
 
 /// The name of a part of a scene.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,7 +27,8 @@ pub struct PartName {
 }
 
 impl PartName {
-    pub(crate) fn key(&self) -> String {
+    /// Returns its key relative to the data set.
+    pub fn key(&self) -> String {
         let (index, of) = self.part;
         format!(
             "{FOLDER}/{}/{}/{index}-of-{of}.zst",
@@ -48,18 +48,18 @@ impl Dataset {
     /// Stores a part, replacing a damaged one.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn put_part(&self, name: &PartName, bytes: &[u8]) -> Result<(), DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn put_part(&self, name: &PartName, bytes: &[u8]) -> Result<(), StorageError> {
         let path = self.path(&name.key());
-        let packed = pack(bytes).map_err(|e| DatasetError::codec("part of a scene", e))?;
+        let packed = pack(bytes).map_err(|e| StorageError::codec("part of a scene", e))?;
         objects::overwrite(&*self.store, &path, packed.into()).await
     }
 
     /// Reads a part. Returns `None` if it is missing or damaged.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn part(&self, name: &PartName) -> Result<Option<Bytes>, DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn part(&self, name: &PartName) -> Result<Option<Bytes>, StorageError> {
         let path = self.path(&name.key());
         let Some(packed) = objects::get(&*self.store, &path).await? else {
             return Ok(None);
@@ -91,32 +91,14 @@ impl Dataset {
     /// Deletes a part, if it exists.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn delete_part(&self, name: &PartName) -> Result<(), DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn delete_part(&self, name: &PartName) -> Result<(), StorageError> {
         let path: Path = self.path(&name.key());
         match self.store.delete(&path).await {
             Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
-            Err(e) => Err(DatasetError::store("delete", self.shown(&path), e)),
+            Err(e) => Err(StorageError::store("delete", self.shown(&path), e)),
         }
     }
-}
-
-/// Compresses a part with a checksum, so that a reader can detect corruption.
-pub(crate) fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
-    let mut packer = zstd::bulk::Compressor::new(LEVEL)?;
-    packer.include_checksum(true)?;
-    packer.compress(bytes)
-}
-
-/// Decompresses a part that states its size, which must be at most `most`.
-pub(crate) fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
-    let invalid = |what: &str| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
-    let size = zstd::zstd_safe::get_frame_content_size(packed);
-    let size = size
-        .ok()
-        .flatten()
-        .ok_or_else(|| invalid("does not say how large it is"))?;
-    picofarm_files::read_entry(zstd::Decoder::new(packed)?, size, most)
 }
 
 #[cfg(test)]

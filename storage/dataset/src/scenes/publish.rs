@@ -4,27 +4,27 @@
 use bytes::Bytes;
 use object_store::path::Path;
 
-use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::layout::record::{Provenance, SceneRecord};
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::{EncodedScene, encode_scene};
-use crate::store::many::{all, check_size, put_again, put_all};
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::many::{all, check_size, put_again, put_all};
+use picofarm_store::objects;
 
 impl Dataset {
     /// Encodes a scene on rayon threads. The function is pure and blocking: call it from async code
     /// through `spawn_blocking`, and pass the result to [`Self::publish_encoded`].
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] names the field and index of an unusable value;
-    /// [`DatasetError::SceneOutOfRange`].
+    /// [`StorageError::Invalid`] names the field and index of an unusable value;
+    /// [`StorageError::SceneOutOfRange`].
     pub fn encode(
         &self,
         scene: u64,
         record: &SceneRecord<'_>,
         provenance: &Provenance,
-    ) -> Result<EncodedScene, DatasetError> {
+    ) -> Result<EncodedScene, StorageError> {
         self.check_scene(scene)?;
         encode_scene(self, scene, record, provenance)
     }
@@ -37,11 +37,11 @@ impl Dataset {
     /// if there is no manifest and the object fails its own checksums.
     ///
     /// # Errors
-    /// [`DatasetError::Conflict`] if an object exists with different bytes and nothing proves them
-    /// wrong (nothing stored is changed); [`DatasetError::Store`].
-    pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
+    /// [`StorageError::Conflict`] if an object exists with different bytes and nothing proves them
+    /// wrong (nothing stored is changed); [`StorageError::Store`].
+    pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, StorageError> {
         match self.publish_once(scene.clone()).await {
-            Err(conflict @ DatasetError::Conflict { .. }) => self.heal(scene, conflict).await,
+            Err(conflict @ StorageError::Conflict { .. }) => self.heal(scene, conflict).await,
             published => published,
         }
     }
@@ -50,8 +50,8 @@ impl Dataset {
     async fn heal(
         &self,
         scene: EncodedScene,
-        conflict: DatasetError,
-    ) -> Result<Manifest, DatasetError> {
+        conflict: StorageError,
+    ) -> Result<Manifest, StorageError> {
         let ours = scene.manifest.clone();
         let path = self.path(&Manifest::key(ours.scene));
         if let Some(stored) = objects::get(&*self.store, &path).await? {
@@ -66,7 +66,7 @@ impl Dataset {
                     }
                     self.manifest(ours.scene).await
                 }
-                Err(DatasetError::Diverged { .. } | DatasetError::Damaged { .. }) => Err(conflict),
+                Err(StorageError::Diverged { .. } | StorageError::Damaged { .. }) => Err(conflict),
                 Err(error) => Err(error),
             };
         }
@@ -107,7 +107,7 @@ impl Dataset {
         array.codec.decode(bytes).is_ok()
     }
 
-    async fn publish_once(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
+    async fn publish_once(&self, scene: EncodedScene) -> Result<Manifest, StorageError> {
         let EncodedScene { manifest, bytes } = scene;
         let paths = manifest.objects.iter().map(|object| self.path(&object.key));
         let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();
@@ -117,7 +117,7 @@ impl Dataset {
             objects::create_or_match(&*self.store, &path, manifest.to_bytes().into());
         let manifest = match put_manifest.await {
             Ok(()) => manifest,
-            Err(conflict @ DatasetError::Conflict { .. }) => {
+            Err(conflict @ StorageError::Conflict { .. }) => {
                 match self.older_form(&path, &manifest).await? {
                     Some(stored) => stored,
                     None => return Err(conflict),
@@ -135,7 +135,7 @@ impl Dataset {
         &self,
         path: &Path,
         ours: &Manifest,
-    ) -> Result<Option<Manifest>, DatasetError> {
+    ) -> Result<Option<Manifest>, StorageError> {
         let stored = objects::require(&*self.store, path).await?;
         let parsed = Manifest::parse(&stored, ours.scene, &self.shown(path));
         Ok(parsed.ok().filter(|stored| stored.same_as(ours)))
@@ -150,7 +150,7 @@ impl Dataset {
         scene: u64,
         record: &SceneRecord<'_>,
         provenance: &Provenance,
-    ) -> Result<Manifest, DatasetError> {
+    ) -> Result<Manifest, StorageError> {
         let encoded = self.encode(scene, record, provenance)?;
         self.publish_encoded(encoded).await
     }
@@ -160,9 +160,9 @@ impl Dataset {
     /// that was finished before a crash.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] if the manifest exists but an object is missing (publishing again
-    /// restores it) or has another size; [`DatasetError::Store`].
-    pub async fn published(&self, scene: u64) -> Result<Option<Manifest>, DatasetError> {
+    /// [`StorageError::Damaged`] if the manifest exists but an object is missing (publishing again
+    /// restores it) or has another size; [`StorageError::Store`].
+    pub async fn published(&self, scene: u64) -> Result<Option<Manifest>, StorageError> {
         self.check_scene(scene)?;
         let path = self.path(&Manifest::key(scene));
         let Some(bytes) = objects::get(&*self.store, &path).await? else {

@@ -6,13 +6,13 @@ use bytes::Bytes;
 use futures::{Stream, StreamExt, stream};
 
 use crate::coding::tiles::Part;
-use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
-use crate::layout::published::scenes_in;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::record::{Intrinsics, Spot};
 use crate::scenes::dataset::{ArrayCodec, Dataset};
-use crate::store::objects::{self, Rereads};
+use picofarm_store::StorageError;
+use picofarm_store::objects::{self, Rereads};
+use picofarm_store::published::scenes_in;
 
 /// An element type of stored arrays.
 pub trait Stored: bytemuck::Pod + sealed::Stored {}
@@ -34,12 +34,33 @@ macro_rules! stored {
 stored!(f32 => F32, u8 => U8, u16 => U16, i16 => I16, u32 => U32);
 
 impl Dataset {
+    /// Reads a scene's encoded object and checks its SHA-256 against the manifest.
+    ///
+    /// # Errors
+    /// [`StorageError::Damaged`], [`StorageError::Store`].
+    pub async fn encoded_object(
+        &self,
+        array: &ArrayCodec,
+        manifest: &Manifest,
+    ) -> Result<Bytes, StorageError> {
+        let key = array.layout.key(manifest.scene);
+        let path = self.path(&key);
+        let bytes = objects::require(&*self.store, &path).await?;
+        if manifest.object(&key).map(|o| &o.sha256) == Some(&picofarm_store::sha256_hex(&bytes)) {
+            return Ok(bytes);
+        }
+        Err(StorageError::Damaged {
+            object: self.shown(&path),
+            what: "its SHA-256 is not the manifest's".into(),
+        })
+    }
+
     /// Returns the manifest of a published scene, without checking its objects (see
     /// [`Self::published`]).
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
-    pub async fn manifest(&self, scene: u64) -> Result<Manifest, DatasetError> {
+    /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Store`].
+    pub async fn manifest(&self, scene: u64) -> Result<Manifest, StorageError> {
         let mut rereads = Rereads::new(&*self.store);
         loop {
             let read = self.manifest_once(scene).await;
@@ -50,12 +71,12 @@ impl Dataset {
         }
     }
 
-    async fn manifest_once(&self, scene: u64) -> Result<Manifest, DatasetError> {
+    async fn manifest_once(&self, scene: u64) -> Result<Manifest, StorageError> {
         self.check_scene(scene)?;
         let path = self.path(&Manifest::key(scene));
         match objects::get(&*self.store, &path).await? {
             Some(bytes) => Manifest::parse(&bytes, scene, &self.shown(&path)),
-            None => Err(DatasetError::NotPublished {
+            None => Err(StorageError::NotPublished {
                 scene,
                 object: self.shown(&path),
             }),
@@ -65,8 +86,8 @@ impl Dataset {
     /// Returns the indices of the published scenes, ascending.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn scenes_present(&self) -> Result<Vec<u64>, DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn scenes_present(&self) -> Result<Vec<u64>, StorageError> {
         let mut scenes = scenes_in(&*self.store, &self.path("manifests")).await?;
         scenes.retain(|scene| *scene < self.spec.scenes);
         Ok(scenes)
@@ -76,8 +97,8 @@ impl Dataset {
     /// `[row][column][bin]`. Blocks its thread while rayon threads decode.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
-    pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+    /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Store`].
+    pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, StorageError> {
         self.read_histogram(scene, Quantity::Transient).await
     }
 
@@ -86,13 +107,13 @@ impl Dataset {
     /// threads.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if the data set has no such transient; those of
+    /// [`StorageError::Invalid`] if the data set has no such transient; those of
     /// [`Self::read_transient`].
     pub async fn read_histogram(
         &self,
         scene: u64,
         quantity: Quantity,
-    ) -> Result<Vec<f32>, DatasetError> {
+    ) -> Result<Vec<f32>, StorageError> {
         let mut target = Vec::new();
         self.read_histogram_into(scene, quantity, &mut target)
             .await?;
@@ -109,11 +130,11 @@ impl Dataset {
         scene: u64,
         quantity: Quantity,
         target: &mut Vec<f32>,
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         let array = self.array_of(quantity)?;
         if !quantity.is_transient() {
             let what = format!("{} is no transient; use read", quantity.name());
-            return Err(DatasetError::invalid("quantity", what));
+            return Err(StorageError::invalid("quantity", what));
         }
         self.decode_into(scene, array, target, Self::decode_shard_into)
             .await
@@ -125,8 +146,8 @@ impl Dataset {
         scene: u64,
         array: &ArrayCodec,
         target: &mut Vec<f32>,
-        decode: impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), DatasetError>,
-    ) -> Result<(), DatasetError> {
+        decode: impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), StorageError>,
+    ) -> Result<(), StorageError> {
         let mut rereads = Rereads::new(&*self.store);
         loop {
             let read = self.decode_once(scene, array, target, &decode).await;
@@ -142,8 +163,8 @@ impl Dataset {
         scene: u64,
         array: &ArrayCodec,
         target: &mut Vec<f32>,
-        decode: &impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), DatasetError>,
-    ) -> Result<(), DatasetError> {
+        decode: &impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), StorageError>,
+    ) -> Result<(), StorageError> {
         let manifest = self.manifest_once(scene).await?;
         let path = self.path(&array.layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
@@ -162,18 +183,18 @@ impl Dataset {
     /// [`Self::read_histogram_into`].
     ///
     /// # Errors
-    /// Those of [`Self::read_histogram`]; [`DatasetError::Invalid`] for a transient of several
+    /// Those of [`Self::read_histogram`]; [`StorageError::Invalid`] for a transient of several
     /// images, such as [`Quantity::TransientSpots`].
     pub async fn read_planes_into(
         &self,
         scene: u64,
         quantity: Quantity,
         target: &mut Vec<f32>,
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         let array = self.array_of(quantity)?;
         if !quantity.is_transient() || array.layout.planes() != 1 {
             let what = format!("{} is no single transient", quantity.name());
-            return Err(DatasetError::invalid("quantity", what));
+            return Err(StorageError::invalid("quantity", what));
         }
         self.decode_into(scene, array, target, Self::decode_planes_into)
             .await
@@ -189,7 +210,7 @@ impl Dataset {
         &self,
         scenes: Vec<u64>,
         ahead: usize,
-    ) -> impl Stream<Item = (u64, Result<Vec<f32>, DatasetError>)> + use<> {
+    ) -> impl Stream<Item = (u64, Result<Vec<f32>, StorageError>)> + use<> {
         let dataset = self.clone();
         stream::iter(scenes)
             .map(move |scene| {
@@ -200,7 +221,7 @@ impl Dataset {
     }
 
     /// Reads a scene's transient and decodes it on a separate thread.
-    async fn read_apart(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+    async fn read_apart(self, scene: u64) -> Result<Vec<f32>, StorageError> {
         let mut rereads = Rereads::new(&*self.store);
         loop {
             let read = self.clone().read_apart_once(scene).await;
@@ -211,7 +232,7 @@ impl Dataset {
         }
     }
 
-    async fn read_apart_once(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+    async fn read_apart_once(self, scene: u64) -> Result<Vec<f32>, StorageError> {
         let manifest = self.manifest_once(scene).await?;
         let path = self.path(&self.array(Quantity::Transient).layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
@@ -219,7 +240,7 @@ impl Dataset {
             self.decode_shard(&manifest, self.array(Quantity::Transient), &bytes)
                 .map_err(|e| e.in_object(|| self.shown(&path)))
         });
-        let broken = |e| DatasetError::codec("cannot decode a scene", e);
+        let broken = |e| StorageError::codec("cannot decode a scene", e);
         decoded.await.map_err(broken)?
     }
 
@@ -227,14 +248,14 @@ impl Dataset {
     /// decodes only the inner chunks that overlap it.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if the window is empty or exceeds the image; those of
+    /// [`StorageError::Invalid`] if the window is empty or exceeds the image; those of
     /// [`Self::read_transient`].
     pub async fn read_transient_crop(
         &self,
         scene: u64,
         rows: Range<u32>,
         columns: Range<u32>,
-    ) -> Result<Vec<f32>, DatasetError> {
+    ) -> Result<Vec<f32>, StorageError> {
         self.read_transient_part(scene, rows, columns, 0..self.spec.gate.bins)
             .await
     }
@@ -244,7 +265,7 @@ impl Dataset {
     /// data sets of format 1).
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if a range is empty or exceeds the transient; those of
+    /// [`StorageError::Invalid`] if a range is empty or exceeds the transient; those of
     /// [`Self::read_transient`].
     pub async fn read_transient_part(
         &self,
@@ -252,7 +273,7 @@ impl Dataset {
         rows: Range<u32>,
         columns: Range<u32>,
         bins: Range<u32>,
-    ) -> Result<Vec<f32>, DatasetError> {
+    ) -> Result<Vec<f32>, StorageError> {
         let limits = [
             ("rows", &rows, self.spec.height),
             ("columns", &columns, self.spec.width),
@@ -263,7 +284,7 @@ impl Dataset {
                 let what = format!(
                     "expected a range within 0..{limit} that is not empty, found {range:?}"
                 );
-                return Err(DatasetError::invalid(field, what));
+                return Err(StorageError::invalid(field, what));
             }
         }
         let of = |range: Range<u32>| range.start as usize..range.end as usize;
@@ -281,16 +302,16 @@ impl Dataset {
     /// decode the other spots.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if the data set has no such transient or no such spot; those of
+    /// [`StorageError::Invalid`] if the data set has no such transient or no such spot; those of
     /// [`Self::read_transient`].
-    pub async fn read_spot(&self, scene: u64, spot: u32) -> Result<Vec<f32>, DatasetError> {
+    pub async fn read_spot(&self, scene: u64, spot: u32) -> Result<Vec<f32>, StorageError> {
         let array = self.array_of(Quantity::TransientSpots)?;
         if spot >= self.spec.spots {
             let what = format!(
                 "the data set has {} spots, counted from 0; found {spot}",
                 self.spec.spots
             );
-            return Err(DatasetError::invalid("spot", what));
+            return Err(StorageError::invalid("spot", what));
         }
         let (height, width) = (self.spec.height as usize, self.spec.width as usize);
         let top = spot as usize * height;
@@ -307,16 +328,16 @@ impl Dataset {
     /// [`Quantity`].
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if `T` is not the stored type or the quantity is a transient;
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    /// [`StorageError::Invalid`] if `T` is not the stored type or the quantity is a transient;
+    /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Store`].
     pub async fn read<T: Stored>(
         &self,
         scene: u64,
         quantity: Quantity,
-    ) -> Result<Vec<T>, DatasetError> {
+    ) -> Result<Vec<T>, StorageError> {
         let array = self.array_of(quantity)?;
         if quantity.is_transient() {
-            return Err(DatasetError::invalid(
+            return Err(StorageError::invalid(
                 "quantity",
                 "transients are read by read_transient and read_histogram",
             ));
@@ -328,7 +349,7 @@ impl Dataset {
                 array.layout.element.name(),
                 T::ELEMENT.name()
             );
-            return Err(DatasetError::invalid("quantity", what));
+            return Err(StorageError::invalid("quantity", what));
         }
         let mut rereads = Rereads::new(&*self.store);
         loop {
@@ -344,12 +365,12 @@ impl Dataset {
         &self,
         scene: u64,
         array: &ArrayCodec,
-    ) -> Result<Vec<T>, DatasetError> {
+    ) -> Result<Vec<T>, StorageError> {
         let path = self.path(&array.layout.key(scene));
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
             // Distinguishes an unpublished scene from one with a missing object.
             self.manifest_once(scene).await?;
-            return Err(DatasetError::Damaged {
+            return Err(StorageError::Damaged {
                 object: self.shown(&path),
                 what: "the object is missing".into(),
             });
@@ -363,7 +384,7 @@ impl Dataset {
     ///
     /// # Errors
     /// See [`Self::read`].
-    pub async fn read_normal(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+    pub async fn read_normal(&self, scene: u64) -> Result<Vec<f32>, StorageError> {
         let codes = self.read::<i16>(scene, Quantity::Normal).await?;
         Ok(codes.into_iter().map(|n| f32::from(n) / 32767.0).collect())
     }
@@ -372,7 +393,7 @@ impl Dataset {
     ///
     /// # Errors
     /// See [`Self::read`].
-    pub async fn read_visibility(&self, scene: u64) -> Result<Vec<u8>, DatasetError> {
+    pub async fn read_visibility(&self, scene: u64) -> Result<Vec<u8>, StorageError> {
         let packed = self.read::<u8>(scene, Quantity::Visibility).await?;
         let pixels = self.spec.pixels();
         let spot = |s: usize| {
@@ -387,7 +408,7 @@ impl Dataset {
     ///
     /// # Errors
     /// See [`Self::read`].
-    pub async fn read_spots(&self, scene: u64) -> Result<Vec<Option<Spot>>, DatasetError> {
+    pub async fn read_spots(&self, scene: u64) -> Result<Vec<Option<Spot>>, StorageError> {
         let rows = self.read::<f32>(scene, Quantity::Spots).await?;
         Ok(rows.chunks_exact(7).map(Spot::from_row).collect())
     }
@@ -396,7 +417,7 @@ impl Dataset {
     ///
     /// # Errors
     /// See [`Self::read`].
-    pub async fn read_intrinsics(&self, scene: u64) -> Result<Intrinsics, DatasetError> {
+    pub async fn read_intrinsics(&self, scene: u64) -> Result<Intrinsics, StorageError> {
         let v = self.read::<f32>(scene, Quantity::Intrinsics).await?;
         Ok(Intrinsics {
             fx: v[0],

@@ -12,12 +12,12 @@ use object_store::ObjectStore;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
-use crate::store::objects;
-use crate::verify::report::Watch;
+use picofarm_store::StorageError;
+use picofarm_store::Watch;
+use picofarm_store::objects;
 
 /// Format version of snapshots.
 const FORMAT: u32 = 1;
@@ -229,9 +229,9 @@ impl Dataset {
     /// Returns an unstored snapshot of the data set's current state.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] names an unusable manifest, or an object that is missing or has
-    /// another size; [`DatasetError::Store`].
-    pub async fn present(&self, watch: Watch<'_>) -> Result<Snapshot, DatasetError> {
+    /// [`StorageError::Damaged`] names an unusable manifest, or an object that is missing or has
+    /// another size; [`StorageError::Store`].
+    pub async fn present(&self, watch: Watch<'_>) -> Result<Snapshot, StorageError> {
         let listing = self.listing().await?;
         let scenes: Vec<u64> = listing
             .manifests
@@ -240,11 +240,11 @@ impl Dataset {
             .filter(|s| *s < self.spec.scenes)
             .collect();
         let listing = &listing;
-        let look = |scene: u64| -> BoxFuture<'_, Result<Looked, DatasetError>> {
+        let look = |scene: u64| -> BoxFuture<'_, Result<Looked, StorageError>> {
             async move {
                 let path = self.path(&Manifest::key(scene));
                 let bytes = objects::require(&*self.store, &path).await?;
-                let damaged = |object: String, what: String| DatasetError::Damaged { object, what };
+                let damaged = |object: String, what: String| StorageError::Damaged { object, what };
                 let manifest = self
                     .usable_manifest(&bytes, scene, &self.shown(&path))
                     .map_err(|what| damaged(self.shown(&path), what))?;
@@ -283,16 +283,16 @@ impl Dataset {
     /// checked.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`] names a missing scene; [`DatasetError::Damaged`] for an
-    /// unreadable manifest; [`DatasetError::Store`].
-    pub async fn pin(&self, scenes: &[u64]) -> Result<Pinned, DatasetError> {
+    /// [`StorageError::NotPublished`] names a missing scene; [`StorageError::Damaged`] for an
+    /// unreadable manifest; [`StorageError::Store`].
+    pub async fn pin(&self, scenes: &[u64]) -> Result<Pinned, StorageError> {
         /// A manifest's hash, and the scene's missing quantities.
-        type Look = Result<([u8; 32], Vec<String>), DatasetError>;
+        type Look = Result<([u8; 32], Vec<String>), StorageError>;
         let look = |scene: u64| -> BoxFuture<'_, Look> {
             async move {
                 let path = self.path(&Manifest::key(scene));
                 let Some(bytes) = objects::get(&*self.store, &path).await? else {
-                    return Err(DatasetError::NotPublished {
+                    return Err(StorageError::NotPublished {
                         scene,
                         object: self.shown(&path),
                     });
@@ -325,9 +325,9 @@ impl Dataset {
     /// already has a snapshot with the same id.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if the name is invalid or belongs to another snapshot;
-    /// [`DatasetError::Store`].
-    pub async fn create_snapshot(&self, snapshot: &Snapshot) -> Result<Option<u64>, DatasetError> {
+    /// [`StorageError::Invalid`] if the name is invalid or belongs to another snapshot;
+    /// [`StorageError::Store`].
+    pub async fn create_snapshot(&self, snapshot: &Snapshot) -> Result<Option<u64>, StorageError> {
         check_name(&snapshot.name)?;
         let bytes = snapshot.to_bytes();
         let size = bytes.len() as u64;
@@ -345,15 +345,15 @@ impl Dataset {
             stored.len(),
             stored.created
         );
-        Err(DatasetError::invalid("snapshot", what))
+        Err(StorageError::invalid("snapshot", what))
     }
 
     /// Reads a stored snapshot.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if there is none of this name; [`DatasetError::Damaged`];
-    /// [`DatasetError::Store`].
-    pub async fn snapshot(&self, name: &str) -> Result<Snapshot, DatasetError> {
+    /// [`StorageError::Invalid`] if there is none of this name; [`StorageError::Damaged`];
+    /// [`StorageError::Store`].
+    pub async fn snapshot(&self, name: &str) -> Result<Snapshot, StorageError> {
         check_name(name)?;
         let path = self.path(&key(name));
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
@@ -366,9 +366,9 @@ impl Dataset {
                 "{} has no snapshot {name:?}; there are: {there}",
                 self.shown(&self.prefix)
             );
-            return Err(DatasetError::invalid("snapshot", what));
+            return Err(StorageError::invalid("snapshot", what));
         };
-        Snapshot::parse(&bytes).map_err(|what| DatasetError::Damaged {
+        Snapshot::parse(&bytes).map_err(|what| StorageError::Damaged {
             object: self.shown(&path),
             what,
         })
@@ -377,10 +377,10 @@ impl Dataset {
     /// Returns the names of the stored snapshots, ascending.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn snapshots(&self) -> Result<Vec<String>, DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn snapshots(&self) -> Result<Vec<String>, StorageError> {
         let folder = self.path("snapshots");
-        let failed = |e| DatasetError::store("list", self.shown(&folder), e);
+        let failed = |e| StorageError::store("list", self.shown(&folder), e);
         let mut names = Vec::new();
         let mut listed = self.store.list(Some(&folder));
         while let Some(object) = listed.try_next().await.map_err(failed)? {
@@ -401,14 +401,14 @@ fn key(name: &str) -> String {
     format!("snapshots/{name}.json.gz")
 }
 
-fn check_name(name: &str) -> Result<(), DatasetError> {
+fn check_name(name: &str) -> Result<(), StorageError> {
     if is_name(name) {
         return Ok(());
     }
     let what = format!(
         "{name:?} must be up to 64 letters, digits, '-', '_' and '.', and not begin with '.'"
     );
-    Err(DatasetError::invalid("snapshot", what))
+    Err(StorageError::invalid("snapshot", what))
 }
 
 fn is_name(name: &str) -> bool {

@@ -4,17 +4,17 @@
 use futures::TryStreamExt;
 use object_store::ObjectStore;
 
-use crate::error::DatasetError;
-use crate::layout::manifest::{seal, unsealed};
 use crate::scenes::dataset::Dataset;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::sealed::{seal, unsealed};
 
 impl Dataset {
     /// Returns the stored versions of a split, ascending.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
-    pub async fn split_versions(&self, name: &str) -> Result<Vec<u64>, DatasetError> {
+    /// [`StorageError::Store`].
+    pub async fn split_versions(&self, name: &str) -> Result<Vec<u64>, StorageError> {
         let folder = self.path(&format!("splits/{name}"));
         let mut versions: Vec<u64> = self
             .store
@@ -24,7 +24,7 @@ impl Dataset {
             )
             .try_collect()
             .await
-            .map_err(|e| DatasetError::store("list", self.shown(&folder), e))?;
+            .map_err(|e| StorageError::store("list", self.shown(&folder), e))?;
         versions.sort_unstable();
         Ok(versions)
     }
@@ -32,12 +32,12 @@ impl Dataset {
     /// Reads a version of a split, with the content given to [`Self::create_split`].
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] if it is missing or changed, because scenes may have moved from
-    /// one side to another; [`DatasetError::Store`].
-    pub async fn read_split(&self, name: &str, version: u64) -> Result<Vec<u8>, DatasetError> {
+    /// [`StorageError::Damaged`] if it is missing or changed, because scenes may have moved from
+    /// one side to another; [`StorageError::Store`].
+    pub async fn read_split(&self, name: &str, version: u64) -> Result<Vec<u8>, StorageError> {
         let path = self.path(&split_key(name, version));
         let bytes = objects::require(&*self.store, &path).await?;
-        check(&split_key(name, version), &bytes).map_err(|what| DatasetError::Damaged {
+        check(&split_key(name, version), &bytes).map_err(|what| StorageError::Damaged {
             object: self.shown(&path),
             what: format!(
                 "{what}; put a copy back, or delete the split and make it again with `picofarm dataset split` and the same \
@@ -50,13 +50,13 @@ impl Dataset {
     /// exists because another process created it first.
     ///
     /// # Errors
-    /// [`DatasetError::Store`].
+    /// [`StorageError::Store`].
     pub async fn create_split(
         &self,
         name: &str,
         version: u64,
         bytes: Vec<u8>,
-    ) -> Result<bool, DatasetError> {
+    ) -> Result<bool, StorageError> {
         let path = self.path(&split_key(name, version));
         objects::create(&*self.store, &path, seal(&bytes).into()).await
     }

@@ -3,10 +3,10 @@
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 
-use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
+use picofarm_store::StorageError;
 
 /// Number of concurrent requests.
 const CONCURRENCY: usize = 16;
@@ -40,8 +40,8 @@ impl Dataset {
     /// Computes the statistics of the data set from its manifests.
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] names an unusable manifest; [`DatasetError::Store`].
-    pub async fn info(&self) -> Result<Summary, DatasetError> {
+    /// [`StorageError::Damaged`] names an unusable manifest; [`StorageError::Store`].
+    pub async fn info(&self) -> Result<Summary, StorageError> {
         let scenes = self.scenes_present().await?;
         let mut summary = Summary {
             spec: self.spec,
@@ -54,7 +54,7 @@ impl Dataset {
             rays: None,
         };
         let (mut noise, mut rays) = (Vec::new(), Vec::new());
-        let read = |scene: u64| -> BoxFuture<'_, Result<Manifest, DatasetError>> {
+        let read = |scene: u64| -> BoxFuture<'_, Result<Manifest, StorageError>> {
             self.manifest(scene).boxed()
         };
         let mut manifests =

@@ -9,11 +9,11 @@ use rayon::prelude::*;
 use crate::coding::shard;
 use crate::coding::tiles::{Part, Tiles};
 use crate::coding::values::Decoder;
-use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::{ArrayCodec, Dataset};
-use crate::store::objects::Rereads;
+use picofarm_store::StorageError;
+use picofarm_store::objects::Rereads;
 
 /// Inner chunks with a gap of at most this many bytes are fetched in one request, including the
 /// gap.
@@ -26,7 +26,7 @@ impl Dataset {
         manifest: &Manifest,
         array: &ArrayCodec,
         part: Part,
-    ) -> Result<Vec<f32>, DatasetError> {
+    ) -> Result<Vec<f32>, StorageError> {
         let mut rereads = Rereads::new(&*self.store);
         loop {
             let read = self.read_part_once(manifest, array, &part).await;
@@ -42,7 +42,7 @@ impl Dataset {
         manifest: &Manifest,
         array: &ArrayCodec,
         part: &Part,
-    ) -> Result<Vec<f32>, DatasetError> {
+    ) -> Result<Vec<f32>, StorageError> {
         let tiles = Tiles::new(&self.spec, &array.layout);
         let wanted: Vec<usize> = (0..tiles.count())
             .filter(|tile| tiles.touches(*tile, part))
@@ -64,10 +64,10 @@ impl Dataset {
         array: &ArrayCodec,
         tiles: &Tiles,
         wanted: &[usize],
-    ) -> Result<Vec<(usize, Option<Bytes>)>, DatasetError> {
+    ) -> Result<Vec<(usize, Option<Bytes>)>, StorageError> {
         let key = array.layout.key(manifest.scene);
         let path = self.path(&key);
-        let damaged = |what: String| DatasetError::Damaged {
+        let damaged = |what: String| StorageError::Damaged {
             object: self.shown(&path),
             what,
         };
@@ -83,7 +83,7 @@ impl Dataset {
         };
         let fetch_error = |e| match e {
             object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
-            e => DatasetError::store("read", self.shown(&path), e),
+            e => StorageError::store("read", self.shown(&path), e),
         };
         let index = self.store.get_range(&path, start..entry.size);
         let index = index.await.map_err(fetch_error)?;
@@ -116,7 +116,7 @@ impl Dataset {
         manifest: &Manifest,
         array: &ArrayCodec,
         bytes: &Bytes,
-    ) -> Result<Vec<f32>, DatasetError> {
+    ) -> Result<Vec<f32>, StorageError> {
         let len = array.layout.planes() * self.spec.transient_len();
         let mut target = vec![0f32; len];
         self.decode_shard_into(manifest, array, bytes, &mut target)?;
@@ -130,7 +130,7 @@ impl Dataset {
         array: &ArrayCodec,
         bytes: &Bytes,
         target: &mut [f32],
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         let decoding = self.decoding(manifest, array);
         let whole = decoding.shard(bytes, target)?;
         self.complete(manifest, whole)
@@ -143,7 +143,7 @@ impl Dataset {
         array: &ArrayCodec,
         bytes: &Bytes,
         target: &mut [f32],
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         let whole = self.decoding(manifest, array).planes(bytes, target)?;
         self.complete(manifest, whole)
     }
@@ -169,11 +169,11 @@ impl Dataset {
         }
     }
 
-    fn complete(&self, manifest: &Manifest, complete: Complete) -> Result<(), DatasetError> {
+    fn complete(&self, manifest: &Manifest, complete: Complete) -> Result<(), StorageError> {
         if complete.0 {
             return Ok(());
         }
-        Err(DatasetError::Damaged {
+        Err(StorageError::Damaged {
             object: self.shown(&self.path(&Manifest::key(manifest.scene))),
             what: "a saturated bin has no exact value in the overflow list".into(),
         })
@@ -194,7 +194,7 @@ pub(crate) struct Decoding<'a> {
 
 impl Decoding<'_> {
     /// Decodes a whole transient from the bytes of its shard, overwriting a target of its size.
-    pub fn shard(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
+    pub fn shard(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, StorageError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
         let chunks = Self::chunks(&tiles, bytes)?;
         if chunks.iter().any(Option::is_none) {
@@ -206,7 +206,7 @@ impl Decoding<'_> {
 
     /// Like [`Self::shard`], but as one image per bin. Tiles with the same bins write to adjacent
     /// memory, so one thread decodes them; different ranges of bins are decoded in parallel.
-    pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
+    pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, StorageError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
         let chunks = Self::chunks(&tiles, bytes)?;
         if chunks.iter().any(Option::is_none) {
@@ -225,7 +225,7 @@ impl Decoding<'_> {
                 }
                 Ok(saturated)
             })
-            .collect::<Result<Vec<bool>, DatasetError>>()?;
+            .collect::<Result<Vec<bool>, StorageError>>()?;
         let bins = self.spec.gate.bins as usize;
         for (index, value) in self.overflow {
             let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
@@ -238,10 +238,10 @@ impl Decoding<'_> {
     }
 
     /// Returns the encoded bytes of each tile of a shard; `None` = all fill value.
-    fn chunks(tiles: &Tiles, bytes: &Bytes) -> Result<Vec<Option<Bytes>>, DatasetError> {
+    fn chunks(tiles: &Tiles, bytes: &Bytes) -> Result<Vec<Option<Bytes>>, StorageError> {
         let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
             let what = format!("{} bytes are too few", bytes.len());
-            return Err(DatasetError::codec("cannot read a shard's index", what));
+            return Err(StorageError::codec("cannot read a shard's index", what));
         };
         let index = shard::parse_index(&bytes[start..], tiles.count(), bytes.len() as u64)?;
         let bytes_of = |r: Range<u64>| bytes.slice(r.start as usize..r.end as usize);
@@ -257,7 +257,7 @@ impl Decoding<'_> {
         chunks: Vec<(usize, Option<Bytes>)>,
         part: &Part,
         target: &mut [f32],
-    ) -> Result<Complete, DatasetError> {
+    ) -> Result<Complete, StorageError> {
         let mut bands = Vec::new();
         let mut rest = &mut *target;
         let mut top = part.rows.start;
@@ -285,7 +285,7 @@ impl Decoding<'_> {
                 }
                 Ok(saturated)
             })
-            .collect::<Result<Vec<bool>, DatasetError>>()?;
+            .collect::<Result<Vec<bool>, StorageError>>()?;
         let bins = self.spec.gate.bins as usize;
         let width = self.spec.width as usize;
         for (index, value) in self.overflow {

@@ -3,23 +3,21 @@
 use serde_json::Value;
 
 use super::{Fault, Problem, Verification};
-use crate::error::DatasetError;
 use crate::layout::group::METADATA;
 use crate::repair::listing::Listing;
+use crate::repair::recipe;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::snapshot::Snapshot;
-use crate::store::objects;
-use crate::{
-    repair::recipe,
-    scenes::{snapshot, splits},
-};
+use crate::scenes::{snapshot, splits};
+use picofarm_store::StorageError;
+use picofarm_store::objects;
 
 impl Dataset {
     /// Checks that the metadata is as the specification requires.
     pub(super) async fn verify_metadata(
         &self,
         report: &mut Verification,
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         for (key, expected) in self.metadata() {
             let path = self.path(&key);
             let fault = match objects::get(&*self.store, &path).await? {
@@ -52,7 +50,7 @@ impl Dataset {
         &self,
         listing: &Listing,
         report: &mut Verification,
-    ) -> Result<(), DatasetError> {
+    ) -> Result<(), StorageError> {
         for key in &listing.records {
             let path = self.path(key);
             let Some(bytes) = objects::get(&*self.store, &path).await? else {
@@ -73,7 +71,8 @@ impl Dataset {
     }
 }
 
-pub(crate) fn metadata_fault(bytes: &[u8], expected: &Value) -> Option<Fault> {
+/// Compares stored metadata with the expected ones. Returns their fault, if they differ.
+pub fn metadata_fault(bytes: &[u8], expected: &Value) -> Option<Fault> {
     let stored: Value = match serde_json::from_slice(bytes) {
         Ok(stored) => stored,
         Err(e) => return Some(Fault::BadMetadata(format!("not JSON: {e}"))),

@@ -5,8 +5,6 @@
 //! time, and in full mode the objects that are decoded concurrently.
 
 mod metadata;
-pub(crate) mod object;
-pub(crate) mod report;
 
 use std::sync::Arc;
 
@@ -14,15 +12,16 @@ use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 
-use crate::error::DatasetError;
-use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
+use crate::layout::manifest::Manifest;
 use crate::repair::listing::Listing;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::snapshot::Snapshot;
-use crate::store::objects;
+use picofarm_store::StorageError;
+use picofarm_store::objects;
+use picofarm_store::sealed::{ObjectEntry, sha256_hex};
 
-pub(crate) use metadata::metadata_fault;
-pub use report::{Fault, Problem, Verification, VerifyMode, Watch};
+pub use metadata::metadata_fault;
+use picofarm_store::{Fault, Problem, Verification, VerifyMode, Watch};
 
 /// Number of manifests read concurrently.
 const MANIFESTS: usize = 32;
@@ -61,19 +60,19 @@ impl Dataset {
     /// Checks the data set and reports each broken, missing or foreign object.
     ///
     /// # Errors
-    /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.
-    pub async fn verify(&self, mode: VerifyMode) -> Result<Verification, DatasetError> {
+    /// [`StorageError::Store`] if the store fails; faults of the data are in the report.
+    pub async fn verify(&self, mode: VerifyMode) -> Result<Verification, StorageError> {
         self.verify_with(&VerifyOptions::new(mode)).await
     }
 
     /// Like [`Self::verify`], with options.
     ///
     /// # Errors
-    /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.
+    /// [`StorageError::Store`] if the store fails; faults of the data are in the report.
     pub async fn verify_with(
         &self,
         options: &VerifyOptions<'_>,
-    ) -> Result<Verification, DatasetError> {
+    ) -> Result<Verification, StorageError> {
         let listing = self.listing().await?;
         let mut report = Verification::default();
         self.verify_metadata(&mut report).await?;
@@ -110,12 +109,12 @@ impl Dataset {
     /// Checks only these scenes.
     ///
     /// # Errors
-    /// [`DatasetError::Store`] if the store fails; faults of the data are in the report.
+    /// [`StorageError::Store`] if the store fails; faults of the data are in the report.
     pub async fn verify_only(
         &self,
         scenes: &[u64],
         mode: VerifyMode,
-    ) -> Result<Verification, DatasetError> {
+    ) -> Result<Verification, StorageError> {
         let mut report = Verification::default();
         for scene in scenes {
             let mut sizes = Vec::new();
@@ -129,7 +128,7 @@ impl Dataset {
                 continue;
             }
             let checked = self.verify_scene(*scene, sizes, None, mode).await?;
-            report.add(checked);
+            checked.add_to(&mut report);
         }
         report.problems.sort_by(|a, b| a.object.cmp(&b.object));
         Ok(report)
@@ -150,7 +149,7 @@ impl Dataset {
         listing: &Listing,
         options: &VerifyOptions<'_>,
         report: &mut Verification,
-    ) -> Result<Vec<u64>, DatasetError> {
+    ) -> Result<Vec<u64>, StorageError> {
         let at_once = match options.mode {
             VerifyMode::Fast => MANIFESTS,
             VerifyMode::Full => std::thread::available_parallelism()
@@ -158,7 +157,7 @@ impl Dataset {
                 .min(SCENES),
         };
         let of = scenes.len() as u64;
-        let check = |scene: u64| -> BoxFuture<'_, Result<CheckedScene, DatasetError>> {
+        let check = |scene: u64| -> BoxFuture<'_, Result<CheckedScene, StorageError>> {
             let arrays = 0..self.arrays.len();
             let sizes = arrays.map(|array| listing.size(array, scene)).collect();
             let expected = options.snapshot.and_then(|s| s.manifest_sha256(scene));
@@ -174,7 +173,7 @@ impl Dataset {
             if !checked.usable {
                 unusable.push(checked.scene);
             }
-            report.add(checked);
+            checked.add_to(report);
         }
         unusable.sort_unstable();
         Ok(unusable)
@@ -186,7 +185,7 @@ impl Dataset {
         sizes: Vec<Option<u64>>,
         expected: Option<String>,
         mode: VerifyMode,
-    ) -> Result<CheckedScene, DatasetError> {
+    ) -> Result<CheckedScene, StorageError> {
         let mut checked = CheckedScene {
             scene,
             usable: false,
@@ -231,7 +230,7 @@ impl Dataset {
         }
         if mode == VerifyMode::Full {
             let read =
-                |array: usize| -> BoxFuture<'_, Result<(usize, Option<Fault>), DatasetError>> {
+                |array: usize| -> BoxFuture<'_, Result<(usize, Option<Fault>), StorageError>> {
                     let fault = self.content(manifest.clone(), array);
                     async move { Ok((array, fault.await?)) }.boxed()
                 };
@@ -258,7 +257,7 @@ impl Dataset {
     ) -> Result<Manifest, String> {
         let manifest = match Manifest::parse(bytes, scene, object) {
             Ok(manifest) => manifest,
-            Err(DatasetError::Damaged { what, .. }) => return Err(what),
+            Err(StorageError::Damaged { what, .. }) => return Err(what),
             Err(e) => return Err(e.to_string()),
         };
         if manifest.checksum.is_none() && manifest.to_bytes() != bytes {
@@ -288,7 +287,7 @@ impl Dataset {
         &self,
         manifest: Arc<Manifest>,
         array: usize,
-    ) -> Result<Option<Fault>, DatasetError> {
+    ) -> Result<Option<Fault>, StorageError> {
         let path = self.path(&manifest.objects[array].key);
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
             return Ok(Some(Fault::Missing));
@@ -359,11 +358,11 @@ struct CheckedScene {
     bytes: u64,
 }
 
-impl Verification {
-    fn add(&mut self, checked: CheckedScene) {
-        self.scenes += 1;
-        self.objects += checked.objects;
-        self.bytes += checked.bytes;
-        self.problems.extend(checked.problems);
+impl CheckedScene {
+    fn add_to(self, report: &mut Verification) {
+        report.scenes += 1;
+        report.objects += self.objects;
+        report.bytes += self.bytes;
+        report.problems.extend(self.problems);
     }
 }

@@ -16,6 +16,7 @@ use object_store::path::Path;
 use object_store::throttle::{ThrottleConfig, ThrottledStore};
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::*;
 use proptest::prelude::*;
 
 type Objects = BTreeMap<String, Vec<u8>>;
@@ -87,7 +88,7 @@ proptest! {
             let manifest = loop {
                 match dataset.publish_encoded(scene.clone()).await {
                     Ok(manifest) => break manifest,
-                    Err(error) => assert!(matches!(error, DatasetError::Store { .. }), "{error}"),
+                    Err(error) => assert!(matches!(error, StorageError::Store { .. }), "{error}"),
                 }
                 tries += 1;
                 assert!(tries < 1000);
@@ -105,7 +106,7 @@ proptest! {
             let decide = move |_: &Path| if random.next() < 0.1 { Fate::Repeated } else { Fate::Good };
             let store = Tricky::new(memory.clone()).deciding(decide);
             match probe(&store, &Path::from("sets"), PROBE_WITHIN).await {
-                Ok(()) | Err(DatasetError::Store { .. }) => {}
+                Ok(()) | Err(StorageError::Store { .. }) => {}
                 Err(error) => panic!("{error}"),
             }
             assert!(objects(&*memory).await.is_empty());

@@ -1,5 +1,5 @@
 //! Tests that every changed byte outside of histograms is detected: in splits, recipes, snapshots,
-//! manifests, metadata and records of models.
+//! manifests and metadata.
 
 use crate::common;
 
@@ -12,6 +12,7 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::*;
 use serde_json::{Value, json};
 
 type Objects = BTreeMap<String, Vec<u8>>;
@@ -158,87 +159,5 @@ async fn a_changed_split_is_not_read_and_says_how_to_make_it_again() {
         );
         let report = dataset.verify(VerifyMode::Fast).await.unwrap();
         assert!(report.problems.iter().any(|p| p.object == path.to_string()));
-    }
-}
-
-#[tokio::test]
-async fn changed_records_of_models_are_refused() {
-    let memory = Arc::new(InMemory::new());
-    let models = Models::new(memory.clone(), &Path::from("store"));
-    let evaluation = Evaluation {
-        predicts: String::new(),
-        key: "k".into(),
-        model: "m".into(),
-        model_sha256: "0".repeat(64),
-        dataset: "d".into(),
-        data: "s".into(),
-        split: SplitUsed {
-            name: "default".into(),
-            version: 1,
-            sha256: "1".repeat(64),
-        },
-        side: "test".into(),
-        scenes: 4,
-        histogram: "transient".into(),
-        sensor: false,
-        times: String::new(),
-        code: "c".into(),
-        metrics: json!({"l1_m": 0.25}),
-    };
-    models.put_evaluation(&evaluation).await.unwrap();
-    let speed = TrainingSpeed {
-        training_key: "t".into(),
-        samples_per_s: 2.5,
-        data_wait_share: 0.1,
-        threads: 2,
-        gpu: None,
-    };
-    models.put_speed("m", &speed).await.unwrap();
-    let trial = TrialRecord {
-        sweep: "s".into(),
-        id: "i".into(),
-        index: 0,
-        values: BTreeMap::new(),
-        over: BTreeMap::new(),
-        model: "m".into(),
-        kind: "tof".into(),
-        training_key: "t".into(),
-        end: TrialEnd::Finished,
-        epochs: 2,
-        loss: Some(0.5),
-        history: vec![json!({"epoch": 1})],
-    };
-    models.put_trial(&trial).await.unwrap();
-    let rung = Rung {
-        index: 0,
-        epochs: 1,
-        loss: 0.75,
-    };
-    models.put_rung("s", "i", &rung).await.unwrap();
-    let read = async || {
-        let found = (
-            models.evaluation("m", "k").await?,
-            models.speed("m", "t").await?,
-            models.trials("s", "i").await?,
-        );
-        Ok::<_, DatasetError>(found)
-    };
-    let before = read().await.unwrap();
-    assert_eq!(before.0.as_ref(), Some(&evaluation));
-    let all = objects(&memory).await;
-    assert_eq!(all.len(), 4);
-    for (key, bytes) in all {
-        let path = Path::from(key.as_str());
-        for at in 0..bytes.len() {
-            let mut changed = bytes.clone();
-            changed[at] ^= 1;
-            memory.put(&path, changed.into()).await.unwrap();
-            let said = match read().await {
-                Err(error) => error.to_string(),
-                Ok(found) => panic!("byte {at} of {key} changed unseen: {found:?}"),
-            };
-            assert!(said.contains(&key), "{said}");
-        }
-        memory.put(&path, bytes.into()).await.unwrap();
     }
 }

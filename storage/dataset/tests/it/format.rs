@@ -7,6 +7,7 @@ use common::*;
 use object_store::ObjectStoreExt;
 use object_store::path::Path;
 use picofarm_dataset::*;
+use picofarm_store::*;
 use zarrs::array::{Array, ArraySubset};
 
 async fn text(store: &dyn object_store::ObjectStore, key: &str) -> String {

@@ -13,6 +13,7 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::*;
 use proptest::prelude::*;
 use serde_json::json;
 
@@ -168,7 +169,7 @@ async fn another_scene_is_an_alarm_and_overwrites_nothing() {
     let made = Scene::new(dataset.spec(), 77);
     let other = dataset.encode(1, &made.record(), &provenance()).unwrap();
     let alarm = dataset.restore(other.clone(), None).await.unwrap_err();
-    assert!(matches!(alarm, DatasetError::Diverged { .. }), "{alarm}");
+    assert!(matches!(alarm, StorageError::Diverged { .. }), "{alarm}");
     // Without the manifest, the other objects contradict it.
     memory
         .delete(&Path::from("sets/a/manifests/1.json"))
@@ -182,7 +183,7 @@ async fn another_scene_is_an_alarm_and_overwrites_nothing() {
     let snapshot = dataset.snapshot("v1").await.unwrap();
     let witness = snapshot.manifest_sha256(1).unwrap();
     let alarm = dataset.restore(other, Some(&witness)).await.unwrap_err();
-    assert!(matches!(alarm, DatasetError::Diverged { .. }), "{alarm}");
+    assert!(matches!(alarm, StorageError::Diverged { .. }), "{alarm}");
     let mut now = objects(&*memory).await;
     now.insert(
         "sets/a/manifests/1.json".into(),

@@ -8,6 +8,7 @@ use std::process::Command;
 
 use common::*;
 use picofarm_dataset::*;
+use picofarm_store::*;
 use serde_json::{Map, Value, json};
 
 struct Expected<'a> {

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use common::*;
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 /// The variable with the folder in which the killed process publishes its scenes.
 const PLACE: &str = "PICOFARM_TEST_PUBLISH";
@@ -32,7 +33,7 @@ async fn publish_all(folder: &Folder) {
         let encoded = encoded.unwrap();
         match dataset.publish_encoded(encoded.clone()).await {
             Ok(_) => {}
-            Err(DatasetError::Conflict { .. }) => {
+            Err(StorageError::Conflict { .. }) => {
                 dataset.restore(encoded, None).await.unwrap();
             }
             Err(error) => panic!("{error}"),

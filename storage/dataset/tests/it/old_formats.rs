@@ -8,6 +8,7 @@ use std::path::Path;
 
 use common::*;
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 /// Unpacks `format-1.zip`: the data sets `sqrt` (with `transient_spots`), `plain` and `counts`,
 /// each with scene 1.

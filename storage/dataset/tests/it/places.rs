@@ -12,6 +12,7 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 #[tokio::test]
 async fn another_specification_is_refused_with_the_field_and_both_values() {
@@ -65,7 +66,7 @@ async fn another_specification_is_refused_with_the_field_and_both_values() {
     let error = Dataset::open(store, Path::from("elsewhere"))
         .await
         .unwrap_err();
-    assert!(matches!(error, DatasetError::NoDataset { .. }));
+    assert!(matches!(error, StorageError::NoDataset { .. }));
 }
 
 #[tokio::test]
@@ -297,7 +298,7 @@ async fn a_place_that_cannot_be_written_is_named_with_a_hint() {
     );
     assert!(matches!(
         probe(&*store, &prefix, PROBE_WITHIN).await,
-        Err(DatasetError::Store { .. })
+        Err(StorageError::Store { .. })
     ));
     // A path below a file.
     let file = tempfile::NamedTempFile::new().unwrap();

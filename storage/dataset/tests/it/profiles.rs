@@ -12,6 +12,7 @@ use object_store::ObjectStoreExt;
 use object_store::memory::InMemory;
 use object_store::path::Path;
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 /// 300 bins: three inner chunks along the bins, the last one cut off.
 fn long(profile: Profile) -> DatasetSpec {
@@ -234,7 +235,7 @@ async fn a_stream_of_scenes_keeps_their_order_and_outlives_a_missing_one() {
         match scene {
             2 => assert!(matches!(
                 h,
-                Err(DatasetError::NotPublished { scene: 2, .. })
+                Err(StorageError::NotPublished { scene: 2, .. })
             )),
             _ => assert_eq!(h.unwrap(), dataset.read_transient(scene).await.unwrap()),
         }

@@ -9,6 +9,7 @@ use common::*;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 #[test]
 fn the_bytes_do_not_depend_on_the_number_of_threads() {
@@ -61,7 +62,7 @@ async fn publishing_something_else_is_a_conflict_that_names_the_object() {
         .publish(1, &scene.record(), &provenance())
         .await
         .unwrap_err();
-    let DatasetError::Conflict {
+    let StorageError::Conflict {
         object,
         stored,
         ours,
@@ -112,7 +113,7 @@ async fn a_scene_half_written_by_a_killed_worker_is_completed() {
     assert_eq!(dataset.published(1).await.unwrap(), None);
     assert!(matches!(
         dataset.manifest(1).await,
-        Err(DatasetError::NotPublished { scene: 1, .. })
+        Err(StorageError::NotPublished { scene: 1, .. })
     ));
     let report = dataset.verify(VerifyMode::Full).await.unwrap();
     assert!(
@@ -197,7 +198,7 @@ async fn racing_publishers_of_the_same_task_all_succeed_and_of_different_ones_co
     let winners = results.iter().filter(|r| r.is_ok()).count();
     assert!(winners <= 1);
     for error in results.iter().filter_map(|r| r.as_ref().err()) {
-        assert!(matches!(error, DatasetError::Conflict { .. }), "{error}");
+        assert!(matches!(error, StorageError::Conflict { .. }), "{error}");
     }
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
     // If each encountered an object of the other, none succeeded, and their objects are orphans.
@@ -265,6 +266,7 @@ async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
             object,
             bytes,
             scene: None,
+            cause: OrphanCause::Write,
         },
     ] = &leftovers[..]
     else {
@@ -305,7 +307,7 @@ async fn a_made_up_manifest_gives_way_to_the_scene_and_a_true_one_does_not() {
         }
         let conflict = dataset.publish_encoded(encode(1)).await.unwrap_err();
         assert!(
-            matches!(conflict, DatasetError::Conflict { .. }),
+            matches!(conflict, StorageError::Conflict { .. }),
             "{conflict}"
         );
         let replaced = dataset.replace_unfounded(encode(1)).await.unwrap().unwrap();

@@ -4,6 +4,7 @@ use crate::common;
 
 use common::*;
 use picofarm_dataset::*;
+use picofarm_store::*;
 use proptest::prelude::*;
 
 fn sigma(h: f32, scale: f32) -> f64 {
@@ -205,7 +206,7 @@ async fn unusable_values_are_named() {
         .unwrap_err();
     assert!(matches!(
         error,
-        DatasetError::SceneOutOfRange {
+        StorageError::SceneOutOfRange {
             scene: 4,
             scenes: 4
         }

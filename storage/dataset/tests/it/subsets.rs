@@ -7,6 +7,7 @@ use common::*;
 use object_store::ObjectStoreExt;
 use object_store::path::Path;
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 /// 36×40 pixels, 100 spots, 8 bins.
 fn rich(profile: Profile) -> DatasetSpec {

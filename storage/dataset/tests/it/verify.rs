@@ -7,6 +7,7 @@ use common::*;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
+use picofarm_store::*;
 
 async fn put(store: &dyn ObjectStore, key: &str, bytes: Vec<u8>) {
     store.put(&Path::from(key), bytes.into()).await.unwrap();
@@ -91,7 +92,7 @@ async fn broken_missing_and_foreign_objects_are_named() {
     // rest can still be read.
     assert!(matches!(
         dataset.read_transient(1).await,
-        Err(DatasetError::Damaged { object, .. }) if object == "sets/a/transient/c/1/0/0/0"
+        Err(StorageError::Damaged { object, .. }) if object == "sets/a/transient/c/1/0/0/0"
     ));
     dataset
         .read_transient_crop(1, 32..36, 32..40)

@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use picofarm_dataset::{Dataset, DatasetError, Predictions, Quantity, SplitUsed, sha256_hex};
+use picofarm_dataset::{Dataset, Quantity};
 use picofarm_model::{
     Random,
     scene::{Order, Scene, Scenes, Unreadable},
@@ -14,7 +14,9 @@ use picofarm_proto::{
     model::Histogram,
     split::{Rank, SplitRecord},
 };
+use picofarm_results::{Predictions, SplitUsed};
 use picofarm_sensor::{Multiplex, PS_PER_M, Sensing, Sensor, SensorError};
+use picofarm_store::{StorageError, sha256_hex};
 use tokio::runtime::Handle;
 
 use super::{Control, TaskError, output::Stores, reprocess::quantity};
@@ -209,7 +211,7 @@ impl Examples {
         let of = (seed, self.scenes[index]);
         let peak = sensor.radiance(&stored.histogram, of, known, &mut seen);
         let peak = peak.map_err(
-            |SensorError::Invalid { field, what }| DatasetError::Invalid {
+            |SensorError::Invalid { field, what }| StorageError::Invalid {
                 field: format!("train.{field}"),
                 what: format!("scene {}: {what}", self.scenes[index]),
             },
@@ -228,7 +230,7 @@ impl Examples {
 
     /// Reads a scene's histogram and its element order, in the order that networks expect if there
     /// is no sensor.
-    async fn histogram(&self, scene: u64) -> Result<(Vec<f32>, Order), DatasetError> {
+    async fn histogram(&self, scene: u64) -> Result<(Vec<f32>, Order), StorageError> {
         let Some(spots) = self
             .spots
             .as_ref()
@@ -256,7 +258,7 @@ impl Examples {
         Ok((sum.finish(), Order::Pixels))
     }
 
-    async fn scene(&self, scene: u64) -> Result<Scene, DatasetError> {
+    async fn scene(&self, scene: u64) -> Result<Scene, StorageError> {
         let dataset = &self.dataset;
         let spec = dataset.spec();
         let seen = async {
@@ -347,7 +349,7 @@ impl Scenes for Examples {
 
 /// Rejects a histogram that has no light or contains numbers that are not finite, because a network
 /// would take both for measurements.
-fn check_light(place: &str, scene: u64, histogram: &[f32]) -> Result<(), DatasetError> {
+fn check_light(place: &str, scene: u64, histogram: &[f32]) -> Result<(), StorageError> {
     let odd = histogram.iter().find(|h| !(h.is_finite() && **h >= 0.0));
     let what = match odd {
         Some(odd) => format!(
@@ -358,7 +360,7 @@ fn check_light(place: &str, scene: u64, histogram: &[f32]) -> Result<(), Dataset
         }
         None => return Ok(()),
     };
-    Err(DatasetError::Invalid {
+    Err(StorageError::Invalid {
         field: "source".into(),
         what: format!("{place}: {what}; render or import the scene again"),
     })

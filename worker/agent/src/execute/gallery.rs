@@ -3,12 +3,12 @@
 
 use std::sync::Arc;
 
-use picofarm_dataset::Evaluation;
 use picofarm_model::{
     Device, Model,
     report::{Picture, pictures},
 };
 use picofarm_proto::model::Histogram;
+use picofarm_results::Evaluation;
 
 use super::{
     Control, TaskError,

@@ -8,17 +8,19 @@ use std::{
 };
 
 use object_store::{ObjectStore, path::Path};
-use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, PROBE_WITHIN, Profile, Subsets,
-    Verdict, check_identity, check_own_folder, expect_identity, open_store, probe,
-};
+use picofarm_dataset::{Dataset, DatasetSpec, EncodedScene, Manifest, Profile, Subsets};
 use picofarm_proto::{
     key::TaskKey,
     model::{RenderTask, TaskSpec, log::VERDICT, memory::Known},
     trace,
 };
+use picofarm_results::Verdict;
 use picofarm_scene::Scene;
 use picofarm_session::{Backoff, memory_mib, random};
+use picofarm_store::{
+    PROBE_WITHIN, StorageError, check_identity, check_own_folder, expect_identity, open_store,
+    probe,
+};
 use picofarm_transient::Settings;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
@@ -106,9 +108,9 @@ impl Stores {
         &self,
         location: &str,
         control: &Control,
-    ) -> Result<picofarm_dataset::Models, TaskError> {
+    ) -> Result<picofarm_results::Models, TaskError> {
         let (store, prefix) = self.probed(location, control)?;
-        Ok(picofarm_dataset::Models::new(store, &prefix))
+        Ok(picofarm_results::Models::new(store, &prefix))
     }
 
     /// Creates or opens the job's data set. The first use of a location probes its store.
@@ -152,9 +154,9 @@ impl Stores {
         &self,
         location: &str,
         control: &Control,
-    ) -> Result<picofarm_dataset::Models, TaskError> {
+    ) -> Result<picofarm_results::Models, TaskError> {
         let (store, prefix) = self.source(location, control)?;
-        Ok(picofarm_dataset::Models::new(store, &prefix))
+        Ok(picofarm_results::Models::new(store, &prefix))
     }
 
     /// Opens a location for reading.
@@ -229,7 +231,7 @@ impl Stores {
     pub(super) fn wait<T>(
         &self,
         control: &Control,
-        request: impl Future<Output = Result<T, DatasetError>>,
+        request: impl Future<Output = Result<T, StorageError>>,
     ) -> Result<T, TaskError> {
         self.wait_for(control, request, of_dataset)
     }
@@ -265,7 +267,7 @@ impl Stores {
     ) -> Result<Option<Manifest>, TaskError> {
         let looked = async {
             match dataset.published(index).await {
-                Err(error @ DatasetError::Damaged { .. }) => {
+                Err(error @ StorageError::Damaged { .. }) => {
                     warn!(%error, task = index, "a published scene is damaged; it is made again to repair it");
                     Ok(None)
                 }
@@ -303,7 +305,7 @@ impl Stores {
         let _in = debug_span!(target: trace::TARGET, "publish").entered();
         self.patiently(control, async || {
             match dataset.publish_encoded(scene.clone()).await {
-                Err(conflict @ DatasetError::Conflict { .. }) => {
+                Err(conflict @ StorageError::Conflict { .. }) => {
                     // A manifest without valid objects must not occupy the scene for ever.
                     let replaced = dataset.replace_unfounded(scene.clone()).await?;
                     replaced.ok_or(conflict)
@@ -319,7 +321,7 @@ impl Stores {
     pub(super) fn patiently<T>(
         &self,
         control: &Control,
-        mut request: impl AsyncFnMut() -> Result<T, DatasetError>,
+        mut request: impl AsyncFnMut() -> Result<T, StorageError>,
     ) -> Result<T, TaskError> {
         let patience = control.elapsed().max(LEAST_PATIENCE).min(self.patience);
         let until = Instant::now() + patience;
@@ -394,7 +396,7 @@ pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
 }
 
 /// Like `of_dataset`, for errors on opening: the location may have no picofarm data set.
-fn of_open(error: DatasetError) -> TaskError {
+fn of_open(error: StorageError) -> TaskError {
     match of_dataset(error) {
         TaskError::Damaged(text) => TaskError::User(text),
         other => other,
@@ -411,18 +413,18 @@ pub(super) fn saying(verdict: &Verdict, of: &str) {
 }
 
 /// Classifies a data set's error by cause.
-pub(super) fn of_dataset(error: DatasetError) -> TaskError {
+pub(super) fn of_dataset(error: StorageError) -> TaskError {
     let text = error.to_string();
     match error {
         // Wrong store settings are the fault of this worker's environment; another worker may have
         // the right ones.
-        DatasetError::Store { .. }
-        | DatasetError::StoreSettings { .. }
-        | DatasetError::Io { .. } => TaskError::Store(text),
+        StorageError::Store { .. }
+        | StorageError::StoreSettings { .. }
+        | StorageError::Io { .. } => TaskError::Store(text),
         // Repeated reading has not helped. Running the task elsewhere may help, and repairing the
         // store does.
-        DatasetError::Damaged { .. } => TaskError::Damaged(text),
-        DatasetError::Codec { .. } => TaskError::Crash(text),
+        StorageError::Damaged { .. } => TaskError::Damaged(text),
+        StorageError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),
     }
 }

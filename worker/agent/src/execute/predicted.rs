@@ -2,9 +2,8 @@
 
 pub(super) mod agreement;
 
-use picofarm_dataset::{
-    DatasetError, EncodedPredictions, PredictionManifest, Predictions, Verdict,
-};
+use picofarm_results::{EncodedPredictions, PredictionManifest, Predictions, Verdict};
+use picofarm_store::StorageError;
 use tracing::{info, warn};
 
 use super::{
@@ -42,7 +41,7 @@ pub(super) fn adopted(
 ) -> Result<Option<Output>, TaskError> {
     let looked = async {
         match predictions.finished(ours.scene, &ours.task_key).await {
-            Err(error @ DatasetError::Damaged { .. }) => {
+            Err(error @ StorageError::Damaged { .. }) => {
                 warn!(%error, "what was predicted is damaged; it is predicted again and put back");
                 Ok(None)
             }

@@ -6,10 +6,9 @@
 use std::path::PathBuf;
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Recipe, Restored,
-    import::{Format, ImportOptions, Source, import_scene},
-    open_store, remains, restore_root,
+    Dataset, DatasetSpec, EncodedScene, Manifest, Recipe, Restored, remains, restore_root,
 };
+use picofarm_exchange::import::{Format, ImportOptions, Source, import_scene};
 use picofarm_files::Opener;
 use picofarm_proto::{
     key::{StageKey, TaskKey, stage_key},
@@ -19,6 +18,7 @@ use picofarm_proto::{
     },
 };
 use picofarm_scene::AssetLibrary;
+use picofarm_store::{StorageError, open_store};
 use serde_json::Value;
 use tokio::runtime::Handle;
 
@@ -200,7 +200,7 @@ impl Repairer {
         let read = async {
             match dataset.manifest(scene).await {
                 Ok(manifest) => Ok(Some(manifest)),
-                Err(DatasetError::NotPublished { .. } | DatasetError::Damaged { .. }) => Ok(None),
+                Err(StorageError::NotPublished { .. } | StorageError::Damaged { .. }) => Ok(None),
                 Err(error) => Err(error),
             }
         };

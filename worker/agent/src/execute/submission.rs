@@ -3,12 +3,13 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use picofarm_dataset::{Profile, check_location};
+use picofarm_dataset::Profile;
 use picofarm_proto::model::{SceneKind, SceneSource, SpecError};
 use picofarm_scene::{
     AssetLibrary,
     import::{Bounds, fingerprint},
 };
+use picofarm_store::check_location;
 
 /// The environment in which a job is submitted.
 #[derive(Debug, Clone, Copy)]

@@ -1,7 +1,9 @@
 //! Source of two-bounce times: the true depths, or those predicted by an infer stage.
 
-use picofarm_dataset::{Dataset, DatasetError, DepthsUsed, Pinned, PinnedDepths, Predictions};
+use picofarm_dataset::{Dataset, Pinned};
 use picofarm_proto::model::train::TRUTH;
+use picofarm_results::{DepthsUsed, PinnedDepths, Predictions};
+use picofarm_store::StorageError;
 
 use super::{
     Control, TaskError,
@@ -79,8 +81,8 @@ impl Times {
         };
         let asked = predictions.pin_depths(scenes, &pinned.manifests);
         let found = stores.wait_for(control, asked, |error| match error {
-            DatasetError::Invalid { what, .. } => TaskError::User(format!("{field}: {what}")),
-            DatasetError::NotPublished { scene, .. } => TaskError::User(format!(
+            StorageError::Invalid { what, .. } => TaskError::User(format!("{field}: {what}")),
+            StorageError::NotPublished { scene, .. } => TaskError::User(format!(
                 "{field}: {} holds nothing of scene {scene}; let its infer stage predict every scene of the data set",
                 predictions.place()
             )),

@@ -8,11 +8,12 @@ use std::{fs, net::SocketAddr, path::Path, time::Duration};
 use common::{Gate, Worker, config, output, soon, spec, until};
 use picofarm_coordinator::{CoordinatorConfig, Running, serve};
 use picofarm_database::CatalogPlace;
-use picofarm_dataset::{Dataset, VerifyMode, open_store};
+use picofarm_dataset::Dataset;
 use picofarm_proto::{
     model::{JobSpec, JobState, JobStatus, RenderTask},
     wire::{self, jobs_client::JobsClient},
 };
+use picofarm_store::{VerifyMode, open_store};
 use picofarm_tests::ports::lasting;
 use tokio_util::sync::CancellationToken;
 

@@ -7,9 +7,10 @@ use crate::place;
 use std::sync::Arc;
 
 use picofarm_agent::{Output, TaskError};
-use picofarm_dataset::{Predictions, open_store};
 use picofarm_model::device::{Gpus, gpus};
 use picofarm_proto::model::{Resources, StageSpec};
+use picofarm_results::Predictions;
+use picofarm_store::open_store;
 use serde_json::json;
 
 use place::*;

@@ -5,8 +5,10 @@ use crate::place;
 use std::collections::BTreeMap;
 
 use picofarm_agent::{ImportFor, NotImported, TaskError, imported};
-use picofarm_dataset::{Dataset, Manifest, NewModel, open_store};
+use picofarm_dataset::{Dataset, Manifest};
 use picofarm_model::weights;
+use picofarm_results::NewModel;
+use picofarm_store::open_store;
 use serde_json::{Value, json};
 
 use place::*;
@@ -75,7 +77,7 @@ async fn an_imported_network_answers_as_the_one_it_was() {
         run(place.evaluation(json!({"models": [model, name], "times": times})))
             .await
             .unwrap();
-        let found = |found: Vec<picofarm_dataset::Evaluation>| found[0].metrics.clone();
+        let found = |found: Vec<picofarm_results::Evaluation>| found[0].metrics.clone();
         let ours = found(models.evaluations(model).await.unwrap());
         assert_eq!(
             found(models.evaluations(&name).await.unwrap()),

@@ -7,10 +7,10 @@ use crate::place;
 use std::sync::Arc;
 
 use picofarm_agent::{Control, Output, TaskError};
-use picofarm_dataset::{
-    Dataset, Predicted, PredictionManifest, Predictions, Quantity, TimesUsed, open_store,
-};
+use picofarm_dataset::{Dataset, Quantity};
 use picofarm_proto::model::{StageSpec, TaskSpec};
+use picofarm_results::{Predicted, PredictionManifest, Predictions, TimesUsed};
+use picofarm_store::open_store;
 use serde_json::{Value, json};
 
 use place::*;

@@ -13,7 +13,7 @@ use std::{
 
 use common::{FakeFarm, soon, spec, stage};
 use picofarm_agent::{Control, Executor, Output, Task, TaskError, execute::TaskExecutor};
-use picofarm_dataset::{Dataset, VerifyMode, Wavelength, identify_store, open_store};
+use picofarm_dataset::{Dataset, Wavelength};
 use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
@@ -22,6 +22,7 @@ use picofarm_proto::{
 };
 use picofarm_scene::{export, primitive};
 use picofarm_settings::Spots;
+use picofarm_store::{VerifyMode, identify_store, open_store};
 use sha2::{Digest, Sha256};
 use tempfile::TempDir;
 use tokio::runtime::Handle;

@@ -13,6 +13,7 @@ use picofarm_proto::{
     model::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
 use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
+use picofarm_store::*;
 use serde_json::json;
 use sha2::Digest;
 use tempfile::TempDir;

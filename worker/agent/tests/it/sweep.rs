@@ -4,8 +4,8 @@
 use crate::place;
 
 use picofarm_agent::model_version;
-use picofarm_dataset::*;
 use picofarm_proto::model::{JobSpec, PromoteSettings, PromoteTask, StageSpec, TaskSpec};
+use picofarm_results::*;
 use serde_json::{Value, json};
 
 use place::*;

@@ -337,7 +337,7 @@ async fn two_bounce_times_follow_from_the_depths_that_an_infer_stage_has_kept() 
     assert_ne!(key("else").await, kept.training_key);
     assert_ne!(key("true").await, kept.training_key);
     assert!(of("true").await.lineage.times.is_none());
-    let hash = |manifest: &picofarm_dataset::ModelManifest| {
+    let hash = |manifest: &picofarm_results::ModelManifest| {
         manifest
             .object("weights.safetensors")
             .unwrap()

@@ -3,14 +3,13 @@
 
 use std::sync::Arc;
 
-use picofarm_dataset::{
-    Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, Wavelength, open_store,
-};
+use picofarm_dataset::{Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, Wavelength};
 use picofarm_model::scene::{Scene as Seen, Scenes};
 use picofarm_proto::{key::TaskKey, model::Histogram};
 use picofarm_scene::{
     Affine, Beam, Camera, Intrinsics, Laser, Material, Mesh, Object, Scene, Vec3,
 };
+use picofarm_store::open_store;
 use picofarm_transient::{Budget, Progress, Settings, Strategy};
 use serde_json::json;
 use tokio::runtime::Runtime;

@@ -4,10 +4,7 @@
 
 mod flash;
 
-use picofarm_dataset::{
-    Dataset, ENCODER_VERSION, Manifest, ModelUsed, Predicted, PredictionManifest, PredictionSpec,
-    Predictions, SceneUsed, sha256_hex,
-};
+use picofarm_dataset::{Dataset, ENCODER_VERSION, Manifest};
 use picofarm_demultiplex::{Settings, VERSION, demultiplex};
 use picofarm_proto::{
     key::TaskKey,
@@ -16,6 +13,10 @@ use picofarm_proto::{
         kinds::{DemultiplexTask, demultiplex::DemultiplexSettings},
     },
 };
+use picofarm_results::{
+    ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions, SceneUsed,
+};
+use picofarm_store::sha256_hex;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 

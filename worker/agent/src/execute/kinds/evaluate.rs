@@ -9,15 +9,15 @@ mod predictions;
 
 use std::ops::Range;
 
-use picofarm_dataset::{
-    Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed, Verdict, sha256_hex,
-};
+use picofarm_dataset::{Dataset, Pinned};
 use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline, memory::Kept};
 use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
 };
+use picofarm_results::{Evaluation, Models, ShardName, SplitUsed, Verdict};
 use picofarm_sensor::Sensor;
+use picofarm_store::sha256_hex;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha2::{Digest, Sha256};

@@ -2,11 +2,13 @@
 
 use std::ops::Range;
 
-use picofarm_dataset::{Dataset, DatasetError, ExportFormat, Exporter};
+use picofarm_dataset::Dataset;
+use picofarm_exchange::{ExportFormat, Exporter};
 use picofarm_proto::{
     model::{ExportTask, SpecError, TaskSpec},
     split::{SIDES, SplitRecord},
 };
+use picofarm_store::StorageError;
 use tracing::info;
 
 use crate::execute::{
@@ -65,9 +67,9 @@ impl Scenes {
     /// Returns the selected published scenes, in ascending order.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] if there is no such split; other errors if the store cannot be
+    /// [`StorageError::Invalid`] if there is no such split; other errors if the store cannot be
     /// read.
-    pub async fn of(&self, dataset: &Dataset) -> Result<Vec<u64>, DatasetError> {
+    pub async fn of(&self, dataset: &Dataset) -> Result<Vec<u64>, StorageError> {
         let mut scenes = dataset.scenes_present().await?;
         match self {
             Self::All => {}
@@ -82,10 +84,10 @@ impl Scenes {
 }
 
 /// Returns the scenes on a side of the newest version of a split, in ascending order.
-async fn of_split(dataset: &Dataset, name: &str, side: &str) -> Result<Vec<u64>, DatasetError> {
+async fn of_split(dataset: &Dataset, name: &str, side: &str) -> Result<Vec<u64>, StorageError> {
     let versions = dataset.split_versions(name).await?;
     let Some(version) = versions.last() else {
-        return Err(DatasetError::Invalid {
+        return Err(StorageError::Invalid {
             field: "scenes".into(),
             what: format!(
                 "{} has no split {name:?}; make it with a split task or `picofarm dataset split`",
@@ -94,7 +96,7 @@ async fn of_split(dataset: &Dataset, name: &str, side: &str) -> Result<Vec<u64>,
         });
     };
     let bytes = dataset.read_split(name, *version).await?;
-    let record = SplitRecord::parse(&bytes).map_err(|what| DatasetError::Damaged {
+    let record = SplitRecord::parse(&bytes).map_err(|what| StorageError::Damaged {
         object: dataset.split_place(name, *version),
         what,
     })?;

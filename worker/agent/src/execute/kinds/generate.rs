@@ -2,10 +2,10 @@
 //! compared with the existing file, because generating takes less time than verifying its origin.
 
 use bytes::Bytes;
-use picofarm_dataset::publish_files;
 use picofarm_files::Opener;
 use picofarm_proto::model::{GenerateTask, SceneSource, SpecError};
 use picofarm_scene::{Scene, SceneError, export};
+use picofarm_store::publish_files;
 use sha2::{Digest, Sha256};
 use tracing::info;
 

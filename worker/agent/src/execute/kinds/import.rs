@@ -1,4 +1,4 @@
-//! Import: copies a scene of a foreign data set into a data set. See [`picofarm_dataset::import`]
+//! Import: copies a scene of a foreign data set into a data set. See [`picofarm_exchange::import`]
 //! for the checks.
 
 use std::{
@@ -6,12 +6,13 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use picofarm_dataset::{
-    DatasetSpec, Profile, Verdict,
-    import::{Format, IMPORT_VERSION, ImportError, ImportOptions, Source, import_scene},
+use picofarm_dataset::{DatasetSpec, Profile};
+use picofarm_exchange::import::{
+    Format, IMPORT_VERSION, ImportError, ImportOptions, Source, import_scene,
 };
 use picofarm_files::{FileError, Opener};
 use picofarm_proto::model::{ImportSettings, ImportTask, SpecError, TaskSpec};
+use picofarm_results::Verdict;
 use tracing::info;
 
 use crate::execute::{

@@ -10,12 +10,13 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use picofarm_dataset::{Dataset, ENCODER_VERSION, Models, Predicted, Predictions};
+use picofarm_dataset::{Dataset, ENCODER_VERSION};
 use picofarm_model::{
     Device, Model, ModelError, masks,
     scene::{Scene, Scenes},
 };
 use picofarm_proto::model::{InferTask, TaskSpec};
+use picofarm_results::{Models, Predicted, Predictions};
 
 mod panel;
 

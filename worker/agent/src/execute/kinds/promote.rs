@@ -1,9 +1,9 @@
 //! Promotion: gives the best of several models a name of its own. The promoted model is a
 //! byte-for-byte copy of the training's result, and its manifest lists the candidates.
 
-use picofarm_dataset::{ModelManifest, NewModel, Promoted, TrialRecord};
 use picofarm_model::metric::Metrics;
 use picofarm_proto::model::PromoteTask;
+use picofarm_results::{ModelManifest, NewModel, Promoted, TrialRecord};
 use tracing::info;
 
 use crate::execute::{
@@ -116,7 +116,7 @@ fn loss(manifest: &ModelManifest) -> Result<f64, TaskError> {
 /// Returns the record of the trial that trained a model, if any.
 fn trial_of(
     stores: &Stores,
-    models: &picofarm_dataset::Models,
+    models: &picofarm_results::Models,
     model: &str,
     control: &Control,
 ) -> Result<Option<TrialRecord>, TaskError> {

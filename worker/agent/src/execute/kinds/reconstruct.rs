@@ -17,9 +17,7 @@ mod written;
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use picofarm_dataset::{
-    DatasetError, Manifest, ReconstructionManifest, Reconstructions, SceneUsed, Verdict,
-};
+use picofarm_dataset::Manifest;
 use picofarm_proto::{
     key::TaskKey,
     model::{
@@ -31,6 +29,8 @@ use picofarm_reconstruct::{
     Measured, Phase, Progress, ReconstructError, Reconstructed, Reconstruction, VERSION, World,
     score, surface,
 };
+use picofarm_results::{ReconstructionManifest, Reconstructions, SceneUsed, Verdict};
+use picofarm_store::StorageError;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 use tracing::{info, warn};
@@ -130,7 +130,7 @@ fn finished(
 ) -> Result<Option<ReconstructionManifest>, TaskError> {
     let looked = async {
         match folder.finished(ours.scene, &ours.task_key).await {
-            Err(error @ DatasetError::Damaged { .. }) => {
+            Err(error @ StorageError::Damaged { .. }) => {
                 warn!(%error, "a reconstruction is damaged; it is made again and put back");
                 Ok(None)
             }

@@ -6,10 +6,6 @@
 
 use std::{collections::BTreeMap, time::Duration};
 
-use picofarm_dataset::{
-    DatasetError, Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports,
-    TrainingSpeed,
-};
 use picofarm_model::{
     Device, Evaluated, Model, cpu,
     metric::Metrics,
@@ -20,6 +16,10 @@ use picofarm_proto::{
     key::report_key,
     model::{ReportTask, train::TRUTH},
 };
+use picofarm_results::{
+    Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports, TrainingSpeed,
+};
+use picofarm_store::StorageError;
 use serde_json::Value;
 use tokio::runtime::Handle;
 use tracing::warn;
@@ -154,7 +154,7 @@ fn finished(
 ) -> Result<Option<ReportManifest>, TaskError> {
     let looked = async {
         match reports.finished(name, key).await {
-            Err(error @ DatasetError::Damaged { .. }) => {
+            Err(error @ StorageError::Damaged { .. }) => {
                 warn!(%error, "a report is damaged; it is made again to repair it");
                 Ok(None)
             }

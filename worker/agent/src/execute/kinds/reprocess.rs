@@ -7,8 +7,8 @@
 //! would never end.
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile,
-    Provenance, Quantity, Subsets,
+    Dataset, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile, Provenance,
+    Quantity, Subsets,
 };
 use picofarm_proto::{
     key::{TaskKey, derived_key},
@@ -20,6 +20,7 @@ use picofarm_proto::{
 use picofarm_sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
+use picofarm_store::StorageError;
 use serde_json::json;
 use tokio::runtime::Handle;
 use tracing::debug_span;
@@ -259,7 +260,7 @@ pub(in crate::execute) fn source_manifest(
     let looked = async {
         match source.manifest(index).await {
             Ok(manifest) => Ok(Ok(manifest)),
-            Err(error @ DatasetError::NotPublished { .. }) => Ok(Err(error)),
+            Err(error @ StorageError::NotPublished { .. }) => Ok(Err(error)),
             Err(error) => Err(error),
         }
     };

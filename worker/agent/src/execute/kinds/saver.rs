@@ -2,7 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use picofarm_dataset::{Checkpoints, DatasetError, Pieces};
+use picofarm_results::{Checkpoints, Pieces};
+use picofarm_store::StorageError;
 use tokio::task::JoinHandle;
 use tracing::{debug, warn};
 
@@ -20,7 +21,7 @@ pub(super) const PIECE: usize = 64 << 20;
 pub(super) struct Saver<'a> {
     stores: &'a Stores,
     checkpoints: Checkpoints,
-    under_way: Option<JoinHandle<Result<(), DatasetError>>>,
+    under_way: Option<JoinHandle<Result<(), StorageError>>>,
 }
 
 impl<'a> Saver<'a> {

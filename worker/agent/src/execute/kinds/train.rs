@@ -12,10 +12,7 @@ use std::{
 };
 
 use bytes::Bytes;
-use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Lineage, Measurement, ModelManifest, Models, NewModel,
-    Pinned, Published, TrainingSpeed, TrialEnd,
-};
+use picofarm_dataset::{Dataset, DatasetSpec, Pinned};
 use picofarm_members::Members;
 use picofarm_model::{
     Device, ModelError, cpu,
@@ -30,7 +27,11 @@ use picofarm_proto::{
         train::{Normalise, Target},
     },
 };
+use picofarm_results::{
+    Lineage, Measurement, ModelManifest, Models, NewModel, Published, TrainingSpeed, TrialEnd,
+};
 use picofarm_sensor::SENSOR_VERSION;
+use picofarm_store::StorageError;
 use tracing::{debug, info, warn};
 
 mod along;
@@ -467,7 +468,7 @@ fn finished(
 ) -> Result<Option<ModelManifest>, TaskError> {
     let looked = async {
         match models.finished(name, key).await {
-            Err(error @ DatasetError::Damaged { .. }) => {
+            Err(error @ StorageError::Damaged { .. }) => {
                 warn!(%error, "a model is damaged; it is trained again to repair it");
                 Ok(None)
             }
@@ -517,7 +518,7 @@ pub(in crate::execute) fn pin(
 /// Classifies a training's error by cause.
 pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
     match error {
-        ModelError::Scene { scene, source } => match source.downcast::<DatasetError>() {
+        ModelError::Scene { scene, source } => match source.downcast::<StorageError>() {
             Ok(error) => of_dataset(*error),
             Err(error) => TaskError::Crash(format!("scene {scene}: {error}")),
         },

@@ -1,7 +1,7 @@
 //! Verification: reads a scene's objects and compares them with its manifest.
 
-use picofarm_dataset::VerifyMode;
 use picofarm_proto::model::{SourceSettings, TaskSpec, kinds::VerifyTask};
+use picofarm_store::VerifyMode;
 
 use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError, output::manifest_sha256,

@@ -1,11 +1,12 @@
 //! Measures whether the predictions of a scene agree with each other and with its spots, without
 //! ground truth.
 
-use picofarm_dataset::{Dataset, Predicted, Quantity};
+use picofarm_dataset::{Dataset, Quantity};
 use picofarm_reconstruct::{
     Agreement,
     source::{Given, Times, given},
 };
+use picofarm_results::Predicted;
 use picofarm_scene::{Camera, Intrinsics, Vec3};
 use serde_json::{Value, json};
 

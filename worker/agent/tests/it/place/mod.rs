@@ -18,7 +18,9 @@ use picofarm_proto::{
     },
     split::{Parts, SplitSettings},
 };
+use picofarm_results::*;
 use picofarm_settings::Gpus;
+use picofarm_store::*;
 use serde_json::json;
 use tempfile::TempDir;
 use tokio::runtime::Handle;

@@ -1,11 +1,12 @@
 //! A scene of a data set as a flash: its multiplexed histogram and calibration, in the scene's
 //! coordinates.
 
-use picofarm_dataset::{Dataset, DatasetError, Manifest, Quantity};
+use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_demultiplex::{Capture, Place, Spot};
 use picofarm_proto::model::{Histogram, kinds::demultiplex::Places};
 use picofarm_scene::{Camera, Intrinsics, Vec3};
 use picofarm_settings::Gate;
+use picofarm_store::StorageError;
 
 use crate::execute::{Control, TaskError, kinds::reconstruct::Frame, output::Stores};
 
@@ -109,7 +110,7 @@ impl Flash {
         scene: u64,
         quantity: Quantity,
         places: Places,
-    ) -> Result<Self, DatasetError> {
+    ) -> Result<Self, StorageError> {
         let spec = dataset.spec();
         let (histogram, all, i, pose, laser) = futures::try_join!(
             dataset.read_histogram(scene, quantity),

@@ -2,7 +2,6 @@
 //! the truth by the metrics of models, so that their figures may be compared. The result is stored
 //! next to the predictions.
 
-use picofarm_dataset::{Evaluation, Predicted, Predictions, Verdict, sha256_hex};
 use picofarm_model::{
     Evaluated, answered_by,
     baseline::Baseline,
@@ -10,6 +9,8 @@ use picofarm_model::{
     scene::Unreadable,
 };
 use picofarm_proto::{key::evaluation_key, model::Histogram};
+use picofarm_results::{Evaluation, Predicted, Predictions, Verdict};
+use picofarm_store::sha256_hex;
 use tracing::info;
 
 use super::{BASELINE, EvaluationRun, metrics, summary};

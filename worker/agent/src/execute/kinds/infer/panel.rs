@@ -3,16 +3,17 @@
 
 use std::collections::BTreeMap;
 
-use picofarm_dataset::{
-    Dataset, Manifest, ModelUsed, Models, PinnedDepths, PredictionManifest, PredictionSpec,
-    Predictions, SceneUsed, TimesUsed,
-};
+use picofarm_dataset::{Dataset, Manifest};
 use picofarm_proto::{
     key::inference_key,
     model::{
         Histogram, InferTask,
         train::{TRUTH, Target},
     },
+};
+use picofarm_results::{
+    ModelUsed, Models, PinnedDepths, PredictionManifest, PredictionSpec, Predictions, SceneUsed,
+    TimesUsed,
 };
 
 use crate::execute::{

@@ -1,12 +1,14 @@
 //! Two-bounce times and masks of a scene, from ground truth or from predictions.
 
-use picofarm_dataset::{Dataset, DatasetError, Manifest, Predictions, Quantity, SceneUsed};
+use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_proto::model::kinds::reconstruct::{Measurements, Mirrors};
 use picofarm_reconstruct::{
     Measured,
     source::{Given, Times, given, weigh},
 };
+use picofarm_results::{Predictions, SceneUsed};
 use picofarm_scene::{Intrinsics, Vec3};
+use picofarm_store::StorageError;
 use serde_json::json;
 
 use super::{
@@ -222,7 +224,7 @@ struct Sure {
 }
 
 /// Reads the images of a data set. Quantities that an import lacks are zero.
-async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, DatasetError> {
+async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, StorageError> {
     let (depth_m, lit, mirror) = futures::try_join!(
         dataset.read::<f32>(scene, Quantity::Depth),
         dataset.read_visibility(scene),

@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use picofarm_dataset::{Checkpoints, Pieces, ReconstructionManifest, Reconstructions};
 use picofarm_platonerf::{MlpSettings, Settings as Networks, Training, grid};
 use picofarm_proto::model::kinds::{ReconstructTask, TaskKind};
 use picofarm_reconstruct::{Measured, Reconstructed, Reconstruction, Settings};
+use picofarm_results::{Checkpoints, Pieces, ReconstructionManifest, Reconstructions};
 use tracing::{info, warn};
 
 use super::of_reconstruction;

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use picofarm_dataset::{DatasetError, RenderArray, encode_render_group};
+use picofarm_dataset::{RenderArray, encode_render_group};
 use picofarm_reconstruct::{
     Evidence, ReconstructError, Reconstructed, Surface, World,
     field::{PEAK, sigmoid, surface_logit},
@@ -12,6 +12,7 @@ use picofarm_reconstruct::{
     score,
 };
 use picofarm_scene::Camera;
+use picofarm_store::StorageError;
 use serde_json::{Value, json};
 
 /// Returns the facts about a reconstruction that do not depend on its true scene. They contain no
@@ -86,7 +87,7 @@ pub fn errors(
 ///
 /// # Errors
 /// Does not fail for a field produced by a reconstruction.
-pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, DatasetError> {
+pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, StorageError> {
     let field = &made.field;
     let [nx, ny, nz] = field.nodes.map(|n| n as u64);
     let density: Vec<f32> = (0..field.logit.len()).map(|i| field.density(i)).collect();

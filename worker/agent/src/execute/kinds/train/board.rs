@@ -1,7 +1,7 @@
 //! Rendezvous of the processes of a distributed training: objects in the store, below the model.
 
-use picofarm_dataset::Models;
 use picofarm_members::{Call, Members, Rendezvous};
+use picofarm_results::Models;
 
 use super::{TrainingRun, of_model};
 use crate::execute::{Control, TaskError, output::Stores};

@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use picofarm_dataset::{DatasetSpec, Gate, ModelManifest, Models};
+use picofarm_dataset::{DatasetSpec, Gate};
 use picofarm_model::{Device, Model, train::Plan};
+use picofarm_results::{ModelManifest, Models};
 use serde::{Deserialize, Serialize};
 
 use super::{WEIGHTS, at, of_model};

@@ -1,7 +1,8 @@
 //! Results of a training: a model's objects and figures.
 
-use picofarm_dataset::{DatasetSpec, Manifest, Measurement, ModelManifest, Profile};
+use picofarm_dataset::{DatasetSpec, Manifest, Profile};
 use picofarm_model::train::{Line, Trained};
+use picofarm_results::{Measurement, ModelManifest};
 use serde_json::{Value, json};
 
 use crate::execute::Output;

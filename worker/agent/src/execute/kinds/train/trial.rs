@@ -2,9 +2,9 @@
 //! have also reached them, and stops if it has fallen behind. Its outcome is recorded under the
 //! sweep's name and is the task's result.
 
-use picofarm_dataset::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
 use picofarm_model::{metric::Metrics, train::Line};
 use picofarm_proto::model::{Domain, Trial};
+use picofarm_results::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
 use serde_json::Value;
 use tracing::info;
 

@@ -3,8 +3,8 @@
 
 use std::cmp::Ordering;
 
-use picofarm_dataset::Rung;
 use picofarm_proto::model::Stop;
+use picofarm_results::Rung;
 
 /// The decision on a trial.
 pub(super) struct Verdict {

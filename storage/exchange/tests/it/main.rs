@@ -1,0 +1,11 @@
+//! Tests of import and export, in one executable because each one links the whole crate.
+
+#[path = "../../../dataset/tests/it/common/mod.rs"]
+mod common;
+mod export;
+mod files;
+mod import_captures;
+mod import_npy;
+mod import_outside;
+mod import_sb3d;
+mod import_two_bounce;

@@ -1,0 +1,99 @@
+//! Object stores: folders and clouds. Opens a store from a path or URL, checks that it is safe for
+//! several writers, and reads, creates and checks single objects with errors that name them.
+//!
+//! Objects are created, never overwritten. A result with several objects is published by its
+//! manifest, which is written last.
+
+mod account;
+mod bandwidth;
+#[cfg(feature = "clouds")]
+mod clouds;
+mod error;
+mod failure;
+pub mod folder;
+mod guard;
+mod identity;
+mod local;
+pub mod many;
+pub mod objects;
+pub mod packed;
+mod place;
+mod probe;
+pub mod published;
+pub mod put_back;
+pub mod sealed;
+mod service;
+#[cfg(feature = "clouds")]
+mod steady;
+pub mod verify;
+mod writable;
+
+use std::sync::Arc;
+
+use object_store::ObjectStore;
+use object_store::local::LocalFileSystem;
+use object_store::path::Path;
+
+pub use bandwidth::{Bandwidth, limit_bandwidth};
+pub use error::StorageError;
+pub use failure::io_hint;
+pub use folder::check_own_folder;
+pub use identity::{IDENTITY, check_identity, expect_identity, identify_store, store_identity};
+pub use local::{leftovers, probe_leftovers};
+pub use objects::publish_files;
+pub use probe::{PROBE, PROBE_WITHIN, probe};
+pub use sealed::{ObjectEntry, sha256_hex};
+pub use verify::{Fault, Problem, Verification, VerifyMode, Watch};
+pub use writable::{Writable, check_writable, local_ground};
+
+use place::Place;
+
+/// Returns the store, and the prefix in it, for a local path, a `file://` URL,
+/// `s3://bucket/prefix`, `gs://bucket/prefix` (Google) or `az://container/prefix` (Azure). The
+/// folder or prefix need not exist. No request is sent to the store yet.
+///
+/// Local writes are flushed to the disk before they count, so that after a power failure an
+/// existing manifest has its objects. Other stores need the feature `clouds`, and take location and
+/// credentials from the environment (docs/credentials.md). A store keeps its connections and its
+/// limit of concurrent requests, so it should be opened once and reused. See also
+/// [`limit_bandwidth`].
+///
+/// # Errors
+/// [`StorageError::UnsupportedStore`] for other schemes and for paths that cannot be object keys;
+/// [`StorageError::StoreSettings`] names a missing or unusable variable.
+pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), StorageError> {
+    if let Some(place) = Place::parse(url_or_path)? {
+        #[cfg(feature = "clouds")]
+        let store = clouds::connect(&place)?;
+        #[cfg(not(feature = "clouds"))]
+        let store = not_built(&place)?;
+        return Ok((store, place.prefix));
+    }
+    let path = local::local_path(url_or_path)?;
+    let prefix = Path::from_absolute_path(&path).map_err(|e| StorageError::UnsupportedStore {
+        url: url_or_path.to_string(),
+        what: format!("cannot be the prefix of object keys: {e}"),
+    })?;
+    Ok((Arc::new(LocalFileSystem::new().with_fsync(true)), prefix))
+}
+
+/// Checks that a location can be parsed. Does not check whether it can be reached.
+///
+/// # Errors
+/// [`StorageError::UnsupportedStore`].
+pub fn check_location(url_or_path: &str) -> Result<(), StorageError> {
+    match Place::parse(url_or_path)? {
+        Some(_) => Ok(()),
+        None => local::local_path(url_or_path).map(drop),
+    }
+}
+
+#[cfg(not(feature = "clouds"))]
+fn not_built(place: &Place) -> Result<Arc<dyn ObjectStore>, StorageError> {
+    let scheme = place.service.scheme();
+    Err(StorageError::UnsupportedStore {
+        url: format!("{scheme}://{}", place.bucket),
+        what: "this picofarm was built without object stores; build it with `--features clouds`, or name a folder"
+            .into(),
+    })
+}
