@@ -196,7 +196,8 @@ fn picture(seen: &Seen, made: &Reconstructed, views: &[Camera]) -> Canvas {
     };
     let mut shown = vec![("3D, from the camera", &camera)];
     shown.extend(by(0.0).map(|v| ("from the side", v)));
-    shown.extend(by(-1.0).map(|v| ("from behind", v)));
+    // Straight back, the view would be of what is behind the camera.
+    shown.extend(by(-0.6).map(|v| ("from behind", v)));
     let step = CELL + GAP;
     let top = GAP + TEXT + GAP;
     let mut canvas = Canvas::new(GAP + (1 + shown.len()) * step, top + CELL + GAP, BACKGROUND);
