@@ -50,8 +50,8 @@ struct Made {
 }
 
 impl Room {
-    /// Reconstructs the first room of the data set at `place`, and writes its mesh and pictures into
-    /// `dir`.
+    /// Reconstructs the first room of the data set at `place`, and writes its mesh and pictures
+    /// into `dir`.
     ///
     /// # Errors
     /// Fails if the data set cannot be read, or the folder cannot be written.

@@ -1,4 +1,5 @@
-//! Demultiplexing in job files: its tasks, keys, refusals, and the stages that read its predictions.
+//! Demultiplexing in job files: its tasks, keys, refusals, and the stages that read its
+//! predictions.
 
 use picofarm_proto::{
     key::stage_key,

@@ -1,5 +1,5 @@
-//! One flash as a job: rooms are rendered, taken apart by physics, evaluated and reconstructed, with
-//! equal bytes however often workers are killed.
+//! One flash as a job: rooms are rendered, taken apart by physics, evaluated and reconstructed,
+//! with equal bytes however often workers are killed.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 

@@ -115,8 +115,8 @@ pub fn answered(
 /// [`evaluate`]; the question's variant must be [`ShadowVariant::All`].
 ///
 /// # Errors
-/// [`ModelError::Scene`] for scenes and predictions that cannot be read; [`ModelError::Invalid`] for
-/// those that do not fit the question or the baseline.
+/// [`ModelError::Scene`] for scenes and predictions that cannot be read; [`ModelError::Invalid`]
+/// for those that do not fit the question or the baseline.
 pub fn answered_by(
     question: &Question,
     said: &mut dyn FnMut(usize) -> Result<Vec<f32>, Unreadable>,
@@ -170,7 +170,8 @@ fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answere
 /// Receives outputs and the batch that they answer.
 type Hear<'a> = &'a mut dyn FnMut(&[f32], &Batch);
 
-/// Compares the outputs for a scene, which `each` passes on, and the trivial answers with the truth.
+/// Compares the outputs for a scene, which `each` passes on, and the trivial answers with the
+/// truth.
 fn tallied(
     question: &Question,
     baseline: &Baseline,

@@ -54,15 +54,16 @@ pub struct Measured {
     pub bin_width_m: f32,
     /// The pixels known to see a mirror, which are not used at all; empty = none known.
     pub mirror: Vec<u8>,
-    /// How surely each pixel's times are its own, 0 to 1, where times were separated from one flash;
-    /// empty = all are.
+    /// How surely each pixel's times are its own, 0 to 1, where times were separated from one
+    /// flash; empty = all are.
     pub confidence: Vec<f32>,
     /// The spots that are not used.
     pub left_out: Vec<LeftOut>,
 }
 
-/// The confidence below which a pixel is no evidence of the room's planes, and below which its light
-/// paths are no evidence of matter. Both were chosen on six furnished rooms (seeds 93001 to 93006).
+/// The confidence below which a pixel is no evidence of the room's planes, and below which its
+/// light paths are no evidence of matter. Both were chosen on six furnished rooms (seeds 93001 to
+/// 93006).
 const SURE: f32 = 0.8;
 const EVIDENT: f32 = 0.6;
 

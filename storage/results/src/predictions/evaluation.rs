@@ -65,8 +65,8 @@ impl Predictions {
 
     /// Returns a hash that pins every byte of the predictions of these scenes, in order, and the
     /// model that predicted the quantity `kind` (`tof`, `shadow`, `specular`). `seen` contains the
-    /// SHA-256 of the scenes' manifests ([`picofarm_dataset::Pinned::manifests`]), which the model's inputs
-    /// must match. Objects are not checked.
+    /// SHA-256 of the scenes' manifests ([`picofarm_dataset::Pinned::manifests`]), which the
+    /// model's inputs must match. Objects are not checked.
     ///
     /// # Errors
     /// [`StorageError::Invalid`] if the quantity is not predicted, or if predictions belong to

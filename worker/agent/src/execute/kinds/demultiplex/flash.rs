@@ -173,8 +173,8 @@ impl Flash {
         &self.which
     }
 
-    /// Returns the probabilities of all `count` spots of the histogram, times 255 and rounded. Beams
-    /// that hit nothing light nothing.
+    /// Returns the probabilities of all `count` spots of the histogram, times 255 and rounded.
+    /// Beams that hit nothing light nothing.
     pub(super) fn of_all(&self, count: usize, lit: &[f32]) -> Vec<u8> {
         let pixels = self.capture().pixels();
         let mut all = vec![0; count * pixels];
