@@ -27,4 +27,4 @@ pub use settings::Settings;
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-1";
+pub const VERSION: &str = "demultiplex-2";
