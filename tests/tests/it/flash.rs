@@ -15,7 +15,7 @@ name = "one flash"
 max_crashes = 1000
 [[stage]]
 name = "rooms"
-scenes = {{ kind = "primitive", count = {scenes}, seed = 8, spots = 4 }}
+scenes = {{ kind = "primitive", count = {scenes}, seed = 9, spots = 25 }}
 render = {{ resolution = 32, samples = 2, bins = 400, bin_width_m = 0.0384 }}
 output = {{ store = {store:?}, dataset = "rooms" }}
 [[stage]]
@@ -110,7 +110,11 @@ fn predictions_of_physics_are_shown_verified_and_repaired_like_those_of_networks
     let info = farm.json(&["dataset", "info", name]);
     assert_eq!(info["scenes"], 2, "{info}");
     assert_eq!(info["spec"]["depth"], true, "{info}");
-    assert_eq!(info["spec"]["spots"].as_array().unwrap().len(), 4, "{info}");
+    assert_eq!(
+        info["spec"]["spots"].as_array().unwrap().len(),
+        25,
+        "{info}"
+    );
     let shown = farm.json(&["dataset", "show", name, "1"]);
     let by = &shown["manifest"]["models"]["tof"];
     assert_eq!(by["name"], "demultiplex", "{shown}");
