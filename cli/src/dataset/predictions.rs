@@ -106,6 +106,9 @@ fn arrays(spec: &PredictionSpec) -> Vec<String> {
     if spec.specular {
         names.push("specular".into());
     }
+    if spec.confidence {
+        names.push("confidence".into());
+    }
     names
 }
 
@@ -113,11 +116,19 @@ fn arrays(spec: &PredictionSpec) -> Vec<String> {
 pub async fn show(args: &DatasetShow, there: &Predictions, output: Output) -> Result<()> {
     let manifest = there.manifest(args.scene).await.map_err(failed)?;
     let facts = json!({
-        "predictions": args.dataset, "scene": args.scene, "kind": "infer", "manifest": manifest,
+        "predictions": args.dataset, "scene": args.scene, "kind": kind(&manifest), "manifest": manifest,
         "manifest_sha256": manifest.sha256(), "bytes": manifest.total_bytes(),
     });
     output.result(&facts, || described(&manifest));
     Ok(())
+}
+
+/// Returns the kind of stage that made predictions: their code's version begins with the method.
+fn kind(manifest: &PredictionManifest) -> &'static str {
+    match manifest.code.starts_with("demultiplex") {
+        true => "demultiplex",
+        false => "infer",
+    }
 }
 
 fn described(manifest: &PredictionManifest) -> String {
@@ -131,7 +142,7 @@ fn described(manifest: &PredictionManifest) -> String {
     let source = &manifest.source;
     let mut rows = vec![
         row("scene", manifest.scene.to_string()),
-        row("made by", "infer".into()),
+        row("made by", kind(manifest).into()),
         row("task key", manifest.task_key.clone()),
         row("code", manifest.code.clone()),
         row("manifest", format!("SHA-256 {}", manifest.sha256())),

@@ -118,6 +118,7 @@ fn predictions_of_physics_are_shown_verified_and_repaired_like_those_of_networks
     let shown = farm.json(&["dataset", "show", name, "1"]);
     let by = &shown["manifest"]["models"]["tof"];
     assert_eq!(by["name"], "demultiplex", "{shown}");
+    assert_eq!(shown["kind"], "demultiplex", "{shown}");
     farm.run(&["dataset", "verify", name]).code(0);
 
     let before = store::hashes(&place);
