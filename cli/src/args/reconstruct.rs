@@ -17,8 +17,8 @@ pub struct Reconstruct {
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and
-    /// visibility of the scene itself; or networks that see one rendered histogram of all spots at
-    /// once
+    /// visibility of the scene itself; or one rendered histogram of all spots at once, separated by
+    /// networks (predictions) or by physics (flash)
     #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
     pub spots_from: SpotsFrom,
     #[command(flatten)]
@@ -127,6 +127,7 @@ pub enum SpotsFrom {
     Captures,
     Truth,
     Predictions,
+    Flash,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]

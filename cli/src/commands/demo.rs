@@ -1,5 +1,6 @@
 //! `picofarm demo`: renders furnished rooms with a whole farm on one machine, and shows them.
 
+mod room;
 mod rooms;
 mod sheet;
 
@@ -16,6 +17,7 @@ use picofarm_proto::{
 };
 use serde_json::json;
 
+use room::Room;
 use rooms::Rooms;
 use sheet::GrowingSheet;
 
@@ -195,7 +197,12 @@ pub async fn run(args: Demo, settings: &Settings, output: Output) -> Result<()> 
     };
     let (place, job, status) = status?;
     verdict(&status)?;
-    tell(&args, &dir, &place, job, &status, output).await
+    tokio::select! {
+        told = tell(&args, &dir, &place, job, &status, output) => told,
+        () = stop.cancelled() => Err(signals::interrupted(
+            "run the same command again: it continues where it stopped",
+        )),
+    }
 }
 
 /// Renders the rooms. Returns the location, the job and its final status.
@@ -257,12 +264,14 @@ async fn tell(
         true => Some(Rooms::verify(place, dir).await?),
         false => None,
     };
+    output.say("taking one flash apart, and reconstructing its room …");
+    let room = Room::of(place, dir).await?;
     let took = status.ended_at_ms.map_or(0, |e| e - status.submitted_at_ms) as f64 / 1000.0;
     let reused = status.stages.first().map_or(0, |s| s.tasks.reused);
     let mut summary = json!({
         "job": job, "dataset": place, "scenes": args.scenes, "reused": reused,
         "bytes": report.bytes, "objects": report.objects, "seconds": took,
-        "contact_sheet": pictures.sheet, "light_in_flight": pictures.flight,
+        "contact_sheet": pictures.sheet, "light_in_flight": pictures.flight, "room": room.facts(),
     });
     if let Some(rooms) = &rooms {
         summary["reconstructions"] = rooms.facts();
@@ -274,10 +283,12 @@ async fn tell(
              data set         {}\n\
              contact sheet    {}\n\
              light in flight  {}\n\
-             {}\
+             {}{}\
              next:\n  \
              {program} dataset info {}\n  \
              {}\
+             {program} scene generate --kind furnished --seed 7 --out room.glb\n  \
+             {program} reconstruct room.glb --spots-from flash --out room-3d\n  \
              {program} job init && {program} up\n",
             args.scenes,
             bytes(report.bytes),
@@ -285,6 +296,7 @@ async fn tell(
             show::line(place),
             pictures.sheet.display(),
             pictures.flight.display(),
+            room.told(),
             rooms.as_ref().map(Rooms::summary).unwrap_or_default(),
             show::argument(place),
             rooms.as_ref().map(Rooms::next).unwrap_or_default(),

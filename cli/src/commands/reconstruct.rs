@@ -1,7 +1,8 @@
 //! `picofarm reconstruct`: reconstructs one scene file without a farm.
 
+mod flash;
 mod mlp;
-mod orbit;
+pub(crate) mod orbit;
 #[cfg(feature = "networks")]
 mod predicted;
 #[cfg(not(feature = "networks"))]
@@ -73,7 +74,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     }
     let networks = match args.spots_from {
         SpotsFrom::Predictions => Some(predicted::read(&args, scene.laser.beams.len()).await?),
-        SpotsFrom::Captures | SpotsFrom::Truth => None,
+        SpotsFrom::Captures | SpotsFrom::Truth | SpotsFrom::Flash => None,
     };
     let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
@@ -143,7 +144,7 @@ fn make(
     };
     check_memory(args, scene, nodes)?;
     let start = Instant::now();
-    let (measured, predictions) = measure(args, scene, networks, threads, watch)?;
+    let (measured, separated) = measure(args, scene, networks, threads, watch)?;
     let lap = |since: Instant| since.elapsed().as_secs_f64();
     let measuring = lap(start);
     let settings = Settings {
@@ -191,8 +192,8 @@ fn make(
     if let Some(settings) = networks {
         metrics["mlp"] = settings;
     }
-    if let Some(predictions) = predictions {
-        metrics["predictions"] = predictions;
+    if let Some((how, facts)) = separated {
+        metrics[how] = facts;
     }
     let scoring = lap(start);
     watch.step("pictures", 0.0);
@@ -216,17 +217,22 @@ fn fit(measured: Measured, settings: Settings, watch: &Watch) -> Result<Reconstr
     }
 }
 
-/// Returns times and masks, and the quality of predictions, if used.
+/// Returns times and masks, and the quality of those that were separated from one flash, if any,
+/// with their name in metrics.json.
 fn measure(
     args: &Reconstruct,
     scene: &Scene,
     networks: Option<&predicted::Networks>,
     threads: usize,
     watch: &Watch,
-) -> Result<(Measured, Option<Value>)> {
+) -> Result<(Measured, Option<(&'static str, Value)>)> {
     if let Some(networks) = networks {
         let (measured, facts) = predicted::measure(args, scene, networks, threads, watch)?;
-        return Ok((measured, Some(facts)));
+        return Ok((measured, Some(("predictions", facts))));
+    }
+    if args.spots_from == SpotsFrom::Flash {
+        let (measured, facts) = flash::measure(args, scene, threads, watch)?;
+        return Ok((measured, Some(("flash", facts))));
     }
     if args.spots_from == SpotsFrom::Truth {
         watch.step("ground truth", 0.0);
@@ -323,6 +329,7 @@ fn metrics(
             SpotsFrom::Captures => "captures",
             SpotsFrom::Truth => "truth",
             SpotsFrom::Predictions => "predictions",
+            SpotsFrom::Flash => "flash",
         },
         "resolution": args.resolution,
         "settings": settings,

@@ -51,6 +51,10 @@ fn the_demo_makes_a_data_set_and_pictures_and_a_second_run_renders_nothing() {
     let dir = scratch.join("demo");
     begins_with(&dir.join("contact-sheet.png"), b"\x89PNG\r\n\x1a\n");
     begins_with(&dir.join("light-in-flight.gif"), b"GIF89a");
+    assert!(first["room"]["triangles"].as_u64().unwrap() > 0, "{first}");
+    begins_with(&dir.join("room-3d/mesh.glb"), b"glTF");
+    begins_with(&dir.join("room-3d/views.png"), b"\x89PNG\r\n\x1a\n");
+    let room = store::hashes(&dir.join("room-3d"));
     let place = dir.join("store/rooms");
     assert_eq!(first["dataset"], place.display().to_string());
     assert_eq!(store::finished(&place), [0, 1]);
@@ -58,6 +62,7 @@ fn the_demo_makes_a_data_set_and_pictures_and_a_second_run_renders_nothing() {
 
     let second = demo(&cli, "2", "4").json();
     assert_eq!(second["job"], first["job"]);
+    assert_eq!(store::hashes(&dir.join("room-3d")), room);
     assert_eq!(store::times(&place), times, "nothing is written again");
 
     // With one more scene, the finished ones do not change.

@@ -69,6 +69,13 @@ fn job(store: &Path, side: u32, samples: u32) -> String {
             ),
         ),
         stage(
+            "demultiplex",
+            &format!(
+                "kind = \"demultiplex\"\nsource = \"render\"\n{}",
+                out("apart")
+            ),
+        ),
+        stage(
             "reconstruct",
             &format!(
                 "kind = \"reconstruct\"\nsource = \"render\"\n\

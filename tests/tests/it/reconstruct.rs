@@ -273,3 +273,55 @@ fn options_of_the_other_field_are_refused() {
         assert!(!scratch.join("made").exists(), "{more:?}");
     }
 }
+
+#[test]
+fn one_flash_becomes_a_room_with_the_same_bytes_on_any_number_of_threads() {
+    let scratch = Scratch::new("reconstruct-flash");
+    let cli = Cli::new(scratch.path());
+    let make = [
+        "scene",
+        "generate",
+        "--kind",
+        "furnished",
+        "--assets",
+        "parametric",
+        "--seed",
+        "92001",
+        "--out",
+        "room.glb",
+    ];
+    cli.run(&make).ok();
+    let flash = |from: &str, threads: &str, out: &str| {
+        let args = [
+            "reconstruct",
+            "room.glb",
+            "--spots-from",
+            from,
+            "--resolution",
+            "64",
+            "--samples",
+            "8",
+            "--nodes",
+            "64",
+            "--threads",
+            threads,
+            "--out",
+            out,
+        ];
+        cli.json(&args)
+    };
+    let said = flash("flash", "1", "one");
+    let number = |path: &str| said.pointer(path).and_then(Value::as_f64).unwrap();
+    assert_eq!(said["spots_from"], "flash");
+    assert!(number("/flash/depth/median_m") < 0.02, "{said}");
+    assert!(
+        number("/flash/masks/iou") > number("/flash/masks/all_lit_iou"),
+        "{said}"
+    );
+    assert!(number("/novel_views/all/l1_m") < 0.5, "{said}");
+    flash("flash", "3", "three");
+    for name in ALWAYS_SAME {
+        let bytes = |out: &str| std::fs::read(scratch.join(out).join(name)).unwrap();
+        assert_eq!(bytes("one"), bytes("three"), "{name}");
+    }
+}

@@ -15,7 +15,7 @@ pub use execute::{
     SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version,
     repin, resolve, scene_size,
 };
-pub use execute::{export, reconstruct, repair, reprocess, split};
+pub use execute::{demultiplex, export, reconstruct, repair, reprocess, split};
 pub use picofarm_session::{
     Access, AccessError, AgentConfig, AgentError, Bearer, ConnectionFailure, Control, Executor,
     Memory, MemoryLimit, Output, StorePrefixes, Summary, Target, Task, TaskError, cores,

@@ -177,7 +177,7 @@ pub fn take_apart(
                     settings,
                 };
                 mirror = mirrors.find(&judge.room(&slants), &mut slants);
-                finish(&rays, &slants)
+                finish(&rays, &slants, settings)
             }
         };
         near = normals(&rays, &depth, NEAR, LEAP);
@@ -265,11 +265,17 @@ fn first_depth(rays: &Rays, volume: &Volume, edges: &[f32], settings: &Settings)
     range.zip(&rays.slant).map(|(r, slant)| r / slant).collect()
 }
 
-/// z-depths of planes.
-fn finish(rays: &Rays, slants: &Slants) -> (Vec<f32>, Vec<f32>) {
-    let depth = (0..rays.len()).map(|p| slants.depth(rays, p)).collect();
-    let confidence = slants.score.iter().map(|s| s.clamp(0.0, 1.0)).collect();
-    (depth, confidence)
+/// z-depths of planes, and how well the histogram speaks for them. A plane that never meets its
+/// pixel's ray is as far away as any that is tried, and nothing speaks for it.
+fn finish(rays: &Rays, slants: &Slants, settings: &Settings) -> (Vec<f32>, Vec<f32>) {
+    let of = |p: usize| {
+        let z = slants.depth(rays, p);
+        match z.is_finite() && z > 0.0 {
+            true => (z, slants.score[p].clamp(0.0, 1.0)),
+            false => (settings.farthest_m / rays.slant[p], 0.0),
+        }
+    };
+    (0..rays.len()).map(of).unzip()
 }
 
 /// Normal of the surface that a spot is on: of the planes seen around it the one, moved to the

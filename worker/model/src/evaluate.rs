@@ -5,10 +5,10 @@ use serde::{Deserialize, Serialize};
 use crate::{
     ModelError,
     baseline::Baseline,
-    input::{Batch, Target, Visit, example},
+    input::{Batch, Question, Target, Visit, example},
     metric::{Metrics, Released, Tally},
     model::Model,
-    scene::{Scene, Scenes},
+    scene::{Scene, Scenes, Unreadable},
 };
 
 /// The result of an evaluation.
@@ -109,8 +109,75 @@ pub fn answered(
     Ok(Some(each))
 }
 
+/// Returns the answers for every scene, in order, from predictions that are stored instead of made
+/// here. `said` returns those of a scene by its index, for all spots if the question is about
+/// shadows: z-depths in metres, or probabilities of masks. The other arguments are those of
+/// [`evaluate`]; the question's variant must be [`ShadowVariant::All`].
+///
+/// # Errors
+/// [`ModelError::Scene`] for scenes and predictions that cannot be read; [`ModelError::Invalid`]
+/// for those that do not fit the question or the baseline.
+pub fn answered_by(
+    question: &Question,
+    said: &mut dyn FnMut(usize) -> Result<Vec<f32>, Unreadable>,
+    baseline: &Baseline,
+    scenes: &dyn Scenes,
+    tell: &mut dyn FnMut(usize, usize) -> bool,
+) -> Result<Option<Vec<Answered>>, ModelError> {
+    let mut each = Vec::with_capacity(scenes.len());
+    for index in 0..scenes.len() {
+        let unreadable = |source| ModelError::Scene {
+            scene: index,
+            source,
+        };
+        let scene = scenes.load(index).map_err(unreadable)?;
+        let mut said = said(index).map_err(unreadable)?;
+        for x in &mut said {
+            *x = match question.target {
+                Target::Tof => (*x / question.depth_scale_m).clamp(0.0, 1.0),
+                // A mask is set from a half on: the sign of a logit.
+                Target::Shadow | Target::Specular => *x - 0.5,
+            };
+        }
+        let answered = tallied(question, baseline, &scene, &mut |hear| {
+            let mut batch = Batch::default();
+            example(&mut batch, question, &scene, Visit::default())?;
+            if said.len() != batch.target.len() {
+                let what = format!(
+                    "have {} values, the truth has {}",
+                    said.len(),
+                    batch.target.len()
+                );
+                return Err(ModelError::invalid("predictions", what));
+            }
+            hear(&said, &batch);
+            Ok(())
+        });
+        each.push(answered.map_err(|e| e.in_scene(index))?);
+        if !tell(index + 1, scenes.len()) {
+            return Ok(None);
+        }
+    }
+    Ok(Some(each))
+}
+
 fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answered, ModelError> {
-    let question = model.question();
+    tallied(model.question(), baseline, scene, &mut |hear| {
+        answers(model, scene, hear)
+    })
+}
+
+/// Receives outputs and the batch that they answer.
+type Hear<'a> = &'a mut dyn FnMut(&[f32], &Batch);
+
+/// Compares the outputs for a scene, which `each` passes on, and the trivial answers with the
+/// truth.
+fn tallied(
+    question: &Question,
+    baseline: &Baseline,
+    scene: &Scene,
+    each: &mut dyn FnMut(Hear) -> Result<(), ModelError>,
+) -> Result<Answered, ModelError> {
     let names = baseline.names().iter();
     let mut found = Answered {
         examples: 0,
@@ -120,7 +187,7 @@ fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answere
             .collect(),
     };
     let (mut plane, mut fits) = (0, true);
-    answers(model, scene, &mut |said, batch| {
+    each(&mut |said, batch| {
         let (side, truth) = ([batch.height, batch.width], &batch.target);
         found.examples += batch.images as u64;
         found.model.add(question, said, truth, side);

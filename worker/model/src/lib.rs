@@ -26,7 +26,7 @@ pub mod weights;
 pub use burn::tensor::Device;
 pub use device::cpu;
 pub use error::ModelError;
-pub use evaluate::{Answered, Evaluated, answered, answers, evaluate, masks};
+pub use evaluate::{Answered, Evaluated, answered, answered_by, answers, evaluate, masks};
 pub use kernel::AdamW;
 pub use model::Model;
 pub use random::Random;

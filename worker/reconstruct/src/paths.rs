@@ -124,7 +124,7 @@ impl<'a> Paths<'a> {
     pub fn get(&self, spot: usize, pixel: usize) -> Option<LightPath> {
         let q = spot * self.points.len() + pixel;
         let origin = self.points[pixel];
-        if self.measured.used[q] == 0 || !origin.is_finite() {
+        if self.measured.used[q] == 0 || !self.measured.is_evident(pixel) || !origin.is_finite() {
             return None;
         }
         let way = self.measured.spots[spot].point - origin;

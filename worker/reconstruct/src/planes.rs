@@ -61,6 +61,7 @@ pub fn planes(measured: &Measured, depth: &Depth, seed: u64) -> Vec<Plane> {
     let points: Vec<Point> = (0..depth.range.len())
         .step_by(STRIDE)
         .filter(|&p| depth.range[p].is_finite() && depth.normal[p] != Vec3::ZERO)
+        .filter(|&p| !measured.is_doubtful(p))
         .map(|p| {
             let x = measured.camera.origin + measured.ray(p) * depth.range[p];
             (x, -depth.normal[p])
@@ -194,6 +195,32 @@ pub fn settle(measured: &Measured, depth: &mut Depth, planes: &[Plane]) {
             if slope > 0.05 {
                 depth.range[p] = range + plane.inside(x) / slope;
                 depth.normal[p] = -plane.normal;
+            }
+        }
+    }
+}
+
+/// Moves doubtful pixels that are behind a plane of the room onto it, because nothing is visible
+/// there: a mirror on a wall shows a room behind the wall. Their light paths are left unused.
+pub fn confine(measured: &mut Measured, depth: &mut Depth, planes: &[Plane]) {
+    let pixels = measured.pixels();
+    for p in 0..pixels {
+        if !depth.range[p].is_finite() || !measured.is_doubtful(p) {
+            continue;
+        }
+        let ray = measured.ray(p);
+        let origin = measured.camera.origin;
+        let x = origin + ray * depth.range[p];
+        let first = planes
+            .iter()
+            .filter(|plane| plane.inside(x) < -BEHIND * CLOSE_M && plane.normal.dot(ray) > 0.05)
+            .map(|plane| (plane.inside(origin) / plane.normal.dot(ray), plane.normal))
+            .filter(|(range, _)| *range > 0.0)
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        if let Some((range, normal)) = first {
+            (depth.range[p], depth.normal[p]) = (range, -normal);
+            for spot in 0..measured.spots.len() {
+                measured.used[spot * pixels + p] = 0;
             }
         }
     }

@@ -12,7 +12,7 @@ use crate::{
     field::{EMPTY, Field, SOLID},
     optimise::{Optimiser, Steps, trainable},
     paths::Paths,
-    planes::{Plane, planes, settle},
+    planes::{Plane, confine, planes, settle},
     progress::{Phase, Progress, begin},
     start::{State, bounds, start},
 };
@@ -118,6 +118,7 @@ impl Reconstruction {
             return Err(ReconstructError::Inconsistent { reasons });
         }
         settle(&measured, &mut depth, &walls);
+        confine(&mut measured, &mut depth, &walls);
         if settings.planes && walls.is_empty() {
             notes.push(
                 "no plane of a room was found: what lies outside the view stays empty".into(),

@@ -4,4 +4,4 @@ mod mesh;
 mod views;
 
 pub use mesh::{Floaters, MeshScore, floaters, mesh_score};
-pub use views::{Class, Split, ViewScore, around, score_views};
+pub use views::{Class, Split, ViewScore, around, around_unseen, score_views};

@@ -1,4 +1,4 @@
-//! `picofarm dataset info|show|verify` for predictions of models.
+//! `picofarm dataset info|show|verify` for predictions, by models or by physics.
 
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_results::{
@@ -42,11 +42,14 @@ pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()
         .iter()
         .map(|m| (m.scene, Verdict::of_agreement(&m.agreement)));
     let summary = summed(verdicts.filter_map(|(scene, verdict)| Some((scene, verdict?))));
-    let facts =
-        json!({"predictions": place, "spec": spec, "scenes": present.len(), "verdict": summary});
+    let evaluations = there.evaluations().await.map_err(failed)?;
+    let facts = json!({
+        "predictions": place, "spec": spec, "scenes": present.len(), "verdict": summary,
+        "evaluations": evaluations,
+    });
     output.result(&facts, || {
         let mut text = format!(
-            "{place}: what models predict ({}) of {} of {} scenes, {}x{} pixels\n",
+            "{place}: predictions ({}) of {} of {} scenes, {}x{} pixels\n",
             arrays(spec).join(", "),
             present.len(),
             spec.scenes,
@@ -55,6 +58,13 @@ pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()
         );
         if let Some(summary) = &summary {
             text += &format!("{}\n", summary.text);
+        }
+        for e in &evaluations {
+            let verdict = Verdict::of_evaluation(&e.predicts, &e.metrics);
+            text += &format!(
+                "{} on {} {} scenes of {}: {}\n",
+                e.predicts, e.scenes, e.side, e.dataset, verdict.text
+            );
         }
         text
     });
@@ -97,6 +107,9 @@ fn arrays(spec: &PredictionSpec) -> Vec<String> {
     if spec.specular {
         names.push("specular".into());
     }
+    if spec.confidence {
+        names.push("confidence".into());
+    }
     names
 }
 
@@ -104,11 +117,19 @@ fn arrays(spec: &PredictionSpec) -> Vec<String> {
 pub async fn show(args: &DatasetShow, there: &Predictions, output: Output) -> Result<()> {
     let manifest = there.manifest(args.scene).await.map_err(failed)?;
     let facts = json!({
-        "predictions": args.dataset, "scene": args.scene, "kind": "infer", "manifest": manifest,
+        "predictions": args.dataset, "scene": args.scene, "kind": kind(&manifest), "manifest": manifest,
         "manifest_sha256": manifest.sha256(), "bytes": manifest.total_bytes(),
     });
     output.result(&facts, || described(&manifest));
     Ok(())
+}
+
+/// Returns the kind of stage that made predictions: their code's version begins with the method.
+fn kind(manifest: &PredictionManifest) -> &'static str {
+    match manifest.code.starts_with("demultiplex") {
+        true => "demultiplex",
+        false => "infer",
+    }
 }
 
 fn described(manifest: &PredictionManifest) -> String {
@@ -122,7 +143,7 @@ fn described(manifest: &PredictionManifest) -> String {
     let source = &manifest.source;
     let mut rows = vec![
         row("scene", manifest.scene.to_string()),
-        row("made by", "infer".into()),
+        row("made by", kind(manifest).into()),
         row("task key", manifest.task_key.clone()),
         row("code", manifest.code.clone()),
         row("manifest", format!("SHA-256 {}", manifest.sha256())),

@@ -13,7 +13,7 @@ use picofarm_store::published::Manifest as _;
 use picofarm_transient::{Gate, Rendered, render};
 use serde_json::{Value, json};
 
-use super::{fits_memory, refused, watch::Watch};
+use super::{fits_memory, flash::AllSpots, refused, watch::Watch};
 use crate::{
     args::{GateArgs, Reconstruct},
     commands::{
@@ -150,7 +150,7 @@ pub fn measure(
         sensor: None,
     };
     fits_memory(&settings, scene, threads)?;
-    let rendered = render(scene, &settings.render_settings(), &Capture(watch))
+    let rendered = render(scene, &settings.render_settings(), &AllSpots(watch))
         .map_err(|e| refused(e.into()))?;
     let mut shown = seen(scene, &rendered);
     let failed = |member: &Member, e: ModelError| {
@@ -206,15 +206,6 @@ pub fn measure(
         "lit_share": share(&rendered.truth.visibility),
     });
     Ok((measured, facts))
-}
-
-/// Forwards the render's progress.
-struct Capture<'a>(&'a Watch);
-
-impl picofarm_transient::Progress for Capture<'_> {
-    fn at(&self, done: f32) -> bool {
-        self.0.step("capture of all spots", done)
-    }
 }
 
 /// Returns the scene as a network's input, with no ground truth except the spots.

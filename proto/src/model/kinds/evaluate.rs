@@ -1,5 +1,6 @@
 //! Evaluation: measures trained models on unseen scenes. One task, or one for each shard of the
-//! scenes and one that joins them. The result is stored next to each model.
+//! scenes and one that joins them. The result is stored next to each model. Or measures stored
+//! predictions of any origin; that result is stored next to them.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -7,7 +8,7 @@ use serde_json::{Value, json};
 use super::{
     fields::Fields,
     kind::{Declared, Manifest, ModelNames, Results, TaskKind, predicts_depth},
-    names::{check_model, check_split, check_times},
+    names::{check_model, check_predictions, check_split, check_times},
     reprocess::Histogram,
     train::{TRUTH, check_spots, is_zero},
 };
@@ -28,8 +29,9 @@ pub(super) const MAX_MODELS: usize = 1_000;
 /// Most shards of an evaluation.
 const MAX_SHARDS: u32 = 10_000;
 
-/// The field of [`EvaluateSettings::times`].
+/// The fields of [`EvaluateSettings::times`] and [`EvaluateSettings::predictions`].
 const TIMES: &str = "evaluate.times";
+const PREDICTIONS: &str = "evaluate.predictions";
 
 /// Evaluates models: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -47,8 +49,13 @@ pub struct EvaluateTask {
 #[serde(deny_unknown_fields)]
 pub struct EvaluateSettings {
     /// Names of models, or of stages that train them (in a matrix, the name before the bracket
-    /// means all of it).
+    /// means all of it). Empty with `predictions`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub models: Vec<String>,
+    /// Instead of models: a demultiplex or infer stage, or the folder that one wrote. Its stored
+    /// predictions are compared with the truth.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub predictions: String,
     /// The split of the data set.
     #[serde(default = "default_split")]
     pub split: String,
@@ -282,16 +289,27 @@ impl TaskKind for EvaluateTask {
     }
 
     fn reads_beside(&self) -> Option<(&'static str, &String)> {
-        is_folder(&self.evaluate.times).then_some((TIMES, &self.evaluate.times))
+        let settings = &self.evaluate;
+        match settings.predictions.is_empty() {
+            true => is_folder(&settings.times).then_some((TIMES, &settings.times)),
+            false => Some((PREDICTIONS, &settings.predictions)),
+        }
     }
 
     fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
-        is_folder(&self.evaluate.times).then_some((TIMES, &mut self.evaluate.times))
+        let settings = &mut self.evaluate;
+        match settings.predictions.is_empty() {
+            true => is_folder(&settings.times).then_some((TIMES, &mut settings.times)),
+            false => Some((PREDICTIONS, &mut settings.predictions)),
+        }
     }
 
-    /// Predicted depths must come from a depth network.
+    /// Predicted depths that a model receives must be depths.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
-        predicts_depth(self, before)
+        match self.evaluate.predictions.is_empty() {
+            true => predicts_depth(self, before),
+            false => Ok(()),
+        }
     }
 
     fn evaluates(&self) -> &[String] {
@@ -316,8 +334,14 @@ impl EvaluateSettings {
     pub fn check(&self) -> Result<(), SpecError> {
         let fail =
             |field: &str, what: String| Err(SpecError::new(format!("evaluate.{field}"), what));
+        if !self.predictions.is_empty() {
+            return self.check_predictions();
+        }
         if self.models.is_empty() || self.models.len() > MAX_MODELS {
-            let what = format!("names {} models; name 1 to {MAX_MODELS}", self.models.len());
+            let what = format!(
+                "names {} models; name 1 to {MAX_MODELS}, or predictions",
+                self.models.len()
+            );
             return fail("models", what);
         }
         for (i, model) in self.models.iter().enumerate() {
@@ -344,6 +368,34 @@ impl EvaluateSettings {
             ),
             None => Ok(()),
             Some(histogram) => check_spots("evaluate.spots", histogram, &self.spots),
+        }
+    }
+
+    /// Checks the settings for stored predictions, which leave no choice of an input.
+    fn check_predictions(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: &str| Err(SpecError::new(format!("evaluate.{field}"), what));
+        let made =
+            "belongs to models; predictions are made already: remove it, or name models instead";
+        if !self.models.is_empty() {
+            let what = "is given together with predictions; give one of the two, and the other a stage of its own";
+            return fail("models", what);
+        }
+        for (field, given) in [
+            ("histogram", self.histogram.is_some()),
+            ("spots", !self.spots.is_empty()),
+            ("times", !self.times.is_empty()),
+            ("sensor", !self.sensor),
+            ("shards", self.shards != 1),
+        ] {
+            if given {
+                return fail(field, made);
+            }
+        }
+        check_predictions(PREDICTIONS, &self.predictions)?;
+        check_split("evaluate.split", &self.split)?;
+        match SIDES.contains(&&*self.side) {
+            true => Ok(()),
+            false => fail("side", &show::unknown(&self.side, &SIDES)),
         }
     }
 }

@@ -179,6 +179,11 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         self.writes()
     }
 
+    /// Returns whether the folder of [`Self::writes`] gets depths without any model.
+    fn writes_depths(&self) -> bool {
+        false
+    }
+
     /// Returns the size of the resulting scenes, given the size of the input scenes.
     fn shape(&self, _source: Option<Shape>) -> Option<Shape> {
         None
@@ -345,15 +350,15 @@ pub(super) fn predicts_depth(
         // Only the store knows the target of an existing model.
         trained.is_none_or(|task| task.predicts() == Some("tof"))
     };
-    if writer
+    let by_model = writer
         .models()
         .into_iter()
-        .any(|(_, model)| predicts(model))
-    {
+        .any(|(_, model)| predicts(model));
+    if by_model || writer.writes_depths() {
         return Ok(());
     }
     let what = format!(
-        "{folder:?} is written by a stage before this one, and holds no depths; name an infer stage with a \"tof\" model"
+        "{folder:?} is written by a stage before this one, and holds no depths; name a demultiplex stage, or an infer stage with a \"tof\" model"
     );
     Err(SpecError::new(field, what))
 }

@@ -5,6 +5,7 @@
 //! [`super::file`] puts before a render stage, the trials of [`super::sweep`], and recipes and
 //! repairs in the agent, which concern rendered, reprocessed or imported scenes.
 
+pub mod demultiplex;
 mod division;
 pub mod evaluate;
 pub mod export;
@@ -32,6 +33,7 @@ use serde::Serialize;
 use super::spec_error::SpecError;
 use crate::show;
 
+pub use demultiplex::{DemultiplexSettings, DemultiplexTask};
 pub use division::Division;
 pub use evaluate::{EvaluateShardTask, EvaluateTask};
 pub use export::{ExportSettings, ExportTask};
@@ -141,6 +143,8 @@ kinds! {
     Part(PartTask),
     /// Evaluates models on shards of the scenes, which an evaluation joins: one task a shard.
     EvaluateShard(EvaluateShardTask),
+    /// Predicts scenes by physics from the histogram of all spots: one task each.
+    Demultiplex(DemultiplexTask),
 }
 
 /// A kind, for reading job files.

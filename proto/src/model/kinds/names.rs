@@ -38,3 +38,15 @@ pub(super) fn check_times(field: &str, name: &str) -> Result<(), SpecError> {
     );
     Err(SpecError::new(field, what))
 }
+
+/// Checks the folder of predictions.
+pub(super) fn check_predictions(field: &str, name: &str) -> Result<(), SpecError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if !name.is_empty() && !name.starts_with('.') && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!(
+        "is {name:?}; give a demultiplex or infer stage, or the plain name of a folder that one wrote"
+    );
+    Err(SpecError::new(field, what))
+}

@@ -19,6 +19,10 @@ pub struct Evaluation {
     pub model: String,
     /// SHA-256 of the model's manifest, in hexadecimal.
     pub model_sha256: String,
+    /// For stored predictions: the predicted quantity (`tof`, `shadow`, `specular`). Empty for
+    /// models, whose manifest names it.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub predicts: String,
     /// Folder of the data set in the same store.
     pub dataset: String,
     /// [`picofarm_dataset::Snapshot::id`] of the scenes.
@@ -55,7 +59,7 @@ impl Evaluation {
         seal(&bytes)
     }
 
-    fn parse(bytes: &[u8]) -> Result<Self, String> {
+    pub(crate) fn parse(bytes: &[u8]) -> Result<Self, String> {
         #[derive(Deserialize)]
         struct Head {
             checksum: String,

@@ -69,6 +69,19 @@ pub(super) fn arrays(spec: &PredictionSpec) -> Vec<PredictedArray> {
             a,
         ));
     }
+    if spec.confidence {
+        let a = json!({
+            "long_name": "how surely the depth is that of the surface, times 255",
+            "scale_factor": 1.0 / 255.0,
+        });
+        arrays.push(PredictedArray::new(
+            "confidence",
+            Element::U8,
+            vec![h, w],
+            IMAGE,
+            a,
+        ));
+    }
     arrays
 }
 

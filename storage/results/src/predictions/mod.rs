@@ -1,11 +1,12 @@
 //! Predictions of scenes by models: a separate Zarr v3 group in a store, next to the data set of
 //! the input scenes. It has the same number of scenes, and one object per scene and array: `depth`,
-//! `lit` and `specular`, as far as there are models for them.
+//! `lit`, `specular` and `confidence`, as far as they are predicted.
 //!
 //! A scene's predictions are published like scenes: objects first, `manifests/<scene>.json` last,
 //! all create-only and pure functions of the task.
 
 mod array;
+mod evaluation;
 mod manifest;
 mod publish;
 mod read;
@@ -39,6 +40,8 @@ pub struct Predicted {
     pub lit: Vec<u8>,
     /// Probability times 255 of a mirror: `[row][column]`.
     pub specular: Vec<u8>,
+    /// Confidence of the depth, times 255: `[row][column]`.
+    pub confidence: Vec<u8>,
 }
 
 /// Encoded predictions of one scene, ready to be published.

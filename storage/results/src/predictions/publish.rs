@@ -53,6 +53,7 @@ impl Predictions {
             let values: &[u8] = match array.name {
                 "depth" => bytemuck::cast_slice(&predicted.depth_m),
                 "lit" => &predicted.lit,
+                "confidence" => &predicted.confidence,
                 _ => &predicted.specular,
             };
             if values.len() != array.bytes() {

@@ -1,18 +1,13 @@
 //! Reads predictions, and pins their bytes for keys of tasks.
 
-use futures::{FutureExt, StreamExt, TryStreamExt, stream};
-use sha2::{Digest, Sha256};
-
 use super::array::PredictedArray;
 use super::{ModelUsed, Predicted, PredictionManifest, Predictions};
 use picofarm_store::StorageError;
-use picofarm_store::concurrent::CONCURRENCY;
-use picofarm_store::published::Manifest;
 
-/// A pinned list of scenes' depths.
+/// A pinned list of scenes' predictions of a quantity.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PinnedDepths {
-    /// Hash that pins every byte of the depths, and the order of the scenes, in hexadecimal.
+    /// Hash that pins every byte of the predictions, and the order of the scenes, in hexadecimal.
     pub id: String,
     /// The model that predicted them; `None` if there are no scenes.
     pub model: Option<ModelUsed>,
@@ -36,51 +31,11 @@ impl Predictions {
         let invalid = |what: String| StorageError::invalid("predictions", what);
         if !self.spec.depth {
             return Err(invalid(format!(
-                "{} holds no depths; give its infer stage a \"tof\" model",
+                "{} holds no depths; give its infer stage a \"tof\" model, or name a demultiplex stage",
                 self.place()
             )));
         }
-        let looks = scenes.iter().map(|scene| self.manifest(*scene).boxed());
-        let looks = stream::iter(looks).buffered(CONCURRENCY);
-        let found: Vec<PredictionManifest> = looks.try_collect().await?;
-        let mut hash = Sha256::new();
-        let mut by: Option<ModelUsed> = None;
-        for (manifest, seen) in found.iter().zip(seen) {
-            if manifest.source.manifest_sha256 != hex::encode(seen) {
-                return Err(invalid(format!(
-                    "{} holds what networks predict of scene {} of {:?}, which is not the scene that is read here; name \
-                     predictions of this data set",
-                    self.place(),
-                    manifest.scene,
-                    manifest.source.dataset,
-                )));
-            }
-            let Some(model) = manifest.models.get("tof") else {
-                return Err(invalid(format!(
-                    "{} does not say which model predicts the depth of scene {}",
-                    self.place(),
-                    manifest.scene
-                )));
-            };
-            match &by {
-                Some(other) if other != model => {
-                    return Err(invalid(format!(
-                        "{} holds depths by {:?} and by {:?}; one model must predict all",
-                        self.place(),
-                        other.name,
-                        model.name
-                    )));
-                }
-                Some(_) => {}
-                None => by = Some(model.clone()),
-            }
-            hash.update(manifest.scene.to_le_bytes());
-            hash.update(Sha256::digest(manifest.to_bytes()));
-        }
-        Ok(PinnedDepths {
-            id: hex::encode(hash.finalize()),
-            model: by,
-        })
+        self.pin("tof", scenes, seen).await
     }
 
     /// Returns the predicted depth of a scene in metres, `[row][column]`, checked against its
@@ -128,6 +83,7 @@ impl Predictions {
             match array.name {
                 "depth" => predicted.depth_m = bytemuck::pod_collect_to_vec(&values),
                 "lit" => predicted.lit = values,
+                "confidence" => predicted.confidence = values,
                 _ => predicted.specular = values,
             }
         }

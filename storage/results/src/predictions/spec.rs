@@ -23,6 +23,9 @@ pub struct PredictionSpec {
     pub spots: Vec<u32>,
     /// Whether mirrors are predicted.
     pub specular: bool,
+    /// Whether the confidence of the depth is stored.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub confidence: bool,
 }
 
 /// Returns the `zarr.json` of the group with these arrays.
@@ -54,6 +57,11 @@ pub(super) fn difference(
         ("depth", text(&stored.depth), text(&asked.depth)),
         ("spots", text(&stored.spots), text(&asked.spots)),
         ("specular", text(&stored.specular), text(&asked.specular)),
+        (
+            "confidence",
+            text(&stored.confidence),
+            text(&asked.confidence),
+        ),
     ]
     .into_iter()
     .find(|(_, stored, asked)| stored != asked)

@@ -28,6 +28,7 @@ async fn changed_records_of_models_are_refused() {
     let memory = Arc::new(InMemory::new());
     let models = Models::new(memory.clone(), &Path::from("store"));
     let evaluation = Evaluation {
+        predicts: String::new(),
         key: "k".into(),
         model: "m".into(),
         model_sha256: "0".repeat(64),

@@ -48,6 +48,7 @@ fn new_model(name: &str, key: &str, builds_on: &[(&str, String)]) -> NewModel {
 
 async fn put_evaluation(models: &Models, model: &ModelManifest) {
     let evaluation = Evaluation {
+        predicts: String::new(),
         key: "e".into(),
         model: model.name.clone(),
         model_sha256: model.sha256(),
@@ -288,6 +289,7 @@ async fn who_builds_on_a_model_is_found() {
         depth: true,
         spots: vec![],
         specular: false,
+        confidence: false,
     };
     for (group, model) in [("seen", "m"), ("others", "n")] {
         let prefix = Path::from("a/store").join(group);

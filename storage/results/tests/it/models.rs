@@ -344,6 +344,7 @@ async fn collection_takes_what_nobody_needs_and_leaves_the_rest() {
 async fn an_evaluation_stands_beside_its_model() {
     let (_dir, models) = local();
     let evaluation = Evaluation {
+        predicts: String::new(),
         key: "ab".into(),
         model: "m".into(),
         model_sha256: "cd".into(),

@@ -24,6 +24,7 @@ fn spec(scenes: u64) -> PredictionSpec {
         depth: true,
         spots: vec![3, 5],
         specular: true,
+        confidence: true,
     }
 }
 
@@ -36,6 +37,7 @@ fn predicted(scene: u64) -> Predicted {
             .collect(),
         lit: (0..2 * n).map(byte).collect(),
         specular: (0..n).map(|i| byte(i * 3)).collect(),
+        confidence: (0..n).map(|i| byte(i * 5)).collect(),
     }
 }
 
@@ -98,7 +100,15 @@ async fn what_was_published_reads_back_and_is_known_again_by_its_task() {
     assert_eq!(there.scenes_present().await.unwrap(), [2]);
     assert_eq!(there.finished(2, "k").await.unwrap().unwrap(), made);
     let keys: Vec<&str> = made.objects.iter().map(|o| &*o.key).collect();
-    assert_eq!(keys, ["depth/c/2/0/0", "lit/c/2/0/0/0", "specular/c/2/0/0"]);
+    assert_eq!(
+        keys,
+        [
+            "depth/c/2/0/0",
+            "lit/c/2/0/0/0",
+            "specular/c/2/0/0",
+            "confidence/c/2/0/0"
+        ]
+    );
     // A second publication, by any process, changes nothing.
     let before = files(folder.path());
     let again = open(folder.path(), &spec(4)).await.unwrap();

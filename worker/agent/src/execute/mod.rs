@@ -7,6 +7,7 @@ mod gallery;
 mod kinds;
 mod memory;
 mod output;
+mod predicted;
 mod recipe;
 mod remade;
 pub mod repair;
@@ -22,7 +23,8 @@ pub use picofarm_session::{Control, Executor, Output, Task, TaskError};
 
 use kinds::{Context, RunTask, STORE_PATIENCE, part, render};
 pub use kinds::{
-    TaskExecutor, export, reconstruct, render::renderer_version, reprocess, resolve, split,
+    TaskExecutor, demultiplex, export, reconstruct, render::renderer_version, reprocess, resolve,
+    split,
 };
 #[cfg(feature = "networks")]
 use kinds::{evaluate, train};

@@ -78,6 +78,7 @@ async fn what_is_kept_is_what_evaluations_found() {
         depth_m,
         lit,
         specular,
+        ..
     } = place.seen().await.read(scene).await.unwrap();
     let rooms = place.rooms().await;
     let depth = rooms.read::<f32>(scene, Quantity::Depth).await.unwrap();

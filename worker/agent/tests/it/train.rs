@@ -403,7 +403,7 @@ async fn predictions_that_do_not_fit_are_refused_by_name_before_anything_is_lear
             "holds no depths; give its infer stage a \"tof\" model",
         ),
         ("short", "holds nothing of scene 4"),
-        ("mixed", "holds depths by "),
+        ("mixed", "holds predictions of \"tof\" by "),
     ] {
         let said = refused(shadows(times)).await;
         assert!(

@@ -36,6 +36,7 @@ fn room() -> Measured {
         used: Vec::new(),
         bin_width_m: 0.0,
         mirror: Vec::new(),
+        confidence: Vec::new(),
         left_out: Vec::new(),
     };
     for (beam, at) in [[1.5, 0.3, 1.0], [-1.5, 0.1, 1.2], [0.2, 1.4, 0.8]]

@@ -70,6 +70,9 @@ struct Sum {
     square: u128,
 }
 
+/// Least distance of a view from surfaces, metres.
+const CLEAR_M: f32 = 0.25;
+
 const UNIT: f64 = 4_294_967_296.0;
 
 impl Sum {
@@ -205,6 +208,51 @@ pub fn around(
     count: usize,
     resolution: u32,
 ) -> Vec<Camera> {
+    let mut stack = world.stack();
+    let open = |eye: Vec3| {
+        !world.buried(&mut stack, eye)
+            && directions().all(|d| {
+                world
+                    .closest(&mut stack, eye, d)
+                    .is_none_or(|hit| hit.range > CLEAR_M)
+            })
+    };
+    circle(measured, range, open, (count, resolution))
+}
+
+/// Like [`around`], but views are omitted if they are within 0.25 m of a surface of the
+/// reconstruction itself: no true scene is needed.
+pub fn around_unseen(
+    measured: &Measured,
+    range: &[f32],
+    renderer: &dyn Distances,
+    count: usize,
+    resolution: u32,
+) -> Vec<Camera> {
+    let all: Vec<Vec3> = directions().collect();
+    let open = |eye: Vec3| {
+        let found = renderer.distances(eye, &all);
+        found.iter().all(|end| !end.met || end.or_end_m > CLEAR_M)
+    };
+    circle(measured, range, open, (count, resolution))
+}
+
+/// Returns directions in which a view needs room.
+fn directions() -> impl Iterator<Item = Vec3> {
+    (0..64).map(|d| {
+        let (z, turn) = ((d as f32 + 0.5) / 32.0 - 1.0, d as f32 * 2.399_963);
+        let r = (1.0 - z * z).sqrt();
+        Vec3::new(r * libm::cosf(turn), z, r * libm::sinf(turn))
+    })
+}
+
+/// Returns the views of [`around`] whose positions are `open`.
+fn circle(
+    measured: &Measured,
+    range: &[f32],
+    mut open: impl FnMut(Vec3) -> bool,
+    (count, resolution): (usize, u32),
+) -> Vec<Camera> {
     let camera = &measured.camera;
     let mut far: Vec<f32> = range
         .iter()
@@ -223,24 +271,11 @@ pub fn around(
     let fov =
         2.0 * libm::atanf(camera.intrinsics.width as f32 * 0.5 / camera.intrinsics.fx).to_degrees();
     let intrinsics = Intrinsics::from_fov(fov, resolution, resolution);
-    let mut stack = world.stack();
-    let mut view = |k: usize| -> Option<Camera> {
+    let view = |k: usize| -> Option<Camera> {
         let angle = std::f32::consts::TAU * k as f32 / count as f32;
         let arm = Vec3::new(libm::cosf(angle), 0.0, libm::sinf(angle)) * (0.3 * median);
         let eye = Vec3::new(centre.x, camera.origin.y, centre.z) + arm;
-        let view = Camera::look_at(eye, centre, intrinsics);
-        if world.buried(&mut stack, eye) {
-            return None;
-        }
-        let open = (0..64).all(|d| {
-            let (z, turn) = ((d as f32 + 0.5) / 32.0 - 1.0, d as f32 * 2.399_963);
-            let r = (1.0 - z * z).sqrt();
-            let d = Vec3::new(r * libm::cosf(turn), z, r * libm::sinf(turn));
-            world
-                .closest(&mut stack, eye, d)
-                .is_none_or(|hit| hit.range > 0.25)
-        });
-        open.then_some(view)
+        open(eye).then(|| Camera::look_at(eye, centre, intrinsics))
     };
-    (0..count).filter_map(&mut view).collect()
+    (0..count).filter_map(view).collect()
 }

@@ -61,6 +61,7 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
             Times::Paths { bin_width_m, .. } => bin_width_m,
         },
         mirror: given.mirror.to_vec(),
+        confidence: Vec::new(),
         left_out: Vec::new(),
     };
     let pixels = measured.pixels();

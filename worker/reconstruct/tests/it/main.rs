@@ -4,6 +4,7 @@ mod agreement;
 mod bad_input;
 mod baselines;
 mod common;
+mod doubt;
 mod masks;
 mod rays;
 mod rooms;

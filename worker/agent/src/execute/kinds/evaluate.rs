@@ -5,6 +5,8 @@
 //! each model. A model that was evaluated on these scenes before is skipped. Shards are only a
 //! cache: the joining task recomputes those that are missing or damaged.
 
+mod predictions;
+
 use std::ops::Range;
 
 use picofarm_dataset::{Dataset, Pinned};
@@ -43,6 +45,9 @@ impl RunTask for EvaluateTask {
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let _kept = Kept::from_now();
         let evaluation = EvaluationRun::new((context, context.device(task)?), self, control)?;
+        if !self.evaluate.predictions.is_empty() {
+            return evaluation.of_predictions(control);
+        }
         let (mut documents, mut computed) = (Vec::new(), false);
         for which in 0..self.evaluate.models.len() {
             let (found, new) = evaluation.of(which, control)?;
@@ -297,6 +302,7 @@ impl<'a> EvaluationRun<'a> {
             key: asked.key.clone(),
             model: name.clone(),
             model_sha256: asked.sha256.clone(),
+            predicts: String::new(),
             dataset: self.task.source.dataset.clone(),
             data: self.data.id.clone(),
             split: self.split.clone(),

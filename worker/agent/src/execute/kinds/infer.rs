@@ -16,18 +16,15 @@ use picofarm_model::{
     scene::{Scene, Scenes},
 };
 use picofarm_proto::model::{InferTask, TaskSpec};
-use picofarm_results::{Models, Predicted, PredictionManifest, Predictions, Verdict};
-use picofarm_store::StorageError;
-use picofarm_store::published::Manifest as _;
-use tracing::{info, warn};
+use picofarm_results::{Models, Predicted, Predictions};
 
-mod agreement;
 mod panel;
 
 use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError,
     examples::Examples,
-    output::{Stores, of_dataset, saying},
+    output::{Stores, of_dataset},
+    predicted::{self, agreement},
     reprocess::source_manifest,
     train::{at, model_version, of_answers, of_model},
     truth,
@@ -37,13 +34,14 @@ use panel::{Member, Panel, Shown, Times};
 /// Progress of the task when all models have run.
 const ASKED: f32 = 0.95;
 
-/// Version of the agreement figures in a manifest.
-const AGREEMENT: &str = "agreement-1";
-
 /// Returns the version of all code of this program that determines the bytes of predictions and
 /// their manifests: networks, encoder and agreement figures. Part of every key.
 pub fn infer_version() -> String {
-    format!("{}/{ENCODER_VERSION}/{AGREEMENT}", model_version())
+    format!(
+        "{}/{ENCODER_VERSION}/{}",
+        model_version(),
+        agreement::VERSION
+    )
 }
 
 /// Cache of models between tasks. It has the models of the latest task.
@@ -87,15 +85,11 @@ impl RunTask for InferTask {
         let predictions = stores
             .wait(control, opened)
             .map_err(|e| at("output.dataset", e))?;
-        let finished = match force {
-            true => None,
-            false => finished(stores, &predictions, &manifest, control)?,
-        };
-        if let Some(there) = finished {
-            tell(&there);
-            return Ok(output(&there, true));
+        if !force && let Some(there) = predicted::adopted(stores, &predictions, &manifest, control)?
+        {
+            return Ok(there);
         }
-        let predicted = panel.ask(
+        let answers = panel.ask(
             stores,
             (&models, cache),
             (device, on_gpu),
@@ -103,55 +97,10 @@ impl RunTask for InferTask {
             control,
         )?;
         manifest.agreement =
-            agreement::of(stores, (&dataset, index), &predicted, &spec.spots, control)?;
-        let encoded = predictions
-            .encode(manifest, &predicted)
-            .map_err(of_dataset)?;
-        let written = stores.patiently(control, async || predictions.restore(&encoded).await)?;
-        for object in written {
-            info!(%object, "was missing or changed, and is put back");
-        }
-        tell(&encoded.manifest);
-        control.at(1.0);
-        Ok(output(&encoded.manifest, false))
+            agreement::of(stores, (&dataset, index), &answers, &spec.spots, control)?;
+        let encoded = predictions.encode(manifest, &answers).map_err(of_dataset)?;
+        predicted::publish(stores, &predictions, &encoded, control)
     }
-}
-
-/// Logs whether the predictions of a scene agree.
-fn tell(manifest: &PredictionManifest) {
-    if let Some(verdict) = Verdict::of_agreement(&manifest.agreement) {
-        saying(
-            &verdict,
-            &format!("predictions of scene {}", manifest.scene),
-        );
-    }
-}
-
-fn output(manifest: &PredictionManifest, adopted: bool) -> Output {
-    Output {
-        manifest_sha256: manifest.sha256(),
-        bytes: manifest.total_bytes(),
-        adopted,
-    }
-}
-
-/// Returns the predictions if this exact task has published them.
-fn finished(
-    stores: &Stores,
-    predictions: &Predictions,
-    ours: &PredictionManifest,
-    control: &Control,
-) -> Result<Option<PredictionManifest>, TaskError> {
-    let looked = async {
-        match predictions.finished(ours.scene, &ours.task_key).await {
-            Err(error @ StorageError::Damaged { .. }) => {
-                warn!(%error, "what was predicted is damaged; it is predicted again and put back");
-                Ok(None)
-            }
-            other => other,
-        }
-    };
-    stores.wait(control, looked)
 }
 
 impl Panel {

@@ -1,6 +1,7 @@
 //! The worker's executor: the table of all task kinds. Each kind runs in a file of its own in this
 //! folder. [`picofarm_proto::model::kinds`] documents the kinds.
 
+pub mod demultiplex;
 #[cfg(feature = "networks")]
 pub(in crate::execute) mod device;
 #[cfg(feature = "networks")]
@@ -35,7 +36,9 @@ use picofarm_model::device::OpenGpu;
 use picofarm_proto::model::{
     EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
-    kinds::{Declared, ReconstructTask, VerifyTask, export::FORMATS, reconstruct::MLP},
+    kinds::{
+        Declared, DemultiplexTask, ReconstructTask, VerifyTask, export::FORMATS, reconstruct::MLP,
+    },
 };
 use picofarm_scene::AssetLibrary;
 use picofarm_session::AgentError;
@@ -141,6 +144,7 @@ kinds! {
     Verify(VerifyTask),
     Part(PartTask),
     EvaluateShard(EvaluateShardTask),
+    Demultiplex(DemultiplexTask),
 }
 
 /// Optional parts of kinds, and whether this program was built with them. See

@@ -43,6 +43,7 @@ use crate::execute::{
     reprocess::source_manifest,
 };
 
+pub(in crate::execute) use captured::Frame;
 pub use captured::slant;
 pub use pictures::{CELL, STEP, columns, first_row, shaded, views};
 pub use written::{density, errors, facts};
@@ -279,7 +280,7 @@ fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {
     }
 }
 
-pub(super) fn of_reconstruction(error: ReconstructError) -> TaskError {
+pub(in crate::execute) fn of_reconstruction(error: ReconstructError) -> TaskError {
     match error {
         ReconstructError::Stopped => TaskError::Stopped,
         error @ ReconstructError::Inconsistent { .. } => TaskError::User(format!(

@@ -159,6 +159,7 @@ impl Panel {
                 .as_ref()
                 .map_or(Vec::new(), |m| m.lit_by.clone()),
             specular: self.specular.is_some(),
+            confidence: false,
         }
     }
 

@@ -69,7 +69,7 @@ pub(super) fn captures(
 }
 
 /// A row-major camera-to-world matrix.
-pub(super) struct Frame<'a>(pub &'a [f32]);
+pub(in crate::execute) struct Frame<'a>(pub &'a [f32]);
 
 impl Frame<'_> {
     fn axis(&self, column: usize) -> Vec3 {

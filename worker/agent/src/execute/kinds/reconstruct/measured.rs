@@ -4,7 +4,7 @@ use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_proto::model::kinds::reconstruct::{Measurements, Mirrors};
 use picofarm_reconstruct::{
     Measured,
-    source::{Given, Times, given},
+    source::{Given, Times, given, weigh},
 };
 use picofarm_results::{Predictions, SceneUsed};
 use picofarm_scene::{Intrinsics, Vec3};
@@ -45,8 +45,8 @@ impl Work<'_> {
         let spec = predictions.spec();
         if !spec.depth || spec.spots.is_empty() {
             return Err(TaskError::User(format!(
-                "reconstruct.predictions: {} holds {}; depth and masks are needed: give its infer stage a \"tof\" and a \
-                 \"shadow\" model",
+                "reconstruct.predictions: {} holds {}; depth and masks are needed: name a demultiplex stage, or give its \
+                 infer stage a \"tof\" and a \"shadow\" model",
                 predictions.place(),
                 match (spec.depth, spec.spots.is_empty()) {
                     (true, _) => "no masks of spots",
@@ -60,8 +60,8 @@ impl Work<'_> {
             .map_err(at)?;
         if manifest.source.manifest_sha256 != manifest_sha256(found) {
             return Err(TaskError::User(format!(
-                "reconstruct.predictions: {} holds what networks predict of scene {index} of {:?}, which is not the scene of \
-                 this stage's source, {:?}; name the data set that the infer stage has read",
+                "reconstruct.predictions: {} holds predictions of scene {index} of {:?}, which is not the scene of \
+                 this stage's source, {:?}; name the data set that the predictions were made of",
                 predictions.place(),
                 manifest.source.dataset,
                 self.0.source.dataset,
@@ -164,7 +164,7 @@ impl Work<'_> {
             range = images.depth_m.iter().enumerate().map(along).collect();
             Times::Range(&range)
         };
-        given(&Given {
+        let mut measured = given(&Given {
             camera,
             laser,
             spots: &spots,
@@ -173,7 +173,13 @@ impl Work<'_> {
             lit: &lit,
             mirror: &images.mirror,
         })
-        .map_err(of_reconstruction)
+        .map_err(of_reconstruction)?;
+        if let Some(sure) = &images.sure {
+            let probability: Vec<f32> = of_beams(&sure.lit, &beams, pixels);
+            weigh(&mut measured, &beams, &probability, &sure.confidence)
+                .map_err(of_reconstruction)?;
+        }
+        Ok(measured)
     }
 
     /// Returns the beams to use.
@@ -206,6 +212,16 @@ struct Images {
     /// `[spot][row][column]` of every spot.
     lit: Vec<u8>,
     mirror: Vec<u8>,
+    /// How sure predictions are, where they say so.
+    sure: Option<Sure>,
+}
+
+/// The confidence of predictions.
+struct Sure {
+    /// Probability of light: `[spot][row][column]` of every spot.
+    lit: Vec<f32>,
+    /// Confidence of the depth: `[row][column]`.
+    confidence: Vec<f32>,
 }
 
 /// Reads the images of a data set. Quantities that an import lacks are zero.
@@ -219,10 +235,11 @@ async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, StorageError
         depth_m,
         lit,
         mirror,
+        sure: None,
     })
 }
 
-/// Returns the images that networks predict. If no network predicts mirrors, there are none: the
+/// Returns the images that are predicted. If no mirrors are predicted, there are none: the
 /// true mirror mask is not used as a substitute.
 fn predicted(
     stores: &Stores,
@@ -246,18 +263,21 @@ fn predicted(
         true => vec![0; pixels],
         false => found.specular.iter().map(likely).collect(),
     };
-    let mut lit = vec![0; spec.spots as usize * pixels];
+    let mut probability = vec![0; spec.spots as usize * pixels];
     let masks = found.lit.chunks_exact(pixels);
     for (number, mask) in predictions.spec().spots.iter().zip(masks) {
-        let to = &mut lit[*number as usize * pixels..][..pixels];
-        for (to, p) in to.iter_mut().zip(mask) {
-            *to = likely(p);
-        }
+        probability[*number as usize * pixels..][..pixels].copy_from_slice(mask);
     }
+    let shares = |all: &[u8]| all.iter().map(|p| f32::from(*p) / 255.0).collect();
+    let sure = predictions.spec().confidence.then(|| Sure {
+        lit: shares(&probability),
+        confidence: shares(&found.confidence),
+    });
     Ok(Images {
         depth_m: found.depth_m,
-        lit,
+        lit: probability.iter().map(likely).collect(),
         mirror,
+        sure,
     })
 }
 

@@ -16,9 +16,12 @@ use crate::execute::{
     output::Stores,
 };
 
+/// Version of the figures in a manifest.
+pub const VERSION: &str = "agreement-1";
+
 /// Compares depths with spots, and masks with both. Returns null if no depth is predicted. `lit_by`
 /// are the spots of the masks.
-pub(super) fn of(
+pub(in crate::execute) fn of(
     stores: &Stores,
     (dataset, scene): (&Dataset, u64),
     predicted: &Predicted,
