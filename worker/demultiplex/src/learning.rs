@@ -10,8 +10,8 @@ pub use crate::{
 
 /// Features of chosen pairs: `[feature][pair]`. Pairs are (index of the spot, pixel).
 ///
-/// With `depth_m` they are those of [`crate::shadows_at`], otherwise of [`crate::demultiplex`]. With
-/// a first forest, what it says around each pair is added.
+/// With `depth_m` they are those of [`crate::shadows_at`], otherwise of [`crate::demultiplex`].
+/// With a first forest, what it says around each pair is added.
 ///
 /// # Errors
 /// [`DemultiplexError`] names the argument that cannot be used.

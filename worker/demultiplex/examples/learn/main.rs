@@ -1,7 +1,7 @@
 //! Learns the model of shadows (`shadows = "learned"`) from rendered rooms, and writes its weights.
-//! Rooms are parametric, of seeds 93001 and on; the same seeds give the same bytes.
+//! Rooms are parametric, of seeds 93001 and on. The committed weights are those of the defaults.
 //!
-//! In the environment, `ROOMS` (24), `FIRST` (93001), `SIDE` (128 pixels), `TREES` (180, of each of
+//! In the environment, `ROOMS` (12), `FIRST` (93001), `SIDE` (128 pixels), `TREES` (150, of each of
 //! two forests), `PAIRS` (12000, of a room), `CACHE` (a folder that keeps rendered rooms), and
 //! `OUT` (worker/demultiplex/src/learned.bin).
 
@@ -39,7 +39,7 @@ fn pairs(room: &Room, seed: u64, count: usize) -> Vec<(usize, usize)> {
 /// Features and answers of all rooms: half from their own depth, half from the truth's.
 fn gather(first_forest: Option<&Forest>) -> (Vec<Vec<f32>>, Vec<bool>) {
     let kind = Kind::of_environment();
-    let (first, rooms) = (variable("FIRST", 93001), variable("ROOMS", 24u64));
+    let (first, rooms) = (variable("FIRST", 93001), variable("ROOMS", 12u64));
     let count = variable("PAIRS", 12_000usize);
     let (mut all, mut lit) = (Vec::new(), Vec::new());
     for seed in first..first + rooms {
@@ -83,7 +83,7 @@ fn wrong(forest: &Forest, features: &[Vec<f32>], lit: &[bool]) -> f64 {
 }
 
 fn main() {
-    let trees = variable("TREES", 180usize);
+    let trees = variable("TREES", 150usize);
     let out: String = variable("OUT", "worker/demultiplex/src/learned.bin".into());
     let mut forests = Vec::new();
     for round in 1..=2 {
