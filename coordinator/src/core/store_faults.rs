@@ -1,4 +1,4 @@
-//! StoreFaults that tasks wait for because they are unavailable, full, forbidden or not mounted. If
+//! Stores that tasks wait for because they are unavailable, full, forbidden or not mounted. If
 //! one worker fails at a store, that worker waits for increasing times while others continue. If
 //! several workers fail and none succeeds, the store waits: one task at a time tries it, at
 //! increasing intervals, however many tasks wait for it. Meanwhile workers do other work.
