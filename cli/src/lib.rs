@@ -136,7 +136,7 @@ fn local_worker() -> Result<()> {
             .transpose()?
     };
     let _last_lines = log(&order.settings.log, traces.as_ref())?;
-    picofarm_dataset::limit_bandwidth(order.settings.bandwidth()?);
+    picofarm_store::limit_bandwidth(order.settings.bandwidth()?);
     let ended = runtime.block_on(commands::local_worker::serve(order));
     if let Some(traces) = traces {
         traces.end();

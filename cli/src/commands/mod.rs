@@ -28,7 +28,7 @@ use crate::{args::Command, error::Result, output::Output, settings::Resolved};
 /// Runs a command.
 pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
     let settings = &resolved.settings;
-    picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
+    picofarm_store::limit_bandwidth(settings.bandwidth()?);
     match command {
         Command::Demo(args) => demo::run(args, settings, output).await,
         Command::Up(args) => up::run(args, settings, output).await,

@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 
 use picofarm_proto::show;
 use picofarm_scene::{
-    Aim, AssetLibrary, Scene, export,
+    AssetLibrary, Scene, export,
     furnished::{self, FurnishedSettings},
     plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},

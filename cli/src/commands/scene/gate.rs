@@ -1,6 +1,6 @@
 //! Chooses the time gate of a render.
 
-use picofarm_figures::short;
+use picofarm_figures::number::short;
 use picofarm_scene::Scene;
 
 use crate::args::{GateArgs, GateChoice, RenderArgs};

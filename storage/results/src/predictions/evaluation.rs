@@ -23,7 +23,12 @@ impl Predictions {
     /// [`StorageError::Store`].
     pub async fn put_evaluation(&self, evaluation: &Evaluation) -> Result<bool, StorageError> {
         let path = self.path(&key(&evaluation.key));
-        objects::create(&**self.published.store(), &path, Bytes::from(evaluation.to_bytes())).await
+        objects::create(
+            &**self.published.store(),
+            &path,
+            Bytes::from(evaluation.to_bytes()),
+        )
+        .await
     }
 
     /// Reads the evaluation with this key.
@@ -48,7 +53,12 @@ impl Predictions {
     /// [`StorageError::Damaged`], [`StorageError::Store`].
     pub async fn evaluations(&self) -> Result<Vec<Evaluation>, StorageError> {
         let folder = self.path(FOLDER);
-        let listed = self.published.store().list(Some(&folder)).try_collect().await;
+        let listed = self
+            .published
+            .store()
+            .list(Some(&folder))
+            .try_collect()
+            .await;
         let listed: Vec<ObjectMeta> =
             listed.map_err(|e| StorageError::store("list", self.shown(&folder), e))?;
         let names = listed

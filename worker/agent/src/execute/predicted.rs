@@ -4,6 +4,7 @@ pub(super) mod agreement;
 
 use picofarm_results::{EncodedPredictions, PredictionManifest, Predictions, Verdict};
 use picofarm_store::StorageError;
+use picofarm_store::published::Manifest as _;
 use tracing::{info, warn};
 
 use super::{

@@ -14,7 +14,7 @@ use picofarm_scene::{
     import::{self, Bounds, ImportOptions},
     primitive::{self, PrimitiveSettings},
 };
-use tracing::{info, warn};
+use tracing::info;
 
 use super::TaskError;
 

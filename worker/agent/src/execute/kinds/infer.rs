@@ -17,6 +17,7 @@ use picofarm_model::{
 };
 use picofarm_proto::model::{InferTask, TaskSpec};
 use picofarm_results::{Models, Predicted, Predictions};
+use picofarm_store::published::Manifest as _;
 
 mod panel;
 
