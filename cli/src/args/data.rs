@@ -13,14 +13,14 @@ use picofarm_exchange::import::{Captures, DepthKind, Format, ImportOptions, Pola
 /// A sensor.
 #[derive(Args, Clone, Default)]
 pub struct SensorArgs {
-    /// Sensor settings (TOML); the options below go before them
+    /// Sensor settings (TOML); the options below override them
     #[arg(long, value_name = "FILE")]
     pub sensor: Option<PathBuf>,
-    /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw it from
+    /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw from
     /// [default: 10..400]
     #[arg(long, value_name = "LOW..HIGH")]
     pub peak_photons: Option<String>,
-    /// Photons for a unit of the transient, instead of a peak
+    /// Photons per unit of the transient, instead of a peak
     #[arg(long, value_name = "N", conflicts_with = "peak_photons")]
     pub photons_per_unit: Option<f64>,
     /// Pulse: fwhm:PS (Gaussian rise, exponential tail) or none; measured pulses go into --sensor
@@ -30,11 +30,10 @@ pub struct SensorArgs {
     /// Timing jitter, full width at half maximum in picoseconds [default: 50]
     #[arg(long, value_name = "PS")]
     pub jitter_ps: Option<f64>,
-    /// Jitter as in the published code: the pulse is shifted by floor(N(0, 2.654)) bins, once a
-    /// scene
+    /// Jitter as in Shoot-Bounce-3D's code: each scene is shifted by floor(N(0, 2.654)) bins
     #[arg(long, conflicts_with = "jitter_ps")]
     pub jitter_sb3d: bool,
-    /// Ambient and dark counts, photons a bin (before --rebin) [default: 0]
+    /// Ambient and dark counts, photons per bin before --rebin [default: 0]
     #[arg(long, value_name = "RATE")]
     pub dark: Option<f64>,
     /// Sum this many adjacent bins [default: 1]
@@ -43,8 +42,8 @@ pub struct SensorArgs {
     /// Write the expected photons instead of drawing counts
     #[arg(long)]
     pub no_poisson: bool,
-    /// Pile-up: at most one photon a pixel and pulse is seen, of so many pulses [default: all
-    /// photons are]
+    /// Pile-up: N pulses, of which a pixel detects at most one photon each [default: all photons
+    /// are detected]
     #[arg(long, value_name = "pulses:N")]
     pub dead_time: Option<String>,
 }
@@ -54,10 +53,10 @@ pub struct DatasetReprocess {
     /// Folder or URL of the data set to read
     #[arg(value_parser = crate::args::location::parse)]
     pub source: String,
-    /// Folder or URL of the data set to make, or to go on with
+    /// Folder or URL of the data set to write or continue
     #[arg(value_parser = crate::args::location::parse)]
     pub target: String,
-    /// Which histogram: transient, transient_4, transient_25, or transient_spots with --spots
+    /// Histogram: transient, transient_4, transient_25, or transient_spots with --spots
     #[arg(long, default_value = "transient", value_name = "NAME", value_parser = Histogram::parse)]
     pub histogram: Histogram,
     /// Sum the histograms of these spots (counted from 0); needs --histogram transient_spots
@@ -65,15 +64,14 @@ pub struct DatasetReprocess {
     pub spots: Vec<u32>,
     #[command(flatten)]
     pub sensor: SensorArgs,
-    /// Drop the bins that --rebin leaves over at the end of the gate; otherwise it must divide the
-    /// bins
+    /// Drop the bins that remain after --rebin; otherwise it must divide the number of bins
     #[arg(long)]
     pub drop_left_over: bool,
-    /// Codec: counts-u16, sqrt-u16, coarse, plain-f32 or lossless [default: counts-u16, with
+    /// Profile: counts-u16, sqrt-u16, coarse, plain-f32 or lossless [default: counts-u16, with
     /// --no-poisson sqrt-u16]
     #[arg(long, value_name = "NAME")]
     pub profile: Option<String>,
-    /// Chooses another draw of the same noise
+    /// Seed of the noise
     #[arg(long, default_value_t = 0, value_parser = super::ranges::whole)]
     pub seed: u64,
     /// Threads [default: all cores]
@@ -83,10 +81,10 @@ pub struct DatasetReprocess {
 
 #[derive(Args)]
 pub struct DatasetReport {
-    /// Folders or URLs of reconstructions, in the order in which they shall appear
+    /// Folders or URLs of reconstructions, in the order of the page
     #[arg(required = true, value_name = "PLACE", value_parser = crate::args::location::parse)]
     pub places: Vec<String>,
-    /// The page to write; the same data as JSON goes next to it
+    /// Page to write, with its data as JSON next to it
     #[arg(long, value_name = "FILE", default_value = "reconstructions.html")]
     pub out: PathBuf,
     /// Title of the page
@@ -102,7 +100,8 @@ pub struct DatasetSplit {
     /// Name of the split
     #[arg(long, default_value = "default")]
     pub name: String,
-    /// Scenes for training, validation and test, together all there are, e.g. 87688,3744,6000
+    /// Numbers of scenes for training, validation and test, in total all scenes, e.g.
+    /// 87688,3744,6000
     #[arg(long, value_name = "N,N,N", value_parser = three::<u64>, required_unless_present_any = ["fractions", "show"])]
     pub counts: Option<[u64; 3]>,
     /// Shares for training, validation and test, e.g. 0.9,0.04,0.06
@@ -124,11 +123,10 @@ pub struct DatasetExport {
     /// Folder or URL for the export
     #[arg(value_parser = crate::args::location::parse)]
     pub dest: String,
-    /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default:
-    /// all]
+    /// Scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
     #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
     pub scenes: Option<Scenes>,
-    /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves
+    /// Format: zarr (packed, 16 scenes per file), sb3d (Shoot-Bounce-3D's), webdataset or hdf5
     #[arg(long, default_value = "zarr", value_name = "NAME", value_parser = ExportFormat::parse)]
     pub format: ExportFormat,
 }
@@ -138,21 +136,21 @@ pub struct DatasetExport {
 pub struct DatasetImport {
     /// Folder with the files
     pub source: PathBuf,
-    /// Folder or URL of the data set to make, or to go on with
+    /// Folder or URL of the data set to write or continue
     #[arg(value_parser = crate::args::location::parse)]
     pub target: String,
-    /// Layout of the files: sb3d, platonerf, bf-lidar or npy [default: whichever is found]
+    /// Format of the files: sb3d, platonerf, bf-lidar or npy [default: detected]
     #[arg(long, value_name = "NAME", value_parser = Format::parse)]
     pub format: Option<Format>,
-    /// Import the scenes named in this file, one a line, in this order [default: all, by name]
+    /// File with the names of scenes to import, one per line, in order [default: all, by name]
     #[arg(long, value_name = "FILE")]
     pub list: Option<PathBuf>,
-    /// Codec: sqrt-u16, coarse, plain-f32, lossless or counts-u16
+    /// Profile: sqrt-u16, coarse, plain-f32, lossless or counts-u16
     #[arg(long, default_value = "sqrt-u16", value_name = "NAME")]
     pub profile: String,
     #[command(flatten)]
     pub options: ImportArgs,
-    /// Compare the contents of files whose scenes are there already, not only their sizes
+    /// Compare the contents of files of imported scenes, not only their sizes
     #[arg(long)]
     pub rehash: bool,
     /// Threads [default: all cores]
@@ -189,11 +187,11 @@ bf-lidar: with --captures sum, t2.mat and two_bounce_detections.mat beside the c
 /// What overrides the files, or what their format is known for.
 #[derive(Args, Clone, Default)]
 pub struct ImportArgs {
-    /// Path of light at the start of the first bin, metres (sb3d, platonerf); bf-lidar: from where
-    /// to keep bins
+    /// Optical path at the start of the first bin, metres (sb3d, platonerf), or of the first bin to
+    /// keep (bf-lidar)
     #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub gate_start_m: Option<f64>,
-    /// Width of a bin, metres of path (sb3d, platonerf, bf-lidar)
+    /// Width of a bin, metres of optical path (sb3d, platonerf, bf-lidar)
     #[arg(long, value_name = "M")]
     pub bin_width_m: Option<f64>,
     /// Number of bins to keep (bf-lidar)
@@ -202,32 +200,32 @@ pub struct ImportArgs {
     /// Horizontal field of view, degrees (sb3d, platonerf)
     #[arg(long, value_name = "DEG")]
     pub fov_deg: Option<f64>,
-    /// Metres in the unit of depth and spots (sb3d)
+    /// Unit of depth and spots, in metres (sb3d)
     #[arg(long, value_name = "M")]
     pub length_unit_m: Option<f64>,
-    /// What 1 means in the masks of visibility (sb3d)
+    /// Meaning of 1 in the visibility masks (sb3d)
     #[arg(long, value_enum)]
     pub visibility: Option<PolarityArg>,
-    /// What the depth image holds (sb3d)
+    /// Meaning of the depth image (sb3d)
     #[arg(long, value_enum)]
     pub depth: Option<DepthArg>,
-    /// Which histograms to take, of 4, 25 or 100 spots (sb3d) [default: the most]
+    /// Histograms to import: of 4, 25 or 100 spots (sb3d) [default: the most]
     #[arg(long, value_name = "N")]
     pub spots: Option<u32>,
-    /// Where the laser is, in the scan's axes: x left, y up, z forward (bf-lidar)
+    /// Position of the laser in the scan's axes: x left, y up, z forward (bf-lidar)
     #[arg(long, value_name = "X,Y,Z", value_parser = three::<f64>, allow_negative_numbers = true)]
     pub laser_m: Option<[f64; 3]>,
-    /// Time of arrival at no distance, seconds (bf-lidar)
+    /// Arrival time at zero distance, seconds (bf-lidar)
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     pub t0_s: Option<f64>,
-    /// Captures of single spots: each a scene, or all of a folder summed into one (platonerf,
+    /// Captures of single spots: one scene each, or the sum of a folder as one scene (platonerf,
     /// bf-lidar)
     #[arg(long, value_enum, default_value_t = CapturesArg::Separate)]
     pub captures: CapturesArg,
-    /// No mirror folds a beam: each goes straight from the laser to its spot (sb3d, npy)
+    /// No mirror folds a beam: each is straight from the laser to its spot (sb3d, npy)
     #[arg(long)]
     pub straight_beams: bool,
-    /// Do not check histograms against geometry; the manifest says so
+    /// Skip the check of histograms against geometry; the manifest records this
     #[arg(long)]
     pub unchecked: bool,
 }

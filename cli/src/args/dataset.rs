@@ -17,21 +17,20 @@ pub enum Dataset {
         #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
     },
-    /// Say where a scene came from: job, code version, seed, scene, parents
+    /// Show where a scene came from: job, code version, seed, source
     Show(DatasetShow),
-    /// Check a data set against its manifests; exit code 6 if anything is wrong
+    /// Check a data set against its manifests; exit code 6 if it is damaged
     Verify(DatasetVerify),
-    /// Make broken scenes again, exactly those, and restore their damaged objects
+    /// Make broken scenes again, and restore their damaged objects
     Repair(DatasetRepair),
-    /// Pin which scenes there are now, or see what was pinned
+    /// Pin the finished scenes under a name, and compare with them
     #[command(subcommand)]
     Snapshot(Snapshot),
-    /// Find objects that belong to no finished scene, left by killed workers, and delete them if
-    /// asked to
+    /// List or delete objects of killed workers that belong to no finished scene
     #[command(alias = "collect")]
     Gc(DatasetGc),
-    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set; of
-    /// reconstructions, a contact sheet
+    /// Draw a contact sheet (PNG) of a data set or of reconstructions, and light in flight (GIF) of
+    /// a data set
     Picture {
         /// Folder or URL of the data set, or of reconstructions
         #[arg(value_parser = crate::args::location::parse)]
@@ -39,21 +38,21 @@ pub enum Dataset {
         /// Folder for the pictures
         #[arg(long, default_value = ".", value_name = "DIR")]
         out: PathBuf,
-        /// Rows of the contact sheet at most
+        /// Maximum number of rows of the contact sheet
         #[arg(long, default_value_t = 8, value_parser = ranges::rows)]
         rows: usize,
     },
-    /// Write a page about reconstructions, and its data as JSON: errors of novel views next to
-    /// published ones, meshes, the best and the worst scene
+    /// Write a page about reconstructions, and its data as JSON: errors of novel views, meshes,
+    /// best and worst scene
     Report(DatasetReport),
-    /// Measure every scene with a sensor into another data set, without rendering; again to resume
+    /// Measure every scene with a sensor, into another data set, without rendering; resumes if run
+    /// again
     Reprocess(DatasetReprocess),
-    /// Pack a data set, or a part of it, into few files for sharing, or write it in the paper's
-    /// layout; again to resume
+    /// Export a data set, or a part of it, in another format; resumes if run again
     Export(DatasetExport),
-    /// Make a data set of the paper's release, of PlatoNeRF's or bounce-flash lidar captures, or of
-    /// .npy files; again to resume
+    /// Import Shoot-Bounce-3D's release, PlatoNeRF's or bounce-flash lidar captures, or .npy files;
+    /// resumes if run again
     Import(Box<DatasetImport>),
-    /// Say which scenes are for training, validation and test; again to take in scenes added since
+    /// Divide scenes into training, validation and test; run again to add new scenes
     Split(DatasetSplit),
 }

@@ -6,13 +6,12 @@ use clap::{Args, ValueEnum};
 
 #[derive(Args)]
 pub struct Demultiplex {
-    /// A Zarr group that `picofarm scene render` or `picofarm scene sense` wrote; it is only read
+    /// A Zarr group of `picofarm scene render` or `picofarm scene sense`; it is not changed
     pub render: PathBuf,
     /// Folder for the new Zarr group and picture.png (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Where the places of the spots come from: the calibration in RENDER, or each beam's own
-    /// one-bounce return
+    /// Source of the spots' places: the calibration in RENDER, or each beam's one-bounce return
     #[arg(long, value_enum, default_value_t = PlacesArg::Given)]
     pub places: PlacesArg,
     /// How shadows are judged: by a few rules, or by trees that were learnt from rendered rooms

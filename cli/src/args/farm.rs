@@ -35,8 +35,7 @@ pub struct Demo {
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
     pub assets: String,
-    /// Then reconstruct each room in 3D, from the depth and shadows of its ground truth: meshes,
-    /// errors, pictures
+    /// Also reconstruct each room in 3D, from the depth and shadows of its ground truth
     #[arg(long)]
     pub reconstruct: bool,
     #[command(flatten)]
@@ -54,8 +53,8 @@ pub struct Up {
     /// Workers to start; they share the cores
     #[arg(long, default_value_t = 1, value_parser = ranges::workers)]
     pub workers: usize,
-    /// Graphics processors, dealt to the workers in turn: how many, or which, as `picofarm model
-    /// devices` names them
+    /// Graphics processors, divided among the workers: a number, or names from `picofarm model
+    /// devices`
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
     #[command(flatten)]
@@ -68,8 +67,7 @@ pub struct Up {
 
 #[derive(Args)]
 pub struct Coordinator {
-    /// The catalog: a SQLite file, for one coordinator, or the URL of a Postgres database, for
-    /// several
+    /// Catalog: a SQLite file for one coordinator, or the URL of a Postgres database for several
     #[arg(
         long,
         default_value = "picofarm-data/catalog.sqlite",
@@ -81,15 +79,15 @@ pub struct Coordinator {
     /// Address to listen on (port 0 = any free port; the address is printed)
     #[arg(long, default_value = "127.0.0.1:7420", value_name = "ADDR")]
     pub listen: SocketAddr,
-    /// Lease time to live in seconds
+    /// Seconds until a lease ends that its worker does not renew
     #[arg(long, default_value_t = 60.0, value_name = "S", value_parser = ranges::lease)]
     pub lease_s: f64,
-    /// Forget jobs this many days after their end, with their history; results stay in their stores
+    /// Remove jobs and their history this many days after their end; results remain in their stores
     /// [default: never]
     #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
-    /// Verify results in stores below this path or URL (give it again for more), or in none
-    /// [default: in folders of this machine; no host is asked]
+    /// Verify results in stores below this path or URL, or in none; may be repeated [default:
+    /// folders of this machine]
     #[arg(
         long,
         value_name = "URL|none",
@@ -107,8 +105,8 @@ pub struct Coordinator {
 
 #[derive(Args)]
 pub struct Traces {
-    /// Send traces to an OpenTelemetry collector by OTLP over gRPC, e.g. http://127.0.0.1:4317
-    /// [default: nowhere]
+    /// OpenTelemetry collector for traces, by OTLP over gRPC, e.g. http://127.0.0.1:4317 [default:
+    /// none]
     #[arg(
         long,
         value_name = "URL",
@@ -132,54 +130,53 @@ impl Traces {
 
 #[derive(Args)]
 pub struct Http {
-    /// Serve /healthz, /readyz and /metrics here over plain HTTP, e.g. 127.0.0.1:7421 (port 0 = any
-    /// free port; the address is printed). Counts only, no names; whoever reaches the address may
-    /// read them without a token [default: nowhere]
+    /// Serve /healthz, /readyz and /metrics at this address over plain HTTP, without a token, e.g.
+    /// 127.0.0.1:7421 (port 0 = any free port) [default: off]
     #[arg(long, value_name = "ADDR", env = "PICOFARM_HTTP")]
     pub http: Option<SocketAddr>,
 }
 
 #[derive(Subcommand)]
 pub enum Workers {
-    /// Tell a worker to finish the task in hand, give the rest back, and end
+    /// Let a worker finish its current task, return the others, and exit
     Drain {
-        /// Its name or id
+        /// Name or id of the worker
         worker: String,
     },
 }
 
 #[derive(Args)]
 pub struct Worker {
-    /// Name, for people [default: host name and process id]
+    /// Name of the worker [default: host name and process id]
     #[arg(long)]
     pub name: Option<String>,
     /// Threads to render with [default: all cores]
     #[arg(long, value_parser = ranges::threads)]
     pub threads: Option<usize>,
-    /// Memory that tasks may take, GiB [default: three quarters of what this machine, its control
-    /// group, the Slurm job and ulimit -v leave]
+    /// Memory for tasks, GiB [default: three quarters of the least of machine, control group, Slurm
+    /// job and ulimit -v]
     #[arg(long, value_name = "GIB", value_parser = ranges::gib)]
     pub memory_gib: Option<f64>,
-    /// Graphics processors it may use: how many, or which, as `picofarm model devices` names them
-    /// (cuda:0,cuda:1). Each is tried before it is used
+    /// Graphics processors to use: a number, or names from `picofarm model devices`
+    /// (cuda:0,cuda:1). Each is tested first
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
-    /// Address of this machine at which other workers reach this one, to train a network together
-    /// (`train.processes`); whoever reaches it and can read the store can join
+    /// Address at which other workers reach this one to train a network together
+    /// (`train.processes`). Any process that reaches it and can read the store can join
     #[arg(long, value_name = "HOST[:PORT]", default_value = "127.0.0.1")]
     pub peers: String,
-    /// Label that stages may ask for (give it again for more)
+    /// Label that a stage can require; may be repeated
     #[arg(long, value_name = "LABEL")]
     pub label: Vec<String>,
-    /// End after this many seconds without work [default: never]
+    /// Exit after this many seconds without work [default: never]
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=1_000_000_000))]
     pub exit_idle_s: Option<u64>,
-    /// Stop work then and give the rest back: a time such as 2026-12-01T18:00:00Z, or a duration
-    /// such as 3h 50m. The coordinator grants only what the worker can finish by then [default: a
-    /// minute before the end of the Slurm job (SLURM_JOB_END_TIME); otherwise never]
+    /// Exit at a time such as 2026-12-01T18:00:00Z, or after a duration such as 3h 50m. The worker
+    /// only gets tasks that should finish before it [default: a minute before the end of the Slurm
+    /// job (SLURM_JOB_END_TIME), otherwise never]
     #[arg(long, value_name = "TIME|DURATION", env = "PICOFARM_END_AT", value_parser = crate::args::end_time::parse)]
     pub end_at: Option<crate::args::end_time::EndAt>,
-    /// Touch only stores in this path or URL (give it again for more) [default: anything]
+    /// Use only stores in this path or URL; may be repeated [default: any]
     #[arg(long, value_name = "URL", value_parser = crate::args::location::parse)]
     pub store_prefix: Vec<String>,
     #[command(flatten)]

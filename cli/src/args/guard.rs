@@ -8,7 +8,7 @@ use picofarm_coordinator::auth::{Expiry, Role, Visibility};
 /// TLS, tokens and limits of a coordinator.
 #[derive(Args)]
 pub struct Guard {
-    /// Certificate (PEM) to show to clients and workers, who then use https://
+    /// Certificate (PEM) of this coordinator; clients and workers then use https://
     #[arg(
         long,
         value_name = "FILE",
@@ -24,7 +24,7 @@ pub struct Guard {
         env = "PICOFARM_TLS_KEY"
     )]
     pub tls_key: Option<PathBuf>,
-    /// Mutual TLS: clients and workers must show a certificate signed by one of these (PEM)
+    /// Require client certificates that one of these authorities (PEM) signed
     #[arg(
         long,
         value_name = "FILE",
@@ -32,19 +32,19 @@ pub struct Guard {
         env = "PICOFARM_CLIENT_CA"
     )]
     pub client_ca: Option<PathBuf>,
-    /// Who may do what (see `picofarm token`); read again whenever it changes
+    /// File with tokens and their roles (see `picofarm token`), read again when it changes
     #[arg(long, value_name = "FILE", env = "PICOFARM_TOKENS")]
     pub tokens: Option<PathBuf>,
-    /// Go without TLS or without tokens where they are wanted
+    /// Allow to run without TLS or tokens where they are required
     #[arg(long)]
     pub allow_insecure: bool,
-    /// Jobs of one caller that have not ended, at most
+    /// Maximum number of active jobs of one caller
     #[arg(long, value_name = "N", default_value_t = 1_000, value_parser = super::ranges::at_least_one)]
     pub max_jobs_per_user: usize,
-    /// Priorities beyond this, above or below 0, are an administrator's
+    /// Maximum priority, above or below 0, without the role of an administrator
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub max_priority: u32,
-    /// What callers see of others' jobs: all, those of their projects (project), or nothing (own);
+    /// Jobs of others that callers see: all, those of their projects (project), or none (own);
     /// administrators see all
     #[arg(
         long,
@@ -53,24 +53,24 @@ pub struct Guard {
         env = "PICOFARM_VISIBILITY"
     )]
     pub visibility: Visibility,
-    /// Keep lines of the audit log (see `picofarm audit`) this many days
+    /// Days to keep entries of the audit log (see `picofarm audit`)
     #[arg(long, value_name = "DAYS", default_value_t = 365)]
     pub audit_days: u32,
-    /// Tasks of one job, at most
+    /// Maximum number of tasks of one job
     #[arg(long, value_name = "N", default_value_t = 10_000_000, value_parser = clap::value_parser!(u64).range(1..))]
     pub max_tasks_per_job: u64,
-    /// Workers connected at a time, at most
+    /// Maximum number of workers connected at a time
     #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = super::ranges::at_least_one)]
     pub max_sessions: usize,
-    /// Connections at a time, at most; never more than the limit of open files allows
+    /// Maximum number of connections at a time; fewer if the limit of open files is lower
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = super::ranges::at_least_one)]
     pub max_connections: usize,
-    /// Connections of one address at a time, at most; of IPv6, one /64 network [default: three
-    /// quarters of all]
+    /// Maximum number of connections of one address, or of one /64 network of IPv6, at a time
+    /// [default: three quarters of all]
     #[arg(long, value_name = "N", value_parser = super::ranges::at_least_one)]
     pub max_connections_per_address: Option<usize>,
-    /// Memory that this process may use, MiB: what requests, jobs and connections may take follows
-    /// from it [default: the limit of its control group or of the machine, 4096 at most]
+    /// Memory that this process may use, MiB; it bounds requests, jobs and connections [default:
+    /// the limit of its control group or machine, 4096 at most]
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(128..=1 << 30), env = "PICOFARM_MEMORY_MIB")]
     pub memory_mib: Option<u64>,
 }
@@ -78,36 +78,35 @@ pub struct Guard {
 /// What can be done with the token file.
 #[derive(Subcommand)]
 pub enum Token {
-    /// Make a token and print it, once: only its SHA-256 is kept
+    /// Create a token and print it once; the file keeps only its SHA-256
     Create {
-        /// Who it is for: jobs and workers carry this name
+        /// Name of the owner, which jobs and workers carry
         #[arg(long)]
         name: String,
-        /// What it may do: view, submit, work, admin
+        /// Roles: view, submit, work, admin
         #[arg(long, value_name = "ROLES", value_delimiter = ',', required = true)]
         role: Vec<Role>,
-        /// Projects that it may name in its jobs (`project = "NAME"`)
+        /// Projects that its jobs may name (`project = "NAME"`)
         #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
         member: Vec<String>,
-        /// Projects all of whose jobs it may cancel, pause, resume and retry
+        /// Projects in which it may cancel, pause, resume and retry all jobs
         #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
         maintainer: Vec<String>,
-        /// When it expires: a time from now (90d, 12h), a date (2027-03-01, its beginning in UTC),
-        /// or e.g. 2027-03-01T08:00:00Z [default: never]
+        /// Expiry: a time from now (90d, 12h), a date (its beginning in UTC), or e.g.
+        /// 2027-03-01T08:00:00Z [default: never]
         #[arg(long, value_name = "TIME", value_parser = expiry)]
         expires: Option<Expiry>,
         #[command(flatten)]
         file: TokenFile,
     },
-    /// List who has access, and until when
+    /// List names, roles and expiry
     List {
         #[command(flatten)]
         file: TokenFile,
     },
-    /// Take someone's access away, and ask the coordinators that --coordinator names whether they
-    /// refuse it now
+    /// Remove a token, and ask each coordinator in --coordinator whether it refuses it now
     Revoke {
-        /// Whose
+        /// Name of the token
         name: String,
         #[command(flatten)]
         file: TokenFile,
@@ -134,10 +133,10 @@ pub struct TokenFile {
 /// Which part of the audit log.
 #[derive(Args)]
 pub struct Audit {
-    /// Only acts of this caller
+    /// Only entries of this caller
     #[arg(long, value_name = "NAME")]
     pub who: Option<String>,
-    /// Only acts on this job: its whole id, as in the log; it may be forgotten by now
+    /// Only entries of this job, by its whole id
     #[arg(long, value_name = "ID")]
     pub job: Option<String>,
     /// Only the last N lines

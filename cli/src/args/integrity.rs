@@ -10,13 +10,13 @@ pub struct DatasetVerify {
     /// Folder or URL of the data set
     #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
-    /// Manifests and sizes only; otherwise every object is hashed and decoded
+    /// Check manifests and sizes only; otherwise every object is hashed and decoded
     #[arg(long)]
     pub fast: bool,
-    /// Expect every scene that there is room for: one that is not finished is a problem
+    /// Count unfinished scenes as problems
     #[arg(long)]
     pub complete: bool,
-    /// Check the scenes of this snapshot alone, which must be as they were then
+    /// Check only the scenes of this snapshot, against the snapshot
     #[arg(long, value_name = "NAME", conflicts_with = "complete")]
     pub snapshot: Option<String>,
 }
@@ -26,25 +26,25 @@ pub struct DatasetRepair {
     /// Folder or URL of the data set
     #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
-    /// Compare manifests and sizes only; this does not find a flipped bit
+    /// Check manifests and sizes only; this misses flipped bits
     #[arg(long)]
     pub fast: bool,
-    /// Make the scenes that are not finished, too
+    /// Also make unfinished scenes
     #[arg(long)]
     pub complete: bool,
-    /// Bring the scenes of this snapshot back to what they were then, and no others
+    /// Restore only the scenes of this snapshot, as they were then
     #[arg(long, value_name = "NAME", conflicts_with = "complete")]
     pub snapshot: Option<String>,
     /// List the damage and its repair; change nothing
     #[arg(long)]
     pub dry_run: bool,
-    /// The job that made the data set, where the data set does not say itself how
+    /// Job file that made the data set, if the data set has no recipe
     #[arg(long, value_name = "FILE")]
     pub job: Option<PathBuf>,
-    /// Where the data set is now that this one was reprocessed from
+    /// Data set that this one was reprocessed from, if it moved
     #[arg(long, value_name = "DATASET", value_parser = crate::args::location::parse)]
     pub source: Option<String>,
-    /// Where the files are that the data set was imported from
+    /// Folder with the files that the data set was imported from
     #[arg(long, value_name = "DIR")]
     pub files: Option<PathBuf>,
     /// Threads [default: all cores]
@@ -57,16 +57,16 @@ pub struct DatasetGc {
     /// Folder or URL of the data set
     #[arg(value_parser = crate::args::location::parse)]
     pub dataset: String,
-    /// Keep younger objects, e.g. 90m, 24h or 7d; a worker may still be writing them
+    /// Keep younger objects, because a worker may still be writing them, e.g. 90m, 24h or 7d
     #[arg(long, default_value = "24h", value_name = "AGE", value_parser = age)]
     pub older_than: Duration,
-    /// Delete them; otherwise only say what would be deleted
+    /// Delete the objects; otherwise they are only listed
     #[arg(long)]
     pub delete: bool,
-    /// Only say what would be deleted, which is what happens without --delete
+    /// Only list the objects, as without --delete
     #[arg(long, conflicts_with = "delete")]
     pub dry_run: bool,
-    /// Allow ages under an hour: no worker runs on this data set now, nor will until this ends
+    /// Allow ages under an hour, because no worker runs on this data set
     #[arg(long)]
     pub nothing_runs: bool,
 }
@@ -83,7 +83,7 @@ pub struct DatasetShow {
 
 #[derive(Subcommand)]
 pub enum Snapshot {
-    /// Pin the finished scenes under a name, for good
+    /// Pin the finished scenes under a name
     Create {
         /// Folder or URL of the data set
         #[arg(value_parser = crate::args::location::parse)]
@@ -97,7 +97,7 @@ pub enum Snapshot {
         #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
     },
-    /// Say what a snapshot pins
+    /// Show the scenes of a snapshot
     Show {
         /// Folder or URL of the data set
         #[arg(value_parser = crate::args::location::parse)]
@@ -105,25 +105,25 @@ pub enum Snapshot {
         /// Name of the snapshot
         name: String,
     },
-    /// Check that the scenes of a snapshot are as they were; exit code 6 if not
+    /// Check that the scenes of a snapshot are unchanged; exit code 6 if not
     Verify {
         /// Folder or URL of the data set
         #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
         /// Name of the snapshot
         name: String,
-        /// Manifests and sizes only; otherwise every object is hashed and decoded
+        /// Check manifests and sizes only; otherwise every object is hashed and decoded
         #[arg(long)]
         fast: bool,
     },
-    /// Say which scenes differ between a snapshot and another, or the data set as it is now
+    /// List scenes that differ between a snapshot and another, or the current data set
     Diff {
         /// Folder or URL of the data set
         #[arg(value_parser = crate::args::location::parse)]
         dataset: String,
         /// Name of the first snapshot
         from: String,
-        /// Name of the second snapshot [default: the data set as it is now]
+        /// Name of the second snapshot [default: the current data set]
         to: Option<String>,
     },
 }

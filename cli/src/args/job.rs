@@ -10,51 +10,50 @@ pub enum Job {
     Init {
         /// Where to write it [default: job.toml; with --kind, KIND.toml]
         file: Option<PathBuf>,
-        /// What kind of job
+        /// Kind of job
         #[arg(long, value_enum)]
         kind: Option<JobKind>,
     },
-    /// Say what a submission would run and what it would reuse; changes nothing
+    /// Show what a submission would run and reuse; changes nothing
     Plan {
         /// The job file
         file: PathBuf,
-        /// Which of the sizes that the file has: the values of its [scale.NAME]
+        /// Use the values of the file's [scale.NAME]
         #[arg(long, value_name = "NAME")]
         scale: Option<String>,
     },
-    /// Submit a job file; the same file again answers with the same job
+    /// Submit a job file; the same file again returns the same job
     Submit {
         /// The job file
         file: PathBuf,
-        /// Which of the sizes that the file has: the values of its [scale.NAME]
+        /// Use the values of the file's [scale.NAME]
         #[arg(long, value_name = "NAME")]
         scale: Option<String>,
         /// Follow the job until it ends
         #[arg(long)]
         watch: bool,
-        /// Submit again although the same job failed or was cancelled
+        /// Submit again after the same job failed or was cancelled
         #[arg(long, conflicts_with = "only_failed")]
         again: bool,
-        /// Only the tasks that were given up when this file was submitted before: the same as `job
-        /// retry`
+        /// Run only the dead tasks of the job of this file, as `job retry` does
         #[arg(long, conflicts_with_all = ["force", "from_stage"])]
         only_failed: bool,
-        /// Run every task although its result exists; each must come out the same, byte for byte
+        /// Run every task again; each result must equal the existing one, byte for byte
         #[arg(long, conflicts_with = "from_stage")]
         force: bool,
-        /// The same for this stage and those that need it
+        /// Run this stage and those that need it again, with the same condition
         #[arg(long, value_name = "NAME")]
         from_stage: Option<String>,
     },
     /// List jobs, the latest first
     List {
-        /// How many at most
+        /// Maximum number of jobs to list
         #[arg(long, default_value_t = 50, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
         limit: u32,
-        /// Go on where an earlier list ended
+        /// Continue where an earlier list ended
         #[arg(long, value_name = "TOKEN")]
         page: Option<String>,
-        /// Only jobs that stand so
+        /// Only jobs in this state
         #[arg(long, value_name = "STATE")]
         state: Option<ListedState>,
         /// Only jobs of this user
@@ -79,28 +78,28 @@ pub enum Job {
         #[arg(long, value_name = "S", value_parser = super::ranges::seconds)]
         timeout_s: Option<f64>,
     },
-    /// Stop a job; what it finished stays
+    /// Cancel a job; its finished results remain
     Cancel {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Hold a job: what runs goes on, nothing else is begun
+    /// Pause a job: running tasks continue, and no other task starts
     Pause {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Let a held job go on
+    /// Continue a paused job
     Resume {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Make a job's dead tasks pending again; with corrected scene files, in a new job that takes
-    /// over the finished scenes
+    /// Run a job's dead tasks again. After a correction of scene files, a new job takes over the
+    /// finished scenes
     Retry {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Show what happened to a job, or to one of its tasks and what it logged on its worker
+    /// Show the history of a job, or of one of its tasks with its log on the worker
     Logs {
         /// Job id, or the first letters of one
         job: String,
@@ -113,14 +112,14 @@ pub enum Job {
         /// Only the last N lines
         #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
         last: u32,
-        /// Go on showing what happens, until the job ends or Ctrl-C
+        /// Follow until the job ends, or until Ctrl-C
         #[arg(long, short)]
         follow: bool,
-        /// What tasks logged on their workers, too; with --task it is always shown
+        /// Also show what tasks logged on their workers; implied by --task
         #[arg(long, short)]
         verbose: bool,
     },
-    /// Say why a job does not run, or why one of its tasks was run, run again or reused
+    /// Explain why a job does not run, or why one of its tasks ran, ran again or was reused
     Explain {
         /// Job id, or the first letters of one
         job: String,

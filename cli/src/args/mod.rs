@@ -95,13 +95,13 @@ Exit codes:
 #[derive(Args, Clone)]
 #[command(next_help_heading = "Global options")]
 pub struct Global {
-    /// Print machine-readable JSON (one document; one a line where a command streams)
+    /// Print JSON: one document, or one per line from commands that stream
     #[arg(long, global = true)]
     pub json: bool,
-    /// Settings file [default: picofarm.toml here, else in the user's configuration folder]
+    /// Settings file [default: picofarm.toml in this folder or in the user's configuration folder]
     #[arg(long, global = true, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// URL of the coordinator; of several on one catalog, with commas between [env:
+    /// URL of the coordinator; several on one catalog, separated by commas [env:
     /// PICOFARM_COORDINATOR]
     #[arg(long, global = true, value_name = "URL")]
     pub coordinator: Option<String>,
@@ -112,14 +112,13 @@ pub struct Global {
     /// PICOFARM_CA]
     #[arg(long, global = true, value_name = "FILE")]
     pub ca: Option<PathBuf>,
-    /// Own certificate for coordinators that want one, PEM [env: PICOFARM_CERT]
+    /// Client certificate, PEM, for coordinators that require one [env: PICOFARM_CERT]
     #[arg(long, global = true, value_name = "FILE")]
     pub cert: Option<PathBuf>,
     /// Private key of --cert, PEM [env: PICOFARM_KEY]
     #[arg(long, global = true, value_name = "FILE")]
     pub key: Option<PathBuf>,
-    /// File with the token that proves who you are; or set PICOFARM_TOKEN [env:
-    /// PICOFARM_TOKEN_FILE]
+    /// File with your token; PICOFARM_TOKEN gives the token itself [env: PICOFARM_TOKEN_FILE]
     #[arg(long, global = true, value_name = "FILE")]
     pub token_file: Option<PathBuf>,
     /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
@@ -144,7 +143,7 @@ impl Command {
 
 #[derive(Subcommand)]
 pub enum Command {
-    /// Render a small furnished-room data set end to end on this machine, and show it
+    /// Render a few furnished rooms on this machine, verify them and draw pictures
     Demo(Demo),
     /// Run a coordinator and workers on this machine until stopped
     Up(Up),
@@ -158,52 +157,52 @@ pub enum Command {
     /// Write, plan, submit and follow jobs
     #[command(subcommand)]
     Job(Job),
-    /// List the workers connected to the coordinator, or tell one to end
+    /// List the connected workers, or stop one
     Workers {
         #[command(subcommand)]
         what: Option<Workers>,
     },
-    /// Show what happened, of all jobs
+    /// Show the history of all jobs
     Events {
-        /// Go on showing what happens, until Ctrl-C
+        /// Follow until Ctrl-C
         #[arg(long, short)]
         follow: bool,
-        /// The last N lines before now
+        /// Only the last N lines
         #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
         last: u32,
-        /// What tasks logged on their workers, too
+        /// Also show what tasks logged on their workers
         #[arg(long, short)]
         verbose: bool,
     },
-    /// Look at data sets, check them, and make others of them
+    /// Inspect, check, copy and convert data sets
     #[command(subcommand)]
     Dataset(Dataset),
-    /// Look at trained models, and take their weights out
+    /// Inspect, check, export and import trained models
     #[command(subcommand)]
     Model(Model),
-    /// Look at sweeps: how their trials fare, which is the best, which values to try next
+    /// Inspect sweeps, and add trials to them
     #[command(subcommand)]
     Sweep(Sweep),
-    /// Make, inspect and render single scenes
+    /// Generate, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),
-    /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm: mesh, density
-    /// and errors
+    /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm
     Reconstruct(Reconstruct),
-    /// Take one flash apart by physics: depth, and which pixels each spot lights, from the
-    /// histogram of all spots at once
+    /// Compute depth, and the pixels that each spot lights, from the histogram of all spots, by
+    /// physics
     Demultiplex(Demultiplex),
-    /// Say who may use a coordinator
+    /// Manage who may use a coordinator
     #[command(subcommand)]
     Token(Token),
-    /// Show who submitted, stopped, held, retried or drained what, or tried to; for administrators
+    /// Show the audit log, for administrators: who submitted, stopped, paused, retried or drained
+    /// what
     Audit(Audit),
-    /// Furniture for generated rooms
+    /// Install and list furniture for generated rooms
     #[command(subcommand)]
     Assets(Assets),
-    /// Show the settings in force and where each comes from
+    /// Show each setting and its source
     Config,
-    /// Check this machine: store, disk, coordinator, furniture
+    /// Check this machine: memory, disk, store, furniture, graphics processors, coordinator
     Doctor(Doctor),
     /// Print completions for a shell
     Completions {
@@ -214,15 +213,15 @@ pub enum Command {
 
 #[derive(Subcommand)]
 pub enum Assets {
-    /// Fetch Sweet Home 3D's furniture (Debian package, 120 MB) into the assets folder
+    /// Download Sweet Home 3D's furniture (Debian package, 120 MB) into the assets folder
     Install,
-    /// Say which furniture is installed
+    /// List the installed furniture
     List,
 }
 
 #[derive(Args)]
 pub struct Doctor {
-    /// Store to check, which is not made if it does not exist [default: the current folder]
+    /// Store to check; it is not created
     #[arg(long, default_value = ".", value_name = "PATH_OR_URL", value_parser = crate::args::location::parse)]
     pub store: String,
 }

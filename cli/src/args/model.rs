@@ -21,16 +21,16 @@ A removal that was interrupted goes on with the same command. It says what remai
 
 #[derive(Subcommand)]
 pub enum Model {
-    /// List the models of a store, those that are still trained, too
+    /// List the models of a store, including trainings in progress
     List {
-        /// Folder or URL of the store (in which data sets lie)
+        /// Folder or URL of the store
         #[arg(value_parser = crate::args::location::parse)]
         store: String,
     },
-    /// List this machine's graphics processors, and try each: a product, a convolution and its
-    /// gradients against the CPU's
+    /// List this machine's graphics processors, and compare a product, a convolution and gradients
+    /// with the CPU's
     Devices,
-    /// Show a model: its network, origin and quality
+    /// Show a model: network, origin, figures
     Show {
         /// Folder or URL of the store
         #[arg(value_parser = crate::args::location::parse)]
@@ -38,7 +38,7 @@ pub enum Model {
         /// Name of the model
         name: String,
     },
-    /// Write a model's weights to a file (safetensors), which PyTorch reads too
+    /// Export a model's weights as safetensors, which PyTorch reads
     Export {
         /// Folder or URL of the store
         #[arg(value_parser = crate::args::location::parse)]
@@ -49,8 +49,7 @@ pub enum Model {
         #[arg(long, value_name = "FILE")]
         out: Option<PathBuf>,
     },
-    /// Take a network that was trained elsewhere into a store: weights by PyTorch's names, as
-    /// safetensors
+    /// Import weights that were trained elsewhere: safetensors with PyTorch's names
     #[command(after_help = IMPORT_HELP)]
     Import {
         /// Folder or URL of the store
@@ -60,58 +59,57 @@ pub enum Model {
         name: String,
         /// The weights (safetensors)
         file: PathBuf,
-        /// Data set of the store whose histograms the network knows: its bins, gate and spots
+        /// Data set of the store with the network's bins, gate and spots
         #[arg(long, value_name = "FOLDER")]
         dataset: String,
-        /// What the network is: a TOML file with the fields of [stage.train] (target, net, input,
-        /// shadow, histogram, …)
+        /// TOML file with the fields of [stage.train] that describe the network (target, net,
+        /// input, shadow, histogram, …)
         #[arg(long, value_name = "FILE")]
         settings: PathBuf,
     },
-    /// Check models: manifest, size and SHA-256 of each object, evaluations, checkpoints (exit code
-    /// 6 where something is broken)
+    /// Check manifests, objects, evaluations and checkpoints of models; exit code 6 if one is
+    /// damaged
     Verify {
         /// Folder or URL of the store
         store: String,
         /// Names of models [default: all]
         names: Vec<String>,
     },
-    /// Restore damaged objects of a model, from bytes that have the recorded SHA-256; say which job
-    /// makes the rest again
+    /// Restore damaged objects of a model from equal bytes; name the job that makes the rest again
     #[command(after_help = REPAIR_HELP)]
     Repair {
         /// Folder or URL of the store
         store: String,
         /// Name of the model
         name: String,
-        /// Only say what would be done
+        /// Only list what would be done
         #[arg(long)]
         dry_run: bool,
     },
-    /// Delete a model: its manifest first, then its objects, evaluations and checkpoints
+    /// Delete a model with its evaluations and checkpoints
     #[command(after_help = REMOVE_HELP)]
     Remove {
         /// Folder or URL of the store
         store: String,
         /// Name of the model
         name: String,
-        /// Also where models or predictions build on it, its manifest cannot be read, or it is
-        /// still trained
+        /// Delete it even if models or predictions depend on it, its manifest is unreadable, or its
+        /// training runs
         #[arg(long)]
         force: bool,
-        /// Only say what would be deleted, and what builds on it
+        /// Only list what would be deleted, and what depends on it
         #[arg(long)]
         dry_run: bool,
     },
-    /// Write a page about models, and its data as JSON: figures next to trivial answers and
-    /// published ones, curves, pictures, speed against error
+    /// Write a page about models, and its data as JSON: figures next to trivial and published ones,
+    /// curves, pictures
     Report {
         /// Folder or URL of the store
         #[arg(value_parser = crate::args::location::parse)]
         store: String,
-        /// Names of models; a name that ends with * means all that begin so [default: all]
+        /// Names of models; NAME* means all that begin with NAME [default: all]
         names: Vec<String>,
-        /// The page to write; the same data as JSON goes next to it
+        /// Page to write, with its data as JSON next to it
         #[arg(long, value_name = "FILE", default_value = "report.html")]
         out: PathBuf,
         /// Title of the page

@@ -12,8 +12,7 @@ pub struct Reconstruct {
     pub file: PathBuf,
     #[command(flatten)]
     pub input: SceneInput,
-    /// Folder for mesh.glb, mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not
-    /// exist, or be empty)
+    /// Folder for the results (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and
@@ -23,8 +22,7 @@ pub struct Reconstruct {
     pub spots_from: SpotsFrom,
     #[command(flatten)]
     pub networks: NetworksArgs,
-    /// What becomes the room's density: a grid, in seconds; or PlatoNeRF's networks, the grid's
-    /// oracle, in hours and more
+    /// Form of the density: a grid, in seconds, or PlatoNeRF's networks, in hours
     #[arg(long, value_enum, default_value_t = FieldArg::Grid)]
     pub field: FieldArg,
     #[command(flatten)]
@@ -35,17 +33,17 @@ pub struct Reconstruct {
     /// Nodes of the density grid along its longest side
     #[arg(long, default_value_t = 192, value_name = "N", conflicts_with = "fine", value_parser = clap::value_parser!(u32).range(16..=512))]
     pub nodes: u32,
-    /// A grid of 256 nodes: a finer mesh, at one and a half times the time
+    /// Use a grid of 256 nodes, which takes one and a half times as long
     #[arg(long)]
     pub fine: bool,
-    /// Leave out what closes the room by planes where the camera does not look
+    /// Do not close the room by planes outside the view
     #[arg(long)]
     pub no_planes: bool,
-    /// Go on where the measurements contradict one another: the result states how
+    /// Continue if the measurements contradict one another; the result records it
     #[arg(long)]
     pub accept_inconsistent: bool,
-    /// Novel views to measure errors in: a circle in the middle of the scene, or PlatoNeRF's 139 in
-    /// its room
+    /// Novel views for the errors: a circle in the middle of the scene, or PlatoNeRF's 139 in its
+    /// room
     #[arg(long, value_enum, default_value_t = ViewsArg::Around)]
     pub views: ViewsArg,
     /// Camera paths per pixel of the captures, for three bounces and more
@@ -66,7 +64,7 @@ pub struct Reconstruct {
 /// What belongs to `--spots-from predictions` alone.
 #[derive(Args)]
 pub struct NetworksArgs {
-    /// Store with the models: a folder or URL, as `picofarm model list` takes it
+    /// Folder or URL of the store with the models
     #[arg(long, value_name = "STORE")]
     pub models: Option<String>,
     /// Model that predicts depth
@@ -75,8 +73,7 @@ pub struct NetworksArgs {
     /// Model that predicts which pixels each spot lights
     #[arg(long, value_name = "NAME")]
     pub shadow: Option<String>,
-    /// Model that predicts mirrors, whose pixels are left out [default: none, mirrors are not
-    /// known]
+    /// Model that predicts mirrors, whose pixels are left out [default: none]
     #[arg(long, value_name = "NAME")]
     pub specular: Option<String>,
 }
@@ -84,7 +81,7 @@ pub struct NetworksArgs {
 /// A detector for `--spots-from captures`; without any of these, the sensor is perfect.
 #[derive(Args)]
 pub struct DetectorArgs {
-    /// Count photons: so many in the brightest bin of the median pixel of each capture
+    /// Count photons, this many in the brightest bin of the median pixel of each capture
     #[arg(long, value_name = "N", value_parser = super::ranges::photons)]
     pub photons: Option<f64>,
     /// Ambient photons in each bin of each pixel, in addition to --photons
@@ -95,17 +92,17 @@ pub struct DetectorArgs {
 /// What belongs to `--field mlp` alone.
 #[derive(Args)]
 pub struct MlpArgs {
-    /// Steps of the networks, an eighth of them on distances alone; the paper takes 200000
+    /// Steps of the networks, an eighth of them on distances alone; PlatoNeRF has 200000
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=100_000_000))]
     pub steps: Option<u32>,
     /// Width of the networks' layers [default: 256]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=1024))]
     pub width: Option<u32>,
-    /// Rays of a step of the networks [default: 1024]
+    /// Rays per step of the networks [default: 1024]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     pub batch: Option<u32>,
-    /// How the networks compare light with shadow masks: the paper's squares, or cross-entropy
-    /// [default: squares]
+    /// Loss of the networks on shadow masks: PlatoNeRF's squares, or cross-entropy [default:
+    /// squares]
     #[arg(long, value_enum)]
     pub shadow_loss: Option<ShadowLossArg>,
 }

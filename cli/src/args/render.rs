@@ -23,7 +23,7 @@ pub struct RenderArgs {
     /// [default: the scene's own]
     #[arg(long, value_name = "PX|WxH", value_parser = resolution)]
     pub resolution: Option<Resolution>,
-    /// Render until the median per-pixel error falls to this share, e.g. 10%
+    /// Render until the median error of a pixel is this share, e.g. 10%
     #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::model::parse_share)]
     pub error: Option<f64>,
     /// Camera paths per pixel [default: 64]
@@ -35,16 +35,16 @@ pub struct RenderArgs {
     /// Longest path in bounces [default: until the gate ends]
     #[arg(long)]
     pub max_bounces: Option<u32>,
-    /// Histograms of subsets of the spots too, from the same rays: 4 and 25 of a 10x10 grid, or
+    /// Also write histograms of some spots, from the same rays: 4 or 25 of a 10x10 grid, or
     /// per-spot for each beam
     #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::args::groups::parse)]
     pub groups: Vec<Group>,
-    /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given
-    /// several times
+    /// Also write a histogram of these beams, counted from 0, as array transient_NAME; may be
+    /// repeated
     #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::args::groups::parse_named)]
     pub group: Vec<Named>,
-    /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the
-    /// renderer chooses by the scene]
+    /// Choose techniques by hand, e.g. path-reuse=1,mirror-images=off [default: chosen by the
+    /// scene]
     #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::args::strategy::parse)]
     pub strategy: Vec<Chosen>,
     #[command(flatten)]
@@ -52,7 +52,7 @@ pub struct RenderArgs {
     /// Share of each pixel's area that is sensitive, a square in its middle [default: 1]
     #[arg(long, value_name = "SHARE")]
     pub fill_factor: Option<f64>,
-    /// Wavelength of the laser, nanometres [default: the one that the scene's reflectances are of]
+    /// Wavelength of the laser, nanometres [default: that of the scene's reflectances]
     #[arg(long, value_delimiter = ',', value_name = "NM")]
     pub wavelengths_nm: Vec<f64>,
     /// Threads [default: all cores]
@@ -116,14 +116,13 @@ fn gate_choice(text: &str) -> Result<GateChoice, String> {
 /// How wide the laser's beams are.
 #[derive(Args)]
 pub struct BeamArgs {
-    /// Diameter of the laser's beams where they leave it, millimetres, 1/e² of the intensity
-    /// [default: 0; without it and --beam-divergence-mrad beams have no width]
+    /// Diameter of the beams at the laser, millimetres, at 1/e² of the intensity [default: 0]
     #[arg(long, value_name = "MM")]
     pub beam_diameter_mm: Option<f64>,
-    /// Divergence of the beams, full angle, milliradians, 1/e² of the intensity [default: 0]
+    /// Divergence of the beams, full angle, milliradians, at 1/e² of the intensity [default: 0]
     #[arg(long, value_name = "MRAD")]
     pub beam_divergence_mrad: Option<f64>,
-    /// Rays that stand for a beam that has a width [default: 16]
+    /// Rays per beam with a width [default: 16]
     #[arg(long, value_name = "N")]
     pub beam_points: Option<u32>,
 }
@@ -150,12 +149,12 @@ pub struct SceneRender {
     /// Folder for the Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Keep two-bounce and 3+ parts and their errors: arrays two, multi, two_se, multi_se,
-    /// two_noise, multi_noise
+    /// Also write the parts by bounces and their errors: two, multi, two_se, multi_se, two_noise,
+    /// multi_noise
     #[arg(long)]
     pub split: bool,
-    /// Render for about this many seconds and state the error reached; ends sooner where --error or
-    /// --samples is reached. The result depends on the machine's speed
+    /// Render for about this many seconds, or until --error or --samples is reached. The result
+    /// depends on the machine's speed
     #[arg(long, value_name = "S", value_parser = seconds)]
     pub seconds: Option<f64>,
 }
@@ -164,8 +163,8 @@ pub struct SceneRender {
 pub struct ScenePlan {
     #[command(flatten)]
     pub render: RenderArgs,
-    /// Say which paths of three bounces and more carry energy and variance, from 64 passes over a
-    /// few tiles
+    /// List classes of paths of three bounces and more by energy and variance, from 64 passes over
+    /// a few tiles
     #[arg(long)]
     pub variance: bool,
 }

@@ -11,14 +11,14 @@ use super::{SceneInput, ScenePlan, SceneRender, SensorArgs, ranges};
 pub enum Scene {
     /// Generate a scene from a seed and write it as .glb
     Generate {
-        /// Kind of scene; desktop is a box on a desk as laboratories have it, plato the room that
-        /// reconstructions are measured in
+        /// Kind of scene; desktop is a box on a desk, plato the room of the reconstruction
+        /// benchmarks
         #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
         kind: GeneratorArg,
         /// Seed
         #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
         seed: u64,
-        /// Where to write it
+        /// File to write
         #[arg(long, default_value = "scene.glb", value_name = "FILE")]
         out: PathBuf,
         /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1,
@@ -32,23 +32,22 @@ pub enum Scene {
         /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
         #[arg(long, default_value = "auto")]
         assets: String,
-        /// What stands in a plato room
+        /// Object in a plato room
         #[arg(long, value_enum, default_value_t = PlatoArg::Chair)]
         object: PlatoArg,
     },
-    /// Say what a scene file holds
+    /// Show the contents of a scene file
     Show {
         /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
         file: PathBuf,
         #[command(flatten)]
         input: SceneInput,
     },
-    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, with meshes and textures) or
-    /// one .ply mesh
+    /// Write a scene as .glb, Mitsuba 3 (.xml, with meshes and textures) or one .ply mesh
     Export(SceneExport),
-    /// Render one scene file without a farm into a small Zarr group
+    /// Render one scene file, without a farm, into a Zarr group
     Render(SceneRender),
-    /// Say what rendering a scene file would take, without rendering it
+    /// Predict time, memory and techniques of a render
     Plan(ScenePlan),
     /// Measure a rendered scene with a sensor: pulse, jitter, photon noise, wider bins
     Sense(SceneSense),
@@ -93,7 +92,7 @@ pub enum PlatoArg {
 
 #[derive(Args)]
 pub struct SceneSense {
-    /// A Zarr group that `picofarm scene render` wrote; it is only read
+    /// A Zarr group of `picofarm scene render`; it is not changed
     pub render: PathBuf,
     /// Folder for the new Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
@@ -103,7 +102,7 @@ pub struct SceneSense {
     /// Seed of the random numbers
     #[arg(long, default_value_t = 0, value_parser = ranges::whole)]
     pub seed: u64,
-    /// Number of the scene, which gives scenes of one seed random numbers of their own
+    /// Number of the scene: scenes of one seed draw different numbers
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = ranges::whole)]
     pub scene: u64,
     /// Threads [default: all cores]

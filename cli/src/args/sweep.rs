@@ -14,54 +14,54 @@ interrupted goes on when it is given again.";
 
 #[derive(Subcommand)]
 pub enum Sweep {
-    /// Say how each trial fares: its values, how far it came, how good it was there
+    /// Show each trial: values, epochs, error
     Status(WhichSweep),
-    /// Say which trial is the best of those that came to their end
+    /// Show the best finished trial
     Best(WhichSweep),
-    /// Write a page about the trials: from best to worst, over epochs, by parameter
+    /// Write a page about the trials: ranking, curves, parameters
     Report {
         #[command(flatten)]
         which: WhichSweep,
-        /// The page to write; the same data as JSON goes next to it
+        /// Page to write, with its data as JSON next to it
         #[arg(long, value_name = "FILE", default_value = "sweep.html")]
         out: PathBuf,
     },
-    /// Write the trials as CSV: a row for each, or for each epoch of each
+    /// Write the trials as CSV: a row for each trial, or for each epoch
     Export {
         #[command(flatten)]
         which: WhichSweep,
         /// The file to write
         #[arg(long, value_name = "FILE", default_value = "sweep.csv")]
         out: PathBuf,
-        /// A row for each epoch of trials that ended: loss, rate and validation along the training
+        /// Write a row for each epoch of ended trials: loss, learning rate and validation
         #[arg(long)]
         curves: bool,
     },
-    /// Compare sweeps: the best of each, how its trials ended, and the least error by epochs spent
+    /// Compare sweeps: best trial, ends of trials, error by epochs spent
     Compare {
         /// Folder or URL of the store
         #[arg(value_parser = crate::args::location::parse)]
         store: String,
-        /// Names of sweeps; NAME/ID for one of several that are called so, NAME for all of them
+        /// Names of sweeps: NAME for all of that name, NAME/ID for one
         #[arg(required = true)]
         names: Vec<String>,
     },
-    /// Write a job file with further trials of a sweep, chosen by what those that have ended found
+    /// Write a job file with more trials, chosen by the results of the ended ones
     #[command(after_help = EXTEND_HELP)]
     Extend(Extend),
-    /// Submit a job file with a sweep, wait for its end, extend it and submit that, in rounds
+    /// Submit a job file with a sweep, wait, extend and submit it, in rounds
     #[command(after_help = RUN_HELP)]
     Run(SweepRun),
 }
 
 #[derive(Args)]
 pub struct WhichSweep {
-    /// Folder or URL of the store (in which data sets and models lie)
+    /// Folder or URL of the store
     #[arg(value_parser = crate::args::location::parse)]
     pub store: String,
-    /// Name of the sweep: that of the model which it is about
+    /// Name of the sweep, which is the name of its model
     pub name: String,
-    /// Which sweep of that name, where there are several: the first digits of its id
+    /// First digits of the sweep's id, if several sweeps have that name
     #[arg(long, value_name = "ID", default_value = "")]
     pub id: String,
 }
@@ -69,8 +69,7 @@ pub struct WhichSweep {
 /// Who chooses values.
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Sampler {
-    /// By what was found: the tree-structured Parzen estimator; at random until 10 trials have
-    /// ended
+    /// Tree-structured Parzen estimator; at random until 10 trials have ended
     Tpe,
     /// At random
     Random,
@@ -79,18 +78,18 @@ pub enum Sampler {
 /// Which sweep gets further trials, and who chooses them.
 #[derive(Args)]
 pub struct MoreTrials {
-    /// The job file, or the latest that was extended
+    /// The job file, or its latest extension
     pub file: PathBuf,
-    /// How many trials to add
+    /// Number of trials to add
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..1000))]
     pub trials: u64,
-    /// Who chooses their values
+    /// How to choose their values
     #[arg(long, value_enum, default_value_t = Sampler::Tpe)]
     pub sampler: Sampler,
-    /// The stage with the sweep, where the job has several
+    /// The stage with the sweep, if the job has several
     #[arg(long, value_name = "NAME")]
     pub stage: Option<String>,
-    /// Which of the sizes that the file has: the values of its [scale.NAME]
+    /// Use the values of the file's [scale.NAME]
     #[arg(long, value_name = "NAME")]
     pub scale: Option<String>,
 }
@@ -99,7 +98,7 @@ pub struct MoreTrials {
 pub struct Extend {
     #[command(flatten)]
     pub more: MoreTrials,
-    /// The name that the best model gets [default: MODEL-TRIALS, e.g. depth-40]
+    /// Name for the best model [default: MODEL-TRIALS, e.g. depth-40]
     #[arg(long, value_name = "NAME")]
     pub promote: Option<String>,
     /// The file to write, in the same folder [default: FILE-TRIALS.toml, e.g. sweep-40.toml]
@@ -111,7 +110,7 @@ pub struct Extend {
 pub struct SweepRun {
     #[command(flatten)]
     pub more: MoreTrials,
-    /// How many times to extend it
+    /// Number of extensions
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..1000))]
     pub rounds: u32,
 }

@@ -82,12 +82,8 @@ fn an_exported_scene_is_read_back_in_every_format() {
 
     cli.run(&["scene", "export", "room.glb", "--out", "room.ply"])
         .ok();
-    let alone = cli.run(&["scene", "export", "room.ply", "--out", "mesh.glb"]);
-    alone.fails(3, &["room.ply", "--frame"]);
-    cli.run(&[
-        "scene", "export", "room.ply", "--frame", "--out", "mesh.glb",
-    ])
-    .ok();
+    cli.run(&["scene", "export", "room.ply", "--out", "mesh.glb"])
+        .ok();
     let facts = cli.json(&["scene", "show", "mesh.glb"]);
     assert_eq!(
         (&facts["triangles"], &facts["beams"]),
@@ -95,6 +91,69 @@ fn an_exported_scene_is_read_back_in_every_format() {
     );
     let nameless = cli.run(&["scene", "export", "room.glb", "--out", "room.usd"]);
     nameless.fails(3, &["room.usd", "--format"]);
+}
+
+#[test]
+fn a_lone_mesh_is_rendered_without_any_option_to_a_picture() {
+    let scratch = Scratch::new("lone-mesh");
+    let cli = Cli::new(scratch.path());
+    // A corner of two walls, in millimetres.
+    let obj = "v 0 0 0\nv 900 0 0\nv 900 700 0\nv 0 700 0\nv 0 0 800\nv 0 700 800\nf 1 2 3 4\nf 1 4 6 5\n";
+    std::fs::write(scratch.join("corner.obj"), obj).unwrap();
+    let render = ["scene", "render", "corner.obj", "--out", "corner.zarr"];
+    let size = ["--resolution", "24x16", "--samples", "4"];
+    let text = cli.run(&[&render[..], &size[..]].concat()).ok().stdout;
+    for said in [
+        "camera: in front",
+        "laser: ",
+        "unit: mm",
+        "gate: ",
+        "--look-from",
+        "--spots",
+        "--unit",
+        "--gate",
+        "preview.png",
+    ] {
+        assert!(text.contains(said), "{said}: {text}");
+    }
+    let png = std::fs::read(scratch.join("corner.zarr/preview.png")).unwrap();
+    assert!(png.starts_with(b"\x89PNG"));
+    // Stated choices are used and not printed.
+    let stated = [
+        "scene",
+        "render",
+        "corner.obj",
+        "--out",
+        "stated.zarr",
+        "--look-from",
+        "0.4,0.4,2",
+        "--look-at",
+        "0.4,0.3,0",
+        "--spots",
+        "4",
+        "--unit",
+        "mm",
+        "--gate",
+        "0.5,8",
+        "--resolution",
+        "16",
+        "--samples",
+        "4",
+    ];
+    let text = cli.run(&stated).ok().stdout;
+    for said in ["camera: ", "laser: ", "unit: ", "gate: "] {
+        assert!(!text.contains(said), "{said}: {text}");
+    }
+    let wrong = [
+        "scene",
+        "render",
+        "corner.obj",
+        "--out",
+        "w",
+        "--look-from",
+        "1,2",
+    ];
+    cli.run(&wrong).fails(2, &["--look-from", "three numbers"]);
 }
 
 #[test]

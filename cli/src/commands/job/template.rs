@@ -14,8 +14,8 @@ pub fn template(kind: JobKind) -> String {
              seed = 1                  # scene i derives its own seed from (seed, i)\n\
              spots = 25                # laser spots: a grid of 1, 4, 16, 25 or 100; or { random = 16 } or { at = [[0.5, 0.5]] }\n\
              fov_deg = 90.0            # horizontal field of view\n\
-             assets = \"auto\"           # sweethome3d where installed, else parametric\n\
-             min_specular = 1          # mirrors a room at least\n"
+             assets = \"auto\"           # sweethome3d if installed, otherwise parametric\n\
+             min_specular = 1          # least number of mirrors in a room\n"
         }
         JobKind::Primitive => {
             "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\
@@ -30,27 +30,27 @@ pub fn template(kind: JobKind) -> String {
              seed = 1                  # scene i derives its own seed from (seed, i)\n\
              spots = 16                # laser spots: a grid of 1, 4, 16, 25 or 100; or { random = 16 } or { at = [[0.5, 0.5]] }\n\
              fov_deg = 46.0            # horizontal field of view; jittered by scene\n\
-             # laser_m = [0.05, 0.0, 0.0]   # the laser beside the camera: x right, y down, z forward\n\
-             # [scenes.rooms]          # ranges; what is left out is as here. kind = \"primitive\" has them too, for living rooms\n\
+             # laser_m = [0.05, 0.0, 0.0]   # laser relative to the camera: x right, y down, z forward\n\
+             # [scenes.rooms]          # ranges, with their defaults; kind = \"primitive\" has them too, for living rooms\n\
              # scale = [0.22, 0.34]    # of 1, a room is 3.6 m wide and deep, each ± 10 %, and 2.6 m high\n\
-             # depth_m = [0.3, 1.4]    # of the view; other views are drawn again\n\
+             # depth_m = [0.3, 1.4]    # of the view; a view outside this range is drawn again\n\
              # fov_jitter_deg = 3.0\n\
              # cube = { width_m = [0.06, 0.16], height_m = [0.06, 0.2] }\n\
              # cylinder = { width_m = [0.0254, 0.0254], height_m = [0.1, 0.3] }\n\
              # mirror = { width_m = [0.12, 0.3], height_m = [0.12, 0.3] }\n\
              # mirror_wall = \"back\"    # or: any, none\n\
-             # mirror_from_m = [0.05, 0.2]   # its lower edge over the floor\n"
+             # mirror_from_m = [0.05, 0.2]   # height of its lower edge\n"
         }
         JobKind::Files => {
-            "kind = \"files\"            # .glb, .gltf or .json scenes, one a task\n\
+            "kind = \"files\"            # .glb, .gltf, .xml or .json scenes, one task each\n\
              files = [\"scene.glb\"]     # relative to this file\n\
-             spots = 25                # for files that bring no laser\n"
+             spots = 25                # for files without a laser\n"
         }
     };
     format!(
-        "# A picofarm job. `picofarm job plan FILE` says what it would run; `picofarm job submit FILE` runs it.\n\
+        "# A picofarm job. `picofarm job plan FILE` shows what it would run; `picofarm job submit FILE` runs it.\n\
          name = \"rooms\"\n\
-         # parts = 8               # heavy scenes: each divided among so many tasks, and joined; the same bytes\n\n\
+         # parts = 8               # divides each scene among this many tasks; the bytes are the same\n\n\
          [scenes]\n{scenes}\n\
          [render]\n\
          resolution = 256          # pixels, square\n\
@@ -59,23 +59,23 @@ pub fn template(kind: JobKind) -> String {
          bins = 637\n\
          samples = 32              # camera paths per pixel; or: error = \"10%\"\n\
          max_bounces = 0           # 0 = until the gate ends\n\
-         # subsets = [4, 25]       # with spots = 100: histograms of these subsets too, from the same rays\n\
-         # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
-         # strategy = {{ path_reuse = 1, mirror_images = false }}  # ways of finding light, chosen by hand\n\
-         # beam = {{ diameter_mm = 4, divergence_mrad = 1 }}  # width of the laser's beams (1/e²); without it none\n\
+         # subsets = [4, 25]       # with spots = 100: also histograms of these subsets, from the same rays\n\
+         # per_spot = true         # also a histogram of each spot, from the same rays: spots times the size\n\
+         # strategy = {{ path_reuse = 1, mirror_images = false }}  # techniques, chosen by hand\n\
+         # beam = {{ diameter_mm = 4, divergence_mrad = 1 }}  # width of the laser's beams (1/e²); default: none\n\
          # fill_factor = 0.3       # share of each pixel's area that is sensitive\n\
-         # wavelengths_nm = [905]  # of the laser; without it, the one that the scenes' reflectances are of\n\n\
+         # wavelengths_nm = [905]  # of the laser; default: that of the scenes' reflectances\n\n\
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\
          profile = \"sqrt-u16\"            # or: coarse, plain-f32, lossless\n\n\
          [limits]\n\
-         max_failures = 3          # a task's own failures before it is given up\n\
-         max_crashes = 3           # losses of the worker under it before it is given up\n\
-         # max_interruptions = 20  # times that a worker gives it back half-way before it is given up\n\
-         # max_workers = 8         # workers that may run the job at a time\n\
-         # deadline = \"2027-01-31T18:00:00Z\"   # what is not done by then is cancelled\n\n\
-         # [resources]             # what a worker must have\n\
+         max_failures = 3          # failures of a task before it is given up\n\
+         max_crashes = 3           # losses of its worker before a task is given up\n\
+         # max_interruptions = 20  # hand-backs by workers before a task is given up\n\
+         # max_workers = 8         # most workers that run the job at a time\n\
+         # deadline = \"2027-01-31T18:00:00Z\"   # unfinished tasks are then cancelled\n\n\
+         # [resources]             # requirements of a worker\n\
          # cores = 8\n\
          # memory_gib = 16\n\
          # labels = [\"fast\"]       # of `picofarm worker --label`\n"
@@ -84,15 +84,15 @@ pub fn template(kind: JobKind) -> String {
 
 /// Returns a job of several stages.
 fn graph() -> String {
-    "# A picofarm job of several stages. `picofarm job plan FILE` says what it would run.\n\
+    "# A picofarm job of several stages. `picofarm job plan FILE` shows what it would run.\n\
      name = \"noisy rooms\"\n\
      priority = 0              # jobs of a higher priority get workers first\n\n\
-     [[stage]]                 # kind = \"render\" unless it says another\n\
+     [[stage]]                 # kind = \"render\" is the default\n\
      name = \"render\"\n\
      scenes = { kind = \"primitive\", count = 8, seed = 1, spots = 25 }\n\
      render = { resolution = 64, samples = 16 }\n\
      output = { store = \"picofarm-data/store\", dataset = \"clean\" }\n\n\
-     [[stage]]                 # one stage for each value of the matrix; {dark} stands for it\n\
+     [[stage]]                 # one stage for each value of the matrix, which replaces {dark}\n\
      name = \"noise\"\n\
      kind = \"reprocess\"\n\
      source = \"render\"         # a stage that makes a data set, or { store = \"…\", dataset = \"…\" }\n\
@@ -102,7 +102,7 @@ fn graph() -> String {
      [[stage]]\n\
      name = \"split\"\n\
      kind = \"split\"\n\
-     source = \"noise[0.5]\"     # it begins when that stage is done\n\
+     source = \"noise[0.5]\"     # starts when that stage is done\n\
      split = { fractions = [0.5, 0.25, 0.25] }\n\n\
      [[stage]]\n\
      name = \"export\"\n\
@@ -119,7 +119,7 @@ fn training() -> String {
      # with furnished rooms, resolution = 256, [scenes] count = 97432 and the defaults of `net` and `optimise` is the paper's.\n\
      name = \"learning\"\n\n\
      [limits]\n\
-     max_crashes = 100         # a training goes on from its last checkpoint, however often its worker is lost\n\n\
+     max_crashes = 100         # a training continues from its last checkpoint when its worker is lost\n\n\
      [[stage]]\n\
      name = \"render\"\n\
      scenes = { kind = \"primitive\", count = 120, seed = 1, spots = 25 }\n\
@@ -130,22 +130,22 @@ fn training() -> String {
      kind = \"split\"\n\
      source = \"render\"\n\
      split = { fractions = [0.8, 0.1, 0.1] }\n\n\
-     [[stage]]                 # depth, from the time that two-bounce light needs\n\
+     [[stage]]                 # depth, from the times of two-bounce light\n\
      name = \"tof\"\n\
      kind = \"train\"\n\
-     source = \"render\"         # it needs the split of that name too: split = \"default\"\n\
-     # resources = { gpus = 1 } # only on workers that have one\n\
+     source = \"render\"         # also needs the split \"default\" of its data set\n\
+     # resources = { gpus = 1 } # only on workers with a graphics processor\n\
      [stage.train]\n\
      target = \"tof\"              # or: shadow, specular\n\
-     model = \"tof\"             # kept in the store; `picofarm model show STORE tof`\n\
-     # scenes = 64             # learn from fewer\n\
+     model = \"tof\"             # name in the store: `picofarm model show STORE tof`\n\
+     # scenes = 64             # train on fewer scenes\n\
      # histogram = \"transient_4\"\n\
      input = { bins = 40 }     # sums of adjacent bins; 0 = all. normalise = \"minmax\" or \"log\"\n\
      net = { architecture = \"unet2d\", width = 16, levels = 3 }\n\
      optimise = { epochs = 30, batch = 8, learning_rate = 1e-2, schedule = \"onecycle\" }\n\
      seed = 1\n\
-     checkpoint_minutes = 1.0  # lost at most when a worker dies\n\n\
-     [[stage]]                 # the depth that it sees in every room\n\
+     checkpoint_minutes = 1.0  # most work that a lost worker costs\n\n\
+     [[stage]]                 # predicted depth of every room\n\
      name = \"depths\"\n\
      kind = \"infer\"\n\
      source = \"render\"\n\
@@ -158,7 +158,7 @@ fn training() -> String {
      [stage.train]\n\
      target = \"shadow\"\n\
      model = \"shadow\"\n\
-     shadow = { variant = \"concat\", times = \"depths\" }   # an infer stage, or the folder that one wrote; or: truth\n\
+     shadow = { variant = \"concat\", times = \"depths\" }   # an infer stage, its folder, or truth\n\
      input = { bins = 40 }\n\
      net = { width = 16, levels = 3 }\n\
      optimise = { epochs = 30, batch = 8 }\n\n\
@@ -178,7 +178,7 @@ fn training() -> String {
      kind = \"evaluate\"\n\
      source = \"render\"\n\
      evaluate = { models = [\"tof\", \"shadow\", \"mirrors\"], side = \"test\" }\n\n\
-     [[stage]]                 # what they see in every room, beside the data set: depth, lit, specular\n\
+     [[stage]]                 # predictions for every room: depth, lit, specular\n\
      name = \"predict\"\n\
      kind = \"infer\"\n\
      source = \"render\"\n\
@@ -192,12 +192,12 @@ fn training() -> String {
 }
 
 fn sweep() -> String {
-    "# A picofarm job that looks for the settings with which a network learns best: half an hour on two cores.\n\
-     # `picofarm sweep status STORE depth` says how trials fare, `sweep report` makes a page of it, and\n\
-     # `picofarm sweep extend FILE --trials 8` adds trials by what was found.\n\
+    "# A picofarm job that finds the settings with which a network learns best: half an hour on two cores.\n\
+     # `picofarm sweep status STORE depth` shows the trials, `sweep report` writes a page about them, and\n\
+     # `picofarm sweep extend FILE --trials 8` adds trials, chosen by their results.\n\
      name = \"sweep\"\n\n\
      [limits]\n\
-     max_crashes = 100         # a trial goes on from its last checkpoint, however often its worker is lost\n\n\
+     max_crashes = 100         # a trial continues from its last checkpoint when its worker is lost\n\n\
      [[stage]]\n\
      name = \"render\"\n\
      scenes = { kind = \"primitive\", count = 120, seed = 1, spots = 25 }\n\
@@ -213,10 +213,10 @@ fn sweep() -> String {
      kind = \"train\"\n\
      source = \"render\"\n\
      [stage.sweep]\n\
-     trials = 27               # drawn at random; left away: each combination, where all parameters are lists\n\
-     seed = 1                  # of the draws; more trials later are further ones\n\
-     stop = { halving = { first = 2, factor = 3 } }   # after 2, 6, 18 epochs only the best third goes on; also: median, hyperband\n\
-     [stage.sweep.over]        # a parameter stands anywhere in the stage as \"{name}\"\n\
+     trials = 27               # drawn at random; without it: every combination, if all parameters are lists\n\
+     seed = 1                  # seed of the draws; later trials continue the sequence\n\
+     stop = { halving = { first = 2, factor = 3 } }   # after 2, 6, 18 epochs the best third continues; also: median, hyperband\n\
+     [stage.sweep.over]        # a parameter may appear anywhere in the stage as \"{name}\"\n\
      lr = { log = [1e-4, 1e-1] }           # or: range = [a, b], int = [a, b], or a list of values\n\
      decay = { log = [1e-5, 1e-1] }\n\
      width = [8, 12, 16]\n\

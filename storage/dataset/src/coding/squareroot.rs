@@ -23,7 +23,7 @@ impl SquareRoot {
     /// ```
     /// use picofarm_dataset::SquareRoot;
     ///
-    /// // 100 photons have a standard deviation of 10; with Δ = 0.2 the error is below a tenth of it.
+    /// // 100 photons have a standard deviation of 10; with Δ = 0.2 the error is a tenth of it.
     /// let code = SquareRoot::new(0.2, 1.0);
     /// assert!((code.decode(code.encode(100.3)) - 100.3).abs() < 1.1);
     /// ```

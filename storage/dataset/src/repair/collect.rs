@@ -137,8 +137,8 @@ impl Dataset {
         self.collect_before(limit, grace, delete).await
     }
 
-    /// Returns the time `grace` ago. If `delete` is set, it is by the clock that sets the timestamps
-    /// of this store's objects.
+    /// Returns the time `grace` ago. If `delete` is set, it is by the clock that sets the
+    /// timestamps of this store's objects.
     ///
     /// # Errors
     /// [`StorageError::Store`].

@@ -66,8 +66,8 @@ pub(super) fn about(quantity: Quantity) -> &'static str {
     }
 }
 
-/// Decodes all arrays of a scene of a data set. Arrays that the scene's source did not have are omitted, and
-/// its unknown values for spots are NaN.
+/// Decodes all arrays of a scene of a data set. Arrays that the scene's source did not have are
+/// omitted, and its unknown values for spots are NaN.
 pub(super) async fn decode(dataset: &Dataset, scene: u64) -> Result<PlainScene, StorageError> {
     let manifest = dataset.manifest(scene).await?;
     let spec = *dataset.spec();

@@ -45,8 +45,8 @@ pub struct ModelManifest {
 pub struct Lineage {
     /// Folder of the data set in the same store.
     pub dataset: String,
-    /// [`picofarm_dataset::Snapshot::id`] of the training and validation scenes, which pins every byte of
-    /// them.
+    /// [`picofarm_dataset::Snapshot::id`] of the training and validation scenes, which pins every
+    /// byte of them.
     pub data: String,
     /// The split.
     pub split: SplitUsed,

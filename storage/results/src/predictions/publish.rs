@@ -79,7 +79,8 @@ impl Predictions {
         })
     }
 
-    /// Publishes encoded predictions like [`picofarm_dataset::Dataset::publish_encoded`] publishes scenes.
+    /// Publishes encoded predictions like [`picofarm_dataset::Dataset::publish_encoded`] publishes
+    /// scenes.
     ///
     /// # Errors
     /// [`StorageError::Conflict`] if an object exists with different bytes;

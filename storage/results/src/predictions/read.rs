@@ -16,8 +16,8 @@ pub struct PinnedDepths {
 impl Predictions {
     /// Returns a hash that pins every byte of the depths of these scenes, in order, and the model
     /// that predicted them. `seen` contains the SHA-256 of the scenes' manifests
-    /// ([`picofarm_dataset::Pinned::manifests`]), which the model's inputs must match. Objects are not
-    /// checked.
+    /// ([`picofarm_dataset::Pinned::manifests`]), which the model's inputs must match. Objects are
+    /// not checked.
     ///
     /// # Errors
     /// [`StorageError::Invalid`] if there are no depths, or if they belong to another scene or to

@@ -1,9 +1,9 @@
-//! Results that consist of objects and a manifest: publishing, listing, reading, checking, restoring
-//! and removing them.
+//! Results that consist of objects and a manifest: publishing, listing, reading, checking,
+//! restoring and removing them.
 //!
-//! A result is published once its manifest exists, because the manifest is written last. All objects
-//! are created, never overwritten, so several writers of equal results do not interfere. Only
-//! [`Published::restore`] overwrites objects, and only by bytes with the recorded SHA-256.
+//! A result is published once its manifest exists, because the manifest is written last. All
+//! objects are created, never overwritten, so several writers of equal results do not interfere.
+//! Only [`Published::restore`] overwrites objects, and only by bytes with the recorded SHA-256.
 
 mod id;
 mod remove;

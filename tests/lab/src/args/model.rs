@@ -72,8 +72,8 @@ pub struct Model {
     /// compare with, and do not measure
     #[arg(long, value_name = "FILE", conflicts_with = "peer")]
     pub record: Option<PathBuf>,
-    /// Another program that takes the same steps, e.g. "python3 tests/lab/peers/model_torch.py bench";
-    /// it is given the record's file as its last argument
+    /// Another program that takes the same steps, e.g. "python3 tests/lab/peers/model_torch.py
+    /// bench"; it is given the record's file as its last argument
     #[arg(long, value_name = "COMMAND")]
     pub peer: Vec<String>,
 }

@@ -1,4 +1,5 @@
-//! `just lab render`: CPU time of the renderer against the true error, and how it grows with the size.
+//! `just lab render`: CPU time of the renderer against the true error, and how it grows with the
+//! size.
 
 mod axes;
 mod curve;

@@ -148,8 +148,8 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 
 /// Reads a scene. The content determines the format: `glTF` magic or a JSON object with `asset` is
 /// glTF, `ply` a lone mesh, XML or a JSON object with `"type": "scene"` a Mitsuba scene, and a JSON
-/// object with `meshes` and `spots` a reference scene. STL is known by its structure, and OBJ by its
-/// extension.
+/// object with `meshes` and `spots` a reference scene. STL is known by its structure, and OBJ by
+/// its extension.
 ///
 /// Files written by [`crate::export`] are restored exactly. In other glTF files, metals become GGX
 /// conductors with α = roughness², partial metals a mix, and all other materials Lambertian with

@@ -45,10 +45,8 @@ impl Walk<'_> {
                 primitive.mode(),
                 Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip
             ) {
-                if self.strict && primitive.mode() == Mode::Points {
-                    return Err(fail(
-                        "is a point cloud, which has no surface; export a mesh of triangles".into(),
-                    ));
+                if primitive.mode() == Mode::Points {
+                    self.points = true;
                 }
                 self.note("dropped", "points and lines");
                 continue;

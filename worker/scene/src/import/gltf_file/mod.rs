@@ -213,6 +213,8 @@ struct Walk<'a> {
     images: Images<(usize, Wrap)>,
     /// The number of vertices and corners read so far.
     corners: usize,
+    /// Whether a point cloud was left out.
+    points: bool,
     /// The number of triangles that masks added so far.
     cut_triangles: usize,
     /// The number of vertices and corners of all objects.
@@ -248,6 +250,7 @@ impl<'a> Walk<'a> {
             strict: true,
             images: Images::default(),
             corners: 0,
+            points: false,
             cut_triangles: 0,
             placed: 0,
             meshes: BTreeMap::new(),
@@ -423,6 +426,12 @@ impl<'a> Walk<'a> {
         ours: Option<SceneExtras>,
     ) -> Result<Draft, SceneError> {
         let path = self.path;
+        if self.objects.is_empty() && self.points {
+            return Err(format_error(
+                path,
+                "is a point cloud, which has no surface; export a mesh of triangles",
+            ));
+        }
         let count = self.objects.len();
         let mut ids: Vec<Option<u32>> = self.objects.iter().map(|(id, _)| *id).collect();
         ids.sort_unstable();

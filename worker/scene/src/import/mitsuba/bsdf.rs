@@ -428,8 +428,8 @@ impl Reader<'_> {
 }
 
 impl Reader<'_> {
-    /// Returns the reflectance at normal incidence of the complex index of refraction `eta` + i `k`,
-    /// if the file states it in numbers.
+    /// Returns the reflectance at normal incidence of the complex index of refraction `eta` + i
+    /// `k`, if the file states it in numbers.
     fn fresnel_of_index(&mut self, node: &Node) -> Result<Option<[f32; 3]>, String> {
         let (Some(eta), Some(k)) = (self.colour(node, "eta")?, self.colour(node, "k")?) else {
             return Ok(None);
