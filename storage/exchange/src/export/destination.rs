@@ -4,7 +4,7 @@ use object_store::ObjectStore;
 use object_store::path::Path;
 
 use super::{ExportFormat, card, packed};
-use picofarm_dataset::{Dataset, Quantity};
+use picofarm_dataset::{Dataset, METADATA, Quantity};
 use picofarm_store::{StorageError, folder, objects};
 
 /// Checks that the destination is empty, or has an export in this format, finished or interrupted.
@@ -20,11 +20,14 @@ pub(super) async fn check(
     prefix: &Path,
 ) -> Result<(), StorageError> {
     let names = folder::names(store, prefix).await?;
-    let own = |name: &&String| writes(format, source, name);
+    // Exports write the group's metadata after the array of source scenes, which data sets lack.
+    let data_set = !names.iter().any(|name| name == packed::SOURCE_SCENE);
+    let own =
+        |name: &&String| writes(format, source, name) && !(data_set && name.as_str() == METADATA);
     let mut strange = names.iter().filter(|name| !own(name));
     let of_another = strange
         .clone()
-        .find_map(|name| Some((name, other_format(name)?)));
+        .find_map(|name| Some((name, other_format(name).filter(|other| *other != format)?)));
     if let Some((name, other)) = of_another {
         let what = format!(
             "{} has an export in the format {:?} in it ({name:?} is a part of it), and this one is in {:?}; choose \

@@ -23,7 +23,7 @@ pub(super) const PACK: usize = 16;
 /// Number of concurrent requests.
 const CONCURRENCY: usize = 8;
 /// Name of the array with the scenes' indices in the source.
-const SOURCE_SCENE: &str = "source_scene";
+pub(super) const SOURCE_SCENE: &str = "source_scene";
 
 /// Checks that the source can be packed.
 pub(super) fn check(source: &Dataset) -> Result<(), StorageError> {

@@ -161,7 +161,7 @@ async fn a_check_names_what_is_broken_and_what_is_missing() {
     let check = async |mode, complete| there.verify(mode, complete, &|_, _| {}).await.unwrap();
     let whole = check(VerifyMode::Full, false).await;
     assert!(whole.is_sound(), "{:?}", whole.problems);
-    assert_eq!((whole.scenes, whole.objects), (2, 6));
+    assert_eq!((whole.scenes, whole.objects), (2, 8));
     let lit = folder.path().join("lit/c/0/0/0/0");
     let mut bytes = std::fs::read(&lit).unwrap();
     bytes[20] ^= 1;
@@ -263,11 +263,14 @@ async fn zarr_python_and_xarray_read_the_same_predictions() {
         ("depth", &depth),
         ("lit", &values.lit),
         ("specular", &values.specular),
+        ("confidence", &values.confidence),
     ] {
         std::fs::write(expected.join(format!("{name}.bin")), bytes).unwrap();
     }
-    let shapes =
-        json!({"depth": ["<f4", [8, 8]], "lit": ["|u1", [2, 8, 8]], "specular": ["|u1", [8, 8]]});
+    let shapes = json!({
+        "depth": ["<f4", [8, 8]], "lit": ["|u1", [2, 8, 8]], "specular": ["|u1", [8, 8]],
+        "confidence": ["|u1", [8, 8]],
+    });
     std::fs::write(expected.join("shapes.json"), shapes.to_string()).unwrap();
     let script = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
         .join("../../tests/interop/read_predictions.py");

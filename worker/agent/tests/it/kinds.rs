@@ -51,6 +51,7 @@ fn first_job(store: &str) -> Value {
         {"kind": "promote", "source": "rooms", "promote": {"model": "best", "among": ["train"]}},
         {"kind": "infer", "source": "rooms", "infer": {"models": ["train"]},
          "output": {"store": store, "dataset": "seen"}},
+        {"kind": "demultiplex", "source": "rooms", "output": {"store": store, "dataset": "apart"}},
         {"kind": "reconstruct", "source": "rooms", "reconstruct": {"views": 2, "grid": {"nodes": 32, "iterations": 3}},
          "output": {"store": store, "dataset": "rooms-3d"}},
         networks(store, 8),

@@ -1,14 +1,22 @@
 //! Completes scenes from files: chooses the unit, the camera and the laser that a file does not
 //! state, and notes each choice with the option that changes it.
 
+use picofarm_settings::Spots;
+
 use crate::{
-    Affine, Aim, Camera, Intrinsics, Laser, Object, Provenance, Scene, Vec3, viewpoint::Viewpoint,
+    Affine, Aim, Camera, Intrinsics, Laser, Object, Provenance, Scene, Vec3,
+    viewpoint::{Surroundings, Viewpoint},
 };
 
 use super::{ImportOptions, Unit, add_note, quoted};
 
 /// The number of spots of a laser that neither the file nor the options describe.
 const SPOTS: u32 = 25;
+/// The least share of a grid's spots that must hit a surface; otherwise the spots are spread over
+/// what the camera sees.
+const LEAST_HITS: f32 = 0.8;
+/// The number of rays along each side of the image that probe what the camera sees.
+const RAYS: usize = 64;
 /// The image size of a camera that the file does not describe, pixels on each side.
 const PIXELS: u32 = 256;
 /// The horizontal field of view of such a camera, degrees.
@@ -184,17 +192,74 @@ impl Draft {
             (Some(FileLaser::Spots(aim)), _) => aim.laser(camera),
             (None, Some(aim)) => aim.laser(camera),
             (None, None) => {
+                let seen = seen(&self.objects, camera);
+                let grid = Aim::grid(SPOTS).expect("a grid of that size exists");
+                let (aim, how) = match share_of_hits(&grid, &seen) >= LEAST_HITS {
+                    true => (grid, "in a grid over its view"),
+                    false => (spread(&seen).unwrap_or(grid), "spread over what it sees"),
+                };
                 self.note(
                     "laser",
                     format!(
-                        "at the camera, {SPOTS} spots in a grid over its view, because the file has none; --spots changes it"
+                        "at the camera, {SPOTS} spots {how}, because the file has none; --spots changes it"
                     ),
                 );
-                let aim = Aim::grid(SPOTS).expect("a grid of that size exists");
                 aim.laser(camera)
             }
         }
     }
+}
+
+/// Returns which pixels of a coarse image see a surface, row by row.
+fn seen(objects: &[Object], camera: &Camera) -> Vec<bool> {
+    let world = Surroundings::new(objects);
+    let i = &camera.intrinsics;
+    let centres = (0..RAYS * RAYS).map(|k| [k % RAYS, k / RAYS].map(film));
+    centres
+        .map(|[x, y]| {
+            let ray = camera.ray(x * i.width as f32, y * i.height as f32);
+            let hit = world.as_ref().and_then(|w| w.closest(camera.origin, ray));
+            hit.is_some()
+        })
+        .collect()
+}
+
+/// Returns the film position of the centre of a coarse row or column.
+fn film(k: usize) -> f32 {
+    (k as f32 + 0.5) / RAYS as f32
+}
+
+fn share_of_hits(aim: &Aim, seen: &[bool]) -> f32 {
+    let pixel = |x: f32| ((x * RAYS as f32) as usize).min(RAYS - 1);
+    let spots = aim.film().iter();
+    let hits = spots.filter(|[x, y]| seen[pixel(*y) * RAYS + pixel(*x)]);
+    hits.count() as f32 / aim.film().len().max(1) as f32
+}
+
+/// Returns spots at pixels that see a surface, each as far from the earlier ones as possible, and
+/// the first nearest to their centre. Returns `None` if no pixel sees a surface.
+fn spread(seen: &[bool]) -> Option<Aim> {
+    let places: Vec<[f32; 2]> = (0..seen.len())
+        .filter(|k| seen[*k])
+        .map(|k| [film(k % RAYS), film(k / RAYS)])
+        .collect();
+    let count = places.len() as f32;
+    let centre = [0, 1].map(|k: usize| places.iter().map(|p| p[k]).sum::<f32>() / count);
+    let square = |a: [f32; 2], b: [f32; 2]| (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
+    let first = *places
+        .iter()
+        .min_by(|a, b| square(**a, centre).total_cmp(&square(**b, centre)))?;
+    let mut chosen = vec![first];
+    let mut far: Vec<f32> = places.iter().map(|p| square(*p, first)).collect();
+    while chosen.len() < (SPOTS as usize).min(places.len()) {
+        let next = (0..far.len()).max_by(|a, b| far[*a].total_cmp(&far[*b]).then(b.cmp(a)))?;
+        chosen.push(places[next]);
+        for (distance, place) in far.iter_mut().zip(&places) {
+            *distance = distance.min(square(*place, places[next]));
+        }
+    }
+    let chosen = chosen.into_iter().map(|p| p.map(f64::from)).collect();
+    Aim::of(&Spots::At(chosen), 0).ok()
 }
 
 /// Returns the smallest and largest world coordinates of all finite vertices.

@@ -726,7 +726,11 @@ fn scenes_in_gltf() {
             }),
             at(-3.0, "hidden"),
         ),
-        ("a mask with holes", mask([0, 255]), quad("masks")),
+        (
+            "a mask with holes",
+            mask([0, 255]),
+            Read([0.0, -0.5, -2.0], [0.5, 0.5, -2.0], 0.5, "masks"),
+        ),
         ("a mask without holes", mask([255, 200]), quad("")),
         (
             "a mask by its factor",
@@ -827,8 +831,11 @@ fn scenes_in_gltf() {
             quad(""),
         ),
         (
-            "a point cloud",
-            Box::new(|f| f.primitive()["mode"] = json!(0)),
+            "nothing but a point cloud",
+            Box::new(|f| {
+                f.primitive()["mode"] = json!(0);
+                f.json["scenes"][0]["nodes"] = json!([1, 2]);
+            }),
             Refused("point cloud"),
         ),
         (

@@ -70,6 +70,7 @@ fn an_object_is_seen_whole_from_outside() {
     ] {
         let text = cuboid(lo, hi, false);
         let scene = read("a.ply", text.as_bytes(), &ImportOptions::default()).expect("reads");
+        assert!(scene.path_range_m().is_some(), "spots hit the object");
         for p in corners(&scene) {
             assert!(sees(&scene.camera, p), "{lo:?} {hi:?} {p:?}");
         }
@@ -220,4 +221,26 @@ fn light_arrives_between_the_nearest_and_the_farthest_surface() {
     let large = read("a.ply", text.as_bytes(), &ImportOptions::default()).expect("reads");
     let [a, b] = large.path_range_m().expect("light returns");
     assert!((a / first - 3.0).abs() < 1e-3 && (b / last - 3.0).abs() < 1e-3);
+}
+
+#[test]
+fn chosen_spots_hit_what_the_camera_sees_and_do_not_meet() {
+    let text = cuboid([0.0; 3], [0.2, 2.0, 0.2], false);
+    let scene = read("a.ply", text.as_bytes(), &ImportOptions::default()).expect("reads");
+    let note = &scene.provenance.notes["chosen.laser"];
+    assert!(note.contains("spread"), "{note}");
+    let beams = &scene.laser.beams;
+    assert_eq!(beams.len(), 25);
+    for (k, a) in beams.iter().enumerate() {
+        // A beam meets the slim box if its closest approach to the axis is within the box.
+        let (o, d) = (scene.laser.origin, a.direction);
+        let along = |t: f32| o + d * t;
+        let inside = (0..4000).map(|n| along(n as f32 * 0.002)).any(|p| {
+            (0.0..=0.2).contains(&p.x) && (0.0..=2.0).contains(&p.y) && (0.0..=0.2).contains(&p.z)
+        });
+        assert!(inside, "beam {k}");
+        for b in &beams[k + 1..] {
+            assert!((a.direction - b.direction).length() > 1e-3);
+        }
+    }
 }
