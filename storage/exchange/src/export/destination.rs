@@ -20,14 +20,16 @@ pub(super) async fn check(
     prefix: &Path,
 ) -> Result<(), StorageError> {
     let names = folder::names(store, prefix).await?;
+    let has = |wanted: &str| names.iter().any(|name| name == wanted);
     // Exports write the group's metadata after the array of source scenes, which data sets lack.
-    let data_set = !names.iter().any(|name| name == packed::SOURCE_SCENE);
-    let own =
-        |name: &&String| writes(format, source, name) && !(data_set && name.as_str() == METADATA);
+    if has(METADATA) && !has(packed::SOURCE_SCENE) {
+        return Err(folder::foreign(store, prefix, "export.dest", METADATA));
+    }
+    let own = |name: &&String| writes(format, source, name);
     let mut strange = names.iter().filter(|name| !own(name));
     let of_another = strange
         .clone()
-        .find_map(|name| Some((name, other_format(name).filter(|other| *other != format)?)));
+        .find_map(|name| Some((name, other_format(name)?)));
     if let Some((name, other)) = of_another {
         let what = format!(
             "{} has an export in the format {:?} in it ({name:?} is a part of it), and this one is in {:?}; choose \
@@ -38,7 +40,7 @@ pub(super) async fn check(
         );
         return Err(StorageError::invalid("export.dest", what));
     }
-    if names.iter().any(|name| name == card::CROISSANT) {
+    if has(card::CROISSANT) {
         return Ok(());
     }
     match strange.next() {

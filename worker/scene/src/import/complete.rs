@@ -51,6 +51,9 @@ impl Draft {
     /// Returns the scene with everything that the renderer needs. The error is the fault, without
     /// the file.
     pub(super) fn complete(mut self, options: &ImportOptions) -> Result<Scene, String> {
+        if self.objects.iter().all(|o| o.mesh.triangles.is_empty()) {
+            return Err("has no triangles; export a mesh with faces".into());
+        }
         self.scale(options);
         let camera = self.camera(options)?;
         let laser = self.laser(options, &camera);
