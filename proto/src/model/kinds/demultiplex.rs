@@ -18,8 +18,9 @@ use crate::model::{
     spec_error::SpecError,
 };
 
-/// Bytes of a pixel for each of the ranges that the method tries, over the bytes of its histogram.
-const RANGES: f64 = 1.5;
+/// Bytes of a pixel for the ranges and the mirrors that the method tries, over the bytes of its
+/// histogram.
+const RANGES: f64 = 3.0;
 /// Bytes of a pixel for each spot: shares of light, probabilities, and what they rest on.
 const PAIR: f64 = 40.0;
 
