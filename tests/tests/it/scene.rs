@@ -98,7 +98,7 @@ fn a_lone_mesh_is_rendered_without_any_option_to_a_picture() {
     let scratch = Scratch::new("lone-mesh");
     let cli = Cli::new(scratch.path());
     // A corner of two walls, in millimetres.
-    let obj = "v 0 0 0\nv 900 0 0\nv 900 700 0\nv 0 700 0\nv 0 0 800\nv 0 700 800\nf 1 2 3 4\nf 1 4 6 5\n";
+    let obj = "v 0 0 0\nv 90 0 0\nv 90 70 0\nv 0 70 0\nv 0 0 80\nv 0 70 80\nf 1 2 3 4\nf 1 4 6 5\n";
     std::fs::write(scratch.join("corner.obj"), obj).unwrap();
     let render = ["scene", "render", "corner.obj", "--out", "corner.zarr"];
     let size = ["--resolution", "24x16", "--samples", "4"];
@@ -116,6 +116,7 @@ fn a_lone_mesh_is_rendered_without_any_option_to_a_picture() {
     ] {
         assert!(text.contains(said), "{said}: {text}");
     }
+    assert!(!text.contains("hit nothing"), "{text}");
     let png = std::fs::read(scratch.join("corner.zarr/preview.png")).unwrap();
     assert!(png.starts_with(b"\x89PNG"));
     // Stated choices are used and not printed.
@@ -126,15 +127,15 @@ fn a_lone_mesh_is_rendered_without_any_option_to_a_picture() {
         "--out",
         "stated.zarr",
         "--look-from",
-        "0.4,0.4,2",
+        "0.04,0.04,0.2",
         "--look-at",
-        "0.4,0.3,0",
+        "0.04,0.03,0",
         "--spots",
         "4",
         "--unit",
         "mm",
         "--gate",
-        "0.5,8",
+        "0.05,0.8",
         "--resolution",
         "16",
         "--samples",
