@@ -22,11 +22,11 @@ pub struct SceneInput {
     /// Laser spots in the camera's view, in place of the file's laser: a grid of 1, 4, 16, 25 or
     /// 100; random:N; or places as X,Y/X,Y (0 to 1, right and down) [default: the file's laser, or
     /// 25]
-    #[arg(long, value_parser = ranges::spots, help_heading = "Scene")]
+    #[arg(long, value_parser = ranges::spots)]
     pub spots: Option<Spots>,
     /// Unit of length of the file: m, cm, mm, in or ft [default: the format's; for formats without
     /// one m, or mm above 50 m]
-    #[arg(long, value_name = "UNIT", help_heading = "Scene")]
+    #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
 }
 
@@ -34,20 +34,20 @@ pub struct SceneInput {
 #[derive(Args, Default)]
 pub struct ViewArgs {
     /// Camera of the file, by name or number from 0 [default: the first]
-    #[arg(long, value_name = "NAME", help_heading = "Scene")]
+    #[arg(long, value_name = "NAME")]
     pub camera: Option<String>,
     /// Position of the camera, metres [default: the file's camera; without one, inside a room or in
     /// front of the objects]
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, help_heading = "Scene")]
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
     pub look_from: Option<Vec3>,
     /// Point in the middle of the image, metres
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, help_heading = "Scene")]
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
     pub look_at: Option<Vec3>,
     /// Width of the view in degrees, 1 to 170
-    #[arg(long, value_name = "DEG", value_parser = ranges::degrees, help_heading = "Scene")]
+    #[arg(long, value_name = "DEG", value_parser = ranges::degrees)]
     pub fov: Option<f32>,
     /// Direction that is upwards in the image [default: 0,1,0]
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, help_heading = "Scene")]
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
     pub up: Option<Vec3>,
 }
 
