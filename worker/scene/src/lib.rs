@@ -25,6 +25,7 @@ mod shape;
 mod spectrum;
 mod texture;
 mod trace;
+mod tree;
 mod vec3;
 mod view;
 mod viewpoint;

@@ -43,7 +43,7 @@ const SEAM: f32 = 1e-6;
 
 /// Computes the intersection by Möller and Trumbore (1997), for both sides. Returns `None` for a
 /// miss or a degenerate triangle.
-fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> Option<f32> {
+pub(crate) fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> Option<f32> {
     let (e1, e2) = (b - a, c - a);
     let p = direction.cross(e2);
     let det = e1.dot(p);

@@ -1,11 +1,8 @@
 //! Chooses a camera for a scene that has none: inside a room, or in front of an object.
 
-use std::{fmt, sync::Arc};
+use std::fmt;
 
-use crate::{
-    Affine, Camera, Intrinsics, Mesh, Object, Vec3,
-    trace::{Hit, Model, World},
-};
+use crate::{Camera, Intrinsics, Object, Vec3, tree::Tree};
 
 /// The number of directions in which a point's surroundings are probed.
 const PROBES: u32 = 96;
@@ -159,38 +156,45 @@ fn in_front(
 
 /// A scene's geometry in world space, ready for rays.
 pub(crate) struct Surroundings {
-    world: World,
+    tree: Tree,
     /// The smallest and largest coordinates, without stray triangles.
     bounds: (Vec3, Vec3),
 }
 
+/// The intersection of a ray with a scene.
+pub(crate) struct Met {
+    /// The ray parameter in units of the direction's length.
+    pub(crate) t: f32,
+    /// The normal of the facet by the order of its corners, not normalised.
+    normal: Vec3,
+}
+
 impl Surroundings {
-    /// Builds the trees. Returns `None` without triangles with finite corners.
+    /// Builds the tree. Returns `None` without triangles with finite corners.
     pub(crate) fn new(objects: &[Object]) -> Option<Self> {
-        let mut mesh = Mesh {
-            materials: vec![crate::Material::diffuse("any", [0.5; 3])],
-            ..Mesh::default()
-        };
+        let mut triangles = Vec::new();
         for object in objects {
             for t in &object.mesh.triangles {
                 let corners = t.map(|v| object.to_world.point(object.mesh.positions[v as usize]));
                 if corners.iter().all(|p| p.is_finite()) {
-                    let first = u32::try_from(mesh.positions.len()).ok()?;
-                    mesh.positions.extend(corners);
-                    mesh.triangles.push([first, first + 1, first + 2]);
+                    triangles.push(corners);
                 }
             }
         }
-        mesh.triangle_material = vec![0; mesh.triangles.len()];
-        let bounds = main_part(&mesh)?;
-        let mut world = World::default();
-        world.add(Arc::new(Model::new(mesh)?), Affine::IDENTITY);
-        Some(Self { world, bounds })
+        let bounds = main_part(&triangles)?;
+        Some(Self {
+            tree: Tree::new(triangles),
+            bounds,
+        })
     }
 
     /// Returns the closest intersection with t > 0.
-    pub(crate) fn closest(&self, from: Vec3, direction: Vec3) -> Option<Hit> {
-        self.world.closest(from, direction)
+    pub(crate) fn closest(&self, from: Vec3, direction: Vec3) -> Option<Met> {
+        let (t, [a, b, c]) = self.tree.closest(from, direction)?;
+        Some(Met {
+            t,
+            normal: (b - a).cross(c - a),
+        })
     }
 
     /// Returns position and target of a camera indoors, or `None` outdoors and in front of lone
@@ -260,7 +264,7 @@ impl Surroundings {
                 return None;
             }
             hits += 1;
-            fronts += u32::from(self.world.facing(hit).dot(direction) < 0.0);
+            fronts += u32::from(hit.normal.dot(direction) < 0.0);
             inverse += 1.0 / hit.t;
         }
         let enclosed = hits as f32 >= ENCLOSED * PROBES as f32;
@@ -290,22 +294,20 @@ impl Surroundings {
     }
 }
 
-/// Returns the bounding box of a mesh whose triangles have corners of their own. A box that is
-/// mostly empty because few small triangles are far away is replaced by that of the rest.
-fn main_part(mesh: &Mesh) -> Option<(Vec3, Vec3)> {
-    let (lo, hi) = mesh.bounds()?;
-    let centre = |t: &[u32; 3]| {
-        let [a, b, c] = t.map(|v| mesh.positions[v as usize]);
-        (a + b + c) * (1.0 / 3.0)
-    };
-    let area = |t: &[u32; 3]| {
-        let [a, b, c] = t.map(|v| mesh.positions[v as usize]);
-        f64::from((b - a).cross(c - a).length())
-    };
-    let triangles: Vec<(Vec3, f64)> = mesh
-        .triangles
+/// Returns the bounding box of triangles. A box that is mostly empty because few small triangles
+/// are far away is replaced by that of the rest.
+fn main_part(all: &[[Vec3; 3]]) -> Option<(Vec3, Vec3)> {
+    let first = all.first()?[0];
+    let (lo, hi) = all
         .iter()
-        .map(|t| (centre(t), area(t)))
+        .flatten()
+        .fold((first, first), |(lo, hi), p| (lo.min(*p), hi.max(*p)));
+    let triangles: Vec<(Vec3, f64)> = all
+        .iter()
+        .map(|[a, b, c]| {
+            let area = f64::from((*b - *a).cross(*c - *a).length());
+            ((*a + *b + *c) * (1.0 / 3.0), area)
+        })
         .collect();
     let total: f64 = triangles.iter().map(|(_, a)| a).sum();
     // The range that holds all but a hundredth of the area, along each axis.
