@@ -123,7 +123,8 @@ fn the_mesh_lies_on_the_true_surfaces_and_little_floats() {
     assert_eq!(back.laser.beams.len(), 16);
     let nothing = picofarm_reconstruct::Surface::default();
     std::fs::write(&path, nothing.glb(&made.measured).unwrap()).unwrap();
-    assert!(read_scene(&path).unwrap().objects.is_empty());
+    let refusal = read_scene(&path).unwrap_err().to_string();
+    assert!(refusal.contains("no triangles"), "{refusal}");
     assert!(
         made.evidence.contains(&Evidence::None),
         "some nodes are guesses, and said to be"
