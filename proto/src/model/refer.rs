@@ -4,7 +4,12 @@
 //! A name refers first to a model that an earlier stage trains, then to a stage. A resolved job
 //! contains only names of models, so that it means the same when it is read again.
 
-use super::{kinds::ModelNames, places::SourceSettings, spec_error::SpecError, stage::StageSpec};
+use super::{
+    kinds::{Makes, ModelNames},
+    places::SourceSettings,
+    spec_error::SpecError,
+    stage::StageSpec,
+};
 
 /// Fills in values that follow from other stages: places, needs and numbers of scenes.
 ///
@@ -83,25 +88,26 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
         return Ok(());
     };
     let source = stage.task.reads().cloned();
-    let at = |field: &str| format!("stage.{}.{field}", stage.name);
-    if let Some((field, folder)) = stage.task.reads_beside_mut() {
-        let found = beside(folder, before, &store).map_err(|e| SpecError::new(at(field), e))?;
+    let in_stage = |field: &str| format!("stage.{}.{field}", stage.name);
+    if let Some((field, folder)) = stage.task.io_mut().folder {
+        let found = written_folder(folder, before, &store)
+            .map_err(|e| SpecError::new(in_stage(field), e))?;
         if let Some(found) = found {
             *folder = found;
         }
     }
-    match stage.task.models_mut() {
+    match stage.task.io_mut().models {
         ModelNames::Single(names) => {
             for (field, name) in names {
                 let mut found =
-                    named(name, before, &store).map_err(|e| SpecError::new(at(field), e))?;
+                    named(name, before, &store).map_err(|e| SpecError::new(in_stage(field), e))?;
                 if found.len() > 1 {
                     let what = format!(
                         "{name:?} stands for {} models; name one stage, as \"{}\"",
                         found.len(),
                         found[0].0
                     );
-                    return Err(SpecError::new(at(field), what));
+                    return Err(SpecError::new(in_stage(field), what));
                 }
                 if let Some((_, model)) = found.pop() {
                     *name = model;
@@ -109,28 +115,29 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
             }
         }
         ModelNames::List(field, names) => {
-            all(names, before, &store).map_err(|e| SpecError::new(at(field), e))?;
+            all(names, before, &store).map_err(|e| SpecError::new(in_stage(field), e))?;
         }
     }
-    let task = &stage.task;
-    let models = task.models();
+    let io = stage.task.io();
+    let models = &io.models;
     let read = |name: &String| models.iter().any(|(_, model)| *model == name);
     let wanted = before.iter().filter(|s| {
         let divides = s.task.divides().is_some_and(|(divided, name)| {
-            Some(divided) == source.as_ref() && task.split() == Some(name)
+            Some(divided) == source.as_ref() && io.split == Some(name)
         });
         // A report uses the evaluations of its models.
-        let evaluates = task.reports().is_some()
+        let evaluates = matches!(io.makes, Makes::Report(..))
             && s.task.models_store() == Some(&store)
-            && s.task.evaluates().iter().any(read);
+            && s.task.io().makes == Makes::Evaluations
+            && s.task.models().into_iter().any(|(_, model)| read(model));
         let trains = s
             .task
             .trains()
             .is_some_and(|(place, model)| *place == store && read(model));
-        let beside = task
-            .reads_beside()
+        let folder = io
+            .folder
             .is_some_and(|(_, folder)| s.task.writes() == Some((&store, folder)));
-        divides || evaluates || trains || beside
+        divides || evaluates || trains || folder
     });
     let wanted: Vec<String> = wanted.map(|s| s.name.clone()).collect();
     for name in wanted {
@@ -142,7 +149,7 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
 }
 
 /// Returns the folder that the stage with this name writes; `None` if the name is a folder's.
-fn beside(name: &str, before: &[StageSpec], store: &str) -> Result<Option<String>, String> {
+fn written_folder(name: &str, before: &[StageSpec], store: &str) -> Result<Option<String>, String> {
     // A folder that a stage writes refers to itself, so that a job may be read again.
     let written = |s: &StageSpec| s.task.writes().is_some_and(|(_, to)| to == name);
     if before.iter().any(written) {

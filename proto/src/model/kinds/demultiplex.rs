@@ -7,11 +7,11 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Results, TaskKind},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Results, TaskKind},
     reprocess::Histogram,
 };
 use crate::model::{
-    destination::Destination,
     limits::check_count,
     memory::{BASE, Known},
     places::{OutputSettings, SourceSettings, check_source, default_profile},
@@ -78,12 +78,22 @@ impl Declared for DemultiplexTask {
 }
 
 impl TaskKind for DemultiplexTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("demultiplex.version", &self.demultiplex.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("demultiplex.version", &self.demultiplex.version),
+            source: Some(&self.source),
+            makes: Makes::Depths(&self.output),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.demultiplex.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.demultiplex.version),
+            source: Some((&mut self.source, &mut self.count)),
+            stores: vec![("output.store", &mut self.output.store)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -120,10 +130,6 @@ impl TaskKind for DemultiplexTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.output)
-    }
-
     fn results(&self) -> Results<'_> {
         Results::scenes(&self.output)
     }
@@ -134,31 +140,10 @@ impl TaskKind for DemultiplexTask {
         Some(BASE + source.truth() + (1.0 + RANGES) * source.histogram() + pairs)
     }
 
-    fn tasks(&self) -> u64 {
-        self.count
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("output.store", &mut self.output.store)]
-    }
-
-    fn writes(&self) -> Option<(&String, &String)> {
-        Some((&self.output.store, &self.output.dataset))
-    }
-
-    fn makes(&self) -> Option<(&String, &String)> {
-        None
-    }
-
-    fn writes_depths(&self) -> bool {
-        true
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.count,
+            ..Dispatch::default()
+        }
     }
 }

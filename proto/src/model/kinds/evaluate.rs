@@ -7,7 +7,8 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, ModelNames, Results, TaskKind, predicts_depth},
+    io::{Io, IoMut, Makes, ModelNames, names},
+    kind::{Declared, Dispatch, Manifest, Results, TaskKind, predicts_depth},
     names::{check_model, check_predictions, check_split, check_times},
     reprocess::Histogram,
     train::{TRUTH, check_spots, is_zero},
@@ -129,12 +130,15 @@ impl Declared for EvaluateShardTask {
 }
 
 impl TaskKind for EvaluateShardTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        self.whole.versioned()
+    fn io(&self) -> Io<'_> {
+        Io {
+            makes: Makes::Nothing,
+            ..self.whole.io()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        self.whole.version_mut()
+    fn io_mut(&mut self) -> IoMut<'_> {
+        self.whole.io_mut()
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -149,16 +153,13 @@ impl TaskKind for EvaluateShardTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::Shared
-    }
-
     fn results(&self) -> Results<'_> {
         let source = &self.whole.source;
         Results {
             field: "source.store",
             store: &source.store,
             folder: format!("{}/evaluate/shards", source.dataset),
+            destination: Destination::Shared,
             manifest: Manifest::None,
         }
     }
@@ -167,40 +168,15 @@ impl TaskKind for EvaluateShardTask {
         self.whole.memory(known, threads)
     }
 
-    fn tasks(&self) -> u64 {
-        u64::from(self.whole.evaluate.shards)
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        self.whole.reads()
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        self.whole.reads_mut()
-    }
-
-    fn reads_beside(&self) -> Option<(&'static str, &String)> {
-        self.whole.reads_beside()
-    }
-
-    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
-        self.whole.reads_beside_mut()
-    }
-
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         self.whole.check_among(before)
     }
 
-    fn split(&self) -> Option<&String> {
-        self.whole.split()
-    }
-
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        self.whole.models()
-    }
-
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        self.whole.models_mut()
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: u64::from(self.whole.evaluate.shards),
+            ..Dispatch::default()
+        }
     }
 }
 
@@ -230,12 +206,31 @@ impl Declared for EvaluateTask {
 }
 
 impl TaskKind for EvaluateTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("evaluate.version", &self.evaluate.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("evaluate.version", &self.evaluate.version),
+            source: Some(&self.source),
+            folder: self.evaluate.folder(),
+            split: Some(&self.evaluate.split),
+            models: names("evaluate.models", &self.evaluate.models),
+            makes: Makes::Evaluations,
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.evaluate.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        let settings = &mut self.evaluate;
+        let folder = match settings.predictions.is_empty() {
+            true => is_folder(&settings.times).then_some((TIMES, &mut settings.times)),
+            false => Some((PREDICTIONS, &mut settings.predictions)),
+        };
+        IoMut {
+            version: Some(&mut settings.version),
+            source: Some((&mut self.source, &mut self.count)),
+            folder,
+            models: ModelNames::List("evaluate.models", &mut settings.models),
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -257,15 +252,12 @@ impl TaskKind for EvaluateTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::Shared
-    }
-
     fn results(&self) -> Results<'_> {
         Results {
             field: "source.store",
             store: &self.source.store,
             folder: format!("{}/evaluate", self.source.dataset),
+            destination: Destination::Shared,
             manifest: Manifest::None,
         }
     }
@@ -276,34 +268,6 @@ impl TaskKind for EvaluateTask {
         Some(BASE + source.two() + asked.fold(0.0, f64::max))
     }
 
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn split(&self) -> Option<&String> {
-        Some(&self.evaluate.split)
-    }
-
-    fn reads_beside(&self) -> Option<(&'static str, &String)> {
-        let settings = &self.evaluate;
-        match settings.predictions.is_empty() {
-            true => is_folder(&settings.times).then_some((TIMES, &settings.times)),
-            false => Some((PREDICTIONS, &settings.predictions)),
-        }
-    }
-
-    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
-        let settings = &mut self.evaluate;
-        match settings.predictions.is_empty() {
-            true => is_folder(&settings.times).then_some((TIMES, &mut settings.times)),
-            false => Some((PREDICTIONS, &mut settings.predictions)),
-        }
-    }
-
     /// Predicted depths that a model receives must be depths.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         match self.evaluate.predictions.is_empty() {
@@ -311,22 +275,18 @@ impl TaskKind for EvaluateTask {
             false => Ok(()),
         }
     }
-
-    fn evaluates(&self) -> &[String] {
-        &self.evaluate.models
-    }
-
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        let models = self.evaluate.models.iter();
-        models.map(|m| ("evaluate.models", m)).collect()
-    }
-
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        ModelNames::List("evaluate.models", &mut self.evaluate.models)
-    }
 }
 
 impl EvaluateSettings {
+    /// Returns the folder that is read in addition to the data set: predictions to compare, or
+    /// those that two-bounce times come from.
+    fn folder(&self) -> Option<(&'static str, &String)> {
+        match self.predictions.is_empty() {
+            true => is_folder(&self.times).then_some((TIMES, &self.times)),
+            false => Some((PREDICTIONS, &self.predictions)),
+        }
+    }
+
     /// Checks every field against its limits.
     ///
     /// # Errors

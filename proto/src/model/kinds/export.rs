@@ -5,7 +5,8 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, Results, TaskKind},
+    io::{Io, IoMut},
+    kind::{Declared, Dispatch, Manifest, Results, TaskKind},
 };
 use crate::model::{
     destination::Destination,
@@ -66,12 +67,20 @@ impl Declared for ExportTask {
 }
 
 impl TaskKind for ExportTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("export.version", Self::VERSION)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("export.version", Self::VERSION),
+            source: Some(&self.source),
+            ..Io::default()
+        }
     }
 
-    fn variant(&self) -> Option<&'static str> {
-        matches!(&*self.export.format, "sb3d" | "hdf5").then_some(FORMATS)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            source: Some((&mut self.source, &mut self.count)),
+            stores: vec![("export.dest", &mut self.export.dest)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -95,15 +104,12 @@ impl TaskKind for ExportTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::folder("export.dest", &self.export.dest, "")
-    }
-
     fn results(&self) -> Results<'_> {
         Results {
             field: "export.dest",
             store: &self.export.dest,
             folder: "/export".into(),
+            destination: Destination::folder("export.dest", &self.export.dest, ""),
             manifest: Manifest::None,
         }
     }
@@ -113,15 +119,10 @@ impl TaskKind for ExportTask {
         Some(BASE + source.truth() + 3.5 * source.histogram())
     }
 
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("export.dest", &mut self.export.dest)]
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            variant: matches!(&*self.export.format, "sb3d" | "hdf5").then_some(FORMATS),
+            ..Dispatch::default()
+        }
     }
 }

@@ -6,7 +6,8 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, Results, TaskKind},
+    io::{Io, IoMut},
+    kind::{Declared, Dispatch, Manifest, Results, TaskKind},
     render::RenderSettings,
     scenes::{FilesIn, SceneKind, SceneSource},
 };
@@ -70,12 +71,21 @@ impl Declared for GenerateTask {
 }
 
 impl TaskKind for GenerateTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("generate.version", &self.generate.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("generate.version", &self.generate.version),
+            scenes: Some(&self.scenes),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.generate.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.generate.version),
+            scenes: Some(&mut self.scenes),
+            stores: vec![("generate.dest", &mut self.generate.dest)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -117,15 +127,12 @@ impl TaskKind for GenerateTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::folder("generate.dest", &self.generate.dest, "")
-    }
-
     fn results(&self) -> Results<'_> {
         Results {
             field: "generate.dest",
             store: &self.generate.dest,
             folder: "/scenes".into(),
+            destination: Destination::folder("generate.dest", &self.generate.dest, ""),
             manifest: match &*self.generate.format {
                 "glb" => Manifest::Gltf,
                 _ => Manifest::None,
@@ -138,19 +145,10 @@ impl TaskKind for GenerateTask {
         Some(BASE)
     }
 
-    fn tasks(&self) -> u64 {
-        self.scenes.count
-    }
-
-    fn scenes(&self) -> Option<&SceneSource> {
-        Some(&self.scenes)
-    }
-
-    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
-        Some(&mut self.scenes)
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("generate.dest", &mut self.generate.dest)]
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.scenes.count,
+            ..Dispatch::default()
+        }
     }
 }

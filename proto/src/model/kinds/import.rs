@@ -5,10 +5,10 @@ use serde_json::{Map, Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Results, TaskKind},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Results, TaskKind},
 };
 use crate::model::{
-    destination::Destination,
     limits::MAX_TASKS,
     memory::{BASE, Known},
     places::OutputSettings,
@@ -95,12 +95,21 @@ impl Declared for ImportTask {
 }
 
 impl TaskKind for ImportTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("import.version", &self.import.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("import.version", &self.import.version),
+            files: Some(("import.folder", &self.import.folder)),
+            makes: Makes::Scenes(&self.output),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.import.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.import.version),
+            stores: vec![("output.store", &mut self.output.store)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -137,10 +146,6 @@ impl TaskKind for ImportTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.output)
-    }
-
     fn results(&self) -> Results<'_> {
         Results::scenes(&self.output)
     }
@@ -150,19 +155,10 @@ impl TaskKind for ImportTask {
         Some(BASE + source.truth() + 3.2 * source.histogram())
     }
 
-    fn tasks(&self) -> u64 {
-        self.import.count
-    }
-
-    fn inputs(&self, _task: Option<u64>) -> Vec<(String, &str)> {
-        vec![("import.folder".into(), &self.import.folder)]
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("output.store", &mut self.output.store)]
-    }
-
-    fn writes(&self) -> Option<(&String, &String)> {
-        Some((&self.output.store, &self.output.dataset))
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.import.count,
+            ..Dispatch::default()
+        }
     }
 }

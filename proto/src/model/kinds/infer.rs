@@ -8,13 +8,13 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, ModelNames, Results, TaskKind},
+    io::{Io, IoMut, Makes, ModelNames, names},
+    kind::{Declared, Dispatch, Results, TaskKind},
     names::check_model,
     reprocess::Histogram,
     train::check_spots,
 };
 use crate::model::{
-    destination::Destination,
     limits::check_count,
     memory::{BASE, Known, Network},
     places::{OutputSettings, SourceSettings, check_source, default_profile},
@@ -72,12 +72,24 @@ impl Declared for InferTask {
 }
 
 impl TaskKind for InferTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("infer.version", &self.infer.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("infer.version", &self.infer.version),
+            source: Some(&self.source),
+            models: names("infer.models", &self.infer.models),
+            makes: Makes::PerScene(&self.output),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.infer.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.infer.version),
+            source: Some((&mut self.source, &mut self.count)),
+            stores: vec![("output.store", &mut self.output.store)],
+            models: ModelNames::List("infer.models", &mut self.infer.models),
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -130,10 +142,6 @@ impl TaskKind for InferTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.output)
-    }
-
     fn results(&self) -> Results<'_> {
         Results::scenes(&self.output)
     }
@@ -145,37 +153,11 @@ impl TaskKind for InferTask {
         Some(BASE + source.two() + weights + asked.fold(0.0, f64::max))
     }
 
-    fn tasks(&self) -> u64 {
-        self.count
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("output.store", &mut self.output.store)]
-    }
-
-    fn writes(&self) -> Option<(&String, &String)> {
-        Some((&self.output.store, &self.output.dataset))
-    }
-
-    fn makes(&self) -> Option<(&String, &String)> {
-        None
-    }
-
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        let models = self.infer.models.iter();
-        models.map(|m| ("infer.models", m)).collect()
-    }
-
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        ModelNames::List("infer.models", &mut self.infer.models)
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.count,
+            ..Dispatch::default()
+        }
     }
 }
 

@@ -5,12 +5,19 @@ use std::fmt;
 
 use serde_json::Value;
 
-use super::{division::Division, fields::Fields, render::RenderTask, scenes::SceneSource};
+use super::{
+    division::Division,
+    fields::Fields,
+    io::{Io, IoMut, Makes},
+    render::RenderTask,
+    scenes::SceneSource,
+    train::TrainSettings,
+};
 use crate::{
     key::hash::{StageKey, TaskKey},
     model::{
         destination::Destination,
-        memory::{Known, Network, Shape},
+        memory::{Known, Shape},
         places::{OutputSettings, SourceSettings},
         spec_error::SpecError,
         trial::Trial,
@@ -41,13 +48,15 @@ pub trait Declared: TaskKind + Sized {
 
 /// The properties of a kind of task for the farm, excluding the code that runs it.
 pub trait TaskKind: fmt::Debug + Send + Sync {
-    /// Returns the version of the code that decides the bytes of the results, and the field with
-    /// it. A worker's version must be equal.
-    fn versioned(&self) -> (&'static str, &str);
+    /// Lists everything that the task reads and makes by name, and its version.
+    fn io(&self) -> Io<'_>;
 
-    /// Returns the version to be filled in; `None` if jobs do not contain it.
-    fn version_mut(&mut self) -> Option<&mut String> {
-        None
+    /// Like [`Self::io`], as far as a submission fills it in.
+    fn io_mut(&mut self) -> IoMut<'_>;
+
+    /// Returns how the tasks are handed out.
+    fn dispatch(&self) -> Dispatch {
+        Dispatch::default()
     }
 
     /// Checks every field against its limits.
@@ -96,10 +105,6 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         None
     }
 
-    /// Where its tasks write, which decides whose that is. Without a default, so that no kind
-    /// leaves it out.
-    fn destination(&self) -> Destination<'_>;
-
     /// Returns the place of the results.
     fn results(&self) -> Results<'_>;
 
@@ -107,152 +112,153 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
     /// depends on unknown data.
     fn memory(&self, known: &Known, threads: u32) -> Option<f64>;
 
-    /// Returns the number of tasks.
-    fn tasks(&self) -> u64 {
-        1
-    }
-
-    /// Returns whether stopped tasks keep their progress, so that the next worker continues from
-    /// there. Such tasks may run for days. None runs twice at a time, and a worker that must end
-    /// does not finish them first.
-    fn resumes(&self) -> bool {
-        false
-    }
-
-    /// Returns the requirement on workers beyond the kind; see
-    /// [`TaskSpec::ability`](super::TaskSpec::ability).
-    fn variant(&self) -> Option<&'static str> {
-        None
-    }
-
-    /// Returns the input data set.
-    fn reads(&self) -> Option<&SourceSettings> {
-        None
-    }
-
-    /// Returns the input data set and the number of its scenes, to be filled in.
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        None
-    }
-
-    /// Returns an additional input with its field: a folder of the same store, into which a stage
-    /// may write something for each scene.
-    fn reads_beside(&self) -> Option<(&'static str, &String)> {
-        None
-    }
-
-    /// Like `reads_beside`, to replace the name of a stage by its folder.
-    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
-        None
-    }
-
-    /// Returns the scenes that are generated or read as files.
-    fn scenes(&self) -> Option<&SceneSource> {
-        None
-    }
-
-    /// The same, for files to be pinned anew.
-    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
-        None
-    }
-
-    /// The paths and URLs that are read in addition to data sets, each with its field: by one task,
-    /// or by all.
-    fn inputs(&self, _task: Option<u64>) -> Vec<(String, &str)> {
-        Vec::new()
-    }
-
-    /// Returns the stores named in addition to that of the input data set, each with its field, to
-    /// be made absolute.
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        Vec::new()
-    }
-
-    /// Returns the store and folder into which something is written for each scene, a data set or
-    /// predictions.
-    fn writes(&self) -> Option<(&String, &String)> {
-        None
-    }
-
-    /// Returns the store and folder of the data set into which scenes are written.
-    fn makes(&self) -> Option<(&String, &String)> {
-        self.writes()
-    }
-
-    /// Returns whether the folder of [`Self::writes`] gets depths without any model.
-    fn writes_depths(&self) -> bool {
-        false
-    }
-
     /// Returns the size of the resulting scenes, given the size of the input scenes.
     fn shape(&self, _source: Option<Shape>) -> Option<Shape> {
         None
     }
+}
 
-    /// Returns the split that the task makes: its data set and its name.
-    fn divides(&self) -> Option<(&SourceSettings, &String)> {
-        None
+/// Parts of [`TaskKind::io`], [`TaskKind::io_mut`] and [`TaskKind::dispatch`].
+impl dyn TaskKind + '_ {
+    /// Returns the version of the code that decides the bytes of the results, and the field with
+    /// it. A worker's version must be equal.
+    pub fn versioned(&self) -> (&'static str, &str) {
+        self.io().version
     }
 
-    /// Returns the split of the data set of [`Self::reads`] that the task uses.
-    fn split(&self) -> Option<&String> {
-        None
+    /// Returns the version to be filled in; `None` if jobs do not contain it.
+    pub fn version_mut(&mut self) -> Option<&mut String> {
+        self.io_mut().version
+    }
+
+    /// Returns the input data set.
+    pub fn reads(&self) -> Option<&SourceSettings> {
+        self.io().source
+    }
+
+    /// Returns the input data set and the number of its scenes, to be filled in.
+    pub fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        self.io_mut().source
+    }
+
+    /// Returns the scenes that are generated or read as files.
+    pub fn scenes(&self) -> Option<&SceneSource> {
+        self.io().scenes
+    }
+
+    /// The same, for files to be pinned anew.
+    pub fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
+        self.io_mut().scenes
+    }
+
+    /// Returns the paths and URLs that are read in addition to data sets, each with its field: by
+    /// one task, or by all.
+    pub fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {
+        self.io().inputs(task)
+    }
+
+    /// Returns the store and folder into which something is written for each scene.
+    pub fn writes(&self) -> Option<(&String, &String)> {
+        self.io().writes()
+    }
+
+    /// Returns the store and folder of the data set into which scenes are written.
+    pub fn makes(&self) -> Option<(&String, &String)> {
+        match self.io().makes {
+            Makes::Scenes(to) => Some((&to.store, &to.dataset)),
+            _ => None,
+        }
+    }
+
+    /// Returns the split that the task makes: its data set and its name.
+    pub fn divides(&self) -> Option<(&SourceSettings, &String)> {
+        match self.io().makes {
+            Makes::Split(source, name) => Some((source, name)),
+            _ => None,
+        }
     }
 
     /// Returns the model that the task trains: store and name.
-    fn trains(&self) -> Option<(&String, &String)> {
-        None
+    pub fn trains(&self) -> Option<(&String, &String)> {
+        match self.io().makes {
+            Makes::Model { store, name, .. } => Some((store, name)),
+            _ => None,
+        }
+    }
+
+    /// Returns the settings of the training.
+    pub fn training(&self) -> Option<&TrainSettings> {
+        match self.io().makes {
+            Makes::Model { training, .. } => training,
+            _ => None,
+        }
     }
 
     /// Returns the target of the trained model.
-    fn predicts(&self) -> Option<&'static str> {
-        None
-    }
-
-    /// Returns the network trained on such scenes.
-    fn network(&self, _source: &Shape) -> Option<Network> {
-        None
-    }
-
-    /// Returns the evaluated models.
-    fn evaluates(&self) -> &[String] {
-        &[]
+    pub fn predicts(&self) -> Option<&'static str> {
+        self.training().map(|train| train.target.name())
     }
 
     /// Returns the report that the task makes: store and name.
-    fn reports(&self) -> Option<(&String, &String)> {
-        None
+    pub fn reports(&self) -> Option<(&String, &String)> {
+        match self.io().makes {
+            Makes::Report(store, name) => Some((store, name)),
+            _ => None,
+        }
     }
 
     /// Returns the store of the models that the task uses or trains.
-    fn models_store(&self) -> Option<&String> {
-        self.reads().map(|source| &source.store)
+    pub fn models_store(&self) -> Option<&String> {
+        self.io().models_store()
     }
 
-    /// Like `models_store`, to be filled in if it may be omitted.
-    fn models_store_mut(&mut self) -> Option<&mut String> {
-        None
+    /// Returns that store, to be filled in if it may be omitted.
+    pub fn models_store_mut(&mut self) -> Option<&mut String> {
+        let io = self.io_mut();
+        let store = io.stores.into_iter().next().filter(|_| io.models_in_store);
+        store.map(|(_, store)| store)
     }
 
     /// Returns the models that the task reads from the store of [`Self::models_store`]: field and
     /// name.
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        Vec::new()
+    pub fn models(&self) -> Vec<(&'static str, &String)> {
+        self.io().models
     }
 
-    /// Like `models`, to replace names of stages by those of their models.
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        ModelNames::Single(Vec::new())
+    /// Returns the number of tasks.
+    pub fn tasks(&self) -> u64 {
+        self.dispatch().tasks
+    }
+
+    /// Returns whether stopped tasks keep their progress; see [`Dispatch::resumes`].
+    pub fn resumes(&self) -> bool {
+        self.dispatch().resumes
     }
 }
 
-/// Names of models in a task.
-#[derive(Debug)]
-pub enum ModelNames<'a> {
-    /// Fields with one name each.
-    Single(Vec<(&'static str, &'a mut String)>),
-    /// A field with any number of names.
-    List(&'static str, &'a mut Vec<String>),
+/// How tasks are handed out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Dispatch {
+    /// The number of tasks.
+    pub tasks: u64,
+    /// Whether stopped tasks keep their progress, so that the next worker continues from there.
+    /// Such tasks may run for days. None runs twice at a time, and a worker that must end does not
+    /// finish them first.
+    pub resumes: bool,
+    /// The requirement on workers beyond the kind; see
+    /// [`TaskSpec::ability`](super::TaskSpec::ability).
+    pub variant: Option<&'static str>,
+}
+
+impl Default for Dispatch {
+    /// Returns one task, which starts anew when it is stopped, for every worker of its kind.
+    fn default() -> Self {
+        Self {
+            tasks: 1,
+            resumes: false,
+            variant: None,
+        }
+    }
 }
 
 /// The place of a stage's results.
@@ -265,6 +271,8 @@ pub struct Results<'a> {
     /// Distinguishes the results from others in the store: a folder, or a name that no folder can
     /// have.
     pub folder: String,
+    /// Where the tasks write, which decides whose that is.
+    pub destination: Destination<'a>,
     /// The manifest by which a store shows whether a result exists.
     pub manifest: Manifest<'a>,
 }
@@ -276,6 +284,7 @@ impl<'a> Results<'a> {
             field: "output.store",
             store: &output.store,
             folder: output.dataset.clone(),
+            destination: Destination::output(output),
             manifest: Manifest::Scene {
                 dataset: &output.dataset,
             },
@@ -325,7 +334,7 @@ pub enum Manifest<'a> {
     },
 }
 
-/// Refuses a folder in [`TaskKind::reads_beside`] if an earlier stage writes it and predicts no
+/// Refuses a folder in [`Io::folder`] if an earlier stage writes it and predicts no
 /// depth. Other folders are checked when the stage runs.
 ///
 /// # Errors
@@ -334,7 +343,7 @@ pub(super) fn predicts_depth(
     task: &dyn TaskKind,
     before: &[&dyn TaskKind],
 ) -> Result<(), SpecError> {
-    let (Some((field, folder)), Some(store)) = (task.reads_beside(), task.models_store()) else {
+    let (Some((field, folder)), Some(store)) = (task.io().folder, task.models_store()) else {
         return Ok(());
     };
     let Some(writer) = before
@@ -354,7 +363,7 @@ pub(super) fn predicts_depth(
         .models()
         .into_iter()
         .any(|(_, model)| predicts(model));
-    if by_model || writer.writes_depths() {
+    if by_model || matches!(writer.io().makes, Makes::Depths(_)) {
         return Ok(());
     }
     let what = format!(

@@ -13,6 +13,7 @@ mod fields;
 pub mod generate;
 pub mod import;
 pub mod infer;
+pub(super) mod io;
 mod kind;
 pub(super) mod names;
 mod part;
@@ -41,7 +42,8 @@ pub use fields::Fields;
 pub use generate::GenerateTask;
 pub use import::ImportTask;
 pub use infer::InferTask;
-pub use kind::{Declared, Manifest, ModelNames, Results, TaskKind};
+pub use io::{Io, IoMut, Makes, ModelNames};
+pub use kind::{Declared, Dispatch, Manifest, Results, TaskKind};
 pub use part::PartTask;
 pub use promote::{PromoteSettings, PromoteTask};
 pub use reconstruct::{ReconstructSettings, ReconstructTask};
@@ -165,7 +167,7 @@ impl TaskSpec {
     /// Returns the ability that a worker must announce to get the tasks. It is the kind, followed
     /// by a colon and the requirement if not every program that runs the kind can run these tasks.
     pub fn ability(&self) -> Cow<'static, str> {
-        match self.variant() {
+        match self.dispatch().variant {
             None => self.kind().into(),
             Some(variant) => format!("{}:{variant}", self.kind()).into(),
         }

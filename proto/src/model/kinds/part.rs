@@ -7,9 +7,9 @@ use serde_json::{Value, json};
 use super::{
     division::Division,
     fields::Fields,
-    kind::{Declared, Manifest, Results, TaskKind},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Manifest, Results, TaskKind},
     render::RenderTask,
-    scenes::SceneSource,
 };
 use crate::{
     key::hash::TaskKey,
@@ -61,12 +61,16 @@ impl Declared for PartTask {
 }
 
 impl TaskKind for PartTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        self.whole.versioned()
+    fn io(&self) -> Io<'_> {
+        Io {
+            makes: Makes::Nothing,
+            tasks_per_scene: self.division().tasks_per_scene(),
+            ..self.whole.io()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        self.whole.version_mut()
+    fn io_mut(&mut self) -> IoMut<'_> {
+        self.whole.io_mut()
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -86,16 +90,13 @@ impl TaskKind for PartTask {
         self.whole.scene_key(scene)
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.whole.output)
-    }
-
     fn results(&self) -> Results<'_> {
         let whole = &self.whole.output;
         Results {
             field: "output.store",
             store: &whole.store,
             folder: format!("{}/parts", whole.dataset),
+            destination: Destination::output(&self.whole.output),
             manifest: Manifest::Part {
                 dataset: &whole.dataset,
                 whole: &self.whole,
@@ -114,24 +115,10 @@ impl TaskKind for PartTask {
         Some(BASE + rendering.with_scene(kept))
     }
 
-    fn tasks(&self) -> u64 {
-        self.whole.scenes.count * self.division().tasks_per_scene()
-    }
-
-    fn scenes(&self) -> Option<&SceneSource> {
-        Some(&self.whole.scenes)
-    }
-
-    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
-        Some(&mut self.whole.scenes)
-    }
-
-    fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {
-        self.whole
-            .inputs(task.map(|task| self.division().split(task).0))
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        self.whole.stores_mut()
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.whole.scenes.count * self.division().tasks_per_scene(),
+            ..Dispatch::default()
+        }
     }
 }

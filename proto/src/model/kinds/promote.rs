@@ -5,7 +5,8 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    io::{Io, IoMut, Makes, ModelNames, names},
+    kind::{Declared, Manifest, Results, TaskKind},
     names::check_model,
 };
 use crate::model::{
@@ -58,12 +59,27 @@ impl Declared for PromoteTask {
 }
 
 impl TaskKind for PromoteTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("promote.version", &self.promote.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("promote.version", &self.promote.version),
+            source: Some(&self.source),
+            models: names("promote.among", &self.promote.among),
+            makes: Makes::Model {
+                store: &self.source.store,
+                name: &self.promote.model,
+                training: None,
+            },
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.promote.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.promote.version),
+            source: Some((&mut self.source, &mut self.count)),
+            models: ModelNames::List("promote.among", &mut self.promote.among),
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -96,17 +112,17 @@ impl TaskKind for PromoteTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        let folder = format!("{MODELS}/{}", self.promote.model);
-        Destination::folder("promote.model", &self.source.store, folder)
-    }
-
     fn results(&self) -> Results<'_> {
         let name = &*self.promote.model;
         Results {
             field: "source.store",
             store: &self.source.store,
             folder: format!("{MODELS}/{name}"),
+            destination: Destination::folder(
+                "promote.model",
+                &self.source.store,
+                format!("{MODELS}/{name}"),
+            ),
             manifest: Manifest::Model { name },
         }
     }
@@ -114,26 +130,5 @@ impl TaskKind for PromoteTask {
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let weights = known.networks.iter().map(Network::weights);
         Some(BASE + 2.0 * weights.fold(0.0, f64::max))
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn trains(&self) -> Option<(&String, &String)> {
-        Some((&self.source.store, &self.promote.model))
-    }
-
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        let models = self.promote.among.iter();
-        models.map(|m| ("promote.among", m)).collect()
-    }
-
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        ModelNames::List("promote.among", &mut self.promote.among)
     }
 }

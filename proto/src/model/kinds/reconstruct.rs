@@ -7,10 +7,10 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Results, TaskKind},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Results, TaskKind},
 };
 use crate::model::{
-    destination::Destination,
     limits::check_count,
     memory::{BASE, Known, Shape},
     places::{OutputSettings, SourceSettings, check_source, default_profile},
@@ -139,6 +139,10 @@ fn mlp_bytes(width: u32) -> f64 {
 /// The field of [`ReconstructSettings::predictions`].
 const PREDICTIONS: &str = "reconstruct.predictions";
 
+fn is_given(folder: &str) -> bool {
+    !folder.is_empty()
+}
+
 impl Declared for ReconstructTask {
     const NAME: &'static str = "reconstruct";
     const FIELDS: &'static [&'static str] = &["source", "count", "reconstruct", "output"];
@@ -154,12 +158,26 @@ impl Declared for ReconstructTask {
 }
 
 impl TaskKind for ReconstructTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("reconstruct.version", &self.reconstruct.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("reconstruct.version", &self.reconstruct.version),
+            source: Some(&self.source),
+            folder: is_given(&self.reconstruct.predictions)
+                .then_some((PREDICTIONS, &self.reconstruct.predictions)),
+            makes: Makes::PerScene(&self.output),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.reconstruct.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.reconstruct.version),
+            source: Some((&mut self.source, &mut self.count)),
+            folder: is_given(&self.reconstruct.predictions)
+                .then_some((PREDICTIONS, &mut self.reconstruct.predictions)),
+            stores: vec![("output.store", &mut self.output.store)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -193,10 +211,6 @@ impl TaskKind for ReconstructTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.output)
-    }
-
     fn results(&self) -> Results<'_> {
         Results::scenes(&self.output)
     }
@@ -217,46 +231,12 @@ impl TaskKind for ReconstructTask {
         Some(BASE + source.truth() + histogram + grid + networks)
     }
 
-    fn tasks(&self) -> u64 {
-        self.count
-    }
-
-    fn resumes(&self) -> bool {
-        self.reconstruct.field == FieldKind::Mlp
-    }
-
-    fn variant(&self) -> Option<&'static str> {
-        (self.reconstruct.field == FieldKind::Mlp).then_some(MLP)
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn reads_beside(&self) -> Option<(&'static str, &String)> {
-        let folder = &self.reconstruct.predictions;
-        (!folder.is_empty()).then_some((PREDICTIONS, folder))
-    }
-
-    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
-        let folder = &mut self.reconstruct.predictions;
-        (!folder.is_empty()).then_some((PREDICTIONS, folder))
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("output.store", &mut self.output.store)]
-    }
-
-    fn writes(&self) -> Option<(&String, &String)> {
-        Some((&self.output.store, &self.output.dataset))
-    }
-
-    fn makes(&self) -> Option<(&String, &String)> {
-        None
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.count,
+            resumes: self.reconstruct.field == FieldKind::Mlp,
+            variant: (self.reconstruct.field == FieldKind::Mlp).then_some(MLP),
+        }
     }
 }
 

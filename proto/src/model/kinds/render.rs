@@ -6,13 +6,13 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Results, TaskKind},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Results, TaskKind},
     scenes::FilesIn,
 };
 use crate::{
     key::hash::{StageKey, TaskKey, task_key},
     model::{
-        destination::Destination,
         memory::{Known, LIGHT_PATHS, Rendering, Shape},
         places::OutputSettings,
         spec_error::{SpecError, within},
@@ -131,12 +131,22 @@ impl Declared for RenderTask {
 }
 
 impl TaskKind for RenderTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("render.renderer", &self.render.renderer)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("render.renderer", &self.render.renderer),
+            scenes: Some(&self.scenes),
+            makes: Makes::Scenes(&self.output),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.render.renderer)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.render.renderer),
+            scenes: Some(&mut self.scenes),
+            stores: vec![("output.store", &mut self.output.store)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -193,10 +203,6 @@ impl TaskKind for RenderTask {
         files.then(|| StageKey::of(self.described(FilesIn::None)))
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.output)
-    }
-
     fn results(&self) -> Results<'_> {
         Results::scenes(&self.output)
     }
@@ -212,37 +218,6 @@ impl TaskKind for RenderTask {
         Some(rendering.coded() + parts)
     }
 
-    fn tasks(&self) -> u64 {
-        self.scenes.count
-    }
-
-    fn scenes(&self) -> Option<&SceneSource> {
-        Some(&self.scenes)
-    }
-
-    fn scenes_mut(&mut self) -> Option<&mut SceneSource> {
-        Some(&mut self.scenes)
-    }
-
-    fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {
-        let SceneKind::Files { files, first, root } = &self.scenes.kind else {
-            return Vec::new();
-        };
-        let root = root.iter().map(|root| ("scenes.root".to_owned(), &**root));
-        let files = files.iter().zip(*first..);
-        let named = files.filter(|(_, i)| task.is_none_or(|task| *i == task));
-        let named = named.map(|(file, i)| (format!("scenes.files[{i}]"), &*file.path));
-        root.chain(named).collect()
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("output.store", &mut self.output.store)]
-    }
-
-    fn writes(&self) -> Option<(&String, &String)> {
-        Some((&self.output.store, &self.output.dataset))
-    }
-
     fn shape(&self, _source: Option<Shape>) -> Option<Shape> {
         Some(Shape {
             height: self.render.resolution,
@@ -250,5 +225,12 @@ impl TaskKind for RenderTask {
             bins: self.render.bins,
             spots: self.scenes.spots.count(),
         })
+    }
+
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.scenes.count,
+            ..Dispatch::default()
+        }
     }
 }

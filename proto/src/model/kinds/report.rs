@@ -7,7 +7,8 @@ use serde_json::{Value, json};
 use super::{
     evaluate::MAX_MODELS,
     fields::Fields,
-    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    io::{Io, IoMut, Makes, ModelNames, names},
+    kind::{Declared, Manifest, Results, TaskKind},
     names::check_model,
 };
 use crate::model::{
@@ -71,12 +72,24 @@ impl Declared for ReportTask {
 }
 
 impl TaskKind for ReportTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("report.version", &self.report.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("report.version", &self.report.version),
+            models_store: Some(&self.report.store),
+            models: names("report.models", &self.report.models),
+            makes: Makes::Report(&self.report.store, &self.report.name),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.report.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.report.version),
+            stores: vec![("report.store", &mut self.report.store)],
+            models_in_store: true,
+            models: ModelNames::List("report.models", &mut self.report.models),
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -87,16 +100,13 @@ impl TaskKind for ReportTask {
         json!({"stage": "report", "settings": self.report})
     }
 
-    fn destination(&self) -> Destination<'_> {
-        let folder = format!("{REPORTS}/{}", self.report.name);
-        Destination::folder("report.name", &self.report.store, folder)
-    }
-
     fn results(&self) -> Results<'_> {
+        let folder = format!("{REPORTS}/{}", self.report.name);
         Results {
             field: "report.store",
             store: &self.report.store,
-            folder: format!("{REPORTS}/{}", self.report.name),
+            folder: folder.clone(),
+            destination: Destination::folder("report.name", &self.report.store, folder),
             manifest: Manifest::Report {
                 name: &self.report.name,
             },
@@ -110,31 +120,6 @@ impl TaskKind for ReportTask {
             .iter()
             .map(|n| n.scene.two() + n.ask(&n.scene));
         Some(BASE + asked.reduce(f64::max)?)
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("report.store", &mut self.report.store)]
-    }
-
-    fn reports(&self) -> Option<(&String, &String)> {
-        Some((&self.report.store, &self.report.name))
-    }
-
-    fn models_store(&self) -> Option<&String> {
-        Some(&self.report.store)
-    }
-
-    fn models_store_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.report.store)
-    }
-
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        let models = self.report.models.iter();
-        models.map(|m| ("report.models", m)).collect()
-    }
-
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        ModelNames::List("report.models", &mut self.report.models)
     }
 }
 

@@ -7,12 +7,12 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Results, TaskKind},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Results, TaskKind},
 };
 use crate::{
     key::hash::StageKey,
     model::{
-        destination::Destination,
         limits::check_count,
         memory::{BASE, Known, Shape},
         places::{OutputSettings, SourceSettings, check_source},
@@ -50,12 +50,22 @@ impl Declared for ReprocessTask {
 }
 
 impl TaskKind for ReprocessTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("reprocess.version", &self.reprocess.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("reprocess.version", &self.reprocess.version),
+            source: Some(&self.source),
+            makes: Makes::Scenes(&self.output),
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.reprocess.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            version: Some(&mut self.reprocess.version),
+            source: Some((&mut self.source, &mut self.count)),
+            stores: vec![("output.store", &mut self.output.store)],
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -81,10 +91,6 @@ impl TaskKind for ReprocessTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::output(&self.output)
-    }
-
     fn results(&self) -> Results<'_> {
         Results::scenes(&self.output)
     }
@@ -95,26 +101,6 @@ impl TaskKind for ReprocessTask {
         // Includes the memory of the previous scene that the allocator still keeps.
         let histograms = if spots { 5.6 } else { 4.2 };
         Some(BASE + source.truth() + histograms * source.histogram())
-    }
-
-    fn tasks(&self) -> u64 {
-        self.count
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        vec![("output.store", &mut self.output.store)]
-    }
-
-    fn writes(&self) -> Option<(&String, &String)> {
-        Some((&self.output.store, &self.output.dataset))
     }
 
     fn shape(&self, source: Option<Shape>) -> Option<Shape> {
@@ -130,6 +116,13 @@ impl TaskKind for ReprocessTask {
             spots,
             ..source
         })
+    }
+
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.count,
+            ..Dispatch::default()
+        }
     }
 }
 

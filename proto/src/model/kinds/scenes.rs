@@ -92,6 +92,18 @@ fn is_zero(n: &u64) -> bool {
 const FURNISHED: u64 = 450_000;
 
 impl SceneKind {
+    /// Returns the paths that are read, each with its field: of one scene, or of all.
+    pub(super) fn inputs(&self, scene: Option<u64>) -> Vec<(String, &str)> {
+        let Self::Files { files, first, root } = self else {
+            return Vec::new();
+        };
+        let root = root.iter().map(|root| ("scenes.root".to_owned(), &**root));
+        let files = files.iter().zip(*first..);
+        let named = files.filter(|(_, i)| scene.is_none_or(|scene| *i == scene));
+        let named = named.map(|(file, i)| (format!("scenes.files[{i}]"), &*file.path));
+        root.chain(named).collect()
+    }
+
     /// Returns the triangles of a scene, as far as memory depends on them; 0 if they are few, or
     /// unknown without the files.
     pub(super) fn triangles(&self) -> u64 {

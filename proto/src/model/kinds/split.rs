@@ -5,6 +5,7 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
+    io::{Io, IoMut, Makes},
     kind::{Declared, Manifest, Results, TaskKind},
 };
 use crate::{
@@ -48,8 +49,20 @@ impl Declared for SplitTask {
 }
 
 impl TaskKind for SplitTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("split.version", Self::VERSION)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("split.version", Self::VERSION),
+            source: Some(&self.source),
+            makes: Makes::Split(&self.source, &self.split.name),
+            ..Io::default()
+        }
+    }
+
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            source: Some((&mut self.source, &mut self.count)),
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -67,21 +80,18 @@ impl TaskKind for SplitTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        let folder = format!("{}/split/{}", self.source.dataset, self.split.name);
-        Destination::Record(Place {
-            field: "split.name",
-            store: &self.source.store,
-            folder: folder.into(),
-        })
-    }
-
     fn results(&self) -> Results<'_> {
         let (dataset, name) = (&*self.source.dataset, &*self.split.name);
+        let folder = format!("{dataset}/split/{name}");
         Results {
             field: "source.store",
             store: &self.source.store,
-            folder: format!("{dataset}/split/{name}"),
+            folder: folder.clone(),
+            destination: Destination::Record(Place {
+                field: "split.name",
+                store: &self.source.store,
+                folder: folder.into(),
+            }),
             manifest: Manifest::Split { dataset, name },
         }
     }
@@ -89,17 +99,5 @@ impl TaskKind for SplitTask {
     /// Lists of scenes take 64 bytes a scene.
     fn memory(&self, _known: &Known, _threads: u32) -> Option<f64> {
         Some(BASE + 64.0 * self.count as f64)
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn divides(&self) -> Option<(&SourceSettings, &String)> {
-        Some((&self.source, &self.split.name))
     }
 }

@@ -11,13 +11,14 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, ModelNames, Results, TaskKind, predicts_depth},
+    io::{Io, IoMut, Makes},
+    kind::{Declared, Dispatch, Manifest, Results, TaskKind, predicts_depth},
     scenes::SceneSource,
 };
 use crate::model::{
     destination::Destination,
     limits::check_count,
-    memory::{BASE, Known, Network, Shape},
+    memory::{BASE, Known},
     places::{MODELS, SourceSettings, check_source},
     spec_error::SpecError,
 };
@@ -61,12 +62,27 @@ impl Declared for TrainTask {
 }
 
 impl TaskKind for TrainTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("train.version", &self.train.version)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("train.version", &self.train.version),
+            source: Some(&self.source),
+            folder: self.train.times().map(|times| (TIMES, times)),
+            split: Some(&self.train.split),
+            models: self.train.models(),
+            makes: Makes::Model {
+                store: &self.source.store,
+                name: &self.train.model,
+                training: Some(&self.train),
+            },
+            ..Io::default()
+        }
     }
 
-    fn version_mut(&mut self) -> Option<&mut String> {
-        Some(&mut self.train.version)
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            source: Some((&mut self.source, &mut self.count)),
+            ..self.train.io_mut()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -89,17 +105,17 @@ impl TaskKind for TrainTask {
         description
     }
 
-    fn destination(&self) -> Destination<'_> {
-        let folder = format!("{MODELS}/{}", self.train.model);
-        Destination::folder("train.model", &self.source.store, folder)
-    }
-
     fn results(&self) -> Results<'_> {
         let name = &*self.train.model;
         Results {
             field: "source.store",
             store: &self.source.store,
             folder: format!("{MODELS}/{name}"),
+            destination: Destination::folder(
+                "train.model",
+                &self.source.store,
+                format!("{MODELS}/{name}"),
+            ),
             manifest: match &self.train.trial {
                 Some(trial) => Manifest::Trial(trial),
                 None => Manifest::Model { name },
@@ -124,47 +140,6 @@ impl TaskKind for TrainTask {
         Some(BASE + source.two() + sensed + learns + sums + others.fold(0.0, f64::max))
     }
 
-    fn tasks(&self) -> u64 {
-        u64::from(self.train.processes)
-    }
-
-    fn resumes(&self) -> bool {
-        true
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
-    }
-
-    fn split(&self) -> Option<&String> {
-        Some(&self.train.split)
-    }
-
-    fn trains(&self) -> Option<(&String, &String)> {
-        Some((&self.source.store, &self.train.model))
-    }
-
-    fn predicts(&self) -> Option<&'static str> {
-        Some(self.train.target.name())
-    }
-
-    fn network(&self, source: &Shape) -> Option<Network> {
-        Some(self.train.network(source))
-    }
-
-    fn reads_beside(&self) -> Option<(&'static str, &String)> {
-        Some((TIMES, self.train.times()?))
-    }
-
-    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
-        self.train.times()?;
-        Some((TIMES, &mut self.train.shadow.times))
-    }
-
     /// Predicted depths must come from a depth network, and spots that are known by their number
     /// must be at the same places in all scenes.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
@@ -184,12 +159,12 @@ impl TaskKind for TrainTask {
         }
     }
 
-    fn models(&self) -> Vec<(&'static str, &String)> {
-        self.train.models()
-    }
-
-    fn models_mut(&mut self) -> ModelNames<'_> {
-        ModelNames::Single(self.train.models_mut())
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: u64::from(self.train.processes),
+            resumes: true,
+            ..Dispatch::default()
+        }
     }
 }
 

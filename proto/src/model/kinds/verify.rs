@@ -6,7 +6,8 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, Results, TaskKind},
+    io::{Io, IoMut},
+    kind::{Declared, Dispatch, Manifest, Results, TaskKind},
 };
 use crate::model::{
     destination::Destination,
@@ -55,8 +56,19 @@ impl Declared for VerifyTask {
 }
 
 impl TaskKind for VerifyTask {
-    fn versioned(&self) -> (&'static str, &str) {
-        ("verify.version", Self::VERSION)
+    fn io(&self) -> Io<'_> {
+        Io {
+            version: ("verify.version", Self::VERSION),
+            source: Some(&self.source),
+            ..Io::default()
+        }
+    }
+
+    fn io_mut(&mut self) -> IoMut<'_> {
+        IoMut {
+            source: Some((&mut self.source, &mut self.count)),
+            ..IoMut::default()
+        }
     }
 
     fn check(&self) -> Result<(), SpecError> {
@@ -72,15 +84,12 @@ impl TaskKind for VerifyTask {
         })
     }
 
-    fn destination(&self) -> Destination<'_> {
-        Destination::Shared
-    }
-
     fn results(&self) -> Results<'_> {
         Results {
             field: "source.store",
             store: &self.source.store,
             folder: format!("{}/verify", self.source.dataset),
+            destination: Destination::Shared,
             manifest: Manifest::None,
         }
     }
@@ -90,15 +99,10 @@ impl TaskKind for VerifyTask {
         Some(BASE + source.truth() + 2.9 * source.histogram())
     }
 
-    fn tasks(&self) -> u64 {
-        self.count
-    }
-
-    fn reads(&self) -> Option<&SourceSettings> {
-        Some(&self.source)
-    }
-
-    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        Some((&mut self.source, &mut self.count))
+    fn dispatch(&self) -> Dispatch {
+        Dispatch {
+            tasks: self.count,
+            ..Dispatch::default()
+        }
     }
 }

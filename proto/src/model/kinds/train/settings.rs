@@ -6,8 +6,12 @@ use picofarm_settings::{
 };
 use serde::{Deserialize, Serialize};
 
+use super::TIMES;
 use crate::model::{
-    kinds::reprocess::Histogram,
+    kinds::{
+        io::{IoMut, ModelNames},
+        reprocess::Histogram,
+    },
     memory::{Network, Shape},
     trial::Trial,
 };
@@ -391,15 +395,19 @@ impl TrainSettings {
         models
     }
 
-    /// Like `models`, to be filled in.
-    pub(crate) fn models_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        let mut models = Vec::new();
-        if !self.specular.on.is_empty() {
-            models.push(("train.specular.on", &mut self.specular.on));
+    /// Returns the fields that a submission fills in.
+    pub(crate) fn io_mut(&mut self) -> IoMut<'_> {
+        let from_folder = self.times().is_some();
+        let models = [
+            ("train.specular.on", &mut self.specular.on),
+            ("train.from", &mut self.from),
+        ];
+        let named = models.into_iter().filter(|(_, name)| !name.is_empty());
+        IoMut {
+            version: Some(&mut self.version),
+            folder: from_folder.then_some((TIMES, &mut self.shadow.times)),
+            models: ModelNames::Single(named.collect()),
+            ..IoMut::default()
         }
-        if !self.from.is_empty() {
-            models.push(("train.from", &mut self.from));
-        }
-        models
     }
 }

@@ -177,7 +177,7 @@ pub fn resolve(task: &mut TaskSpec, here: &Submission<'_>) -> Result<(), SpecErr
     if let Some((source, _)) = task.reads_mut() {
         source.store = here.store("source.store", &source.store)?;
     }
-    for (field, store) in task.stores_mut() {
+    for (field, store) in task.io_mut().stores {
         *store = here.store(field, store)?;
     }
     let (field, ours) = (task.versioned().0, version(task.kind()));

@@ -62,7 +62,7 @@ impl RunTask for ReconstructTask {
     }
 
     fn resolve(&mut self, _: &Submission<'_>) -> Result<(), SpecError> {
-        match (self.variant(), mlp::NOT_BUILT) {
+        match (self.dispatch().variant, mlp::NOT_BUILT) {
             (Some(_), Some(what)) => Err(SpecError::new("reconstruct.field", what)),
             _ => Ok(()),
         }

@@ -73,7 +73,7 @@ pub fn forget(
     manifest: &ReconstructionManifest,
     (stores, control): (&Stores, &Control),
 ) -> Result<(), TaskError> {
-    if !task.resumes() {
+    if !task.dispatch().resumes {
         return Ok(());
     }
     stores.wait(control, folder.checkpoints_of(&manifest.task_key).delete())
