@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    model::{Histogram, JobSpec, ReportSettings, StageSpec, TrainSettings},
+    spec::{Histogram, JobSpec, ReportSettings, StageSpec, TrainSettings},
     split::SplitSettings,
 };
 use hash::canonical;

@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use picofarm_proto::model::Histogram;
+use picofarm_proto::spec::Histogram;
 
 use picofarm_agent::export::Scenes;
 use picofarm_exchange::ExportFormat;

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use picofarm_agent::Submission;
 use picofarm_proto::{
-    model::{JobSpec, RenderTask, TaskSpec, scaled},
     show,
+    spec::{JobSpec, RenderTask, TaskSpec, scaled},
 };
 
 use crate::{

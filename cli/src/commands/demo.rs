@@ -9,11 +9,9 @@ use std::{net::SocketAddr, path::Path};
 use picofarm_agent::Access;
 use picofarm_proto::{
     ids::JobId,
-    model::{
-        Budget, JobSpec, JobState, JobStatus, OutputSettings, RenderSettings, RenderTask,
-        SceneKind, SceneSource,
-    },
+    messages::{JobState, JobStatus},
     show,
+    spec::{Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource},
 };
 use serde_json::json;
 

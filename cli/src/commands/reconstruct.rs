@@ -15,7 +15,7 @@ use std::time::Instant;
 
 use picofarm_agent::{Memory, reconstruct};
 use picofarm_figures::Canvas;
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     kinds::reconstruct::grid_bytes,
     memory::{Shape, gib},
 };

@@ -2,7 +2,7 @@
 //! other users may only reuse its results.
 
 use picofarm_catalog::{OwnedPlace, Owner, Sight, StageRecord};
-use picofarm_proto::model::{Destination, SpecError, StageSpec};
+use picofarm_proto::spec::{Destination, SpecError, StageSpec};
 
 use crate::auth::Caller;
 

@@ -12,7 +12,7 @@ use std::{
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{LogAllowance, LogLevel, LogLine, TaskLog, log::cut},
+    messages::{LogAllowance, LogLevel, LogLine, TaskLog, log::cut},
 };
 use tracing::{
     Event, Level, Subscriber,
@@ -204,7 +204,7 @@ impl Unsent {
 mod tests {
     use picofarm_proto::{
         ids::{Epoch, RangeId},
-        model::log::{BYTES, LINES},
+        messages::log::{BYTES, LINES},
     };
     use tracing::{info, warn};
     use tracing_subscriber::prelude::*;

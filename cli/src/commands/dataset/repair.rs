@@ -8,7 +8,7 @@ use picofarm_agent::{
     repair::{Hints, Repairer},
 };
 use picofarm_dataset::{Dataset, Snapshot};
-use picofarm_proto::model::SourceSettings;
+use picofarm_proto::spec::SourceSettings;
 use picofarm_store::{Problem, VerifyMode};
 use serde_json::json;
 use tokio::runtime::Handle;

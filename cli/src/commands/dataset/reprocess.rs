@@ -7,7 +7,7 @@ use picofarm_agent::{
     Control, TaskError,
     reprocess::{Reprocessor, sensor_version},
 };
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, TaskKind,
 };
 use serde_json::json;

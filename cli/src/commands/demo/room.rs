@@ -11,7 +11,7 @@ use picofarm_agent::{
 use picofarm_dataset::{Dataset, Quantity};
 use picofarm_demultiplex::{DepthScore, Settings, Truth, demultiplex, score as flash_score};
 use picofarm_figures::{Canvas, TEXT};
-use picofarm_proto::model::kinds::demultiplex::Places;
+use picofarm_proto::spec::kinds::demultiplex::Places;
 use picofarm_reconstruct::{
     ReconstructError, Reconstructed, Settings as GridSettings, Surface, Unwatched, reconstruct,
     render::Renderer, score, source::from_flash, surface,

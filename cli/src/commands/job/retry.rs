@@ -4,8 +4,9 @@
 
 use picofarm_proto::{
     ids::JobId,
-    model::{JobSpec, JobState, SceneKind},
+    messages::JobState,
     show,
+    spec::{JobSpec, SceneKind},
 };
 use serde_json::json;
 

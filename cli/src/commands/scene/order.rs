@@ -1,7 +1,7 @@
 //! A scene file and its render settings, as `scene render` and `scene plan` read them.
 
 use picofarm_agent::SceneSize;
-use picofarm_proto::{model::RenderSettings, show};
+use picofarm_proto::{show, spec::RenderSettings};
 use picofarm_scene::{Intrinsics, Scene};
 use picofarm_transient::{Budget, Settings};
 

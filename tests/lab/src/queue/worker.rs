@@ -11,7 +11,7 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, LeaseRef, WorkerId},
     key::{StageKey, task_key},
-    model::{Abilities, Finished, Lease, WorkerHello},
+    messages::{Abilities, Finished, Lease, WorkerHello},
     wire::{
         self, farm_client::FarmClient, session_request::Message as Say,
         session_response::Message as Heard,

@@ -11,7 +11,7 @@ use picofarm_model::{
     scene::{Order, Scene, Scenes, Unreadable},
 };
 use picofarm_proto::{
-    model::Histogram,
+    spec::Histogram,
     split::{Rank, SplitRecord},
 };
 use picofarm_results::{Predictions, SplitUsed};

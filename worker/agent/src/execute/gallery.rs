@@ -7,7 +7,7 @@ use picofarm_model::{
     Device, Model,
     report::{Picture, pictures},
 };
-use picofarm_proto::model::Histogram;
+use picofarm_proto::spec::Histogram;
 use picofarm_results::Evaluation;
 
 use super::{

@@ -1,13 +1,13 @@
 //! Checks that a task fits into the memory available to this worker's tasks.
-//! [`picofarm_proto::model::memory`] defines that limit.
+//! [`picofarm_proto::spec::memory`] defines that limit.
 
 use picofarm_dataset::DatasetSpec;
 use picofarm_proto::{
-    model::{
+    show,
+    spec::{
         TaskSpec,
         memory::{Known, Rendering, Shape, gib, peak_bytes},
     },
-    show,
 };
 use picofarm_scene::Scene;
 use picofarm_transient::Settings;
@@ -140,7 +140,7 @@ pub fn check_memory(settings: &Settings, size: SceneSize, threads: usize) -> Res
 mod tests {
     use std::sync::Arc;
 
-    use picofarm_proto::model::JobSpec;
+    use picofarm_proto::spec::JobSpec;
     use picofarm_scene::primitive::{self, PrimitiveSettings};
     use picofarm_transient::{Budget, Gate};
 

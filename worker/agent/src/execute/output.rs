@@ -11,7 +11,8 @@ use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{Dataset, DatasetSpec, EncodedScene, Manifest, Profile, Subsets};
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderTask, TaskSpec, log::VERDICT, memory::Known},
+    messages::log::VERDICT,
+    spec::{RenderTask, TaskSpec, memory::Known},
     trace,
 };
 use picofarm_results::Verdict;

@@ -6,7 +6,7 @@
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
     key::{StageKey, TaskKey, task_key},
-    model::{
+    spec::{
         OutputSettings, RenderTask, ReprocessTask, SceneKind, StageSpec, TaskSpec, kinds::TaskKind,
     },
 };

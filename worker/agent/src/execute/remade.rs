@@ -1,7 +1,7 @@
 //! Makes the scenes of a data set again from its recipes, as the ground truth for results computed
 //! from them.
 
-use picofarm_proto::model::{SourceSettings, TaskSpec};
+use picofarm_proto::spec::{SourceSettings, TaskSpec};
 use picofarm_scene::Scene;
 
 use super::{Context, Control, TaskError, recipe, reprocess::source_manifest, scenes};

@@ -12,7 +12,7 @@ use picofarm_exchange::import::{Format, ImportOptions, Source, import_scene};
 use picofarm_files::Opener;
 use picofarm_proto::{
     key::{StageKey, TaskKey, stage_key},
-    model::{
+    spec::{
         JobSpec, OutputSettings, RenderTask, ReprocessSettings, ReprocessTask, SourceSettings,
         TaskSpec,
     },

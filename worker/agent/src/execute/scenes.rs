@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use picofarm_files::Opener;
 use picofarm_proto::{
     key::scene_seed,
-    model::{SceneFile, SceneKind, SceneSource},
+    spec::{SceneFile, SceneKind, SceneSource},
 };
 use picofarm_scene::{
     Aim, AssetLibrary, Scene, SceneError,

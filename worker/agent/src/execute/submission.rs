@@ -4,7 +4,7 @@
 use std::path::{Component, Path, PathBuf};
 
 use picofarm_dataset::Profile;
-use picofarm_proto::model::{SceneKind, SceneSource, SpecError};
+use picofarm_proto::spec::{SceneKind, SceneSource, SpecError};
 use picofarm_scene::{
     AssetLibrary,
     import::{Bounds, fingerprint},

@@ -1,7 +1,7 @@
 //! Source of two-bounce times: the true depths, or those predicted by an infer stage.
 
 use picofarm_dataset::{Dataset, Pinned};
-use picofarm_proto::model::train::TRUTH;
+use picofarm_proto::spec::train::TRUTH;
 use picofarm_results::{DepthsUsed, PinnedDepths, Predictions};
 use picofarm_store::StorageError;
 

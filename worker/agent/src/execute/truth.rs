@@ -2,7 +2,7 @@
 //! placeholders stored instead are meaningless, but a network would learn them as if they were
 //! true.
 
-use picofarm_proto::model::{TrainSettings, train::Target};
+use picofarm_proto::spec::{TrainSettings, train::Target};
 
 use super::TaskError;
 

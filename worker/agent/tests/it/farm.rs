@@ -10,7 +10,8 @@ use picofarm_coordinator::{CoordinatorConfig, Running, serve};
 use picofarm_database::CatalogPlace;
 use picofarm_dataset::Dataset;
 use picofarm_proto::{
-    model::{JobSpec, JobState, JobStatus, RenderTask},
+    messages::{JobState, JobStatus},
+    spec::{JobSpec, RenderTask},
     wire::{self, jobs_client::JobsClient},
 };
 use picofarm_store::{VerifyMode, open_store};

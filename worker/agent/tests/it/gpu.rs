@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use picofarm_agent::{Output, TaskError};
 use picofarm_model::device::{Gpus, gpus};
-use picofarm_proto::model::{Resources, StageSpec};
+use picofarm_proto::spec::{Resources, StageSpec};
 use picofarm_results::Predictions;
 use picofarm_store::open_store;
 use serde_json::json;

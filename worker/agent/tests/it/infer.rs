@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use picofarm_agent::{Control, Output, TaskError};
 use picofarm_dataset::{Dataset, Quantity};
-use picofarm_proto::model::{StageSpec, TaskSpec};
+use picofarm_proto::spec::{StageSpec, TaskSpec};
 use picofarm_results::{Predicted, PredictionManifest, Predictions, TimesUsed};
 use picofarm_store::open_store;
 use picofarm_store::published::Manifest as _;

@@ -15,7 +15,7 @@ use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::stage_key,
-    model::{
+    spec::{
         JobSpec, StageSpec,
         memory::{Known, Shape, peak_bytes},
     },

@@ -14,7 +14,7 @@ use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::stage_key,
-    model::{Budget, PartTask, RenderTask, StageSpec, TaskSpec},
+    spec::{Budget, PartTask, RenderTask, StageSpec, TaskSpec},
 };
 use picofarm_settings::Wavelength;
 use tokio::runtime::Handle;

@@ -18,7 +18,7 @@ use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::stage_key,
-    model::{RenderTask, SceneFile, SceneKind},
+    spec::{RenderTask, SceneFile, SceneKind},
 };
 use picofarm_scene::{export, primitive};
 use picofarm_settings::Spots;

@@ -10,7 +10,7 @@ use picofarm_agent::{
 use picofarm_dataset::*;
 use picofarm_proto::{
     key::{TaskKey, derived_key},
-    model::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
+    spec::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
 use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
 use picofarm_store::*;

@@ -5,7 +5,7 @@ use crate::place;
 use std::{path::PathBuf, sync::Arc};
 
 use picofarm_agent::{Output, TaskError};
-use picofarm_proto::model::{StageSpec, TaskSpec, kinds::EvaluateShardTask};
+use picofarm_proto::spec::{StageSpec, TaskSpec, kinds::EvaluateShardTask};
 use serde_json::json;
 
 use place::*;

@@ -4,7 +4,7 @@
 use crate::place;
 
 use picofarm_agent::model_version;
-use picofarm_proto::model::{JobSpec, PromoteSettings, PromoteTask, StageSpec, TaskSpec};
+use picofarm_proto::spec::{JobSpec, PromoteSettings, PromoteTask, StageSpec, TaskSpec};
 use picofarm_results::*;
 use picofarm_store::published::Manifest as _;
 use serde_json::{Value, json};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use picofarm_dataset::{Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, Wavelength};
 use picofarm_model::scene::{Scene as Seen, Scenes};
-use picofarm_proto::{key::TaskKey, model::Histogram};
+use picofarm_proto::{key::TaskKey, spec::Histogram};
 use picofarm_scene::{
     Affine, Beam, Camera, Intrinsics, Laser, Material, Mesh, Object, Scene, Vec3,
 };

@@ -8,7 +8,7 @@ use picofarm_dataset::{Dataset, ENCODER_VERSION, Manifest};
 use picofarm_demultiplex::{Settings, VERSION, demultiplex};
 use picofarm_proto::{
     key::TaskKey,
-    model::{
+    spec::{
         TaskSpec,
         kinds::{DemultiplexTask, demultiplex::DemultiplexSettings},
     },

@@ -13,7 +13,7 @@ use picofarm_dataset::{Dataset, Pinned};
 use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline, memory::Kept};
 use picofarm_proto::{
     key::evaluation_key,
-    model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
+    spec::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
 };
 use picofarm_results::{Evaluation, Models, ShardName, SplitUsed, Verdict};
 use picofarm_sensor::Sensor;

@@ -5,7 +5,7 @@ use std::ops::Range;
 use picofarm_dataset::Dataset;
 use picofarm_exchange::{ExportFormat, Exporter};
 use picofarm_proto::{
-    model::{ExportTask, SpecError, TaskSpec},
+    spec::{ExportTask, SpecError, TaskSpec},
     split::{SIDES, SplitRecord},
 };
 use picofarm_store::StorageError;

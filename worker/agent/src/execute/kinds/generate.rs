@@ -3,7 +3,7 @@
 
 use bytes::Bytes;
 use picofarm_files::Opener;
-use picofarm_proto::model::{GenerateTask, SceneSource, SpecError};
+use picofarm_proto::spec::{GenerateTask, SceneSource, SpecError};
 use picofarm_scene::{Scene, SceneError, export};
 use picofarm_store::publish_files;
 use sha2::{Digest, Sha256};

@@ -11,7 +11,7 @@ use picofarm_exchange::import::{
     Format, IMPORT_VERSION, ImportError, ImportOptions, Source, import_scene,
 };
 use picofarm_files::{FileError, Opener};
-use picofarm_proto::model::{ImportSettings, ImportTask, SpecError, TaskSpec};
+use picofarm_proto::spec::{ImportSettings, ImportTask, SpecError, TaskSpec};
 use picofarm_results::Verdict;
 use picofarm_store::published::Manifest as _;
 use tracing::info;

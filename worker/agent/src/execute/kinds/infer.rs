@@ -15,7 +15,7 @@ use picofarm_model::{
     Device, Model, ModelError, masks,
     scene::{Scene, Scenes},
 };
-use picofarm_proto::model::{InferTask, TaskSpec};
+use picofarm_proto::spec::{InferTask, TaskSpec};
 use picofarm_results::{Models, Predicted, Predictions};
 use picofarm_store::published::Manifest as _;
 

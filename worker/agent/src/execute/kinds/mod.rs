@@ -1,5 +1,5 @@
 //! The worker's executor: the table of all task kinds. Each kind runs in a file of its own in this
-//! folder. [`picofarm_proto::model::kinds`] documents the kinds.
+//! folder. [`picofarm_proto::spec::kinds`] documents the kinds.
 
 pub mod demultiplex;
 #[cfg(feature = "networks")]
@@ -33,7 +33,7 @@ use std::{collections::BTreeMap, path::PathBuf, time::Duration};
 use picofarm_files::Opener;
 #[cfg(feature = "networks")]
 use picofarm_model::device::OpenGpu;
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
     kinds::{

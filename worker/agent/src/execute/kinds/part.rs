@@ -5,7 +5,7 @@
 use picofarm_dataset::{Dataset, PartName};
 use picofarm_proto::{
     key::TaskKey,
-    model::{PartTask, RenderTask, SpecError},
+    spec::{PartTask, RenderTask, SpecError},
     trace,
 };
 use picofarm_scene::Scene;

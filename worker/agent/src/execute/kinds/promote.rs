@@ -2,7 +2,7 @@
 //! byte-for-byte copy of the training's result, and its manifest lists the candidates.
 
 use picofarm_model::metric::Metrics;
-use picofarm_proto::model::PromoteTask;
+use picofarm_proto::spec::PromoteTask;
 use picofarm_results::{ModelManifest, NewModel, Promoted, TrialRecord};
 use picofarm_store::published::Manifest as _;
 use tracing::info;

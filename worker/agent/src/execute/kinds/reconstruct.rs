@@ -20,7 +20,7 @@ use bytes::Bytes;
 use picofarm_dataset::Manifest;
 use picofarm_proto::{
     key::TaskKey,
-    model::{
+    spec::{
         SpecError, TaskSpec,
         kinds::{ReconstructTask, TaskKind, reconstruct::ReconstructSettings},
     },

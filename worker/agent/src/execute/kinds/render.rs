@@ -8,7 +8,8 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderSettings, RenderTask, SpecError, TaskKind, log::DARK},
+    messages::log::DARK,
+    spec::{RenderSettings, RenderTask, SpecError, TaskKind},
     trace,
 };
 use picofarm_scene::{Camera, Scene};

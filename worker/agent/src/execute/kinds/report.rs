@@ -14,7 +14,7 @@ use picofarm_model::{
 };
 use picofarm_proto::{
     key::report_key,
-    model::{ReportTask, train::TRUTH},
+    spec::{ReportTask, train::TRUTH},
 };
 use picofarm_results::{
     Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports, TrainingSpeed,

@@ -12,7 +12,7 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::{TaskKey, derived_key},
-    model::{
+    spec::{
         Histogram, ReprocessSettings, ReprocessTask, SourceSettings, SpecError, TaskKind, TaskSpec,
     },
     trace,

@@ -8,7 +8,7 @@ use std::{collections::BTreeSet, time::Duration};
 
 use picofarm_dataset::Dataset;
 use picofarm_proto::{
-    model::{SourceSettings, SplitTask},
+    spec::{SourceSettings, SplitTask},
     split::{SplitRecord, SplitSettings},
 };
 use sha2::{Digest, Sha256};
@@ -119,7 +119,7 @@ fn run(
     dataset: &str,
     control: &Control,
 ) -> Result<Split, TaskError> {
-    let user = |e: picofarm_proto::model::SpecError| TaskError::User(e.to_string());
+    let user = |e: picofarm_proto::spec::SpecError| TaskError::User(e.to_string());
     settings.check().map_err(user)?;
     let dataset = stores.open_source(store, dataset, control)?;
     let present = present(stores, &dataset, control)?;

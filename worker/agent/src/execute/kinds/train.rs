@@ -22,7 +22,7 @@ use picofarm_model::{
 };
 use picofarm_proto::{
     key::training_key,
-    model::{
+    spec::{
         TaskSpec, TrainSettings, TrainTask,
         train::{Normalise, Target},
     },

@@ -1,6 +1,6 @@
 //! Verification: reads a scene's objects and compares them with its manifest.
 
-use picofarm_proto::model::{SourceSettings, TaskSpec, kinds::VerifyTask};
+use picofarm_proto::spec::{SourceSettings, TaskSpec, kinds::VerifyTask};
 use picofarm_store::VerifyMode;
 
 use crate::execute::{

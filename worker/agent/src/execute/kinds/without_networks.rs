@@ -1,7 +1,7 @@
 //! Substitutes for the task kinds that need networks, in a build without them. Such a worker does
 //! not offer these kinds, and such a program cannot submit them.
 
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     EvaluateShardTask, EvaluateTask, InferTask, PromoteTask, ReportTask, TrainTask,
 };
 

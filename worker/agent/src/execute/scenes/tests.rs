@@ -3,7 +3,7 @@
 
 use std::fs;
 
-use picofarm_proto::model::SpecError;
+use picofarm_proto::spec::SpecError;
 use picofarm_scene::export::glb_bytes;
 use serde_json::{Value, json};
 

@@ -9,9 +9,10 @@ use picofarm_agent::{
 use picofarm_proto::{
     ids::{Epoch, JobId, LeaseRef, RangeId},
     key::stage_key,
-    model::{
-        Budget, Lease, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource,
-        StageSpec, TaskSpec,
+    messages::Lease,
+    spec::{
+        Budget, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec,
+        TaskSpec,
     },
     wire::{
         self, SessionRequest, SessionResponse,

@@ -12,7 +12,7 @@ use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::{TaskKey, stage_key},
-    model::{
+    spec::{
         EvaluateSettings, EvaluateTask, InferTask, ReportTask, SourceSettings, StageSpec, TaskSpec,
         TrainSettings, TrainTask,
     },

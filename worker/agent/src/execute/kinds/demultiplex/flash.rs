@@ -3,7 +3,7 @@
 
 use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_demultiplex::{Capture, Place, Spot};
-use picofarm_proto::model::{Histogram, kinds::demultiplex::Places};
+use picofarm_proto::spec::{Histogram, kinds::demultiplex::Places};
 use picofarm_scene::{Camera, Intrinsics, Vec3};
 use picofarm_settings::Gate;
 use picofarm_store::StorageError;

@@ -8,7 +8,7 @@ use picofarm_model::{
     input::{DEPTH_SCALE_M, Normalise, Question, ShadowVariant, Target},
     scene::Unreadable,
 };
-use picofarm_proto::{key::evaluation_key, model::Histogram};
+use picofarm_proto::{key::evaluation_key, spec::Histogram};
 use picofarm_results::{Evaluation, Predicted, Predictions, Verdict};
 use picofarm_store::sha256_hex;
 use tracing::info;

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use picofarm_dataset::{Dataset, Manifest};
 use picofarm_proto::{
     key::inference_key,
-    model::{
+    spec::{
         Histogram, InferTask,
         train::{TRUTH, Target},
     },

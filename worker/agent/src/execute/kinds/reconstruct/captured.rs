@@ -2,7 +2,7 @@
 //! set.
 
 use picofarm_dataset::Dataset;
-use picofarm_proto::model::kinds::reconstruct::ReconstructSettings;
+use picofarm_proto::spec::kinds::reconstruct::ReconstructSettings;
 use picofarm_reconstruct::{
     Measured,
     source::{Captures, LIT_THRESHOLD},

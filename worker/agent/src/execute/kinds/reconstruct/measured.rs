@@ -1,7 +1,7 @@
 //! Two-bounce times and masks of a scene, from ground truth or from predictions.
 
 use picofarm_dataset::{Dataset, Manifest, Quantity};
-use picofarm_proto::model::kinds::reconstruct::{Measurements, Mirrors};
+use picofarm_proto::spec::kinds::reconstruct::{Measurements, Mirrors};
 use picofarm_reconstruct::{
     Measured,
     source::{Given, Times, given, weigh},

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use picofarm_platonerf::{MlpSettings, Settings as Networks, Training, grid};
-use picofarm_proto::model::kinds::{ReconstructTask, TaskKind};
+use picofarm_proto::spec::kinds::{ReconstructTask, TaskKind};
 use picofarm_reconstruct::{Measured, Reconstructed, Reconstruction, Settings};
 use picofarm_results::{Checkpoints, Pieces, ReconstructionManifest, Reconstructions};
 use tracing::{info, warn};

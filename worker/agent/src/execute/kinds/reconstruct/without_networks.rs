@@ -1,7 +1,7 @@
 //! Substitute for PlatoNeRF's networks in a build without networks. Such a worker does not offer
 //! them.
 
-use picofarm_proto::model::kinds::ReconstructTask;
+use picofarm_proto::spec::kinds::ReconstructTask;
 use picofarm_reconstruct::{Measured, Reconstructed, Settings};
 use picofarm_results::{Checkpoints, ReconstructionManifest, Reconstructions};
 use picofarm_settings::MlpSettings;

@@ -4,7 +4,7 @@ use std::fmt;
 
 use picofarm_dataset::{DatasetSpec, Manifest};
 use picofarm_model::{Model, ModelError, cpu, train::Plan};
-use picofarm_proto::model::{Histogram, TrainSettings, train::Normalise};
+use picofarm_proto::spec::{Histogram, TrainSettings, train::Normalise};
 use picofarm_results::{Lineage, ModelManifest, NewModel, SplitUsed};
 use picofarm_store::sha256_hex;
 use serde_json::{Value, json};

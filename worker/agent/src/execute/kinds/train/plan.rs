@@ -8,7 +8,7 @@ use picofarm_model::{
     scene::Scenes,
     train::Plan,
 };
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     TrainSettings,
     train::{Normalise, Schedule, Target},
 };

@@ -3,7 +3,7 @@
 //! sweep's name and is the task's result.
 
 use picofarm_model::{metric::Metrics, train::Line};
-use picofarm_proto::model::{Domain, Trial};
+use picofarm_proto::spec::{Domain, Trial};
 use picofarm_results::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
 use picofarm_store::published::Manifest as _;
 use serde_json::Value;

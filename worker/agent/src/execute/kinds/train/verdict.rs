@@ -1,9 +1,9 @@
 //! Decides whether a trial continues, by the losses of other trials at the same rung. Pure;
-//! [`picofarm_proto::model::Stop`] documents the rules.
+//! [`picofarm_proto::spec::Stop`] documents the rules.
 
 use std::cmp::Ordering;
 
-use picofarm_proto::model::Stop;
+use picofarm_proto::spec::Stop;
 use picofarm_results::Rung;
 
 /// The decision on a trial.
@@ -67,7 +67,7 @@ fn median(numbers: &mut [f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use picofarm_proto::model::{Halving, Median};
+    use picofarm_proto::spec::{Halving, Median};
     use proptest::prelude::*;
 
     use super::*;
