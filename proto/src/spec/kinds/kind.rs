@@ -17,7 +17,7 @@ use crate::{
     key::hash::{StageKey, TaskKey},
     spec::{
         destination::Destination,
-        memory::{Known, Shape},
+        memory::{Known, Network, Shape},
         places::{OutputSettings, SourceSettings},
         spec_error::SpecError,
         trial::Trial,
@@ -197,6 +197,11 @@ impl dyn TaskKind + '_ {
     /// Returns the target of the trained model.
     pub fn predicts(&self) -> Option<&'static str> {
         self.training().map(|train| train.target.name())
+    }
+
+    /// Returns the network trained on such scenes.
+    pub fn network(&self, source: &Shape) -> Option<Network> {
+        self.training().map(|train| train.network(source))
     }
 
     /// Returns the report that the task makes: store and name.

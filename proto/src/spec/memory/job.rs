@@ -51,8 +51,7 @@ fn networks(before: &[StageSpec], spec: &StageSpec) -> Vec<Network> {
             .rposition(|s| s.task.trains() == Some((store, model)))?;
         let source = before[at].task.reads()?;
         let scenes = made(&before[..at], (&source.store, &source.dataset))?;
-        let training = before[at].task.training()?;
-        Some(training.network(&scenes))
+        before[at].task.network(&scenes)
     };
     let models = spec.task.models();
     models
