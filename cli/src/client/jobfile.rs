@@ -3,11 +3,11 @@
 
 use std::path::Path;
 
-use picofarm_agent::Submission;
 use picofarm_proto::{
     show,
     spec::{JobSpec, RenderTask, TaskSpec, scaled},
 };
+use picofarm_tasks::Submission;
 
 use crate::{
     error::{CliError, Result},
@@ -112,7 +112,7 @@ pub fn resolve_task(task: &mut TaskSpec, base: &Path, asset_dir: &Path) -> Resul
         base,
         assets: &[asset_dir.to_owned()],
     };
-    Ok(picofarm_agent::resolve(task, &here)?)
+    Ok(picofarm_tasks::resolve(task, &here)?)
 }
 
 /// Like `resolve_task`, for one rendering.

@@ -28,7 +28,7 @@ use tracing_subscriber::{
 /// Targets with lines that are forwarded, from INFO upwards. Those of other libraries are not,
 /// because their content is unknown.
 const OURS: [&str; 9] = [
-    "picofarm_agent",
+    "picofarm_tasks",
     "picofarm_dataset",
     "picofarm_exchange",
     "picofarm_model",

@@ -14,7 +14,6 @@ use std::{
 
 use futures::future::BoxFuture;
 use object_store::{ObjectStore, path::Path};
-use picofarm_agent::StorePrefixes;
 use picofarm_coordinator::{ResultReader, ResultState};
 use picofarm_dataset::PartName;
 use picofarm_proto::spec::{
@@ -23,6 +22,7 @@ use picofarm_proto::spec::{
 };
 use picofarm_results::{Held, Holdings};
 use picofarm_store::{StorageError, check_identity, open_store};
+use picofarm_tasks::StorePrefixes;
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
 use uuid::Uuid;

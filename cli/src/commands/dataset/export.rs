@@ -3,9 +3,9 @@
 
 use std::time::Instant;
 
-use picofarm_agent::export::Scenes;
 use picofarm_exchange::{Exported, Exporter};
 use picofarm_store::open_store;
+use picofarm_tasks::export::Scenes;
 use serde_json::json;
 
 use super::{failed, open};

@@ -4,10 +4,6 @@
 
 use std::path::{Path, PathBuf};
 
-use picofarm_agent::{
-    demultiplex::Flash,
-    reconstruct::{CELL, shaded},
-};
 use picofarm_dataset::{Dataset, Quantity};
 use picofarm_demultiplex::{DepthScore, Settings, Truth, demultiplex, score as flash_score};
 use picofarm_figures::{Canvas, TEXT};
@@ -18,6 +14,10 @@ use picofarm_reconstruct::{
 };
 use picofarm_scene::Camera;
 use picofarm_store::StorageError;
+use picofarm_tasks::{
+    demultiplex::Flash,
+    reconstruct::{CELL, shaded},
+};
 use serde_json::{Value, json};
 
 use crate::{

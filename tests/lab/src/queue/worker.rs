@@ -122,7 +122,7 @@ impl Simulated {
             Ok(response) => response.into_inner(),
             Err(status)
                 if status.code() == tonic::Code::Unavailable
-                    || picofarm_agent::lost_connection(&status) =>
+                    || picofarm_tasks::lost_connection(&status) =>
             {
                 return End::Lost;
             }
