@@ -2,7 +2,7 @@
 
 use std::{fs, path::Path, time::SystemTime};
 
-use picofarm_model::report::{Entry, Report, html, json};
+use picofarm_report::{Entry, Report, html, json};
 use picofarm_results::Models;
 use picofarm_tasks::{Control, report::Collector};
 use serde_json::json;

@@ -6,12 +6,12 @@
 
 use std::{collections::BTreeMap, time::Duration};
 
-use picofarm_model::report::{Data, Entry, Report, Speed, html, json};
 use picofarm_model::{Device, Evaluated, Model, cpu, metric::Metrics, train::Line};
 use picofarm_proto::{
     key::report_key,
     spec::{ReportTask, train::TRUTH},
 };
+use picofarm_report::{Data, Entry, Report, Speed, html, json};
 use picofarm_results::{
     Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports, TrainingSpeed,
 };

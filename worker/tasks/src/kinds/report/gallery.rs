@@ -3,9 +3,9 @@
 
 use std::sync::Arc;
 
-use picofarm_model::report::{Picture, pictures};
 use picofarm_model::{Device, Model};
 use picofarm_proto::spec::Histogram;
+use picofarm_report::{Picture, pictures};
 use picofarm_results::Evaluation;
 
 use crate::{

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::Entry;
-use crate::{
+use picofarm_model::{
     input::{DEPTH_SCALE_M, ShadowVariant, Target},
     net::Architecture,
 };

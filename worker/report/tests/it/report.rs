@@ -10,9 +10,9 @@ use picofarm_model::{
     baseline::Baseline,
     cpu, evaluate,
     input::{ShadowVariant, Target},
-    report::{Entry, Report, html, json, pictures},
     train::{Control, Training},
 };
+use picofarm_report::{Entry, Report, html, json, pictures};
 
 fn trained(target: Target) -> Entry {
     let (plan, sources) = (plan(target, ShadowVariant::Concat), sources());

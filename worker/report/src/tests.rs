@@ -6,7 +6,7 @@ use super::{
     Data, Entry, Picture, Plane, Report, Speed, Spread, html, json, published, summary,
     table::table,
 };
-use crate::{
+use picofarm_model::{
     Evaluated,
     input::{Normalise, Question, ShadowVariant, Target},
     metric::{Metrics, Released},
@@ -38,7 +38,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         time_projection: TimeProjection::Shared,
         swin: Swin::default(),
         frozen: false,
-        precision: crate::net::Precision::F32,
+        precision: picofarm_model::net::Precision::F32,
     };
     let trivial = |metrics: &Metrics| match metrics {
         Metrics::Depth { .. } => vec![
@@ -172,12 +172,12 @@ fn seeds_of_an_experiment_are_one_row_beside_trivial_and_published_figures() {
 #[test]
 fn equal_figures_of_several_seeds_have_no_deviation() {
     for value in [0.403_124_202_604_601_76, 0.1, 1.0 / 3.0] {
-        let spread = Spread::of(&[value; 3]).unwrap();
+        let spread = Spread::from_values(&[value; 3]).unwrap();
         assert_eq!((spread.mean, spread.deviation), (value, Some(0.0)));
     }
-    let spread = Spread::of(&[1.0, 2.0, 3.0]).unwrap();
+    let spread = Spread::from_values(&[1.0, 2.0, 3.0]).unwrap();
     assert_eq!((spread.mean, spread.deviation), (2.0, Some(1.0)));
-    assert_eq!(Spread::of(&[]), None);
+    assert_eq!(Spread::from_values(&[]), None);
 }
 
 #[test]

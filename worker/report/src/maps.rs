@@ -10,7 +10,7 @@ use super::{
     table::target_name,
     text::Safe,
 };
-use crate::{input::Target, metric::Metrics};
+use picofarm_model::{input::Target, metric::Metrics};
 
 /// Returns the examples of all models that have some.
 pub(super) fn maps(report: &Report) -> String {

@@ -9,9 +9,9 @@ use super::{
     summary::{Figures, TARGETS},
     text::Safe,
 };
-use crate::{
+use picofarm_model::{
     input::{ShadowVariant, Target},
-    net::{Architecture, StemForm, TimeProjection},
+    net::{StemForm, TimeProjection},
 };
 
 /// Returns the name of a target.
@@ -297,16 +297,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
     if entry.data.noise {
         words.push("photon noise".to_owned());
     }
-    let architecture = match net.architecture {
-        Architecture::Unet2d => format!("2D U-Net, width {}, {} levels", net.width, net.levels),
-        Architecture::Unet25d => format!("2.5D U-Net, width {}, {} levels", net.width, net.levels),
-        Architecture::Swinir => format!(
-            "SwinIR, width {}, {} groups of {} blocks, {} heads, windows {4}×{4}",
-            net.width, net.swin.groups, net.swin.depth, net.swin.heads, net.swin.window
-        ),
-        Architecture::Embeddings => format!("learned feature embeddings, width {}", net.width),
-        Architecture::Nlost => format!("NLOST, width {}", net.width),
-    };
+    let architecture = net.describe();
     let stem = match (net.stem, net.stem_form) {
         (0, _) => String::new(),
         (width, StemForm::Block) => format!(", stem {width}"),

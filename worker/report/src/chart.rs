@@ -210,7 +210,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::report::number::short;
+    use crate::number::short;
 
     fn axis(log: bool, zero: bool) -> Axis<'static> {
         Axis {

@@ -98,7 +98,7 @@ fn costs(report: &Report, summary: &Summary) -> String {
             .models
             .iter()
             .filter_map(|i| report.models[*i].speed?.seconds);
-        let seconds = Spread::of(&seconds.collect::<Vec<_>>());
+        let seconds = Spread::from_values(&seconds.collect::<Vec<_>>());
         let speed = group
             .samples_per_s
             .map_or_else(none, |s| match s.deviation {
@@ -129,7 +129,7 @@ fn costs(report: &Report, summary: &Summary) -> String {
 }
 
 fn unit(group: &Group) -> &'static str {
-    if group.target == crate::input::Target::Tof {
+    if group.target == picofarm_model::input::Target::Tof {
         "m"
     } else {
         "(1 − IoU)"

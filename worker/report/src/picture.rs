@@ -3,11 +3,10 @@
 use base64::{Engine, engine::general_purpose::STANDARD};
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
 
-use crate::{
-    ModelError, answers,
+use picofarm_model::{
+    Model, ModelError, answers,
     input::{Target, intensity},
     metric::{Metrics, Tally},
-    model::Model,
     scene::Scenes,
 };
 

@@ -24,7 +24,10 @@ pub mod trials;
 use picofarm_figures::{number, text};
 use serde::{Deserialize, Serialize};
 
-use crate::{Evaluated, Model, train::Line, train::Plan};
+use picofarm_model::{
+    Evaluated, Model,
+    train::{Line, Plan},
+};
 
 pub use page::html;
 pub use paper::{Published, published, unlike};

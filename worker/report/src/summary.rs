@@ -9,7 +9,12 @@ use super::{
     Data, Entry, Published, Report, Speed,
     paper::{self, published},
 };
-use crate::{Evaluated, input::Target, metric::Metrics, train::Line, train::Plan};
+use picofarm_model::{
+    Evaluated,
+    input::Target,
+    metric::Metrics,
+    train::{Line, Plan},
+};
 
 /// Metrics by name: `mae_m` and `rmse_m` of depths in metres; `iou`, `mae` and `f1` of masks.
 pub type Figures = BTreeMap<&'static str, Spread>;
@@ -100,7 +105,7 @@ pub(super) const TARGETS: [Target; 3] = [Target::Tof, Target::Shadow, Target::Sp
 
 impl Spread {
     /// Returns the spread of values, or `None` if there are none.
-    pub fn of(values: &[f64]) -> Option<Self> {
+    pub fn from_values(values: &[f64]) -> Option<Self> {
         let (first, n) = (*values.first()?, values.len() as f64);
         // Relative to the first value: equal values then have no deviation from rounding.
         let mean = first + values.iter().map(|v| v - first).sum::<f64>() / n;
@@ -178,9 +183,9 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
         trivial.entry(name.clone()).or_default().push(*metrics);
     }
     let errors: Vec<f64> = evaluated.iter().map(|e| e.metrics.loss()).collect();
-    let error = Spread::of(&errors);
+    let error = Spread::from_values(&errors);
     let of_trivial =
-        |all: &[Metrics]| Spread::of(&all.iter().map(Metrics::loss).collect::<Vec<_>>());
+        |all: &[Metrics]| Spread::from_values(&all.iter().map(Metrics::loss).collect::<Vec<_>>());
     let best = trivial
         .iter()
         .filter_map(|(name, all)| Some((name.clone(), of_trivial(all)?.mean)))
@@ -226,7 +231,7 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
         published: repeats.filter(|_| unlike.is_empty()),
         repeats,
         unlike,
-        samples_per_s: Spread::of(&speeds),
+        samples_per_s: Spread::from_values(&speeds),
         error,
         models,
     }
@@ -240,7 +245,7 @@ fn figures(runs: impl Iterator<Item = Vec<(&'static str, f64)>>) -> Figures {
     }
     let spreads = each
         .into_iter()
-        .filter_map(|(name, values)| Some((name, Spread::of(&values)?)));
+        .filter_map(|(name, values)| Some((name, Spread::from_values(&values)?)));
     spreads.collect()
 }
 

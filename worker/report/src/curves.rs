@@ -7,7 +7,7 @@ use super::{
     summary::TARGETS,
     table::{error_name, target_name},
 };
-use crate::{
+use picofarm_model::{
     input::Target,
     metric::Metrics,
     train::{Line, epochs_at},

@@ -11,7 +11,7 @@ use super::{
     number::{digits, short},
     text::Safe,
 };
-use crate::train::{Line, epochs_at};
+use picofarm_model::train::{Line, epochs_at};
 
 /// A sweep.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -313,7 +313,7 @@ fn far_apart(values: impl Iterator<Item = f64>) -> bool {
     low > 0.0 && high > 10.0 * low
 }
 
-/// Returns the name of [`crate::metric::Metrics::loss`] for a kind of prediction.
+/// Returns the name of [`picofarm_model::metric::Metrics::loss`] for a kind of prediction.
 pub fn error_name(kind: &str) -> &'static str {
     match kind {
         "tof" => "MAE (m)",
@@ -324,7 +324,7 @@ pub fn error_name(kind: &str) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::metric::Metrics;
+    use picofarm_model::metric::Metrics;
 
     fn tried(index: u64, lr: f64, end: End, losses: &[f64]) -> Tried {
         let line = |(i, mae_m): (usize, &f64)| Line {
