@@ -11,7 +11,9 @@ mod predictions;
 use std::ops::Range;
 
 use picofarm_dataset::{Dataset, Pinned};
-use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline, memory::Kept};
+use picofarm_model::{
+    Answered, Device, Evaluated, answered, baseline::Baseline, memory::RetainedMemory,
+};
 use picofarm_proto::spec::{EvaluateShardTask, EvaluateTask, TaskSpec};
 use picofarm_results::{Evaluation, Models, ShardName, SplitUsed, Verdict};
 use picofarm_store::sha256_hex;
@@ -41,7 +43,7 @@ impl RunTask for EvaluateTask {
 
     /// Evaluates the models that `task` names, and joins their shards if there are any.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let _retained = Kept::from_now();
+        let _retained = RetainedMemory::from_now();
         let evaluation = EvaluationRun::new((context, context.device(task)?), self, control)?;
         if !self.evaluate.predictions.is_empty() {
             return evaluation.of_predictions(control);
@@ -69,7 +71,7 @@ impl RunTask for EvaluateShardTask {
     /// Evaluates the models on the scenes of shard `task.index`. Skips models with a finished
     /// evaluation or shard.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let _retained = Kept::from_now();
+        let _retained = RetainedMemory::from_now();
         let evaluation =
             EvaluationRun::new((context, context.device(task)?), &self.whole, control)?;
         let (mut bytes, mut computed) = (0, false);
@@ -206,7 +208,7 @@ impl<'a> EvaluationRun<'a> {
             });
         }
         let target = asked.model.model.question().target;
-        let metrics = metrics(&Evaluated::of(target, &answered), &self.scenes);
+        let metrics = metrics(&Evaluated::from_scenes(target, &answered), &self.scenes);
         info!("{name}: {}", summary(&metrics));
         let made = Evaluation {
             key: asked.key.clone(),

@@ -16,7 +16,7 @@ use picofarm_dataset::DatasetSpec;
 use picofarm_members::Members;
 use picofarm_model::{
     Device, ModelError,
-    memory::Kept,
+    memory::RetainedMemory,
     scene::Scenes,
     train::{Ended, Event, Line, Plan, Sources, Trained, Training},
 };
@@ -61,7 +61,7 @@ impl RunTask for TrainTask {
     /// Trains the model that `task` names; with `force`, even if it exists. Uses a GPU if the job
     /// asks for `gpus`.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let _retained = Kept::from_now();
+        let _retained = RetainedMemory::from_now();
         let stores = &context.stores;
         let force = task.spec.force;
         let training = TrainingRun {

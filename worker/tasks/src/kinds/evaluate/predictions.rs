@@ -126,7 +126,7 @@ impl EvaluationRun<'_> {
         let answered = answered_by(&question, &mut said, &baseline, &scenes, &mut tell_of)
             .map_err(model_error)?
             .ok_or(TaskError::Stopped)?;
-        let metrics = metrics(&Evaluated::of(target, &answered), &self.scenes);
+        let metrics = metrics(&Evaluated::from_scenes(target, &answered), &self.scenes);
         info!("{name}: {}", summary(&metrics));
         let made = Evaluation {
             key,
