@@ -26,11 +26,6 @@ impl Rng {
         Self(SplitMix64(mix(mix(mix(seed) ^ (stream as u64)) ^ index)))
     }
 
-    /// Returns 64 uniform bits.
-    pub fn bits(&mut self) -> u64 {
-        self.0.bits()
-    }
-
     /// Returns a uniform number in [0, 1), a multiple of 2⁻²⁴.
     pub fn unit(&mut self) -> f32 {
         self.0.unit()

@@ -47,7 +47,7 @@ impl Network for Embeddings {
         Self::declare(d, spec)
     }
 
-    fn multiple(spec: &NetSpec) -> (usize, &'static str, String) {
+    fn multiple(_spec: &NetSpec) -> (usize, &'static str, String) {
         (2, "net.architecture", "embeddings halve the image".into())
     }
 

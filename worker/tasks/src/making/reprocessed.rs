@@ -12,7 +12,6 @@ use picofarm_proto::{
 use picofarm_sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
-use picofarm_store::published::Manifest as _;
 use serde_json::json;
 use tracing::debug_span;
 

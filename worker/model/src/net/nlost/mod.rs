@@ -371,7 +371,7 @@ impl Network for Nlost {
         Self::declare(d, spec)
     }
 
-    fn multiple(spec: &NetSpec) -> (usize, &'static str, String) {
+    fn multiple(_spec: &NetSpec) -> (usize, &'static str, String) {
         let what =
             format!("nlost halves the image, and windows have {WINDOW}×{WINDOW} pixels of that");
         (2 * WINDOW, "net.architecture", what)

@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use picofarm_dataset::DatasetSpec;
-use picofarm_model::{cpu, scene::Scenes};
+use picofarm_model::cpu;
 use picofarm_proto::{
     key::training_key,
     spec::{TaskSpec, TrainSettings, TrainTask, train::Target},
