@@ -9,7 +9,7 @@ use picofarm_reconstruct::{
 };
 use picofarm_scene::Scene;
 use picofarm_store::published::Manifest as _;
-use picofarm_tasks::reconstruct::slant;
+use picofarm_tasks::slant;
 use picofarm_transient::{Gate, Rendered, render};
 use serde_json::{Value, json};
 

@@ -305,14 +305,9 @@ fn a_job_survives_the_catalog_and_says_its_memory() {
                 bins: 637,
                 spots: 4,
             };
-            let training = stage.task.training();
-            let networks = training.into_iter().map(|train| train.network(&shape));
             let known = Known {
                 source: Some(shape),
-                networks: training
-                    .map(|train| train.network(&shape))
-                    .into_iter()
-                    .collect(),
+                networks: stage.task.network(&shape).into_iter().collect(),
             };
             // A report's memory depends only on its models.
             if stage.task.kind() != "report" {
