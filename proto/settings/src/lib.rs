@@ -1,6 +1,6 @@
 //! The plain settings shared by jobs, data sets, the renderer and the networks. Each is declared
-//! once in this crate, and all other crates use its type. [`random`] has the random numbers that all
-//! of them share.
+//! once in this crate, and all other crates use its type. [`random`] has the random numbers that
+//! all of them share.
 
 mod gate;
 mod gpus;

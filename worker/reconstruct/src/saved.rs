@@ -1,5 +1,5 @@
-//! The form in which the state of a fit is stored: eight bytes for format and version, a fingerprint
-//! of the inputs, and little-endian numbers. The grid's fit and PlatoNeRF's share it.
+//! The form in which the state of a fit is stored: eight bytes for format and version, a
+//! fingerprint of the inputs, and little-endian numbers. The grid's fit and PlatoNeRF's share it.
 
 use crate::ReconstructError;
 

@@ -1,5 +1,5 @@
-//! What a kind of task reads and writes: data sets, folders, scenes, models, splits and reports. One
-//! list for each kind serves checks between stages, substitution of names, plans and lineage.
+//! What a kind of task reads and writes: data sets, folders, scenes, models, splits and reports.
+//! One list for each kind serves checks between stages, substitution of names, plans and lineage.
 
 use super::scenes::SceneSource;
 use crate::spec::{
@@ -74,7 +74,8 @@ pub struct IoMut<'a> {
     pub folder: Option<(&'static str, &'a mut String)>,
     /// [`Io::scenes`], for files to be pinned anew.
     pub scenes: Option<&'a mut SceneSource>,
-    /// The stores named in addition to that of the source, each with its field, to be made absolute.
+    /// The stores named in addition to that of the source, each with its field, to be made
+    /// absolute.
     pub stores: Vec<(&'static str, &'a mut String)>,
     /// Whether the first of these stores has the models, and is that of the stage that trains them
     /// if it is left out.

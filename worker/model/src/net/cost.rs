@@ -28,8 +28,8 @@ impl NetSpec {
         (voxel * self.dense.div_ceil(2) * (side / 2).pow(2)) as f64
     }
 
-    /// Returns the cost of the part from a volume of `channels`, with half as many rows and columns,
-    /// to the output.
+    /// Returns the cost of the part from a volume of `channels`, with half as many rows and
+    /// columns, to the output.
     pub(super) fn of_rendering(&self, side: usize, channels: usize) -> f64 {
         let (pixels, coarse) = (side * side, (side / 2).pow(2));
         let (features, outputs) = (2 * channels, self.outputs);

@@ -1,5 +1,5 @@
-//! The code that runs each kind of task. A kind imports only modules below this folder, and no other
-//! kind. [`picofarm_proto::spec::kinds`] documents the kinds.
+//! The code that runs each kind of task. A kind imports only modules below this folder, and no
+//! other kind. [`picofarm_proto::spec::kinds`] documents the kinds.
 
 pub mod demultiplex;
 #[cfg(feature = "networks")]

@@ -1,4 +1,5 @@
-//! Opens and checks the inputs of a training: its scenes, the models that it builds on, and its key.
+//! Opens and checks the inputs of a training: its scenes, the models that it builds on, and its
+//! key.
 
 use std::{collections::BTreeMap, sync::Arc};
 
