@@ -7,6 +7,8 @@ pub(crate) mod examples;
 pub(crate) mod models;
 pub(crate) mod scenes;
 #[cfg(feature = "networks")]
+pub(crate) mod sides;
+#[cfg(feature = "networks")]
 pub(crate) mod times;
 #[cfg(feature = "networks")]
 pub(crate) mod truth;

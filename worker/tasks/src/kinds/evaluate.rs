@@ -25,8 +25,9 @@ use tracing::{info, warn};
 use crate::{
     errors::{in_field, model_error, prediction_error},
     input::{
-        examples::{Examples, first, sides},
+        examples::Examples,
         models::{model_version, pin},
+        sides::{first, sides},
     },
     stores::{Stores, saying},
     task::{Context, Control, Output, RunTask, Task, TaskError},

@@ -11,8 +11,9 @@ use picofarm_results::Evaluation;
 use crate::{
     errors::model_error,
     input::{
-        examples::{Examples, sides},
+        examples::Examples,
         models::{Known, pin, trained},
+        sides::sides,
         times::Times,
         truth,
     },

@@ -16,8 +16,9 @@ use super::{TrainingRun, results};
 use crate::{
     errors::in_field,
     input::{
-        examples::{Examples, first, sides},
+        examples::Examples,
         models::{Known, pin},
+        sides::{first, sides},
         times::Times,
         truth,
     },
