@@ -18,6 +18,7 @@ mod matching;
 mod mirrors;
 mod peaks;
 mod planes;
+mod residual;
 pub mod score;
 mod settings;
 mod shadows;
@@ -27,9 +28,10 @@ mod unmix;
 pub use capture::{Capture, Place, Spot};
 pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
 pub use error::DemultiplexError;
+pub use residual::{Residual, residual};
 pub use score::{DepthScore, MaskScore, Truth};
 pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-3";
+pub const VERSION: &str = "demultiplex-4";
