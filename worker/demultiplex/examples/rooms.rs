@@ -4,7 +4,8 @@
 //! In the environment, `ROOMS` (20), `FIRST` (91001, the first seed), `SIDE` (128 pixels), `SPOTS`
 //! (25), `ERROR` (0.1, of the renders), `ASSETS` (parametric, or sweethome3d from the folder
 //! `ASSETS_DIR`), `CACHE` (a folder that keeps rendered rooms), `SHADOWS` (physics or
-//! learned, instead of the default), and `RETURNS` takes the spots' places from their own one-bounce returns.
+//! learned, instead of the default), and `RETURNS` takes the spots' places from their own
+//! one-bounce returns.
 
 #[path = "common/mod.rs"]
 mod common;

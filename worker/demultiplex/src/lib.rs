@@ -1,6 +1,7 @@
 //! One flash taken apart by physics: from a multiplexed histogram, in which the light of all spots
 //! is added up, to the depth of each pixel and to which spots light it. Every two-bounce
-//! time follows from geometry. Nothing is learnt but, on request, the judgement of shadows.
+//! time follows from geometry. Nothing is learnt but the judgement of shadows, which may be left to
+//! rules.
 //!
 //! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or
 //! files.

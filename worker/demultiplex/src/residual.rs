@@ -25,8 +25,8 @@ const PIXELS: usize = 4096;
 pub struct Residual {
     /// The number of compared pairs of a pixel and a spot.
     pub peaks: usize,
-    /// The median distance of the brightest bin's centre of light from the predicted time, metres of
-    /// path.
+    /// The median distance of the brightest bin's centre of light from the predicted time, metres
+    /// of path.
     pub median_m: f64,
     /// The same at shifted times, where no peak is predicted: what wrong depths would have.
     pub control_m: f64,

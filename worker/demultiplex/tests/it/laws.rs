@@ -172,9 +172,9 @@ fn two_spots_that_collide_everywhere_are_mostly_reported_as_ambiguous() {
     );
 }
 
-fn learned() -> Settings {
+fn physics() -> Settings {
     Settings {
-        shadows: Shading::Learned,
+        shadows: Shading::Physics,
         ..Settings::default()
     }
 }
@@ -185,7 +185,7 @@ fn threads_change_no_byte() {
     let beams = room.beams(true);
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-        let run = || demultiplex(&room.capture(&beams), &learned());
+        let run = || demultiplex(&room.capture(&beams), &Settings::default());
         pool.build().unwrap().install(run).expect("a room")
     };
     assert_eq!(on(1), on(4));
@@ -308,7 +308,7 @@ fn a_capture_without_light_is_taken_apart_in_both_ways() {
     let mut room = Room::new(8, &grid(2), None);
     room.histogram.fill(0.0);
     let beams = room.beams(true);
-    for settings in [Settings::default(), learned()] {
+    for settings in [Settings::default(), physics()] {
         let found = demultiplex(&room.capture(&beams), &settings).expect("no error");
         assert!(found.lit.iter().all(|p| (0.0..=1.0).contains(p)));
     }
