@@ -12,8 +12,8 @@ mod run;
 #[cfg(feature = "networks")]
 pub use execute::{ImportFor, NotImported, imported, infer_version, model_version, report, takes};
 pub use execute::{
-    SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version,
-    repin, resolve, scene_size,
+    SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_settings,
+    renderer_version, repin, resolve, scene_size,
 };
 pub use execute::{demultiplex, export, reconstruct, repair, reprocess, split};
 pub use picofarm_session::{

@@ -122,6 +122,7 @@ pub fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Subset]) -> Res
         .collect();
     let arrays_of_all = subsets.iter().map(|s| s.array.clone());
     let wavelengths: serde_json::Map<_, _> = settings
+        .optics
         .wavelengths_nm
         .nm()
         .into_iter()

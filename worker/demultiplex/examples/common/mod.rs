@@ -7,7 +7,7 @@ use std::{env, fs, path::PathBuf, str::FromStr};
 use picofarm_demultiplex::{Capture, Place, Spot, Truth};
 use picofarm_scene::{AssetLibrary, Camera, Vec3, furnished};
 use picofarm_settings::Spots;
-use picofarm_transient::{self as transient, Budget, Gate, Progress, Strategy, Wavelength};
+use picofarm_transient::{self as transient, Budget, Gate, Progress};
 
 struct Unstopped;
 
@@ -159,17 +159,9 @@ struct Arrays {
 impl Arrays {
     fn render(scene: &picofarm_scene::Scene, seed: u64, kind: &Kind) -> Self {
         let settings = transient::Settings {
-            gate: GATE,
-            budget: Budget::Error(kind.error),
-            max_bounces: None,
             one_bounce: true,
             seed,
-            split: false,
-            groups: Vec::new(),
-            strategy: Strategy::default(),
-            beam: None,
-            fill_factor: 1.0,
-            wavelengths_nm: Wavelength::NONE,
+            ..transient::Settings::new(GATE, Budget::Error(kind.error))
         };
         let made = transient::render(scene, &settings, &Unstopped).expect("a render");
         let float = |all: &[u8]| all.iter().map(|x| f32::from(*x)).collect();
