@@ -190,6 +190,4 @@ class Dataset:
         )
 
 
-def open(url: str | os.PathLike[str], **options: Any) -> Dataset:
-    """Opens a data set; see `Dataset` for the options."""
-    return Dataset(url, **options)
+open = Dataset

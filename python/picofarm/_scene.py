@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -239,7 +239,8 @@ class Gate:
     @property
     def paths_m(self) -> NDArray[np.float64]:
         """Optical path at the middle of each bin, metres."""
-        return self.start_m + (np.arange(self.bins) + 0.5) * self.bin_width_m
+        middles = np.arange(self.bins, dtype=np.float64) + 0.5
+        return np.asarray(self.start_m + middles * self.bin_width_m, np.float64)
 
     @property
     def times_ns(self) -> NDArray[np.float64]:
@@ -371,8 +372,8 @@ class Render:
             raise ValueError(f"pixel: {(row, column)} is outside of {height} rows, {width} columns")
         figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
         light = self.transient.sum(axis=2)
-        white = np.quantile(light, 0.99) or 1.0
-        axes[0].imshow(np.sqrt(np.clip(light / white, 0, 1)), cmap="inferno")
+        white = float(np.quantile(light, 0.99)) or 1.0
+        axes[0].imshow(np.sqrt(np.minimum(light / white, 1.0)), cmap="inferno")
         axes[0].set_title("all light")
         seen = np.where(self.depth > 0, self.depth, np.nan)
         figure.colorbar(axes[1].imshow(seen, cmap="viridis"), ax=axes[1], label="depth, m")
@@ -501,15 +502,17 @@ def _mesh(
 def _plain(value: Any) -> Any:
     """Returns a Mitsuba dict with lists in place of arrays and transforms."""
     if hasattr(value, "matrix"):
-        return np.asarray(value.matrix, dtype=float).reshape(4, 4).tolist()
+        rows: Any = np.asarray(value.matrix, dtype=np.float64)
+        return rows.reshape(4, 4).tolist()
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        items = cast("Mapping[object, Any]", value).items()
+        return {str(key): _plain(item) for key, item in items}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
+        return [_plain(item) for item in cast("Sequence[Any]", value)]
     if isinstance(value, (str, bool, int, float)) or value is None:
         return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(cast("os.PathLike[str]", value))
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         raise ValueError(f"the Mitsuba dict holds {type(value).__name__}, which is not plain data")

@@ -1,6 +1,7 @@
 //! Renders scenes into arrays.
 
 use numpy::{IntoPyArray, PyArrayMethods};
+use picofarm_proto::model::RenderSettings;
 use picofarm_scene::Spot;
 use picofarm_transient::{Budget, Gate, GroundTruth, Rendered, Settings, Split};
 use pyo3::{exceptions::PyMemoryError, prelude::*, types::PyDict};
@@ -35,29 +36,24 @@ pub(crate) fn render<'py>(
     threads: Option<usize>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let budget = match error {
-        Some(share) if share > 0.0 && share < 1.0 => Budget::Error(share),
-        Some(share) => {
-            return Err(argument(
-                "error",
-                format!("expected a share between 0 and 1, such as 0.1, found {share}"),
-            ));
-        }
-        None => Budget::Samples(samples),
-    };
-    if !(1..=1 << 16).contains(&bins) {
-        return Err(argument(
-            "bins",
-            format!("expected 1 to 65536, found {bins}"),
-        ));
-    }
     let gate = py.detach(|| self::gate(&scene.scene, bins, gate));
+    let asked = RenderSettings {
+        gate_start_m: gate.start_m,
+        bin_width_m: gate.bin_width_m,
+        bins,
+        budget: error.map_or(Budget::Samples(samples), Budget::Error),
+        max_bounces: max_bounces.unwrap_or(0),
+        ..RenderSettings::default()
+    };
+    // Checked as in a job, so that the ranges are defined in one place.
+    asked.check().map_err(|e| {
+        let field = e.field.trim_start_matches("render.");
+        argument(field, e.what)
+    })?;
     let settings = Settings {
-        max_bounces,
-        one_bounce: true,
         seed,
         split,
-        ..Settings::new(gate, budget)
+        ..picofarm_agent::renderer_settings(&asked)
     };
     let size = picofarm_agent::scene_size(&scene.scene);
     let cores = threads.unwrap_or_else(picofarm_agent::cores);

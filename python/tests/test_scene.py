@@ -169,7 +169,7 @@ def test_unusable_meshes_are_refused_by_name(change: dict[str, object], words: s
     ],
 )
 def test_any_layout_of_the_same_mesh_is_the_same_scene(array: np.ndarray) -> None:
-    array.flags.writeable = False
+    array.setflags(write=False)
     usual = picofarm.Scene([SQUARE], **FRONT).render(8, samples=1, bins=32)
     other = picofarm.Scene([{**SQUARE, "vertices": array}], **FRONT).render(8, samples=1, bins=32)
     assert np.array_equal(usual.transient, other.transient)
