@@ -24,7 +24,7 @@ use std::{
     ffi::OsString,
     io::{ErrorKind, Write},
     process::ExitCode,
-    sync::OnceLock,
+    sync::{Once, OnceLock},
 };
 
 use tracing_subscriber::{Layer, prelude::*};
@@ -65,6 +65,11 @@ fn run(args: impl Iterator<Item = OsString>, version: &'static str) -> u8 {
         Ok(()) => 0,
         Err(e) => e.report(json),
     }
+}
+
+/// Returns whether this program runs inside another one.
+pub(crate) fn has_host() -> bool {
+    START.get().is_some()
 }
 
 /// Returns a command that starts this program again.
@@ -143,9 +148,12 @@ fn with_settings(
 
 /// Selects the only cryptography provider of all TLS code of this process.
 pub fn provide_cryptography() {
-    rustls::crypto::ring::default_provider()
-        .install_default()
-        .expect("nothing has chosen one before main");
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        rustls::crypto::ring::default_provider()
+            .install_default()
+            .expect("no other code of this process chooses one");
+    });
 }
 
 /// Runs a worker process of `up` or `demo`. Its parent has resolved the settings.

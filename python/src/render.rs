@@ -36,6 +36,9 @@ pub(crate) fn render<'py>(
     threads: Option<usize>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
+    if bins == 0 {
+        return Err(argument("bins", "expected at least 1"));
+    }
     let gate = py.detach(|| self::gate(&scene.scene, bins, gate));
     let asked = RenderSettings {
         gate_start_m: gate.start_m,

@@ -87,7 +87,7 @@ def test_a_mitsuba_dict_is_a_scene() -> None:
     dictionary["wall"]["to_world"] = matrix @ np.diag([3.0, 3.0, -1.0, 1.0])
     scene = picofarm.Scene(dictionary, spots=4)
     assert scene.triangles == 2
-    assert scene.render(8, samples=1, bins=32).depth.max() == pytest.approx(2.0, abs=1e-4)
+    assert scene.render(8, samples=2, bins=32).depth.max() == pytest.approx(2.0, abs=1e-4)
 
 
 def test_one_flash_gives_depth_and_shadows() -> None:
@@ -170,8 +170,8 @@ def test_unusable_meshes_are_refused_by_name(change: dict[str, object], words: s
 )
 def test_any_layout_of_the_same_mesh_is_the_same_scene(array: np.ndarray) -> None:
     array.setflags(write=False)
-    usual = picofarm.Scene([SQUARE], **FRONT).render(8, samples=1, bins=32)
-    other = picofarm.Scene([{**SQUARE, "vertices": array}], **FRONT).render(8, samples=1, bins=32)
+    usual = picofarm.Scene([SQUARE], **FRONT).render(8, samples=2, bins=32)
+    other = picofarm.Scene([{**SQUARE, "vertices": array}], **FRONT).render(8, samples=2, bins=32)
     assert np.array_equal(usual.transient, other.transient)
 
 
@@ -214,7 +214,7 @@ def test_many_renders_take_no_more_memory() -> None:
 
     def peak(count: int) -> int:
         for _ in range(count):
-            scene.render(samples=1, bins=16, threads=1)
+            scene.render(samples=2, bins=16, threads=1)
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     before = peak(20)
