@@ -4,7 +4,7 @@
 
 use std::{env, fs, path::PathBuf, str::FromStr};
 
-use picofarm_demultiplex::{Capture, Place, Spot, Truth};
+use picofarm_demultiplex::{Capture, Place, Settings, Shading, Spot, Truth};
 use picofarm_scene::{AssetLibrary, Camera, Vec3, furnished};
 use picofarm_settings::Spots;
 use picofarm_transient::{self as transient, Budget, Gate, Progress};
@@ -24,6 +24,19 @@ pub fn variable<T: FromStr>(name: &str, usual: T) -> T {
         text.parse()
             .unwrap_or_else(|_| panic!("{name}={text:?} cannot be read; see the example's head"))
     })
+}
+
+/// Returns the settings of the method: shadows by `SHADOWS`, or the default.
+pub fn settings() -> Settings {
+    let mut settings = Settings::default();
+    if let Ok(name) = env::var("SHADOWS") {
+        settings.shadows = match &*name {
+            "physics" => Shading::Physics,
+            "learned" => Shading::Learned,
+            other => panic!("SHADOWS={other:?}: expected physics or learned"),
+        };
+    }
+    settings
 }
 
 /// A kind of room.
