@@ -57,6 +57,8 @@ fn imports(text: &str) -> Vec<String> {
             }
         }
     }
+    // After the last comma of a group there is no path.
+    found.retain(|path| !path.trim().is_empty());
     found
 }
 
@@ -107,7 +109,7 @@ fn a_module_imports_only_lower_layers_and_a_kind_no_other_kind() {
 
 #[test]
 fn the_layers_test_reads_imports_in_braces() {
-    let text = "use crate::{a::{b, c}, d};\nuse crate::e::f;";
+    let text = "use crate::{a::{b, c}, d,};\nuse crate::e::f;";
     let all = imports(text);
     let heads: Vec<(&str, &str)> = all.iter().map(|path| head(path)).collect();
     assert_eq!(heads, [("a", ""), ("d", ""), ("e", "f")]);
