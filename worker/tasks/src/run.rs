@@ -6,7 +6,7 @@ use picofarm_session::{AgentConfig, AgentError, StorePrefixes, Summary, opener, 
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
-use crate::TaskExecutor;
+use crate::executor::TaskExecutor;
 
 /// Runs a worker for every kind of task, until `shutdown` or until the coordinator refuses it.
 ///
