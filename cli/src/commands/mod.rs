@@ -15,6 +15,7 @@ pub mod local;
 pub(crate) mod local_worker;
 mod model;
 mod reconstruct;
+mod rendered;
 mod scene;
 #[cfg(feature = "networks")]
 mod sweep;

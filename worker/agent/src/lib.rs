@@ -9,12 +9,12 @@
 pub mod execute;
 mod run;
 
+pub use execute::{
+    By, SceneSize, Submission, TaskExecutor, absolute, check_memory, encode_render, render_bytes,
+    renderer_version, repin, resolve, scene_size,
+};
 #[cfg(feature = "networks")]
 pub use execute::{ImportFor, NotImported, imported, infer_version, model_version, report, takes};
-pub use execute::{
-    SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version,
-    repin, resolve, scene_size,
-};
 pub use execute::{demultiplex, export, reconstruct, repair, reprocess, split};
 pub use picofarm_session::{
     Access, AccessError, AgentConfig, AgentError, Bearer, ConnectionFailure, Control, Executor,
