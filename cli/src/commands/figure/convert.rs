@@ -1,0 +1,67 @@
+//! SVG to PNG and PDF, with a font of the program's own, so that every machine draws the same.
+
+use std::sync::Arc;
+
+use picofarm_figures::paper::Drawn;
+use resvg::{
+    tiny_skia::{Pixmap, Transform},
+    usvg::{Options, Tree, fontdb::Database},
+};
+
+use super::Format;
+use crate::error::{CliError, Code, Result};
+
+/// Points in an inch, which is the unit of the parsed document.
+const POINTS: f32 = 72.0;
+/// The most pixels of a PNG.
+const MOST: f64 = 400e6;
+
+/// Returns the figure as PDF, or as PNG with this many pixels per inch.
+///
+/// # Errors
+/// Fails for a PNG of too many pixels.
+pub(super) fn convert(drawn: &Drawn, format: Format, dpi: u32) -> Result<Vec<u8>> {
+    let mut fonts = Database::new();
+    fonts.load_font_data(epaint_default_fonts::UBUNTU_LIGHT.to_vec());
+    fonts.set_sans_serif_family("Ubuntu");
+    let options = Options {
+        dpi: POINTS,
+        fontdb: Arc::new(fonts),
+        ..Options::default()
+    };
+    let broken = |e: &dyn std::fmt::Display| {
+        CliError::new(Code::Failed, format!("the figure cannot be converted: {e}"))
+    };
+    let tree = Tree::from_str(&drawn.svg, &options).map_err(|e| broken(&e))?;
+    if format == Format::Pdf {
+        let page = svg2pdf::PageOptions { dpi: POINTS };
+        let conversion = svg2pdf::ConversionOptions::default();
+        return svg2pdf::to_pdf(&tree, conversion, page).map_err(|e| broken(&e));
+    }
+    let pixels = |mm: f64| (mm / 25.4 * f64::from(dpi)).round().max(1.0);
+    let (width, height) = (pixels(drawn.width_mm), pixels(drawn.height_mm));
+    if width * height > MOST {
+        let what = format!("--dpi {dpi}: the PNG would have {width} x {height} pixels");
+        return Err(CliError::input(what).hint("choose a smaller --dpi or --width"));
+    }
+    let mut pixmap = Pixmap::new(width as u32, height as u32)
+        .ok_or_else(|| broken(&"no room for its pixels"))?;
+    let size = tree.size();
+    let scale = Transform::from_scale(width as f32 / size.width(), height as f32 / size.height());
+    resvg::render(&tree, scale, &mut pixmap.as_mut());
+    with_density(pixmap, dpi)
+}
+
+/// Encodes the pixels, which cover the page, with their density.
+fn with_density(pixmap: Pixmap, dpi: u32) -> Result<Vec<u8>> {
+    let (width, height) = (pixmap.width(), pixmap.height());
+    let rgb: Vec<u8> = pixmap
+        .pixels()
+        .iter()
+        .flat_map(|p| [p.red(), p.green(), p.blue()])
+        .collect();
+    let metre = (f64::from(dpi) / 0.0254).round() as u32;
+    Ok(picofarm_figures::rgb_png_with_density(
+        width, height, &rgb, metre,
+    ))
+}
