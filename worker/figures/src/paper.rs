@@ -173,6 +173,61 @@ mod tests {
     }
 
     #[test]
+    fn a_known_scene_is_drawn_as_before() {
+        // A ramp of depth, and a histogram with a peak that a spot explains.
+        let map = crate::viridis;
+        let depth = [1.0f32, 1.5, 2.0, 2.5, 3.0, 3.5];
+        let image = Image {
+            title: "depth".into(),
+            width: 3,
+            height: 2,
+            rgb: depth.iter().flat_map(|d| map((d - 1.0) / 2.5)).collect(),
+            bar: Some(Bar {
+                low: 1.0,
+                high: 3.5,
+                clipped: true,
+                exponent: 1.0,
+                name: "z-depth",
+                unit: "m",
+                map,
+            }),
+            keys: vec![],
+            marks: vec![[1.5, 1.0]],
+        };
+        let labels = Image {
+            title: "labels & <more>".into(),
+            bar: None,
+            keys: vec![Key {
+                colour: [255, 0, 16],
+                text: "a very long name".into(),
+            }],
+            ..image.clone()
+        };
+        let curve = Curve {
+            title: "pixel (1, 0)".into(),
+            range: [5.0, 9.0],
+            horizontal: ("time", "ns"),
+            vertical: ("light", "1/(m² sr)"),
+            values: vec![0.0, 2e-5, 8e-5, 1e-5],
+            marks: vec![Mark { at: 7.5, style: 0 }, Mark { at: 70.0, style: 0 }],
+            styles: vec![Style {
+                colour: [214, 96, 30],
+                text: "lit".into(),
+            }],
+        };
+        let panels = [
+            Panel::Image(image),
+            Panel::Image(labels),
+            Panel::Curve(curve),
+        ];
+        let drawn = draw(&panels, 85.0, 2).unwrap();
+        assert_eq!(drawn.svg.matches("image-rendering:pixelated").count(), 2);
+        // The bar's ends are the limits of its values.
+        assert!(drawn.svg.contains(">1</text>") && drawn.svg.contains(">≥ 3.5</text>"));
+        insta::assert_snapshot!(drawn.svg);
+    }
+
+    #[test]
     fn a_width_without_room_states_the_least_one() {
         let image = Image {
             title: "t".into(),

@@ -39,6 +39,8 @@ const COVERED: f64 = 0.99;
 const EXPONENT: f64 = 0.5;
 /// Shares of the light that have arrived at the times without `--times`.
 const SHARES: [f64; 3] = [0.1, 0.4, 0.75];
+/// Share of a pixel's light before the end of its histogram's panel.
+const ARRIVED: f64 = 0.99;
 /// Unit of the histograms.
 const RADIANCE: &str = "1/(m² sr)";
 
@@ -335,8 +337,15 @@ fn histogram(args: &Figure, source: &Source) -> Result<Panel> {
     };
     // Lit spots are drawn over the others.
     curve.marks.sort_by_key(|m| m.style);
-    // From the first light or mark to the last, with a margin.
-    let light = (0..view.bins).filter(|b| all[*b] > 0.0);
+    // From the first light or mark until nearly all has arrived, with a margin.
+    let total: f64 = all.iter().map(|v| f64::from(*v)).sum();
+    let mut arrived = 0.0;
+    let before_end = |b: &usize| {
+        let early = arrived < ARRIVED * total;
+        arrived += f64::from(all[*b]);
+        early && all[*b] > 0.0
+    };
+    let light = (0..view.bins).filter(before_end);
     let start = view.nanoseconds(0);
     let width = view.nanoseconds(1) - start;
     let marks = curve.marks.iter().map(|m| ((m.at - start) / width).floor());

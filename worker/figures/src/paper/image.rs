@@ -164,7 +164,9 @@ impl Bar {
         };
         let (top, bottom) = (a.y, a.y + a.height);
         let mut taken = vec![top, bottom];
+        let mut letters = 0;
         let mut tick = |y: f64, text: &str| {
+            letters = letters.max(text.chars().count());
             line(body, [x + BAR, y], [x + BAR + 1.5, y], THIN);
             *body += &label(x + BAR + 2.5, y + 2.0, SMALL, "start", text);
         };
@@ -186,7 +188,9 @@ impl Bar {
             }
         }
         let name = axis(self.name, self.unit, power);
-        *body += &upwards(x + BAR + 25.0, a.y + a.height / 2.0, &name);
+        // After the longest number.
+        let x = x + BAR + 8.5 + 0.5 * SMALL * letters as f64;
+        *body += &upwards(x, a.y + a.height / 2.0, &name);
     }
 }
 

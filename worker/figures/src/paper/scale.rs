@@ -13,7 +13,7 @@ pub fn ticks(low: f64, high: f64, count: usize) -> Vec<f64> {
     let step = [1.0, 2.0, 5.0, 10.0]
         .into_iter()
         .map(|s| s * power)
-        .find(|s| *s >= rough * 0.999)
+        .find(|s| *s >= rough * 0.7)
         .unwrap_or(rough);
     let first = libm::ceil(low / step - 1e-9) as i64;
     let last = libm::floor(high / step + 1e-9) as i64;
@@ -57,7 +57,8 @@ mod tests {
     #[test]
     fn ticks_are_round_and_within_the_limits() {
         assert_eq!(ticks(0.0, 10.0, 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
-        assert_eq!(ticks(0.72, 4.11, 3), [2.0, 4.0]);
+        assert_eq!(ticks(0.72, 4.11, 3), [1.0, 2.0, 3.0, 4.0]);
+        assert_eq!(ticks(20.0, 85.0, 3), [20.0, 40.0, 60.0, 80.0]);
         assert_eq!(ticks(1.0, 1.0, 3), [0.0; 0]);
         for (low, high) in [(-3.0, 1e-3), (1e-9, 3e-9), (5.0, 1e12)] {
             let ticks = ticks(low, high, 4);
