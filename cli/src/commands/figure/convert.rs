@@ -36,7 +36,8 @@ pub(super) fn convert(drawn: &Drawn, format: Format, dpi: u32) -> Result<Vec<u8>
     if format == Format::Pdf {
         let page = svg2pdf::PageOptions { dpi: POINTS };
         let conversion = svg2pdf::ConversionOptions::default();
-        return svg2pdf::to_pdf(&tree, conversion, page).map_err(|e| broken(&e));
+        let pdf = svg2pdf::to_pdf(&tree, conversion, page).map_err(|e| broken(&e))?;
+        return Ok(ordered(&pdf));
     }
     let pixels = |mm: f64| (mm / 25.4 * f64::from(dpi)).round().max(1.0);
     let (width, height) = (pixels(drawn.width_mm), pixels(drawn.height_mm));
@@ -52,6 +53,29 @@ pub(super) fn convert(drawn: &Drawn, format: Format, dpi: u32) -> Result<Vec<u8>
     with_density(pixmap, dpi)
 }
 
+/// Sorts the entries of each dictionary of resources. svg2pdf writes them in the order of a hash
+/// map, which differs from run to run. Entries are whole lines, so no offset of an object changes.
+fn ordered(pdf: &[u8]) -> Vec<u8> {
+    let is_entry = |line: &[u8]| line.trim_ascii().starts_with(b"/") && line.ends_with(b" 0 R");
+    let mut sorted: Vec<&[u8]> = Vec::new();
+    let mut first = 0;
+    let mut within_stream = false;
+    for line in pdf.split(|b| *b == b'\n') {
+        within_stream = match line {
+            b"stream" => true,
+            _ => within_stream && !line.ends_with(b"endstream"),
+        };
+        if within_stream || !is_entry(line) {
+            if let Some(entries) = sorted.get_mut(first..) {
+                entries.sort_unstable();
+            }
+            first = sorted.len() + 1;
+        }
+        sorted.push(line);
+    }
+    sorted.join(&b'\n')
+}
+
 /// Encodes the pixels, which cover the page, with their density.
 fn with_density(pixmap: Pixmap, dpi: u32) -> Result<Vec<u8>> {
     let (width, height) = (pixmap.width(), pixmap.height());
@@ -64,4 +88,17 @@ fn with_density(pixmap: Pixmap, dpi: u32) -> Result<Vec<u8>> {
     Ok(picofarm_figures::rgb_png_with_density(
         width, height, &rgb, metre,
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn entries_of_resources_are_sorted_and_streams_are_kept() {
+        let pdf = b"<<\n  /xo1 8 0 R\n  /xo0 9 0 R\n>>\nstream\n/b 1 0 R\n/a 1 0 R\nendstream\nend";
+        let expected =
+            b"<<\n  /xo0 9 0 R\n  /xo1 8 0 R\n>>\nstream\n/b 1 0 R\n/a 1 0 R\nendstream\nend";
+        assert_eq!(ordered(pdf), expected);
+    }
 }
