@@ -21,6 +21,10 @@ demo *args:
 lab *args:
     cargo run --release -p picofarm-lab -- {{args}}
 
+# Build the wheel of the Python package (needs `pip install maturin`).
+wheel:
+    maturin build --release --manifest-path python/Cargo.toml --out target/wheels
+
 # Check links, regenerate the command reference, and build the book if mdbook is installed.
 docs:
     cargo build --features full

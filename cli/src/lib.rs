@@ -21,8 +21,10 @@ mod traces;
 mod traces;
 
 use std::{
+    ffi::OsString,
     io::{ErrorKind, Write},
     process::ExitCode,
+    sync::{Once, OnceLock},
 };
 
 use tracing_subscriber::{Layer, prelude::*};
@@ -35,29 +37,59 @@ use crate::{
     traces::Traces,
 };
 
+/// The command that starts this program again, without arguments; unset for its own executable.
+static START: OnceLock<Vec<OsString>> = OnceLock::new();
+
 /// Runs the whole program, from its command line to its exit code. `version` is the text of
 /// `--version`.
 pub fn run_program(version: &'static str) -> ExitCode {
+    ExitCode::from(run(std::env::args_os().skip(1), version))
+}
+
+/// Like [`run_program`], for a program inside another one such as an interpreter. `start` is the
+/// command that runs this program, without arguments. Returns the exit code.
+pub fn run_program_as(start: Vec<OsString>, args: Vec<OsString>, version: &'static str) -> u8 {
+    // A second call in this process has the same command.
+    let _ = START.set(start);
+    run(args.into_iter(), version)
+}
+
+fn run(args: impl Iterator<Item = OsString>, version: &'static str) -> u8 {
     provide_cryptography();
-    let cli = match args::parse(std::env::args_os(), version) {
+    let cli = match args::parse(std::iter::once("picofarm".into()).chain(args), version) {
         Ok(cli) => cli,
         Err(asked) => return usage(&asked),
     };
     let json = cli.global.json;
     match start(cli) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => ExitCode::from(e.report(json)),
+        Ok(()) => 0,
+        Err(e) => e.report(json),
     }
 }
 
+/// Returns whether this program runs inside another one.
+pub(crate) fn has_host() -> bool {
+    START.get().is_some()
+}
+
+/// Returns a command that starts this program again.
+pub(crate) fn this_program() -> std::io::Result<std::process::Command> {
+    let Some([program, args @ ..]) = START.get().map(Vec::as_slice) else {
+        return Ok(std::process::Command::new(std::env::current_exe()?));
+    };
+    let mut command = std::process::Command::new(program);
+    command.args(args);
+    Ok(command)
+}
+
 /// Prints help, the version, or an error about the arguments.
-fn usage(asked: &clap::Error) -> ExitCode {
+fn usage(asked: &clap::Error) -> u8 {
     let printed = asked.print().and_then(|()| std::io::stdout().flush());
     match printed {
         Err(e) if !asked.use_stderr() && e.kind() != ErrorKind::BrokenPipe => {
-            ExitCode::from(error::io("standard output", &e).report(false))
+            error::io("standard output", &e).report(false)
         }
-        _ => ExitCode::from(u8::try_from(asked.exit_code()).unwrap_or(2)),
+        _ => u8::try_from(asked.exit_code()).unwrap_or(2),
     }
 }
 
@@ -115,10 +147,13 @@ fn with_settings(
 }
 
 /// Selects the only cryptography provider of all TLS code of this process.
-fn provide_cryptography() {
-    rustls::crypto::ring::default_provider()
-        .install_default()
-        .expect("nothing has chosen one before main");
+pub fn provide_cryptography() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        rustls::crypto::ring::default_provider()
+            .install_default()
+            .expect("no other code of this process chooses one");
+    });
 }
 
 /// Runs a worker process of `up` or `demo`. Its parent has resolved the settings.

@@ -20,7 +20,7 @@ def zarr_store(location):
         return location
     import obstore
 
-    # A moment for its threads before the interpreter ends; see transients.py.
+    # A moment for its threads before the interpreter ends (https://github.com/PyO3/pyo3-async-runtimes/issues/40).
     atexit.register(time.sleep, 0.2)
 
     return zarr.storage.ObjectStore(obstore.store.from_url(location), read_only=True)

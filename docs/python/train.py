@@ -16,7 +16,7 @@ import time
 
 import numpy
 
-from transients import Transients
+import picofarm
 
 try:
     import torch
@@ -24,21 +24,19 @@ except ImportError:
     torch = None
 
 
-class RandomCrops(Transients):
+class RandomCrops(picofarm.Dataset):
     """Another square of each scene each time; what a network is fed, and no more."""
 
-    def __init__(self, location, side, **rest):
-        super().__init__(location, arrays=("transient", "depth"), **rest)
+    def __init__(self, url, side, **rest):
+        super().__init__(url, arrays=("transient", "depth"), threads=1, **rest)
         self.side = side
-        smallest = min(self._open()[1]["depth"].shape[1:])
-        if not 0 < side <= smallest:
-            raise ValueError(f"crop {side}: expected 1 to {smallest} pixels")
+        if not 0 < side <= min(self.shape):
+            raise ValueError(f"crop {side}: expected 1 to {min(self.shape)} pixels")
 
     def __getitem__(self, index):
         rng = numpy.random.default_rng()
-        _, height, width = self._open()[1]["depth"].shape
-        corner = (int(rng.integers(height - self.side + 1)), int(rng.integers(width - self.side + 1)))
-        scene = self.read(int(self.scenes[index]), crop=(*corner, self.side, self.side))
+        corner = (int(rng.integers(length - self.side + 1)) for length in self.shape)
+        scene = self.read(self.scenes[index], crop=(*corner, self.side, self.side))
         h = scene["transient"].reshape(self.side**2, -1)
         # When light comes tells the distance, not how much of it.
         h /= h.max(axis=1, keepdims=True).clip(1e-20)

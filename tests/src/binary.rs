@@ -1,4 +1,4 @@
-//! Locates the `picofarm` program under test.
+//! Locates the `picofarm` program and the Python extension module under test.
 //!
 //! Cargo tells only the tests of its own package where a binary is (`CARGO_BIN_EXE_…`), and builds
 //! it only for them. This module therefore runs `cargo build --bin picofarm` once per test process.
@@ -26,11 +26,30 @@ pub fn picofarm() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
     BINARY.get_or_init(|| match env::var_os("PICOFARM_TEST_BINARY") {
         Some(path) => PathBuf::from(path),
-        None => build(),
+        None => build().program.clone(),
     })
 }
 
-fn build() -> PathBuf {
+/// Returns the shared library of the Python package's extension module, built from this workspace.
+///
+/// # Panics
+/// If the module cannot be built.
+pub fn python_module() -> &'static Path {
+    &build().python_module
+}
+
+/// The files that Cargo built.
+struct Built {
+    program: PathBuf,
+    python_module: PathBuf,
+}
+
+fn build() -> &'static Built {
+    static BUILT: OnceLock<Built> = OnceLock::new();
+    BUILT.get_or_init(run_cargo)
+}
+
+fn run_cargo() -> Built {
     let test = env::current_exe().expect("the running test has a path");
     // <target>/<profile>/deps/<test>
     let profile = test
@@ -71,6 +90,7 @@ fn build() -> PathBuf {
             "picofarm/full,picofarm/wgpu",
             "--bin",
             "picofarm",
+            "--lib",
             "--test",
             "it",
         ])
@@ -87,10 +107,20 @@ fn build() -> PathBuf {
         .output()
         .expect("cargo starts");
     assert!(output.status.success(), "cargo build: {}", output.status);
-    String::from_utf8_lossy(&output.stdout)
+    let messages = String::from_utf8_lossy(&output.stdout);
+    let messages: Vec<Value> = messages
         .lines()
-        .filter_map(|line| serde_json::from_str::<Value>(line).ok())
-        .filter(|m| m["target"]["name"] == "picofarm" && m["target"]["kind"][0] == "bin")
-        .find_map(|m| m["executable"].as_str().map(PathBuf::from))
-        .expect("cargo names the program it built")
+        .filter_map(|line| serde_json::from_str(line).ok())
+        .collect();
+    let target = |kind: &str, name: &str| {
+        messages
+            .iter()
+            .find(|m| m["target"]["name"] == name && m["target"]["kind"][0] == kind)
+            .unwrap_or_else(|| panic!("cargo names no {kind} {name}"))
+    };
+    let path = |value: &Value| PathBuf::from(value.as_str().expect("a path"));
+    Built {
+        program: path(&target("bin", "picofarm")["executable"]),
+        python_module: path(&target("cdylib", "picofarm_native")["filenames"][0]),
+    }
 }

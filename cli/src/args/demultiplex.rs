@@ -15,7 +15,7 @@ pub struct Demultiplex {
     #[arg(long, value_enum, default_value_t = PlacesArg::Given)]
     pub places: PlacesArg,
     /// How shadows are judged: by a few rules, or by trees that were learnt from rendered rooms
-    #[arg(long, value_enum, default_value_t = ShadowsArg::Physics)]
+    #[arg(long, value_enum, default_value_t = ShadowsArg::Learned)]
     pub shadows: ShadowsArg,
     /// Threads [default: all cores]
     #[arg(long, value_parser = super::ranges::threads)]

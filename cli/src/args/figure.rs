@@ -35,8 +35,8 @@ pub struct Figure {
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = super::ranges::whole)]
     pub scene: u64,
     /// Panels in their order: image, depth, range, normals, labels, masks (the number of spots that
-    /// light a pixel), mask:SPOT (one spot's), mirrors, error (of a render with --split), light (all
-    /// of it), transient (light in flight at --times), histogram (of --pixel)
+    /// light a pixel), mask:SPOT (one spot's), mirrors, error (of a render with --split), light
+    /// (all of it), transient (light in flight at --times), histogram (of --pixel)
     #[arg(long, value_delimiter = ',', value_name = "PANEL,…", value_parser = panel, default_values = ["image", "depth", "light", "masks", "transient", "histogram"])]
     pub panels: Vec<PanelArg>,
     /// Times of light in flight, after the pulse leaves the laser [default: when 10, 40 and 75 % of

@@ -3,13 +3,16 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use picofarm_transient::{BeamWidth, Gate};
+use picofarm_transient::{BeamWidth, Gate, Optics, Wavelength};
 
 use super::SceneInput;
 
-use crate::args::{
-    groups::{Group, Named},
-    strategy::Chosen,
+use crate::{
+    args::{
+        groups::{Group, Named},
+        strategy::Chosen,
+    },
+    error::{CliError, Result},
 };
 
 /// What to render and how.
@@ -48,13 +51,7 @@ pub struct RenderArgs {
     #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::args::strategy::parse)]
     pub strategy: Vec<Chosen>,
     #[command(flatten)]
-    pub beam: BeamArgs,
-    /// Share of each pixel's area that is sensitive, a square in its middle [default: 1]
-    #[arg(long, value_name = "SHARE")]
-    pub fill_factor: Option<f64>,
-    /// Wavelength of the laser, nanometres [default: that of the scene's reflectances]
-    #[arg(long, value_delimiter = ',', value_name = "NM")]
-    pub wavelengths_nm: Vec<f64>,
+    pub optics: OpticsArgs,
     /// Threads [default: all cores]
     #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
@@ -77,7 +74,7 @@ pub struct Resolution {
 }
 
 /// Parses a width, or a width and a height.
-fn resolution(text: &str) -> Result<Resolution, String> {
+fn resolution(text: &str) -> std::result::Result<Resolution, String> {
     let side = |text: &str| -> Option<u32> {
         let side = text.trim().parse().ok()?;
         (1..=4096).contains(&side).then_some(side)
@@ -100,7 +97,7 @@ pub enum GateChoice {
     Range([f64; 2]),
 }
 
-fn gate_choice(text: &str) -> Result<GateChoice, String> {
+fn gate_choice(text: &str) -> std::result::Result<GateChoice, String> {
     if text == "auto" {
         return Ok(GateChoice::Auto);
     }
@@ -113,9 +110,9 @@ fn gate_choice(text: &str) -> Result<GateChoice, String> {
         .ok_or_else(|| "expected auto, or start and end in metres such as 1,25".into())
 }
 
-/// How wide the laser's beams are.
+/// The optics of laser and pixels.
 #[derive(Args)]
-pub struct BeamArgs {
+pub struct OpticsArgs {
     /// Diameter of the beams at the laser, millimetres, at 1/e² of the intensity [default: 0]
     #[arg(long, value_name = "MM")]
     pub beam_diameter_mm: Option<f64>,
@@ -125,11 +122,32 @@ pub struct BeamArgs {
     /// Rays per beam with a width [default: 16]
     #[arg(long, value_name = "N")]
     pub beam_points: Option<u32>,
+    /// Share of each pixel's area that is sensitive, a square in its middle [default: 1]
+    #[arg(long, value_name = "SHARE")]
+    pub fill_factor: Option<f64>,
+    /// Wavelength of the laser, nanometres [default: that of the scene's reflectances]
+    #[arg(long, value_delimiter = ',', value_name = "NM")]
+    pub wavelengths_nm: Vec<f64>,
 }
 
-impl BeamArgs {
-    /// Returns the width; `None` if no option sets it.
-    pub fn width(&self) -> Option<BeamWidth> {
+impl OpticsArgs {
+    /// Returns the optics.
+    ///
+    /// # Errors
+    /// Fails for an invalid wavelength. [`picofarm_proto::model::RenderSettings::check`] checks the
+    /// other options.
+    pub fn optics(&self) -> Result<Optics> {
+        let default = Optics::default();
+        Ok(Optics {
+            beam: self.width(),
+            fill_factor: self.fill_factor.unwrap_or(default.fill_factor),
+            wavelengths_nm: Wavelength::of(&self.wavelengths_nm)
+                .map_err(|(at, what)| CliError::input(format!("--wavelengths-nm{at}: {what}")))?,
+        })
+    }
+
+    /// Returns the beams' width; `None` if no option sets it.
+    fn width(&self) -> Option<BeamWidth> {
         let default = BeamWidth::default();
         let said = self.beam_diameter_mm.is_some()
             || self.beam_divergence_mrad.is_some()

@@ -279,16 +279,13 @@ mod tests {
     }
 
     #[test]
-    fn subsets_and_strategies_can_be_switched_on_in_the_template() {
+    fn every_render_setting_of_the_template_can_be_switched_on() {
         let dir = tempfile::tempdir().unwrap();
-        let text = template(JobKind::Primitive)
-            .replace("spots = 25 ", "spots = 100 ")
-            .replace("# subsets", "subsets")
-            .replace("# per_spot", "per_spot")
-            .replace("# strategy", "strategy")
-            .replace("# beam =", "beam =")
-            .replace("# fill_factor =", "fill_factor =");
-        let text = text.replace("# wavelengths_nm", "wavelengths_nm");
+        let text = template(JobKind::Primitive).replace("spots = 25 ", "spots = 100 ");
+        let (scenes, rest) = text.split_once("[render]").expect("it renders");
+        let (render, rest) = rest.split_once("[output]").expect("it has an output");
+        let render = render.replace("\n# ", "\n");
+        let text = format!("{scenes}[render]{render}[output]{rest}");
         let several = text.replace("[905]", "[905, 532]");
         let refused = read(&written(dir.path(), &several), dir.path()).unwrap_err();
         let expected = "render.wavelengths_nm";
@@ -305,9 +302,20 @@ mod tests {
         assert!(render.per_spot);
         assert_eq!(render.strategy.path_reuse, Some(1));
         assert!(render.strategy.mirror_images.is_some());
-        assert_eq!(render.fill_factor, 0.3);
-        let beam = render.beam.expect("it has a width");
+        let beam = render.optics.beam.expect("it has a width");
         assert_eq!((beam.diameter_mm, beam.divergence_mrad), (4.0, 1.0));
+        let all = serde_json::to_value(render).unwrap();
+        let (_, settings) = text.split_once("[render]").expect("it renders");
+        let names = settings
+            .lines()
+            .skip(1)
+            .map_while(|line| line.split_once(" ="));
+        for (name, _) in names {
+            assert!(
+                !all[name].is_null(),
+                "{name} is not read, or is its default"
+            );
+        }
         let wrong = text.replace("diameter_mm = 4", "diameter_mm = -4");
         let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
         assert!(

@@ -7,7 +7,8 @@ use std::time::Instant;
 
 use picofarm_dataset::{RenderArray, write_render_group};
 use picofarm_demultiplex::{
-    Demultiplexed, DepthScore, MaskScore, Settings, Shading, VERSION, demultiplex, score,
+    Demultiplexed, DepthScore, MaskScore, Residual, Settings, Shading, VERSION, demultiplex,
+    residual, score,
 };
 use serde_json::{Map, json};
 
@@ -53,6 +54,7 @@ struct Made {
     depth: Option<DepthScore>,
     masks: Option<MaskScore>,
     mirrors: Option<f64>,
+    residual: Option<Residual>,
     spots: usize,
     placed: usize,
     seconds: f64,
@@ -75,6 +77,7 @@ fn make(args: Demultiplex) -> Result<Made> {
     let depth = truth.as_ref().map(|t| score::depth(&found.depth_m, t));
     let masks = truth.as_ref().and_then(|t| score::masks(&found, t));
     let mirrors = truth.as_ref().and_then(|t| score::mirrors(&found, t));
+    let residual = residual(&flash.capture(), &found);
     let attributes = json!({
         "demultiplexed": args.render.file_name().map(|n| n.to_string_lossy()),
         "scene": flash.attributes.get("scene"),
@@ -91,7 +94,7 @@ fn make(args: Demultiplex) -> Result<Made> {
         "confidence": "0 to 1: how well the histogram speaks for the depth",
         "settings": settings,
         "version": VERSION,
-        "scores": {"depth": depth, "masks": masks, "mirrors_iou": mirrors},
+        "scores": {"depth": depth, "masks": masks, "mirrors_iou": mirrors, "residual": residual},
     });
     let attributes = attributes
         .as_object()
@@ -108,6 +111,7 @@ fn make(args: Demultiplex) -> Result<Made> {
         depth,
         masks,
         mirrors,
+        residual,
         seconds,
     })
 }
@@ -158,6 +162,12 @@ fn summary(made: &Made) -> String {
     if made.placed < made.spots {
         let lost = made.spots - made.placed;
         text += &format!("  {lost} spots have no return in the histogram and light nothing\n");
+    }
+    if let Some(r) = &made.residual {
+        text += &format!(
+            "  peaks of {} pairs agree with the depth to {:.4} m of path (wrong times have {:.4})\n",
+            r.peaks, r.median_m, r.control_m
+        );
     }
     if let Some(d) = &made.depth {
         text += &format!(

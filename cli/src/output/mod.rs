@@ -252,7 +252,8 @@ pub fn duration(seconds: f64) -> String {
 /// as `target/release/picofarm` under `cargo run`, or its name if the shell found it by `PATH`.
 pub fn program() -> String {
     let called = std::env::args().next().unwrap_or_default();
-    match called.contains('/') {
+    // In another program, that is the other program's path.
+    match called.contains('/') && !crate::has_host() {
         true => show::argument(&called).to_string(),
         false => "picofarm".to_owned(),
     }

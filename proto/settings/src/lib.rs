@@ -5,6 +5,7 @@
 mod gate;
 mod gpus;
 mod network;
+mod optics;
 mod reconstruct;
 mod render;
 mod rooms;
@@ -17,6 +18,7 @@ pub use gpus::Gpus;
 pub use network::{
     Architecture, Precision, Schedule, ShadowVariant, StemForm, Swin, Target, TimeProjection,
 };
+pub use optics::Optics;
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
 pub use render::{BeamWidth, Budget, Choice, Strategy};
 pub use rooms::{MirrorWall, PrimitiveRooms, Sizes};

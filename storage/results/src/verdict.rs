@@ -89,7 +89,13 @@ impl Verdict {
             return Self::doubtful(format!("do not trust it: {}", against.join("; ")));
         }
         let residual = agreement["time_residual_m"].as_f64();
+        let flash = &metrics["flash"]["residual"];
+        let peaks = flash["median_m"].as_f64().zip(flash["control_m"].as_f64());
+        let peaks = peaks.map(|(own, control)| {
+            format!("peaks agree to {own:.4} m (wrong times have {control:.4})")
+        });
         let mut said = Vec::new();
+        said.extend(peaks);
         said.extend(residual.map(|m| format!("times agree to {m:.4} m")));
         said.extend(loss.map(|loss| format!("held-out loss {loss:.3} (a guess has {GUESS:.3})")));
         match (said.is_empty(), agreement.is_null()) {

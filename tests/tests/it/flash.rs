@@ -96,7 +96,7 @@ fn flashes_are_taken_apart_evaluated_and_reconstructed_with_equal_bytes_however_
         found.push(evaluation["predicts"].as_str().unwrap());
     }
     found.sort_unstable();
-    assert_eq!(found, ["shadow", "tof"], "{info}");
+    assert_eq!(found, ["shadow", "specular", "tof"], "{info}");
 }
 
 #[test]

@@ -1,6 +1,7 @@
-//! The Python example of docs/python, xarray and tensorstore read the same data as the program,
-//! from disk and from S3, and the example trains. Runs if `PICOFARM_PYTHON` names a Python with
-//! zarr, xarray, tensorstore, obstore and h5py.
+//! The Python package passes its own tests (`python/tests`). It, xarray and tensorstore read the
+//! same data as the program, from disk and from S3, and the example of docs/python trains. Runs if
+//! `PICOFARM_PYTHON` names a Python with zarr, xarray, tensorstore, obstore, h5py, pytest and
+//! matplotlib.
 
 use std::{
     ffi::OsString,
@@ -23,10 +24,30 @@ fn python(name: &str) -> Option<OsString> {
     python
 }
 
+/// Returns the folder of this repository.
+fn repository() -> PathBuf {
+    Path::new(&picofarm_tests::package()).join("..")
+}
+
+/// Installs the Python package into a folder of `farm` and returns commands that import it.
+fn with_package(farm: &Farm) -> Cli {
+    let path = farm.scratch.join("site");
+    let package = path.join("picofarm");
+    std::fs::create_dir_all(&package).unwrap();
+    for entry in repository().join("python/picofarm").read_dir().unwrap() {
+        let source = entry.unwrap().path();
+        if source.is_file() {
+            std::fs::copy(&source, package.join(source.file_name().unwrap())).unwrap();
+        }
+    }
+    let module = picofarm_tests::binary::python_module();
+    std::os::unix::fs::symlink(module, package.join("_native.abi3.so")).unwrap();
+    farm.cli().with("PYTHONPATH", &path.display().to_string())
+}
+
 /// Runs a script of this repository to its successful end, with the variables of `cli`.
 fn run(python: &OsString, cli: &Cli, script: &str, args: &[&str]) -> Ended {
-    let folder = Path::new(&picofarm_tests::package()).join("..");
-    let script = folder.join(script).display().to_string();
+    let script = repository().join(script).display().to_string();
     // `-B`: writes no bytecode next to the scripts.
     cli.run_other(python, &[&["-B", &script], args].concat())
         .ok()
@@ -82,7 +103,7 @@ fn reprocess(farm: &Farm, source: &Path, target: &str, profile: &str) -> String 
 
 /// Runs everything that the example does, at one location.
 fn everything(python: &OsString, farm: &Farm, source: &Path, place: &dyn Fn(&str) -> String) {
-    let cli = farm.cli();
+    let cli = with_package(farm);
     for (profile, saturates) in [
         ("sqrt-u16", true),
         ("coarse", false),
@@ -91,7 +112,7 @@ fn everything(python: &OsString, farm: &Farm, source: &Path, place: &dyn Fn(&str
     ] {
         let target = place(profile);
         let exported = reprocess(farm, source, &target, profile);
-        let check = "tests/interop/check_transients.py";
+        let check = "tests/interop/check_package.py";
         let found = run(python, &cli, check, &[&target, &exported]).json();
         assert_eq!(found["scenes"], COUNT);
         assert_eq!(
@@ -132,25 +153,31 @@ fn everything(python: &OsString, farm: &Farm, source: &Path, place: &dyn Fn(&str
 }
 
 #[test]
-fn the_example_reads_what_the_program_reads_and_learns_from_a_disk() {
+fn the_package_reads_what_the_program_exports_and_learns_from_a_disk() {
     let Some(python) = python("python") else {
         return;
     };
     let (farm, source) = rooms("python");
     let place = |profile: &str| farm.store().join(profile).display().to_string();
     everything(&python, &farm, &source, &place);
-    let target = place("sqrt-u16");
-    std::fs::remove_file(Path::new(&target).join("scale/c/4")).unwrap();
-    run(
-        &python,
-        &farm.cli(),
-        "tests/interop/check_refusals.py",
-        &[&target],
-    );
 }
 
 #[test]
-fn the_example_reads_what_the_program_reads_and_learns_from_s3() {
+fn the_package_passes_its_own_tests() {
+    let Some(python) = python("python-package") else {
+        return;
+    };
+    let (farm, source) = rooms("python-package");
+    let cli = with_package(&farm).with("PICOFARM_DATASET", &source.display().to_string());
+    let tests = repository().join("python/tests").display().to_string();
+    let pytest = ["-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", &tests];
+    let ended = cli.run_other(&python, &pytest).ok();
+    assert!(ended.stdout.contains(" passed"), "{}", ended.stdout);
+    assert!(!ended.stdout.contains(" skipped"), "{}", ended.stdout);
+}
+
+#[test]
+fn the_package_reads_what_the_program_exports_and_learns_from_s3() {
     let Some(python) = python("python-s3") else {
         return;
     };

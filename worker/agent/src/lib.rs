@@ -11,7 +11,7 @@ mod run;
 
 pub use execute::{
     By, SceneSize, Submission, TaskExecutor, absolute, check_memory, encode_render, render_bytes,
-    renderer_version, repin, resolve, scene_size,
+    renderer_settings, renderer_version, repin, resolve, scene_size,
 };
 #[cfg(feature = "networks")]
 pub use execute::{ImportFor, NotImported, imported, infer_version, model_version, report, takes};

@@ -2,11 +2,17 @@
 //! counts the light of rooms that nothing was tuned on. "Photons" are those of the median pixel's
 //! brightest bin.
 //!
-//! In the environment: as for the example `rooms`, with `ROOMS` (3).
+//! In the environment: as for the example `rooms`, with `ROOMS` (3), and `SVG`, a path to which
+//! both are drawn.
 
+#[path = "common/chart.rs"]
+mod chart;
 #[path = "common/mod.rs"]
 mod common;
 
+use std::{env, fs};
+
+use chart::{Panel, Series};
 use common::{Kind, Room, variable};
 use picofarm_demultiplex::{Capture, Demultiplexed, Settings, Shading, demultiplex, score};
 use picofarm_sensor::{Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values, sense};
@@ -73,6 +79,8 @@ fn main() {
     );
     println!("| --- | --- | --- | --- | --- | --- | --- |");
     let mut groups = [[0.0; 2]; LIT.len()];
+    // Photons; depth MAE, that of the worst room, and median in metres.
+    let mut curve = Vec::new();
     for photons in [
         None,
         Some(400.0),
@@ -114,6 +122,7 @@ fn main() {
                 by_lit(&room, &physics, &mut groups);
             }
         }
+        curve.push((photons, [sum[0], worst, sum[1]]));
         let name = photons.map_or("all light".to_owned(), |p| p.to_string());
         let mirrors = mirrors.iter().sum::<f64>() / mirrors.len() as f64;
         println!(
@@ -137,4 +146,62 @@ fn main() {
             sum / count
         );
     }
+    if let Some(path) = env::var_os("SVG") {
+        fs::write(&path, drawn(&curve, &groups)).expect("SVG is a path that can be written");
+    }
+}
+
+/// Name of a group of pixels.
+fn group(n: usize) -> String {
+    match LIT.get(n + 1) {
+        None => format!("{}+", LIT[n]),
+        Some(next) if *next == LIT[n] + 1 => LIT[n].to_string(),
+        Some(next) => format!("{}–{}", LIT[n], next - 1),
+    }
+}
+
+/// The chart of both.
+fn drawn(curve: &[(Option<f64>, [f64; 3])], groups: &[[f64; 2]]) -> String {
+    // 10 to 400 photons, then all light.
+    let position = |photons: Option<f64>| match photons {
+        Some(photons) => 0.85 * (photons / 10.0).ln() / 40.0f64.ln(),
+        None => 1.0,
+    };
+    let series = |name, k: usize| Series {
+        name,
+        points: curve
+            .iter()
+            .map(|(n, errors)| (position(*n), errors[k]))
+            .collect(),
+    };
+    let photons = Panel {
+        title: "by photons",
+        axis: "photons in the brightest bin of the median pixel",
+        ticks: curve
+            .iter()
+            .map(|(n, _)| (position(*n), n.map_or("all".into(), |n| n.to_string())))
+            .collect(),
+        series: vec![
+            series("mean", 0),
+            series("mean, worst room", 1),
+            series("median", 2),
+        ],
+    };
+    let place = |n: usize| n as f64 / (groups.len() - 1) as f64;
+    let lit = Panel {
+        title: "by lit spots",
+        axis: "spots that light a pixel (without noise)",
+        ticks: (0..groups.len()).map(|n| (place(n), group(n))).collect(),
+        series: vec![Series {
+            name: "mean",
+            points: groups
+                .iter()
+                .enumerate()
+                .map(|(n, [sum, count])| (place(n), sum / count))
+                .collect(),
+        }],
+    };
+    let title =
+        "Error of depth from one flash, by photons and by the number of spots that light a pixel";
+    chart::draw(title, &[photons, lit], [0.001, 0.5])
 }

@@ -3,16 +3,17 @@
 //!
 //! In the environment, `ROOMS` (20), `FIRST` (91001, the first seed), `SIDE` (128 pixels), `SPOTS`
 //! (25), `ERROR` (0.1, of the renders), `ASSETS` (parametric, or sweethome3d from the folder
-//! `ASSETS_DIR`), `CACHE` (a folder that keeps rendered rooms), `SHADOWS` (physics, or
-//! learned), and `RETURNS` takes the spots' places from their own one-bounce returns.
+//! `ASSETS_DIR`), `CACHE` (a folder that keeps rendered rooms), `SHADOWS` (physics or
+//! learned, instead of the default), and `RETURNS` takes the spots' places from their own
+//! one-bounce returns.
 
 #[path = "common/mod.rs"]
 mod common;
 
 use std::time::Instant;
 
-use common::{Kind, Room, variable};
-use picofarm_demultiplex::{Demultiplexed, Settings, Shading, demultiplex, score, shadows_at};
+use common::{Kind, Room, settings, variable};
+use picofarm_demultiplex::{Demultiplexed, demultiplex, score, shadows_at};
 
 /// Depth MAE, mirrors' MAE (NaN without any), median; IoU and IoU over carrying pairs from its own
 /// depth; the same from the true depth; IoU of "all lit"; IoU of mirrors; seconds.
@@ -21,14 +22,7 @@ type Row = [f64; 10];
 fn scores(room: &Room) -> Row {
     let capture = room.capture();
     let truth = room.truth();
-    let settings = Settings {
-        shadows: match variable("SHADOWS", "physics".to_owned()).as_str() {
-            "physics" => Shading::Physics,
-            "learned" => Shading::Learned,
-            other => panic!("SHADOWS={other:?}: expected physics or learned"),
-        },
-        ..Settings::default()
-    };
+    let settings = settings();
     let start = Instant::now();
     let own = demultiplex(&capture, &settings).expect("a capture");
     let seconds = start.elapsed().as_secs_f64();

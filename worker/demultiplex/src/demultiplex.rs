@@ -18,7 +18,7 @@ use crate::{
     unmix::Unmix,
 };
 
-/// Half width of the neighbourhood that a normal follows from, pixels.
+/// Half width of the neighbourhood that a normal follows from, steps ([`Rays::step`]).
 const NEAR: usize = 2;
 /// Share of depth beyond which a neighbour is another surface.
 const LEAP: f32 = 0.04;
@@ -180,7 +180,7 @@ pub fn take_apart(
                 finish(&rays, &slants, settings)
             }
         };
-        near = normals(&rays, &depth, NEAR, LEAP);
+        near = normals(&rays, &depth, NEAR * rays.step(), LEAP);
         for s in &mut sources {
             s.normal = spot_normal(&rays, &depth, &near, s);
         }
@@ -201,6 +201,7 @@ pub fn take_apart(
             mirror: &mirror,
             albedo: &albedo,
             log: &log,
+            bin_m: gate.bin_width_m as f32,
             sources: &sources,
             normals: &near,
             shares: &shares,

@@ -5,6 +5,9 @@ use picofarm_settings::Gate;
 
 use crate::{Capture, Place};
 
+/// Focal length per step between neighbours, pixels.
+const STEP_FOCAL: f32 = 64.0;
+
 /// The pinhole: unit directions through the middles of pixels.
 #[derive(Debug, Clone)]
 pub struct Rays {
@@ -37,6 +40,14 @@ impl Rays {
     /// Pixels.
     pub fn len(&self) -> usize {
         self.unit.len()
+    }
+
+    /// Pixels between neighbours that are compared, so that neighbourhoods have the same angle in
+    /// images of any size: 1 up to 128 pixels over 90°, 2 at 256.
+    pub fn step(&self) -> usize {
+        (self.lens.fx.max(self.lens.fy) / STEP_FOCAL)
+            .round()
+            .max(1.0) as usize
     }
 
     /// The point of z-depth 1 on the ray of a pixel's middle.

@@ -18,7 +18,7 @@ static WEIGHTS: LazyLock<Vec<Forest>> = LazyLock::new(|| {
 });
 
 /// Names of the features of a pair.
-pub const FEATURES: [&str; 36] = [
+pub const FEATURES: [&str; 37] = [
     "found",
     "pooled",
     "bound",
@@ -55,7 +55,11 @@ pub const FEATURES: [&str; 36] = [
     "lit spots",
     "behind around",
     "brightness",
+    "peak",
 ];
+/// Bins from which on two spots' light does not overlap.
+const OVERLAP: f32 = 2.0;
+
 /// What the features are made of.
 pub struct Scene<'a> {
     pub rays: &'a Rays,
@@ -65,6 +69,8 @@ pub struct Scene<'a> {
     pub albedo: &'a [f32],
     /// Log intensity.
     pub log: &'a [f32],
+    /// Width of a bin, metres.
+    pub bin_m: f32,
     pub sources: &'a [Source],
     pub normals: &'a [picofarm_scene::Vec3],
     /// `[pixel][source]`.
@@ -74,12 +80,24 @@ pub struct Scene<'a> {
 }
 
 impl Scene<'_> {
+    /// Log intensity and albedo of the median pixel. Both are in units of the brightest bin, which
+    /// depends on the size of a pixel.
+    fn usual(&self) -> [f32; 2] {
+        [self.log, self.albedo].map(|image| {
+            let mut all = image.to_vec();
+            let middle = all.len() / 2;
+            *all.select_nth_unstable_by(middle, f32::total_cmp).1
+        })
+    }
+
     /// Features of all pairs of a source, `[feature][pixel]`.
     pub fn features(&self, i: usize) -> Vec<Vec<f32>> {
         let (n, pixels) = (self.sources.len(), self.rays.len());
         let mut out = vec![vec![0.0f32; pixels]; FEATURES.len()];
         let source = &self.sources[i];
         let judged = &self.judged[i];
+        let [usual_log, usual_albedo] = self.usual();
+        let step = self.rays.step();
         for p in 0..pixels {
             let s = &self.shares[p * n + i];
             let way = &judged.way[p];
@@ -87,7 +105,7 @@ impl Scene<'_> {
             let off = x - source.point;
             let (mut low, mut high) = (f32::INFINITY, 0.0f32);
             let (mut found, mut behind, mut count) = (0.0, 0.0, 0.0);
-            for q in around(self.rays, p, 1, 1) {
+            for q in around(self.rays, p, step, step) {
                 low = low.min(self.depth[q]);
                 high = high.max(self.depth[q]);
                 if alike(self.depth, p, q) {
@@ -123,7 +141,7 @@ impl Scene<'_> {
                 judged.smooth[p],
                 self.confidence[p],
                 (high - low) / self.depth[p],
-                self.albedo[p],
+                self.albedo[p] / usual_albedo.max(f32::MIN_POSITIVE),
                 s.window[0],
                 s.window[1],
                 s.window[2],
@@ -138,7 +156,8 @@ impl Scene<'_> {
                 -self.normals[p].dot(off),
                 lit / facing,
                 behind / count,
-                self.log[p],
+                self.log[p] - usual_log,
+                s.peak,
             ];
             for (out, value) in out.iter_mut().zip(values) {
                 out[p] = if value.is_finite() { value } else { 0.0 };
@@ -148,7 +167,8 @@ impl Scene<'_> {
     }
 
     /// What the first forest says around the pairs of a source, `[feature][pixel]`: its log odds,
-    /// their means over a small and a wide neighbourhood, the share of lit spots, and a median.
+    /// their means over a small and a wide neighbourhood, the share of lit spots, a median, and the
+    /// light that other spots explain.
     pub fn around(&self, i: usize, odds: &[Vec<f32>]) -> Vec<Vec<f32>> {
         let own: Vec<f32> = odds[i].iter().map(|o| o.clamp(-5.0, 5.0)).collect();
         let mean = |reach: usize, stride: usize| -> Vec<f32> {
@@ -172,15 +192,46 @@ impl Scene<'_> {
             })
             .map(|sum| sum / odds.len() as f32)
             .collect();
-        let wide = (self.rays.width / 40).max(2);
-        let median = median_3x3(&own, self.rays.width);
+        let step = self.rays.step();
+        let median = median_3x3(&own, self.rays.width, step);
+        let [explained, rest] = self.explained(i, odds);
         vec![
             own.clone(),
-            mean(1, 1),
-            mean(2 * wide, wide.div_ceil(2)),
+            mean(step, step),
+            mean(6 * step, 2 * step),
             all,
             median,
+            explained,
+            rest,
         ]
+    }
+
+    /// Light of other spots in the bins of a source's pairs if the odds are right, and what is left
+    /// of the light there without it; both over what full light of the source brings.
+    fn explained(&self, i: usize, odds: &[Vec<f32>]) -> [Vec<f32>; 2] {
+        let n = self.sources.len();
+        let of = |p: usize| {
+            let pair = &self.shares[p * n..][..n];
+            let own = &pair[i];
+            if own.expected <= 0.0 {
+                return (0.0, 0.0);
+            }
+            let x = self.rays.unit[p] * (self.depth[p] * self.rays.slant[p]);
+            let time = self.sources[i].path(x);
+            let mut others = 0.0;
+            for (j, (source, share)) in self.sources.iter().zip(pair).enumerate() {
+                let apart = (source.path(x) - time).abs() / self.bin_m;
+                if j == i || share.expected <= 0.0 || apart >= OVERLAP {
+                    continue;
+                }
+                let lit = 1.0 / (1.0 + libm::expf(-odds[j][p]));
+                others += lit * share.expected / own.expected * (1.0 - apart / OVERLAP);
+            }
+            let there: f32 = own.window[1..4].iter().sum();
+            (others.min(50.0), (there - others).clamp(-8.0, 8.0))
+        };
+        let (explained, rest) = (0..self.rays.len()).map(of).unzip();
+        [explained, rest]
     }
 
     /// Log odds of all pairs by given forests, `[source][pixel]`.

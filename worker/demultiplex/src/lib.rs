@@ -1,6 +1,7 @@
 //! One flash taken apart by physics: from a multiplexed histogram, in which the light of all spots
 //! is added up, to the depth of each pixel and to which spots light it. Every two-bounce
-//! time follows from geometry. Nothing is learnt but, on request, the judgement of shadows.
+//! time follows from geometry. Nothing is learnt but the judgement of shadows, which may be left to
+//! rules.
 //!
 //! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or
 //! files.
@@ -18,6 +19,7 @@ mod matching;
 mod mirrors;
 mod peaks;
 mod planes;
+mod residual;
 pub mod score;
 mod settings;
 mod shadows;
@@ -27,9 +29,10 @@ mod unmix;
 pub use capture::{Capture, Place, Spot};
 pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
 pub use error::DemultiplexError;
+pub use residual::{Residual, residual};
 pub use score::{DepthScore, MaskScore, Truth};
 pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-3";
+pub const VERSION: &str = "demultiplex-4";

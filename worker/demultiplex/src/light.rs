@@ -37,6 +37,8 @@ pub struct Share {
     pub others: f32,
     /// Expected light over the noise of its bins.
     pub clear: f32,
+    /// The share of its light in its brightest bin: a pixel's own width spreads it.
+    pub peak: f32,
     /// Cosine at the spot, and at what the pixel sees.
     pub cosines: [f32; 2],
     /// Bins about its time, over the background and over what full light brings.
@@ -89,7 +91,7 @@ impl Light<'_> {
                 .par_chunks(n)
                 .map(|shares| amplitude(shares, &scale))
                 .collect();
-            albedo = median_3x3(&raw, self.rays.width);
+            albedo = median_3x3(&raw, self.rays.width, self.rays.step());
             let mut bright: Vec<f32> = albedo.iter().copied().filter(|a| *a > 0.0).collect();
             let typical = quantile(&mut bright, 0.5).unwrap_or(1.0);
             let least = (1e-4 * typical).max(1e-30);
@@ -174,6 +176,9 @@ impl Light<'_> {
             *share = Share {
                 expected,
                 cosines,
+                peak: found.map_or(0.0, |(_, kernel)| {
+                    kernel.iter().copied().fold(0.0, f32::max)
+                }),
                 ..Share::default()
             };
             w.returns.push(found.map(|(first, kernel)| Return {
@@ -389,15 +394,20 @@ fn quantile(all: &mut [f32], share: f32) -> Option<f32> {
     all.get((share * all.len() as f32) as usize).copied()
 }
 
-/// Median over each pixel's neighbours.
-pub fn median_3x3(image: &[f32], width: usize) -> Vec<f32> {
+/// Median over each pixel and its eight neighbours that are `step` pixels away.
+pub fn median_3x3(image: &[f32], width: usize, step: usize) -> Vec<f32> {
     let height = image.len() / width;
     let of = |p: usize| {
         let (column, row) = (p % width, p / width);
         let mut near = Vec::with_capacity(9);
-        for v in row.saturating_sub(1)..(row + 2).min(height) {
-            for u in column.saturating_sub(1)..(column + 2).min(width) {
-                near.push(image[v * width + u]);
+        for v in [row.checked_sub(step), Some(row), Some(row + step)] {
+            for u in [column.checked_sub(step), Some(column), Some(column + step)] {
+                if let (Some(v), Some(u)) = (v, u)
+                    && v < height
+                    && u < width
+                {
+                    near.push(image[v * width + u]);
+                }
             }
         }
         near.sort_by(f32::total_cmp);

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "snake_case")]
 pub enum Shading {
     /// By a few rules: geometry, and a logistic regression with 20 numbers over light.
-    #[default]
     Physics,
     /// By boosted trees over what the physics knows, learnt from rendered rooms.
+    #[default]
     Learned,
 }
 
@@ -87,7 +87,7 @@ impl Default for Settings {
             early_slack_m: 0.2,
             early_gap_m: 0.1,
             rounds: 1,
-            shadows: Shading::Physics,
+            shadows: Shading::Learned,
         }
     }
 }

@@ -34,7 +34,7 @@ const UNDECIDED: std::ops::Range<f32> = 0.15..0.9;
 const VISIBLE: f32 = 3.0;
 
 /// Steps of a ray through the depth map.
-const STEPS: usize = 32;
+const STEPS: usize = 64;
 /// A point this far behind a surface is hidden, as a share of its depth.
 const BEHIND: f32 = 0.006;
 /// A ray deeper than this behind a surface may pass behind it, metres.
@@ -192,13 +192,13 @@ fn judge(share: &Share, way: &Way) -> (f32, Ground) {
 
 /// Mean log odds over neighbours of alike depth.
 fn spread(rays: &Rays, depth: &[f32], logit: &[f32]) -> Vec<f32> {
-    let (width, height) = (rays.width, rays.height);
+    let (width, height, step) = (rays.width, rays.height, rays.step());
     (0..rays.len())
         .map(|p| {
             let (column, row) = (p % width, p / width);
             let (mut sum, mut weight) = (0.0, 0.0);
-            for v in row.saturating_sub(1)..(row + 2).min(height) {
-                for u in column.saturating_sub(1)..(column + 2).min(width) {
+            for v in row.saturating_sub(step)..(row + step + 1).min(height) {
+                for u in column.saturating_sub(step)..(column + step + 1).min(width) {
                     let q = v * width + u;
                     let w = if q == p { 2.0 } else { 1.0 };
                     if alike(depth, p, q) {

@@ -1,5 +1,6 @@
 //! Tools for pictures and pages of results: a canvas, colour maps, PNG, GIF; numbers and texts in
-//! HTML. [`scene`] draws stored scenes, [`paper`] figures for papers; the rest is independent of the content.
+//! HTML. [`scene`] draws stored scenes, [`paper`] figures for papers; the rest is independent of
+//! the content.
 
 mod animation;
 mod canvas;

@@ -57,9 +57,10 @@ pub struct Agreement {
     pub verdict: Verdict,
     /// The contradictions, a sentence each.
     pub reasons: Vec<String>,
-    /// The number of compared pairs of a pixel and a spot.
+    /// The number of compared pairs of a pixel and a spot; 0 where times were computed from depth.
     pub times: usize,
-    /// The median difference between a time and the depth from all spots' times, metres of path.
+    /// The median difference between a time and the depth from all spots' times, metres of path;
+    /// `None` where times were computed from depth.
     pub time_residual_m: Option<f32>,
     /// The spot with the largest such median, and that median.
     pub worst_spot: Option<(usize, f32)>,
@@ -164,6 +165,8 @@ pub(crate) fn check(measured: &Measured, depth: &Depth, times: &Times) -> Agreem
 
 fn figures(measured: &Measured, depth: &Depth, times: Option<&Times>, masks: bool) -> Agreement {
     let known = |x: f32| x.is_finite().then_some(x);
+    // Times that were computed from one depth agree by construction, which says nothing.
+    let times = times.filter(|_| !measured.computed);
     let by_spot = times.iter().flat_map(|t| t.by_spot_m.iter().copied());
     let worst = by_spot
         .enumerate()

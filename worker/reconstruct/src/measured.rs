@@ -52,6 +52,8 @@ pub struct Measured {
     /// The width of the bins of the times, metres; 0 = times are exact. A time is the middle of its
     /// bin.
     pub bin_width_m: f32,
+    /// Whether times were computed from one depth a pixel, so that they agree by construction.
+    pub computed: bool,
     /// The pixels known to see a mirror, which are not used at all; empty = none known.
     pub mirror: Vec<u8>,
     /// How surely each pixel's times are its own, 0 to 1, where times were separated from one

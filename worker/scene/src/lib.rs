@@ -37,6 +37,7 @@ pub use laser::{Aim, Beam, Laser, Spot};
 pub use material::{Bsdf, Distribution, Material};
 pub use mesh::Mesh;
 pub use model::{Object, Provenance, Scene, SceneError};
+pub use range::FittedGate;
 pub use spectrum::{AtWavelength, SpectrumPoint};
 pub use texture::{Texture, Wrap};
 pub use vec3::{Affine, Vec3};

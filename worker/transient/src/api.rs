@@ -2,7 +2,7 @@
 //! `[row][column][bin]`; per-spot images are `[spot][row][column]`.
 
 use picofarm_scene::Spot;
-pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelength};
+pub use picofarm_settings::{BeamWidth, Budget, Gate, Optics, Strategy, Wavelength};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values. It is part of every task key, so change it whenever any output
@@ -31,19 +31,9 @@ pub struct Settings {
     /// The techniques to render with.
     #[serde(default)]
     pub strategy: Strategy,
-    /// The width of the laser's beams; `None` renders beams without a width. Spots and ground truth
-    /// are always those of the beams' centres.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub beam: Option<BeamWidth>,
-    /// Sensitive share of each pixel's area, 10⁻⁶ to 1: a square in the pixel's middle.
-    /// Histograms are means over this square; the ground truth is always taken at the pixels'
-    /// middles.
-    #[serde(default = "whole", skip_serializing_if = "is_whole")]
-    pub fill_factor: f64,
-    /// Wavelength of the laser. Without one, materials reflect what their [`picofarm_scene::Bsdf`]
-    /// says.
-    #[serde(default, skip_serializing_if = "Wavelength::is_none")]
-    pub wavelengths_nm: Wavelength,
+    /// The optics of laser and pixels.
+    #[serde(flatten)]
+    pub optics: Optics,
 }
 
 impl Settings {
@@ -52,14 +42,14 @@ impl Settings {
     ///
     /// # Examples
     /// ```
-    /// use picofarm_transient::{Budget, Gate, Settings};
+    /// use picofarm_transient::{Budget, Gate, Optics, Settings};
     ///
     /// let gate = Gate { start_m: 1.0, bin_width_m: 0.0384, bins: 637 };
     /// let settings = Settings {
     ///     max_bounces: Some(2),
     ///     ..Settings::new(gate, Budget::Samples(16))
     /// };
-    /// assert_eq!(settings.fill_factor, 1.0);
+    /// assert_eq!(settings.optics, Optics::default());
     /// ```
     pub fn new(gate: Gate, budget: Budget) -> Self {
         Self {
@@ -71,20 +61,9 @@ impl Settings {
             split: false,
             groups: vec![],
             strategy: Strategy::default(),
-            beam: None,
-            fill_factor: whole(),
-            wavelengths_nm: Wavelength::NONE,
+            optics: Optics::default(),
         }
     }
-}
-
-fn whole() -> f64 {
-    1.0
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-fn is_whole(share: &f64) -> bool {
-    *share == 1.0
 }
 
 /// Receives the progress of a render and may end it.

@@ -6,7 +6,7 @@
 use std::{
     io::{BufRead, BufReader, Write},
     os::unix::process::ExitStatusExt,
-    process::{Child, ChildStdin, Command, ExitStatus, Stdio},
+    process::{Child, ChildStdin, ExitStatus, Stdio},
     sync::{Arc, Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
@@ -120,8 +120,8 @@ impl Shared {
         if state.stopping {
             return Ok(None);
         }
-        let program = std::env::current_exe().map_err(failed)?;
-        let mut child = Command::new(program)
+        let mut child = crate::this_program()
+            .map_err(failed)?
             .arg(local_worker::COMMAND)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

@@ -1,7 +1,9 @@
 //! `picofarm reconstruct --spots-from flash`: times and masks from a single histogram of all spots,
 //! by physics. No ground truth is used: the input is the histogram and the positions of the spots.
 
-use picofarm_demultiplex::{Capture, Place, Settings, Spot, Truth, VERSION, demultiplex, score};
+use picofarm_demultiplex::{
+    Capture, Place, Settings, Spot, Truth, VERSION, demultiplex, residual, score,
+};
 use picofarm_reconstruct::{
     Measured,
     source::{CaptureSettings, from_flash},
@@ -76,6 +78,7 @@ pub fn measure(
     };
     let facts = json!({
         "version": VERSION,
+        "residual": residual(&capture, &found),
         "depth": score::depth(&found.depth_m, &truth),
         "masks": score::masks(&found, &truth),
     });

@@ -5,12 +5,6 @@ use picofarm_scene::Scene;
 
 use crate::args::{GateArgs, GateChoice, RenderArgs};
 
-/// The least number of bins between a scene's first and last light for which the default gate is
-/// kept.
-const LEAST_BINS: f64 = 24.0;
-/// How far a chosen gate reaches beyond the last light of two bounces, for longer paths.
-const BEYOND: f64 = 1.25;
-
 /// Returns the stated gate, or one that fits the scene. The choice is added to the scene's notes.
 pub fn choose(args: &RenderArgs, scene: &mut Scene) -> GateArgs {
     let bins = args.gate.bins;
@@ -28,24 +22,16 @@ pub fn choose(args: &RenderArgs, scene: &mut Scene) -> GateArgs {
     if stated && !auto {
         return args.gate;
     }
-    let Some([first, last]) = scene.path_range_m() else {
+    let Some(fitted) = scene.fitted_gate(args.gate.gate()) else {
         return args.gate;
     };
-    let usual = args.gate.gate();
-    let end = usual.start_m + usual.bin_width_m * f64::from(usual.bins);
-    let fits =
-        first >= usual.start_m && last <= end && last - first >= LEAST_BINS * usual.bin_width_m;
-    if fits && !auto {
+    if fitted.usual_fits && !auto {
         return args.gate;
     }
-    let start = 0.9 * first;
-    let width = BEYOND * (last - start) / f64::from(bins);
-    // Three digits, rounded up.
-    let digits = 10f64.powf(2.0 - width.log10().floor());
-    let width = (width * digits).ceil() / digits;
+    let [first, last] = fitted.path_range_m;
     let chosen = GateArgs {
-        gate_start_m: (start * digits).floor() / digits,
-        bin_width_m: width,
+        gate_start_m: fitted.gate.start_m,
+        bin_width_m: fitted.gate.bin_width_m,
         bins,
     };
     scene.provenance.notes.insert(

@@ -39,7 +39,7 @@ pub fn spec(order: &Order) -> Result<DatasetSpec> {
         spots: order.scene.laser.beams.len() as u32,
         subsets: Subsets::of(&sizes).map_err(CliError::input)?,
         per_spot: has(Quantity::TransientSpots),
-        wavelengths_nm: order.settings.wavelengths_nm,
+        wavelengths_nm: order.settings.optics.wavelengths_nm,
         two_bounce: false,
         gate: order.settings.gate,
         profile: Profile::LOSSLESS,

@@ -3,7 +3,7 @@
 use picofarm_agent::SceneSize;
 use picofarm_proto::{model::RenderSettings, show};
 use picofarm_scene::{Intrinsics, Scene};
-use picofarm_transient::{Budget, Settings, Wavelength};
+use picofarm_transient::{Budget, Settings};
 
 use super::gate;
 use crate::{
@@ -55,10 +55,8 @@ impl Order {
                 None => Budget::Samples(samples),
             },
             max_bounces: args.max_bounces.unwrap_or(0),
-            beam: args.beam.width(),
-            fill_factor: args.fill_factor.unwrap_or(1.0),
-            wavelengths_nm: Wavelength::of(&args.wavelengths_nm)
-                .map_err(|(at, what)| CliError::input(format!("--wavelengths-nm{at}: {what}")))?,
+            strategy: strategy::together(&args.strategy)?,
+            optics: args.optics.optics()?,
             ..RenderSettings::default()
         };
         // Checked as in a job, so that the ranges are defined in one place.
@@ -69,17 +67,10 @@ impl Order {
         })?;
         let wanted = groups::wanted(&args.groups, &args.group, scene.laser.beams.len())?;
         let settings = Settings {
-            gate: asked.gate(),
-            budget: asked.budget,
-            max_bounces: args.max_bounces.filter(|most| *most != 0),
-            one_bounce: true,
             seed: args.seed,
             split,
             groups: wanted.iter().flat_map(|w| w.groups.clone()).collect(),
-            strategy: strategy::together(&args.strategy)?,
-            beam: asked.beam,
-            fill_factor: asked.fill_factor,
-            wavelengths_nm: asked.wavelengths_nm,
+            ..picofarm_agent::renderer_settings(&asked)
         };
         Ok(Self {
             scene,

@@ -6,7 +6,7 @@ use std::{
 };
 
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Progress, RenderError, Rendered, Settings, Strategy, Wavelength};
+use picofarm_transient::{Budget, Progress, RenderError, Rendered, Settings};
 use rustix::time::{ClockId, clock_gettime};
 use tokio_util::sync::CancellationToken;
 
@@ -37,17 +37,8 @@ pub fn cpu_time() -> Duration {
 /// Returns the settings of a benchmark's renders: without one-bounce peaks, which are analytic.
 pub fn settings(args: &RenderArgs, budget: Budget, seed: u64) -> Settings {
     Settings {
-        gate: args.gate.gate(),
-        budget,
-        max_bounces: None,
-        one_bounce: false,
         seed,
-        split: false,
-        groups: vec![],
-        strategy: Strategy::default(),
-        beam: None,
-        fill_factor: 1.0,
-        wavelengths_nm: Wavelength::NONE,
+        ..Settings::new(args.gate.gate(), budget)
     }
 }
 

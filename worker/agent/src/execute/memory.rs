@@ -142,27 +142,19 @@ mod tests {
 
     use picofarm_proto::model::JobSpec;
     use picofarm_scene::primitive::{self, PrimitiveSettings};
-    use picofarm_transient::{Budget, Gate, Strategy, Wavelength};
+    use picofarm_transient::{Budget, Gate};
 
     use super::*;
 
     fn settings() -> Settings {
+        let gate = Gate {
+            start_m: 1.0,
+            bin_width_m: 0.0384,
+            bins: 637,
+        };
         Settings {
-            gate: Gate {
-                start_m: 1.0,
-                bin_width_m: 0.0384,
-                bins: 637,
-            },
-            budget: Budget::Samples(4),
-            max_bounces: None,
             one_bounce: true,
-            seed: 0,
-            split: false,
-            groups: vec![],
-            strategy: Strategy::default(),
-            beam: None,
-            fill_factor: 1.0,
-            wavelengths_nm: Wavelength::NONE,
+            ..Settings::new(gate, Budget::Samples(4))
         }
     }
 

@@ -24,7 +24,7 @@ pub use picofarm_session::{Control, Executor, Output, Task, TaskError};
 use kinds::{Context, RunTask, STORE_PATIENCE, part, render};
 pub use kinds::{
     TaskExecutor, demultiplex, export, reconstruct,
-    render::{By, encode_render, renderer_version},
+    render::{By, encode_render, renderer_settings, renderer_version},
     reprocess, resolve, split,
 };
 #[cfg(feature = "networks")]

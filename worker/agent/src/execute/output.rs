@@ -383,7 +383,7 @@ pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
         subsets: Subsets::of(&render.subsets)
             .map_err(|e| TaskError::User(format!("render.subsets: {e}")))?,
         per_spot: render.per_spot,
-        wavelengths_nm: render.wavelengths_nm,
+        wavelengths_nm: render.optics.wavelengths_nm,
         two_bounce: false,
         gate: render.gate(),
         profile: Profile::parse(&spec.output.profile)

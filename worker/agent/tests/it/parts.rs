@@ -27,7 +27,7 @@ fn heavy(store: &Path) -> RenderTask {
     spec.render.resolution = 40;
     spec.render.budget = Budget::Samples(3);
     spec.render.max_bounces = 0;
-    spec.render.wavelengths_nm = Wavelength::of(&[611.4]).unwrap();
+    spec.render.optics.wavelengths_nm = Wavelength::of(&[611.4]).unwrap();
     spec
 }
 

@@ -473,7 +473,7 @@ async fn a_job_at_a_wavelength_stores_what_reflects_there() {
     let mut seen = vec![];
     for nm in [611.4, 464.3] {
         let mut place = Place::new();
-        place.spec.render.wavelengths_nm = Wavelength::of(&[nm]).unwrap();
+        place.spec.render.optics.wavelengths_nm = Wavelength::of(&[nm]).unwrap();
         place.spec.output.profile = "lossless".into();
         place.run(1).await.unwrap();
         let (store, prefix) = open_store(&place.spec.output.store).unwrap();

@@ -4,10 +4,10 @@
 
 use std::{env, fs, path::PathBuf, str::FromStr};
 
-use picofarm_demultiplex::{Capture, Place, Spot, Truth};
+use picofarm_demultiplex::{Capture, Place, Settings, Shading, Spot, Truth};
 use picofarm_scene::{AssetLibrary, Camera, Vec3, furnished};
 use picofarm_settings::Spots;
-use picofarm_transient::{self as transient, Budget, Gate, Progress, Strategy, Wavelength};
+use picofarm_transient::{self as transient, Budget, Gate, Progress};
 
 struct Unstopped;
 
@@ -24,6 +24,19 @@ pub fn variable<T: FromStr>(name: &str, usual: T) -> T {
         text.parse()
             .unwrap_or_else(|_| panic!("{name}={text:?} cannot be read; see the example's head"))
     })
+}
+
+/// Returns the settings of the method: shadows by `SHADOWS`, or the default.
+pub fn settings() -> Settings {
+    let mut settings = Settings::default();
+    if let Ok(name) = env::var("SHADOWS") {
+        settings.shadows = match &*name {
+            "physics" => Shading::Physics,
+            "learned" => Shading::Learned,
+            other => panic!("SHADOWS={other:?}: expected physics or learned"),
+        };
+    }
+    settings
 }
 
 /// A kind of room.
@@ -159,17 +172,9 @@ struct Arrays {
 impl Arrays {
     fn render(scene: &picofarm_scene::Scene, seed: u64, kind: &Kind) -> Self {
         let settings = transient::Settings {
-            gate: GATE,
-            budget: Budget::Error(kind.error),
-            max_bounces: None,
             one_bounce: true,
             seed,
-            split: false,
-            groups: Vec::new(),
-            strategy: Strategy::default(),
-            beam: None,
-            fill_factor: 1.0,
-            wavelengths_nm: Wavelength::NONE,
+            ..transient::Settings::new(GATE, Budget::Error(kind.error))
         };
         let made = transient::render(scene, &settings, &Unstopped).expect("a render");
         let float = |all: &[u8]| all.iter().map(|x| f32::from(*x)).collect();

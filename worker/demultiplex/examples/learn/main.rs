@@ -1,9 +1,11 @@
 //! Learns the model of shadows (`shadows = "learned"`) from rendered rooms, and writes its weights.
-//! Rooms are parametric, of seeds 93001 and on. The committed weights are those of the defaults.
+//! Rooms are parametric, of three image sizes, so that the model holds for any. The committed
+//! weights are those of the defaults.
 //!
-//! In the environment, `ROOMS` (12), `FIRST` (93001), `SIDE` (128 pixels), `TREES` (150, of each of
-//! two forests), `PAIRS` (12000, of a room), `CACHE` (a folder that keeps rendered rooms), and
-//! `OUT` (worker/demultiplex/src/learned.bin).
+//! In the environment, `SETS` (pixels a side : first seed : rooms, comma separated;
+//! 128:95001:24,256:95101:6,64:95201:8), `TREES` (200, of each of two forests), `PAIRS` (20000, of
+//! a room), `CACHE` (a folder that keeps rendered rooms), and `OUT`
+//! (worker/demultiplex/src/learned.bin).
 
 mod boost;
 #[path = "../common/mod.rs"]
@@ -36,13 +38,34 @@ fn pairs(room: &Room, seed: u64, count: usize) -> Vec<(usize, usize)> {
     all
 }
 
+/// The kinds and seeds of all rooms.
+fn sets() -> Vec<(Kind, u64)> {
+    let text: String = variable("SETS", "128:95001:24,256:95101:6,64:95201:8".into());
+    let set = |part: &str| -> Option<Vec<(Kind, u64)>> {
+        let numbers: Vec<u64> = part.split(':').map_while(|n| n.parse().ok()).collect();
+        let &[side, first, rooms] = &numbers[..] else {
+            return None;
+        };
+        let kind = Kind {
+            side: u32::try_from(side).ok()?,
+            ..Kind::of_environment()
+        };
+        Some(
+            (first..first + rooms)
+                .map(|seed| (kind.clone(), seed))
+                .collect(),
+        )
+    };
+    let all: Option<Vec<_>> = text.split(',').map(set).collect();
+    let all = all.unwrap_or_else(|| panic!("SETS={text:?}: expected SIDE:FIRST:ROOMS,..."));
+    all.concat()
+}
+
 /// Features and answers of all rooms: half from their own depth, half from the truth's.
 fn gather(first_forest: Option<&Forest>) -> (Vec<Vec<f32>>, Vec<bool>) {
-    let kind = Kind::of_environment();
-    let (first, rooms) = (variable("FIRST", 93001), variable("ROOMS", 12u64));
-    let count = variable("PAIRS", 12_000usize);
+    let count = variable("PAIRS", 20_000usize);
     let (mut all, mut lit) = (Vec::new(), Vec::new());
-    for seed in first..first + rooms {
+    for (kind, seed) in sets() {
         let room = Room::new(seed, &kind);
         for depth in [None, Some(&room.depth[..])] {
             let salt = seed * 2 + u64::from(depth.is_some());
@@ -83,7 +106,7 @@ fn wrong(forest: &Forest, features: &[Vec<f32>], lit: &[bool]) -> f64 {
 }
 
 fn main() {
-    let trees = variable("TREES", 150usize);
+    let trees = variable("TREES", 200usize);
     let out: String = variable("OUT", "worker/demultiplex/src/learned.bin".into());
     let mut forests = Vec::new();
     for round in 1..=2 {

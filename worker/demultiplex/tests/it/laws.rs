@@ -4,7 +4,8 @@ use crate::common;
 
 use common::{Plate, Room, Shape, grid, scattered};
 use picofarm_demultiplex::{
-    Capture, Demultiplexed, Ground, Settings, Shading, Truth, demultiplex, score, shadows_at,
+    Capture, Demultiplexed, Ground, Settings, Shading, Truth, demultiplex, residual, score,
+    shadows_at,
 };
 use picofarm_scene::Vec3;
 use picofarm_sensor::{Draws, poisson};
@@ -36,6 +37,21 @@ fn a_box_room_comes_back_to_a_tenth_of_a_bin() {
     let tenth = 0.1 * room.gate.bin_width_m as f32;
     assert!(median < tenth, "median {median} m, a tenth is {tenth} m");
     assert!(most < 10.0 * tenth, "95th percentile {most} m");
+}
+
+#[test]
+fn peaks_agree_with_right_depths_and_not_with_wrong_ones() {
+    let room = Room::new(SIDE, &grid(5), None);
+    let beams = room.beams(true);
+    let capture = room.capture(&beams);
+    let mut found = apart(&room, true);
+    let right = residual(&capture, &found).expect("pairs");
+    assert!(right.peaks > 1000, "{right:?}");
+    assert!(right.median_m < 0.25 * room.gate.bin_width_m, "{right:?}");
+    assert!(right.control_m > 4.0 * right.median_m, "{right:?}");
+    found.depth_m.iter_mut().for_each(|z| *z *= 1.1);
+    let wrong = residual(&capture, &found).expect("pairs");
+    assert!(wrong.median_m > 4.0 * right.median_m, "{wrong:?}");
 }
 
 #[test]
@@ -156,9 +172,9 @@ fn two_spots_that_collide_everywhere_are_mostly_reported_as_ambiguous() {
     );
 }
 
-fn learned() -> Settings {
+fn physics() -> Settings {
     Settings {
-        shadows: Shading::Learned,
+        shadows: Shading::Physics,
         ..Settings::default()
     }
 }
@@ -169,7 +185,7 @@ fn threads_change_no_byte() {
     let beams = room.beams(true);
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-        let run = || demultiplex(&room.capture(&beams), &learned());
+        let run = || demultiplex(&room.capture(&beams), &Settings::default());
         pool.build().unwrap().install(run).expect("a room")
     };
     assert_eq!(on(1), on(4));
@@ -292,7 +308,7 @@ fn a_capture_without_light_is_taken_apart_in_both_ways() {
     let mut room = Room::new(8, &grid(2), None);
     room.histogram.fill(0.0);
     let beams = room.beams(true);
-    for settings in [Settings::default(), learned()] {
+    for settings in [Settings::default(), physics()] {
         let found = demultiplex(&room.capture(&beams), &settings).expect("no error");
         assert!(found.lit.iter().all(|p| (0.0..=1.0).contains(p)));
     }

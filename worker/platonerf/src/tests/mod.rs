@@ -36,6 +36,7 @@ fn room() -> Measured {
         used: Vec::new(),
         bin_width_m: 0.0,
         mirror: Vec::new(),
+        computed: false,
         confidence: Vec::new(),
         left_out: Vec::new(),
     };

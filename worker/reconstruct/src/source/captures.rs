@@ -52,6 +52,7 @@ impl Captures {
             used: Vec::new(),
             bin_width_m: gate.bin_width_m as f32,
             mirror: Vec::new(),
+            computed: false,
             confidence: Vec::new(),
             left_out: Vec::new(),
         };

@@ -60,6 +60,7 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
             Times::Range(_) => 0.0,
             Times::Paths { bin_width_m, .. } => bin_width_m,
         },
+        computed: matches!(given.times, Times::Range(_)),
         mirror: given.mirror.to_vec(),
         confidence: Vec::new(),
         left_out: Vec::new(),

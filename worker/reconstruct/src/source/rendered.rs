@@ -2,9 +2,7 @@
 
 use picofarm_scene::Scene;
 use picofarm_settings::Sensor;
-use picofarm_transient::{
-    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelength, render,
-};
+use picofarm_transient::{Budget, Gate, Progress, Rendered, Settings, render};
 
 use super::{Captures, LIT_THRESHOLD};
 use crate::{Measured, ReconstructError};
@@ -29,17 +27,9 @@ impl CaptureSettings {
     /// Returns the renderer's settings for one capture.
     pub fn render_settings(&self) -> Settings {
         Settings {
-            gate: self.gate,
-            budget: Budget::Samples(self.samples),
-            max_bounces: None,
             one_bounce: true,
             seed: self.seed,
-            split: false,
-            groups: Vec::new(),
-            strategy: Strategy::default(),
-            beam: None,
-            fill_factor: 1.0,
-            wavelengths_nm: Wavelength::NONE,
+            ..Settings::new(self.gate, Budget::Samples(self.samples))
         }
     }
 }
@@ -49,22 +39,14 @@ impl CaptureSettings {
 /// # Errors
 /// [`ReconstructError::Render`].
 pub fn truth_of(scene: &Scene, progress: &dyn Progress) -> Result<Rendered, ReconstructError> {
+    let gate = Gate {
+        start_m: 0.0,
+        bin_width_m: 1e6,
+        bins: 1,
+    };
     let settings = Settings {
-        gate: Gate {
-            start_m: 0.0,
-            bin_width_m: 1e6,
-            bins: 1,
-        },
-        budget: Budget::Samples(1),
         max_bounces: Some(1),
-        one_bounce: false,
-        seed: 0,
-        split: false,
-        groups: Vec::new(),
-        strategy: Strategy::default(),
-        beam: None,
-        fill_factor: 1.0,
-        wavelengths_nm: Wavelength::NONE,
+        ..Settings::new(gate, Budget::Samples(1))
     };
     Ok(render(scene, &settings, progress)?)
 }

@@ -48,6 +48,7 @@ pub fn from_truth(
         used: Vec::new(),
         bin_width_m: how.bin_width_m,
         mirror: truth.specular.clone(),
+        computed: false,
         confidence: Vec::new(),
         left_out: Vec::new(),
     };

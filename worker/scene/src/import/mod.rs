@@ -22,7 +22,7 @@ use std::{
 
 use picofarm_files::{FileError, Opener};
 
-use crate::{Aim, Camera, Scene, SceneError, Vec3};
+use crate::{Aim, Camera, Object, Provenance, Scene, SceneError, Vec3};
 
 pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
@@ -135,6 +135,36 @@ impl Bounds {
         };
         self.files.within([self.root.as_deref().unwrap_or(own)])
     }
+}
+
+/// Returns a scene of the given objects, in metres. Camera and laser are those of `options`, or are
+/// chosen as for a file without them.
+///
+/// # Errors
+/// [`SceneError::Invalid`] if there are no triangles, or if the view of `options` is unusable.
+pub fn complete(
+    name: &str,
+    objects: Vec<Object>,
+    labels: Vec<String>,
+    options: &ImportOptions,
+) -> Result<Scene, SceneError> {
+    let draft = complete::Draft {
+        name: name.to_owned(),
+        objects,
+        labels,
+        cameras: vec![],
+        laser: None,
+        has_unit: true,
+        provenance: Provenance {
+            source: "objects".into(),
+            ..Provenance::default()
+        },
+    };
+    draft.complete(options).map_err(|what| SceneError::Invalid {
+        scene: name.to_owned(),
+        field: "objects".into(),
+        what,
+    })
 }
 
 /// Reads a scene with its own camera and laser, and files from its own folder only; see

@@ -116,9 +116,6 @@ impl Emitters {
     ) -> Result<Self, RenderError> {
         let world = beam_tracer.world;
         let invalid = |field: String, what: String| Err(RenderError::Invalid { field, what });
-        if let Err((field, what)) = width.check() {
-            return invalid(format!("beam.{field}"), what);
-        }
         let mut stack = world.bvh.stack();
         let beams = || scene.laser.beams.iter().enumerate();
         for (beam, b) in beams() {

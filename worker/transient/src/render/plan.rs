@@ -17,7 +17,7 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
     if settings.one_bounce {
         strategies.push("one bounce: analytic".into());
     }
-    if let Some(width) = &settings.beam {
+    if let Some(width) = &settings.optics.beam {
         strategies.push(format!(
             "wide beams: {} rays for each, {} mm and {} mrad",
             width.points, width.diameter_mm, width.divergence_mrad
@@ -27,7 +27,7 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
                 .into(),
         );
     }
-    if let Some(nm) = settings.wavelengths_nm.nm() {
+    if let Some(nm) = settings.optics.wavelengths_nm.nm() {
         strategies.push(format!("wavelengths: {nm} nm, in one pass"));
         let (coloured, materials) = colours(scene);
         if coloured > 0 {
@@ -39,10 +39,10 @@ pub(crate) fn plan(scene: &Scene, settings: &Settings, frame: &Frame, paths: u32
             approximations.push("glass lets every wavelength through alike".into());
         }
     }
-    if settings.fill_factor != 1.0 {
+    if settings.optics.fill_factor != 1.0 {
         strategies.push(format!(
             "pixels: {} of their area is sensitive",
-            settings.fill_factor
+            settings.optics.fill_factor
         ));
     }
     if longest >= 2 {

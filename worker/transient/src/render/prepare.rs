@@ -42,16 +42,16 @@ pub(crate) fn prepare<R>(
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
-    let wavelength = settings.wavelengths_nm.nm();
+    let wavelength = settings.optics.wavelengths_nm.nm();
     let mut world = World::load(scene, wavelength, settings.gate.end_m(), stop)?;
-    world.sensitive = settings.fill_factor.sqrt() as f32;
+    world.sensitive = settings.optics.fill_factor.sqrt() as f32;
     let beams = Beams {
         world: &world,
         tuning: tuning.beams,
     };
     let spots = beams.spots(&scene.laser.beams);
     let middles = Emitters::new(scene, beams, &spots)?;
-    let wide = settings.beam.as_ref();
+    let wide = settings.optics.beam.as_ref();
     let wide = wide
         .map(|width| Emitters::widened(scene, beams, width))
         .transpose()?;

@@ -25,14 +25,8 @@ pub(crate) fn check(settings: &Settings) -> Result<(), RenderError> {
             format!("is {}, expected a path length of 0 m or more", g.start_m),
         );
     }
-    if !(1e-6..=1.0).contains(&settings.fill_factor) {
-        return bad(
-            "fill_factor",
-            format!(
-                "is {}, expected a share of a pixel's area, 0.000001 to 1",
-                settings.fill_factor
-            ),
-        );
+    if let Err((field, what)) = settings.optics.check() {
+        return bad(&field, what);
     }
     if g.bins == 0 || g.bins > 1 << 20 {
         return bad("gate.bins", format!("is {}, expected 1 to 1048576", g.bins));

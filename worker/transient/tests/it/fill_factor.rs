@@ -4,7 +4,7 @@ use crate::common;
 
 use common::{energy, grey, ok, quad, room, scene, settings, sphere, v};
 use picofarm_scene::{Bsdf, Distribution, Material, Scene};
-use picofarm_transient::{Budget, Rendered, Settings, render};
+use picofarm_transient::{Budget, Optics, Rendered, Settings, render};
 
 /// Returns a room with a near-mirror on its right wall, a ball in front of it, and a spot next to
 /// the floor.
@@ -35,7 +35,10 @@ fn furnished(size: u32) -> Scene {
 
 fn set(fill_factor: f64, samples: u32, seed: u64) -> Settings {
     Settings {
-        fill_factor,
+        optics: Optics {
+            fill_factor,
+            ..Optics::default()
+        },
         seed,
         ..settings(Budget::Samples(samples))
     }

@@ -9,7 +9,7 @@ use picofarm_scene::{
     SpectrumPoint, Spot, Vec3,
 };
 use picofarm_transient::{
-    BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, Wavelength, render,
+    BeamWidth, Budget, Gate, Optics, RenderError, Rendered, Settings, Strategy, Wavelength, render,
 };
 use proptest::{prelude::*, strategy::Strategy as Draw};
 
@@ -235,7 +235,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
             }
         });
     let fill_factor =
-        prop_oneof![3 => Just(1.0), 3 => 0.01f64..1.0, 1 => Just(1e-6), 1 => Just(0.0)];
+        prop_oneof![3 => Just(1.0), 3 => 0.01f64..1.0, 1 => Just(0.01), 1 => Just(0.0)];
     let wavelength = 250.0f64..2000.0;
     let wavelengths = prop_oneof![
         2 => Just(Wavelength::NONE),
@@ -288,9 +288,11 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                         mirror_images,
                         ..Strategy::default()
                     },
-                    beam,
-                    fill_factor,
-                    wavelengths_nm,
+                    optics: Optics {
+                        beam,
+                        fill_factor,
+                        wavelengths_nm,
+                    },
                 }
             },
         )

@@ -8,8 +8,7 @@ use picofarm_scene::{
 };
 use picofarm_settings::Spots;
 use picofarm_transient::{
-    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, Wavelength, render,
-    render_within,
+    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, render, render_within,
 };
 
 /// Counts the progress calls, and requests a stop from the call `stop_at` on.
@@ -38,26 +37,20 @@ impl Progress for Asked {
 }
 
 fn settings(budget: Budget) -> Settings {
+    let gate = Gate {
+        start_m: 1.0,
+        bin_width_m: 0.384,
+        bins: 64,
+    };
     Settings {
-        gate: Gate {
-            start_m: 1.0,
-            bin_width_m: 0.384,
-            bins: 64,
-        },
-        budget,
-        max_bounces: None,
         one_bounce: true,
         seed: 7,
-        split: false,
-        groups: vec![],
         strategy: Strategy {
             caustics: Some(true),
             ellipsoidal: Some(true),
             ..Strategy::default()
         },
-        beam: None,
-        fill_factor: 1.0,
-        wavelengths_nm: Wavelength::NONE,
+        ..Settings::new(gate, budget)
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use common::{energy, grey, near, ok, quad, room, scene, settings, two_only, v};
 use picofarm_scene::{Bsdf, Material, Object, Scene, SpectrumPoint, Texture, Vec3, Wrap};
-use picofarm_transient::{Budget, Rendered, Settings, Wavelength};
+use picofarm_transient::{Budget, Optics, Rendered, Settings, Wavelength};
 
 const NM: [f64; 3] = [905.0, 532.0, 450.0];
 
@@ -70,7 +70,10 @@ fn alone(scene: &Scene, nm: f64) -> Scene {
 
 fn at(nm: f64, set: Settings) -> Settings {
     Settings {
-        wavelengths_nm: Wavelength::of(&[nm]).unwrap(),
+        optics: Optics {
+            wavelengths_nm: Wavelength::of(&[nm]).unwrap(),
+            ..set.optics
+        },
         ..set
     }
 }

@@ -6,7 +6,7 @@ use crate::common;
 
 use common::{beam_to, energy, grey, ok, quad, room, scene, settings, two_only, v};
 use picofarm_scene::{Bsdf, Material, Scene, Vec3};
-use picofarm_transient::{BeamWidth, Budget, Rendered, Settings, render};
+use picofarm_transient::{BeamWidth, Budget, Optics, Rendered, Settings, render};
 
 fn width(diameter_mm: f64, divergence_mrad: f64, points: u32) -> BeamWidth {
     BeamWidth {
@@ -16,13 +16,20 @@ fn width(diameter_mm: f64, divergence_mrad: f64, points: u32) -> BeamWidth {
     }
 }
 
+fn optics(beam: Option<BeamWidth>) -> Optics {
+    Optics {
+        beam,
+        ..Optics::default()
+    }
+}
+
 /// One bounce alone.
 fn one(beam: Option<BeamWidth>) -> Settings {
     Settings {
         max_bounces: Some(1),
         one_bounce: true,
         split: false,
-        beam,
+        optics: optics(beam),
         ..settings(Budget::Samples(2))
     }
 }
@@ -250,7 +257,7 @@ fn light_from_a_wide_spot_is_that_of_point_spots_drawn_from_the_same_beam() {
     let s = scene(objects, 8, &[v(0.0, 0.0, -1.0)]);
     let of = |s: &Scene, beam, seed| {
         let set = Settings {
-            beam,
+            optics: optics(beam),
             seed,
             max_bounces: Some(3),
             ..settings(Budget::Samples(64))
@@ -311,7 +318,7 @@ fn subsets_of_wide_beams_add_up_to_all_of_them() {
     let walls = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let s = scene(walls, 16, &[v(0.3, 0.2, -1.0), v(-0.5, -0.1, -1.0)]);
     let set = Settings {
-        beam: Some(width(10.0, 2.0, 7)),
+        optics: optics(Some(width(10.0, 2.0, 7))),
         groups: vec![vec![0], vec![1]],
         ..settings(Budget::Samples(4))
     };
@@ -328,7 +335,15 @@ fn subsets_of_wide_beams_add_up_to_all_of_them() {
 fn a_beam_of_almost_no_width_is_a_beam_without_one() {
     let walls = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let s = scene(walls, 16, &[v(0.3, 0.2, -1.0)]);
-    let of = |beam| pixels(&ok(&s, &Settings { beam, ..two_only() }));
+    let of = |beam| {
+        pixels(&ok(
+            &s,
+            &Settings {
+                optics: optics(beam),
+                ..two_only()
+            },
+        ))
+    };
     let (thin, none) = (of(Some(width(1e-3, 0.0, 16))), of(None));
     for (a, b) in thin.iter().zip(&none) {
         // The positions within the pixels differ.
@@ -345,7 +360,7 @@ fn widths_that_cannot_be_used_are_refused_by_their_field() {
     let mut s = scene(walls, 4, &[v(0.3, 0.2, -1.0)]);
     let refused = |s: &Scene, beam| {
         let set = Settings {
-            beam: Some(beam),
+            optics: optics(Some(beam)),
             ..two_only()
         };
         render(s, &set, &common::Quiet).unwrap_err().to_string()
@@ -358,7 +373,7 @@ fn widths_that_cannot_be_used_are_refused_by_their_field() {
     let end: Vec3 = ok(&s, &two_only()).spots[0].expect("a spot").point;
     s.laser.beams = vec![beam_to(end, v(0.0, 0.0, 1.0), 4)];
     let set = Settings {
-        beam: Some(width(5.0, 0.0, 8)),
+        optics: optics(Some(width(5.0, 0.0, 8))),
         ..two_only()
     };
     assert!(energy(&ok(&s, &set).transient) > 0.0);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Strategy, Wavelength};
+use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Optics, Strategy, Wavelength};
 use serde::{Deserialize, Serialize};
 
 use crate::model::{
@@ -39,20 +39,9 @@ pub struct RenderSettings {
     /// Techniques of the renderer chosen by hand. The renderer chooses the others.
     #[serde(skip_serializing_if = "Strategy::is_default")]
     pub strategy: Strategy,
-    /// The width of the laser's beams; without it they have no width.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub beam: Option<BeamWidth>,
-    /// Sensitive fraction of each pixel's area: a square in its middle.
-    #[serde(skip_serializing_if = "is_whole")]
-    pub fill_factor: f64,
-    /// Wavelength of the laser, nanometres. Without one, materials reflect as at the laser's own.
-    #[serde(skip_serializing_if = "Wavelength::is_none")]
-    pub wavelengths_nm: Wavelength,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-fn is_whole(share: &f64) -> bool {
-    *share == 1.0
+    /// The optics of laser and pixels.
+    #[serde(flatten)]
+    pub optics: Optics,
 }
 
 impl Default for RenderSettings {
@@ -70,9 +59,7 @@ impl Default for RenderSettings {
             subsets: vec![],
             per_spot: false,
             strategy: Strategy::default(),
-            beam: None,
-            fill_factor: 1.0,
-            wavelengths_nm: Wavelength::NONE,
+            optics: Optics::default(),
         }
     }
 }
@@ -139,11 +126,9 @@ impl RenderSettings {
                 check_share(e).map_err(|what| SpecError::new("render.error", what))?
             }
         }
-        let share = "of a pixel's area; 1 is all of it";
-        within("render.fill_factor", self.fill_factor, (0.01, 1.0), share)?;
-        if let Some(Err((field, what))) = self.beam.map(|beam| beam.check()) {
-            return fail(&format!("beam.{field}"), what);
-        }
+        self.optics
+            .check()
+            .map_err(|(field, what)| SpecError::new(format!("render.{field}"), what))?;
         match self.max_bounces {
             1 => fail(
                 "max_bounces",
@@ -311,10 +296,13 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             subsets,
             per_spot: text.per_spot,
             strategy,
-            beam: text.beam,
-            fill_factor: text.fill_factor.unwrap_or(default.fill_factor),
-            wavelengths_nm: Wavelength::of(&text.wavelengths_nm)
-                .map_err(|(at, what)| SpecError::new(format!("render.wavelengths_nm{at}"), what))?,
+            optics: Optics {
+                beam: text.beam,
+                fill_factor: text.fill_factor.unwrap_or(default.optics.fill_factor),
+                wavelengths_nm: Wavelength::of(&text.wavelengths_nm).map_err(|(at, what)| {
+                    SpecError::new(format!("render.wavelengths_nm{at}"), what)
+                })?,
+            },
         })
     }
 }

@@ -10,7 +10,7 @@ use picofarm_scene::{
     Affine, Beam, Camera, Intrinsics, Laser, Material, Mesh, Object, Scene, Vec3,
 };
 use picofarm_store::open_store;
-use picofarm_transient::{Budget, Progress, Settings, Strategy};
+use picofarm_transient::{Budget, Progress, Settings};
 use serde_json::json;
 use tokio::runtime::Runtime;
 
@@ -112,21 +112,9 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
     };
     let scene = room();
     let settings = Settings {
-        gate: picofarm_transient::Gate {
-            start_m: gate.start_m,
-            bin_width_m: gate.bin_width_m,
-            bins: gate.bins,
-        },
-        budget: Budget::Samples(64),
         max_bounces: Some(2),
-        one_bounce: false,
         seed: 1,
-        split: false,
-        groups: vec![],
-        strategy: Strategy::default(),
-        beam: None,
-        fill_factor: 1.0,
-        wavelengths_nm: Wavelength::NONE,
+        ..Settings::new(gate, Budget::Samples(64))
     };
     let rendered = picofarm_transient::render(&scene, &settings, &Quiet).unwrap();
     let spots = rendered.spots.iter();

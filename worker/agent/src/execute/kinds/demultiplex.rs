@@ -84,7 +84,7 @@ impl RunTask for DemultiplexTask {
         let answers = Predicted {
             lit: flash.of_all(spec.spots.len(), &made.lit),
             depth_m: made.depth_m,
-            specular: Vec::new(),
+            specular: made.mirror_probability.iter().map(|m| byte(*m)).collect(),
             confidence: made.confidence.iter().map(|c| byte(*c)).collect(),
         };
         manifest.agreement =
@@ -103,7 +103,7 @@ fn spec(dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec {
         width: source.width,
         depth: true,
         spots,
-        specular: false,
+        specular: true,
         confidence: true,
     }
 }
@@ -128,7 +128,7 @@ fn manifest(task: &DemultiplexTask, scene: u64, found: &Manifest) -> PredictionM
     };
     let named = json!([source.manifest_sha256, method]);
     let key = TaskKey(Sha256::digest(named.to_string()).into());
-    let kinds = ["tof", "shadow"].map(|kind| (kind.to_owned(), used.clone()));
+    let kinds = ["tof", "shadow", "specular"].map(|kind| (kind.to_owned(), used.clone()));
     PredictionManifest {
         scene,
         task_key: key.to_string(),

@@ -8,7 +8,7 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderTask, SpecError, TaskKind, log::DARK},
+    model::{RenderSettings, RenderTask, SpecError, TaskKind, log::DARK},
     trace,
 };
 use picofarm_scene::{Camera, Scene};
@@ -218,8 +218,7 @@ pub(in crate::execute) fn prepare(
         seconds = begun.elapsed().as_secs_f32(),
         "scene made"
     );
-    let settings = settings(spec, dataset.spec(), key)?;
-    Ok((scene, settings))
+    Ok((scene, settings(spec, dataset.spec(), key)))
 }
 
 /// Forwards the renderer's progress to the task's control.
@@ -231,28 +230,26 @@ impl Progress for Watched<'_> {
     }
 }
 
-/// Returns the renderer's settings for a task. The seed is the first bytes of the task's key, so
-/// that only the task determines the result.
-fn settings(
-    spec: &RenderTask,
-    dataset: &DatasetSpec,
-    key: &TaskKey,
-) -> Result<Settings, TaskError> {
-    let render = &spec.render;
-    let head = key.0[..8].try_into().expect("a key has 32 bytes");
-    Ok(Settings {
-        gate: render.gate(),
-        budget: render.budget,
+/// Returns the renderer's settings for the render settings of a job or of the command line.
+pub fn renderer_settings(render: &RenderSettings) -> Settings {
+    Settings {
         max_bounces: (render.max_bounces != 0).then_some(render.max_bounces),
         one_bounce: true,
-        seed: u64::from_le_bytes(head),
-        split: false,
-        groups: subsets::groups(dataset),
         strategy: render.strategy,
-        beam: render.beam,
-        fill_factor: render.fill_factor,
-        wavelengths_nm: render.wavelengths_nm,
-    })
+        optics: render.optics,
+        ..Settings::new(render.gate(), render.budget)
+    }
+}
+
+/// Returns the renderer's settings for a task. The seed is the first bytes of the task's key, so
+/// that only the task determines the result.
+fn settings(spec: &RenderTask, dataset: &DatasetSpec, key: &TaskKey) -> Settings {
+    let head = key.0[..8].try_into().expect("a key has 32 bytes");
+    Settings {
+        seed: u64::from_le_bytes(head),
+        groups: subsets::groups(dataset),
+        ..renderer_settings(&spec.render)
+    }
 }
 
 /// Returns the render in the form that the data set stores.

@@ -18,9 +18,7 @@ use picofarm_scene::{
     Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Spot,
     Vec3,
 };
-use picofarm_transient::{
-    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelength, render,
-};
+use picofarm_transient::{Budget, Gate, Progress, Rendered, Settings, render};
 
 /// Lets every render run to completion.
 pub struct Quiet;
@@ -46,17 +44,9 @@ pub fn gate() -> Gate {
 
 pub fn settings(budget: Budget) -> Settings {
     Settings {
-        gate: gate(),
-        budget,
-        max_bounces: None,
-        one_bounce: false,
         seed: 1,
         split: true,
-        groups: vec![],
-        strategy: Strategy::default(),
-        beam: None,
-        fill_factor: 1.0,
-        wavelengths_nm: Wavelength::NONE,
+        ..Settings::new(gate(), budget)
     }
 }
 

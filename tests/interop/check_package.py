@@ -1,4 +1,4 @@
-"""Compares what docs/python/transients.py reads with what the program exports: check_transients.py DATASET HDF5-FOLDER.
+"""Compares what the Python package reads with what the program exports: check_transients.py DATASET HDF5-FOLDER.
 
 Prints how many saturated bins there were, as JSON.
 """
@@ -10,8 +10,7 @@ import sys
 import h5py
 import numpy
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "docs" / "python"))
-from transients import Transients
+import picofarm
 
 
 def same(what, found, expected):
@@ -20,7 +19,7 @@ def same(what, found, expected):
 
 
 location, exported = sys.argv[1], pathlib.Path(sys.argv[2])
-scenes = Transients(location)
+scenes = picofarm.open(location)
 files = sorted(exported.glob("*.h5"))
 assert len(files) == len(scenes) > 0, (files, scenes.scenes)
 saturated = 0

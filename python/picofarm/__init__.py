@@ -1,0 +1,18 @@
+"""Time-resolved light: renderer, data sets and render farm.
+
+    import picofarm
+
+    room = picofarm.furnished(seed=7)
+    render = room.render(64, error=0.1)
+    render.transient            # float32 [row, column, bin]
+    render.plot()
+
+`Scene` opens scene files and arrays, `open` opens data sets, and the command line `picofarm` is
+part of the package. Lengths are metres of optical path, times are nanoseconds.
+"""
+
+from ._data import Dataset, open
+from ._native import __version__
+from ._scene import Flash, Gate, Render, Scene, furnished
+
+__all__ = ["Dataset", "Flash", "Gate", "Render", "Scene", "__version__", "furnished", "open"]

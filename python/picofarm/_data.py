@@ -1,0 +1,193 @@
+"""Data sets as sequences of scenes, for loops, notebooks and PyTorch."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from . import _native
+from ._scene import Gate
+
+_Window = tuple[int, int, int, int]
+_IMAGES = frozenset(
+    "intensity depth range normal instance label specular visibility two_bounce_path rgb".split()
+)
+_DEFAULT = ("transient", "depth", "visibility", "specular", "intensity", "spots", "intrinsics")
+
+
+class Dataset:
+    """The scenes of a data set: `len(data)`, `data[i]`, and a loop over all.
+
+    It is a map-style data set of PyTorch: a `DataLoader` with any number of workers reads it, with
+    `fork` and with `spawn`. Every read checks the stored checksums.
+
+    Args:
+        url: Folder, or URL such as `s3://bucket/rooms`. Credentials come from the environment.
+        split: `train`, `validation` or `test` of a split made by `picofarm dataset split`.
+        scenes: Indices of scenes. Without it and without `split`, all published scenes.
+        arrays: Names of arrays to read of each scene.
+        crop: (row, column, height, width) in pixels. The intrinsics move with it.
+        bins: (first, end) of the bins.
+        split_name: Name of the split.
+        split_version: Version of the split; the newest without it.
+        threads: Threads that decode; all cores without it. Use 1 in workers of a `DataLoader`.
+
+    Raises:
+        FileNotFoundError: There is no data set.
+        ValueError: An argument does not fit the data set.
+        OSError: The store cannot be read, or data are damaged.
+    """
+
+    def __init__(
+        self,
+        url: str | os.PathLike[str],
+        *,
+        split: str | None = None,
+        scenes: Sequence[int] | None = None,
+        arrays: Sequence[str] = _DEFAULT,
+        crop: _Window | None = None,
+        bins: tuple[int, int] | None = None,
+        split_name: str = "default",
+        split_version: int | None = None,
+        threads: int | None = None,
+    ) -> None:
+        if split is not None and scenes is not None:
+            raise ValueError("scenes: give scenes or split, not both")
+        self.url = os.fspath(url)
+        self._threads = threads
+        self._native = _native.Dataset(self.url, threads)
+        facts = json.loads(self._native.facts())
+        spec = facts["spec"]
+        self.gate = Gate(**spec["gate"])
+        """The gate of all scenes."""
+        self.shape: tuple[int, int] = (spec["height"], spec["width"])
+        """Height and width of the images, pixels."""
+        self.spots: int = spec["spots"]
+        """Number of laser spots of a scene."""
+        self.available: tuple[str, ...] = tuple(facts["arrays"])
+        """Names of all arrays of the data set."""
+        self.arrays = tuple(arrays)
+        unknown = [name for name in self.arrays if name not in self.available]
+        if unknown:
+            have = ", ".join(self.available)
+            raise ValueError(f"arrays: the data set has no {', '.join(unknown)}, but {have}")
+        self._window = self._check_window(crop)
+        self._bins = self._check_bins(bins)
+        if split is not None:
+            self.scenes = self._split(split, split_name, split_version)
+        elif scenes is not None:
+            self.scenes = [int(scene) for scene in scenes]
+        else:
+            self.scenes = self._native.scenes()
+        """Indices of the scenes, in order."""
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self.read(self.scenes[index])
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (self.read(scene) for scene in self.scenes)
+
+    def read(
+        self, scene: int, *, crop: _Window | None = None, bins: tuple[int, int] | None = None
+    ) -> dict[str, Any]:
+        """Returns the arrays of a scene by its index in the data set, with `scene` and `scale`
+        (photons per unit of the histogram).
+
+        Args:
+            scene: Index in the data set.
+            crop: Replaces the window of the data set in this read.
+            bins: Replaces the bins of the data set in this read.
+
+        Raises:
+            KeyError: The scene is not published.
+            ValueError: The scene was imported without one of the arrays.
+        """
+        window = self._window if crop is None else self._check_window(crop)
+        span = self._bins if bins is None else self._check_bins(bins)
+        manifest = self.manifest(scene)
+        missing = manifest["provenance"]["plan"].get("missing", [])
+        lacking = [name for name in self.arrays if name in missing]
+        if lacking:
+            names = ", ".join(lacking)
+            raise ValueError(f"arrays: scene {scene} was imported without {names}; leave them out")
+        made: dict[str, Any] = {"scene": scene, "scale": manifest["scale"]}
+        for name in self.arrays:
+            made[name] = self._array(scene, name, window, span)
+        return made
+
+    def manifest(self, scene: int) -> dict[str, Any]:
+        """Returns the manifest of a scene: objects, checksums, seed, versions and errors."""
+        return json.loads(self._native.manifest(scene))
+
+    def _array(self, scene: int, name: str, window: _Window, bins: tuple[int, int]) -> Any:
+        top, left, height, width = window
+        whole = (height, width) == self.shape and bins == (0, self.gate.bins)
+        if name == "transient" and not whole:
+            part = ((top, top + height), (left, left + width), bins)
+            return self._native.read(scene, name, part)
+        array = self._native.read(scene, name, None)
+        if name == "normal":
+            array = array.astype(np.float32) / np.float32(32767)
+        if name == "intrinsics":
+            return array - np.array([0, 0, left, top], np.float32)
+        if name in ("visibility", "two_bounce_path"):
+            array = array[:, top : top + height, left : left + width]
+        elif name.startswith("transient"):
+            first, end = bins
+            array = array[..., top : top + height, left : left + width, first:end]
+        elif name in _IMAGES:
+            array = array[top : top + height, left : left + width]
+        return np.ascontiguousarray(array)
+
+    def _check_window(self, crop: _Window | None) -> _Window:
+        height, width = self.shape
+        if crop is None:
+            return (0, 0, height, width)
+        top, left, h, w = (int(n) for n in crop)
+        if not (0 <= top < top + h <= height and 0 <= left < left + w <= width):
+            what = f"expected (row, column, height, width) within {height}x{width} pixels"
+            raise ValueError(f"crop: {what}, found {crop}")
+        return (top, left, h, w)
+
+    def _check_bins(self, bins: tuple[int, int] | None) -> tuple[int, int]:
+        if bins is None:
+            return (0, self.gate.bins)
+        first, end = (int(n) for n in bins)
+        if not 0 <= first < end <= self.gate.bins:
+            what = f"expected 0 <= first < end <= {self.gate.bins}"
+            raise ValueError(f"bins: {what}, found {bins}")
+        return (first, end)
+
+    def _split(self, side: str, name: str, version: int | None) -> list[int]:
+        sides = ("train", "validation", "test")
+        if side not in sides:
+            raise ValueError(f"split: expected one of {', '.join(sides)}, found {side!r}")
+        _, text = self._native.split(name, version)
+        # One digit per scene of the data set.
+        digits = json.loads(text)["sides"]
+        wanted = str(sides.index(side))
+        return [scene for scene, digit in enumerate(digits) if digit == wanted]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_native"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._native = _native.Dataset(self.url, self._threads)
+
+    def __repr__(self) -> str:
+        height, width = self.shape
+        return (
+            f"<picofarm.Dataset {self.url!r}: {len(self)} scenes, {width}x{height} pixels, "
+            f"{self.gate.bins} bins, {self.spots} spots>"
+        )
+
+
+open = Dataset

@@ -1,0 +1,86 @@
+"""Data sets, read by the module and by zarr."""
+
+import multiprocessing
+import pathlib
+import pickle
+
+import numpy as np
+import pytest
+
+import picofarm
+
+
+def test_arrays_are_those_of_zarr(dataset: str) -> None:
+    zarr = pytest.importorskip("zarr")
+    data = picofarm.open(dataset)
+    group = zarr.open_group(dataset, mode="r")
+    assert len(data) > 1
+    for scene in data:
+        index = scene["scene"]
+        assert np.array_equal(scene["depth"], group["depth"][index])
+        stored = group["transient"][index]
+        coding = group["transient"].attrs
+        expected = stored
+        exact = np.ones(stored.shape, bool)
+        if "delta" in coding:
+            code = stored.astype("float32")
+            expected = (code * np.float32(coding["delta"] / 2)) ** 2 / scene["scale"]
+            # The manifest has the values of bins that the code cannot hold.
+            exact = stored != coding["saturated_code"]
+        assert np.allclose(scene["transient"][exact], expected[exact], rtol=1e-5)
+        assert np.all(scene["transient"][~exact] > 0)
+        assert scene["visibility"].shape == (data.spots, *data.shape)
+
+
+def test_crops_and_bins_are_parts_of_the_whole(dataset: str) -> None:
+    whole = picofarm.open(dataset)[0]
+    part = picofarm.open(dataset, crop=(3, 5, 8, 9), bins=(10, 40))[0]
+    assert np.array_equal(part["transient"], whole["transient"][3:11, 5:14, 10:40])
+    for name in ("depth", "specular", "intensity"):
+        assert np.array_equal(part[name], whole[name][3:11, 5:14])
+    assert np.array_equal(part["visibility"], whole["visibility"][:, 3:11, 5:14])
+    assert np.allclose(part["intrinsics"] - whole["intrinsics"], [0, 0, -5, -3])
+
+
+def test_a_copy_in_another_process_reads_the_same(dataset: str) -> None:
+    data = picofarm.open(dataset, arrays=["transient", "depth"], bins=(0, 50))
+    expected = data[1]["transient"]
+    assert np.array_equal(pickle.loads(pickle.dumps(data))[1]["transient"], expected)
+    for method in ("fork", "spawn"):
+        with multiprocessing.get_context(method).Pool(2) as pool:
+            scenes = pool.map(data.__getitem__, [1, 1, 1])
+        assert all(np.array_equal(scene["transient"], expected) for scene in scenes)
+
+
+def test_unusable_arguments_are_refused_by_name(dataset: str) -> None:
+    with pytest.raises(ValueError, match="arrays: .*photons"):
+        picofarm.open(dataset, arrays=["photons"])
+    with pytest.raises(ValueError, match="crop: "):
+        picofarm.open(dataset, crop=(0, 0, 10_000, 1))
+    with pytest.raises(ValueError, match="bins: "):
+        picofarm.open(dataset, bins=(5, 5))
+    with pytest.raises(ValueError, match="split_name: .*dataset split"):
+        picofarm.open(dataset, split="train", split_name="absent")
+    with pytest.raises(ValueError, match="split: .*validation"):
+        picofarm.open(dataset, split="dev")
+    with pytest.raises(ValueError, match="split or scenes|not both"):
+        picofarm.open(dataset, split="train", scenes=[0])
+    with pytest.raises(KeyError, match="99999"):
+        picofarm.open(dataset).read(99999)
+    with pytest.raises(FileNotFoundError):
+        picofarm.open(dataset + "-absent")
+
+
+def test_flipped_bytes_are_noticed(dataset: str, tmp_path: pathlib.Path) -> None:
+    import shutil
+
+    copy = tmp_path / "rooms"
+    shutil.copytree(dataset, copy)
+    files = (path for path in sorted((copy / "transient").rglob("*")) if path.is_file())
+    file = next(path for path in files if path.name != "zarr.json")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(OSError, match="transient"):
+        for _ in picofarm.open(str(copy)):
+            pass
