@@ -54,48 +54,57 @@ pub async fn run(args: Figure, output: Output) -> Result<()> {
     }
     let source = Source::read(&args).await?;
     let work = move || -> Result<Made> {
-        let (drawn, panels) = draw(&args, &source)?;
+        let drawn = match files.is_empty() {
+            true => None,
+            false => Some(draw(&args, &source)?),
+        };
         let mut written = Vec::new();
-        for (format, path) in files {
-            let bytes = match format {
-                Format::Svg => drawn.svg.clone().into_bytes(),
-                other => convert(&drawn, other, args.dpi)?,
-            };
-            write_atomically(&path, &bytes)?;
-            written.push(path);
+        if let Some((drawn, _)) = &drawn {
+            for (format, path) in files {
+                let bytes = match format {
+                    Format::Svg => drawn.svg.clone().into_bytes(),
+                    other => convert(drawn, other, args.dpi)?,
+                };
+                write_atomically(&path, &bytes)?;
+                written.push(path);
+            }
         }
         if let Some(path) = &args.animate {
             let side = ANIMATED.div_ceil(source.view.width.max(source.view.height).max(1));
             write_atomically(path, &flight(&source.view, map(args.colours), side))?;
             written.push(path.clone());
         }
-        Ok(Made {
-            drawn,
-            panels,
-            written,
-        })
+        Ok(Made { drawn, written })
     };
     let made = tokio::task::spawn_blocking(work)
         .await
         .map_err(|e| CliError::new(Code::Failed, format!("drawing broke: {e}")))??;
-    let (width, height) = (made.drawn.width_mm, made.drawn.height_mm);
-    output.result(
-        &json!({"files": made.written, "width_mm": width, "height_mm": height, "panels": made.panels}),
-        || {
-            let lines = made.written.iter().map(|path| format!("{}\n", path.display()));
-            format!(
-                "{}{} panels, {width} x {height:.1} mm\n",
-                lines.collect::<String>(),
-                made.panels
-            )
-        },
-    );
+    let size = made.drawn.as_ref().map(|(drawn, panels)| {
+        let (width, height) = (drawn.width_mm, drawn.height_mm);
+        json!({"width_mm": width, "height_mm": height, "panels": panels})
+    });
+    let mut facts = size.unwrap_or_else(|| json!({}));
+    facts["files"] = json!(made.written);
+    output.result(&facts, || {
+        let lines = made
+            .written
+            .iter()
+            .map(|path| format!("{}\n", path.display()));
+        let size = made
+            .drawn
+            .as_ref()
+            .map_or(String::new(), |(drawn, panels)| {
+                let (width, height) = (drawn.width_mm, drawn.height_mm);
+                format!("{panels} panels, {width} x {height:.1} mm\n")
+            });
+        lines.collect::<String>() + &size
+    });
     Ok(())
 }
 
 struct Made {
-    drawn: Drawn,
-    panels: usize,
+    /// The figure and its number of panels, if one was asked for.
+    drawn: Option<(Drawn, usize)>,
     written: Vec<PathBuf>,
 }
 

@@ -165,7 +165,7 @@ const ASCII_STL: &str = "solid corner\nfacet normal 0 0 1\nouter loop\nvertex 0 
 const MESH_OBJ: &str = "mtllib mesh.mtl\nv 0 0 0 1 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0 1.0\nv 0 0 1\nvt 0 0\nvt 1 0 0\nvt 1 1\n\
     g a b\ns 1\nusemtl red\nf 1/1 2/2 3/3 \\\n4/1\nusemtl tex\nf -5 -4 -1\nusemtl none\nf 1//1 4//1 5//1\nl 1 2\np 1\n";
 
-const MTL: &str = "newmtl red\nKd 0.8 0.1 0.1\nKs .5 .5 .5\nNs 200\nd 0.5\nillum 2\nnewmtl tex\nKd spectral a.rfl\nmap_Kd -s 1 1 1 -o 0 0 0 wood.png\n\
+const MTL: &str = "newmtl red\nKd 0.8 0.1 0.1\nKs .5 .5 .5\nNs 200\nd 0.5\nillum 2\nnewmtl tex\nKd .5 .5 .5\nmap_Kd -s 1 1 1 -o 0 0 0 wood.png\n\
     Pr 0.2\nPm 1\nTr 0.1\nKe 1 1 1\nmap_Bump -bm 0.5 b.png\n";
 
 /// A binary STL of two triangles.
