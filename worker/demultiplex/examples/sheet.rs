@@ -1,7 +1,7 @@
 //! A sheet of the best, the median and the worst room by mean error of depth: true depth, found
 //! depth, its error, mirrors, and the masks of two spots. Writes a PNG to `OUT` (sheet.png).
 //!
-//! In the environment: as for the example `rooms`, and `CELL` (120), the side of an image in
+//! In the environment: as for the example `rooms`, and `CELL` (104), the side of an image in
 //! pixels.
 
 #[path = "common/mod.rs"]
@@ -62,7 +62,7 @@ fn row(canvas: &mut Canvas, n: usize, cell: usize, name: &str, room: &Room, foun
 fn main() {
     let kind = Kind::of_environment();
     let (first, count) = (variable("FIRST", 91001), variable("ROOMS", 20u64));
-    let cell = variable("CELL", 120usize);
+    let cell = variable("CELL", 104usize);
     let take = |seed: u64| {
         let room = Room::new(seed, &kind);
         let found = demultiplex(&room.capture(), &settings()).expect("a capture");
