@@ -116,8 +116,8 @@ impl From<picofarm_scene::SceneError> for CliError {
     }
 }
 
-impl From<picofarm_proto::model::SpecError> for CliError {
-    fn from(e: picofarm_proto::model::SpecError) -> Self {
+impl From<picofarm_proto::spec::SpecError> for CliError {
+    fn from(e: picofarm_proto::spec::SpecError) -> Self {
         CliError::input(e)
     }
 }

@@ -189,7 +189,7 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<logging::Flush> {
     };
     let filter = tracing_subscriber::EnvFilter::try_new(&filter).map_err(|e| {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
-            .hint("e.g. --log info, or --log picofarm_agent=debug")
+            .hint("e.g. --log info, or --log picofarm_tasks=debug")
     })?;
     let started = logging::LogLines::start(std::io::stderr());
     let (lines, last_lines) = started.map_err(|e| error::io("cannot start a thread", &e))?;
@@ -200,7 +200,7 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<logging::Flush> {
         .with_filter(filter);
     tracing_subscriber::registry()
         .with(stderr)
-        .with(picofarm_agent::task_logs())
+        .with(picofarm_tasks::task_logs())
         .with(traces.map(Traces::layer))
         .init();
     Ok(last_lines)

@@ -7,9 +7,9 @@ use figment::{
     providers::{Env, Serialized},
     value::{Dict, Map, Value},
 };
-use picofarm_agent::Access;
 use picofarm_credentials::Secret;
 use picofarm_store::Bandwidth;
+use picofarm_tasks::Access;
 use serde::{Deserialize, Serialize};
 
 use crate::{

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    model::{Histogram, JobSpec, ReportSettings, StageSpec, TrainSettings},
+    spec::{Histogram, JobSpec, ReportSettings, StageSpec, TrainSettings},
     split::SplitSettings,
 };
 use hash::canonical;
@@ -44,9 +44,7 @@ pub fn training_key(
     let mut shaping = settings.clone();
     shaping.split = String::new();
     shaping.scenes = 0;
-    for (_, name) in shaping.models_mut() {
-        *name = "model".into();
-    }
+    shaping.io_mut().models.replace_all("model");
     if shaping.times().is_some() {
         shaping.shadow.times = "predictions".into();
     }

@@ -1,13 +1,14 @@
-//! The vocabulary of the farm and its wire: typed ids, the checked model of jobs, and the generated
-//! protobuf types with their conversions. No I/O.
+//! The vocabulary of the farm and its wire: typed ids, the checked specs of jobs, the messages, and
+//! the generated protobuf types with their conversions. No I/O.
 
 pub mod codec;
 pub mod compatibility;
 pub mod convert;
 pub mod ids;
 pub mod key;
-pub mod model;
+pub mod messages;
 pub mod show;
+pub mod spec;
 pub mod split;
 pub mod trace;
 

@@ -15,7 +15,7 @@ use std::collections::BTreeSet;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::model::SpecError;
+use crate::spec::SpecError;
 
 /// Format of the record.
 pub const SPLIT_FORMAT: u32 = 1;

@@ -83,7 +83,7 @@ impl Dataset {
     #[new]
     fn new(py: Python<'_>, url: String, threads: Option<usize>) -> PyResult<Self> {
         picofarm_cli::provide_cryptography();
-        let threads = threads.unwrap_or_else(picofarm_agent::cores);
+        let threads = threads.unwrap_or_else(picofarm_tasks::cores);
         if !(1..=4096).contains(&threads) {
             return Err(argument(
                 "threads",

@@ -1,7 +1,7 @@
 //! Renders scenes into arrays.
 
 use numpy::{IntoPyArray, PyArrayMethods};
-use picofarm_proto::model::RenderSettings;
+use picofarm_proto::spec::RenderSettings;
 use picofarm_scene::Spot;
 use picofarm_transient::{Budget, Gate, GroundTruth, Rendered, Settings, Split};
 use pyo3::{exceptions::PyMemoryError, prelude::*, types::PyDict};
@@ -56,11 +56,11 @@ pub(crate) fn render<'py>(
     let settings = Settings {
         seed,
         split,
-        ..picofarm_agent::renderer_settings(&asked)
+        ..picofarm_tasks::renderer_settings(&asked)
     };
-    let size = picofarm_agent::scene_size(&scene.scene);
-    let cores = threads.unwrap_or_else(picofarm_agent::cores);
-    picofarm_agent::check_memory(&settings, size, cores).map_err(PyMemoryError::new_err)?;
+    let size = picofarm_tasks::scene_size(&scene.scene);
+    let cores = threads.unwrap_or_else(picofarm_tasks::cores);
+    picofarm_tasks::check_memory(&settings, size, cores).map_err(PyMemoryError::new_err)?;
     let rendered = work::run(py, threads, progress.as_ref(), |watch| {
         picofarm_transient::render(&scene.scene, &settings, watch)
     })?;

@@ -44,7 +44,7 @@ pub(crate) fn run<T: Send>(
     progress: Option<&Py<PyAny>>,
     work: impl FnOnce(&Watch) -> T + Send,
 ) -> PyResult<T> {
-    let threads = threads.unwrap_or_else(picofarm_agent::cores);
+    let threads = threads.unwrap_or_else(picofarm_tasks::cores);
     if !(1..=4096).contains(&threads) {
         return Err(PyValueError::new_err(format!(
             "threads: expected 1 to 4096, found {threads}"

@@ -4,11 +4,11 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use picofarm_proto::model::Histogram;
+use picofarm_proto::spec::Histogram;
 
-use picofarm_agent::export::Scenes;
 use picofarm_exchange::ExportFormat;
 use picofarm_exchange::import::{Captures, DepthKind, Format, ImportOptions, Polarity};
+use picofarm_tasks::export::Scenes;
 
 /// A sensor.
 #[derive(Args, Clone, Default)]

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use picofarm_agent::absolute;
+use picofarm_tasks::absolute;
 
 /// Parses the folder or URL of a store, of a data set or of something in one. Resolves `..`; the
 /// rest stays as typed.

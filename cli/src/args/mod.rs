@@ -123,7 +123,7 @@ pub struct Global {
     /// File with your token; PICOFARM_TOKEN gives the token itself [env: PICOFARM_TOKEN_FILE]
     #[arg(long, global = true, value_name = "FILE")]
     pub token_file: Option<PathBuf>,
-    /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
+    /// Log filter for stderr, e.g. info or picofarm_tasks=debug [env: PICOFARM_LOG]
     #[arg(long, global = true, value_name = "FILTER")]
     pub log: Option<String>,
 }

@@ -27,7 +27,7 @@ pub struct RenderArgs {
     #[arg(long, value_name = "PX|WxH", value_parser = resolution)]
     pub resolution: Option<Resolution>,
     /// Render until the median error of a pixel is this share, e.g. 10%
-    #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::model::parse_share)]
+    #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::spec::parse_share)]
     pub error: Option<f64>,
     /// Camera paths per pixel [default: 64]
     #[arg(long)]
@@ -134,7 +134,7 @@ impl OpticsArgs {
     /// Returns the optics.
     ///
     /// # Errors
-    /// Fails for an invalid wavelength. [`picofarm_proto::model::RenderSettings::check`] checks the
+    /// Fails for an invalid wavelength. [`picofarm_proto::spec::RenderSettings::check`] checks the
     /// other options.
     pub fn optics(&self) -> Result<Optics> {
         let default = Optics::default();

@@ -5,10 +5,11 @@ use std::time::Duration;
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
-    model::{
-        AuditEntry, ConnectedWorker, Event, JobPlan, JobSpec, JobState, JobStatus, JobSummary,
-        Reason, TaskExplanation,
+    messages::{
+        AuditEntry, ConnectedWorker, Event, JobPlan, JobState, JobStatus, JobSummary, Reason,
+        TaskExplanation,
     },
+    spec::JobSpec,
     wire,
 };
 use serde::Serialize;

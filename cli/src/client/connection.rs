@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use picofarm_agent::{Access, Bearer, ConnectionFailure, Target, lost_connection};
 use picofarm_coordinator::auth::ACCEPTED;
 use picofarm_proto::wire::{self, jobs_client::JobsClient};
+use picofarm_tasks::{Access, Bearer, ConnectionFailure, Target, lost_connection};
 use tonic::{Code as Grpc, Response, Status, transport::Endpoint};
 
 use super::{Jobs, refused};

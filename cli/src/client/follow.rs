@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use picofarm_proto::{
     ids::JobId,
-    model::{EventKind, JobState, JobStatus},
+    messages::{EventKind, JobState, JobStatus},
 };
 
 use crate::{

@@ -3,11 +3,11 @@
 
 use std::path::Path;
 
-use picofarm_agent::Submission;
 use picofarm_proto::{
-    model::{JobSpec, RenderTask, TaskSpec, scaled},
     show,
+    spec::{JobSpec, RenderTask, TaskSpec, scaled},
 };
+use picofarm_tasks::Submission;
 
 use crate::{
     error::{CliError, Result},
@@ -112,7 +112,7 @@ pub fn resolve_task(task: &mut TaskSpec, base: &Path, asset_dir: &Path) -> Resul
         base,
         assets: &[asset_dir.to_owned()],
     };
-    Ok(picofarm_agent::resolve(task, &here)?)
+    Ok(picofarm_tasks::resolve(task, &here)?)
 }
 
 /// Like `resolve_task`, for one rendering.
@@ -288,12 +288,9 @@ mod tests {
         let text = format!("{scenes}[render]{render}[output]{rest}");
         let several = text.replace("[905]", "[905, 532]");
         let refused = read(&written(dir.path(), &several), dir.path()).unwrap_err();
-        let expected = "render.wavelengths_nm";
         let message = &refused.message;
-        assert!(
-            message.contains(expected) && message.contains("has 2, expected one"),
-            "{message}"
-        );
+        assert!(message.contains("render.wavelengths_nm"), "{message}");
+        assert!(message.contains("has 2, expected one"), "{message}");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
         let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
             unreachable!("the template renders");
@@ -306,23 +303,15 @@ mod tests {
         assert_eq!((beam.diameter_mm, beam.divergence_mrad), (4.0, 1.0));
         let all = serde_json::to_value(render).unwrap();
         let (_, settings) = text.split_once("[render]").expect("it renders");
-        let names = settings
-            .lines()
-            .skip(1)
-            .map_while(|line| line.split_once(" ="));
-        for (name, _) in names {
-            assert!(
-                !all[name].is_null(),
-                "{name} is not read, or is its default"
-            );
+        let lines = settings.lines().skip(1);
+        for (name, _) in lines.map_while(|line| line.split_once(" =")) {
+            assert!(!all[name].is_null(), "{name} is unread or its default");
         }
         let wrong = text.replace("diameter_mm = 4", "diameter_mm = -4");
-        let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
-        assert!(
-            error.message.contains("render.beam.diameter_mm"),
-            "{}",
-            error.message
-        );
+        let message = read(&written(dir.path(), &wrong), dir.path())
+            .unwrap_err()
+            .message;
+        assert!(message.contains("render.beam.diameter_mm"), "{message}");
         let wrong = text.replace("mirror_images", "lobes");
         let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
         assert!(

@@ -9,8 +9,8 @@ pub mod stores;
 
 use std::time::Duration;
 
-use picofarm_agent::{Access, Bearer, lost_connection};
-use picofarm_proto::{convert::ConvertError, model::SpecError, wire::jobs_client::JobsClient};
+use picofarm_proto::{convert::ConvertError, spec::SpecError, wire::jobs_client::JobsClient};
+use picofarm_tasks::{Access, Bearer, lost_connection};
 use tonic::{
     Code as Grpc, Response, Status, service::interceptor::InterceptedService, transport::Channel,
 };

@@ -6,8 +6,9 @@ use std::{collections::BTreeSet, time::Duration};
 
 use picofarm_dataset::Dataset;
 use picofarm_proto::{
-    model::{JobPlan, JobSpec, StageSpec, kinds::Manifest},
+    messages::JobPlan,
     show,
+    spec::{JobSpec, StageSpec, kinds::Manifest},
 };
 use picofarm_store::{StorageError, check_writable, identify_store, open_store, store_identity};
 

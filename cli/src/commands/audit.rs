@@ -1,6 +1,6 @@
 //! `picofarm audit`: shows the audit log.
 
-use picofarm_proto::{model::AuditEntry, show};
+use picofarm_proto::{messages::AuditEntry, show};
 
 use crate::{
     args::Audit,

@@ -4,13 +4,13 @@ pub(super) mod stored;
 
 use std::{net::SocketAddr, sync::Arc, time::Duration};
 
-use picofarm_agent::Memory;
 use picofarm_coordinator::{
     Connections, CoordinatorConfig, CoordinatorError, MemoryBounds, ResultReader, Running,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
 use picofarm_database::CatalogPlace;
+use picofarm_tasks::Memory;
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 

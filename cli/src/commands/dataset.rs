@@ -16,13 +16,13 @@ pub mod verify;
 
 use std::path::{Path, PathBuf};
 
-use picofarm_agent::TaskError;
 use picofarm_dataset::{Dataset, Summary};
 use picofarm_figures::{
     inferno,
     scene::{View, flight, sheet},
 };
 use picofarm_store::{StorageError, open_store};
+use picofarm_tasks::TaskError;
 use serde_json::json;
 
 use crate::{

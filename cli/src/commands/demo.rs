@@ -6,15 +6,13 @@ mod sheet;
 
 use std::{net::SocketAddr, path::Path};
 
-use picofarm_agent::Access;
 use picofarm_proto::{
     ids::JobId,
-    model::{
-        Budget, JobSpec, JobState, JobStatus, OutputSettings, RenderSettings, RenderTask,
-        SceneKind, SceneSource,
-    },
+    messages::{JobState, JobStatus},
     show,
+    spec::{Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource},
 };
+use picofarm_tasks::Access;
 use serde_json::json;
 
 use room::Room;
@@ -149,7 +147,7 @@ pub async fn run(args: Demo, settings: &Settings, output: Output) -> Result<()> 
     std::fs::create_dir_all(&dir).map_err(|e| io(dir.display(), &e))?;
     let workers = args
         .workers
-        .unwrap_or_else(|| picofarm_agent::cores().min(2))
+        .unwrap_or_else(|| picofarm_tasks::cores().min(2))
         .max(1);
     let r = &task.render;
     output.say(format!(

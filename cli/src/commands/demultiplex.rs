@@ -28,7 +28,7 @@ use crate::{
 /// A render that cannot be read or used, or a folder that is taken.
 pub async fn run(args: Demultiplex, output: Output) -> Result<()> {
     free_folder(&args.out)?;
-    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let threads = args.threads.unwrap_or_else(picofarm_tasks::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()

@@ -65,13 +65,13 @@ fn processor() -> Check {
     Check {
         what: "processor",
         verdict: Verdict::Ok,
-        detail: format!("{} cores, {}", picofarm_agent::cores(), vector_kernel()),
+        detail: format!("{} cores, {}", picofarm_tasks::cores(), vector_kernel()),
     }
 }
 
 /// Reports the memory that tasks may use, and the source of this limit.
 fn memory() -> Check {
-    let found = picofarm_agent::Memory::here();
+    let found = picofarm_tasks::Memory::here();
     Check {
         what: "memory",
         verdict: match found {

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use picofarm_proto::{ids::JobId, model::Event};
+use picofarm_proto::{ids::JobId, messages::Event};
 
 use crate::{
     client::{Client, Page},
@@ -179,7 +179,7 @@ fn show(events: Vec<Event>, job: Option<JobId>, output: Output) {
 
 #[cfg(test)]
 mod tests {
-    use picofarm_proto::model::EventKind;
+    use picofarm_proto::messages::EventKind;
 
     use super::*;
 

@@ -15,11 +15,7 @@ use std::{
 };
 
 use clap::ValueEnum;
-use picofarm_proto::{
-    ids::JobId,
-    model::{Event, JobSpec},
-    show,
-};
+use picofarm_proto::{ids::JobId, messages::Event, show, spec::JobSpec};
 use serde_json::json;
 
 use finish::finish;

@@ -4,8 +4,8 @@ mod keeper;
 
 use std::{net::SocketAddr, path::Path, time::Duration};
 
-use picofarm_agent::Memory;
 use picofarm_proto::ids::WorkerId;
+use picofarm_tasks::Memory;
 use tokio::task::JoinSet;
 use uuid::Uuid;
 
@@ -75,7 +75,7 @@ impl Local {
             keepers: Vec::new(),
             workers: JoinSet::new(),
         };
-        let cores = picofarm_agent::cores();
+        let cores = picofarm_tasks::cores();
         let memory = Memory::here();
         for i in 0..workers {
             let order = Order {

@@ -4,9 +4,9 @@
 
 use std::io::{BufRead, Write};
 
-use picofarm_agent::{Access, AgentConfig};
 use picofarm_proto::ids::WorkerId;
 use picofarm_settings::Gpus;
+use picofarm_tasks::{Access, AgentConfig};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 use tokio::signal::unix::{SignalKind, signal};
@@ -145,7 +145,7 @@ async fn work(order: Order) -> Result<()> {
         access,
         store_prefixes: Vec::new(),
     };
-    let summary = picofarm_agent::run(config, stop).await;
+    let summary = picofarm_tasks::run(config, stop).await;
     summary.map(|_| ()).map_err(|e| worker::agent_error(&e))
 }
 

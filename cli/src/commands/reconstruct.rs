@@ -13,9 +13,8 @@ mod written;
 
 use std::time::Instant;
 
-use picofarm_agent::{Memory, reconstruct};
 use picofarm_figures::Canvas;
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     kinds::reconstruct::grid_bytes,
     memory::{Shape, gib},
 };
@@ -28,6 +27,7 @@ use picofarm_reconstruct::{
 use picofarm_results::Verdict;
 use picofarm_scene::{Camera, Scene, plato};
 use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
+use picofarm_tasks::{Memory, reconstruct};
 use picofarm_transient::RenderError;
 use serde_json::{Value, json};
 
@@ -76,7 +76,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
         SpotsFrom::Predictions => Some(predicted::read(&args, scene.laser.beams.len()).await?),
         SpotsFrom::Captures | SpotsFrom::Truth | SpotsFrom::Flash => None,
     };
-    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let threads = args.threads.unwrap_or_else(picofarm_tasks::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
@@ -269,8 +269,8 @@ fn sensor(args: &Reconstruct) -> Option<Sensor> {
 
 /// Rejects a render that does not fit into memory.
 fn fits_memory(settings: &CaptureSettings, scene: &Scene, threads: usize) -> Result<()> {
-    let size = picofarm_agent::scene_size(scene);
-    picofarm_agent::check_memory(&settings.render_settings(), size, threads)
+    let size = picofarm_tasks::scene_size(scene);
+    picofarm_tasks::check_memory(&settings.render_settings(), size, threads)
         .map_err(|e| CliError::new(Code::Resource, e))
 }
 

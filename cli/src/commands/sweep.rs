@@ -9,8 +9,8 @@ mod search;
 
 use std::{fs, path::Path, time::SystemTime};
 
-use picofarm_model::report::trials::{self, Sweep};
 use picofarm_proto::show;
+use picofarm_report::trials::{self, Sweep};
 use serde_json::json;
 
 use self::records::{Records, loss, read};

@@ -5,11 +5,11 @@ use std::{
     time::{Duration, Instant, SystemTime},
 };
 
-use picofarm_agent::Access;
 use picofarm_coordinator::auth::{
     BY_CERTIFICATE, BY_DIGEST, Entry, Expiry, Roles, TokenError, Tokens,
 };
 use picofarm_credentials::CredentialError;
+use picofarm_tasks::Access;
 use serde_json::json;
 
 use crate::{

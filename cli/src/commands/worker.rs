@@ -2,7 +2,7 @@
 
 use std::time::{Duration, SystemTime};
 
-use picofarm_agent::{AgentConfig, AgentError, Memory};
+use picofarm_tasks::{AgentConfig, AgentError, Memory};
 use serde_json::json;
 
 use crate::{
@@ -30,7 +30,7 @@ pub async fn run(args: Worker, settings: &Settings, output: Output) -> Result<()
         name: args.name.unwrap_or_else(default_name),
         worker_id: None,
         ended: String::new(),
-        threads: args.threads.unwrap_or_else(picofarm_agent::cores),
+        threads: args.threads.unwrap_or_else(picofarm_tasks::cores),
         memory_mib: memory.as_ref().map_or(0, Memory::for_tasks_mib),
         memory_from: memory.map_or_else(String::new, |memory| memory.to_string()),
         gpus: args.gpus,
@@ -43,7 +43,7 @@ pub async fn run(args: Worker, settings: &Settings, output: Output) -> Result<()
         store_prefixes: args.store_prefix,
     };
     output.say(format!("worker {} for {}", config.name, config.coordinator));
-    let summary = picofarm_agent::run(config, stop)
+    let summary = picofarm_tasks::run(config, stop)
         .await
         .map_err(|e| agent_error(&e))?;
     output.result(

@@ -3,12 +3,13 @@
 use std::collections::BTreeSet;
 
 use picofarm_proto::{
-    model::{
-        Estimate, Event, JobPlan, JobSpec, JobStatus, StagePlan,
+    messages::{Estimate, Event, JobPlan, JobStatus, StagePlan},
+    show,
+    spec::{
+        JobSpec,
         matrix::{same_matrix, together},
         memory::gib,
     },
-    show,
 };
 
 use crate::output::{bytes, duration, table};

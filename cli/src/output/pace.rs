@@ -4,7 +4,7 @@
 
 use std::{collections::HashMap, time::Instant};
 
-use picofarm_proto::model::{JobState, JobStatus, StageState, StageStatus};
+use picofarm_proto::messages::{JobState, JobStatus, StageState, StageStatus};
 
 use crate::output::duration;
 
@@ -119,7 +119,8 @@ mod tests {
 
     use picofarm_proto::{
         ids::JobId,
-        model::{JobSpec, Limits, RunningTask, TaskCounts},
+        messages::{RunningTask, TaskCounts},
+        spec::{JobSpec, Limits},
     };
 
     use super::*;

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use picofarm_catalog::CatalogError;
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
-    model::{Failure, Finished, JobPlan, JobSpec, SpecError, TaskLog, TaskProgress, WorkerHello},
+    messages::{Failure, Finished, JobPlan, TaskLog, TaskProgress, WorkerHello},
+    spec::{JobSpec, SpecError},
 };
 use tokio::sync::{mpsc, oneshot};
 

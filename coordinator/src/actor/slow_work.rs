@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::Finished,
+    messages::Finished,
 };
 
 use crate::core::{Reported, SessionId};

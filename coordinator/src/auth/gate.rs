@@ -8,7 +8,7 @@ use std::{
 
 use picofarm_credentials::Described;
 use picofarm_proto::{
-    model::{Act, Outcome, audit::WHO_BYTES},
+    messages::{Act, Outcome, audit::WHO_BYTES},
     show,
 };
 use tokio::sync::watch;

@@ -5,7 +5,7 @@ use std::{fmt, str::FromStr};
 use picofarm_catalog::{Owner, Sight};
 use picofarm_proto::{
     ids::JobId,
-    model::{JobSpec, SpecError},
+    spec::{JobSpec, SpecError},
 };
 
 use super::{caller::Caller, roles::Role};

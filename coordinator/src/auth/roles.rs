@@ -2,7 +2,7 @@
 
 use std::{fmt, str::FromStr};
 
-use picofarm_proto::model::Act;
+use picofarm_proto::messages::Act;
 use serde::{Deserialize, Serialize};
 
 /// A right that a caller may have.

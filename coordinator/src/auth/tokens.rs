@@ -7,7 +7,7 @@ mod tests;
 use std::path::{Path, PathBuf};
 
 use picofarm_credentials::{CredentialError, Described, LockedFile, Secret, private, read_text};
-use picofarm_proto::model::check_project;
+use picofarm_proto::spec::check_project;
 use rustls::crypto::ring;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use picofarm_proto::{ids::WorkerId, model::FailureKind};
+use picofarm_proto::{ids::WorkerId, messages::FailureKind};
 
 use super::budget::Backoff;
 

@@ -2,10 +2,7 @@
 //! have separate budgets.
 
 use picofarm_catalog::Exception;
-use picofarm_proto::{
-    ids::StageRef,
-    model::{FailureKind, Limits},
-};
+use picofarm_proto::{ids::StageRef, messages::FailureKind, spec::Limits};
 
 use super::words::span;
 

@@ -6,7 +6,7 @@ use std::collections::{BTreeSet, HashMap};
 use picofarm_catalog::{Changes, Claim, News, Owned, Range, RangeState, Want};
 use picofarm_proto::{
     ids::{JobId, StageRef, WorkerId},
-    model::EventKind,
+    messages::EventKind,
 };
 
 use super::{

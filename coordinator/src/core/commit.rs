@@ -5,7 +5,7 @@ use picofarm_catalog::{Output, Range, RangeState};
 use picofarm_proto::{
     ids::StageRef,
     key::task_key,
-    model::{EventKind, Finished},
+    messages::{EventKind, Finished},
 };
 
 use super::{

@@ -6,7 +6,7 @@ use std::cmp::Reverse;
 use picofarm_catalog::RangeState;
 use picofarm_proto::{
     ids::{StageRef, WorkerId},
-    model::{EventKind, Lease},
+    messages::{EventKind, Lease},
 };
 
 use super::{

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
     ids::{StageRef, WorkerId},
-    model::{EventKind, FailureKind, Finished, JobSpec, kinds::Manifest},
+    messages::{EventKind, FailureKind, Finished},
+    spec::{JobSpec, kinds::Manifest},
 };
 
 use super::{history::EventDetails, message::SessionId, state::Core, store_faults::store_of};

@@ -1,6 +1,6 @@
 //! Returns which connected workers could run a planned job. Changes nothing.
 
-use picofarm_proto::model::JobSpec;
+use picofarm_proto::spec::JobSpec;
 
 use super::{placement, state::Core};
 

@@ -3,7 +3,7 @@
 use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
     ids::{Incarnation, WorkerId},
-    model::{EventKind, FailureKind},
+    messages::{EventKind, FailureKind},
 };
 
 use super::{history::EventDetails, message::SessionId, state::Core};

@@ -3,7 +3,7 @@
 use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
     ids::{RangeId, StageRef, WorkerId},
-    model::{EventKind, FailureKind},
+    messages::{EventKind, FailureKind},
 };
 
 use super::{

@@ -4,7 +4,8 @@
 use picofarm_catalog::{Changes, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
-    model::{FailureKind, Limits},
+    messages::FailureKind,
+    spec::Limits,
 };
 use proptest::prelude::*;
 use uuid::Uuid;

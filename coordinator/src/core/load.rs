@@ -96,7 +96,7 @@ impl Load {
 mod tests {
     use std::sync::Arc;
 
-    use picofarm_proto::model::{JobSpec, JobState};
+    use picofarm_proto::{messages::JobState, spec::JobSpec};
     use uuid::Uuid;
 
     use super::*;

@@ -1,6 +1,6 @@
 //! Adds the log lines of tasks to their history.
 
-use picofarm_proto::model::{EventKind, TaskLog};
+use picofarm_proto::messages::{EventKind, TaskLog};
 
 use super::{history::EventDetails, message::SessionId, state::Core};
 

@@ -1,6 +1,6 @@
 //! The messages of the core to workers.
 
-use picofarm_proto::{ids::LeaseRef, model::Lease};
+use picofarm_proto::{ids::LeaseRef, messages::Lease};
 
 /// Number of a session, unique in this process.
 pub(crate) type SessionId = u64;

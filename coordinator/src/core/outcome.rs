@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use picofarm_catalog::{Changes, Exception, NewEvent, Output, Range, Worker};
 use picofarm_proto::{
     ids::{LeaseRef, RangeId, StageRef},
-    model::EventKind,
+    messages::EventKind,
 };
 
 use super::{

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use picofarm_catalog::JobRecord;
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::{JobSpec, JobState, JobStatus, RunningTask, StageState, StageStatus},
+    messages::{JobState, JobStatus, RunningTask, StageState, StageStatus},
+    spec::JobSpec,
 };
 
 use super::state::Core;

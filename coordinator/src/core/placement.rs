@@ -1,8 +1,11 @@
 //! Decides which worker may take tasks of each job, and how many at once. Pure.
 
-use picofarm_proto::model::{
-    Abilities, SceneKind, StageSpec,
-    memory::{Known, gib, peak_bytes},
+use picofarm_proto::{
+    messages::Abilities,
+    spec::{
+        SceneKind, StageSpec,
+        memory::{Known, gib, peak_bytes},
+    },
 };
 
 /// Furniture that every worker generates itself.

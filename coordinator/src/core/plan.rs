@@ -5,7 +5,8 @@ use std::collections::BTreeSet;
 use picofarm_catalog::{Job, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    model::{JobPlan, JobSpec, StagePlan, StageSpec, matrix::of_matrix, memory::peak_bytes},
+    messages::{JobPlan, StagePlan},
+    spec::{JobSpec, StageSpec, matrix::of_matrix, memory::peak_bytes},
 };
 use serde_json::Value;
 
@@ -232,7 +233,7 @@ fn differences(lines: &mut Vec<String>, path: String, was: Option<&Value>, is: O
 
 #[cfg(test)]
 mod tests {
-    use picofarm_proto::model::{PromoteSettings, PromoteTask, SourceSettings, TaskSpec};
+    use picofarm_proto::spec::{PromoteSettings, PromoteTask, SourceSettings, TaskSpec};
 
     use super::*;
 

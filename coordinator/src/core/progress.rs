@@ -1,6 +1,6 @@
 //! The last reported progress of running tasks.
 
-use picofarm_proto::model::{LogAllowance, TaskAt};
+use picofarm_proto::messages::{LogAllowance, TaskAt};
 
 #[derive(Debug, Clone)]
 pub(super) struct Progress {

@@ -5,7 +5,8 @@
 use picofarm_catalog::{Changes, Culprit, Mark, NewEvent, Range, RangeState, Row, Run};
 use picofarm_proto::{
     ids::{LeaseRef, StageRef, WorkerId},
-    model::{EventKind, bounds},
+    messages::EventKind,
+    spec::bounds,
 };
 
 use super::{

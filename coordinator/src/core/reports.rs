@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{EventKind, Failure, FailureKind, TaskProgress},
+    messages::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
 use super::{

@@ -3,7 +3,7 @@
 use picofarm_catalog::{Range, Worker};
 use picofarm_proto::{
     ids::{LeaseRef, WorkerId},
-    model::WorkerHello,
+    messages::WorkerHello,
 };
 
 use super::{

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     ids::{JobId, StageRef, WorkerId},
-    model::ConnectedWorker,
+    messages::ConnectedWorker,
 };
 
 use super::{

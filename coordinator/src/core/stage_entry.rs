@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use picofarm_catalog::{Exception, Free, Job, StageRecord};
 use picofarm_proto::{
     ids::StageRef,
-    model::{Abilities, FailureKind, JobSpec, StageSpec, memory::Known},
+    messages::{Abilities, FailureKind},
+    spec::{JobSpec, StageSpec, memory::Known},
 };
 
 use super::{blocklist::Blocklist, budget::fresh, held_ranges::HeldRanges, placement};

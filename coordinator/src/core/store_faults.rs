@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use picofarm_proto::{
     ids::{RangeId, StageRef, WorkerId},
-    model::TaskSpec,
+    spec::TaskSpec,
 };
 
 use super::{budget::Backoff, candidate::NotEligible};

@@ -9,7 +9,7 @@
 use picofarm_catalog::{Mark, Range};
 use picofarm_proto::{
     ids::{Epoch, LeaseRef, RangeId, StageRef, WorkerId},
-    model::{EventKind, Lease},
+    messages::{EventKind, Lease},
 };
 
 use super::{

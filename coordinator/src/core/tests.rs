@@ -8,7 +8,7 @@ mod troubled;
 mod world;
 
 use picofarm_catalog::{EventQuery, Sight};
-use picofarm_proto::model::{Failure, FailureKind, Lease};
+use picofarm_proto::messages::{Failure, FailureKind, Lease};
 use proptest::prelude::*;
 
 use world::{Op, SETTINGS, TASKS, World, op};
@@ -218,7 +218,7 @@ fn a_stage_is_over_although_its_last_instance_believed_to_hold_a_lease_that_ende
         world.beat(0).await;
         world.flush(0).await;
         let state = first(&world).await.state;
-        assert_eq!(state, picofarm_proto::model::StageState::Done);
+        assert_eq!(state, picofarm_proto::messages::StageState::Done);
         for instance in &world.instances {
             instance.catalog.close().await;
         }

@@ -7,7 +7,7 @@ use std::{
 
 use picofarm_proto::{
     ids::{Incarnation, RangeId, WorkerId},
-    model::Abilities,
+    messages::Abilities,
 };
 
 use super::message::SessionId;

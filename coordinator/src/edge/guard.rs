@@ -7,7 +7,7 @@ use std::{
 
 use futures::future::{Either, Ready, ready};
 use picofarm_credentials::Described;
-use picofarm_proto::model::Outcome;
+use picofarm_proto::messages::Outcome;
 use tonic::{Status, body::Body, metadata::MetadataValue};
 use tower::{Layer, Service};
 

@@ -3,7 +3,8 @@
 use picofarm_catalog::{Holdups, TaskRecord};
 use picofarm_proto::{
     ids::JobId,
-    model::{Event, JobState, Limits, RunningTask, StageStatus, TaskCounts},
+    messages::{Event, JobState, RunningTask, StageStatus, TaskCounts},
+    spec::Limits,
 };
 
 use crate::core::{Candidate, RunningOn};

@@ -1,10 +1,12 @@
 //! Explains why a job's tasks do not run.
 
 use picofarm_catalog::{Exception, Holdups};
-use picofarm_proto::model::{
-    Event, EventKind, JobState, Reason, StageState, StageStatus, TaskCounts,
-    matrix::{same_matrix, together},
-    memory::gib,
+use picofarm_proto::{
+    messages::{Event, EventKind, JobState, Reason, StageState, StageStatus, TaskCounts},
+    spec::{
+        matrix::{same_matrix, together},
+        memory::gib,
+    },
 };
 
 use super::facts::JobFacts;

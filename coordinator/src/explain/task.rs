@@ -1,7 +1,7 @@
 //! Explains the state of one task.
 
 use picofarm_catalog::RangeState;
-use picofarm_proto::model::{Event, EventKind, Made, TaskExplanation, TaskOutput, TaskState};
+use picofarm_proto::messages::{Event, EventKind, Made, TaskExplanation, TaskOutput, TaskState};
 
 use super::facts::TaskFacts;
 use crate::core::span;

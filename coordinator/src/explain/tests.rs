@@ -6,7 +6,7 @@ mod task;
 use picofarm_catalog::{Exception, Holdups};
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::{Event, EventKind, JobState, TaskCounts},
+    messages::{Event, EventKind, JobState, TaskCounts},
 };
 use uuid::Uuid;
 

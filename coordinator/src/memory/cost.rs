@@ -2,7 +2,7 @@
 
 use std::io;
 
-use picofarm_proto::model::JobSpec;
+use picofarm_proto::spec::JobSpec;
 
 /// A message takes its length twice: once as received and once as decoded.
 pub(crate) const TWICE: u64 = 2;

@@ -11,7 +11,7 @@ use std::{
 use picofarm_catalog::{Catalog, NewAudit};
 use picofarm_proto::{
     ids::JobId,
-    model::{
+    messages::{
         Act, Outcome,
         audit::{DETAIL_BYTES, WHO_BYTES},
     },

@@ -11,7 +11,7 @@ use std::{
 };
 
 use picofarm_catalog::Changes;
-use picofarm_proto::model::{EventKind, FailureKind, TaskCounts};
+use picofarm_proto::messages::{EventKind, FailureKind, TaskCounts};
 
 use crate::core::{SessionId, ToWorker};
 

@@ -1,7 +1,7 @@
 //! The coordinator's trace spans. A lease begins a trace, and the commit of each of its tasks ends
 //! a branch. See [`picofarm_proto::trace`].
 
-use picofarm_proto::{model::Finished, trace};
+use picofarm_proto::{messages::Finished, trace};
 use tracing::{Level, Span, debug_span, enabled};
 
 use crate::core::{SessionId, ToWorker};

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use picofarm_catalog::{Gone, Recorded, ResultSet, Run};
-use picofarm_proto::model::StageSpec;
+use picofarm_proto::spec::StageSpec;
 use sha2::{Digest, Sha256};
 
 use super::{conflicts::ReusedScenes, result_reader::ResultState};

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use picofarm_catalog::{Job, Owner, Recorded, ResultSet, Sight};
 use picofarm_proto::{
     ids::JobId,
-    model::{SceneFile, SpecError, StageSpec},
+    spec::{SceneFile, SpecError, StageSpec},
 };
 
 use crate::{

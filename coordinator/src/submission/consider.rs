@@ -5,7 +5,7 @@ use std::sync::Arc;
 use picofarm_catalog::{Job, Owner, Recorded, ResultSet, Specs};
 use picofarm_proto::{
     ids::JobId,
-    model::{JobPlan, JobState},
+    messages::{JobPlan, JobState},
 };
 
 use super::{

@@ -3,11 +3,7 @@
 use std::sync::Arc;
 
 use picofarm_catalog::{Job, StageRecord};
-use picofarm_proto::{
-    ids::JobId,
-    key::spec_hash,
-    model::{JobSpec, JobState},
-};
+use picofarm_proto::{ids::JobId, key::spec_hash, messages::JobState, spec::JobSpec};
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
 

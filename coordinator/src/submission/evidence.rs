@@ -8,7 +8,7 @@ use std::{
 use picofarm_catalog::Recorded;
 use picofarm_proto::{
     ids::{StageRef, WorkerId},
-    model::JobSpec,
+    spec::JobSpec,
 };
 
 /// Most stores remembered.

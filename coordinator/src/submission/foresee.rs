@@ -3,7 +3,10 @@
 //! Pure.
 
 use picofarm_catalog::{Job, ResultSet, Timing};
-use picofarm_proto::model::{Estimate, JobPlan, JobSpec, StageSpec, TaskSpec};
+use picofarm_proto::{
+    messages::{Estimate, JobPlan},
+    spec::{JobSpec, StageSpec, TaskSpec},
+};
 use picofarm_settings::Budget;
 
 use crate::core::{EligibleWorkers, StageWorkers, plan::changes};
@@ -174,7 +177,7 @@ pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &EligibleWorkers) -
 
 #[cfg(test)]
 mod tests {
-    use picofarm_proto::model::StagePlan;
+    use picofarm_proto::messages::StagePlan;
     use serde_json::json;
 
     use super::*;

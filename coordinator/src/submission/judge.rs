@@ -1,10 +1,7 @@
 //! Runs the slow work of the actor: reading jobs, and checking disputed results against a store.
 
 use picofarm_catalog::{Gone, Recorded, ResultSet};
-use picofarm_proto::{
-    ids::JobId,
-    model::{Finished, StageSpec},
-};
+use picofarm_proto::{ids::JobId, messages::Finished, spec::StageSpec};
 
 use super::{result_reader::ResultState, service::Submissions, store_checks::plan_deadline};
 use crate::{

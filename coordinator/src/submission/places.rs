@@ -2,7 +2,7 @@
 //! other users may only reuse its results.
 
 use picofarm_catalog::{OwnedPlace, Owner, Sight, StageRecord};
-use picofarm_proto::model::{Destination, SpecError, StageSpec};
+use picofarm_proto::spec::{Destination, SpecError, StageSpec};
 
 use crate::auth::Caller;
 
@@ -15,7 +15,7 @@ pub(super) fn written(
 ) -> Vec<(usize, OwnedPlace)> {
     let mut places = Vec::new();
     for (position, (spec, stage)) in specs.iter().zip(stages).enumerate() {
-        let destination = spec.task.destination();
+        let destination = spec.task.results().destination;
         if let Some(place) = destination.place() {
             let mine = OwnedPlace {
                 place: place.normal(),
@@ -54,7 +54,7 @@ pub(super) fn refused(
     other: &OwnedPlace,
     sight: &Sight,
 ) -> SpecError {
-    let destination = stage.task.destination();
+    let destination = stage.task.results().destination;
     let field = destination.place().map_or("output", |place| place.field);
     let (place, whose) = match sight.sees(&other.owner) {
         true => (

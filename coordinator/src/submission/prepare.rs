@@ -3,7 +3,7 @@
 use picofarm_catalog::{Job, NewEvent, Range, Run, StageRecord};
 use picofarm_proto::{
     ids::{JobId, RangeId},
-    model::{EventKind, JobState},
+    messages::{EventKind, JobState},
 };
 use uuid::Uuid;
 

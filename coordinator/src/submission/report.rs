@@ -1,7 +1,7 @@
 //! Describes the effect of submitting a draft, as a plan.
 
 use picofarm_catalog::Job;
-use picofarm_proto::{ids::JobId, model::JobPlan};
+use picofarm_proto::{ids::JobId, messages::JobPlan};
 
 use super::{check::Findings, draft::Draft};
 use crate::core::plan;

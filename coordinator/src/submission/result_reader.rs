@@ -4,7 +4,7 @@
 use std::fmt;
 
 use futures::future::BoxFuture;
-use picofarm_proto::model::StageSpec;
+use picofarm_proto::spec::StageSpec;
 
 /// The state of a recorded result in its store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use picofarm_catalog::{Catalog, CatalogError, Job, Specs, StageRecord};
-use picofarm_proto::{ids::JobId, model::JobState};
+use picofarm_proto::{ids::JobId, messages::JobState};
 use tokio::sync::{Mutex, mpsc};
 
 use super::{

@@ -8,7 +8,7 @@ use std::{
 };
 
 use picofarm_catalog::Recorded;
-use picofarm_proto::model::StageSpec;
+use picofarm_proto::spec::StageSpec;
 use tokio::{
     sync::Semaphore,
     time::{Instant, timeout_at},

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use picofarm_catalog::{Gone, Outcome, OwnedPlace, Owner, Run, Submission};
 use picofarm_proto::{
     ids::JobId,
-    model::{JobPlan, JobState, SpecError},
+    messages::{JobPlan, JobState},
+    spec::SpecError,
 };
 use uuid::Uuid;
 

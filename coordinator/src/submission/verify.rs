@@ -13,7 +13,7 @@ use std::{
 };
 
 use picofarm_catalog::Recorded;
-use picofarm_proto::{ids::StageRef, model::JobSpec};
+use picofarm_proto::{ids::StageRef, spec::JobSpec};
 
 use super::{result_reader::ResultState, service::Submissions, store_checks::report_deadline};
 use crate::{actor::StoreCheck, core::Reported};

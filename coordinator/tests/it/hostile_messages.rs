@@ -10,7 +10,7 @@ use picofarm_coordinator::{CoordinatorConfig, Running, VERSION, serve};
 use picofarm_database::CatalogPlace;
 use picofarm_proto::{
     PROTOCOL,
-    model::{JobSpec, RenderTask, TaskSpec},
+    spec::{JobSpec, RenderTask, TaskSpec},
     wire::{
         self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
         session_response::Message as Heard,

@@ -1,11 +1,12 @@
 //! The plain settings shared by jobs, data sets, the renderer and the networks. Each is declared
-//! once in this crate, and all other crates use its type. This crate computes, reads and sends
-//! nothing.
+//! once in this crate, and all other crates use its type. [`random`] has the random numbers that
+//! all of them share.
 
 mod gate;
 mod gpus;
 mod network;
 mod optics;
+pub mod random;
 mod reconstruct;
 mod render;
 mod rooms;

@@ -2,7 +2,7 @@
 
 use super::{ConvertError, parse};
 use crate::{
-    model::{Act, AuditEntry, Outcome},
+    messages::{Act, AuditEntry, Outcome},
     wire,
 };
 

@@ -2,7 +2,7 @@
 
 use super::{ConvertError, parse, required};
 use crate::{
-    model::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState},
+    messages::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState},
     wire,
 };
 

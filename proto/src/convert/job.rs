@@ -2,7 +2,7 @@
 
 use super::{ConvertError, required};
 use crate::{
-    model::{JobSpec, StageSpec},
+    spec::{JobSpec, StageSpec},
     wire,
 };
 

@@ -8,7 +8,7 @@ mod status;
 
 use std::str::FromStr;
 
-use crate::model::SpecError;
+use crate::spec::SpecError;
 
 /// An invalid wire message.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -6,10 +6,11 @@ use super::{ConvertError, at_most, checked, parse, required};
 use crate::{
     ids::{Epoch, LeaseRef},
     key::{StageKey, TaskKey},
-    model::{
+    messages::{
         Abilities, Failure, FailureKind, Finished, Lease, LogLevel, LogLine, TaskAt, TaskLog,
-        TaskProgress, WorkerHello, bounds, check_label, log,
+        TaskProgress, WorkerHello, log,
     },
+    spec::{bounds, check_label},
     wire,
 };
 

@@ -2,10 +2,11 @@
 
 use super::{ConvertError, parse, required};
 use crate::{
-    model::{
+    messages::{
         Estimate, Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask,
-        StagePlan, StageState, StageStatus, TaskCounts, bounds,
+        StagePlan, StageState, StageStatus, TaskCounts,
     },
+    spec::bounds,
     wire,
 };
 

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::{spec_hash, stage_key},
-    model::{JobSpec, SpecError, TaskSpec},
+    spec::{JobSpec, SpecError, TaskSpec},
     wire,
 };
 
@@ -202,7 +202,7 @@ fn a_lease_brings_only_its_own_files() {
     (expected[3], expected[4]) = (Some("/3.glb"), Some("/4.glb"));
     assert_eq!(paths, expected);
     let text = serde_json::to_string(&part).unwrap();
-    let back: picofarm_proto::model::StageSpec = serde_json::from_str(&text).unwrap();
+    let back: picofarm_proto::spec::StageSpec = serde_json::from_str(&text).unwrap();
     assert_eq!(back, part);
     // A submitted job lists all of them.
     let whole = JobSpec {

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::stage_key,
-    model::{JobSpec, TaskSpec},
+    spec::{JobSpec, TaskSpec},
     wire,
 };
 

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::{StageKey, spec_hash, stage_key},
-    model::{JobSpec, RenderTask, SpecError, TaskSpec},
+    spec::{JobSpec, RenderTask, SpecError, TaskSpec},
     wire,
 };
 

@@ -1,7 +1,7 @@
 //! Numbers of a job outside any sensible range are refused with the field, the value, the range and
 //! the correct form. Those at the ends of their ranges pass.
 
-use picofarm_proto::model::{JobSpec, parse_share};
+use picofarm_proto::spec::{JobSpec, parse_share};
 use serde_json::{Value, json};
 
 fn job() -> Value {

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::{TaskKey, derived_key},
-    model::ReprocessSettings,
+    spec::ReprocessSettings,
 };
 
 fn read(text: &str) -> Result<ReprocessSettings, toml::de::Error> {

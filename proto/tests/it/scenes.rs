@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use picofarm_proto::{
     key::{StageKey, stage_key, task_key},
-    model::{JobSpec, PrimitiveRooms, SceneKind, SceneSource, Spots, StageSpec, TaskSpec},
+    spec::{JobSpec, PrimitiveRooms, SceneKind, SceneSource, Spots, StageSpec, TaskSpec},
     wire,
 };
 

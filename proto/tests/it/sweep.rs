@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::stage_key,
-    model::{Domain, Halving, JobSpec, Median, StageSpec, Stop, TaskSpec, TrainSettings, Trial},
+    spec::{Domain, Halving, JobSpec, Median, StageSpec, Stop, TaskSpec, TrainSettings, Trial},
     wire,
 };
 use proptest::prelude::*;
@@ -411,7 +411,7 @@ proptest! {
     #[test]
     fn draws_lie_in_their_domain_and_domains_come_back_from_json(domain in domain(), seed: u64, number in 0u64..2000) {
         let over = [("x".to_owned(), domain.clone())].into();
-        let value = picofarm_proto::model::domain::draw(&over, seed, number)["x"].clone();
+        let value = picofarm_proto::spec::domain::draw(&over, seed, number)["x"].clone();
         prop_assert!(domain.contains(&value), "{value} of {domain:?}");
         let text = serde_json::to_string(&domain).unwrap();
         prop_assert_eq!(&serde_json::from_str::<Domain>(&text).unwrap(), &domain);

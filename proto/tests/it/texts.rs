@@ -1,7 +1,7 @@
 //! Texts of jobs that are too long or control terminals are refused, with the names of their
 //! fields.
 
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     JobSpec,
     bounds::{NAME_BYTES, PLACE_BYTES, TEXT_BYTES, steers},
 };

@@ -3,7 +3,7 @@
 
 use picofarm_proto::{
     key::stage_key,
-    model::{
+    spec::{
         Histogram, JobSpec, StageSpec, TaskSpec, TrainSettings,
         train::{Architecture, Normalise, Precision, Schedule, ShadowVariant, Target},
     },

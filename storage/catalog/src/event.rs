@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     ids::JobId,
-    model::{EventKind, TaskCounts},
+    messages::{EventKind, TaskCounts},
 };
 
 use crate::{range::Run, rights::Sight};

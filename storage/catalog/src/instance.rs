@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use picofarm_proto::{
     ids::{Incarnation, InstanceId, JobId, RangeId, StageRef, WorkerId},
-    model::JobState,
+    messages::JobState,
 };
 
 use crate::{

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use picofarm_proto::{
     ids::{JobId, StageRef},
     key::{StageKey, stage_key},
-    model::{JobSpec, JobState, StageSpec, StageState, TaskCounts},
+    messages::{JobState, StageState, TaskCounts},
+    spec::{JobSpec, StageSpec},
 };
 
 use crate::task::Exception;

@@ -33,7 +33,7 @@ use std::{fmt, sync::Arc};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{JobId, StageRef, WorkerId},
-    model::{Event, JobState, TaskCounts},
+    messages::{Event, JobState, TaskCounts},
 };
 
 pub use changes::Changes;

@@ -1,6 +1,6 @@
 //! Operations on many jobs: pages of the job list, and deletion of old jobs.
 
-use picofarm_proto::model::{JobState, JobSummary};
+use picofarm_proto::messages::{JobState, JobSummary};
 
 use crate::Sight;
 

@@ -3,7 +3,7 @@
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::JobId,
-    model::{Act, AuditEntry, Outcome},
+    messages::{Act, AuditEntry, Outcome},
 };
 
 use crate::{CatalogError, Job, ResultSet};
@@ -29,7 +29,7 @@ impl From<&Job> for Owner {
 /// A folder of a store into which jobs write. It is owned by the first submitter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OwnedPlace {
-    /// Its normal form (`picofarm_proto::model::Place`).
+    /// Its normal form (`picofarm_proto::spec::Place`).
     pub place: String,
     /// Whether the place is a named record in a data set, which may have another owner; otherwise
     /// it is a folder with all of its content.

@@ -1,6 +1,6 @@
 //! Computes when stages may begin and when a job is over. Pure functions.
 
-use picofarm_proto::model::{JobState, StageState, TaskCounts};
+use picofarm_proto::messages::{JobState, StageState, TaskCounts};
 
 /// A stored stage, with its tasks counted.
 #[derive(Debug, Clone, PartialEq)]

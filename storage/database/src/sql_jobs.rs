@@ -20,10 +20,7 @@ macro_rules! job_queries {
         pub(crate) mod job_query {
             use std::{collections::BTreeMap, sync::Arc};
 
-            use picofarm_proto::{
-                ids::{JobId, StageRef},
-                model::{JobSpec, JobState},
-            };
+            use picofarm_proto::{ids::{JobId, StageRef}, messages::JobState, spec::JobSpec};
             use sqlx::Row;
 
             use super::query::{exception, stage_of, uint};

@@ -8,10 +8,7 @@ macro_rules! listing_queries {
         pub(crate) mod listing_query {
             use std::collections::BTreeMap;
 
-            use picofarm_proto::{
-                ids::JobId,
-                model::{JobState, JobSummary, TaskCounts},
-            };
+            use picofarm_proto::{ids::JobId, messages::{JobState, JobSummary, TaskCounts}};
             use sqlx::{QueryBuilder, Row};
 
             use super::query::{marks, uint};

@@ -5,10 +5,7 @@
 macro_rules! rights_queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod rights_query {
-            use picofarm_proto::{
-                ids::JobId,
-                model::{Act, AuditEntry, Outcome},
-            };
+            use picofarm_proto::{ids::JobId, messages::{Act, AuditEntry, Outcome}};
             use sqlx::{Connection as _, QueryBuilder, Row};
             use uuid::Uuid;
 

@@ -7,10 +7,7 @@ macro_rules! stage_queries {
         pub(crate) mod stage_query {
             use std::collections::BTreeMap;
 
-            use picofarm_proto::{
-                ids::{JobId, StageRef},
-                model::{EventKind, StageState, TaskCounts},
-            };
+            use picofarm_proto::{ids::{JobId, StageRef}, messages::{EventKind, StageState, TaskCounts}};
             use sqlx::Row;
 
             use super::query::{marks, uint};

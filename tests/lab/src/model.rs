@@ -13,7 +13,7 @@ use picofarm_model::{
     ModelError,
     device::{self, Gpus},
     input::{Batch, Target},
-    memory::Kept,
+    memory::RetainedMemory,
     net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
     train::Learner,
     trial::{Apart, Trial},
@@ -131,7 +131,7 @@ pub fn run(args: &ModelArgs, output: Output, stop: &CancellationToken) -> Result
     }
     // As in a worker's training. Called only here, so that memory retained from earlier steps does
     // not hide the memory of one step.
-    let _kept = Kept::from_now();
+    let _kept = RetainedMemory::from_now();
     for peer in &mut peers {
         peer.steps(1)?;
     }

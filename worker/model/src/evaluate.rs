@@ -40,7 +40,7 @@ pub struct Answered {
 impl Evaluated {
     /// Computes the metrics of scenes in order. The result is identical to the bit however the
     /// scenes were divided among evaluations.
-    pub fn of(target: Target, scenes: &[Answered]) -> Self {
+    pub fn from_scenes(target: Target, scenes: &[Answered]) -> Self {
         let mut whole = Tally::default();
         let mut trivial: Vec<(String, Tally)> = Vec::new();
         for scene in scenes {
@@ -80,7 +80,7 @@ pub fn evaluate(
 ) -> Result<Option<Evaluated>, ModelError> {
     let answered = answered(model, baseline, scenes, tell)?;
     let target = model.question().target;
-    Ok(answered.map(|scenes| Evaluated::of(target, &scenes)))
+    Ok(answered.map(|scenes| Evaluated::from_scenes(target, &scenes)))
 }
 
 /// Returns the answers for every scene, in order; [`Evaluated::of`] computes the metrics from them.

@@ -16,7 +16,6 @@ pub mod net;
 pub mod ops;
 pub mod parameters;
 mod random;
-pub mod report;
 pub mod scene;
 pub mod train;
 pub mod trial;

@@ -25,7 +25,7 @@ const PURGE_DELAY: mi_option_t = 15;
 /// The time for which free memory is held, milliseconds.
 const KEPT_MS: c_long = 10_000;
 
-/// The number of live [`Kept`] guards, and the option's value before the first.
+/// The number of live [`RetainedMemory`] guards, and the option's value before the first.
 static ASKED: Mutex<(usize, c_long)> = Mutex::new((0, 0));
 
 // SAFETY of the two calls below: both read or write one number in a table and are valid for any
@@ -43,9 +43,9 @@ fn set_delay(ms: c_long) {
 /// A guard: while one exists, free memory is held for longer. If the program uses another
 /// allocator, the guard has no effect.
 #[derive(Debug)]
-pub struct Kept(());
+pub struct RetainedMemory(());
 
-impl Kept {
+impl RetainedMemory {
     /// Creates a guard that takes effect immediately.
     pub fn from_now() -> Self {
         let mut asked = ASKED.lock().unwrap_or_else(PoisonError::into_inner);
@@ -61,7 +61,7 @@ impl Kept {
     }
 }
 
-impl Drop for Kept {
+impl Drop for RetainedMemory {
     fn drop(&mut self) {
         let mut asked = ASKED.lock().unwrap_or_else(PoisonError::into_inner);
         asked.0 -= 1;
@@ -73,14 +73,14 @@ impl Drop for Kept {
 
 #[cfg(test)]
 mod tests {
-    use super::{KEPT_MS, Kept, delay};
+    use super::{KEPT_MS, RetainedMemory, delay};
 
     /// Also checks that the number still belongs to that option: its default is one second.
     #[test]
     fn free_memory_is_kept_for_longer_while_anybody_asks() {
         assert_eq!(delay(), 1000, "unset MIMALLOC_PURGE_DELAY");
-        let one = Kept::from_now();
-        let other = Kept::from_now();
+        let one = RetainedMemory::from_now();
+        let other = RetainedMemory::from_now();
         drop(one);
         assert_eq!(delay(), KEPT_MS);
         drop(other);

@@ -169,7 +169,7 @@ impl Tally {
                 rmse_m: (self.squared / n).sqrt(),
             },
             Target::Shadow | Target::Specular => {
-                let [mae, iou, f1] = Overlap::of(&self.masks).figures(1.0);
+                let [mae, iou, f1] = Overlap::sum(&self.masks).figures(1.0);
                 Metrics::Mask { mae, iou, f1 }
             }
         }
@@ -185,7 +185,7 @@ impl Tally {
                 let each: Vec<[f64; 3]> = self
                     .masks
                     .chunks(BATCH)
-                    .map(|batch| Overlap::of(batch).figures(0.0))
+                    .map(|batch| Overlap::sum(batch).figures(0.0))
                     .collect();
                 let mean = |k: usize| {
                     each.iter().map(|figures| figures[k]).sum::<f64>() / each.len().max(1) as f64
@@ -202,7 +202,7 @@ impl Tally {
 
 impl Overlap {
     /// Returns the sum of several masks' counts.
-    fn of(masks: &[Self]) -> Self {
+    fn sum(masks: &[Self]) -> Self {
         masks.iter().fold(Self::default(), |a, b| Self {
             both: a.both + b.both,
             said: a.said + b.said,

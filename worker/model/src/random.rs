@@ -1,35 +1,35 @@
 //! Random numbers that depend only on a seed and a stream. They are the same on every machine, in
 //! every order and for any number of threads.
 
-/// SplitMix64 over a seed and a stream (Steele, Lea, Flood 2014): one sequence for each pair.
+use picofarm_settings::random::{GOLDEN, SplitMix64, mix};
+
+/// The random numbers of a seed and a stream: one sequence for each pair.
 #[derive(Debug, Clone)]
-pub struct Random(u64);
+pub struct Random(SplitMix64);
 
 impl Random {
     /// Returns the sequence of a stream of a seed.
     pub fn new(seed: u64, stream: &[u64]) -> Self {
-        let mut state = mix(seed ^ 0x9E37_79B9_7F4A_7C15);
+        let mut state = mix(seed ^ GOLDEN);
         for part in stream {
             state = mix(state ^ mix(part.wrapping_add(0xD1B5_4A32_D192_ED03)));
         }
-        Self(state)
+        Self(SplitMix64(state))
     }
 
     /// Returns 64 random bits.
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        mix(self.0)
+        self.0.bits()
     }
 
     /// Returns a uniform integer in 0..n; n must be positive.
     pub fn below(&mut self, n: u64) -> u64 {
-        // Multiply-shift; the bias is below n / 2^64.
-        ((u128::from(self.bits()) * u128::from(n)) >> 64) as u64
+        self.0.below(n)
     }
 
     /// Returns a uniform number in [0, 1) with 24 bits.
     pub fn unit(&mut self) -> f32 {
-        (self.bits() >> 40) as f32 / (1u64 << 24) as f32
+        self.0.unit()
     }
 
     /// Returns a normal number with mean 0 and variance 1 (Box and Muller 1958). It has the same
@@ -49,10 +49,4 @@ impl Random {
         }
         order
     }
-}
-
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
 }

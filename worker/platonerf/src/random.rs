@@ -1,5 +1,7 @@
-//! Random numbers that depend only on their purpose: SplitMix64 (Steele et al. 2014) of a seed and
+//! Random numbers that depend only on their purpose: those of a seed and
 //! names, and a shuffled order with elements that can be computed one by one.
+
+use picofarm_settings::random::{GOLDEN, SplitMix64, mix};
 
 /// The purpose of random numbers.
 #[derive(Debug, Clone, Copy)]
@@ -11,32 +13,25 @@ pub(crate) enum Purpose {
 
 /// A sequence of random numbers.
 #[derive(Debug, Clone)]
-pub(crate) struct Random(u64);
-
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
+pub(crate) struct Random(SplitMix64);
 
 impl Random {
     /// Returns the sequence of a purpose and two numbers.
     pub fn new(seed: u64, purpose: Purpose, a: u64, b: u64) -> Self {
-        let mut state = mix(seed ^ 0x9e37_79b9_7f4a_7c15);
+        let mut state = mix(seed ^ GOLDEN);
         for part in [purpose as u64, a, b] {
             state = mix(state ^ mix(part.wrapping_add(0xd1b5_4a32_d192_ed03)));
         }
-        Self(state)
+        Self(SplitMix64(state))
     }
 
     fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        mix(self.0)
+        self.0.bits()
     }
 
     /// Returns a uniform number in [0, 1), a multiple of 2⁻²⁴.
     pub fn unit(&mut self) -> f32 {
-        (self.bits() >> 40) as f32 * (1.0 / 16_777_216.0)
+        self.0.unit()
     }
 }
 

@@ -6,10 +6,10 @@
 //! matrix products that add in another order.
 
 use burn::tensor::Device;
-use picofarm_reconstruct::{Measured, Phase, Progress, ReconstructError};
+use picofarm_reconstruct::{Measured, Phase, Progress, ReconstructError, saved::Moments};
 
 use crate::{
-    adam::Moments,
+    adam,
     loss::{AllDraws, Counts, Stage, loss},
     network::{Network, Shape, host},
     random::{Purpose, Random},
@@ -181,7 +181,7 @@ impl Training {
         self.state.step += 1;
         let each = self.state.weights.iter_mut().zip(&mut self.state.moments);
         for ((weights, moments), gradient) in each.zip(gradients) {
-            moments.step(weights, gradient, rate, self.state.step);
+            adam::step(moments, weights, gradient, rate, self.state.step);
         }
     }
 

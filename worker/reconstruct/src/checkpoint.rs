@@ -2,7 +2,9 @@
 //! optimisation is stored; the earlier steps are repeated in a few seconds with the same bits.
 
 use crate::{
-    Measured, Progress, ReconstructError, Reconstruction, Settings, reconstruction::Saved,
+    Measured, Progress, ReconstructError, Reconstruction, Settings,
+    reconstruction::Saved,
+    saved::{self, Fingerprint},
 };
 
 /// The first bytes of a checkpoint: its format and version.
@@ -11,18 +13,17 @@ const MAGIC: &[u8; 8] = b"pfrecon2";
 impl Reconstruction {
     /// Returns the state as bytes: little-endian, a few MB.
     pub fn checkpoint(&self) -> Vec<u8> {
-        let mut out = MAGIC.to_vec();
-        out.extend(self.fingerprint().to_le_bytes());
-        let Some(saved) = self.saved() else {
+        let mut out = saved::header(MAGIC, self.fingerprint());
+        let Some(state) = self.saved() else {
             return out;
         };
-        out.extend(saved.done.to_le_bytes());
-        out.extend(saved.misses.to_le_bytes());
-        out.extend(saved.settles.unwrap_or(u32::MAX).to_le_bytes());
-        out.extend(saved.loss.to_le_bytes());
-        out.extend(saved.held_out.to_le_bytes());
-        for values in [&saved.logits, &saved.first, &saved.second] {
-            out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+        out.extend(state.done.to_le_bytes());
+        out.extend(state.misses.to_le_bytes());
+        out.extend(state.settles.unwrap_or(u32::MAX).to_le_bytes());
+        out.extend(state.loss.to_le_bytes());
+        out.extend(state.held_out.to_le_bytes());
+        for values in [&state.logits, &state.first, &state.second] {
+            saved::put(&mut out, values);
         }
         out
     }
@@ -38,26 +39,16 @@ impl Reconstruction {
         checkpoint: &[u8],
         progress: &dyn Progress,
     ) -> Result<Self, ReconstructError> {
-        let bad = |what: &str| ReconstructError::invalid("checkpoint", what);
         let mut begun = Self::begin(measured, settings, progress)?;
-        let rest = checkpoint.strip_prefix(MAGIC);
-        let rest = rest.ok_or_else(|| bad("is none, or of another version; begin anew"))?;
-        let (print, rest) = rest
-            .split_first_chunk()
-            .ok_or_else(|| bad("is cut off; begin anew"))?;
-        if u64::from_le_bytes(*print) != begun.fingerprint() {
-            return Err(bad(
-                "is of other measurements or settings; give those it was made with",
-            ));
-        }
+        let rest = saved::body(MAGIC, begun.fingerprint(), checkpoint)?;
         if rest.is_empty() {
             return Ok(begun);
         }
         let nodes = begun.trainable_nodes().len();
         if rest.len() != 28 + 12 * nodes {
-            return Err(bad("is cut off; begin anew"));
+            return Err(saved::cut_off());
         }
-        let cut = || bad("is cut off; begin anew");
+        let cut = saved::cut_off;
         let (done, rest) = rest.split_first_chunk().ok_or_else(cut)?;
         let (misses, rest) = rest.split_first_chunk().ok_or_else(cut)?;
         let (settles, rest) = rest.split_first_chunk().ok_or_else(cut)?;
@@ -65,10 +56,7 @@ impl Reconstruction {
         let (held_out, rest) = rest.split_first_chunk().ok_or_else(cut)?;
         let settles = u32::from_le_bytes(*settles);
         let (words, _) = rest.as_chunks::<4>();
-        let values = |part: usize| -> Vec<f32> {
-            let part = &words[part * nodes..(part + 1) * nodes];
-            part.iter().map(|w| f32::from_le_bytes(*w)).collect()
-        };
+        let values = |part| saved::part(words, part, nodes);
         begun.set_saved(Saved {
             done: u32::from_le_bytes(*done),
             loss: f64::from_le_bytes(*loss),
@@ -82,14 +70,10 @@ impl Reconstruction {
         Ok(begun)
     }
 
-    /// Returns the FNV-1a hash of the optimisation's inputs.
+    /// Returns the hash of the optimisation's inputs.
     fn fingerprint(&self) -> u64 {
-        let mut hash = 0xcbf2_9ce4_8422_2325u64;
-        let mut take = |x: u32| {
-            for byte in x.to_le_bytes() {
-                hash = (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
-            }
-        };
+        let mut hash = Fingerprint::default();
+        let mut take = |x: u32| hash.take(&x.to_le_bytes());
         let settings = self.settings();
         take(settings.iterations);
         take(settings.batch);
@@ -99,6 +83,6 @@ impl Reconstruction {
             take(i);
             take(self.start_field().logit[i as usize].to_bits());
         }
-        hash
+        hash.value()
     }
 }

@@ -23,6 +23,7 @@ mod rays;
 mod reconstruction;
 pub mod render;
 mod rng;
+pub mod saved;
 pub mod score;
 pub mod source;
 mod start;

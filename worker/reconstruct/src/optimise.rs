@@ -24,7 +24,7 @@ use crate::{
     start::State,
 };
 
-pub(crate) use adam::Moments;
+pub(crate) use crate::saved::Moments;
 pub use cast::{Cast, cast_ray};
 
 /// Gradients are multiples of 2⁻²⁴.

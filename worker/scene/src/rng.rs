@@ -3,6 +3,8 @@
 //! It is implemented here because the same seed must always give the same scene: no dependency may
 //! change the stream, and every derived number uses only integer or IEEE arithmetic.
 
+use picofarm_settings::random::{GOLDEN, mix};
+
 /// A stream of random numbers (O'Neill 2014, PCG-XSH-RR 64/32).
 #[derive(Debug, Clone)]
 pub(crate) struct Rng {
@@ -10,21 +12,17 @@ pub(crate) struct Rng {
     increment: u64,
 }
 
-/// Computes one step of SplitMix64 (Steele et al. 2014), which spreads neighbouring seeds far
-/// apart.
-fn splitmix(x: u64) -> u64 {
-    let z = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
+/// Spreads neighbouring seeds far apart.
+fn spread(seed: u64) -> u64 {
+    mix(seed.wrapping_add(GOLDEN))
 }
 
 impl Rng {
     /// Returns stream number `stream` of `seed`; different pairs give unrelated streams.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
         let mut rng = Self {
-            state: splitmix(seed ^ splitmix(stream)),
-            increment: (splitmix(stream.wrapping_add(seed.rotate_left(32))) << 1) | 1,
+            state: spread(seed ^ spread(stream)),
+            increment: (spread(stream.wrapping_add(seed.rotate_left(32))) << 1) | 1,
         };
         rng.next_u32();
         rng

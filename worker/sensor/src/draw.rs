@@ -1,6 +1,8 @@
 //! Random counts: a separate generator for each (seed, scene, pixel, bin), and exact Poisson and
 //! binomial draws.
 
+use picofarm_settings::random::{GOLDEN, mix};
+
 use crate::alias::{SplitRate, TABLED};
 
 /// The purpose of a stream of numbers.
@@ -10,16 +12,6 @@ pub(crate) enum Purpose {
     Peak = 2,
     Roll = 3,
 }
-
-/// SplitMix64's output function (Steele, Lea & Flood 2014).
-#[inline(always)]
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
-
-const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
 
 /// The key of one pixel's numbers.
 #[derive(Debug, Clone, Copy)]

@@ -14,7 +14,7 @@ use std::{
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
-    model::{Abilities, WorkerHello},
+    messages::{Abilities, WorkerHello},
     trace,
 };
 use tokio_util::sync::CancellationToken;

@@ -4,7 +4,7 @@
 use std::path::{Component, Path, PathBuf};
 
 use picofarm_files::Opener;
-use picofarm_proto::model::StageSpec;
+use picofarm_proto::spec::StageSpec;
 
 use crate::AgentError;
 

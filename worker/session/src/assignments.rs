@@ -14,7 +14,7 @@ use std::{
 use picofarm_proto::{
     ids::LeaseRef,
     key::StageKey,
-    model::{Failure, FailureKind, Finished, Lease},
+    messages::{Failure, FailureKind, Finished, Lease},
 };
 
 use crate::{

@@ -9,9 +9,9 @@ use std::{
 use picofarm_proto::{
     ids::{Epoch, JobId, LeaseRef, RangeId},
     key::StageKey,
-    model::{
-        Lease, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec,
-        TaskAt, TaskSpec,
+    messages::{Lease, TaskAt},
+    spec::{
+        OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec, TaskSpec,
     },
 };
 use picofarm_settings::{PrimitiveRooms, Spots};

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, SystemTime},
 };
 
-use picofarm_proto::{ids::WorkerId, model::check_label};
+use picofarm_proto::{ids::WorkerId, spec::check_label};
 use picofarm_settings::Gpus;
 
 use crate::{Access, AccessError};

@@ -14,7 +14,8 @@ use std::{
 use picofarm_proto::{
     ids::JobId,
     key::{StageKey, TaskKey, task_key},
-    model::{StageSpec, TaskAt},
+    messages::TaskAt,
+    spec::StageSpec,
 };
 
 /// One task to run.

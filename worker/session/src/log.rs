@@ -12,7 +12,7 @@ use std::{
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{LogAllowance, LogLevel, LogLine, TaskLog, log::cut},
+    messages::{LogAllowance, LogLevel, LogLine, TaskLog, log::cut},
 };
 use tracing::{
     Event, Level, Subscriber,
@@ -28,7 +28,7 @@ use tracing_subscriber::{
 /// Targets with lines that are forwarded, from INFO upwards. Those of other libraries are not,
 /// because their content is unknown.
 const OURS: [&str; 9] = [
-    "picofarm_agent",
+    "picofarm_tasks",
     "picofarm_dataset",
     "picofarm_exchange",
     "picofarm_model",
@@ -204,7 +204,7 @@ impl Unsent {
 mod tests {
     use picofarm_proto::{
         ids::{Epoch, RangeId},
-        model::log::{BYTES, LINES},
+        messages::log::{BYTES, LINES},
     };
     use tracing::{info, warn};
     use tracing_subscriber::prelude::*;

@@ -3,7 +3,8 @@
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{Failure, Finished, Lease, TaskLog, TaskProgress, bounds},
+    messages::{Failure, Finished, Lease, TaskLog, TaskProgress},
+    spec::bounds,
     wire::{self, session_request, session_response},
 };
 

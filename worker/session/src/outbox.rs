@@ -87,7 +87,7 @@ impl Outbox {
 #[cfg(test)]
 mod tests {
     use picofarm_proto::ids::{Epoch, RangeId};
-    use picofarm_proto::model::{Failure, FailureKind};
+    use picofarm_proto::messages::{Failure, FailureKind};
     use uuid::Uuid;
 
     use super::*;

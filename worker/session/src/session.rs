@@ -25,7 +25,7 @@
 use std::time::Duration;
 
 use picofarm_proto::{
-    model::WorkerHello,
+    messages::WorkerHello,
     wire::{self, farm_client::FarmClient, session_request, session_response},
 };
 use tokio::sync::mpsc;

@@ -14,15 +14,15 @@ use std::{
 
 use futures::future::BoxFuture;
 use object_store::{ObjectStore, path::Path};
-use picofarm_agent::StorePrefixes;
 use picofarm_coordinator::{ResultReader, ResultState};
 use picofarm_dataset::PartName;
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     StageSpec,
     kinds::{Manifest, TaskKind},
 };
 use picofarm_results::{Held, Holdings};
 use picofarm_store::{StorageError, check_identity, open_store};
+use picofarm_tasks::StorePrefixes;
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
 use uuid::Uuid;
@@ -138,7 +138,7 @@ impl StoreReader {
 
 /// Returns the folder of this machine that a location names.
 fn folder(location: &str) -> Option<PathBuf> {
-    let place = picofarm_proto::model::Place {
+    let place = picofarm_proto::spec::Place {
         field: "store",
         store: location,
         folder: "".into(),
@@ -341,7 +341,7 @@ mod tests {
             r#"{{"name": "test", "scenes": {{"kind": "primitive", "count": 2}},
                 "render": {{"renderer": "r1"}}, "output": {{"store": "{store}", "dataset": "d"}}}}"#
         );
-        let spec: picofarm_proto::model::JobSpec = serde_json::from_str(&text).unwrap();
+        let spec: picofarm_proto::spec::JobSpec = serde_json::from_str(&text).unwrap();
         spec.stages[0].clone()
     }
 

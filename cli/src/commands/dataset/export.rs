@@ -3,9 +3,9 @@
 
 use std::time::Instant;
 
-use picofarm_agent::export::Scenes;
 use picofarm_exchange::{Exported, Exporter};
 use picofarm_store::open_store;
+use picofarm_tasks::export::Scenes;
 use serde_json::json;
 
 use super::{failed, open};
@@ -23,7 +23,7 @@ pub async fn run(args: DatasetExport, output: Output) -> Result<()> {
     let stop = signals::stop_on_signal()?;
     let dataset = open(&args.dataset).await?;
     let which = args.scenes.unwrap_or(Scenes::All);
-    let scenes = which.of(&dataset).await.map_err(failed)?;
+    let scenes = which.select(&dataset).await.map_err(failed)?;
     let (store, prefix) = open_store(&args.dest).map_err(failed)?;
     let mut export =
         Exporter::new(args.format, &dataset, &scenes, &*store, prefix).map_err(failed)?;

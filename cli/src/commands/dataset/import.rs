@@ -25,7 +25,7 @@ pub async fn run(args: DatasetImport, output: Output) -> Result<()> {
     let start = Instant::now();
     let stop = signals::stop_on_signal()?;
     let names = args.list.as_deref().map(names).transpose()?;
-    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let threads = args.threads.unwrap_or_else(picofarm_tasks::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| {
         CliError::new(

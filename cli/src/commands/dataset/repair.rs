@@ -3,13 +3,13 @@
 
 use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
-use picofarm_agent::{
+use picofarm_dataset::{Dataset, Snapshot};
+use picofarm_proto::spec::SourceSettings;
+use picofarm_store::{Problem, VerifyMode};
+use picofarm_tasks::{
     Control, TaskError,
     repair::{Hints, Repairer},
 };
-use picofarm_dataset::{Dataset, Snapshot};
-use picofarm_proto::model::SourceSettings;
-use picofarm_store::{Problem, VerifyMode};
 use serde_json::json;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
@@ -100,7 +100,7 @@ pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Re
         let written = dataset.restore_metadata().await.map_err(failed)?;
         done.written.extend(written);
     }
-    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let threads = args.threads.unwrap_or_else(picofarm_tasks::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| {
         CliError::new(

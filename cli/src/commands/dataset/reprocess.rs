@@ -3,12 +3,12 @@
 
 use std::{sync::Arc, time::Instant};
 
-use picofarm_agent::{
+use picofarm_proto::spec::{
+    OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, TaskKind,
+};
+use picofarm_tasks::{
     Control, TaskError,
     reprocess::{Reprocessor, sensor_version},
-};
-use picofarm_proto::model::{
-    OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, TaskKind,
 };
 use serde_json::json;
 use tokio::runtime::Handle;
@@ -25,7 +25,7 @@ use crate::{
 
 pub async fn run(args: DatasetReprocess, output: Output) -> Result<()> {
     let task = task(&args)?;
-    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let threads = args.threads.unwrap_or_else(picofarm_tasks::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
@@ -150,7 +150,7 @@ impl Work {
     }
 
     /// Reprocesses one scene. Stops when a signal arrives.
-    fn one(&self, scene: u64) -> Result<picofarm_agent::Output, TaskError> {
+    fn one(&self, scene: u64) -> Result<picofarm_tasks::Output, TaskError> {
         let control = Arc::new(Control::default());
         let (stop, stopped) = (self.stop.clone(), control.clone());
         let watch = self.runtime.spawn(async move {

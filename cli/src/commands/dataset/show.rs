@@ -1,7 +1,7 @@
 //! `picofarm dataset show`: shows the origin of a scene.
 
-use picofarm_agent::repair::leads_to;
 use picofarm_store::published::Manifest as _;
+use picofarm_tasks::repair::leads_to;
 use serde_json::{Value, json};
 
 use super::{failed, open, predictions};

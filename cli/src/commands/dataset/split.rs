@@ -1,10 +1,10 @@
 //! `picofarm dataset split`: divides the scenes into training, validation and test.
 
-use picofarm_agent::{
+use picofarm_proto::split::{Parts, SIDES, SplitSettings};
+use picofarm_tasks::{
     Control,
     split::{Split, Splitter},
 };
-use picofarm_proto::split::{Parts, SIDES, SplitSettings};
 use serde_json::json;
 use tokio::runtime::Handle;
 

@@ -4,20 +4,20 @@
 
 use std::path::{Path, PathBuf};
 
-use picofarm_agent::{
-    demultiplex::Flash,
-    reconstruct::{CELL, shaded},
-};
 use picofarm_dataset::{Dataset, Quantity};
 use picofarm_demultiplex::{DepthScore, Settings, Truth, demultiplex, score as flash_score};
 use picofarm_figures::{Canvas, TEXT};
-use picofarm_proto::model::kinds::demultiplex::Places;
+use picofarm_proto::spec::kinds::demultiplex::Places;
 use picofarm_reconstruct::{
     ReconstructError, Reconstructed, Settings as GridSettings, Surface, Unwatched, reconstruct,
     render::Renderer, score, source::from_flash, surface,
 };
 use picofarm_scene::Camera;
 use picofarm_store::StorageError;
+use picofarm_tasks::{
+    demultiplex::Flash,
+    reconstruct::{CELL, shaded},
+};
 use serde_json::{Value, json};
 
 use crate::{

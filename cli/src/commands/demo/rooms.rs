@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use picofarm_proto::{
-    model::{
+    show,
+    spec::{
         OutputSettings, RenderTask, SourceSettings, StageSpec, TaskSpec,
         kinds::{ReconstructTask, reconstruct::ReconstructSettings},
     },
-    show,
 };
 use picofarm_reconstruct::Settings as GridSettings;
 use serde_json::{Value, json};

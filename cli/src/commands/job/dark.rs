@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 
 use picofarm_proto::{
-    model::{
+    messages::{
         EventKind, JobStatus,
         log::{DARK, marked},
     },

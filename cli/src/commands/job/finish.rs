@@ -1,6 +1,6 @@
 //! The result of a job that was followed.
 
-use picofarm_proto::model::JobStatus;
+use picofarm_proto::messages::JobStatus;
 
 use super::{dark, verdicts};
 use crate::{

@@ -1,7 +1,7 @@
 //! `picofarm job list`: shows a page of the jobs.
 
 use picofarm_proto::{
-    model::{JobState, JobSummary},
+    messages::{JobState, JobSummary},
     show,
 };
 use serde_json::json;

@@ -4,8 +4,9 @@
 
 use picofarm_proto::{
     ids::JobId,
-    model::{JobSpec, JobState, SceneKind},
+    messages::JobState,
     show,
+    spec::{JobSpec, SceneKind},
 };
 use serde_json::json;
 
@@ -83,7 +84,7 @@ fn repin(spec: &mut JobSpec) -> std::result::Result<Vec<String>, String> {
         let Some(scenes) = stage.task.scenes_mut() else {
             continue;
         };
-        let positions = picofarm_agent::repin(scenes).map_err(|e| e.to_string())?;
+        let positions = picofarm_tasks::repin(scenes).map_err(|e| e.to_string())?;
         if positions.is_empty() {
             continue;
         }

@@ -1,6 +1,6 @@
 //! Formats the result of `job submit`, including when an identical job exists.
 
-use picofarm_proto::model::{JobPlan, JobState, JobStatus};
+use picofarm_proto::messages::{JobPlan, JobState, JobStatus};
 use serde_json::json;
 
 use super::finish::finish;

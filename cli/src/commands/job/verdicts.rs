@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use picofarm_proto::{
-    model::{
+    messages::{
         Event, EventKind, JobStatus,
         log::{VERDICT, marked},
     },
@@ -85,7 +85,8 @@ fn verdict_lines(status: &JobStatus, events: &[Event]) -> Vec<Line> {
 mod tests {
     use picofarm_proto::{
         ids::JobId,
-        model::{JobSpec, JobState, Limits, StageState, StageStatus, TaskCounts},
+        messages::{JobState, StageState, StageStatus, TaskCounts},
+        spec::{JobSpec, Limits},
     };
 
     use super::*;

@@ -3,7 +3,7 @@
 use picofarm_store::published::Manifest as _;
 use std::path::Path;
 
-use picofarm_agent::{ImportFor, NotImported, imported};
+use picofarm_tasks::{ImportFor, NotImported, imported};
 use serde_json::json;
 
 use super::open;

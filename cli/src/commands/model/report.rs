@@ -2,9 +2,9 @@
 
 use std::{fs, path::Path, time::SystemTime};
 
-use picofarm_agent::{Control, report::Collector};
-use picofarm_model::report::{Entry, Report, html, json};
+use picofarm_report::{Entry, Report, html, json};
 use picofarm_results::Models;
+use picofarm_tasks::{Control, report::Collector};
 use serde_json::json;
 use tokio::runtime::Handle;
 

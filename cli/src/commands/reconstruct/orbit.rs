@@ -1,9 +1,9 @@
 //! An animation that orbits a reconstruction.
 
-use picofarm_agent::reconstruct::{CELL, shaded};
 use picofarm_figures::animation;
 use picofarm_reconstruct::{Reconstructed, render::Renderer};
 use picofarm_scene::Camera;
+use picofarm_tasks::reconstruct::{CELL, shaded};
 
 /// Frames of the animation.
 const FRAMES: usize = 24;

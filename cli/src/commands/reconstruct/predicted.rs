@@ -2,7 +2,6 @@
 //! histogram of all spots (Shoot-Bounce-3D, appendices C and E). No ground truth is used: the input
 //! is the histogram and the positions of the spots.
 
-use picofarm_agent::reconstruct::slant;
 use picofarm_model::{Model, ModelError, cpu, input::Target, masks, scene};
 use picofarm_reconstruct::{
     Measured,
@@ -10,6 +9,7 @@ use picofarm_reconstruct::{
 };
 use picofarm_scene::Scene;
 use picofarm_store::published::Manifest as _;
+use picofarm_tasks::slant;
 use picofarm_transient::{Gate, Rendered, render};
 use serde_json::{Value, json};
 
@@ -74,7 +74,7 @@ pub async fn read(args: &Reconstruct, beams: usize) -> Result<Networks> {
                 target.name()
             )));
         }
-        let (knows, multiple) = picofarm_agent::takes(&manifest).map_err(&wrong)?;
+        let (knows, multiple) = picofarm_tasks::takes(&manifest).map_err(&wrong)?;
         if !args.resolution.is_multiple_of(multiple) {
             return Err(wrong(format!(
                 "takes images whose sides are multiples of {multiple}, --resolution is {}",

@@ -41,7 +41,7 @@ fn into(dir: &Path, made: &Made) -> Result<()> {
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))
     };
     fs::create_dir_all(dir).map_err(|e| io(dir.display(), &e))?;
-    let objects = picofarm_agent::reconstruct::density(&made.reconstructed)
+    let objects = picofarm_tasks::reconstruct::density(&made.reconstructed)
         .map_err(|e| CliError::new(Code::Resource, e))?;
     for (key, bytes) in &objects {
         let path = dir.join("density.zarr").join(key);

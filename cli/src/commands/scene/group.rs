@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use picofarm_agent::{By, encode_render, renderer_version};
 use picofarm_dataset::{
     Dataset, DatasetSpec, Profile, Quantity, RenderArray, SingleRenderParts, Subsets,
     write_single_render,
 };
+use picofarm_tasks::{By, encode_render, renderer_version};
 use picofarm_transient::Rendered;
 use serde_json::json;
 

@@ -1,8 +1,8 @@
 //! A scene file and its render settings, as `scene render` and `scene plan` read them.
 
-use picofarm_agent::SceneSize;
-use picofarm_proto::{model::RenderSettings, show};
+use picofarm_proto::{show, spec::RenderSettings};
 use picofarm_scene::{Intrinsics, Scene};
+use picofarm_tasks::SceneSize;
 use picofarm_transient::{Budget, Settings};
 
 use super::gate;
@@ -70,13 +70,13 @@ impl Order {
             seed: args.seed,
             split,
             groups: wanted.iter().flat_map(|w| w.groups.clone()).collect(),
-            ..picofarm_agent::renderer_settings(&asked)
+            ..picofarm_tasks::renderer_settings(&asked)
         };
         Ok(Self {
             scene,
             settings,
             wanted,
-            threads: args.threads.unwrap_or_else(picofarm_agent::cores).max(1),
+            threads: args.threads.unwrap_or_else(picofarm_tasks::cores).max(1),
         })
     }
 
@@ -94,17 +94,17 @@ impl Order {
 
     /// Returns the numbers of pixels, spots and bins that the memory depends on.
     pub fn size(&self) -> SceneSize {
-        picofarm_agent::scene_size(&self.scene)
+        picofarm_tasks::scene_size(&self.scene)
     }
 
     /// Returns the maximum memory of the render, in bytes.
     pub fn memory(&self) -> u64 {
-        picofarm_agent::render_bytes(&self.settings, self.size(), self.threads)
+        picofarm_tasks::render_bytes(&self.settings, self.size(), self.threads)
     }
 
     /// Checks that this memory is available.
     pub fn fits(&self) -> Result<(), String> {
-        picofarm_agent::check_memory(&self.settings, self.size(), self.threads)
+        picofarm_tasks::check_memory(&self.settings, self.size(), self.threads)
     }
 }
 

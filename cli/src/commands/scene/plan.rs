@@ -1,6 +1,6 @@
 //! `picofarm scene plan`: what a render would take, without rendering.
 
-use picofarm_proto::{model::memory::gib, show};
+use picofarm_proto::{show, spec::memory::gib};
 use picofarm_transient::{ClassVariance, Forecast, RenderError};
 use serde_json::json;
 

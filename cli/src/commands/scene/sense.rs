@@ -21,7 +21,7 @@ use crate::{
 pub async fn run(args: SceneSense, output: Output) -> Result<()> {
     let sensor = sensor::settings(&args.sensor)?;
     files::free_folder(&args.out)?;
-    let threads = args.threads.unwrap_or_else(picofarm_agent::cores).max(1);
+    let threads = args.threads.unwrap_or_else(picofarm_tasks::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()

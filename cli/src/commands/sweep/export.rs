@@ -2,7 +2,7 @@
 
 use std::{fs, path::Path};
 
-use picofarm_model::report::trials::{Sweep, Tried, Value};
+use picofarm_report::trials::{Sweep, Tried, Value};
 use serde_json::json;
 
 use crate::{

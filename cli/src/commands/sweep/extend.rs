@@ -16,8 +16,8 @@ use std::{
 
 use super::search::{Outcome, Tried, Values, tpe};
 use picofarm_proto::{
-    model::{TaskSpec, Trial},
     show,
+    spec::{TaskSpec, Trial},
 };
 use picofarm_results::TrialRecord;
 use serde_json::{Value, json};
@@ -232,7 +232,7 @@ impl NewFile {
 }
 
 /// Returns the selected sweep of a job's stages.
-fn find(stages: &[picofarm_proto::model::StageSpec], stage: Option<&str>) -> Result<Sweep> {
+fn find(stages: &[picofarm_proto::spec::StageSpec], stage: Option<&str>) -> Result<Sweep> {
     let mut sweeps: Vec<Sweep> = Vec::new();
     for spec in stages {
         let TaskSpec::Train(task) = &spec.task else {

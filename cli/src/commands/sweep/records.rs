@@ -3,10 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::search::Outcome;
-use picofarm_model::{
-    report::trials::{End, Sweep, Tried as Row, Value as Shown, error_name},
-    train::Line,
-};
+use picofarm_model::train::Line;
+use picofarm_report::trials::{End, Sweep, Tried as Row, Value as Shown, error_name};
 use picofarm_results::{Models, Rung, TrialEnd, TrialRecord};
 use serde_json::Value;
 

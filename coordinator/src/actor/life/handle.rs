@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use picofarm_catalog::CatalogError;
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::{FailureKind, JobState},
+    messages::{FailureKind, JobState},
 };
 
 use super::{Life, reports::KnownManifests};

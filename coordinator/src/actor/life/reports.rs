@@ -2,7 +2,7 @@
 
 use std::collections::{HashMap, hash_map::Entry};
 
-use picofarm_proto::{ids::StageRef, model::Finished};
+use picofarm_proto::{ids::StageRef, messages::Finished};
 
 use super::Life;
 use crate::{

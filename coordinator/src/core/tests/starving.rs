@@ -3,7 +3,8 @@
 use picofarm_catalog::RangeState;
 use picofarm_proto::{
     ids::StageRef,
-    model::{FailureKind, JobSpec, StageState},
+    messages::{FailureKind, StageState},
+    spec::JobSpec,
 };
 use proptest::prelude::*;
 

@@ -1,6 +1,6 @@
 //! Workers on which every task fails, and workers that end before their tasks do.
 
-use picofarm_proto::model::FailureKind;
+use picofarm_proto::messages::FailureKind;
 
 use super::{
     block_on,

@@ -16,10 +16,11 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, InstanceId, JobId, WorkerId},
     key::task_key,
-    model::{
-        Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, TaskAt, TaskProgress,
+    messages::{
+        Abilities, Failure, FailureKind, Finished, JobState, Lease, TaskAt, TaskProgress,
         WorkerHello,
     },
+    spec::JobSpec,
 };
 use proptest::prelude::*;
 use uuid::Uuid;

@@ -6,7 +6,7 @@ use std::{
 };
 
 use picofarm_credentials::CredentialError;
-use picofarm_proto::model::{Act, Outcome};
+use picofarm_proto::messages::{Act, Outcome};
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;

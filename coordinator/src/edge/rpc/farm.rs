@@ -14,7 +14,8 @@ use picofarm_proto::{
     PROTOCOL, compatibility,
     convert::ConvertError,
     ids::LeaseRef,
-    model::{WorkerHello, bounds},
+    messages::WorkerHello,
+    spec::bounds,
     wire::{
         self, farm_server::Farm, session_request::Message as From, session_response::Message as To,
     },

@@ -8,7 +8,8 @@ use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
     ids::JobId,
-    model::{Act, JobState, bounds},
+    messages::{Act, JobState},
+    spec::bounds,
     wire::{self, jobs_server::Jobs},
 };
 use tokio::sync::mpsc;

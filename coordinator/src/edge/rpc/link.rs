@@ -6,7 +6,8 @@ use picofarm_catalog::{Catalog, CatalogError, Specs};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
-    model::{JobState, JobStatus, SpecError, bounds},
+    messages::{JobState, JobStatus},
+    spec::{SpecError, bounds},
     wire,
 };
 use tokio::sync::{mpsc, oneshot, watch};

@@ -3,7 +3,7 @@
 use picofarm_catalog::{EventQuery, Owner, ResultSet, Sight};
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::{Event, EventKind},
+    messages::{Event, EventKind},
     wire,
 };
 use tonic::Status;

@@ -3,7 +3,7 @@
 use picofarm_catalog::{JobQuery, Sight};
 use picofarm_proto::{
     ids::JobId,
-    model::{JobSpec, StageSpec, bounds},
+    spec::{JobSpec, StageSpec, bounds},
     wire,
 };
 use tonic::Status;

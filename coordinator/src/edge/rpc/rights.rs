@@ -1,7 +1,7 @@
 //! Checks who may see and change which job, and records it in the audit log.
 
 use picofarm_catalog::Owner;
-use picofarm_proto::{ids::JobId, model::Act};
+use picofarm_proto::{ids::JobId, messages::Act};
 use tonic::Status;
 
 use super::link::{Link, broken, no_such_job};

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use picofarm_proto::{ids::JobId, model::JobState, wire};
+use picofarm_proto::{ids::JobId, messages::JobState, wire};
 use prost::Message;
 use tokio::sync::mpsc;
 use tonic::Status;

@@ -1,7 +1,7 @@
 //! Why a job's tasks do not run.
 
 use picofarm_catalog::{Exception, Holdups};
-use picofarm_proto::model::{
+use picofarm_proto::messages::{
     Event, EventKind, JobState, RunningTask, StageState, StageStatus, TaskCounts,
 };
 

@@ -3,7 +3,8 @@
 use picofarm_catalog::{LeaseState, Mark, Output, Range, RangeState, TaskRecord};
 use picofarm_proto::{
     ids::{Epoch, Incarnation, RangeId, WorkerId},
-    model::{EventKind, Limits, TaskState},
+    messages::{EventKind, TaskState},
+    spec::Limits,
 };
 use uuid::Uuid;
 

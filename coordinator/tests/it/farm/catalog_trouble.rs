@@ -4,7 +4,7 @@
 use std::{path::PathBuf, process::Command};
 
 use picofarm_database::CatalogPlace;
-use picofarm_proto::{model::JobState, wire};
+use picofarm_proto::{messages::JobState, wire};
 
 use crate::farm::harness::{Farm, catalog_of, rendering, spec};
 

@@ -19,10 +19,8 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
     key::task_key,
-    model::{
-        Abilities, JobSpec, JobState, JobStatus, Lease, RenderTask, StageSpec, TaskSpec,
-        WorkerHello,
-    },
+    messages::{Abilities, JobState, JobStatus, Lease, WorkerHello},
+    spec::{JobSpec, RenderTask, StageSpec, TaskSpec},
     wire::{
         self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
         session_response::Message as Heard,

@@ -1,6 +1,6 @@
 //! Jobs from their owner's point of view.
 
-use picofarm_proto::{model::JobState, wire};
+use picofarm_proto::{messages::JobState, wire};
 use tonic::Code;
 
 use crate::farm::harness::{Farm, hello, rendering, spec};

@@ -4,7 +4,7 @@
 use picofarm_database::{CatalogPlace, testing::hold_writes};
 use picofarm_proto::{
     ids::Incarnation,
-    model::JobState,
+    messages::JobState,
     wire::{self, session_response::Message as Heard},
 };
 use uuid::Uuid;

@@ -1,6 +1,6 @@
 //! The list of jobs over the wire: paged, latest first, without specs.
 
-use picofarm_proto::{model::bounds, wire};
+use picofarm_proto::{spec::bounds, wire};
 use prost::Message;
 use tonic::Code;
 

@@ -1,7 +1,7 @@
 //! Logs of tasks: recorded for the holder of the live lease, within the task's allowance.
 
 use picofarm_proto::{
-    model::{Lease, log},
+    messages::{Lease, log},
     wire::{self, session_request::Message as Say},
 };
 

@@ -4,7 +4,8 @@
 use picofarm_database::testing;
 use picofarm_proto::{
     key::task_key,
-    model::{JobSpec, JobState, Lease},
+    messages::{JobState, Lease},
+    spec::JobSpec,
     wire::{self, session_request::Message as Say},
 };
 use tonic::Code;

@@ -2,10 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use picofarm_proto::{
-    model::{JobSpec, JobState},
-    wire,
-};
+use picofarm_proto::{messages::JobState, spec::JobSpec, wire};
 
 use crate::farm::harness::{Farm, Worker, manifest, rendering, spec};
 

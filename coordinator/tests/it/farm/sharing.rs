@@ -2,7 +2,8 @@
 //! idle workers.
 
 use picofarm_proto::{
-    model::{JobSpec, JobState, Lease, StageState},
+    messages::{JobState, Lease, StageState},
+    spec::JobSpec,
     wire::{self, session_response::Message as Heard},
 };
 
@@ -49,7 +50,7 @@ async fn a_stage_begins_when_what_it_needs_is_done_and_each_knows_its_own() {
     let mut farm = Farm::start().await;
     let job = farm.submit(&graph()).await.job_id;
     let mut worker = farm.worker().await;
-    let states = |status: &picofarm_proto::model::JobStatus| -> Vec<_> {
+    let states = |status: &picofarm_proto::messages::JobStatus| -> Vec<_> {
         status.stages.iter().map(|s| s.state).collect()
     };
     let status = farm.status(&job).await;

@@ -2,7 +2,7 @@
 
 use picofarm_coordinator::{CoordinatorConfig, CoordinatorError, serve};
 use picofarm_database::CatalogPlace;
-use picofarm_proto::model::JobState;
+use picofarm_proto::messages::JobState;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 

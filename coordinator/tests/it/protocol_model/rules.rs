@@ -26,7 +26,7 @@ pub struct Rules {
     /// `core/commit.rs`.
     pub commit_checks_lease: bool,
     /// A worker reports a task only after it has stored the objects and then the manifest. Enforced
-    /// by `worker/agent/src/execute/kinds/render.rs` over `storage/dataset/src/scenes/publish.rs`.
+    /// by `worker/tasks/src/kinds/render.rs` over `storage/dataset/src/scenes/publish.rs`.
     pub store_precedes_report: bool,
     /// A worker that finds a manifest treats the task as finished only if the objects exist.
     /// Otherwise it renders again. Enforced by `storage/dataset/src/scenes/publish.rs`

@@ -9,7 +9,7 @@ use picofarm_coordinator::{
 };
 use picofarm_database::{CatalogPlace, testing};
 use picofarm_proto::{
-    model::JobSpec,
+    spec::JobSpec,
     wire::{self, farm_client::FarmClient, jobs_client::JobsClient},
 };
 use tokio_util::sync::CancellationToken;

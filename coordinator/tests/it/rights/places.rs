@@ -2,7 +2,7 @@
 
 use picofarm_coordinator::auth::Visibility;
 use picofarm_proto::{
-    model::{JobSpec, TaskSpec},
+    spec::{JobSpec, TaskSpec},
     wire,
 };
 use tonic::Code;

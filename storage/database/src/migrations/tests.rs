@@ -3,10 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use picofarm_catalog::{Catalog, JobRecord, ResultSet};
-use picofarm_proto::{
-    ids::JobId,
-    model::{JobSpec, JobState},
-};
+use picofarm_proto::{ids::JobId, messages::JobState, spec::JobSpec};
 use sha2::{Digest, Sha256};
 use sqlx::{Connection, SqliteConnection};
 use uuid::Uuid;

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::EventKind,
+    messages::EventKind,
 };
 
 use sqlx::PgConnection;

@@ -23,7 +23,7 @@ use std::{sync::Mutex, time::Duration};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{InstanceId, JobId, StageRef, WorkerId},
-    model::{Event, JobState, TaskCounts},
+    messages::{Event, JobState, TaskCounts},
 };
 use sqlx::{Connection, PgPool, postgres::PgRow};
 use uuid::Uuid;

@@ -2,7 +2,7 @@
 //! coordinator's life, because an entry from a fenced coordinator is also true.
 
 use async_trait::async_trait;
-use picofarm_proto::{ids::JobId, model::AuditEntry};
+use picofarm_proto::{ids::JobId, messages::AuditEntry};
 
 use super::{PostgresCatalog, rights_query};
 use picofarm_catalog::{AuditQuery, CatalogError, NewAudit, OwnedPlace, Owner, ResultSet, Rights};

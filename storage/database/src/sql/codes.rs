@@ -1,6 +1,6 @@
 //! The codes in columns that SQLite and Postgres share.
 
-use picofarm_proto::model::{EventKind, JobState, StageState};
+use picofarm_proto::messages::{EventKind, JobState, StageState};
 
 use picofarm_catalog::Mark;
 

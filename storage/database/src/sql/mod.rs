@@ -30,10 +30,7 @@ pub(crate) use history;
 macro_rules! queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod query {
-            use picofarm_proto::{
-                ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
-                model::{Event, EventKind},
-            };
+            use picofarm_proto::{ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId}, messages::{Event, EventKind}};
             use sqlx::Row;
 
             use picofarm_catalog::{EventQuery, Exception, LeaseState, Mark, Output, Range, RangeState, ResultSet, Run, TaskRecord, Worker, Gone, Recorded};

@@ -16,7 +16,7 @@ use std::{collections::BTreeMap, path::PathBuf};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{InstanceId, JobId, StageRef, WorkerId},
-    model::{Event, JobState, TaskCounts},
+    messages::{Event, JobState, TaskCounts},
 };
 use sqlx::{Connection, SqlitePool, sqlite::SqliteRow};
 use tokio::sync::Mutex;

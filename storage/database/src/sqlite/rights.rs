@@ -1,7 +1,7 @@
 //! Owners of jobs and the audit log, in SQLite.
 
 use async_trait::async_trait;
-use picofarm_proto::{ids::JobId, model::AuditEntry};
+use picofarm_proto::{ids::JobId, messages::AuditEntry};
 
 use super::{SqliteCatalog, rights_query};
 use picofarm_catalog::{AuditQuery, CatalogError, NewAudit, OwnedPlace, Owner, ResultSet, Rights};

@@ -10,7 +10,8 @@ use picofarm_catalog::{
 use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
 use picofarm_proto::{
     ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
-    model::{EventKind, JobSpec, JobState},
+    messages::{EventKind, JobState},
+    spec::JobSpec,
 };
 use uuid::Uuid;
 

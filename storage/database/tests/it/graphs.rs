@@ -8,7 +8,7 @@ use picofarm_catalog::{
 use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    model::{EventKind, JobState, StageState},
+    messages::{EventKind, JobState, StageState},
 };
 use uuid::Uuid;
 

@@ -12,7 +12,8 @@ use picofarm_catalog::{
 use picofarm_database::{CatalogPlace, testing};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    model::{EventKind, JobSpec, JobState},
+    messages::{EventKind, JobState},
+    spec::JobSpec,
 };
 use uuid::Uuid;
 

@@ -8,7 +8,8 @@ use picofarm_catalog::{
 use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
 use picofarm_proto::{
     ids::JobId,
-    model::{Act, EventKind, JobSpec, JobState, Outcome},
+    messages::{Act, EventKind, JobState, Outcome},
+    spec::JobSpec,
 };
 use uuid::Uuid;
 

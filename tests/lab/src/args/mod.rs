@@ -97,7 +97,7 @@ pub struct Render {
     pub truth: Option<PathBuf>,
     /// Errors to give the time for; the stopping rule is tried with the first
     #[arg(long, value_delimiter = ',', default_value = "10%,5%,2%", value_name = "E,…",
-          value_parser = picofarm_proto::model::parse_share)]
+          value_parser = picofarm_proto::spec::parse_share)]
     pub error: Vec<f64>,
     /// Threads of the measured renders (the converged one uses all cores)
     #[arg(long, default_value_t = 1, value_parser = ranges::threads)]

@@ -14,7 +14,7 @@ use std::{
 };
 
 use picofarm_database::CatalogPlace;
-use picofarm_proto::model::{JobSpec, JobState};
+use picofarm_proto::{messages::JobState, spec::JobSpec};
 use serde::Serialize;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;

@@ -53,7 +53,7 @@ impl Server {
     }
 
     pub async fn client(&self) -> Result<Client> {
-        Client::connect(&self.url, &picofarm_agent::Access::default()).await
+        Client::connect(&self.url, &picofarm_tasks::Access::default()).await
     }
 
     /// Kills the process and starts another on the same catalog. Returns the resources used by the

@@ -11,7 +11,7 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, LeaseRef, WorkerId},
     key::{StageKey, task_key},
-    model::{Abilities, Finished, Lease, WorkerHello},
+    messages::{Abilities, Finished, Lease, WorkerHello},
     wire::{
         self, farm_client::FarmClient, session_request::Message as Say,
         session_response::Message as Heard,
@@ -122,7 +122,7 @@ impl Simulated {
             Ok(response) => response.into_inner(),
             Err(status)
                 if status.code() == tonic::Code::Unavailable
-                    || picofarm_agent::lost_connection(&status) =>
+                    || picofarm_tasks::lost_connection(&status) =>
             {
                 return End::Lost;
             }

@@ -59,7 +59,7 @@ impl<'a> Bench<'a> {
         output: Output,
         stop: &'a CancellationToken,
     ) -> Result<Self> {
-        let threads = threads.unwrap_or_else(picofarm_agent::cores).max(1);
+        let threads = threads.unwrap_or_else(picofarm_tasks::cores).max(1);
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .build()

@@ -95,7 +95,7 @@ pub async fn run(
     let (stop, runtime) = (stop.clone(), Handle::current());
     let work = move || -> Result<Report> {
         let rows = rows(&codecs, &samples, output, &stop)?;
-        let cores = picofarm_agent::cores();
+        let cores = picofarm_tasks::cores();
         let mut threads = vec![1, 2.min(cores), cores];
         threads.dedup();
         let reading = match args.no_reading {

@@ -2,11 +2,11 @@
 
 use std::{net::SocketAddr, path::Path};
 
-use picofarm_agent::Access;
 use picofarm_dataset::{Dataset, Profile};
-use picofarm_proto::model::{
+use picofarm_proto::spec::{
     Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, Spots,
 };
+use picofarm_tasks::Access;
 use tokio_util::sync::CancellationToken;
 
 use super::sample::Sample;

@@ -29,7 +29,7 @@ impl MomentShape {
 
     /// Returns the index of the moment at distance `by` − 1 from moment `at`, if it is in the same
     /// image; `by` is 0, 1 or 2.
-    fn beside(&self, at: usize, by: usize) -> Option<usize> {
+    fn adjacent(&self, at: usize, by: usize) -> Option<usize> {
         let moment = (at % self.moments + by).checked_sub(1)?;
         (moment < self.moments).then(|| at / self.moments * self.moments + moment)
     }
@@ -38,7 +38,7 @@ impl MomentShape {
 impl Kernels {
     /// Concatenates the values of the moments before, at and after each, with zeros beyond the
     /// ends. Writes all of `out`, which is three times as long as `x`.
-    pub fn beside(self, s: &MomentShape, x: &[f32], out: &mut [f32]) {
+    pub fn adjacent(self, s: &MomentShape, x: &[f32], out: &mut [f32]) {
         assert_eq!((x.len(), out.len()), (s.len(), 3 * s.len()), "lengths");
         if s.is_empty() {
             return;
@@ -46,7 +46,7 @@ impl Kernels {
         let each = out.par_chunks_exact_mut(3 * s.values).enumerate();
         each.for_each(|(at, out)| {
             for (by, out) in out.chunks_exact_mut(s.values).enumerate() {
-                match s.beside(at, by) {
+                match s.adjacent(at, by) {
                     Some(from) => out.copy_from_slice(&x[from * s.values..][..s.values]),
                     None => out.fill(0.0),
                 }
@@ -54,8 +54,8 @@ impl Kernels {
         });
     }
 
-    /// Computes the gradient of [`Kernels::beside`]. Writes all of `dx`.
-    pub fn beside_grad(self, s: &MomentShape, dy: &[f32], dx: &mut [f32]) {
+    /// Computes the gradient of [`Kernels::adjacent`]. Writes all of `dx`.
+    pub fn adjacent_grad(self, s: &MomentShape, dy: &[f32], dx: &mut [f32]) {
         assert_eq!((dx.len(), dy.len()), (s.len(), 3 * s.len()), "lengths");
         if s.is_empty() {
             return;
@@ -64,7 +64,7 @@ impl Kernels {
         each.for_each(|(at, dx)| {
             // A moment is the first of three for the next one, and the last for the previous one.
             let part = |by: usize| {
-                let of = s.beside(at, by)?;
+                let of = s.adjacent(at, by)?;
                 Some(&dy[(3 * of + 2 - by) * s.values..][..s.values])
             };
             self.run(Sum {

@@ -10,6 +10,7 @@ use burn::tensor::Tensor;
 
 use super::{
     downsample::Downsample,
+    network::Network,
     pass::{Input, Pass},
     rendering::{Rendering, by_channel, normalised},
     spec::NetSpec,
@@ -36,5 +37,30 @@ impl Embeddings {
         let rows = volume.dims()[2];
         let volume = normalised(by_channel(volume, time));
         self.depth.forward(pass, volume, rows)
+    }
+}
+
+impl Network for Embeddings {
+    const OVER_TIME: bool = true;
+
+    fn build(d: &mut Declarations, spec: &NetSpec) -> Self {
+        Self::declare(d, spec)
+    }
+
+    fn multiple(_spec: &NetSpec) -> (usize, &'static str, String) {
+        (2, "net.architecture", "embeddings halve the image".into())
+    }
+
+    fn multiply_adds(spec: &NetSpec, side: usize) -> f64 {
+        let (streams, width) = (spec.streams(), spec.width);
+        spec.of_downsample(side, width) + spec.of_rendering(side, width + streams)
+    }
+
+    fn describe(spec: &NetSpec) -> String {
+        format!("learned feature embeddings, width {}", spec.width)
+    }
+
+    fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        Self::forward(self, pass, input)
     }
 }

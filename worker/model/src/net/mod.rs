@@ -5,6 +5,7 @@ mod cost;
 mod downsample;
 mod embeddings;
 mod layer;
+mod network;
 mod nlost;
 mod pass;
 mod rendering;
@@ -15,7 +16,7 @@ mod unet25d;
 mod unet2d;
 mod volume;
 
-use std::ops::Range;
+use std::{ops::Range, sync::Arc};
 
 use burn::tensor::Tensor;
 
@@ -27,11 +28,7 @@ use crate::{
     ModelError,
     parameters::{Declarations, Declared},
 };
-use embeddings::Embeddings;
-use nlost::Nlost;
-use swinir::Swinir;
-use unet2d::Unet2d;
-use unet25d::Unet25d;
+use network::{AnyNetwork, registered};
 
 /// A network without its parameters' values.
 #[derive(Debug, Clone)]
@@ -39,16 +36,7 @@ pub struct Net {
     spec: NetSpec,
     declared: Vec<Declared>,
     segments: Vec<Range<usize>>,
-    body: Body,
-}
-
-#[derive(Debug, Clone)]
-enum Body {
-    Unet2d(Unet2d),
-    Unet25d(Unet25d),
-    Swinir(Swinir),
-    Embeddings(Box<Embeddings>),
-    Nlost(Box<Nlost>),
+    network: Arc<dyn AnyNetwork>,
 }
 
 impl Net {
@@ -59,16 +47,7 @@ impl Net {
     pub fn new(spec: NetSpec) -> Result<Self, ModelError> {
         spec.check()?;
         let mut declarations = Declarations::default();
-        let body = match spec.architecture {
-            Architecture::Unet2d => Body::Unet2d(Unet2d::declare(&mut declarations, &spec)),
-            Architecture::Unet25d => Body::Unet25d(Unet25d::declare(&mut declarations, &spec)),
-            Architecture::Swinir => Body::Swinir(Swinir::declare(&mut declarations, &spec)),
-            Architecture::Embeddings => {
-                let net = Embeddings::declare(&mut declarations, &spec);
-                Body::Embeddings(Box::new(net))
-            }
-            Architecture::Nlost => Body::Nlost(Box::new(Nlost::declare(&mut declarations, &spec))),
-        };
+        let network = (registered(spec.architecture).build)(&mut declarations, &spec);
         let begins = std::iter::once(0).chain(declarations.cuts.iter().copied());
         let ends = declarations.cuts.iter().copied();
         let ends = ends.chain([declarations.list.len()]);
@@ -76,7 +55,7 @@ impl Net {
             spec,
             segments: begins.zip(ends).map(|(begin, end)| begin..end).collect(),
             declared: declarations.list,
-            body,
+            network,
         })
     }
 
@@ -111,12 +90,6 @@ impl Net {
         );
         assert_eq!(input.one_hot.is_some(), self.spec.one_hot > 0);
         pass.compute_in(self.spec.precision);
-        match &self.body {
-            Body::Unet2d(net) => net.forward(pass, input),
-            Body::Unet25d(net) => net.forward(pass, input, self.spec.frozen),
-            Body::Swinir(net) => net.forward(pass, input),
-            Body::Embeddings(net) => net.forward(pass, input),
-            Body::Nlost(net) => net.forward(pass, input),
-        }
+        self.network.forward(pass, input)
     }
 }

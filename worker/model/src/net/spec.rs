@@ -3,7 +3,7 @@
 pub use picofarm_settings::{Architecture, Precision, StemForm, Swin, TimeProjection};
 use serde::{Deserialize, Serialize};
 
-use super::nlost;
+use super::network::registered;
 use crate::ModelError;
 
 /// The shape of a network.
@@ -78,34 +78,18 @@ impl NetSpec {
 
     /// Returns the required divisor of width and height.
     pub fn multiple(&self) -> usize {
-        match self.architecture {
-            Architecture::Unet2d | Architecture::Unet25d => 1 << (self.levels - 1),
-            Architecture::Swinir => self.swin.window as usize,
-            Architecture::Embeddings => 2,
-            Architecture::Nlost => 2 * nlost::WINDOW,
-        }
+        (registered(self.architecture).multiple)(self).0
     }
 
     /// Returns the reason for [`Self::multiple`], and the setting that determines it.
     pub fn why_multiple(&self) -> (&'static str, String) {
-        match self.architecture {
-            Architecture::Unet2d | Architecture::Unet25d => {
-                let what = format!("{} halve the image {} times", self.levels, self.levels - 1);
-                ("net.levels", what)
-            }
-            Architecture::Swinir => {
-                let what = format!("windows have {0}×{0} pixels", self.swin.window);
-                ("net.swin.window", what)
-            }
-            Architecture::Embeddings => ("net.architecture", "embeddings halve the image".into()),
-            Architecture::Nlost => {
-                let what = format!(
-                    "nlost halves the image, and windows have {0}×{0} pixels of that",
-                    nlost::WINDOW
-                );
-                ("net.architecture", what)
-            }
-        }
+        let (_, setting, what) = (registered(self.architecture).multiple)(self);
+        (setting, what)
+    }
+
+    /// Describes the network for reports.
+    pub fn describe(&self) -> String {
+        (registered(self.architecture).describe)(self)
     }
 
     /// Returns the number of input streams of networks with a time dimension: the measurement, and
@@ -119,74 +103,41 @@ impl NetSpec {
     /// # Errors
     /// [`ModelError::Invalid`] naming the field.
     pub fn check(&self) -> Result<(), ModelError> {
-        let within = |field: &str, value: usize, least: usize, most: usize| {
-            if (least..=most).contains(&value) {
-                return Ok(());
-            }
-            let what = format!("{value} lies outside {least}..={most}");
-            Err(ModelError::invalid(format!("net.{field}"), what))
-        };
-        within("dense", self.dense, 1, 16_384)?;
-        within("one_hot", self.one_hot, 0, 16_384)?;
-        within("outputs", self.outputs, 1, 1_024)?;
-        within("width", self.width, 1, 1_024)?;
-        within("levels", self.levels, 2, 8)?;
-        within("stem", self.stem, 0, 4_096)?;
-        if self.architecture == Architecture::Unet25d {
-            within("time", self.time, 1, 4_096)?;
-            let divisor = 1 << (self.levels - 1);
-            if !self.time.is_multiple_of(divisor) {
-                let what = format!(
-                    "{} must be a multiple of {divisor}: it is halved {} times (levels - 1)",
-                    self.time,
-                    self.levels - 1
-                );
-                return Err(ModelError::invalid("net.time_features", what));
-            }
-            if self.stem != 0 {
-                return Err(ModelError::invalid("net.stem", "is for unet2d; remove it"));
-            }
-        }
-        let timed = matches!(
-            self.architecture,
-            Architecture::Unet25d | Architecture::Embeddings | Architecture::Nlost
-        );
-        if timed && self.one_hot != 0 && self.one_hot != self.dense {
+        self.check_within("dense", self.dense, 1, 16_384)?;
+        self.check_within("one_hot", self.one_hot, 0, 16_384)?;
+        self.check_within("outputs", self.outputs, 1, 1_024)?;
+        self.check_within("width", self.width, 1, 1_024)?;
+        self.check_within("levels", self.levels, 2, 8)?;
+        self.check_within("stem", self.stem, 0, 4_096)?;
+        let network = registered(self.architecture);
+        if network.over_time && self.one_hot != 0 && self.one_hot != self.dense {
             let what = "the two streams of a network over time must have the same bins";
             return Err(ModelError::invalid("net.one_hot", what));
         }
-        self.check_other()
-    }
-
-    /// Checks the settings of networks other than U-Nets.
-    fn check_other(&self) -> Result<(), ModelError> {
-        if matches!(
-            self.architecture,
-            Architecture::Unet2d | Architecture::Unet25d
-        ) {
-            return Ok(());
-        }
-        if self.stem != 0 {
+        if self.stem != 0 && !network.has_stem {
             return Err(ModelError::invalid("net.stem", "is for unet2d; remove it"));
         }
-        if self.frozen {
+        if self.frozen && !network.has_encoder {
             let what = "a frozen encoder with a decoder of its own is for unet2d and unet25d";
             return Err(ModelError::invalid("net.frozen", what));
         }
-        if self.architecture == Architecture::Nlost && !self.width.is_multiple_of(nlost::HEADS) {
-            let what = format!(
-                "{} must be a multiple of {}: heads and scales share it",
-                self.width,
-                nlost::HEADS
-            );
-            return Err(ModelError::invalid("net.width", what));
+        (network.check)(self)
+    }
+
+    /// Checks that a field lies within its limits.
+    #[expect(clippy::unused_self, reason = "as the other checks are called")]
+    pub(super) fn check_within(
+        &self,
+        field: &str,
+        value: usize,
+        least: usize,
+        most: usize,
+    ) -> Result<(), ModelError> {
+        if (least..=most).contains(&value) {
+            return Ok(());
         }
-        if self.architecture == Architecture::Swinir {
-            self.swin
-                .check(self.width)
-                .map_err(|(field, what)| ModelError::invalid(format!("net.{field}"), what))?;
-        }
-        Ok(())
+        let what = format!("{value} lies outside {least}..={most}");
+        Err(ModelError::invalid(format!("net.{field}"), what))
     }
 }
 

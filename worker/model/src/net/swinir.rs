@@ -8,17 +8,18 @@ use burn::tensor::Tensor;
 
 use super::{
     layer::{Conv, Dense, LayerNorm, table},
+    network::Network,
     pass::{Input, Pass},
     spec::{NetSpec, Swin},
 };
 use crate::{
-    ops,
+    ModelError, ops,
     parameters::{Declarations, Id},
 };
 
 /// The ratio of the channels between the two layers of a block's perceptron to those of the
 /// features.
-pub(super) const BETWEEN: usize = 2;
+const BETWEEN: usize = 2;
 
 #[derive(Debug, Clone)]
 pub(super) struct Swinir {
@@ -102,6 +103,48 @@ impl Swinir {
         let x = channels_first(self.norm.forward(pass, x));
         let x = self.after.forward(pass, x, None) + first;
         self.last.forward(pass, x, None)
+    }
+}
+
+impl Network for Swinir {
+    const OVER_TIME: bool = false;
+
+    fn build(d: &mut Declarations, spec: &NetSpec) -> Self {
+        Self::declare(d, spec)
+    }
+
+    fn multiple(spec: &NetSpec) -> (usize, &'static str, String) {
+        let what = format!("windows have {0}×{0} pixels", spec.swin.window);
+        (spec.swin.window as usize, "net.swin.window", what)
+    }
+
+    fn check(spec: &NetSpec) -> Result<(), ModelError> {
+        let checked = spec.swin.check(spec.width);
+        checked.map_err(|(field, what)| ModelError::invalid(format!("net.{field}"), what))
+    }
+
+    fn multiply_adds(spec: &NetSpec, side: usize) -> f64 {
+        let (e, swin) = (spec.width, &spec.swin);
+        let convolutions =
+            spec.dense + spec.one_hot + e * (swin.groups as usize + 1) + spec.outputs;
+        let tokens = (swin.window as usize).pow(2);
+        // Queries, keys, values and the output layer; the perceptron; scores and the weighted sums
+        // of values.
+        let block = 4 * e * e + 2 * BETWEEN * e * e + 2 * tokens * e;
+        let blocks = (swin.groups * swin.depth) as usize;
+        ((9 * e * convolutions + blocks * block) * side * side) as f64
+    }
+
+    fn describe(spec: &NetSpec) -> String {
+        let swin = &spec.swin;
+        format!(
+            "SwinIR, width {}, {} groups of {} blocks, {} heads, windows {4}×{4}",
+            spec.width, swin.groups, swin.depth, swin.heads, swin.window
+        )
+    }
+
+    fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        Self::forward(self, pass, input)
     }
 }
 

@@ -10,12 +10,13 @@ use burn::tensor::{Tensor, activation::relu};
 
 use super::{
     block::{Linear, norm},
+    network::Network,
     pass::{Input, Norm, Pass},
     spec::{NetSpec, TimeProjection},
     unet2d::{Decoder, hand_on, is_bottleneck},
 };
 use crate::{
-    ops,
+    ModelError, ops,
     parameters::{Begin, Declarations, Id},
 };
 
@@ -28,6 +29,7 @@ pub(super) struct Unet25d {
     encoders: Vec<[Cbr; 2]>,
     /// The projections of each level's moments to one.
     skips: Vec<Vec<Linear>>,
+    frozen: bool,
     decoder: Decoder,
 }
 
@@ -85,12 +87,13 @@ impl Unet25d {
             projections,
             encoders,
             skips,
+            frozen: spec.frozen,
             decoder: Decoder::declare(d, &spec.widths(), spec.outputs),
         }
     }
 
-    pub(super) fn forward(&self, pass: &mut Pass, input: Input, frozen: bool) -> Tensor<4> {
-        let features = match frozen {
+    pub(super) fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        let features = match self.frozen {
             true => pass.frozen(|pass| self.features(pass, input, true)),
             false => self.features(pass, input, false),
         };
@@ -137,6 +140,58 @@ impl Unet25d {
     }
 }
 
+impl Network for Unet25d {
+    const HAS_ENCODER: bool = true;
+    const OVER_TIME: bool = true;
+
+    fn build(d: &mut Declarations, spec: &NetSpec) -> Self {
+        Self::declare(d, spec)
+    }
+
+    fn multiple(spec: &NetSpec) -> (usize, &'static str, String) {
+        let what = format!("{} halve the image {} times", spec.levels, spec.levels - 1);
+        (1 << (spec.levels - 1), "net.levels", what)
+    }
+
+    fn check(spec: &NetSpec) -> Result<(), ModelError> {
+        spec.check_within("time", spec.time, 1, 4_096)?;
+        let divisor = 1 << (spec.levels - 1);
+        if spec.time.is_multiple_of(divisor) {
+            return Ok(());
+        }
+        let what = format!(
+            "{} must be a multiple of {divisor}: it is halved {} times (levels - 1)",
+            spec.time,
+            spec.levels - 1
+        );
+        Err(ModelError::invalid("net.time_features", what))
+    }
+
+    fn multiply_adds(spec: &NetSpec, side: usize) -> f64 {
+        let streams = spec.streams();
+        let mut sum = (streams * spec.dense * spec.time * side * side) as f64;
+        let mut inputs = streams;
+        for (level, width) in spec.widths().into_iter().enumerate() {
+            let (pixels, time) = ((side >> level).pow(2), spec.time >> level);
+            let between = inputs.max(width / 2);
+            sum += (27 * (inputs + width) * between * pixels * time) as f64;
+            let sizes = steps(time);
+            let over_time: usize = sizes.windows(2).map(|pair| pair[0] * pair[1]).sum();
+            sum += (over_time * width * pixels) as f64;
+            inputs = width;
+        }
+        sum + spec.of_decoder(side)
+    }
+
+    fn describe(spec: &NetSpec) -> String {
+        format!("2.5D U-Net, width {}, {} levels", spec.width, spec.levels)
+    }
+
+    fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        Self::forward(self, pass, input)
+    }
+}
+
 /// Maps (N·T, C, H, W) to (N, C, H, W) through layers over time, with ReLU between them.
 fn project(pass: &Pass, x: Tensor<4>, time: usize, layers: &[Linear]) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
@@ -179,7 +234,7 @@ impl Cbr {
 
     fn forward(&self, pass: &mut Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
         let c = x.dims()[1];
-        let beside = ops::beside(x, time);
+        let beside = ops::adjacent(x, time);
         let weight: Tensor<5> = pass.get(self.weight);
         let outputs = weight.dims()[0];
         let weight = weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3]);

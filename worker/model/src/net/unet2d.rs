@@ -4,6 +4,7 @@ use burn::tensor::{Int, Tensor};
 
 use super::{
     block::{Block, Cbr, Final, Linear},
+    network::Network,
     pass::{Input, Pass},
     spec::{NetSpec, StemForm},
 };
@@ -92,6 +93,51 @@ impl Unet2d {
             false => self.features(pass, input),
         };
         self.decoder.forward(pass, features)
+    }
+}
+
+impl Network for Unet2d {
+    const HAS_ENCODER: bool = true;
+    const HAS_STEM: bool = true;
+    const OVER_TIME: bool = false;
+
+    fn build(d: &mut Declarations, spec: &NetSpec) -> Self {
+        Self::declare(d, spec)
+    }
+
+    fn multiple(spec: &NetSpec) -> (usize, &'static str, String) {
+        let what = format!("{} halve the image {} times", spec.levels, spec.levels - 1);
+        (1 << (spec.levels - 1), "net.levels", what)
+    }
+
+    fn multiply_adds(spec: &NetSpec, side: usize) -> f64 {
+        let of = |inputs: usize, outputs: usize, level: usize| {
+            let pixels = (side >> level).pow(2);
+            (9 * inputs * outputs * pixels) as f64
+        };
+        let mut inputs = spec.dense + spec.one_hot;
+        let mut sum = 0.0;
+        if spec.stem > 0 {
+            sum += match spec.stem_form {
+                StemForm::Block => of(inputs, spec.stem, 0),
+                StemForm::Linear => of(inputs, spec.stem, 0) / 9.0,
+            };
+            inputs = spec.stem;
+        }
+        for (level, width) in spec.widths().iter().enumerate() {
+            let between = inputs.max(width / 2);
+            sum += of(inputs, between, level) + of(between, *width, level);
+            inputs = *width;
+        }
+        sum + spec.of_decoder(side)
+    }
+
+    fn describe(spec: &NetSpec) -> String {
+        format!("2D U-Net, width {}, {} levels", spec.width, spec.levels)
+    }
+
+    fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        Self::forward(self, pass, input)
     }
 }
 

@@ -49,7 +49,7 @@ fn seen(x: Tensor<4>, time: usize, seen: Seen) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     let (n, moments) = (images / time, seen.moments(time));
     if seen.taps == 3 && seen.apart == 1 {
-        let beside = ops::beside(x, time);
+        let beside = ops::adjacent(x, time);
         return match seen.stride {
             1 => beside,
             _ => every_second(beside, time),
@@ -203,7 +203,7 @@ pub(super) fn doubled_in_time(
         .flip([2, 4, 5])
         .permute([3, 1, 2, 0, 4, 5])
         .reshape([2 * o, 3 * c, 3, 3]);
-    let y = conv3x3(pass, ops::beside(x, time), weight);
+    let y = conv3x3(pass, ops::adjacent(x, time), weight);
     y.reshape([2 * images, o, h, w])
 }
 
@@ -222,7 +222,7 @@ pub(super) fn doubled_in_space(
         .flip([2, 3, 5])
         .permute([4, 6, 1, 2, 0, 3, 5])
         .reshape([4 * o, 3 * c, 3, 3]);
-    let y = conv3x3(pass, ops::beside(x, time), weight);
+    let y = conv3x3(pass, ops::adjacent(x, time), weight);
     y.reshape([images, 2, 2, o, h, w])
         .permute([0, 3, 4, 1, 5, 2])
         .reshape([images, o, 2 * h, 2 * w])

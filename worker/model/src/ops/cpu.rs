@@ -53,7 +53,7 @@ pub trait NetOps: Backend {
     fn crop(x: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self>;
     fn leaky_relu(x: FloatTensor<Self>, slope: f32) -> FloatTensor<Self>;
     fn taps(x: FloatTensor<Self>, repeated: bool) -> FloatTensor<Self>;
-    fn beside(x: FloatTensor<Self>, moments: usize) -> FloatTensor<Self>;
+    fn adjacent(x: FloatTensor<Self>, moments: usize) -> FloatTensor<Self>;
     fn halve_time(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn adamw(
         p: FloatTensor<Self>,
@@ -346,12 +346,12 @@ impl NetOps for Flex {
         })
     }
 
-    fn beside(x: Cpu, moments: usize) -> Cpu {
+    fn adjacent(x: Cpu, moments: usize) -> Cpu {
         let x = contiguous(x);
         let [n, c, h, w] = dims(&x);
         let s = moment_shape([n, c, h, w], moments);
         made([n, 3 * c, h, w], |out| {
-            Kernels::best().beside(&s, values(&x), out);
+            Kernels::best().adjacent(&s, values(&x), out);
         })
     }
 

@@ -195,7 +195,7 @@ impl Backward<Flex, 1> for Beside {
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = grads.consume::<Flex>(&ops.node);
         let [to_x] = ops.parents;
-        give!(grads, to_x, gradient::beside_grad(dy, ops.state));
+        give!(grads, to_x, gradient::adjacent_grad(dy, ops.state));
     }
 }
 
@@ -335,8 +335,8 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
         Tracked::new(Flex::taps(x.into_primitive(), repeated))
     }
 
-    fn beside(x: Tracked, moments: usize) -> Tracked {
-        let y = Flex::beside(x.primitive().clone(), moments);
+    fn adjacent(x: Tracked, moments: usize) -> Tracked {
+        let y = Flex::adjacent(x.primitive().clone(), moments);
         match Beside.prepare::<C>([x.node()]).compute_bound().stateful() {
             OpsKind::Tracked(to) => to.finish(moments, y),
             OpsKind::UnTracked(to) => to.finish(y),

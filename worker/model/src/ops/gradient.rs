@@ -165,12 +165,12 @@ pub(super) fn gelu_grad(x: Cpu, dy: Cpu) -> Cpu {
 }
 
 /// Returns the gradient of the input.
-pub(super) fn beside_grad(dy: Cpu, moments: usize) -> Cpu {
+pub(super) fn adjacent_grad(dy: Cpu, moments: usize) -> Cpu {
     let dy = contiguous(dy);
     let [n, c, h, w] = dims(&dy);
     let s = moment_shape([n, c / 3, h, w], moments);
     made([n, c / 3, h, w], |dx| {
-        Kernels::best().beside_grad(&s, values(&dy), dx);
+        Kernels::best().adjacent_grad(&s, values(&dy), dx);
     })
 }
 

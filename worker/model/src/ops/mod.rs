@@ -191,11 +191,11 @@ pub fn leaky_relu(x: Tensor<4>, slope: f32) -> Tensor<4> {
 
 /// Concatenates the channels of the moments before, at and after each, for images of `moments` each
 /// (N·T, C, H, W): (N·T, 3·C, H, W), with zeros beyond the first and the last.
-pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
+pub fn adjacent(x: Tensor<4>, moments: usize) -> Tensor<4> {
     if !has_kernels(&x.device()) {
-        return plain::beside(x, moments);
+        return plain::adjacent(x, moments);
     }
-    Tensor::from_dispatch(Dispatch::beside(x.into_dispatch(), moments))
+    Tensor::from_dispatch(Dispatch::adjacent(x.into_dispatch(), moments))
 }
 
 /// The greater value of each two consecutive images, (N, C, H, W) to (N/2, C, H, W). Of equal

@@ -203,8 +203,8 @@ pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     x.narrow(2, 1, h - 2).narrow(3, 1, w - 2) + bias.reshape([1, c, 1, 1])
 }
 
-/// See [`super::beside`].
-pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
+/// See [`super::adjacent`].
+pub fn adjacent(x: Tensor<4>, moments: usize) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     let n = images / moments;
     let dark = Tensor::<5>::zeros([n, 1, c, h, w], &x.device()).cast(x.dtype());

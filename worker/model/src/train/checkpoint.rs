@@ -45,7 +45,7 @@ pub struct Snapshot {
 impl Snapshot {
     /// Takes a snapshot. `kept` contains the values at the best validation, if the training returns
     /// those.
-    pub(super) fn of(
+    pub(super) fn take(
         learner: &Learner,
         position: &Position,
         kept: Option<&Parameters>,

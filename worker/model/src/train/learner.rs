@@ -1,10 +1,12 @@
 //! A network with its parameters and the optimiser's state, trained step by step.
 
 use burn::tensor::{Device, Tensor};
+
 use rayon::{iter::ParallelIterator, slice::ParallelSlice};
 
 use super::{
-    group::{Block, Blocks},
+    gradients::{Gradients, Summed},
+    group::Block,
     loss::{Loss, loss},
     schedule::Pace,
 };
@@ -64,47 +66,10 @@ pub(super) struct Forward {
     pub(super) cuts: Vec<Cut>,
 }
 
-/// The gradients of a step's batches, summed as [`Blocks`] are.
-#[derive(Default)]
-pub struct Gradients {
-    pub(super) blocks: Blocks<Summed>,
-    /// The running statistics after the step's first batch, if the sum includes it.
-    pub(super) moved: Vec<(Id, Tensor<1>)>,
-    /// The loss of the batch added last.
-    pub(super) latest: Option<Loss>,
-}
-
 /// A batch on a learner's device.
 pub struct Brought {
     input: Input,
     target: Vec<f32>,
-}
-
-/// Gradients and losses summed over batches. There is a gradient for each declared parameter; it is
-/// `None` if the parameter is not learned.
-pub(super) struct Summed {
-    pub(super) gradients: Vec<Option<Tensor<1>>>,
-    pub(super) losses: Loss,
-}
-
-impl Summed {
-    /// Returns `len` numbers: the gradients in the order of declaration, and the loss.
-    pub(super) fn numbers(&self, len: usize) -> Vec<f32> {
-        let mut values = Vec::with_capacity(len);
-        for gradient in self.gradients.iter().flatten() {
-            values.extend(download(gradient));
-        }
-        values.push(self.losses.clone().value());
-        values
-    }
-
-    pub(super) fn add(one: Self, other: Self) -> Self {
-        let both = one.gradients.into_iter().zip(other.gradients);
-        Self {
-            gradients: both.map(|(a, b)| Some(a? + b?)).collect(),
-            losses: one.losses.plus(other.losses),
-        }
-    }
 }
 
 impl Learner {

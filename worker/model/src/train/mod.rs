@@ -1,6 +1,9 @@
 //! Training: from scenes to weights.
 
 mod checkpoint;
+mod clock;
+mod event;
+mod gradients;
 pub mod group;
 mod learner;
 mod load;
@@ -10,15 +13,18 @@ mod position;
 mod run;
 mod schedule;
 mod segments;
+mod validate;
 
 use serde::{Deserialize, Serialize};
 
 pub use checkpoint::{Snapshot, left_by};
-pub use learner::{Gradients, Learner, predict};
+pub use event::{Control, Ended, Event, Sources, Trained};
+pub use gradients::Gradients;
+pub use learner::{Learner, predict};
 pub use load::Loading;
 pub use picofarm_settings::Schedule;
 pub use position::{Line, Position, epochs_at};
-pub use run::{Control, Ended, Event, Sources, Trained, Training};
+pub use run::Training;
 pub use schedule::Pace;
 
 use crate::{ModelError, input::Question, net::NetSpec};

@@ -1,124 +1,34 @@
 //! Runs a training from its current position to its end.
 
-use std::{
-    ops::Range,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{ops::Range, sync::Arc, time::Instant};
 
 use burn::tensor::Device;
 
 use super::{
     Plan,
     checkpoint::{self, Snapshot},
+    clock::Clock,
+    event::{Control, Ended, Event, Sources, Trained},
+    gradients::Gradients,
     group::{Group, Member, Next, Standing},
-    learner::{Gradients, Learner},
+    learner::Learner,
     load::{Course, Loading, Making, Ready},
-    position::{Line, Position},
+    position::Position,
     schedule,
 };
-use crate::{
-    ModelError,
-    device::computes,
-    input::Visit,
-    metric::{Metrics, Tally},
-    model::{PLAN, not_finite},
-    net::Net,
-    parameters::Parameters,
-    scene::Scenes,
-    weights,
-};
-
-/// An event of a training.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Event {
-    /// A finished optimiser step.
-    Step {
-        /// The number of finished steps.
-        step: u64,
-        /// The number of steps of the whole training.
-        of: u64,
-        /// The current epoch, from 1.
-        epoch: u64,
-        /// The mean loss of the step.
-        loss: f32,
-        /// Training examples per second, over all processes of the training, since this process
-        /// started or resumed.
-        samples_per_s: f64,
-        /// The share of that time in which the network waited for data.
-        data_wait_share: f64,
-    },
-    /// A validation within an epoch.
-    Validated(Line),
-    /// The end of an epoch.
-    Epoch(Line),
-}
-
-/// Whether to continue.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Control {
-    /// Continue.
-    Continue,
-    /// Stop after this step.
-    Stop,
-}
-
-/// The reason why a run ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ended {
-    /// The training is finished.
-    Finished,
-    /// The caller stopped the training; it can resume from a checkpoint.
-    Stopped,
-    /// The training is finished, and another process stores the result.
-    Elsewhere,
-}
-
-/// The scenes of a training.
-pub struct Sources {
-    /// The training scenes.
-    pub train: Arc<dyn Scenes>,
-    /// The validation scenes, evaluated after each epoch; may be empty.
-    pub validation: Arc<dyn Scenes>,
-}
+use crate::{ModelError, device::computes, model::PLAN, net::Net, parameters::Parameters, weights};
 
 /// A training.
 pub struct Training {
-    plan: Plan,
-    learner: Learner,
-    position: Position,
+    pub(super) plan: Plan,
+    pub(super) learner: Learner,
+    pub(super) position: Position,
     /// With `early_stop`: the values at the best validation.
-    kept: Option<Parameters>,
-    sources: Sources,
-    loading: Loading,
+    pub(super) kept: Option<Parameters>,
+    pub(super) sources: Sources,
+    pub(super) loading: Loading,
     device: Device,
-    leads: bool,
-}
-
-/// The result of a training.
-#[derive(Debug, Clone)]
-pub struct Trained {
-    /// The weights as safetensors, by PyTorch's names.
-    pub weights: Vec<u8>,
-    /// A line for each epoch, and for each validation within one.
-    pub history: Vec<Line>,
-    /// Whether the training ended before its last epoch.
-    pub stopped_early: bool,
-    /// The step that produced these weights: with `early_stop` the one with the best validation,
-    /// else the last.
-    pub kept_step: u64,
-}
-
-impl Trained {
-    /// Returns the line with the metrics of these weights.
-    pub fn kept(&self) -> Option<&Line> {
-        self.history.iter().find(|line| line.step == self.kept_step)
-    }
-
-    /// Returns the number of whole epochs.
-    pub fn epochs(&self) -> usize {
-        self.history.iter().filter(|line| !line.within).count()
-    }
+    pub(super) leads: bool,
 }
 
 impl Training {
@@ -202,7 +112,7 @@ impl Training {
 
     /// Returns the training's current state, which can be written while it continues.
     pub fn snapshot(&self) -> Snapshot {
-        Snapshot::of(
+        Snapshot::take(
             &self.learner,
             &self.position,
             self.kept.as_ref(),
@@ -393,7 +303,7 @@ impl Training {
     }
 
     /// Returns the optimiser's settings at a step.
-    fn pace(&self, step: u64) -> schedule::Pace {
+    pub(super) fn pace(&self, step: u64) -> schedule::Pace {
         schedule::pace(&self.plan, step, self.sources.train.len())
     }
 
@@ -401,123 +311,8 @@ impl Training {
         self.position.epoch == self.plan.epochs || self.position.stopped_early
     }
 
-    fn ends_epoch(&self) -> bool {
+    pub(super) fn ends_epoch(&self) -> bool {
         self.position.batches == self.plan.batches(self.sources.train.len())
-    }
-
-    /// Returns whether an epoch has just ended, or a validation within it is due.
-    fn line_is_due(&self) -> bool {
-        let (step, every) = (self.learner.steps(), self.plan.validate_every);
-        let validate =
-            every > 0 && step.is_multiple_of(every) && !self.sources.validation.is_empty();
-        self.ends_epoch() || (validate && self.position.steps > 0)
-    }
-
-    /// Validates if this process leads, or else receives the line from the leading process. Returns
-    /// `None` if that process was lost.
-    fn write_line(
-        &mut self,
-        group: Option<&mut (dyn Group + '_)>,
-    ) -> Result<Option<Line>, ModelError> {
-        let line = match group {
-            Some(group) if !self.leads => match group.hear(self.learner.digest())? {
-                Some(line) => line,
-                None => return Ok(None),
-            },
-            group => {
-                let line = self.line()?;
-                if let Some(group) = group
-                    && !group.is_alone()
-                {
-                    group.tell(&line, self.learner.digest());
-                }
-                line
-            }
-        };
-        let validation = line.validation;
-        let position = &mut self.position;
-        position.history.push(line);
-        (position.losses, position.steps) = (0.0, 0);
-        if !line.within {
-            position.epoch += 1;
-            position.batches = 0;
-        }
-        if let Some(loss) = validation.map(|m| m.loss()) {
-            // A NaN or infinite loss is never the best.
-            if loss.is_finite() && position.best.is_none_or(|best| loss < best) {
-                position.best = Some(loss);
-                position.since_best = 0;
-                if self.plan.early_stop > 0 {
-                    position.kept_step = line.step;
-                    self.kept = Some(self.learner.kept().clone());
-                }
-            } else {
-                position.since_best += 1;
-            }
-            let patience = self.plan.early_stop;
-            position.stopped_early = patience > 0 && position.since_best >= patience;
-        }
-        Ok(Some(line))
-    }
-
-    /// Returns the line of the current position, with metrics on the validation scenes.
-    fn line(&self) -> Result<Line, ModelError> {
-        let validation = match self.sources.validation.is_empty() {
-            true => None,
-            false => Some(self.validate()?),
-        };
-        let (position, step) = (&self.position, self.learner.steps());
-        Ok(Line {
-            epoch: position.epoch + 1,
-            within: !self.ends_epoch(),
-            step,
-            loss: position.losses / position.steps as f64,
-            learning_rate: self.pace(step - 1).learning_rate,
-            validation,
-        })
-    }
-
-    /// Returns the metrics on the unmodified validation scenes. The spot of a scene depends only on
-    /// the scene's index.
-    fn validate(&self) -> Result<Metrics, ModelError> {
-        let scenes = &*self.sources.validation;
-        let mut tally = Tally::default();
-        let question = &self.plan.question;
-        let visit = |which: u64| {
-            let index = which as usize;
-            let spot = match question.by_spot() {
-                true => index % question.spots,
-                false => 0,
-            };
-            let visit = Visit {
-                spot,
-                ..Visit::default()
-            };
-            (index, visit, None)
-        };
-        let making = Making {
-            plan: &self.plan,
-            scenes,
-            visit: &visit,
-            count: scenes.len() as u64,
-            loading: self.loading,
-        };
-        making.ahead(|ready| {
-            for at in 0..scenes.len().div_ceil(self.plan.batch) {
-                let batch = ready.next()?;
-                let said = self.learner.predict(&batch);
-                if let Some(odd) = said.iter().position(|value| !value.is_finite()) {
-                    let scene = at * self.plan.batch + odd / (said.len() / batch.images.max(1));
-                    let step = self.learner.steps();
-                    let why = not_finite(&said, odd, &batch, None);
-                    let what = format!("validation scene {scene} (counted from 0): {why}");
-                    return Err(ModelError::NotFinite { step, what });
-                }
-                tally.add(question, &said, &batch.target, [batch.height, batch.width]);
-            }
-            Ok::<(), ModelError>(())
-        })?;
-        Ok(tally.metrics(self.plan.question.target))
     }
 
     /// Returns the result.
@@ -580,25 +375,4 @@ fn restored(
         return Err(ModelError::weights(what));
     }
     Ok((header.position, kept))
-}
-
-/// Measures the time for which the network waited.
-struct Clock {
-    began: Instant,
-    waited: Duration,
-    samples: usize,
-}
-
-impl Clock {
-    fn new() -> Self {
-        Self {
-            began: Instant::now(),
-            waited: Duration::ZERO,
-            samples: 0,
-        }
-    }
-
-    fn share(&self) -> f64 {
-        self.waited.as_secs_f64() / self.began.elapsed().as_secs_f64().max(f64::MIN_POSITIVE)
-    }
 }

@@ -6,8 +6,9 @@ use std::ops::Range;
 use burn::tensor::Tensor;
 
 use super::{
+    gradients::{Gradients, Summed},
     group::{Block, Blocks, Part, add_values},
-    learner::{Brought, Forward, Gradients, Learner, Summed},
+    learner::{Brought, Forward, Learner},
     loss::Loss,
 };
 use crate::{

@@ -117,7 +117,7 @@ fn figures_are_the_same_to_the_bit_in_however_many_parts_scenes_are_asked() {
             vec![0, 0, 7, 7],
         ] {
             let parts = bounds.windows(2).flat_map(|b| part(b[0], b[1]));
-            let joined = Evaluated::of(target, &parts.collect::<Vec<_>>());
+            let joined = Evaluated::from_scenes(target, &parts.collect::<Vec<_>>());
             assert_eq!(joined, whole);
         }
     }

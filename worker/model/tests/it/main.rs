@@ -7,6 +7,5 @@ mod gpu;
 mod operations;
 mod optimiser;
 mod precision;
-mod report;
 mod segments;
 mod training;

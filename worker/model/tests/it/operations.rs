@@ -111,14 +111,18 @@ fn what_is_done_along_time_equals_burns_and_so_do_its_gradients() {
     for (images, moments, c, h, w) in [(2, 4, 3, 5, 2), (1, 2, 1, 4, 6), (3, 6, 2, 3, 3)] {
         let x = random([images * moments, c, h, w], 1);
         equal!(
-            ops::beside(x.clone(), moments),
-            plain::beside(x.clone(), moments),
+            ops::adjacent(x.clone(), moments),
+            plain::adjacent(x.clone(), moments),
             x
         );
         equal!(ops::halve_time(x.clone()), plain::halve_time(x.clone()), x);
     }
     let x = random([3, 2, 2, 2], 2);
-    equal!(ops::beside(x.clone(), 1), plain::beside(x.clone(), 1), x);
+    equal!(
+        ops::adjacent(x.clone(), 1),
+        plain::adjacent(x.clone(), 1),
+        x
+    );
 }
 
 #[test]

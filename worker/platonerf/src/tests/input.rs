@@ -111,7 +111,7 @@ fn a_dead_start_is_drawn_anew() {
         };
         let mut training = Training::begin(room(), settings).unwrap();
         assert!(training.run(&Unwatched).unwrap());
-        let dead = |m: &crate::adam::Moments| m.first.iter().all(|g| *g == 0.0);
+        let dead = |m: &picofarm_reconstruct::saved::Moments| m.first.iter().all(|g| *g == 0.0);
         assert!(
             !training.state().moments.iter().any(dead),
             "seed {seed} learns"

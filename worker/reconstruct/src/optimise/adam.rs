@@ -15,22 +15,6 @@ const ANCHOR: f32 = 0.05;
 /// The logit beyond which the gradient almost vanishes.
 const FULL: f32 = 6.0;
 
-/// The running means of the gradients and of their squares.
-#[derive(Debug, Clone)]
-pub(crate) struct Moments {
-    pub first: Vec<f32>,
-    pub second: Vec<f32>,
-}
-
-impl Moments {
-    pub fn new(nodes: usize) -> Self {
-        Self {
-            first: vec![0.0; nodes],
-            second: vec![0.0; nodes],
-        }
-    }
-}
-
 /// The values common to all updates of an iteration.
 pub(super) struct Rate {
     rate: f32,

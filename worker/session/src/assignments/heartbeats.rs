@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{TaskAt, TaskProgress},
+    messages::{TaskAt, TaskProgress},
 };
 
 use super::Assignments;

@@ -9,7 +9,7 @@ use std::{
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
     key::StageKey,
-    model::StageSpec,
+    spec::StageSpec,
 };
 
 /// A lease and its remaining tasks.

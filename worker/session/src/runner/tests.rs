@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Mutex, sync::mpsc::Sender};
 use picofarm_proto::{
     ids::JobId,
     key::StageKey,
-    model::{JobSpec, StageSpec},
+    spec::{JobSpec, StageSpec},
 };
 use uuid::Uuid;
 

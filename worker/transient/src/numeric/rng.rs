@@ -1,6 +1,8 @@
 //! Random numbers: PCG-XSH-RR 64/32 (O'Neill 2014), seeded by SplitMix64 from (seed, stream,
 //! index), so that a number depends on its purpose and never on the thread that draws it.
 
+use picofarm_settings::random::{GOLDEN, mix};
+
 /// A small, fast generator of one stream.
 #[derive(Debug, Clone)]
 pub(crate) struct Rng {
@@ -33,11 +35,9 @@ pub(crate) enum Stream {
     Extent = 6,
 }
 
-fn splitmix(mut z: u64) -> u64 {
-    z = z.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
+/// Spreads neighbouring seeds far apart.
+fn spread(seed: u64) -> u64 {
+    mix(seed.wrapping_add(GOLDEN))
 }
 
 impl Rng {
@@ -45,12 +45,12 @@ impl Rng {
     pub fn new(seed: u64, stream: Stream, pixel: u64, pass: u64) -> Self {
         let key = [stream as u64, pixel, pass]
             .into_iter()
-            .fold(splitmix(seed), |key, part| {
-                splitmix(key.rotate_left(17) ^ splitmix(part))
+            .fold(spread(seed), |key, part| {
+                spread(key.rotate_left(17) ^ spread(part))
             });
         let mut rng = Self {
             state: key,
-            increment: splitmix(key) | 1,
+            increment: spread(key) | 1,
         };
         rng.next_u32();
         rng

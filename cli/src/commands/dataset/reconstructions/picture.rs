@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use picofarm_agent::reconstruct::{CELL, STEP, columns, first_row};
 use picofarm_figures::{Canvas, TEXT};
 use picofarm_results::Reconstructions;
 use picofarm_store::StorageError;
+use picofarm_tasks::reconstruct::{CELL, STEP, columns, first_row};
 
 use super::{figure, metrics};
 use crate::{

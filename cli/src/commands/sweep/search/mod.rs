@@ -15,7 +15,7 @@ pub mod tpe;
 
 use std::{cmp::Ordering, collections::BTreeMap};
 
-use picofarm_proto::model::Domain;
+use picofarm_proto::spec::Domain;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 

@@ -12,7 +12,7 @@
 
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
-use picofarm_proto::model::{Domain, Interval};
+use picofarm_proto::spec::{Domain, Interval};
 use serde_json::Value;
 
 use super::{Space, Values, below, bits, uniform};

@@ -174,7 +174,7 @@ fn before_enough_trials_have_ended_values_are_those_that_the_sweep_draws() {
             outcome: Outcome::Finished(1.0),
         })
         .collect();
-    let drawn = |trial| picofarm_proto::model::domain::draw(space, 3, trial);
+    let drawn = |trial| picofarm_proto::spec::domain::draw(space, 3, trial);
     let proposed = tpe::propose(space, &few, 3, 9, 4);
     assert_eq!(proposed, (9..13).map(drawn).collect::<Vec<_>>());
 }

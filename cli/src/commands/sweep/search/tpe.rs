@@ -9,7 +9,7 @@
 //! the others, so that a round does not propose the same values many times ("constant liar"). Tried
 //! values are not proposed again, because a training with the same values is the same training.
 
-use picofarm_proto::model::domain;
+use picofarm_proto::spec::domain;
 
 use super::{Space, Tried, Values, parzen::Mixture, ranked};
 

@@ -12,8 +12,8 @@ fn moments_lie_beside_their_neighbours_of_the_same_image_and_gradients_go_back()
     let (x, dy) = (noise(s.len(), 1), noise(3 * s.len(), 2));
     let out = same_bits(|k| {
         let (mut out, mut dx) = (vec![f32::NAN; 3 * s.len()], vec![f32::NAN; s.len()]);
-        k.beside(&s, &x, &mut out);
-        k.beside_grad(&s, &dy, &mut dx);
+        k.adjacent(&s, &x, &mut out);
+        k.adjacent_grad(&s, &dy, &mut dx);
         vec![out, dx]
     });
     let mut expected = vec![0.0; s.len()];

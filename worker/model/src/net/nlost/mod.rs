@@ -23,6 +23,7 @@ use burn::tensor::{Tensor, activation::relu};
 
 use super::{
     downsample::{BOX, Downsample},
+    network::Network,
     pass::{Input, Pass},
     rendering::{Rendering, by_channel, normalised},
     residual::{Residual, SLOPE},
@@ -30,18 +31,18 @@ use super::{
     volume::{self, Seen},
 };
 use crate::{
-    ops,
+    ModelError, ops,
     parameters::{Begin, Declarations, Id},
 };
 use attention::{Decoder, Encoder};
 
 /// The number of features of the first volume that convolutions compute, in addition to the
 /// filtered ones.
-pub(super) const FIRST: usize = 3;
+const FIRST: usize = 3;
 /// The number of attention heads.
 pub(super) const HEADS: usize = 4;
 /// The number of rows and columns of a window of the local encoder: the released code's at 128².
-pub(super) const WINDOW: usize = 16;
+const WINDOW: usize = 16;
 /// The ratio of the channels between the two layers of a perceptron to those of the features.
 pub(super) const BETWEEN: usize = 4;
 
@@ -360,6 +361,67 @@ impl Nlost {
             pass.lower(pass.get(bias)),
         );
         (relu(pass.raise(y)), time)
+    }
+}
+
+impl Network for Nlost {
+    const OVER_TIME: bool = true;
+
+    fn build(d: &mut Declarations, spec: &NetSpec) -> Self {
+        Self::declare(d, spec)
+    }
+
+    fn multiple(_spec: &NetSpec) -> (usize, &'static str, String) {
+        let what =
+            format!("nlost halves the image, and windows have {WINDOW}×{WINDOW} pixels of that");
+        (2 * WINDOW, "net.architecture", what)
+    }
+
+    fn check(spec: &NetSpec) -> Result<(), ModelError> {
+        if spec.width.is_multiple_of(HEADS) {
+            return Ok(());
+        }
+        let what = format!(
+            "{} must be a multiple of {HEADS}: heads and scales share it",
+            spec.width
+        );
+        Err(ModelError::invalid("net.width", what))
+    }
+
+    fn multiply_adds(spec: &NetSpec, side: usize) -> f64 {
+        let (c, features) = (spec.width, spec.streams() + FIRST);
+        let [_, second, third, fourth, fifth] = moments(spec.dense);
+        let (pixels, coarse) = ((side / 2).pow(2), (side / 4).pow(2));
+        let part = c / 4;
+        let scales = 27 * 2 * (features * part + part * part) * second;
+        let halved = 27 * 6 * c * c * third;
+        let embedded = 125 * c * c * fourth + (125 + 1) * c * c * fifth;
+        // Queries, keys, values and the output layers over the image and over time; scores and the
+        // weighted sums of values.
+        let attention = |tokens: usize| {
+            let layers = (8 + 2 * BETWEEN) * c * c;
+            (layers + 2 * (tokens + fifth) * c) * fifth
+        };
+        let near = 27 * c * c * fifth + attention(WINDOW.pow(2));
+        let far = (125 + 27) * c * c * fifth + attention(coarse);
+        let upwards = 27 * c * c * fifth;
+        let sums = 2 * (3 * c * c + c * c / groups(c) + 2 * c);
+        let decoders = 2 * (sums + 2 * BETWEEN * c * c) * fifth;
+        let over_time = 27 * (c * c / 2 * 2 + c * c / 8 * 4 + c * c / 4 * 8) * fifth;
+        let joined = 27 * (3 * c * c + c * features) * second;
+        let of_pixel =
+            scales + halved + embedded + near + upwards + decoders + 2 * over_time + joined;
+        spec.of_downsample(side, FIRST)
+            + (of_pixel * pixels + far * coarse) as f64
+            + spec.of_rendering(side, features)
+    }
+
+    fn describe(spec: &NetSpec) -> String {
+        format!("NLOST, width {}", spec.width)
+    }
+
+    fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        Self::forward(self, pass, input)
     }
 }
 
