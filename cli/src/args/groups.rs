@@ -1,5 +1,6 @@
 //! `--groups` and `--group`: subsets of the beams with histograms of their own.
 
+use picofarm_dataset::Quantity;
 use picofarm_sensor::{SPOTS_4_OF_100, SPOTS_25_OF_100};
 
 use crate::error::{CliError, Result};
@@ -29,6 +30,8 @@ pub struct Wanted {
     pub groups: Vec<Vec<u32>>,
     /// Whether it has a spot axis.
     pub per_spot: bool,
+    /// The quantity of data sets that it is, if it is one.
+    pub quantity: Option<Quantity>,
 }
 
 /// Parses `4`, `25` or `per-spot`.
@@ -85,12 +88,13 @@ pub fn wanted(groups: &[Group], named: &[Named], beams: usize) -> Result<Vec<Wan
     };
     for group in groups {
         add(match group {
-            Group::Four => of_grid("4", &SPOTS_4_OF_100, beams)?,
-            Group::TwentyFive => of_grid("25", &SPOTS_25_OF_100, beams)?,
+            Group::Four => of_grid("4", Quantity::Transient4, &SPOTS_4_OF_100, beams)?,
+            Group::TwentyFive => of_grid("25", Quantity::Transient25, &SPOTS_25_OF_100, beams)?,
             Group::PerSpot => Wanted {
                 array: "transient_spots".into(),
                 groups: (0..beams as u32).map(|beam| vec![beam]).collect(),
                 per_spot: true,
+                quantity: Some(Quantity::TransientSpots),
             },
         })?;
     }
@@ -108,13 +112,22 @@ pub fn wanted(groups: &[Group], named: &[Named], beams: usize) -> Result<Vec<Wan
             array: format!("transient_{name}"),
             groups: vec![chosen.clone()],
             per_spot: false,
+            quantity: None,
         })?;
     }
+    // In the order of a data set's arrays, then as stated.
+    let order = |wanted: &Wanted| {
+        let at = Quantity::ALL
+            .iter()
+            .position(|q| Some(*q) == wanted.quantity);
+        at.unwrap_or(usize::MAX)
+    };
+    all.sort_by_key(order);
     Ok(all)
 }
 
 /// Returns a subset of the 10×10 grid.
-fn of_grid(name: &str, spots: &[usize], beams: usize) -> Result<Wanted> {
+fn of_grid(name: &str, quantity: Quantity, spots: &[usize], beams: usize) -> Result<Wanted> {
     if beams != 100 {
         return Err(CliError::input(format!(
             "--groups {name}: the {name} beams are some of the 100 of a 10x10 grid ({:?}…), but this laser has {beams}, \
@@ -127,6 +140,7 @@ fn of_grid(name: &str, spots: &[usize], beams: usize) -> Result<Wanted> {
         array: format!("transient_{name}"),
         groups: vec![spots.iter().map(|&s| s as u32).collect()],
         per_spot: false,
+        quantity: Some(quantity),
     })
 }
 

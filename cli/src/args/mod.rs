@@ -5,6 +5,7 @@ mod dataset;
 mod demultiplex;
 pub mod end_time;
 mod farm;
+mod figure;
 pub mod groups;
 mod guard;
 mod input;
@@ -30,6 +31,7 @@ pub use data::{
 pub use dataset::Dataset;
 pub use demultiplex::{Demultiplex, PlacesArg, ShadowsArg};
 pub use farm::{Coordinator, Demo, Http, Traces, Up, Worker, Workers};
+pub use figure::{ColoursArg, Figure, PanelArg};
 pub use guard::{Audit, Guard, Token};
 pub use input::SceneInput;
 pub use integrity::{DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
@@ -191,6 +193,8 @@ pub enum Command {
     /// Compute depth, and the pixels that each spot lights, from the histogram of all spots, by
     /// physics
     Demultiplex(Demultiplex),
+    /// Draw a figure of a render for a paper: SVG, PDF and PNG
+    Figure(Figure),
     /// Manage who may use a coordinator
     #[command(subcommand)]
     Token(Token),

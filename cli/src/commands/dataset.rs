@@ -17,7 +17,10 @@ pub mod verify;
 use std::path::{Path, PathBuf};
 
 use picofarm_dataset::{Dataset, Summary};
-use picofarm_figures::scene::{View, flight, sheet};
+use picofarm_figures::{
+    inferno,
+    scene::{View, flight, sheet},
+};
 use picofarm_store::{StorageError, open_store};
 use picofarm_tasks::TaskError;
 use serde_json::json;
@@ -245,20 +248,21 @@ pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
     let (scenes, sheet_path, flight_path) =
         (scenes.to_vec(), drawn.sheet.clone(), drawn.flight.clone());
     tokio::task::spawn_blocking(move || {
-        let read = |scene| handle.block_on(view(&dataset, scene));
+        let read = |scene| handle.block_on(view(&dataset, scene)).map_err(failed);
         save(&sheet(&scenes, read)?, &sheet_path)?;
-        write_atomically(&flight_path, &flight(&read(first)?))
+        write_atomically(&flight_path, &flight(&read(first)?, inferno, 1))
     })
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("drawing broke: {e}")))??;
     Ok(drawn)
 }
 
-async fn view(dataset: &Dataset, scene: u64) -> Result<View> {
+/// Reads what pictures of a scene need.
+pub(super) async fn view(dataset: &Dataset, scene: u64) -> Result<View, StorageError> {
     use picofarm_dataset::Quantity as Q;
     let spec = *dataset.spec();
-    let intrinsics = dataset.read_intrinsics(scene).await.map_err(failed)?;
-    let spots = dataset.read_spots(scene).await.map_err(failed)?;
+    let intrinsics = dataset.read_intrinsics(scene).await?;
+    let spots = dataset.read_spots(scene).await?;
     let film = |s: picofarm_dataset::Spot| {
         let [x, y, z] = s.position;
         (z > 0.0).then(|| {
@@ -275,14 +279,11 @@ async fn view(dataset: &Dataset, scene: u64) -> Result<View> {
         bins: spec.gate.bins as usize,
         gate_start_m: spec.gate.start_m,
         bin_width_m: spec.gate.bin_width_m,
-        transient: dataset.read_transient(scene).await.map_err(failed)?,
-        depth: dataset.read::<f32>(scene, Q::Depth).await.map_err(failed)?,
-        rgb: dataset.read::<u8>(scene, Q::Rgb).await.map_err(failed)?,
-        specular: dataset
-            .read::<u8>(scene, Q::Specular)
-            .await
-            .map_err(failed)?,
-        visibility: dataset.read_visibility(scene).await.map_err(failed)?,
+        transient: dataset.read_transient(scene).await?,
+        depth: dataset.read::<f32>(scene, Q::Depth).await?,
+        rgb: dataset.read::<u8>(scene, Q::Rgb).await?,
+        specular: dataset.read::<u8>(scene, Q::Specular).await?,
+        visibility: dataset.read_visibility(scene).await?,
         spots: spots.into_iter().map(|s| s.and_then(film)).collect(),
     })
 }

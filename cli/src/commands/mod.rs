@@ -10,11 +10,13 @@ mod demo;
 mod demultiplex;
 mod doctor;
 mod events;
+mod figure;
 pub(crate) mod job;
 pub mod local;
 pub(crate) mod local_worker;
 mod model;
 mod reconstruct;
+mod rendered;
 mod scene;
 #[cfg(feature = "networks")]
 mod sweep;
@@ -51,6 +53,7 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Reconstruct(args) => reconstruct::run(args, output).await,
         Command::Demultiplex(args) => demultiplex::run(args, output).await,
+        Command::Figure(args) => figure::run(args, output).await,
         Command::Token(command) => token::run(command, resolved, output).await,
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,

@@ -23,6 +23,9 @@ pub use layout::quantity::{Element, Quantity};
 pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
 pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelength};
 pub use render_group::read::RenderGroup;
+pub use render_group::single::{
+    SINGLE_PICTURE, SingleRender, SingleRenderParts, write_single_render,
+};
 pub use render_group::write::{RenderArray, encode_render_group, write_render_group};
 pub use repair::collect::{Collection, MIN_GRACE, Orphan, OrphanCause};
 pub use repair::recipe::Recipe;

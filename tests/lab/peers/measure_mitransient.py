@@ -5,7 +5,7 @@
 
 SCENE.json is a scene with exact meshes, materials, camera and laser spots (see worker/scene/src/import/reference.rs).
 DIR is a converged render of the same scene, written by
-`picofarm scene render SCENE.json --split --resolution 64 --samples N --out DIR`: its arrays `two` and `multi` are what
+`picofarm scene render SCENE.json --split --resolution 64 --samples N --out DIR`: the arrays `render/two` and `render/multi` are what
 the error is measured against (one-bounce peaks are left out), its standard errors are taken off in quadrature.
 
 A delta beam lights a point. mitransient has no light that is a point of a surface, so a spot becomes, by `--mode`:
@@ -226,7 +226,7 @@ class Truth:
     def __init__(self, folder):
         import zarr
 
-        group = zarr.open_group(folder, mode="r")
+        group = zarr.open_group(Path(folder) / "render", mode="r")
         get = lambda name: group[name][:].astype(np.float64)  # noqa: E731
         self.value = get("two") + get("multi")
         self.noise = (get("two_se") ** 2 + get("multi_se") ** 2).sum(2)

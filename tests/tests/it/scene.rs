@@ -192,14 +192,44 @@ fn the_parts_of_a_split_render_add_up_to_the_whole() {
     let group = scratch.join("room.zarr");
     let get = |name: &str| array(&group, name);
     let (shape, whole) = get("transient");
-    assert_eq!(shape, [16, 16, 64]);
-    let (two, multi) = (get("two").1, get("multi").1);
-    for name in ["two_se", "multi_se"] {
+    assert_eq!(shape, [1, 16, 16, 64]);
+    let (two, multi) = (get("render/two").1, get("render/multi").1);
+    for name in ["render/two_se", "render/multi_se"] {
         let (shape, error) = get(name);
         assert_eq!(shape, [16, 16, 64]);
         assert!(error.iter().all(|e| e.is_finite() && *e >= 0.0), "{name}");
     }
-    assert_eq!(get("depth").0, [16, 16]);
+    assert_eq!(get("depth").0, [1, 16, 16]);
+
+    // The folder is a data set of one scene, with all its ground truth.
+    let info = cli.json(&["dataset", "info", "room.zarr"]);
+    assert_eq!(
+        (&info["scenes"], &info["bytes"].is_u64()),
+        (&1.into(), &true)
+    );
+    cli.run(&["dataset", "verify", "room.zarr", "--complete"])
+        .ok();
+    let export = ["dataset", "export", "--format", "webdataset"];
+    cli.run(&[&export[..], &["room.zarr", "exported"]].concat())
+        .ok();
+    for (name, values) in [("normal", 3), ("label", 1), ("instance", 1), ("rgb", 3)] {
+        let store = Arc::new(FilesystemStore::new(&group).unwrap());
+        let array = Array::open(store, &format!("/{name}")).unwrap();
+        assert_eq!(
+            array.shape().iter().product::<u64>(),
+            256 * values,
+            "{name}"
+        );
+    }
+    // A damaged ground truth is found.
+    let depth = group.join("depth/c/0/0/0");
+    let whole_depth = std::fs::read(&depth).unwrap();
+    let mut flipped = whole_depth.clone();
+    flipped[20] ^= 1;
+    std::fs::write(&depth, flipped).unwrap();
+    cli.run(&["dataset", "verify", "room.zarr"])
+        .fails(6, &["depth/c/0/0/0"]);
+    std::fs::write(&depth, whole_depth).unwrap();
 
     // The remainder is the one-bounce light: never negative, and present only where a spot is seen.
     let sum = |a: &[f32]| a.iter().map(|&v| f64::from(v)).sum::<f64>();

@@ -73,13 +73,13 @@ fn groups_of_a_render_add_up_and_are_those_asked_for() {
     );
     let group = scratch.join("room.zarr");
     let (shape, whole) = array(&group, "transient");
-    assert_eq!(shape, [16, 16, 64]);
+    assert_eq!(shape, [1, 16, 16, 64]);
     let (shape, spots) = array(&group, "transient_spots");
-    assert_eq!(shape, [100, 16, 16, 64]);
+    assert_eq!(shape, [1, 100, 16, 16, 64]);
     let of = |spots_of: &mut dyn Iterator<Item = usize>| sum(&spots, whole.len(), spots_of);
     same("transient", &whole, &of(&mut (0..100)));
     let (shape, four) = array(&group, "transient_4");
-    assert_eq!(shape, [16, 16, 64]);
+    assert_eq!(shape, [1, 16, 16, 64]);
     same("transient_4", &four, &of(&mut FOUR.into_iter()));
     let mut grid = (0..25).map(|i| i / 5 * 20 + i % 5 * 2 + 1);
     same(
@@ -87,7 +87,7 @@ fn groups_of_a_render_add_up_and_are_those_asked_for() {
         &array(&group, "transient_25").1,
         &of(&mut grid),
     );
-    let left = array(&group, "transient_left").1;
+    let left = array(&group, "render/transient_left").1;
     same("transient_left", &left, &of(&mut [0, 5, 7].into_iter()));
 
     // Without groups, the main histogram is the same.

@@ -37,7 +37,7 @@ pub use kinds::{
     report,
     train::{ImportFor, NotImported, imported},
 };
-pub use making::rendered::{renderer_settings, renderer_version};
+pub use making::rendered::{By, encode_render, renderer_settings, renderer_version};
 pub use memory::{SceneSize, check_memory, render_bytes, scene_size};
 pub use picofarm_session::{
     Access, AccessError, AgentConfig, AgentError, Bearer, ConnectionFailure, Control, Executor,

@@ -1,8 +1,12 @@
-//! The Zarr group of one render.
+//! The folder of one render: a data set of one scene.
 
 use std::path::Path;
 
-use picofarm_dataset::{RenderArray, write_render_group};
+use picofarm_dataset::{
+    Dataset, DatasetSpec, Profile, Quantity, RenderArray, SingleRenderParts, Subsets,
+    write_single_render,
+};
+use picofarm_tasks::{By, encode_render, renderer_version};
 use picofarm_transient::Rendered;
 use serde_json::json;
 
@@ -12,100 +16,71 @@ use super::{
 };
 use crate::{
     args::groups::Wanted,
-    error::{CliError, Code, Result, io},
+    error::{CliError, Code, Result},
 };
 
-/// The picture in the folder of a render.
-pub const PREVIEW: &str = "preview.png";
-
-/// The histograms of a subset of the beams.
-pub struct Subset {
-    array: String,
-    per_spot: bool,
-    data: Vec<f32>,
-}
-
-/// Takes the subsets' histograms out of the render. Each is freed as soon as it is copied, so that
-/// the histograms of a hundred spots are never in memory twice.
-pub fn take_subsets(rendered: &mut Rendered, order: &Order) -> Vec<Subset> {
-    let one = rendered.transient.len();
-    let mut groups = std::mem::take(&mut rendered.groups).into_iter();
-    let join = move |wanted: &Wanted| Subset {
-        array: wanted.array.clone(),
-        per_spot: wanted.per_spot,
-        data: if wanted.per_spot {
-            let count = wanted.groups.len();
-            let mut all = Vec::with_capacity(count * one);
-            groups.by_ref().take(count).for_each(|g| all.extend(g));
-            all
-        } else {
-            groups.next().unwrap_or_default()
-        },
-    };
-    order.wanted.iter().map(join).collect()
-}
-
-/// Writes the render as a Zarr group.
+/// Returns the properties of the one-scene data set that a render is stored as.
 ///
 /// # Errors
-/// Fails if a value is not finite, or if the group cannot be written.
-pub fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Subset]) -> Result<()> {
+/// Returns the option at fault for sizes that no data set has.
+pub fn spec(order: &Order) -> Result<DatasetSpec> {
+    let has = |quantity| order.wanted.iter().any(|w| w.quantity == Some(quantity));
+    let sizes = [(Quantity::Transient4, 4), (Quantity::Transient25, 25)];
+    let sizes: Vec<u32> = sizes
+        .into_iter()
+        .filter(|s| has(s.0))
+        .map(|s| s.1)
+        .collect();
+    let i = &order.scene.camera.intrinsics;
+    let spec = DatasetSpec {
+        scenes: 1,
+        height: i.height,
+        width: i.width,
+        spots: order.scene.laser.beams.len() as u32,
+        subsets: Subsets::of(&sizes).map_err(CliError::input)?,
+        per_spot: has(Quantity::TransientSpots),
+        wavelengths_nm: order.settings.optics.wavelengths_nm,
+        two_bounce: false,
+        gate: order.settings.gate,
+        profile: Profile::LOSSLESS,
+    };
+    spec.check().map_err(|e| {
+        CliError::input(e).hint("--resolution, --spots and --bins change these numbers")
+    })?;
+    Ok(spec)
+}
+
+/// Writes the render as a data set of one scene, with what data sets lack in its group `render`.
+///
+/// # Errors
+/// Fails if a value is not finite, or if the folder cannot be written.
+pub async fn write(out: &Path, order: &Order, spec: &DatasetSpec, r: &Rendered) -> Result<()> {
     let Order {
         scene,
         settings,
         wanted,
         ..
     } = order;
-    let (h, w, b) = (
+    let cube = [
         u64::from(r.height),
         u64::from(r.width),
         u64::from(r.gate.bins),
-    );
-    let cube = [h, w, b];
-    let each = [scene.laser.beams.len() as u64, h, w, b];
+    ];
     let histogram = |name, data| RenderArray {
         name,
         shape: &cube,
         dimension_names: &["row", "column", "bin"],
         data,
     };
-    let masks = [scene.laser.beams.len() as u64, h, w];
-    let flags = |all: &[u8]| all.iter().map(|x| f32::from(*x)).collect::<Vec<_>>();
-    let (specular, visibility) = (flags(&r.truth.specular), flags(&r.truth.visibility));
-    let mut arrays = vec![
-        histogram("transient", &r.transient),
-        RenderArray {
-            name: "depth",
-            shape: &cube[..2],
-            dimension_names: &["row", "column"],
-            data: &r.truth.depth,
-        },
-        RenderArray {
-            name: "specular",
-            shape: &cube[..2],
-            dimension_names: &["row", "column"],
-            data: &specular,
-        },
-    ];
-    if !visibility.is_empty() {
-        arrays.push(RenderArray {
-            name: "visibility",
-            shape: &masks,
-            dimension_names: &["spot", "row", "column"],
-            data: &visibility,
-        });
-    }
-    for s in subsets {
-        arrays.push(match s.per_spot {
-            false => histogram(&s.array, &s.data),
-            true => RenderArray {
-                name: &s.array,
-                shape: &each,
-                dimension_names: &["spot", "row", "column", "bin"],
-                data: &s.data,
-            },
-        });
-    }
+    let (standard, named): (Vec<&Wanted>, Vec<&Wanted>) =
+        wanted.iter().partition(|w| w.quantity.is_some());
+    let first: usize = standard.iter().map(|w| w.groups.len()).sum();
+    let groups = r.groups.get(first..).unwrap_or_default();
+    let mut arrays: Vec<RenderArray<'_>> = named
+        .iter()
+        .zip(groups)
+        .map(|(wanted, data)| histogram(&wanted.array, data))
+        .collect();
     if let Some(s) = &r.split {
         arrays.extend([
             histogram("two", &s.two),
@@ -116,30 +91,19 @@ pub fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Subset]) -> Res
             histogram("multi_noise", &s.multi_noise),
         ]);
     }
+    check_finite(&scene.name, &histogram("transient", &r.transient))?;
+    for array in &arrays {
+        check_finite(&scene.name, array)?;
+    }
     let beams: serde_json::Map<_, _> = wanted
         .iter()
         .map(|w| (w.array.clone(), json!(w.groups.concat())))
         .collect();
-    let arrays_of_all = subsets.iter().map(|s| s.array.clone());
-    let wavelengths: serde_json::Map<_, _> = settings
-        .optics
-        .wavelengths_nm
-        .nm()
-        .into_iter()
-        .flat_map(|nm| {
-            let names = ["transient".to_owned()].into_iter();
-            names
-                .chain(arrays_of_all.clone())
-                .map(move |name| (name, json!(nm)))
-        })
-        .collect();
-    let mut attributes = json!({
+    let attributes = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
-        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; two_noise, multi_noise: draws of the errors of two and multi; the square of their sum over any pixels and bins estimates that sum's variance",
-        "specular": "1 where the first surface is a mirror",
-        "visibility": "1 where the spot of a beam lights what a pixel's middle sees",
+        "parts": "two: exactly two bounces; multi: three and more; *_se: standard errors; two_noise, multi_noise: draws of the errors of two and multi; the square of their sum over any pixels and bins estimates that sum's variance",
         "subsets": beams,
         "gate": r.gate,
         "settings": settings,
@@ -151,29 +115,7 @@ pub fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Subset]) -> Res
         "plan": r.plan,
         "renderer": picofarm_transient::RENDERER_VERSION,
     });
-    if !wavelengths.is_empty() {
-        attributes["wavelengths_nm"] = json!(wavelengths);
-    }
     let attributes = attributes.as_object().expect("written as an object");
-    for array in arrays
-        .iter()
-        .filter(|array| array.dimension_names.contains(&"bin"))
-    {
-        if let Some(at) = array.data.iter().position(|x| !x.is_finite()) {
-            let (x, bins) = (array.data[at], r.gate.bins as usize);
-            let what = format!(
-                "scene {:?}: {} is {x} at pixel {}, bin {}; nothing was written",
-                scene.name,
-                array.name,
-                at / bins,
-                at % bins
-            );
-            return Err(CliError::new(Code::Failed, what).hint(
-                "the renderer is at fault: report it with the scene, or try another --seed",
-            ));
-        }
-    }
-    write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))?;
     let picture = preview::draw(&Preview {
         width: r.width as usize,
         height: r.height as usize,
@@ -183,7 +125,41 @@ pub fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Subset]) -> Res
         transient: &r.transient,
         depth: &r.truth.depth,
     });
-    let path = out.join(PREVIEW);
-    std::fs::write(&path, picture.png())
-        .map_err(|e| io(format!("cannot write {}", path.display()), &e))
+    let parts = SingleRenderParts {
+        arrays: &arrays,
+        attributes,
+        picture: &picture.png(),
+    };
+    // The scene's content is not hashed: its file and choices are in the provenance.
+    let made_from = json!([
+        scene.provenance,
+        scene.camera,
+        scene.laser.origin,
+        r.spots,
+        settings
+    ]);
+    let by = By {
+        task_key: picofarm_store::sha256_hex(made_from.to_string().as_bytes()),
+        renderer: renderer_version(),
+    };
+    let encode = |dataset: &Dataset| encode_render(dataset, 0, scene, settings, r, by);
+    write_single_render(out, spec, encode, &parts)
+        .await
+        .map_err(|e| CliError::new(Code::Resource, e))
+}
+
+/// Checks that all values of a histogram are finite.
+fn check_finite(scene: &str, array: &RenderArray<'_>) -> Result<()> {
+    let Some(at) = array.data.iter().position(|x| !x.is_finite()) else {
+        return Ok(());
+    };
+    let (x, bins) = (array.data[at], array.shape[2] as usize);
+    let what = format!(
+        "scene {scene:?}: {} is {x} at pixel {}, bin {}; nothing was written",
+        array.name,
+        at / bins,
+        at % bins
+    );
+    Err(CliError::new(Code::Failed, what)
+        .hint("the renderer is at fault: report it with the scene, or try another --seed"))
 }

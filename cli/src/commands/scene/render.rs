@@ -8,12 +8,13 @@ use std::{
     time::Instant,
 };
 
+use picofarm_dataset::SINGLE_PICTURE;
 use picofarm_transient::{Budget, Progress, RenderError};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use super::{
-    group::{PREVIEW, take_subsets, write},
+    group::{spec, write},
     order::{Order, decisions, notes, warnings},
 };
 use crate::{
@@ -45,7 +46,7 @@ impl Progress for Watcher {
 /// Maximum samples of a render that only time limits: more than any render reaches.
 const MOST_SAMPLES: u32 = 1 << 20;
 
-/// Renders a scene file into a Zarr group.
+/// Renders a scene file into a data set of one scene.
 ///
 /// # Errors
 /// Fails on an unusable scene or argument, too little memory, a folder in use, or an interruption.
@@ -57,6 +58,7 @@ pub async fn run(args: SceneRender, output: Output) -> Result<()> {
         order.settings.budget = Budget::Samples(MOST_SAMPLES);
     }
     order.fits().map_err(|e| CliError::new(Code::Resource, e))?;
+    let spec = spec(&order)?;
     let watcher = Watcher {
         done: AtomicU32::new(0),
         meter: Mutex::new(Meter::new(output)),
@@ -80,25 +82,24 @@ pub async fn run(args: SceneRender, output: Output) -> Result<()> {
     if let Ok(meter) = watcher.meter.into_inner() {
         meter.finish();
     }
-    let mut rendered = rendered.map_err(|e| match e {
+    let rendered = rendered.map_err(|e| match e {
         RenderError::Stopped => signals::interrupted("nothing was written"),
         RenderError::Memory { .. } => CliError::new(Code::Resource, e),
         e => CliError::input(e),
     })?;
     let seconds = start.elapsed().as_secs_f64();
-    let subsets = take_subsets(&mut rendered, &order);
     if args.seconds.is_some() {
         // Records the samples actually used, so that the render can be repeated.
         order.settings.budget = Budget::Samples(rendered.error.samples);
     }
-    write(&args.out, &order, &rendered, &subsets)?;
+    write(&args.out, &order, &spec, &rendered).await?;
     let (e, threads) = (&rendered.error, order.threads);
     let arrays: Vec<&str> = order.wanted.iter().map(|w| w.array.as_str()).collect();
     output.result(
         &json!({
             "out": args.out, "seconds": seconds, "threads": threads, "rays": rendered.rays,
             "error": e, "overflow": rendered.overflow, "plan": rendered.plan, "subsets": arrays,
-            "warnings": rendered.warnings, "picture": args.out.join(PREVIEW),
+            "warnings": rendered.warnings, "picture": args.out.join(SINGLE_PICTURE),
             "notes": order.scene.provenance.notes,
         }),
         || {
@@ -110,7 +111,7 @@ pub async fn run(args: SceneRender, output: Output) -> Result<()> {
             if !arrays.is_empty() {
                 text += &format!("  also {}\n", arrays.join(", "));
             }
-            text += &format!("  picture: {}\n", args.out.join(PREVIEW).display());
+            text += &format!("  picture: {}\n", args.out.join(SINGLE_PICTURE).display());
             text + &notes(&order.scene) + &decisions(&rendered.plan) + &warnings(&rendered.warnings)
         },
     );

@@ -7,13 +7,13 @@ use picofarm_sensor::{
     Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
     sense as measure,
 };
-use picofarm_store::StorageError;
 use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
 
 use super::sensor;
 use crate::{
     args::SceneSense,
+    commands::rendered::{self, Folder},
     error::{CliError, Code, Result},
     output::{Output, duration, files},
 };
@@ -50,22 +50,26 @@ struct Report {
 }
 
 fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
-    let group = RenderGroup::open(&args.render).map_err(|e| unreadable(args, e))?;
-    let gate = gate(&group, &args.render)?;
-    let (shape, transient) = read(&group, "transient", args)?;
+    let dir = &args.render;
+    let Folder::Render(render) = Folder::open(dir)? else {
+        return Err(CliError::input(format!("{}: is no render", dir.display()))
+            .hint("expected a folder that `picofarm scene render FILE --out FOLDER` wrote"));
+    };
+    let group = &render.group;
+    let spec = render.dataset.spec();
+    let gate = spec.gate;
+    let shape = vec![
+        u64::from(spec.height),
+        u64::from(spec.width),
+        u64::from(gate.bins),
+    ];
     let bins = gate.bins as usize;
-    if shape.last() != Some(&u64::from(gate.bins)) {
-        return Err(CliError::input(format!(
-            "{}: the transient has the shape {shape:?}, but the gate has {bins} bins",
-            args.render.display()
-        )));
-    }
+    let transient = rendered::transient(dir, &render)?;
     // Only a scale by peak depends on the two-bounce part.
     let by_peak = !matches!(sensor.scale, Scale::Fixed { .. });
-    let two = if by_peak && group.has("two") {
-        Some(read(&group, "two", args)?.1)
-    } else {
-        None
+    let two = match by_peak && group.has("two") {
+        true => Some(rendered::array(dir, group, "two", &shape)?),
+        false => None,
     };
     let input = Histograms {
         transient: &transient,
@@ -80,7 +84,7 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         (true, Some(_)) => "two",
         (true, None) => "transient",
     };
-    let attributes = attributes(&group, gate, sensor, &sensed, args, scale_from);
+    let attributes = attributes(group, gate, sensor, &sensed, args, scale_from);
     let mut shape = shape;
     if let Some(last) = shape.last_mut() {
         *last = sensed.bins as u64;
@@ -131,29 +135,6 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         text += &format!(", {:.2e} lost to pile-up", dropped.pile_up_photons);
     }
     Ok(Report { facts, text })
-}
-
-fn read(group: &RenderGroup, name: &str, args: &SceneSense) -> Result<(Vec<u64>, Vec<f32>)> {
-    group.read(name).map_err(|e| unreadable(args, e))
-}
-
-fn unreadable(args: &SceneSense, error: StorageError) -> CliError {
-    let code = match &error {
-        StorageError::Codec { .. } => Code::Damaged,
-        _ => Code::Input,
-    };
-    CliError::new(code, format!("{}: {error}", args.render.display()))
-        .hint("expected a folder that `picofarm scene render FILE --out FOLDER` wrote")
-}
-
-fn gate(group: &RenderGroup, path: &Path) -> Result<Gate> {
-    let gate: Gate = serde_json::from_value(group.attributes()["gate"].clone()).map_err(|e| {
-        CliError::input(format!(
-            "{}/zarr.json: attributes.gate: expected start_m, bin_width_m and bins: {e}",
-            path.display()
-        ))
-    })?;
-    Ok(gate)
 }
 
 /// Returns the attributes that are needed to interpret the counts, and to reproduce them.
@@ -242,6 +223,12 @@ fn write(
 
 #[cfg(test)]
 mod tests {
+    use futures::executor::block_on;
+    use picofarm_dataset::{
+        Dataset, DatasetSpec, Intrinsics, Profile, Provenance, SceneRecord, SingleRenderParts,
+        Subsets, Wavelength, write_single_render,
+    };
+
     use super::*;
     use crate::args::SensorArgs;
 
@@ -263,7 +250,7 @@ mod tests {
         sense(args, &sensor::settings(&args.sensor)?)
     }
 
-    /// A render group of 3×2 pixels and 50 bins of 8 ps, as `scene render --split` writes it.
+    /// A render of 3×2 pixels and 50 bins of 8 ps, as `scene render --split` writes it.
     fn rendered(folder: &Path) {
         let shape = [3u64, 2, 50];
         let two: Vec<f32> = (0..300)
@@ -271,23 +258,68 @@ mod tests {
             .collect();
         let mut transient = two.clone();
         transient[5] = 0.05;
-        let array = |name, data| RenderArray {
-            name,
-            shape: &shape,
-            dimension_names: &["row", "column", "bin"],
-            data,
+        let spec = DatasetSpec {
+            scenes: 1,
+            height: 3,
+            width: 2,
+            spots: 1,
+            subsets: Subsets::NONE,
+            per_spot: false,
+            wavelengths_nm: Wavelength::NONE,
+            two_bounce: false,
+            gate: Gate {
+                start_m: 1.0,
+                bin_width_m: 0.002_398_34,
+                bins: 50,
+            },
+            profile: Profile::LOSSLESS,
+        };
+        let record = SceneRecord {
+            transient: &transient,
+            subsets: &[],
+            depth: &[1.0; 6],
+            range: &[1.0; 6],
+            normal: &[0.0; 18],
+            instance: &[1; 6],
+            label: &[1; 6],
+            specular: &[0; 6],
+            visibility: &[1; 6],
+            two_bounce: &[],
+            rgb: &[0.5; 18],
+            spots: &[None],
+            intrinsics: Intrinsics {
+                fx: 2.0,
+                fy: 2.0,
+                cx: 1.0,
+                cy: 1.5,
+            },
+            camera: [[0.0; 4]; 4],
+            laser: [0.0; 3],
+            scale: 1.0,
+        };
+        let provenance = Provenance {
+            task_key: "a test".into(),
+            renderer: "transient-1".into(),
+            seed: 0,
+            plan: Value::Null,
         };
         let attributes = json!({
-            "scene": "room",
-            "gate": {"start_m": 1.0, "bin_width_m": 0.002_398_34, "bins": 50},
-            "camera": {"a": 1}, "spots": [], "renderer": "transient-1",
+            "scene": "room", "camera": {"a": 1}, "spots": [], "renderer": "transient-1", "gate": spec.gate,
         });
-        write_render_group(
-            &folder.join("render"),
-            &[array("transient", &transient), array("two", &two)],
-            attributes.as_object().unwrap(),
-        )
-        .unwrap();
+        let two = RenderArray {
+            name: "two",
+            shape: &shape,
+            dimension_names: &["row", "column", "bin"],
+            data: &two,
+        };
+        let parts = SingleRenderParts {
+            arrays: &[two],
+            attributes: attributes.as_object().unwrap(),
+            picture: b"",
+        };
+        let encode = |dataset: &Dataset| dataset.encode(0, &record, &provenance);
+        let dir = folder.join("render");
+        block_on(write_single_render(&dir, &spec, encode, &parts)).unwrap();
     }
 
     #[test]
@@ -376,14 +408,14 @@ mod tests {
         assert!(message.contains("rebin: expected 1 to 50"), "{message}");
         let (_, message) = fails(with(|s| s.dark = Some(-1.0)));
         assert!(message.contains("sensor.dark_per_bin"), "{message}");
-        let chunk = folder.path().join("render/transient/c/0/0/0");
+        let chunk = folder.path().join("render/transient/c/0/0/0/0");
         let mut bytes = std::fs::read(&chunk).unwrap();
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;
         std::fs::write(&chunk, bytes).unwrap();
         let (code, message) = fails(args(folder.path(), "out"));
         assert!(
-            code == Code::Damaged && message.contains("transient/c/0/0/0"),
+            code == Code::Damaged && message.contains("transient/c/0/0/0/0"),
             "{message}"
         );
         assert_eq!(list(), before);

@@ -1,4 +1,5 @@
-//! Single renders as small Zarr groups in a local folder.
+//! Single renders in a local folder, and small Zarr groups of plain arrays.
 
 pub(crate) mod read;
+pub(crate) mod single;
 pub(crate) mod write;

@@ -45,33 +45,59 @@ pub fn write_render_group<T: Stored + Send + Sync>(
     attributes: &Map<String, Value>,
 ) -> Result<(), StorageError> {
     check(arrays)?;
-    let dir = std::path::absolute(dir).map_err(|e| StorageError::io("resolve", dir, e))?;
-    refuse_occupied(&dir)?;
-    let (Some(parent), Some(name)) = (dir.parent(), dir.file_name()) else {
-        return Err(StorageError::invalid(
-            "dir",
-            format!("expected a new folder, found {}", dir.display()),
-        ));
-    };
-    fs::create_dir_all(parent).map_err(|e| StorageError::io("create", parent, e))?;
-    let partial = parent.join(format!(
-        ".{}.partial-{}",
-        name.display(),
-        uuid::Uuid::new_v4()
-    ));
-    let written = write_into(&partial, arrays, attributes).and_then(|()| {
-        // The rename replaces an empty folder, and fails if it was filled in the meantime.
-        fs::rename(&partial, &dir).map_err(|e| StorageError::io("create", &dir, e))
-    });
-    if written.is_err() {
-        // The first error is the one to report. Leftovers that cannot be removed remain visible in
-        // the folder.
-        let _ = fs::remove_dir_all(&partial);
-    }
-    written
+    let folder = NewFolder::begin(dir)?;
+    write_into(folder.path(), arrays, attributes)?;
+    folder.finish()
 }
 
-fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), StorageError> {
+/// A folder that appears when it is complete: its files are written next to it, and it is renamed.
+#[derive(Debug)]
+pub(crate) struct NewFolder {
+    dir: PathBuf,
+    partial: PathBuf,
+}
+
+impl NewFolder {
+    /// Starts the new folder `dir`.
+    pub fn begin(dir: &Path) -> Result<Self, StorageError> {
+        let dir = std::path::absolute(dir).map_err(|e| StorageError::io("resolve", dir, e))?;
+        refuse_occupied(&dir)?;
+        let (Some(parent), Some(name)) = (dir.parent(), dir.file_name()) else {
+            return Err(StorageError::invalid(
+                "dir",
+                format!("expected a new folder, found {}", dir.display()),
+            ));
+        };
+        let partial = parent.join(format!(
+            ".{}.partial-{}",
+            name.display(),
+            uuid::Uuid::new_v4()
+        ));
+        fs::create_dir_all(&partial).map_err(|e| StorageError::io("create", &partial, e))?;
+        Ok(Self { dir, partial })
+    }
+
+    /// Returns where its files are written.
+    pub fn path(&self) -> &Path {
+        &self.partial
+    }
+
+    /// Gives the folder its name.
+    pub fn finish(self) -> Result<(), StorageError> {
+        // The rename replaces an empty folder, and fails if it was filled in the meantime.
+        fs::rename(&self.partial, &self.dir).map_err(|e| StorageError::io("create", &self.dir, e))
+    }
+}
+
+impl Drop for NewFolder {
+    fn drop(&mut self) {
+        // Once renamed there is nothing to remove. Leftovers that cannot be removed remain visible.
+        let _ = fs::remove_dir_all(&self.partial);
+    }
+}
+
+/// Checks names, shapes and lengths.
+pub(crate) fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), StorageError> {
     for (i, array) in arrays.iter().enumerate() {
         let invalid = |what: String| {
             Err(StorageError::invalid(
@@ -127,7 +153,8 @@ fn refuse_occupied(dir: &Path) -> Result<(), StorageError> {
     }
 }
 
-fn write_into<T: Stored + Send + Sync>(
+/// Writes a group into a folder.
+pub(crate) fn write_into<T: Stored + Send + Sync>(
     dir: &Path,
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,

@@ -5,6 +5,7 @@ use object_store::path::Path;
 
 use crate::layout::group::METADATA;
 use crate::layout::manifest::manifest_scene;
+use crate::render_group::single::is_of_single;
 use crate::repair::recipe;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::part_scene;
@@ -113,7 +114,7 @@ impl Dataset {
             listing.metadata.push(key);
         } else if snapshot::is_snapshot(&key) || recipe::is_recipe(&key) || splits::is_split(&key) {
             listing.records.push(key);
-        } else if key != IDENTITY {
+        } else if key != IDENTITY && !is_of_single(&key) {
             // The identity exists if the data set's folder was itself used as a store.
             listing.foreign.push(key);
         }

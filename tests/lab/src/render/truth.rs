@@ -60,7 +60,7 @@ pub fn read(dir: &Path, scene: &Scene, gate: Gate) -> Result<Truth> {
             "write it with `picofarm scene render SCENE --split --resolution N --out DIR`, same gate",
         )
     };
-    let store = FilesystemStore::new(dir).map_err(|e| bad(e.to_string()))?;
+    let store = FilesystemStore::new(dir.join("render")).map_err(|e| bad(e.to_string()))?;
     let store = Arc::new(store);
     let group = Group::open(store.clone(), "/").map_err(|e| bad(e.to_string()))?;
     let stored = group.attributes().get("gate").cloned();

@@ -1,7 +1,7 @@
 //! Light in flight: one scene's transient as an animated GIF, with a few bins per frame.
 
 use super::{View, quantile};
-use crate::{animation, inferno};
+use crate::animation;
 
 /// Maximum number of frames; bins are summed to stay within it.
 const FRAMES: usize = 160;
@@ -10,21 +10,28 @@ const DELAY: u16 = 6;
 
 /// Returns the animation. Exposure is common to all frames (the signal to the power 0.4), so
 /// brightness can be compared over time. The palette is the colour map itself, so no colour is
-/// approximated.
-pub fn flight(view: &View) -> Vec<u8> {
+/// approximated. A pixel is a square of `side` pixels of the animation.
+pub fn flight(view: &View, map: fn(f32) -> [u8; 3], side: usize) -> Vec<u8> {
     let (first, last) = lively(&view.energy_by_bin());
     let step = (last - first).div_ceil(FRAMES).max(1);
     let white = exposure(view, step, first, last);
     let palette: Vec<u8> = (0..=255u8)
-        .flat_map(|i| inferno(f32::from(i) / 255.0))
+        .flat_map(|i| map(f32::from(i) / 255.0))
         .collect();
     let frame = |lo: usize| -> Vec<u8> {
         let slice = view.slice(lo, (lo + step).min(view.bins));
         let bright = |v: &f32| ((v / white).clamp(0.0, 1.0).powf(0.4) * 255.0).round() as u8;
-        slice.iter().map(bright).collect()
+        let bright: Vec<u8> = slice.iter().map(bright).collect();
+        let rows = bright.chunks_exact(view.width.max(1));
+        rows.flat_map(|row| {
+            let wide: Vec<u8> = row.iter().flat_map(|v| vec![*v; side]).collect();
+            wide.repeat(side)
+        })
+        .collect()
     };
     let mut frames = (first..last).step_by(step).map(frame);
-    animation((view.width, view.height), &palette, DELAY, &mut frames)
+    let size = (view.width * side, view.height * side);
+    animation(size, &palette, DELAY, &mut frames)
 }
 
 /// Returns the bins between the first light and the arrival of 92 % of the energy. After that there
@@ -75,6 +82,7 @@ mod tests {
             visibility: vec![0; 12],
             spots: vec![None],
         };
-        assert!(flight(&view).starts_with(b"GIF89a"));
+        let gif = flight(&view, crate::inferno, 3);
+        assert!(gif.starts_with(b"GIF89a\x0c\0\x09\0"));
     }
 }

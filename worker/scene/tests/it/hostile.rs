@@ -3,7 +3,7 @@
 
 use crate::common;
 
-use std::{path::Path, sync::OnceLock};
+use std::{io::Write, path::Path, sync::OnceLock};
 
 use picofarm_scene::{
     Aim, export,
@@ -143,7 +143,71 @@ const ASCII_PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float
 
 const OBJ: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvn 0 0 1\no a\nusemtl b\nf 1/1/1 2/1/1 3/1/1\nf -3 -2 -1\n";
 
-const FILES: [&str; 7] = [
+/// A scene in the words of older and of other programs' Mitsuba files.
+const SHAPES: &str = r#"<scene version="0.6.0"><default name="spp" value="4"/><default name="tint" value="0.5"/>
+<sensor type="perspective"><float name="fov" value="60"/><string name="fov_axis" value="x"/>
+<transform name="toWorld"><lookAt origin="0, 1, -4" target="0, 0, 0" up="0, 1, 0"/><translate x="0.1"/><scale value="1"/><rotate y="1" angle="5"/></transform>
+<film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/></film>
+<sampler type="independent"><integer name="sampleCount" value="$spp"/></sampler></sensor>
+<bsdf type="plastic" id="p"><rgb name="diffuseReflectance" value="$tint, .2, .3"/><float name="intIOR" value="1.5"/></bsdf>
+<bsdf type="principled" id="q"><rgb name="base_color" value=".8 .2 .3"/><float name="metallic" value="0.4"/><float name="roughness" value="0.3"/></bsdf>
+<bsdf type="mask" id="m"><float name="opacity" value="0.9"/><bsdf type="conductor"><string name="material" value="Au"/></bsdf></bsdf>
+<shape type="shapegroup" id="g"><shape type="serialized"><string name="filename" value="shape.serialized"/><integer name="shapeIndex" value="0"/><ref id="p"/></shape></shape>
+<shape type="instance"><ref id="g"/><transform name="toWorld"><matrix value="1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"/></transform></shape>
+<shape type="serialized"><string name="filename" value="shape.serialized"/><boolean name="faceNormals" value="true"/><ref id="q"/></shape>
+<shape type="cylinder"><point name="p0" x="0" y="0" z="0"/><point name="p1" value="0 1 0"/><float name="radius" value="0.2"/><ref id="m"/></shape>
+<shape type="sphere"><point name="center" x="0" y="0" z="1"/><float name="radius" value="0.5"/><emitter type="area"><spectrum name="radiance" value="400:1, 700:2"/></emitter></shape>
+<shape type="disk"/><emitter type="constant"/><integrator type="path"/></scene>"#;
+
+const ASCII_STL: &str = "solid corner\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n\
+    facet normal 0 1 0\nouter loop\nvertex 0 0 0\nvertex 0 0 1e0\nvertex 1 0 0\nendloop\nendfacet\nendsolid corner\n";
+
+const MESH_OBJ: &str = "mtllib mesh.mtl\nv 0 0 0 1 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0 1.0\nv 0 0 1\nvt 0 0\nvt 1 0 0\nvt 1 1\n\
+    g a b\ns 1\nusemtl red\nf 1/1 2/2 3/3 \\\n4/1\nusemtl tex\nf -5 -4 -1\nusemtl none\nf 1//1 4//1 5//1\nl 1 2\np 1\n";
+
+const MTL: &str = "newmtl red\nKd 0.8 0.1 0.1\nKs .5 .5 .5\nNs 200\nd 0.5\nillum 2\nnewmtl tex\nKd .5 .5 .5\nmap_Kd -s 1 1 1 -o 0 0 0 wood.png\n\
+    Pr 0.2\nPm 1\nTr 0.1\nKe 1 1 1\nmap_Bump -bm 0.5 b.png\n";
+
+/// A binary STL of two triangles.
+fn binary_stl() -> Vec<u8> {
+    let mut bytes = vec![b' '; 80];
+    bytes.extend(2u32.to_le_bytes());
+    for z in [0.0f32, 1.0] {
+        let corners = [0.0, 0.0, 1.0, 0.0, 0.0, z, 1.0, 0.0, z, 0.0, 1.0, z];
+        bytes.extend(corners.iter().flat_map(|x: &f32| x.to_le_bytes()));
+        bytes.extend([0; 2]);
+    }
+    bytes
+}
+
+/// The content of a serialized mesh before compression: a square with normals and texture
+/// coordinates.
+fn serialized_content() -> Vec<u8> {
+    let mut bytes = 0x1003u32.to_le_bytes().to_vec();
+    bytes.extend(b"square\0");
+    bytes.extend(4u64.to_le_bytes());
+    bytes.extend(2u64.to_le_bytes());
+    let positions = [0.0f32, 0., 0., 1., 0., 0., 1., 1., 0., 0., 1., 0.];
+    let normals = [0.0f32, 0., 1.].repeat(4);
+    let uv = [0.0f32, 0., 1., 0., 1., 1., 0., 1.];
+    let floats = positions.iter().chain(&normals).chain(&uv);
+    bytes.extend(floats.flat_map(|x| x.to_le_bytes()));
+    bytes.extend([0u32, 1, 2, 0, 2, 3].iter().flat_map(|i| i.to_le_bytes()));
+    bytes
+}
+
+/// Returns a serialized file of one mesh with this content.
+fn serialized(content: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0x1c, 0x04, 4, 0];
+    let mut encoder = flate2::write::ZlibEncoder::new(&mut bytes, flate2::Compression::fast());
+    encoder.write_all(content).expect("memory takes it");
+    encoder.finish().expect("memory takes it");
+    bytes.extend(0u64.to_le_bytes());
+    bytes.extend(1u32.to_le_bytes());
+    bytes
+}
+
+const FILES: [&str; 14] = [
     "room.glb",
     "room.gltf",
     "room.xml",
@@ -151,7 +215,28 @@ const FILES: [&str; 7] = [
     "mesh.ply",
     "meshes/0000-0.ply",
     "part.obj",
+    "shapes.xml",
+    "shape.serialized",
+    "inside.serialized",
+    "mesh.stl",
+    "text.stl",
+    "mesh.obj",
+    "mesh.mtl",
 ];
+
+/// Returns the file that is written, what is written, and the scene that is read, if a file is read
+/// through another one.
+fn written(name: &'static str, bytes: Vec<u8>) -> (&'static str, Vec<u8>, Option<&'static str>) {
+    match name {
+        "meshes/0000-0.ply" => (name, bytes, Some("room.xml")),
+        "part.obj" => (name, bytes, Some("scene.json")),
+        "shape.serialized" => (name, bytes, Some("shapes.xml")),
+        // Damage before compression, which would hide it.
+        "inside.serialized" => ("shape.serialized", serialized(&bytes), Some("shapes.xml")),
+        "mesh.mtl" => (name, bytes, Some("mesh.obj")),
+        _ => (name, bytes, None),
+    }
+}
 
 /// A Lambertian and mixes, with textures and spectra. Small, so that damage hits what matters.
 fn room() -> picofarm_scene::Scene {
@@ -184,6 +269,13 @@ fn files() -> &'static [Vec<u8>] {
             ASCII_PLY.into(),
             read("meshes/0000-0.ply"),
             OBJ.into(),
+            SHAPES.into(),
+            serialized(&serialized_content()),
+            serialized_content(),
+            binary_stl(),
+            ASCII_STL.into(),
+            MESH_OBJ.into(),
+            MTL.into(),
         ]
     })
 }
@@ -193,7 +285,12 @@ fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
     let scene = room();
     export::write_mitsuba(&scene, &folder.path().join("room.xml")).expect("writes");
-    std::fs::write(folder.path().join("part.obj"), OBJ).expect("writes");
+    let write = |name: &str, bytes: &[u8]| {
+        std::fs::write(folder.path().join(name), bytes).expect("writes");
+    };
+    write("part.obj", OBJ.as_bytes());
+    write("shape.serialized", &serialized(&serialized_content()));
+    write("mesh.mtl", MTL.as_bytes());
     folder
 }
 
@@ -312,7 +409,7 @@ fn the_undamaged_files_are_read() {
         std::fs::write(&path, bytes).expect("writes");
         // Meshes are read through the scenes that name them; one may be edge-on to a framing
         // camera.
-        if !name.ends_with(".obj") && !name.starts_with("meshes/") {
+        if *name != "part.obj" && written(name, vec![]).2.is_none() {
             import::read_scene_with(&path, &options, &Bounds::default()).expect(name);
         }
     }
@@ -322,20 +419,28 @@ fn the_undamaged_files_are_read() {
 fn damaged_files_never_panic_nor_pass_as_sound_nor_fill_the_memory() {
     let before = peak_kb();
     let shared = folder();
-    let strategy = (0..FILES.len(), proptest::collection::vec(damage(), 1..5));
-    let mut runner = runner(1500);
+    // `PICOFARM_FUZZ_FILE` damages one file alone.
+    let only = std::env::var("PICOFARM_FUZZ_FILE").ok();
+    let chosen: Vec<usize> = (0..FILES.len())
+        .filter(|k| only.as_deref().is_none_or(|only| only == FILES[*k]))
+        .collect();
+    assert!(!chosen.is_empty(), "PICOFARM_FUZZ_FILE is one of {FILES:?}");
+    let which = proptest::sample::select(chosen);
+    let strategy = (which, proptest::collection::vec(damage(), 1..5));
+    let mut runner = runner(2500);
     let outcome = runner.run(&strategy, |(which, all)| {
         let bytes = damaged(&files()[which], &all);
-        let name = FILES[which];
-        // Meshes are read through the scenes that name them.
-        let (scene, as_scene) = match name {
-            "meshes/0000-0.ply" => ("room.xml", 2),
-            "part.obj" => ("scene.json", 3),
-            _ => return survives(shared.path(), name, &bytes),
+        let (name, bytes, scene) = written(FILES[which], bytes);
+        let Some(scene) = scene else {
+            return survives(shared.path(), name, &bytes);
         };
         std::fs::write(shared.path().join(name), &bytes).expect("writes");
-        let result = survives(shared.path(), scene, &files()[as_scene]);
-        std::fs::write(shared.path().join(name), &files()[which]).expect("writes");
+        let whole = |name| {
+            let at = FILES.iter().position(|f| *f == name).expect("a file");
+            &files()[at]
+        };
+        let result = survives(shared.path(), scene, whole(scene));
+        std::fs::write(shared.path().join(name), whole(name)).expect("writes");
         result
     });
     if let Err(e) = outcome {

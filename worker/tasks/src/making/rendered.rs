@@ -13,6 +13,7 @@ use picofarm_proto::{
     trace,
 };
 use picofarm_scene::{Camera, Scene};
+use picofarm_store::StorageError;
 use picofarm_transient::{Progress, RENDERER_VERSION, Rendered, Settings};
 use serde_json::json;
 use tracing::{debug_span, info, warn};
@@ -92,23 +93,49 @@ pub(crate) fn make_by(
         };
         warn!("{mark}{warning}");
     }
-    let camera = &scene.camera;
+    let made = By {
+        task_key: key.to_string(),
+        renderer: spec.render.renderer.clone(),
+    };
+    debug_span!(target: trace::TARGET, "encode")
+        .in_scope(|| encode_render(dataset, index, &scene, &settings, &rendered, made))
+        .map_err(dataset_error)
+}
+
+/// What made a scene, for its provenance.
+pub struct By {
+    /// Names the scene's bytes.
+    pub task_key: String,
+    /// Version of the code that determines them.
+    pub renderer: String,
+}
+
+/// Encodes a render as scene `index` of a data set, with its ground truth.
+///
+/// # Errors
+/// Those of [`Dataset::encode`].
+pub fn encode_render(
+    dataset: &Dataset,
+    index: u64,
+    scene: &Scene,
+    settings: &Settings,
+    rendered: &Rendered,
+    by: By,
+) -> Result<EncodedScene, StorageError> {
     let spots: Vec<_> = rendered
         .spots
         .iter()
-        .map(|spot| spot.as_ref().map(|s| in_camera(s, camera)))
+        .map(|spot| spot.as_ref().map(|s| in_camera(s, &scene.camera)))
         .collect();
-    let subsets = subsets::records(dataset.spec(), &rendered);
-    let record = record(&scene, &rendered, &subsets, &spots);
+    let subsets = subsets::records(dataset.spec(), rendered);
+    let record = record(scene, rendered, &subsets, &spots);
     let provenance = Provenance {
-        task_key: key.to_string(),
-        renderer: spec.render.renderer.clone(),
+        task_key: by.task_key,
+        renderer: by.renderer,
         seed: settings.seed,
-        plan: account(&scene, &rendered, settings.max_bounces),
+        plan: account(scene, rendered, settings.max_bounces),
     };
-    debug_span!(target: trace::TARGET, "encode")
-        .in_scope(|| dataset.encode(index, &record, &provenance))
-        .map_err(dataset_error)
+    dataset.encode(index, &record, &provenance)
 }
 
 /// Checks that the job asks for this version of the renderer.
