@@ -183,7 +183,7 @@ fn drawn(curve: &[(Option<f64>, [f64; 3])], groups: &[[f64; 2]]) -> String {
             .collect(),
         series: vec![
             series("mean", 0),
-            series("mean, worst room", 1),
+            series("worst room", 1),
             series("median", 2),
         ],
     };
