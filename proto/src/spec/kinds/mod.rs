@@ -1,9 +1,9 @@
 //! The kinds of tasks. Each is declared by one file in this folder, which defines its form in a job
 //! file ([`Declared`]) and its properties for the farm ([`TaskKind`]). The table below lists them.
-//! The code that runs a kind's tasks is one file too, under the agent's `execute`, with a line in
-//! the table there. No other code knows kinds by name, except for related kinds: the parts that
-//! [`super::file`] puts before a render stage, the trials of [`super::sweep`], and recipes and
-//! repairs in the agent, which concern rendered, reprocessed or imported scenes.
+//! The code that runs a kind's tasks is one file in `worker/tasks/src/kinds`, with a line in the
+//! table of `worker/tasks/src/executor.rs`. Other code knows related kinds only: the parts that
+//! [`super::file`] puts before a render stage, the trials of [`super::sweep`], recipes and repairs
+//! of rendered, reprocessed or imported scenes, and the verdicts that `job watch` prints.
 
 pub mod demultiplex;
 mod division;

@@ -5,7 +5,7 @@ use std::f32::consts::PI;
 use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
 
 /// The scattering models of the renderer. A new model is a variant here, its density, pdf and
-/// sampling in this file, and a variant of [`Bsdf`]. The rest of the renderer queries the
+/// sampling in `bsdf.rs`, and a variant of [`Bsdf`]. The rest of the renderer queries the
 /// properties of a [`Surface`] and does not match on models.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
