@@ -3,6 +3,7 @@
 //! those of the whole room, and small changes.
 
 use picofarm_scene::Vec3;
+use picofarm_settings::random::{GOLDEN, SplitMix64};
 use rayon::prelude::*;
 
 use crate::{
@@ -214,21 +215,17 @@ fn through(plane: Plane, film: Vec3, z: f32) -> Plane {
     ]
 }
 
-/// Numbers that look random and follow from pixel and round alone (splitmix64).
-struct Noise(u64);
+/// Random numbers that follow from pixel and round alone.
+struct Noise(SplitMix64);
 
 impl Noise {
     fn new(pixel: u64, round: u64) -> Self {
-        Self(pixel.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd1b5_4a32_d192_ed03))
+        let state = pixel.wrapping_mul(GOLDEN) ^ round.wrapping_mul(0xd1b5_4a32_d192_ed03);
+        Self(SplitMix64(state))
     }
 
-    /// In [−1, 1).
+    /// Returns a uniform number in [−1, 1).
     fn signed(&mut self) -> f32 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^= z >> 31;
-        (z >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+        (self.0.bits() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
     }
 }

@@ -3,7 +3,10 @@
 
 use std::io::Cursor;
 
-use crate::{Bsdf, Material, Mesh, Vec3, import::polygon::Triangulation};
+use crate::{
+    Bsdf, Material, Mesh, Vec3,
+    import::{mtl::complete_colours, polygon::Triangulation},
+};
 
 use super::catalogue::{Archive, Item};
 
@@ -54,6 +57,8 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
         let text = archive
             .read(&format!("{folder}/{name}"))
             .map_err(|_| tobj::LoadError::OpenFileFailed)?;
+        let text = String::from_utf8(text).map_err(|_| tobj::LoadError::ReadError)?;
+        let text = complete_colours(&text).map_err(|_| tobj::LoadError::MaterialParseError)?;
         tobj::load_mtl_buf(&mut Cursor::new(text))
     })
     .map_err(|e| e.to_string())?;

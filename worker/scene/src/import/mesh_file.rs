@@ -14,6 +14,7 @@ use super::{
     complete::Draft,
     far, format_error,
     image::{self, Images},
+    mtl,
     obj::{self, Obj},
     read_file, stl,
 };
@@ -106,7 +107,9 @@ fn existing(path: &Path, name: &str, opener: &Opener) -> Option<PathBuf> {
 }
 
 fn read_library(file: &Path, opener: &Opener) -> Result<Vec<tobj::Material>, String> {
-    let text = read_file(opener, file).map_err(|e| e.to_string())?;
+    let bytes = read_file(opener, file).map_err(|e| e.to_string())?;
+    let text = mtl::complete_colours(&String::from_utf8_lossy(&bytes))
+        .map_err(|what| format!("{}: {what}", file.display()))?;
     tobj::load_mtl_buf(&mut Cursor::new(text))
         .map(|(materials, _)| materials)
         .map_err(|e| format!("{}: {e}", file.display()))

@@ -9,6 +9,7 @@ mod gltf_file;
 mod image;
 mod mesh_file;
 mod mitsuba;
+pub(crate) mod mtl;
 mod obj;
 mod ply;
 pub(crate) mod polygon;
