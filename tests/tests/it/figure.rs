@@ -42,7 +42,9 @@ fn a_figure_is_an_svg_a_pdf_of_one_page_and_a_png_of_the_stated_size() {
         known().fold(f32::MAX, f32::min),
         known().fold(0.0, f32::max),
     ] {
-        let text = format!("{limit:.2}");
+        // Three digits.
+        let decimals = if limit < 1.0 { 3 } else { 2 };
+        let text = format!("{limit:.decimals$}");
         let text = text.trim_end_matches('0').trim_end_matches('.');
         assert!(svg.contains(&format!(">{text}</text>")), "{text}");
     }
