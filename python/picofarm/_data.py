@@ -23,7 +23,7 @@ class Dataset:
     """The scenes of a data set: `len(data)`, `data[i]`, and a loop over all.
 
     It is a map-style data set of PyTorch: a `DataLoader` with any number of workers reads it, with
-    `fork` and with `spawn`. Every read checks the stored checksums.
+    `fork` and with `spawn`. Every read checks the CRC-32C of the chunks.
 
     Args:
         url: Folder, or URL such as `s3://bucket/rooms`. Credentials come from the environment.

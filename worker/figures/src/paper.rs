@@ -18,7 +18,7 @@ const POINTS: f64 = 72.0 / 25.4;
 /// Room of a panel for the labels of the vertical axis.
 const LEFT: f64 = 21.0;
 /// Room for a colour bar or a key.
-const RIGHT: f64 = 37.0;
+const RIGHT: f64 = 46.0;
 /// Room for the title.
 const TOP: f64 = 11.0;
 /// Room for the labels of the horizontal axis.
