@@ -360,8 +360,8 @@ impl Taken {
     }
 }
 
-/// Refuses a folder in [`Io::folder`] if an earlier stage writes it without what is taken from it.
-/// Other folders are checked when the stage runs.
+/// Refuses a folder in [`Io::folder`] if an earlier stage writes it and it lacks what the task
+/// takes. Other folders are checked when the stage runs.
 ///
 /// # Errors
 /// Returns a [`SpecError`] at the field that names the folder.
