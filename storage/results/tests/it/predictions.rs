@@ -169,7 +169,7 @@ async fn a_check_names_what_is_broken_and_what_is_missing() {
     let check = async |mode, complete| there.verify(mode, complete, &|_, _| {}).await.unwrap();
     let whole = check(VerifyMode::Full, false).await;
     assert!(whole.is_sound(), "{:?}", whole.problems);
-    assert_eq!((whole.scenes, whole.objects), (2, 8));
+    assert_eq!((whole.scenes, whole.objects), (2, 10));
     let lit = folder.path().join("lit/c/0/0/0/0");
     let mut bytes = std::fs::read(&lit).unwrap();
     bytes[20] ^= 1;
