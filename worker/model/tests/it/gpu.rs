@@ -69,6 +69,7 @@ fn networks() -> impl Iterator<Item = Trial> {
                     heads: 2,
                     window: 8,
                 },
+                added: false,
                 frozen: false,
                 precision: Precision::F32,
             },
