@@ -60,9 +60,19 @@ pub(crate) fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> 
 }
 
 impl Model {
-    /// Builds the tree. Returns `None` for a mesh without triangles or with a non-finite vertex.
+    /// The greatest coordinate of a vertex, metres. The areas of obvhs's boxes overflow far beyond
+    /// it, which makes obvhs panic.
+    pub(crate) const FARTHEST_M: f32 = 1e6;
+
+    /// Builds the tree. Returns `None` for a mesh without triangles or with a vertex beyond
+    /// [`Self::FARTHEST_M`].
     pub(crate) fn new(mesh: Mesh) -> Option<Self> {
-        if mesh.triangles.is_empty() || !mesh.positions.iter().all(|p| p.is_finite()) {
+        let near = |p: &Vec3| {
+            <[f32; 3]>::from(*p)
+                .iter()
+                .all(|x| x.abs() <= Self::FARTHEST_M)
+        };
+        if mesh.triangles.is_empty() || !mesh.positions.iter().all(near) {
             return None;
         }
         let (lo, hi) = mesh.bounds()?;
@@ -280,6 +290,52 @@ mod tests {
             let down = Vec3::new(zero, -1.0, zero);
             let hit = model.closest(Vec3::new(0.63, 1.5, 0.04), down, f32::MAX);
             assert_eq!(hit.map(|(t, _)| t), Some(0.5));
+        }
+    }
+
+    #[test]
+    fn meshes_of_any_triangles_are_searched_or_refused() {
+        use proptest::prelude::*;
+        let number = prop_oneof![
+            Just(0.0f32),
+            Just(-0.0f32),
+            Just(1.0f32),
+            Just(f32::MAX),
+            Just(f32::MIN_POSITIVE),
+            -1.0f32..1.0,
+            any::<f32>().prop_filter("finite", |x| x.is_finite()),
+        ];
+        let point = [number.clone(), number.clone(), number];
+        let points = proptest::collection::vec(point, 1..6);
+        let corners = proptest::collection::vec((0..6usize, 0..6usize, 0..6usize), 1..300);
+        let mut runner = proptest::test_runner::TestRunner::new(ProptestConfig {
+            failure_persistence: None,
+            cases: 500,
+            ..ProptestConfig::default()
+        });
+        let outcome = runner.run(&(points, corners), |(points, corners)| {
+            let count = points.len();
+            let mesh = Mesh {
+                positions: points.into_iter().map(Vec3::from).collect(),
+                triangles: corners
+                    .iter()
+                    .map(|&(a, b, c)| [a, b, c].map(|v| (v % count) as u32))
+                    .collect(),
+                triangle_material: vec![0; corners.len()],
+                materials: vec![Material::diffuse("grey", [0.5; 3])],
+                ..Mesh::default()
+            };
+            if let Some(model) = Model::new(mesh) {
+                for direction in [[0.0, 0.0, 1.0], [1.0, 0.5, -0.25]] {
+                    let origin = Vec3::new(0.1, 0.2, -3.0);
+                    let hit = model.closest(origin, Vec3::from(direction), f32::MAX);
+                    prop_assert!(hit.is_none_or(|(t, _)| t.is_finite()));
+                }
+            }
+            Ok(())
+        });
+        if let Err(e) = outcome {
+            panic!("{e}");
         }
     }
 }

@@ -8,7 +8,7 @@ use std::{
 use picofarm_files::{FileError, Opener};
 use sha2::{Digest, Sha256};
 
-use crate::{LABELS, Mesh, SceneError, Vec3, body, import};
+use crate::{LABELS, Mesh, SceneError, Vec3, body, import, trace::Model};
 
 use super::obj::drop_degenerate;
 
@@ -288,6 +288,12 @@ fn parse(row: &Row) -> Result<(Mesh, bool), String> {
         *p = turned * row.scale;
         if !p.is_finite() {
             return Err("a vertex is not finite".into());
+        }
+        if <[f32; 3]>::from(*p)
+            .iter()
+            .any(|x| x.abs() > Model::FARTHEST_M)
+        {
+            return Err("a vertex is more than 1000 km from the origin; correct the scale".into());
         }
     }
     if mesh.uv.iter().flatten().any(|x| !x.is_finite()) {
