@@ -1,7 +1,7 @@
 //! Reads files named by the user: only regular files up to a maximum size. A pipe, a device or a
 //! folder is rejected by name, because reading it could block or never end.
 
-use std::path::Path;
+use std::{io::Read, path::Path};
 
 use picofarm_files::{FileError, Opener};
 
@@ -37,7 +37,29 @@ pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
 /// # Errors
 /// Fails like [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> Result<String> {
-    String::from_utf8(read(path, most)?).map_err(|_| {
+    text(read(path, most)?, path)
+}
+
+/// Reads at most `most` bytes of text from standard input.
+///
+/// # Errors
+/// Fails if standard input cannot be read, is larger, or is not UTF-8.
+pub fn read_stdin(most: u64) -> Result<String> {
+    let name = Path::new("standard input");
+    let mut bytes = Vec::new();
+    let mut input = std::io::stdin().lock().take(most + 1);
+    input
+        .read_to_end(&mut bytes)
+        .map_err(|e| io(name.display(), &e))?;
+    if bytes.len() as u64 > most {
+        let what = format!("standard input: is larger than {most} bytes");
+        return Err(CliError::input(what));
+    }
+    text(bytes, name)
+}
+
+fn text(bytes: Vec<u8>, path: &Path) -> Result<String> {
+    String::from_utf8(bytes).map_err(|_| {
         CliError::input(format!(
             "{}: is not a text file; expected UTF-8",
             path.display()

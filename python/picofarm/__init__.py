@@ -7,12 +7,31 @@
     render.transient            # float32 [row, column, bin]
     render.plot()
 
-`Scene` opens scene files and arrays, `open` opens data sets, and the command line `picofarm` is
-part of the package. Lengths are metres of optical path, times are nanoseconds.
+`Scene` opens scene files and arrays, `open` opens data sets, and `Client` submits jobs to a farm,
+which `local` starts on this machine. The command line `picofarm` is part of the package. Lengths
+are metres of optical path, times are nanoseconds.
 """
 
-from ._data import Dataset, open
+from ._data import Dataset, Stream, open
+from ._farm import Client, FarmError, Job, JobFailed, LocalFarm, Sweep, local
 from ._native import __version__
 from ._scene import Flash, Gate, Render, Scene, furnished
 
-__all__ = ["Dataset", "Flash", "Gate", "Render", "Scene", "__version__", "furnished", "open"]
+__all__ = [
+    "Client",
+    "Dataset",
+    "FarmError",
+    "Flash",
+    "Gate",
+    "Job",
+    "JobFailed",
+    "LocalFarm",
+    "Render",
+    "Scene",
+    "Stream",
+    "Sweep",
+    "__version__",
+    "furnished",
+    "local",
+    "open",
+]

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import _native
 from ._scene import Gate
@@ -122,6 +125,31 @@ class Dataset:
             made[name] = self._array(scene, name, window, span)
         return made
 
+    def stream(
+        self,
+        *,
+        seed: int | None = 0,
+        epoch: int = 0,
+        rank: int = 0,
+        ranks: int = 1,
+        crop: int | None = None,
+        ahead: int = 4,
+    ) -> Stream:
+        """Returns the scenes of an epoch as an iterator that reads ahead.
+
+        Args:
+            seed: Seed of the order; None keeps the order of `scenes`. The order is the same on
+                every machine.
+            epoch: Number of the epoch. Each has another order.
+            rank: Number of this process among `ranks` that share the scenes. Every process gets
+                equally many; the remainder is left out.
+            ranks: Number of processes.
+            crop: Side of a square that is cut out of each scene, pixels. Its corner is a random
+                multiple of 32 pixels, which reads the fewest chunks.
+            ahead: Number of scenes that threads read ahead.
+        """
+        return Stream(self, seed, epoch, rank, ranks, crop, ahead)
+
     def manifest(self, scene: int) -> dict[str, Any]:
         """Returns the manifest of a scene: objects, checksums, seed, versions and errors."""
         return json.loads(self._native.manifest(scene))
@@ -188,6 +216,107 @@ class Dataset:
             f"<picofarm.Dataset {self.url!r}: {len(self)} scenes, {width}x{height} pixels, "
             f"{self.gate.bins} bins, {self.spots} spots>"
         )
+
+
+class Stream:
+    """The scenes of an epoch in order, read ahead by threads. See `Dataset.stream`.
+
+    A loop over it reads the rest of the epoch, and the next loop reads the next epoch. Pickle and
+    `state_dict` keep the position.
+    """
+
+    def __init__(
+        self,
+        data: Dataset,
+        seed: int | None,
+        epoch: int,
+        rank: int,
+        ranks: int,
+        crop: int | None,
+        ahead: int,
+    ) -> None:
+        if not 0 <= rank < ranks:
+            raise ValueError(f"rank: expected 0 to {ranks - 1}, found {rank}")
+        if crop is not None and not 0 < crop <= min(data.shape):
+            raise ValueError(f"crop: expected 1 to {min(data.shape)} pixels, found {crop}")
+        if ahead < 1:
+            raise ValueError(f"ahead: expected at least 1, found {ahead}")
+        if seed is not None and not 0 <= seed < 2**64:
+            raise ValueError(f"seed: expected 0 to 2^64 - 1, found {seed}")
+        self.data = data
+        self.epoch = epoch
+        """Number of the epoch."""
+        self._seed, self._rank, self._ranks = seed, rank, ranks
+        self._crop, self._ahead = crop, ahead
+        self._worker, self._workers = 0, 1
+        self._position = 0
+
+    def __len__(self) -> int:
+        """Number of scenes of this process in an epoch."""
+        return len(self.data) // self._ranks
+
+    def set_epoch(self, epoch: int) -> None:
+        """Starts an epoch."""
+        self.epoch, self._position = epoch, 0
+
+    def share_among_workers(self, worker: int, workers: int) -> None:
+        """Divides the scenes of this process among its loading processes."""
+        self._worker, self._workers = worker, workers
+
+    def state_dict(self) -> dict[str, int]:
+        """Returns the position: the epoch, and the number of scenes read in it."""
+        return {"epoch": self.epoch, "position": self._position}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Continues at a position."""
+        self.epoch, self._position = int(state["epoch"]), int(state["position"])
+
+    def order(self) -> list[int]:
+        """Returns the scenes of this process in the epoch, read ones included."""
+        scenes = np.array(self.data.scenes, np.uint64)
+        if self._seed is not None:
+            key = _mixed(_mixed(np.array([self._seed], np.uint64)) + np.uint64(self.epoch))
+            scenes = scenes[np.argsort(_mixed(scenes ^ key), kind="stable")]
+        mine = scenes[self._rank :: self._ranks][: len(self)]
+        return [int(scene) for scene in mine[self._worker :: self._workers]]
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        waiting = deque(self.order()[self._position :])
+        reading: deque[Future[dict[str, Any]]] = deque()
+        with ThreadPoolExecutor(self._ahead, "picofarm-read") as threads:
+            try:
+                while waiting or reading:
+                    while waiting and len(reading) < self._ahead:
+                        reading.append(threads.submit(self._read, waiting.popleft()))
+                    scene = reading.popleft().result()
+                    # The caller has this scene once it continues, or takes the state.
+                    self._position += 1
+                    yield scene
+            finally:
+                for future in reading:
+                    future.cancel()
+        self.set_epoch(self.epoch + 1)
+
+    def _read(self, scene: int) -> dict[str, Any]:
+        if self._crop is None:
+            return self.data.read(scene)
+        corners = np.array([2 * scene, 2 * scene + 1], np.uint64)
+        key = np.array([self._seed or 0], np.uint64) + np.uint64(self.epoch)
+        random = _mixed(_mixed(corners) ^ _mixed(key))
+        top, left = (
+            int(r % np.uint64((length - self._crop) // 32 + 1)) * 32
+            for r, length in zip(random, self.data.shape, strict=True)
+        )
+        return self.data.read(scene, crop=(top, left, self._crop, self._crop))
+
+
+def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Returns SplitMix64 of each number."""
+    with np.errstate(over="ignore"):
+        z = x + np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return z ^ (z >> np.uint64(31))
 
 
 open = Dataset

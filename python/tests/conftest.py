@@ -1,10 +1,14 @@
 """Shared by the tests of the Python package. `PICOFARM_DATASET` names a data set of small rooms."""
 
+import importlib.util
 import os
 
 import pytest
 
 import picofarm
+
+# Needs PyTorch, which is too large to install for every run of the tests.
+collect_ignore = [] if importlib.util.find_spec("torch") else ["test_torch.py"]
 
 
 @pytest.fixture(scope="session")

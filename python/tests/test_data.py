@@ -84,3 +84,49 @@ def test_flipped_bytes_are_noticed(dataset: str, tmp_path: pathlib.Path) -> None
     with pytest.raises(OSError, match="transient"):
         for _ in picofarm.open(str(copy)):
             pass
+
+
+def test_a_stream_reads_each_scene_once_an_epoch_in_an_order_of_its_own(dataset: str) -> None:
+    data = picofarm.open(dataset, arrays=["depth"], threads=1)
+    stream = data.stream(seed=3, ahead=2)
+    epochs = [[scene["scene"] for scene in stream] for _ in range(6)]
+    assert all(sorted(epoch) == data.scenes for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+    assert epochs[2] == data.stream(seed=3, epoch=2).order()
+    assert data.stream(seed=None).order() == data.scenes
+
+
+def test_ranks_and_workers_share_the_scenes_without_overlap(dataset: str) -> None:
+    data = picofarm.open(dataset, arrays=["depth"])
+    parts = [data.stream(seed=1, rank=rank, ranks=2) for rank in range(2)]
+    assert len(parts[0]) == len(parts[1]) == len(data) // 2
+    read = [scene for part in parts for scene in part.order()]
+    assert len(set(read)) == len(read)
+    whole = parts[0].order()
+    shares = []
+    for worker in range(2):
+        parts[0].share_among_workers(worker, 2)
+        shares += parts[0].order()
+    assert sorted(shares) == sorted(whole)
+
+
+def test_a_stream_continues_at_its_position(dataset: str) -> None:
+    data = picofarm.open(dataset, arrays=["transient", "depth"])
+    stream = data.stream(seed=5, crop=8)
+    expected = [(scene["scene"], scene["transient"].sum()) for scene in stream]
+    stream = data.stream(seed=5, crop=8)
+    first = next(iter(stream))
+    assert first["transient"].shape == (8, 8, data.gate.bins)
+    copy = data.stream(seed=5, crop=8)
+    copy.load_state_dict(stream.state_dict())
+    rest = [(scene["scene"], scene["transient"].sum()) for scene in copy]
+    assert [(first["scene"], first["transient"].sum()), *rest] == expected
+    rest = [scene["scene"] for scene in pickle.loads(pickle.dumps(stream))]
+    assert rest == [scene for scene, _ in expected[1:]]
+
+
+def test_unusable_streams_are_refused_by_name(dataset: str) -> None:
+    data = picofarm.open(dataset)
+    for name, value in {"rank": 1, "crop": 10_000, "ahead": 0, "seed": -1}.items():
+        with pytest.raises(ValueError, match=f"{name}: "):
+            data.stream(**{name: value})

@@ -63,9 +63,7 @@ def test_the_program_renders_the_same_bits(tmp_path: pathlib.Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "picofarm", "--json", "scene", "render", file, "--out", out]
     done = subprocess.run([*command, *view, *gate], capture_output=True, text=True, check=True)
-    scene = picofarm.Scene(
-        file, look_from=(0, 0, 2), look_at=(0, 0, 0), fov=40, spots=4, unit="m"
-    )
+    scene = picofarm.Scene(file, look_from=(0, 0, 2), look_at=(0, 0, 0), fov=40, spots=4, unit="m")
     mine = scene.render(8, samples=4, bins=50, gate=(3.0, 6.0))
     assert json.loads(done.stdout)["error"] == mine.facts["error"]
     assert json.loads(done.stdout)["rays"] == mine.facts["rays"]

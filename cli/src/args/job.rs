@@ -16,7 +16,7 @@ pub enum Job {
     },
     /// Show what a submission would run and reuse; changes nothing
     Plan {
-        /// The job file
+        /// The job file, TOML or JSON; - reads standard input
         file: PathBuf,
         /// Use the values of the file's [scale.NAME]
         #[arg(long, value_name = "NAME")]
@@ -24,7 +24,7 @@ pub enum Job {
     },
     /// Submit a job file; the same file again returns the same job
     Submit {
-        /// The job file
+        /// The job file, TOML or JSON; - reads standard input
         file: PathBuf,
         /// Use the values of the file's [scale.NAME]
         #[arg(long, value_name = "NAME")]

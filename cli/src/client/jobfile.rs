@@ -28,16 +28,27 @@ fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
 }
 
 fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
-    let text = files::read_text(path, files::LISTS)?;
+    let stdin = path == Path::new("-");
+    let text = match stdin {
+        true => files::read_stdin(files::LISTS)?,
+        false => files::read_text(path, files::LISTS)?,
+    };
     let failed = |e: &dyn std::fmt::Display| {
         let what = show::suggest(e.to_string().trim_end());
         CliError::input(format!("{}: {what}", path.display()))
             .hint("`picofarm job init` writes a job file with every field explained")
     };
-    // Parsed from the text if possible, because errors then name the line.
-    let table: toml::Table = toml::from_str(&text).map_err(|e| failed(&e))?;
-    let spec: JobSpec = if scale.is_some() || table.contains_key("scale") {
-        let value = serde_json::to_value(&table).map_err(|e| failed(&e))?;
+    // No TOML starts with a brace.
+    let json = text.trim_start().starts_with('{');
+    let value: serde_json::Value = match json {
+        true => serde_json::from_str(&text).map_err(|e| failed(&e))?,
+        false => {
+            let table: toml::Table = toml::from_str(&text).map_err(|e| failed(&e))?;
+            serde_json::to_value(&table).map_err(|e| failed(&e))?
+        }
+    };
+    // TOML is parsed from the text if possible, because errors then name the line.
+    let spec: JobSpec = if json || scale.is_some() || value.get("scale").is_some() {
         let value = scaled(value, scale).map_err(|e| failed(&e))?;
         serde_json::from_value(value).map_err(|e| failed(&e))?
     } else {
@@ -45,7 +56,7 @@ fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<
     };
     let base = path
         .parent()
-        .filter(|p| !p.as_os_str().is_empty())
+        .filter(|p| !stdin && !p.as_os_str().is_empty())
         .unwrap_or(Path::new("."));
     resolve(spec, base, asset_dir).map_err(|e| CliError {
         message: format!("{}: {}", path.display(), e.message),
@@ -55,7 +66,7 @@ fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<
 
 /// Reads a job file and pins everything that a submission needs. If the file omits the number of
 /// scenes of an existing data set, it is read from the store. `scale` selects one of the file's
-/// sizes.
+/// sizes. The file is TOML or JSON; `-` is standard input, whose paths start at the current folder.
 ///
 /// # Errors
 /// Input errors that name the file, the field and the expected value. Also fails if a data set
@@ -163,6 +174,23 @@ mod tests {
             let store = spec.stages[0].task.writes().unwrap().0;
             assert!(Path::new(store).is_absolute());
         }
+    }
+
+    #[test]
+    fn a_job_in_json_is_the_same_job_as_in_toml() {
+        let dir = tempfile::tempdir().unwrap();
+        let text = template(JobKind::Primitive);
+        let expected = read(&written(dir.path(), &text), dir.path()).unwrap();
+        let table: toml::Table = toml::from_str(&text).unwrap();
+        let json = serde_json::to_string_pretty(&table).unwrap();
+        let found = read(&written(dir.path(), &json), dir.path()).unwrap();
+        assert_eq!(found, expected);
+        let wrong = json.replace("\"resolution\"", "\"resolutions\"");
+        let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
+        assert!(
+            error.message.contains("did you mean `resolution`"),
+            "{error:?}"
+        );
     }
 
     #[test]

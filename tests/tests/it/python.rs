@@ -33,11 +33,15 @@ fn repository() -> PathBuf {
 fn with_package(farm: &Farm) -> Cli {
     let path = farm.scratch.join("site");
     let package = path.join("picofarm");
-    std::fs::create_dir_all(&package).unwrap();
-    for entry in repository().join("python/picofarm").read_dir().unwrap() {
-        let source = entry.unwrap().path();
-        if source.is_file() {
-            std::fs::copy(&source, package.join(source.file_name().unwrap())).unwrap();
+    let source = repository().join("python/picofarm");
+    for folder in ["", "torch"] {
+        std::fs::create_dir_all(package.join(folder)).unwrap();
+        for entry in source.join(folder).read_dir().unwrap() {
+            let file = entry.unwrap().path();
+            if file.extension().is_some_and(|e| e == "py") {
+                let name = file.file_name().unwrap();
+                std::fs::copy(&file, package.join(folder).join(name)).unwrap();
+            }
         }
     }
     let module = picofarm_tests::binary::python_module();
