@@ -4,11 +4,13 @@
 //! which a scene is accepted are the same on every machine. Each mesh has its own tree, independent
 //! of the scene.
 
-use std::{sync::Arc, time::Duration};
+use std::sync::Arc;
 
 use obvhs::{
     BvhBuildParams,
-    cwbvh::{CwBvh, builder::build_cwbvh_from_tris},
+    bvh2::reinsertion::ReinsertionOptimizer,
+    cwbvh::{CwBvh, bvh2_to_cwbvh::bvh2_to_cwbvh},
+    ploc::PlocBuilder,
     ray::{Ray, RayHit},
     triangle::Triangle,
 };
@@ -59,13 +61,41 @@ pub(crate) fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> 
     (inside && t.is_finite()).then_some(t)
 }
 
+/// The depth of a tree up to which obvhs searches it.
+const DEEPEST: usize = 31;
+
+/// Builds a tree as obvhs's own `build_cwbvh_from_tris`, which does not check the depth. Returns
+/// `None` for a tree that is too deep.
+fn built(triangles: &[Triangle]) -> Option<CwBvh> {
+    let params = BvhBuildParams::fast_build();
+    let mut binary = PlocBuilder::with_capacity(triangles.len()).build(
+        params.ploc_search_distance,
+        triangles,
+        (0..triangles.len() as u32).collect(),
+        params.sort_precision,
+        params.search_depth_threshold,
+    );
+    ReinsertionOptimizer::default().run(&mut binary, params.reinsertion_batch_ratio, None);
+    let tree = bvh2_to_cwbvh(&binary, params.max_prims_per_leaf.clamp(1, 3), true, false);
+    let mut open = vec![(0, 0)];
+    while let Some((node, depth)) = open.pop() {
+        if depth > DEEPEST {
+            return None;
+        }
+        let node = tree.nodes.get(node)?;
+        let inner = (0..8).filter(|child| !node.is_child_empty(*child) && !node.is_leaf(*child));
+        open.extend(inner.map(|child| (node.child_node_index(child) as usize, depth + 1)));
+    }
+    Some(tree)
+}
+
 impl Model {
     /// The greatest coordinate of a vertex, metres. The areas of obvhs's boxes overflow far beyond
     /// it, which makes obvhs panic.
     pub(crate) const FARTHEST_M: f32 = 1e6;
 
-    /// Builds the tree. Returns `None` for a mesh without triangles or with a vertex beyond
-    /// [`Self::FARTHEST_M`].
+    /// Builds the tree. Returns `None` for a mesh without triangles, with a vertex beyond
+    /// [`Self::FARTHEST_M`], or with so many triangles in the same place that no tree divides them.
     pub(crate) fn new(mesh: Mesh) -> Option<Self> {
         let near = |p: &Vec3| {
             <[f32; 3]>::from(*p)
@@ -86,16 +116,11 @@ impl Model {
                 v2: corner(c),
             })
             .collect();
-        let tree = build_cwbvh_from_tris(
-            &triangles,
-            BvhBuildParams::fast_build(),
-            &mut Duration::default(),
-        );
         Some(Self {
             mesh: Arc::new(mesh),
             lo,
             hi,
-            tree,
+            tree: built(&triangles)?,
         })
     }
 

@@ -358,8 +358,15 @@ impl Asset {
                     (mesh, made_opaque, false)
                 }
             };
+            let model = Model::new(standing(mesh));
+            if model.is_none() {
+                tracing::warn!(
+                    model = self.name,
+                    "furniture model left out: no ray finds its triangles"
+                );
+            }
             Some(Loaded {
-                model: Arc::new(Model::new(standing(mesh))?),
+                model: Arc::new(model?),
                 made_opaque,
                 untextured,
             })
