@@ -10,7 +10,7 @@ use gltf::{
     accessor::DataType,
     json::{
         self, Index, Root,
-        accessor::{ComponentType, GenericComponentType, Type},
+        accessor::{ComponentType, GenericComponentType},
         validation::{Checked, USize64},
     },
 };
