@@ -15,7 +15,7 @@ are metres of optical path, times are nanoseconds.
 from ._data import Dataset, Stream, open
 from ._farm import Client, FarmError, Job, JobFailed, LocalFarm, Sweep, local
 from ._native import __version__
-from ._scene import Flash, Gate, Render, Scene, furnished
+from ._scene import Flash, Gate, Reconstruction, Render, Scene, Sensed, furnished
 
 __all__ = [
     "Client",
@@ -26,8 +26,10 @@ __all__ = [
     "Job",
     "JobFailed",
     "LocalFarm",
+    "Reconstruction",
     "Render",
     "Scene",
+    "Sensed",
     "Stream",
     "Sweep",
     "__version__",

@@ -346,6 +346,11 @@ class Sweep:
         return self._facts["trials"]
 
     @property
+    def error(self) -> str:
+        """Name of the error that trials are compared by, with its unit."""
+        return self._facts["error"]
+
+    @property
     def best(self) -> dict[str, Any]:
         """The finished trial with the least error."""
         return run(["sweep", "best", self.store, self.name])
@@ -356,14 +361,13 @@ class Sweep:
             import pandas
         except ImportError as e:
             raise ImportError(f"{e}; pip install 'picofarm[farm]'") from None
-        error = self._facts["error"]
         rows = [
             {
                 "trial": trial["index"],
                 **dict(trial["values"]),
                 "end": trial["end"],
                 "epochs": trial["epochs"],
-                error: trial["loss"],
+                self.error: trial["loss"],
                 "model": trial["model"],
             }
             for trial in self.trials

@@ -35,6 +35,25 @@ def demultiplex(
     shadows: str,
     threads: int | None,
 ) -> dict[str, Any]: ...
+def reconstruct(
+    histogram: NDArray[np.float32],
+    scene: Scene,
+    gate: tuple[float, float],
+    spots: NDArray[np.float32],
+    nodes: int | None,
+    seed: int,
+    threads: int | None,
+    progress: Callable[[float], object] | None,
+) -> dict[str, Any]: ...
+def sense(
+    histogram: NDArray[np.float32],
+    two: NDArray[np.float32] | None,
+    bin_width_m: float,
+    sensor: str,
+    seed: int,
+    scene: int,
+    threads: int | None,
+) -> dict[str, Any]: ...
 
 class Scene:
     @staticmethod
@@ -52,6 +71,9 @@ class Scene:
     ) -> Scene: ...
     @staticmethod
     def from_meshes(meshes: Sequence[_Mesh], view: _View, spots: _Spots) -> Scene: ...
+    def seen_from(
+        self, look_from: _Point, look_at: _Point, fov: float | None, up: _Point
+    ) -> Scene: ...
     def resized(self, height: int, width: int) -> Scene: ...
     @property
     def name(self) -> str: ...

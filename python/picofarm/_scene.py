@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import json
 import operator
 import os
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     import xarray
 
 _METRES_PER_NS = 0.299792458
-_Point = Sequence[float]
+_Point = Sequence[float] | NDArray[np.floating[Any]]
 _Spots = int | str | Sequence[tuple[float, float]]
 _Floats = NDArray[np.float32]
 
@@ -128,13 +131,35 @@ class Scene:
 
     @property
     def camera(self) -> dict[str, Any]:
-        """Intrinsics (pixels) and pose (world axes, metres)."""
+        """`intrinsics` (pixels), `origin` (metres), and the axes `right`, `down` and `forward`."""
         return json.loads(self._native.facts())["camera"]
 
     @property
     def notes(self) -> dict[str, str]:
         """What was chosen for the scene and what was left out of its file."""
         return json.loads(self._native.facts())["provenance"]["notes"]
+
+    def seen_from(
+        self,
+        look_from: _Point,
+        look_at: _Point,
+        *,
+        fov: float | None = None,
+        up: _Point | None = None,
+    ) -> Scene:
+        """Returns the scene with a camera elsewhere. The laser stays where it is.
+
+        Args:
+            look_from: Position of the camera, metres.
+            look_at: Point in the middle of the image, metres.
+            fov: Width of the view, degrees; that of the camera without it.
+            up: Direction that is upwards in the image; that of the camera without it.
+        """
+        eye, target = _point("look_from", look_from), _point("look_at", look_at)
+        upwards = _point("up", up) or tuple(-x for x in self.camera["down"])
+        assert eye is not None and target is not None
+        angle = None if fov is None else float(fov)
+        return Scene._of(self._native.seen_from(eye, target, angle, upwards))
 
     def render(
         self,
@@ -307,31 +332,128 @@ class Render:
         """Beams that hit nothing, an image without light."""
         return self.facts["warnings"]
 
+    def sense(
+        self,
+        sensor: Mapping[str, Any] | None = None,
+        *,
+        peak_photons: float | tuple[float, float] | None = None,
+        seed: int = 0,
+        number: int = 0,
+        threads: int | None = None,
+    ) -> Sensed:
+        """Returns what a single-photon sensor counts. The same arguments give the same counts.
+
+        Args:
+            sensor: Settings as in a job file: `pulse`, `jitter`, `scale`, `dark_per_bin`,
+                `poisson`, `rebin` and `dead_time`. Without them, a pulse of 128 ps, 50 ps of
+                jitter and a peak of 10 to 400 photons.
+            peak_photons: Photons in the brightest bin of the median pixel, or a range to draw
+                from. Replaces `scale` of `sensor`.
+            seed: Seed of the noise.
+            number: Number of the scene, which selects its own noise.
+            threads: Number of threads; all cores without it.
+
+        Raises:
+            ValueError: A setting is unusable.
+        """
+        spec = dict(sensor or {})
+        if isinstance(peak_photons, Sequence):
+            low, high = peak_photons
+            spec["scale"] = {"kind": "peak_range", "low": float(low), "high": float(high)}
+        elif peak_photons is not None:
+            spec["scale"] = {"kind": "peak", "photons": float(peak_photons)}
+        made = _native.sense(
+            self.transient,
+            self.two,
+            self.gate.bin_width_m,
+            json.dumps(spec),
+            _whole("seed", seed),
+            _whole("number", number),
+            None if threads is None else _whole("threads", threads),
+        )
+        facts = json.loads(made["facts"])
+        gate = Gate(self.gate.start_m, facts["bin_width_m"], facts["bins"])
+        return Sensed(render=self, gate=gate, counts=made["counts"], facts=facts)
+
     def demultiplex(
         self,
         *,
         histogram: ArrayLike | None = None,
-        shadows: str = "physics",
+        shadows: str = "learned",
         threads: int | None = None,
     ) -> Flash:
         """Finds depth, shadows and mirrors in the light of all spots, without the ground truth.
 
         Args:
-            histogram: Replaces `transient`, for example with photon counts.
-            shadows: `physics`, or `learned` from rendered rooms.
+            histogram: Replaces `transient`, for example with a measured one.
+            shadows: `learned` from rendered rooms, or `physics`.
             threads: Number of threads; all cores without it.
         """
         values = self.transient if histogram is None else histogram
+        return self._demultiplex(values, self.gate, shadows, threads)
+
+    def _demultiplex(
+        self, values: ArrayLike, gate: Gate, shadows: str, threads: int | None
+    ) -> Flash:
         light = _floats("histogram", values, 3)
         made = _native.demultiplex(
             light,
             self.scene._native,
-            (self.gate.start_m, self.gate.bin_width_m),
+            (gate.start_m, gate.bin_width_m),
             self.spots,
             shadows,
             None if threads is None else _whole("threads", threads),
         )
         return Flash(**made)
+
+    def reconstruct(
+        self,
+        *,
+        histogram: ArrayLike | None = None,
+        nodes: int | None = None,
+        seed: int = 0,
+        threads: int | None = None,
+        progress: bool | Callable[[float], object] = False,
+    ) -> Reconstruction:
+        """Returns the room in 3D from the light of all spots, and its errors against the scene.
+
+        Args:
+            histogram: Replaces `transient`, for example with a measured one.
+            nodes: Nodes along the longest side of the grid, 16 to 512; 192 without it.
+            seed: Seed of the random numbers.
+            threads: Number of threads; all cores without it.
+            progress: Prints the progress to standard error, or is called with the share done.
+
+        Raises:
+            ValueError: The histogram contradicts the scene's calibration, or an argument is wrong.
+            KeyboardInterrupt: Ctrl-C was pressed.
+        """
+        values = self.transient if histogram is None else histogram
+        return self._reconstruct(values, self.gate, nodes, seed, threads, progress)
+
+    def _reconstruct(
+        self,
+        values: ArrayLike,
+        gate: Gate,
+        nodes: int | None,
+        seed: int,
+        threads: int | None,
+        progress: bool | Callable[[float], object],
+    ) -> Reconstruction:
+        made = _native.reconstruct(
+            _floats("histogram", values, 3),
+            self.scene._native,
+            (gate.start_m, gate.bin_width_m),
+            self.spots,
+            None if nodes is None else _whole("nodes", nodes),
+            _whole("seed", seed),
+            None if threads is None else _whole("threads", threads),
+            _Percent("reconstructing") if progress is True else (progress or None),
+        )
+        if progress is True:
+            print(file=sys.stderr)
+        facts = json.loads(made.pop("facts"))
+        return Reconstruction(scene=self.scene, facts=facts, **made)
 
     def to_xarray(self) -> xarray.Dataset:
         """Returns the arrays with dimensions, coordinates and units. Needs xarray."""
@@ -387,9 +509,97 @@ class Render:
         axes[2].set_title(f"pixel ({row}, {column})")
         return figure
 
+    def animate(
+        self, file: str | os.PathLike[str], *, frames: int = 100, fps: int = 20
+    ) -> pathlib.Path:
+        """Writes light in flight as a GIF (or MP4, with ffmpeg) and returns its path. Needs
+        matplotlib.
+
+        Args:
+            file: Where to write. The extension selects the format.
+            frames: Number of frames, from the first light to the last.
+            fps: Frames per second.
+        """
+        plt = _optional("matplotlib.pyplot", "plot")
+        animation = _optional("matplotlib.animation", "plot")
+        lit = np.flatnonzero(self.transient.any(axis=(0, 1)))
+        first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, self.gate.bins)
+        edges = np.unique(np.linspace(first, last, _whole("frames", frames) + 1).astype(int))
+        white = float(np.quantile(self.transient[..., first:last].max(axis=2), 0.9)) or 1.0
+        figure, axes = plt.subplots(figsize=(4, 4), layout="constrained")
+        height, width = self.depth.shape
+        image = axes.imshow(np.zeros((height, width)), cmap="inferno", vmin=0, vmax=1)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        times = self.gate.times_ns
+
+        def draw(k: int) -> tuple[Any, ...]:
+            light = self.transient[..., edges[k] : edges[k + 1]].max(axis=2)
+            image.set_data(np.sqrt(np.minimum(light / white, 1.0)))
+            axes.set_title(f"{times[edges[k]]:.2f} ns")
+            return (image,)
+
+        path = pathlib.Path(file)
+        movie = animation.FuncAnimation(figure, draw, frames=len(edges) - 1)
+        movie.save(path, writer="pillow" if path.suffix == ".gif" else None, fps=fps)
+        plt.close(figure)
+        return path
+
+    def _repr_html_(self) -> str:
+        try:
+            figure = self.plot()
+        except ImportError:
+            return f"<p>{html.escape(repr(self))}</p>"
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=80)
+        _optional("matplotlib.pyplot", "plot").close(figure)
+        data = base64.b64encode(buffer.getvalue()).decode()
+        title = html.escape(repr(self))
+        return f'<p>{title}</p><img alt="{title}" src="data:image/png;base64,{data}">'
+
     def __repr__(self) -> str:
         height, width, bins = self.transient.shape
         return f"<picofarm.Render {width}x{height} pixels, {bins} bins, error {self.error:.1%}>"
+
+
+@dataclass(frozen=True, repr=False)
+class Sensed:
+    """What a sensor counted."""
+
+    render: Render
+    """The measured light."""
+    gate: Gate
+    """The gate of the counts."""
+    counts: NDArray[np.uint32] | _Floats
+    """Photons, `[row, column, bin]`; expected photons if `poisson` is off."""
+    facts: dict[str, Any] = field(repr=False)
+    """Settings, photons that the gate or pile-up dropped, and what set the scale."""
+
+    @property
+    def scale(self) -> float:
+        """Photons per unit of `Render.transient`."""
+        return self.facts["scale"]
+
+    def demultiplex(self, *, shadows: str = "learned", threads: int | None = None) -> Flash:
+        """Finds depth, shadows and mirrors in the counts. See `Render.demultiplex`."""
+        return self.render._demultiplex(self.counts, self.gate, shadows, threads)
+
+    def reconstruct(
+        self,
+        *,
+        nodes: int | None = None,
+        seed: int = 0,
+        threads: int | None = None,
+        progress: bool | Callable[[float], object] = False,
+    ) -> Reconstruction:
+        """Returns the room in 3D from the counts. See `Render.reconstruct`."""
+        counts = self.counts
+        return self.render._reconstruct(counts, self.gate, nodes, seed, threads, progress)
+
+    def __repr__(self) -> str:
+        height, width, bins = self.counts.shape
+        photons = float(self.counts.sum(dtype=np.float64)) / (height * width)
+        return f"<picofarm.Sensed {width}x{height} pixels, {bins} bins, {photons:.0f} photons each>"
 
 
 @dataclass(frozen=True, repr=False)
@@ -417,17 +627,86 @@ class Flash:
         return f"<picofarm.Flash {width}x{height} pixels, {len(self.beams)} spots>"
 
 
+@dataclass(frozen=True, repr=False)
+class Reconstruction:
+    """A room in 3D."""
+
+    scene: Scene
+    """The scene that was measured."""
+    vertices: _Floats
+    """World axes, metres, `[n, 3]`."""
+    triangles: NDArray[np.uint32]
+    """Indices of vertices, counter-clockwise seen from empty space, `[m, 3]`."""
+    glb: bytes = field(repr=False)
+    """A glTF file with the surface, the camera and the laser."""
+    facts: dict[str, Any] = field(repr=False)
+    """Errors against the scene, planes, spots that were left out, and a verdict."""
+
+    @property
+    def error(self) -> float:
+        """Mean error of depth in 24 views from other places in the room, metres."""
+        return self.facts["novel_views"]["all"]["l1_m"]
+
+    def save(self, file: str | os.PathLike[str]) -> pathlib.Path:
+        """Writes the surface as `.glb` and returns its path."""
+        path = pathlib.Path(file)
+        path.write_bytes(self.glb)
+        return path
+
+    def plot(
+        self, *, look_from: _Point | None = None, look_at: _Point | None = None, fov: float = 90.0
+    ) -> matplotlib.figure.Figure:
+        """Draws the surface and the true scene from another place. Needs matplotlib.
+
+        Args:
+            look_from: Where to stand, metres; without it, across the room, above the middle.
+            look_at: Point in the middle of the picture; without it, the middle of the room.
+            fov: Width of the view, degrees.
+        """
+        plt = _optional("matplotlib.pyplot", "plot")
+        camera = self.scene.camera
+        eye, ahead, up = (
+            np.array(camera["origin"]),
+            np.array(camera["forward"]),
+            -np.array(camera["down"]),
+        )
+        middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+        target = middle if look_at is None else np.asarray(look_at, float)
+        if look_from is None:
+            farthest = float(((self.vertices - eye) @ ahead).max())
+            place = eye + 0.8 * farthest * ahead + 0.3 * up
+        else:
+            place = np.asarray(look_from, float)
+        mesh = {"vertices": self.vertices, "triangles": self.triangles}
+        surface = Scene([mesh], look_from=place, look_at=target, fov=fov, up=up, spots=1)
+        truth = self.scene.seen_from(place, target, fov=fov)
+        figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
+        for panel, scene, title in zip(axes, (surface, truth), ("one flash", "truth"), strict=True):
+            seen = scene.render((256, 256), samples=2, bins=16)
+            shade = np.where(seen.depth > 0, 0.15 + 0.85 * np.abs(seen.normal[..., 2]), 0)
+            panel.imshow(shade, cmap="bone", vmin=0, vmax=1)
+            panel.set_title(title)
+            panel.set_xticks([])
+            panel.set_yticks([])
+        return figure
+
+    def __repr__(self) -> str:
+        size = f"{len(self.triangles)} triangles, error {self.error:.3f} m"
+        return f"<picofarm.Reconstruction {self.scene.name!r}: {size}>"
+
+
 class _Percent:
     """Prints a share to standard error whenever its percentage changes."""
 
-    def __init__(self) -> None:
+    def __init__(self, what: str = "rendering") -> None:
+        self.what = what
         self.last = -1
 
     def __call__(self, share: float) -> None:
         percent = int(100 * share)
         if percent != self.last:
             self.last = percent
-            print(f"\rrendering: {percent} %", end="", file=sys.stderr, flush=True)
+            print(f"\r{self.what}: {percent} %", end="", file=sys.stderr, flush=True)
 
 
 def _point(name: str, value: _Point | None) -> tuple[float, float, float] | None:

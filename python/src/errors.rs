@@ -1,6 +1,7 @@
 //! Maps errors of the Rust crates to Python's exceptions.
 
 use picofarm_demultiplex::DemultiplexError;
+use picofarm_reconstruct::ReconstructError;
 use picofarm_scene::SceneError;
 use picofarm_store::StorageError;
 use picofarm_transient::RenderError;
@@ -36,6 +37,15 @@ pub(crate) fn render(error: RenderError) -> PyErr {
 /// Returns a `ValueError` naming the argument.
 pub(crate) fn demultiplex(error: DemultiplexError) -> PyErr {
     PyValueError::new_err(error.to_string())
+}
+
+/// Returns a `ValueError`, or a `RuntimeError` if the work was stopped.
+pub(crate) fn reconstruct(error: ReconstructError) -> PyErr {
+    match error {
+        ReconstructError::Stopped => PyRuntimeError::new_err(error.to_string()),
+        ReconstructError::Render(e) => render(e),
+        _ => PyValueError::new_err(error.to_string()),
+    }
 }
 
 /// Returns a `KeyError` for a scene that is not published, a `FileNotFoundError` without a data

@@ -6,6 +6,7 @@ mod errors;
 mod flash;
 mod render;
 mod scene;
+mod sensor;
 mod work;
 
 use std::ffi::OsString;
@@ -30,6 +31,8 @@ fn _native(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(main, m)?)?;
     m.add_function(wrap_pyfunction!(render::render, m)?)?;
     m.add_function(wrap_pyfunction!(flash::demultiplex, m)?)?;
+    m.add_function(wrap_pyfunction!(flash::reconstruct, m)?)?;
+    m.add_function(wrap_pyfunction!(sensor::sense, m)?)?;
     m.add_class::<scene::Scene>()?;
     m.add_class::<data::Dataset>()?;
     Ok(())

@@ -128,6 +128,38 @@ impl Scene {
         Self::new(scene.map_err(errors::scene)?)
     }
 
+    /// Returns the scene with a camera elsewhere. `up` must not be along the view.
+    fn seen_from(
+        &self,
+        look_from: [f32; 3],
+        look_at: [f32; 3],
+        fov: Option<f32>,
+        up: [f32; 3],
+    ) -> PyResult<Self> {
+        let mut scene = (*self.scene).clone();
+        let camera = &mut scene.camera;
+        let (eye, up) = (Vec3::from(look_from), Vec3::from(up));
+        let forward = (Vec3::from(look_at) - eye).normalized();
+        let right = forward.cross(up).normalized();
+        if !forward.is_finite() {
+            return Err(argument("look_at", "expected another point than look_from"));
+        }
+        if !right.is_finite() {
+            return Err(argument("up", "expected a direction across the view"));
+        }
+        let (right, down) = (right, forward.cross(right));
+        (camera.origin, camera.forward) = (eye, forward);
+        (camera.right, camera.down) = (right, down);
+        if let Some(fov) = fov {
+            if !(fov > 0.0 && fov < 180.0) {
+                return Err(argument("fov", format!("expected 0 to 180, found {fov}")));
+            }
+            let i = &mut camera.intrinsics;
+            *i = Intrinsics::from_fov(fov, i.width, i.height);
+        }
+        Self::new(scene)
+    }
+
     /// Returns the scene with an image of another size.
     fn resized(&self, height: u32, width: u32) -> PyResult<Self> {
         let mut scene = (*self.scene).clone();

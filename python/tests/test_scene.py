@@ -229,3 +229,65 @@ def test_plots_and_xarray_show_the_render(render: picofarm.Render) -> None:
     data = render.to_xarray()
     assert data["transient"].dims == ("row", "column", "bin")
     assert data["time"].attrs["units"] == "ns"
+
+
+def test_a_sensor_counts_photons(render: picofarm.Render) -> None:
+    sensed = render.sense(peak_photons=100, seed=3)
+    assert sensed.counts.dtype == np.uint32
+    assert sensed.counts.shape == render.transient.shape
+    assert np.array_equal(sensed.counts, render.sense(peak_photons=100, seed=3, threads=1).counts)
+    assert not np.array_equal(sensed.counts, render.sense(peak_photons=100, seed=4).counts)
+    quiet = {"poisson": False, "pulse": {"kind": "none"}, "rebin": 2}
+    expected = render.sense({**quiet, "jitter": {"kind": "gaussian", "fwhm_ps": 0}})
+    assert expected.gate.bins == render.gate.bins // 2
+    assert expected.gate.bin_width_m == 2 * render.gate.bin_width_m
+    pairs = render.transient.reshape(*render.depth.shape, -1, 2).sum(axis=3)
+    assert np.allclose(expected.counts, expected.scale * pairs, rtol=1e-4, atol=1e-4)
+    assert "photons each" in repr(sensed)
+    assert sensed.demultiplex().depth.shape == render.depth.shape
+    for bad in ({"dark": 1}, {"rebin": 0}, {"dark_per_bin": -1}):
+        with pytest.raises(ValueError, match="sensor: "):
+            render.sense(bad)
+    with pytest.raises(ValueError, match="photons"):
+        render.sense(peak_photons=-1)
+
+
+def test_light_in_flight_and_notebooks_show_the_render(
+    render: picofarm.Render, tmp_path: pathlib.Path
+) -> None:
+    pytest.importorskip("matplotlib").use("agg")
+    file = render.animate(tmp_path / "light.gif", frames=5)
+    assert file.read_bytes()[:3] == b"GIF"
+    page = render._repr_html_()
+    assert "data:image/png" in page and "16x16 pixels" in page
+
+
+def test_a_room_is_reconstructed_from_one_flash(tmp_path: pathlib.Path) -> None:
+    room = picofarm.furnished(11, resolution=32)
+    render = room.render(samples=16, bins=637)
+    shares: list[float] = []
+    made = render.reconstruct(nodes=32, progress=shares.append)
+    assert made.vertices.shape[1] == 3 and made.triangles.max() < len(made.vertices)
+    assert 0 < made.error < 1
+    assert shares == sorted(shares)
+    again = render.reconstruct(nodes=32, threads=1)
+    assert again.glb == made.glb
+    file = made.save(tmp_path / "room.glb")
+    assert picofarm.Scene(file).triangles == len(made.triangles)
+    pytest.importorskip("matplotlib").use("agg")
+    made.plot().savefig(tmp_path / "behind.png")
+    with pytest.raises(ValueError, match="nodes"):
+        render.reconstruct(nodes=3)
+
+
+def test_a_scene_is_seen_from_elsewhere(room: picofarm.Scene) -> None:
+    camera = room.camera
+    ahead = np.add(camera["origin"], camera["forward"])
+    same = room.seen_from(camera["origin"], ahead)
+    assert np.allclose(same.camera["down"], camera["down"], atol=1e-5)
+    turned = room.seen_from(ahead, camera["origin"], fov=60).render(16, samples=2, bins=16)
+    assert turned.depth.max() > 0
+    with pytest.raises(ValueError, match="look_at"):
+        room.seen_from((0, 0, 0), (0, 0, 0))
+    with pytest.raises(ValueError, match="up"):
+        room.seen_from((0, 0, 0), (0, 0, 1), up=(0, 0, 1))

@@ -1,7 +1,7 @@
 //! The Python package passes its own tests (`python/tests`). It, xarray and tensorstore read the
-//! same data as the program, from disk and from S3, and the example of docs/python trains. Runs if
-//! `PICOFARM_PYTHON` names a Python with zarr, xarray, tensorstore, obstore, h5py, pytest and
-//! matplotlib.
+//! same data as the program, from disk and from S3, and the example of docs/python trains. The
+//! notebooks run. Runs if `PICOFARM_PYTHON` names a Python with zarr, xarray, tensorstore, obstore,
+//! h5py, pytest, matplotlib, pandas, nbclient and ipykernel.
 
 use std::{
     ffi::OsString,
@@ -29,9 +29,9 @@ fn repository() -> PathBuf {
     Path::new(&picofarm_tests::package()).join("..")
 }
 
-/// Installs the Python package into a folder of `farm` and returns commands that import it.
-fn with_package(farm: &Farm) -> Cli {
-    let path = farm.scratch.join("site");
+/// Installs the Python package into a folder of `scratch` and returns commands that import it.
+fn with_package(scratch: &Path, cli: Cli) -> Cli {
+    let path = scratch.join("site");
     let package = path.join("picofarm");
     let source = repository().join("python/picofarm");
     for folder in ["", "torch"] {
@@ -46,7 +46,7 @@ fn with_package(farm: &Farm) -> Cli {
     }
     let module = picofarm_tests::binary::python_module();
     std::os::unix::fs::symlink(module, package.join("_native.abi3.so")).unwrap();
-    farm.cli().with("PYTHONPATH", &path.display().to_string())
+    cli.with("PYTHONPATH", &path.display().to_string())
 }
 
 /// Runs a script of this repository to its successful end, with the variables of `cli`.
@@ -107,7 +107,7 @@ fn reprocess(farm: &Farm, source: &Path, target: &str, profile: &str) -> String 
 
 /// Runs everything that the example does, at one location.
 fn everything(python: &OsString, farm: &Farm, source: &Path, place: &dyn Fn(&str) -> String) {
-    let cli = with_package(farm);
+    let cli = with_package(farm.scratch.path(), farm.cli());
     for (profile, saturates) in [
         ("sqrt-u16", true),
         ("coarse", false),
@@ -172,12 +172,32 @@ fn the_package_passes_its_own_tests() {
         return;
     };
     let (farm, source) = rooms("python-package");
-    let cli = with_package(&farm).with("PICOFARM_DATASET", &source.display().to_string());
+    let cli = with_package(farm.scratch.path(), farm.cli()).with("PICOFARM_DATASET", &source.display().to_string());
     let tests = repository().join("python/tests").display().to_string();
     let pytest = ["-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", &tests];
     let ended = cli.run_other(&python, &pytest).ok();
     assert!(ended.stdout.contains(" passed"), "{}", ended.stdout);
     assert!(!ended.stdout.contains(" skipped"), "{}", ended.stdout);
+}
+
+#[test]
+fn the_notebooks_of_the_documentation_run() {
+    let Some(python) = python("notebooks") else {
+        return;
+    };
+    let scratch = Scratch::new("notebooks");
+    let cli = with_package(scratch.path(), Cli::new(scratch.path()));
+    let mut notebooks: Vec<String> = repository()
+        .join("docs/notebooks")
+        .read_dir()
+        .unwrap()
+        .map(|entry| entry.unwrap().path().display().to_string())
+        .collect();
+    notebooks.sort();
+    assert_eq!(notebooks.len(), 4, "{notebooks:?}");
+    let notebooks: Vec<&str> = notebooks.iter().map(String::as_str).collect();
+    let ended = run(&python, &cli, "tests/interop/run_notebooks.py", &notebooks);
+    assert_eq!(ended.stdout.matches(": ran").count(), 4, "{}", ended.stdout);
 }
 
 #[test]
