@@ -172,7 +172,8 @@ fn the_package_passes_its_own_tests() {
         return;
     };
     let (farm, source) = rooms("python-package");
-    let cli = with_package(farm.scratch.path(), farm.cli()).with("PICOFARM_DATASET", &source.display().to_string());
+    let cli = with_package(farm.scratch.path(), farm.cli())
+        .with("PICOFARM_DATASET", &source.display().to_string());
     let tests = repository().join("python/tests").display().to_string();
     let pytest = ["-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", &tests];
     let ended = cli.run_other(&python, &pytest).ok();

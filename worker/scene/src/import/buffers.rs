@@ -21,14 +21,14 @@ impl Buffers {
     /// Reads or decodes every buffer.
     pub(super) fn read(
         path: &Path,
-        buffers: &[json::Buffer],
+        root: &json::Root,
         mut blob: Option<Vec<u8>>,
         files: &Opener,
     ) -> Result<Self, SceneError> {
         let read = |(index, buffer): (usize, &json::Buffer)| {
             let at = format!("buffers[{index}]");
             let length = usize::try_from(buffer.byte_length.0).unwrap_or(usize::MAX);
-            if is_fallback(buffer) {
+            if is_fallback(root, index) {
                 return Ok(Vec::new());
             }
             if let Some(uri) = &buffer.uri
@@ -48,7 +48,7 @@ impl Buffers {
             })?;
             checked(path, &at, data, length)
         };
-        let all = buffers.iter().enumerate();
+        let all = root.buffers.iter().enumerate();
         all.map(read).collect::<Result<_, _>>().map(Self)
     }
 
@@ -114,11 +114,21 @@ impl Buffers {
     }
 }
 
-/// Returns whether a buffer only serves readers without meshopt's extension.
-fn is_fallback(buffer: &json::Buffer) -> bool {
+/// Returns whether a buffer only serves readers without meshopt's extension: it says so, or it has
+/// no content and all of its views are compressed.
+fn is_fallback(root: &json::Root, index: usize) -> bool {
+    const NAME: &str = "meshopt_compression";
+    let buffer = &root.buffers[index];
     let extensions = buffer.extensions.iter().flat_map(|e| &e.others);
-    let mut stated = extensions.filter(|(name, _)| name.ends_with("meshopt_compression"));
+    let mut stated = extensions.filter(|(name, _)| name.ends_with(NAME));
+    let views = root.buffer_views.iter();
+    let mut own = views.filter(|v| v.buffer.value() == index).peekable();
+    let compressed = |view: &json::buffer::View| {
+        let mut extensions = view.extensions.iter().flat_map(|e| e.others.keys());
+        extensions.any(|name| name.ends_with(NAME))
+    };
     stated.any(|(_, e)| e.get("fallback") == Some(&serde_json::Value::Bool(true)))
+        || (buffer.uri.is_none() && own.peek().is_some() && own.all(compressed))
 }
 
 fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8>, SceneError> {

@@ -132,7 +132,7 @@ fn open(
     let mut parsed = parsed;
     parsed.check().map_err(fail)?;
     let blob = parsed.blob.take();
-    let mut buffers = Buffers::read(path, &parsed.root.buffers, blob, files)?;
+    let mut buffers = Buffers::read(path, &parsed.root, blob, files)?;
     plain::convert(&mut parsed.root, &mut buffers.0).map_err(fail)?;
     let (document, facts) = parsed.document(bytes).map_err(fail)?;
     Ok((document, buffers, facts))
