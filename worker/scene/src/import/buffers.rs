@@ -25,10 +25,11 @@ impl Buffers {
         mut blob: Option<Vec<u8>>,
         files: &Opener,
     ) -> Result<Self, SceneError> {
+        let fallbacks = fallbacks(root);
         let read = |(index, buffer): (usize, &json::Buffer)| {
             let at = format!("buffers[{index}]");
             let length = usize::try_from(buffer.byte_length.0).unwrap_or(usize::MAX);
-            if is_fallback(root, index) {
+            if fallbacks[index] {
                 return Ok(Vec::new());
             }
             if let Some(uri) = &buffer.uri
@@ -114,21 +115,27 @@ impl Buffers {
     }
 }
 
-/// Returns whether a buffer only serves readers without meshopt's extension: it says so, or it has
-/// no content and all of its views are compressed.
-fn is_fallback(root: &json::Root, index: usize) -> bool {
+/// Returns for each buffer whether it only serves readers without meshopt's extension: it says so,
+/// or it has no content and all of its views are compressed.
+fn fallbacks(root: &json::Root) -> Vec<bool> {
     const NAME: &str = "meshopt_compression";
-    let buffer = &root.buffers[index];
-    let extensions = buffer.extensions.iter().flat_map(|e| &e.others);
-    let mut stated = extensions.filter(|(name, _)| name.ends_with(NAME));
-    let views = root.buffer_views.iter();
-    let mut own = views.filter(|v| v.buffer.value() == index).peekable();
-    let compressed = |view: &json::buffer::View| {
+    // The numbers of views and of compressed views.
+    let mut views = vec![(0u32, 0u32); root.buffers.len()];
+    for view in &root.buffer_views {
         let mut extensions = view.extensions.iter().flat_map(|e| e.others.keys());
-        extensions.any(|name| name.ends_with(NAME))
+        let compressed = extensions.any(|name| name.ends_with(NAME));
+        if let Some((all, packed)) = views.get_mut(view.buffer.value()) {
+            (*all, *packed) = (*all + 1, *packed + u32::from(compressed));
+        }
+    }
+    let buffers = root.buffers.iter().zip(views);
+    let fallback = |(buffer, (all, packed)): (&json::Buffer, (u32, u32))| {
+        let extensions = buffer.extensions.iter().flat_map(|e| &e.others);
+        let mut stated = extensions.filter(|(name, _)| name.ends_with(NAME));
+        stated.any(|(_, e)| e.get("fallback") == Some(&serde_json::Value::Bool(true)))
+            || (buffer.uri.is_none() && all > 0 && all == packed)
     };
-    stated.any(|(_, e)| e.get("fallback") == Some(&serde_json::Value::Bool(true)))
-        || (buffer.uri.is_none() && own.peek().is_some() && own.all(compressed))
+    buffers.map(fallback).collect()
 }
 
 fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8>, SceneError> {
