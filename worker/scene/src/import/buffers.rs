@@ -29,7 +29,8 @@ impl Buffers {
         let read = |(index, buffer): (usize, &json::Buffer)| {
             let at = format!("buffers[{index}]");
             let length = usize::try_from(buffer.byte_length.0).unwrap_or(usize::MAX);
-            if fallbacks[index] {
+            // The binary chunk is the first buffer.
+            if fallbacks[index] && (index > 0 || blob.is_none()) {
                 return Ok(Vec::new());
             }
             if let Some(uri) = &buffer.uri
