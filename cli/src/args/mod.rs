@@ -221,6 +221,12 @@ pub enum Assets {
     Install,
     /// List the installed furniture
     List,
+    /// Make the list of a folder of .glb models, assets.csv: categories come from the names of
+    /// folders and files, or from the metadata of the Amazon Berkeley Objects
+    Scan {
+        /// Folder of models [default: the assets folder]
+        folder: Option<PathBuf>,
+    },
 }
 
 #[derive(Args)]

@@ -8,6 +8,7 @@ mod install;
 mod materials;
 mod obj;
 mod parametric;
+mod scan;
 mod small;
 mod storage;
 mod upholstery;
@@ -24,6 +25,7 @@ use crate::{Mesh, SceneError, rng::Rng, trace::Model};
 use catalogue::{Archive, Item};
 
 pub use install::install;
+pub use scan::{Scanned, scan};
 
 /// Changes whenever a parametric model changes shape.
 const PARAMETRIC_VERSION: &str = "parametric-1";

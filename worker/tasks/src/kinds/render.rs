@@ -1,7 +1,7 @@
 //! Rendering: adopts a scene that exists, or makes, renders, encodes and publishes it.
 
 use picofarm_files::Opener;
-use picofarm_proto::spec::{RenderTask, SpecError, TaskKind};
+use picofarm_proto::spec::{RenderSettings, RenderTask, SpecError, TaskKind};
 use picofarm_scene::{FittedGate, Scene};
 use picofarm_store::published::Manifest as _;
 use picofarm_transient::Settings;
@@ -92,6 +92,12 @@ fn fit_gate(task: &mut RenderTask) -> Result<(), SpecError> {
         return Err(fail(what.into()));
     };
     let fitted = FittedGate::new(range, task.render.gate());
+    if fitted.gate.bin_width_m > RenderSettings::MAX_BIN_M {
+        let [_, last] = range;
+        return Err(fail(format!(
+            "\"auto\" cannot be fitted: light takes up to {last:.0} m; set scenes.unit, for example to \"mm\""
+        )));
+    }
     if !fitted.usual_fits {
         task.render.gate_start_m = fitted.gate.start_m;
         task.render.bin_width_m = fitted.gate.bin_width_m;

@@ -98,6 +98,9 @@ impl RenderSettings {
     /// The available subsets of the 10×10 grid of spots.
     pub const SUBSETS: [u32; 2] = [4, 25];
 
+    /// Widest bin, metres of optical path.
+    pub const MAX_BIN_M: f64 = 10.0;
+
     /// Most pixels of an image's side.
     pub const MAX_SIDE: u32 = 4096;
 
@@ -117,7 +120,8 @@ impl RenderSettings {
         // From a hundredth of a picosecond to 33 ns, beyond any detector on either side.
         // Picoseconds mistaken for metres are outside this range.
         let width = "metres of optical path; 1 ps is 0.0002998 m, so 128 ps are 0.0384";
-        within("render.bin_width_m", self.bin_width_m, (1e-6, 10.0), width)?;
+        let widths = (1e-6, Self::MAX_BIN_M);
+        within("render.bin_width_m", self.bin_width_m, widths, width)?;
         within("render.bins", self.bins, (1, 65_536), "bins")?;
         if let Some(n) = self.subsets.iter().find(|n| !Self::SUBSETS.contains(n)) {
             return fail(
