@@ -99,6 +99,12 @@ def test_histograms_are_normalised_as_in_the_paper() -> None:
     assert float(one_hot[:, 0, 1].sum()) == 0
     assert picofarm.torch.metrics("tof", [1, 2], [1, 4]) == {"mae_m": 1.0, "rmse_m": 2**0.5}
     assert picofarm.torch.metrics("shadow", [0.9, 0.2], [1, 1])["iou"] == 0.5
+    spec = {"architecture": "unet2d", "dense": 5, "width": 4, "levels": 2}
+    evidence = torch.randn(1, 5, 8, 8)
+    plain = picofarm.torch.network(spec).eval()
+    added = picofarm.torch.network({**spec, "added": True}).eval()
+    added.load_state_dict(plain.state_dict())
+    assert torch.allclose(added(evidence), plain(evidence) + evidence[:, -1:])
     with pytest.raises(ValueError, match="architecture"):
         picofarm.torch.network({"architecture": "unet4d"})
 

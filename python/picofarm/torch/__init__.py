@@ -72,7 +72,11 @@ def network(spec: Mapping[str, Any]) -> nn.Module:
         known = ", ".join(ARCHITECTURES)
         raise ValueError(f"architecture: expected one of {known}, found {name!r}")
     whole = {"width": 128, "levels": 6, "stem": 0, "time": 0, "one_hot": 0, "outputs": 1, **spec}
-    return ARCHITECTURES[name](whole)
+    module = ARCHITECTURES[name](whole)
+    if spec.get("added", False):
+        # A network over evidence corrects the log odds in the last channel.
+        module.register_forward_hook(lambda _, inputs, output: output + inputs[0][:, -1:])
+    return module
 
 
 class Model(nn.Module):
@@ -96,6 +100,8 @@ class Model(nn.Module):
                 its two-bounce time, `[row, column]`; -1 outside of the gate.
         """
         question = self.question
+        if question["variant"] == "evidence":
+            raise ValueError("transient: the model reads evidence, not histograms; call `network`")
         planes = normalised(transient, question["bins"], question["normalise"])
         if question.get("intensity_only", False):
             raise ValueError("transient: the model reads intensities; call `network` with them")
