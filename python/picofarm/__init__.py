@@ -12,12 +12,16 @@ which `local` starts on this machine. The command line `picofarm` is part of the
 are metres of optical path, times are nanoseconds.
 """
 
+from ._arguments import Gate
 from ._data import Dataset, Stream, open
 from ._farm import Client, FarmError, Job, JobFailed, LocalFarm, Sweep, local
+from ._flash import Capture, Flash, Reconstruction
 from ._native import __version__
-from ._scene import Flash, Gate, Reconstruction, Render, Scene, Sensed, furnished
+from ._render import Render, Sensed
+from ._scene import Scene, furnished
 
 __all__ = [
+    "Capture",
     "Client",
     "Dataset",
     "FarmError",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _native
-from ._scene import Gate
+from ._arguments import Gate
 
 _Window = tuple[int, int, int, int]
 _IMAGES = frozenset(

@@ -29,7 +29,7 @@ def render(
 ) -> dict[str, Any]: ...
 def demultiplex(
     histogram: NDArray[np.float32],
-    scene: Scene,
+    view: Viewpoint,
     gate: tuple[float, float],
     spots: NDArray[np.float32],
     shadows: str,
@@ -37,7 +37,8 @@ def demultiplex(
 ) -> dict[str, Any]: ...
 def reconstruct(
     histogram: NDArray[np.float32],
-    scene: Scene,
+    view: Viewpoint,
+    scene: Scene | None,
     gate: tuple[float, float],
     spots: NDArray[np.float32],
     nodes: int | None,
@@ -54,6 +55,16 @@ def sense(
     scene: int,
     threads: int | None,
 ) -> dict[str, Any]: ...
+
+class Viewpoint:
+    def __new__(
+        cls,
+        intrinsics: tuple[float, float, float, float],
+        shape: tuple[int, int],
+        laser: _Point,
+    ) -> Viewpoint: ...
+    @staticmethod
+    def of_scene(scene: Scene) -> Viewpoint: ...
 
 class Scene:
     @staticmethod

@@ -7,7 +7,7 @@ use picofarm_demultiplex::{Capture, Place, Settings, Shading, Spot};
 use picofarm_reconstruct::{
     Phase, Progress, ReconstructError, Reconstruction, World, score, source, surface,
 };
-use picofarm_scene::Vec3;
+use picofarm_scene::{Camera, Intrinsics, Vec3};
 use picofarm_settings::GridSettings;
 use picofarm_tasks::reconstruct::{errors as errors_of, facts};
 use picofarm_transient::Gate;
@@ -27,9 +27,62 @@ const VIEW_SIDE: u32 = 128;
 /// Number of these views.
 const VIEWS: usize = 24;
 
+/// Camera and laser of a capture.
+#[pyclass(frozen, module = "picofarm._native")]
+pub(crate) struct Viewpoint {
+    camera: Camera,
+    laser: Vec3,
+}
+
+#[pymethods]
+impl Viewpoint {
+    /// A camera at the origin that looks along z, with x to the right and y downwards. `intrinsics`
+    /// are fx, fy, cx, cy in pixels; `shape` is (height, width).
+    #[new]
+    fn new(intrinsics: [f32; 4], shape: (u32, u32), laser: [f32; 3]) -> PyResult<Self> {
+        let [fx, fy, cx, cy] = intrinsics;
+        let sound = [fx, fy].iter().all(|f| f.is_finite() && *f > 0.0);
+        if !sound || !cx.is_finite() || !cy.is_finite() {
+            let what = format!("expected fx, fy, cx, cy in pixels, found {intrinsics:?}");
+            return Err(argument("intrinsics", what));
+        }
+        let laser = Vec3::from(laser);
+        if !laser.is_finite() {
+            return Err(argument("laser", "expected a position in metres"));
+        }
+        let (height, width) = shape;
+        Ok(Self {
+            camera: Camera {
+                intrinsics: Intrinsics {
+                    fx,
+                    fy,
+                    cx,
+                    cy,
+                    width,
+                    height,
+                },
+                origin: Vec3::ZERO,
+                right: Vec3::new(1.0, 0.0, 0.0),
+                down: Vec3::new(0.0, 1.0, 0.0),
+                forward: Vec3::new(0.0, 0.0, 1.0),
+            },
+            laser,
+        })
+    }
+
+    /// Camera and laser of a scene.
+    #[staticmethod]
+    fn of_scene(scene: &Scene) -> Self {
+        Self {
+            camera: scene.scene.camera,
+            laser: scene.scene.laser.origin,
+        }
+    }
+}
+
 /// A histogram with the beams that made spots.
 struct Flash<'a> {
-    scene: &'a picofarm_scene::Scene,
+    view: &'a Viewpoint,
     histogram: &'a [f32],
     gate: Gate,
     /// Index of each spot's beam.
@@ -41,27 +94,27 @@ struct Flash<'a> {
 
 impl<'a> Flash<'a> {
     /// `spots` are rows of at least x, y, z, and the path from the laser in the last column; rows
-    /// of NaN are beams without a spot.
+    /// of NaN are beams without a spot. Rows of three columns are directions of beams whose spots
+    /// are unknown.
     fn new(
-        scene: &'a Scene,
+        view: &'a Viewpoint,
         histogram: &'a PyReadonlyArray3<'_, f32>,
         gate: (f64, f64),
         spots: &PyReadonlyArray2<'_, f32>,
     ) -> PyResult<Self> {
-        let scene = &scene.scene;
         let shape = histogram.shape();
-        let image = &scene.camera.intrinsics;
+        let image = &view.camera.intrinsics;
         if shape[..2] != [image.height as usize, image.width as usize] {
             let what = format!(
-                "has {}x{} pixels, but the scene's image has {}x{}",
+                "has {}x{} pixels, but the camera's image has {}x{}",
                 shape[0], shape[1], image.height, image.width
             );
             return Err(argument("histogram", what));
         }
         let contiguous = |name: &str| argument(name, "the array must be contiguous");
         let columns = spots.shape()[1];
-        if columns < 4 {
-            let what = format!("expected at least 4 columns (x, y, z, path), found {columns}");
+        if columns < 3 {
+            let what = format!("expected at least 3 columns, found {columns}");
             return Err(argument("spots", what));
         }
         let rows = spots.as_slice().map_err(|_| contiguous("spots"))?;
@@ -70,15 +123,21 @@ impl<'a> Flash<'a> {
             let (point, path_m) = (Vec3::new(row[0], row[1], row[2]), row[columns - 1]);
             if point.is_finite() && path_m.is_finite() {
                 beams.push(k);
-                known.push(Spot {
-                    direction: point - scene.laser.origin,
-                    place: Some(Place { point, path_m }),
+                known.push(match columns {
+                    3 => Spot {
+                        direction: point,
+                        place: None,
+                    },
+                    _ => Spot {
+                        direction: point - view.laser,
+                        place: Some(Place { point, path_m }),
+                    },
                 });
             }
         }
         let bins = u32::try_from(shape[2]);
         Ok(Self {
-            scene,
+            view,
             histogram: histogram.as_slice().map_err(|_| contiguous("histogram"))?,
             gate: Gate {
                 start_m: gate.0,
@@ -95,8 +154,8 @@ impl<'a> Flash<'a> {
         Capture {
             histogram: self.histogram,
             gate: self.gate,
-            camera: &self.scene.camera,
-            laser: self.scene.laser.origin,
+            camera: &self.view.camera,
+            laser: self.view.laser,
             spots: &self.spots,
         }
     }
@@ -107,7 +166,7 @@ impl<'a> Flash<'a> {
 pub(crate) fn demultiplex<'py>(
     py: Python<'py>,
     histogram: PyReadonlyArray3<'py, f32>,
-    scene: &Scene,
+    view: &Viewpoint,
     gate: (f64, f64),
     spots: PyReadonlyArray2<'py, f32>,
     shadows: &str,
@@ -124,7 +183,7 @@ pub(crate) fn demultiplex<'py>(
         },
         ..Settings::default()
     };
-    let flash = Flash::new(scene, &histogram, gate, &spots)?;
+    let flash = Flash::new(view, &histogram, gate, &spots)?;
     let capture = flash.capture();
     let found = work::run(py, threads, None, |_| {
         picofarm_demultiplex::demultiplex(&capture, &settings)
@@ -150,13 +209,15 @@ pub(crate) fn demultiplex<'py>(
 }
 
 /// Reconstructs a room from a histogram `[row, column, bin]` of all spots. Returns a dict of
-/// `vertices`, `triangles`, `glb` (a file), and `facts` (JSON) with the errors against the scene.
+/// `vertices`, `triangles`, `glb` (a file), and `facts` (JSON). With a scene, `facts` has the errors
+/// against it.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "a function of another language")]
 pub(crate) fn reconstruct<'py>(
     py: Python<'py>,
     histogram: PyReadonlyArray3<'py, f32>,
-    scene: &Scene,
+    view: &Viewpoint,
+    scene: Option<&Scene>,
     gate: (f64, f64),
     spots: PyReadonlyArray2<'py, f32>,
     nodes: Option<u32>,
@@ -173,9 +234,9 @@ pub(crate) fn reconstruct<'py>(
     settings
         .check()
         .map_err(|(field, what)| argument(field, what))?;
-    let flash = Flash::new(scene, &histogram, gate, &spots)?;
+    let flash = Flash::new(view, &histogram, gate, &spots)?;
     let made = work::run(py, threads, progress.as_ref(), |watch| {
-        room(&flash, settings, &Phases(watch))
+        room(&flash, scene, settings, &Phases(watch))
     })??;
     let (positions, triangles) = (made.mesh.positions, made.mesh.triangles);
     let (points, corners) = (positions.len(), triangles.len());
@@ -198,7 +259,12 @@ struct Room {
     facts: String,
 }
 
-fn room(flash: &Flash<'_>, settings: GridSettings, watch: &Phases<'_>) -> PyResult<Room> {
+fn room(
+    flash: &Flash<'_>,
+    truth: Option<&Scene>,
+    settings: GridSettings,
+    watch: &Phases<'_>,
+) -> PyResult<Room> {
     let capture = flash.capture();
     let found = picofarm_demultiplex::demultiplex(&capture, &Settings::default());
     let found = found.map_err(errors::demultiplex)?;
@@ -210,11 +276,13 @@ fn room(flash: &Flash<'_>, settings: GridSettings, watch: &Phases<'_>) -> PyResu
         }
         let made = reconstruction.finish();
         let mesh = surface(&made.field);
-        let world = World::new(flash.scene);
-        let range = &made.depth.range;
-        let views = score::around(&made.measured, range, &world, VIEWS, VIEW_SIDE);
         let mut all = facts(&made, &mesh);
-        all.extend(errors_of(&made, &mesh, &world, &views, settings.seed)?);
+        if let Some(truth) = truth {
+            let world = World::new(&truth.scene);
+            let range = &made.depth.range;
+            let views = score::around(&made.measured, range, &world, VIEWS, VIEW_SIDE);
+            all.extend(errors_of(&made, &mesh, &world, &views, settings.seed)?);
+        }
         let glb = mesh.glb(&made.measured)?;
         let facts = serde_json::Value::Object(all).to_string();
         Ok(Room { mesh, glb, facts })

@@ -35,5 +35,6 @@ fn _native(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(sensor::sense, m)?)?;
     m.add_class::<scene::Scene>()?;
     m.add_class::<data::Dataset>()?;
+    m.add_class::<flash::Viewpoint>()?;
     Ok(())
 }

@@ -291,3 +291,37 @@ def test_a_scene_is_seen_from_elsewhere(room: picofarm.Scene) -> None:
         room.seen_from((0, 0, 0), (0, 0, 0))
     with pytest.raises(ValueError, match="up"):
         room.seen_from((0, 0, 0), (0, 0, 1), up=(0, 0, 1))
+
+
+def test_a_capture_needs_no_scene() -> None:
+    room = picofarm.furnished(11, resolution=32)
+    render = room.render(samples=16, bins=637)
+    flash = render.demultiplex()
+    # World to camera.
+    camera = room.camera
+    axes = np.array([camera["right"], camera["down"], camera["forward"]])
+    spots = (render.spots[:, :3] - camera["origin"]) @ axes.T
+    laser = (0.0, 0.0, 0.0)
+    measured = {"gate": render.gate, "laser": laser, "fov": 90}
+    capture = picofarm.Capture(render.transient, spots=spots, **measured)
+    found = capture.demultiplex()
+    assert np.median(np.abs(found.depth - flash.depth)) < 1e-3
+    seen = picofarm.Capture(render.transient, directions=spots, **measured).demultiplex()
+    assert np.median(np.abs(seen.depth - render.depth)) < 0.05
+    halves = np.stack([render.transient * 0.25, render.transient * 0.75])
+    with pytest.raises(ValueError, match="spots: has 25 rows, but there are 2"):
+        picofarm.Capture(halves, spots=spots, **measured)
+    made = capture.reconstruct(nodes=32)
+    assert len(made.triangles) > 100 and np.isnan(made.error)
+    pytest.importorskip("matplotlib").use("agg")
+    made.plot()
+    for name, bad in {
+        "spots": {"spots": spots[:, :2]},
+        "directions": {"spots": spots, "directions": spots},
+        "fov": {"spots": spots, "fov": 200},
+        "intrinsics": {"spots": spots, "fov": None, "intrinsics": [1, 2]},
+        "gate": {"spots": spots, "gate": picofarm.Gate(1.0, 0.1, 3)},
+        "laser": {"spots": spots, "laser": (np.nan, 0, 0)},
+    }.items():
+        with pytest.raises(ValueError, match=name):
+            picofarm.Capture(render.transient, **{**measured, **bad})

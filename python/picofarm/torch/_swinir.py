@@ -3,7 +3,6 @@
 # pyright: basic
 from __future__ import annotations
 
-
 import torch
 from torch import nn
 from torch.nn import functional as F

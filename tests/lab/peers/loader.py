@@ -1,11 +1,15 @@
-"""Compares the readers of a data set: loader.py DATASET [--scenes N].
+"""Compares the readers of a data set: loader.py DATASET [--scenes N] [--workers 0,2,4].
 
-Prints CPU seconds and wall seconds per read of the Python package, zarr-python and tensorstore, for whole scenes, aligned
-crops of 64x64 pixels and single bins. All read the same scenes in the same process, in turns, and the values are compared.
-All compare chunks with their CRC-32C; the package also reads the manifest of each scene.
+DATASET is a folder or an s3:// URL. Prints CPU seconds and wall seconds per read of the Python package, zarr-python and
+tensorstore, for whole scenes, aligned crops of 64x64 pixels and single bins. All read the same scenes, in turns, and the
+values are compared. All compare chunks with their CRC-32C; the package also reads the manifest of each scene. With
+--workers, spawned processes of one decoding thread each read whole scenes and crops, and scenes per second are printed.
 """
 
 import argparse
+import atexit
+import multiprocessing
+import os
 import time
 
 import numpy
@@ -13,6 +17,34 @@ import tensorstore
 import zarr
 
 import picofarm
+
+PARTS = {
+    "whole": lambda h, w, bins: (slice(0, h), slice(0, w), slice(0, bins)),
+    "crop 64x64": lambda h, w, bins: (slice(64, 128), slice(64, 128), slice(0, bins)),
+    "one bin": lambda h, w, bins: (slice(0, h), slice(0, w), slice(200, 201)),
+}
+
+
+def zarr_store(location):
+    if "://" not in location:
+        return location
+    import obstore
+
+    # A moment for its threads before the interpreter ends (https://github.com/PyO3/pyo3-async-runtimes/issues/40).
+    atexit.register(time.sleep, 0.2)
+    return zarr.storage.ObjectStore(obstore.store.from_url(location), read_only=True)
+
+
+def kvstore(location):
+    if "://" not in location:
+        return {"driver": "file", "path": os.path.join(os.path.abspath(location), "transient", "")}
+    bucket, _, prefix = location.removeprefix("s3://").partition("/")
+    found = {"driver": "s3", "bucket": bucket, "path": f"{prefix.rstrip('/')}/transient/"}
+    if "AWS_ENDPOINT_URL" in os.environ:
+        found |= {"endpoint": os.environ["AWS_ENDPOINT_URL"], "aws_region": os.environ.get("AWS_REGION", "us-east-1")}
+    if "AWS_ACCESS_KEY_ID" in os.environ:
+        found["aws_credentials"] = {"type": "environment"}
+    return found
 
 
 def decoded(stored, coding, scale):
@@ -24,46 +56,59 @@ def decoded(stored, coding, scale):
     return h
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("dataset")
-    parser.add_argument("--scenes", type=int, default=3)
-    parser.add_argument("--rounds", type=int, default=3)
-    args = parser.parse_args()
-    package = picofarm.open(args.dataset, arrays=["transient"])
-    group = zarr.open_group(args.dataset, mode="r")
-    coding = group["transient"].attrs.asdict()
-    if "delta" not in coding:
-        raise SystemExit(f"{args.dataset}: expected the profile sqrt-u16")
-    spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{args.dataset}/transient/"}}
-    tensor = tensorstore.open(spec, read=True).result()
-    height, width, bins = group["transient"].shape[1:]
-    parts = {
-        "whole": (slice(0, height), slice(0, width), slice(0, bins)),
-        "crop 64x64": (slice(64, 128), slice(64, 128), slice(0, bins)),
-        "one bin": (slice(0, height), slice(0, width), slice(200, 201)),
-    }
-    scenes = package.scenes[: args.scenes]
+class Readers:
+    """The three readers of one data set. `threads` bounds those that decode."""
 
-    def with_package(scene, rows, columns, span):
-        crop = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
-        return package.read(scene, crop=crop, bins=(span.start, span.stop))["transient"]
+    def __init__(self, location, threads=None):
+        self.package = picofarm.open(location, arrays=["transient"], threads=threads)
+        self.group = zarr.open_group(zarr_store(location), mode="r")
+        if threads:
+            zarr.config.set({"threading.max_workers": threads, "async.concurrency": 10})
+        self.coding = self.group["transient"].attrs.asdict()
+        if "delta" not in self.coding:
+            raise SystemExit(f"{location}: expected the profile sqrt-u16")
+        spec = {"driver": "zarr3", "kvstore": kvstore(location)}
+        if threads:
+            spec["context"] = {"data_copy_concurrency": {"limit": threads}}
+        self.tensor = tensorstore.open(spec, read=True).result()
+        self.scales = self.group["scale"][:]
+        self.shape = self.group["transient"].shape[1:]
 
-    def with_zarr(scene, *part):
-        return decoded(group["transient"][scene, *part], coding, group["scale"][scene])
+    def read(self, reader, scene, part):
+        rows, columns, span = PARTS[part](*self.shape)
+        if reader == "picofarm":
+            crop = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+            return self.package.read(scene, crop=crop, bins=(span.start, span.stop))["transient"]
+        if reader == "zarr-python":
+            stored = self.group["transient"][scene, rows, columns, span]
+        else:
+            stored = self.tensor[scene, rows, columns, span].read().result()
+        return decoded(stored, self.coding, self.scales[scene])
 
-    def with_tensorstore(scene, *part):
-        return decoded(tensor[scene, *part].read().result(), coding, group["scale"][scene])
 
-    readers = {"picofarm": with_package, "zarr-python": with_zarr, "tensorstore": with_tensorstore}
-    for name, part in parts.items():
-        spent = {reader: [] for reader in readers}
-        for _ in range(args.rounds):
+NAMES = ("picofarm", "zarr-python", "tensorstore")
+
+
+def begin(location):
+    global readers
+    readers = Readers(location, threads=1)
+
+
+def load(task):
+    return readers.read(*task).shape
+
+
+def table(location, count, rounds):
+    readers = Readers(location)
+    scenes = readers.package.scenes[:count]
+    for part in PARTS:
+        spent = {reader: [] for reader in NAMES}
+        for _ in range(rounds):
             for scene in scenes:
                 first = None
-                for reader, read in readers.items():
+                for reader in NAMES:
                     cpu, wall = time.process_time(), time.perf_counter()
-                    h = read(scene, *part)
+                    h = readers.read(reader, scene, part)
                     spent[reader].append((time.process_time() - cpu, time.perf_counter() - wall))
                     if first is None:
                         first = h
@@ -74,7 +119,41 @@ def main():
         base = numpy.median([cpu for cpu, _ in spent["picofarm"]])
         for reader, times in spent.items():
             cpu, wall = numpy.median(times, axis=0)
-            print(f"{name:12} {reader:12} {1000 * cpu:8.1f} CPU ms {1000 * wall:8.1f} ms {cpu / base:6.1f}x")
+            print(f"{part:12} {reader:12} {1000 * cpu:8.1f} CPU ms {1000 * wall:8.1f} ms {cpu / base:6.1f}x")
+
+
+def by_workers(location, workers, count, rounds):
+    scenes = picofarm.open(location).scenes[:count] * rounds
+    for part in ("whole", "crop 64x64"):
+        for reader in NAMES:
+            tasks = [(reader, scene, part) for scene in scenes]
+            if workers == 0:
+                begin(location)
+                load(tasks[0])
+                start = time.perf_counter()
+                list(map(load, tasks))
+                seconds = time.perf_counter() - start
+            else:
+                with multiprocessing.get_context("spawn").Pool(workers, begin, (location,)) as pool:
+                    # Starts the processes and opens the arrays.
+                    pool.map(load, tasks[:1] * workers, chunksize=1)
+                    start = time.perf_counter()
+                    pool.map(load, tasks, chunksize=1)
+                    seconds = time.perf_counter() - start
+            print(f"{workers} workers {part:12} {reader:12} {len(tasks) / seconds:8.1f} scenes/s")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("dataset")
+    parser.add_argument("--scenes", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--workers", help="numbers of processes, e.g. 0,2,4")
+    args = parser.parse_args()
+    if args.workers is None:
+        return table(args.dataset, args.scenes, args.rounds)
+    for workers in args.workers.split(","):
+        by_workers(args.dataset, int(workers), args.scenes, args.rounds)
 
 
 if __name__ == "__main__":
