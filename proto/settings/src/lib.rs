@@ -18,7 +18,8 @@ mod wavelengths;
 pub use gate::Gate;
 pub use gpus::Gpus;
 pub use network::{
-    Architecture, Precision, Schedule, ShadowVariant, StemForm, Swin, Target, TimeProjection,
+    Architecture, EvidenceForm, Precision, Schedule, ShadowVariant, StemForm, Swin, Target,
+    TimeProjection,
 };
 pub use optics::Optics;
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};

@@ -40,6 +40,8 @@ pub enum ShadowVariant {
     Index,
     /// m alone; predicts the masks of all spots at once.
     All,
+    /// What a demultiplex stage knows of the spot. The output is added to the stage's log odds.
+    Evidence,
 }
 
 impl ShadowVariant {
@@ -50,12 +52,47 @@ impl ShadowVariant {
             Self::Difference => "difference",
             Self::Index => "index",
             Self::All => "all",
+            Self::Evidence => "evidence",
         }
     }
 
     /// Returns whether the network uses two-bounce times.
     pub fn is_timed(self) -> bool {
         matches!(self, Self::Concat | Self::Difference)
+    }
+
+    /// Returns whether spots are known by their number, so that they must be at the same places in
+    /// all scenes.
+    pub fn is_numbered(self) -> bool {
+        matches!(self, Self::Index | Self::All)
+    }
+}
+
+/// The planes of evidence that a demultiplex stage stores for each spot, and that a network takes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvidenceForm {
+    /// Version of the code that makes them.
+    pub version: String,
+    /// Names of the planes. The last has log odds of being lit.
+    pub planes: Vec<String>,
+}
+
+impl EvidenceForm {
+    /// Codes of the last plane for a difference of one in log odds.
+    const STEPS: f32 = 16.0;
+    /// The least code of log odds that are not negative.
+    const MIDDLE: f32 = 128.0;
+
+    /// Returns the code of log odds: sixteenths, limited to ±8.
+    pub fn code(log_odds: f32) -> u8 {
+        ((log_odds * Self::STEPS).floor() + Self::MIDDLE).clamp(0.0, 255.0) as u8
+    }
+
+    /// Returns the log odds that a code stands for: the middle of its sixteenth, which has the sign
+    /// of what was coded.
+    pub fn log_odds(code: u8) -> f32 {
+        (f32::from(code) + 0.5 - Self::MIDDLE) / Self::STEPS
     }
 }
 
@@ -199,4 +236,20 @@ pub enum Schedule {
     Restarts,
     /// Constant.
     Constant,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::EvidenceForm;
+
+    #[test]
+    fn codes_of_log_odds_keep_their_sign_and_are_near() {
+        for odds in [-7.9f32, -1.0, -0.06, -1e-6, 0.0, 1e-6, 0.06, 1.0, 7.9] {
+            let back = EvidenceForm::log_odds(EvidenceForm::code(odds));
+            assert_eq!(back >= 0.0, odds >= 0.0, "{odds}: {back}");
+            assert!((back - odds).abs() <= 0.032, "{odds}: {back}");
+        }
+        assert_eq!(EvidenceForm::code(-1e9), 0);
+        assert_eq!(EvidenceForm::code(1e9), 255);
+    }
 }

@@ -46,11 +46,15 @@ fn a_demultiplexing_has_a_task_for_each_scene_and_needs_no_model() {
     assert_eq!(again, spec);
     let key = |settings: &str| stage_key(good(&apart(settings, PLACE)).stages.last().unwrap());
     let plain = key("");
-    assert_eq!(key("histogram = \"transient\", places = \"given\""), plain);
+    let defaults =
+        "histogram = \"transient\", places = \"given\", depth = \"own\", evidence = false";
+    assert_eq!(key(defaults), plain);
     for other in [
         "histogram = \"transient_25\"",
         "places = \"returns\"",
         "version = \"x\"",
+        "depth = \"truth\"",
+        "evidence = true",
     ] {
         assert_ne!(key(other), plain, "{other}");
     }
@@ -100,4 +104,80 @@ fn its_predictions_serve_where_those_of_networks_do() {
     );
     let needs = &spec.stages.last().unwrap().needs;
     assert!(needs.contains(&"apart".to_owned()), "{needs:?}");
+}
+
+/// A split and a shadow network with more settings.
+fn network(settings: &str) -> String {
+    format!(
+        "[[stage]]\nkind = \"split\"\nsource = \"rooms\"\nsplit = {{ fractions = [0.5, 0.3, 0.2] }}\n\
+         [[stage]]\nname = \"shadow\"\nkind = \"train\"\nsource = \"rooms\"\n\
+         train = {{ target = \"shadow\", model = \"sh\", {settings} }}\n"
+    )
+}
+
+fn evaluation(times: &str) -> String {
+    format!(
+        "[[stage]]\nkind = \"evaluate\"\nsource = \"rooms\"\n\
+         evaluate = {{ models = [\"shadow\"], times = \"{times}\" }}\n"
+    )
+}
+
+#[test]
+fn networks_take_evidence_and_depths_from_stages_that_store_them() {
+    let evident = network("shadow = { variant = \"evidence\", times = \"apart\" }");
+    let timed = network("shadow = { times = \"apart\" }");
+    let spec = good(&(apart("evidence = true", PLACE) + &evident + &evaluation("apart")));
+    let needs = &spec.stages[3].needs;
+    assert!(needs.contains(&"apart".to_owned()), "{needs:?}");
+    let TaskSpec::Train(task) = &spec.stages[3].task else {
+        panic!("{spec:?}");
+    };
+    assert!(task.train.takes_evidence());
+    good(&(apart("depth = \"truth\", evidence = true", PLACE) + &evident));
+    for (stages, expected) in [
+        (
+            apart("", PLACE) + &evident,
+            "train.shadow.times: \"rooms-apart\" is written by a stage before this one, and holds no evidence",
+        ),
+        (
+            apart("depth = \"truth\"", PLACE) + &timed,
+            "train.shadow.times: \"rooms-apart\" is written by a stage before this one, and holds no depths",
+        ),
+        (
+            apart("depth = \"truth\", evidence = true", PLACE)
+                + &network("")
+                + &evaluation("apart"),
+            "evaluate.times: \"rooms-apart\" is written by a stage before this one, and holds no depths",
+        ),
+        (apart("depth = \"guessed\"", PLACE), "guessed"),
+    ] {
+        let said = refused(&stages);
+        assert!(said.contains(expected), "{said:?} lacks {expected:?}");
+    }
+}
+
+#[test]
+fn settings_of_histograms_are_refused_for_networks_on_evidence() {
+    let shadow = "shadow = { variant = \"evidence\", times = \"apart\" }";
+    for (settings, expected) in [
+        (
+            "shadow = { variant = \"evidence\" }".to_owned(),
+            "train.shadow.times: is \"truth\"",
+        ),
+        (
+            format!("{shadow}, input = {{ bins = 8 }}"),
+            "train.input: is for histograms",
+        ),
+        (
+            format!("{shadow}, sensor = {{ dark_per_bin = 0.1 }}"),
+            "train.sensor: is for histograms",
+        ),
+        (
+            format!("{shadow}, net = {{ architecture = \"nlost\" }}"),
+            "train.net.architecture: is \"nlost\"",
+        ),
+    ] {
+        let said = refused(&(apart("evidence = true", PLACE) + &network(&settings)));
+        assert!(said.contains(expected), "{said:?} lacks {expected:?}");
+    }
 }

@@ -232,6 +232,7 @@ fn trial(args: &ModelArgs) -> Trial {
                 heads: args.heads,
                 window: args.window,
             },
+            added: false,
             frozen: false,
             precision: match args.precision {
                 Numbers::F32 => Precision::F32,

@@ -15,6 +15,7 @@ mod deleted;
 mod demo;
 mod demultiplex;
 mod everyday;
+mod evidence;
 mod figure;
 mod flash;
 mod given_times;

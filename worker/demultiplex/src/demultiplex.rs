@@ -6,9 +6,10 @@ use picofarm_settings::Gate;
 
 use crate::{
     Capture, DemultiplexError, Ground, Place, Settings, Shading,
+    evidence::Evidence,
     fill::fill,
     geometry::{Rays, Source, normals, places},
-    learned::{Scene, log_odds},
+    learned::{Scene, forests},
     light::Light,
     matching,
     mirrors::Mirrors,
@@ -68,7 +69,29 @@ pub fn demultiplex(
     capture: &Capture,
     settings: &Settings,
 ) -> Result<Demultiplexed, DemultiplexError> {
-    take_apart(capture, settings, None, &mut |_| {})
+    take_apart(capture, settings, None, None, &mut |_| {})
+}
+
+/// Takes one flash apart like [`demultiplex`], or like [`shadows_at`] with `depth_m`, and also
+/// returns the evidence.
+///
+/// # Errors
+/// [`DemultiplexError`] names the argument that cannot be used.
+pub fn with_evidence(
+    capture: &Capture,
+    depth_m: Option<&[f32]>,
+    settings: &Settings,
+) -> Result<(Demultiplexed, Evidence), DemultiplexError> {
+    if let Some(depth_m) = depth_m {
+        check_depth(capture, depth_m)?;
+    }
+    if settings.shadows != Shading::Learned {
+        let what = "the evidence is what the learned shadows are judged by";
+        return Err(DemultiplexError::invalid("settings.shadows", what));
+    }
+    let mut evidence = Evidence::new(capture.spots.len(), capture.pixels());
+    let found = take_apart(capture, settings, depth_m, Some(&mut evidence), &mut |_| {})?;
+    Ok((found, evidence))
 }
 
 /// The same where z-depths are known already, metres, `[row][column]`: only shadows and albedo are
@@ -81,19 +104,31 @@ pub fn shadows_at(
     depth_m: &[f32],
     settings: &Settings,
 ) -> Result<Demultiplexed, DemultiplexError> {
+    check_depth(capture, depth_m)?;
+    take_apart(capture, settings, Some(depth_m), None, &mut |_| {})
+}
+
+fn check_depth(capture: &Capture, depth_m: &[f32]) -> Result<(), DemultiplexError> {
     let pixels = capture.pixels();
     if depth_m.len() != pixels || depth_m.iter().any(|z| !z.is_finite()) {
         let what = format!("expected {pixels} finite values, one for each pixel");
         return Err(DemultiplexError::invalid("depth_m", what));
     }
-    take_apart(capture, settings, Some(depth_m), &mut |_| {})
+    Ok(())
 }
 
-/// The method; `watch` sees what shadows are judged by.
+/// What the forests say of all pairs, and what the last of them sees ([`Scene::judged`]).
+pub struct Judgement {
+    pub odds: Vec<Vec<f32>>,
+    pub seen: Vec<Vec<Vec<u8>>>,
+}
+
+/// The method; `watch` sees what shadows are judged by, and `evidence` receives it.
 pub fn take_apart(
     capture: &Capture,
     settings: &Settings,
     known_depth: Option<&[f32]>,
+    mut evidence: Option<&mut Evidence>,
     watch: &mut dyn FnMut(&Scene),
 ) -> Result<Demultiplexed, DemultiplexError> {
     capture.check()?;
@@ -207,12 +242,16 @@ pub fn take_apart(
             shares: &shares,
             judged: &judged,
         };
-        let odds = match settings.shadows {
+        let judgement = match settings.shadows {
             Shading::Physics => None,
-            Shading::Learned => Some(log_odds(&scene)),
+            Shading::Learned => {
+                let (odds, seen) = scene.judged(forests(), evidence.is_some());
+                Some(Judgement { odds, seen })
+            }
         };
         let chance = |i: usize, p: usize| {
-            let odds = odds.as_ref().map_or(&judged[i].smooth, |odds| &odds[i]);
+            let learned = judgement.as_ref().map(|j| &j.odds[i]);
+            let odds = learned.unwrap_or(&judged[i].smooth);
             1.0 / (1.0 + libm::expf(-odds[p]))
         };
         let n = sources.len();
@@ -223,6 +262,9 @@ pub fn take_apart(
             continue;
         }
         watch(&scene);
+        if let (Some(evidence), Some(judgement)) = (evidence.as_deref_mut(), &judgement) {
+            evidence.fill(&sources, judgement);
+        }
         for (i, (s, judged)) in sources.iter().zip(&judged).enumerate() {
             let part = s.beam * pixels..(s.beam + 1) * pixels;
             for (p, out) in all[part.clone()].iter_mut().enumerate() {

@@ -57,6 +57,16 @@ pub const FEATURES: [&str; 37] = [
     "brightness",
     "peak",
 ];
+/// Names of what [`Scene::around`] adds for the second forest.
+pub const AROUND: [&str; 7] = [
+    "log odds before",
+    "log odds near",
+    "log odds around",
+    "share of spots that light it",
+    "log odds, median",
+    "light of other spots",
+    "rest without other spots",
+];
 /// Bins from which on two spots' light does not overlap.
 const OVERLAP: f32 = 2.0;
 
@@ -234,29 +244,31 @@ impl Scene<'_> {
         [explained, rest]
     }
 
-    /// Log odds of all pairs by given forests, `[source][pixel]`.
-    pub fn log_odds(&self, forests: &[Forest]) -> Vec<Vec<f32>> {
+    /// Log odds of all pairs by given forests, `[source][pixel]`, and with `keep` what the last
+    /// forest sees, `[source][feature][pixel]`: how many of a feature's borders its value exceeds.
+    pub fn judged(&self, forests: &[Forest], keep: bool) -> (Vec<Vec<f32>>, Vec<Vec<Vec<u8>>>) {
         let pixels = self.rays.len();
-        let indices = || (0..self.sources.len()).into_par_iter();
-        let mut odds: Vec<Vec<f32>> = indices()
-            .map(|i| forests[0].log_odds(&cut(&forests[0], &self.features(i)), pixels))
-            .collect();
-        for forest in &forests[1..] {
-            odds = indices()
-                .map(|i| {
-                    let mut all = self.features(i);
+        let mut odds: Vec<Vec<f32>> = Vec::new();
+        let mut seen = Vec::new();
+        for forest in forests {
+            let of = |i: usize| {
+                let mut all = self.features(i);
+                if !odds.is_empty() {
                     all.extend(self.around(i, &odds));
-                    forest.log_odds(&cut(forest, &all), pixels)
-                })
-                .collect();
+                }
+                let seen = cut(forest, &all);
+                let odds = forest.log_odds(&seen, pixels);
+                (odds, if keep { seen } else { Vec::new() })
+            };
+            (odds, seen) = (0..self.sources.len()).into_par_iter().map(of).unzip();
         }
-        odds
+        (odds, seen)
     }
 }
 
-/// Log odds of all pairs by the weights of this crate.
-pub fn log_odds(scene: &Scene) -> Vec<Vec<f32>> {
-    scene.log_odds(&WEIGHTS)
+/// The forests of this crate.
+pub fn forests() -> &'static [Forest] {
+    &WEIGHTS
 }
 
 fn cut(forest: &Forest, features: &[Vec<f32>]) -> Vec<Vec<u8>> {

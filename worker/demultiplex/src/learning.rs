@@ -23,8 +23,8 @@ pub fn features(
     pairs: &[(usize, usize)],
 ) -> Result<Vec<Vec<f32>>, DemultiplexError> {
     let mut out = Vec::new();
-    take_apart(capture, settings, depth_m, &mut |scene| {
-        let odds = first.map(|f| scene.log_odds(std::slice::from_ref(f)));
+    take_apart(capture, settings, depth_m, None, &mut |scene| {
+        let odds = first.map(|f| scene.judged(std::slice::from_ref(f), false).0);
         let parts: Vec<Vec<Vec<f32>>> = (0..scene.sources.len())
             .into_par_iter()
             .map(|i| {

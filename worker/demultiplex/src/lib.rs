@@ -9,6 +9,7 @@
 mod capture;
 mod demultiplex;
 mod error;
+mod evidence;
 mod fill;
 mod forest;
 mod geometry;
@@ -27,8 +28,9 @@ mod sweep;
 mod unmix;
 
 pub use capture::{Capture, Place, Spot};
-pub use demultiplex::{Demultiplexed, demultiplex, shadows_at};
+pub use demultiplex::{Demultiplexed, demultiplex, shadows_at, with_evidence};
 pub use error::DemultiplexError;
+pub use evidence::Evidence;
 pub use residual::{Residual, residual};
 pub use score::{DepthScore, MaskScore, Truth};
 pub use settings::{Settings, Shading};

@@ -241,6 +241,7 @@ mod tests {
             intensity_only: false,
             spots: 1,
             depth_scale_m: 4.5,
+            evidence: None,
         }
     }
 

@@ -43,6 +43,9 @@ pub struct Scene {
     /// The length of each spot's beam from the laser, metres. Mirrors fold the beam and make it
     /// longer than the straight line. NaN if the beam hits nothing.
     pub beams_m: Vec<f32>,
+    /// Codes of the evidence, if the network sees it: `[spot][plane][row][column]`. The histogram
+    /// may then be empty.
+    pub evidence: Vec<u8>,
     /// The intrinsics fx, fy, cx, cy in pixels.
     pub intrinsics: [f64; 4],
 }
@@ -61,6 +64,7 @@ impl Scene {
             spots: self.spots.clone(),
             lit: self.lit.clone(),
             beams_m: self.beams_m.clone(),
+            evidence: self.evidence.clone(),
             ..*self
         }
     }
@@ -114,7 +118,7 @@ impl Scene {
     pub fn bytes(&self) -> usize {
         let seen = self.seen_depth_m.as_ref().map_or(0, Vec::len);
         let floats = self.histogram.len() + self.depth_m.len() + seen;
-        4 * floats + self.specular.len() + self.lit.len()
+        4 * floats + self.specular.len() + self.lit.len() + self.evidence.len()
     }
 
     /// Returns the number of pixels.

@@ -102,6 +102,7 @@ pub fn published(entry: &Entry) -> Option<Published> {
             ShadowVariant::Difference => ("A.1 difference", Some(0.0231), Some(0.950)),
             ShadowVariant::Index => ("A.1 index", Some(0.0896), Some(0.799)),
             ShadowVariant::All => ("A.1 all at once", Some(0.0984), Some(0.788)),
+            ShadowVariant::Evidence => return None,
         },
     };
     Some(Published {

@@ -272,9 +272,10 @@ fn seeds(group: &Group) -> String {
 pub(super) fn sees(report: &Report, group: &Group) -> String {
     let entry = &report.models[group.models[0]];
     let (question, net) = (&entry.plan.question, &entry.plan.net);
-    let mut words = vec![match question.intensity_only {
-        true => "intensity only".to_owned(),
-        false => format!("{} bins", question.bins),
+    let mut words = vec![match (&question.evidence, question.intensity_only) {
+        (Some(form), _) => format!("{} planes", form.planes.len()),
+        (None, true) => "intensity only".to_owned(),
+        (None, false) => format!("{} bins", question.bins),
     }];
     if question.target == Target::Shadow {
         let variant = match question.variant {
@@ -282,6 +283,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
             ShadowVariant::Difference => "difference",
             ShadowVariant::Index => "index",
             ShadowVariant::All => "all spots at once",
+            ShadowVariant::Evidence => "evidence",
         };
         words.extend([variant.to_owned(), format!("{} spots", question.spots)]);
         if question.variant == ShadowVariant::All {

@@ -23,6 +23,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         intensity_only: false,
         spots: 4,
         depth_scale_m: 4.5,
+        evidence: None,
     };
     let (dense, one_hot, outputs) = question.channels();
     let net = NetSpec {
@@ -37,6 +38,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         time: 0,
         time_projection: TimeProjection::Shared,
         swin: Swin::default(),
+        added: false,
         frozen: false,
         precision: picofarm_model::net::Precision::F32,
     };

@@ -215,6 +215,7 @@ fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
     let spots = rendered.spots.iter();
     scene::Scene {
         seen_depth_m: None,
+        evidence: Vec::new(),
         height: i.height as usize,
         width: i.width as usize,
         bins: rendered.gate.bins as usize,

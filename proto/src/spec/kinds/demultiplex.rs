@@ -46,6 +46,14 @@ pub struct DemultiplexSettings {
     pub histogram: Histogram,
     /// Source of the places of the spots.
     pub places: Places,
+    /// Source of the depths at which shadows are judged. With `"truth"`, no depths, mirrors and
+    /// confidences are stored.
+    #[serde(skip_serializing_if = "is_default")]
+    pub depth: DepthSource,
+    /// Whether the evidence of each spot is stored too, for networks (`shadow.variant =
+    /// "evidence"`).
+    #[serde(skip_serializing_if = "is_default")]
+    pub evidence: bool,
     /// Version of the method and of the encoder, part of every task key; filled in at submission if
     /// omitted.
     pub version: String,
@@ -61,6 +69,21 @@ pub enum Places {
     /// The spots' own one-bounce returns in the histogram. Beams that a mirror folds keep the given
     /// place.
     Returns,
+}
+
+/// Source of the depths at which shadows are judged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DepthSource {
+    /// The method's own, from the histogram.
+    #[default]
+    Own,
+    /// The ground truth.
+    Truth,
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl Declared for DemultiplexTask {
@@ -82,7 +105,11 @@ impl TaskKind for DemultiplexTask {
         Io {
             version: ("demultiplex.version", &self.demultiplex.version),
             source: Some(&self.source),
-            makes: Makes::Depths(&self.output),
+            makes: Makes::Apart {
+                to: &self.output,
+                depths: self.demultiplex.depth == DepthSource::Own,
+                evidence: self.demultiplex.evidence,
+            },
             ..Io::default()
         }
     }
@@ -137,7 +164,12 @@ impl TaskKind for DemultiplexTask {
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let source = known.source.as_ref()?;
         let pairs = PAIR * source.pixels() * f64::from(source.spots);
-        Some(BASE + source.truth() + (1.0 + RANGES) * source.histogram() + pairs)
+        // As the forests see it, as codes, and coded for the store.
+        let evidence = match self.demultiplex.evidence {
+            true => 3.0 * source.evidence(),
+            false => 0.0,
+        };
+        Some(BASE + source.truth() + (1.0 + RANGES) * source.histogram() + pairs + evidence)
     }
 
     fn dispatch(&self) -> Dispatch {

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::{
     fields::Fields,
     io::{Io, IoMut, Makes, ModelNames, names},
-    kind::{Declared, Dispatch, Manifest, Results, TaskKind, predicts_depth},
+    kind::{Declared, Dispatch, Manifest, Results, Taken, TaskKind, holds},
     names::{check_model, check_predictions, check_split, check_times},
     reprocess::Histogram,
     train::{TRUTH, check_spots, is_zero},
@@ -268,12 +268,21 @@ impl TaskKind for EvaluateTask {
         Some(BASE + source.two() + asked.fold(0.0, f64::max))
     }
 
-    /// Predicted depths that a model receives must be depths.
+    /// The folder that models take depths or evidence from must have them.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
-        match self.evaluate.predictions.is_empty() {
-            true => predicts_depth(self, before),
-            false => Ok(()),
+        if !self.evaluate.predictions.is_empty() {
+            return Ok(());
         }
+        let taken = |model: &String| {
+            let place = Some((&self.source.store, model));
+            let trained = before.iter().find(|task| task.trains() == place);
+            let settings = trained.and_then(|task| task.training());
+            settings.map_or(Taken::Unknown, Taken::of)
+        };
+        for model in &self.evaluate.models {
+            holds(self, taken(model), before)?;
+        }
+        Ok(())
     }
 }
 

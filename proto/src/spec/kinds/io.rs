@@ -44,8 +44,15 @@ pub enum Makes<'a> {
     Scenes(&'a OutputSettings),
     /// Something for each scene of the source, which is no data set: predictions, reconstructions.
     PerScene(&'a OutputSettings),
-    /// Like `PerScene`, with depths that no model predicts.
-    Depths(&'a OutputSettings),
+    /// Like `PerScene`, by physics and not by models.
+    Apart {
+        /// The destination.
+        to: &'a OutputSettings,
+        /// Whether depths are among it.
+        depths: bool,
+        /// Whether evidence is among it.
+        evidence: bool,
+    },
     /// A split of a data set, and its name.
     Split(&'a SourceSettings, &'a String),
     /// A model.
@@ -121,7 +128,7 @@ impl<'a> Io<'a> {
     /// Returns the store and folder into which something is written for each scene.
     pub fn writes(&self) -> Option<(&'a String, &'a String)> {
         match self.makes {
-            Makes::Scenes(to) | Makes::PerScene(to) | Makes::Depths(to) => {
+            Makes::Scenes(to) | Makes::PerScene(to) | Makes::Apart { to, .. } => {
                 Some((&to.store, &to.dataset))
             }
             _ => None,

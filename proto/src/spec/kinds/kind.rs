@@ -339,13 +339,35 @@ pub enum Manifest<'a> {
     },
 }
 
-/// Refuses a folder in [`Io::folder`] if an earlier stage writes it and predicts no
-/// depth. Other folders are checked when the stage runs.
+/// What a network takes from the folder in [`Io::folder`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// Depths, from which two-bounce times follow.
+    Depths,
+    /// Evidence.
+    Evidence,
+    /// Only the store knows.
+    Unknown,
+}
+
+impl Taken {
+    /// Returns what a network of these settings takes.
+    pub(super) fn of(settings: &TrainSettings) -> Self {
+        match settings.takes_evidence() {
+            true => Self::Evidence,
+            false => Self::Depths,
+        }
+    }
+}
+
+/// Refuses a folder in [`Io::folder`] if an earlier stage writes it and it lacks what the task
+/// takes. Other folders are checked when the stage runs.
 ///
 /// # Errors
 /// Returns a [`SpecError`] at the field that names the folder.
-pub(super) fn predicts_depth(
+pub(super) fn holds(
     task: &dyn TaskKind,
+    taken: Taken,
     before: &[&dyn TaskKind],
 ) -> Result<(), SpecError> {
     let (Some((field, folder)), Some(store)) = (task.io().folder, task.models_store()) else {
@@ -364,15 +386,36 @@ pub(super) fn predicts_depth(
         // Only the store knows the target of an existing model.
         trained.is_none_or(|task| task.predicts() == Some("tof"))
     };
-    let by_model = writer
-        .models()
-        .into_iter()
-        .any(|(_, model)| predicts(model));
-    if by_model || matches!(writer.io().makes, Makes::Depths(_)) {
+    let (depths, evidence) = match writer.io().makes {
+        Makes::Apart {
+            depths, evidence, ..
+        } => (depths, evidence),
+        _ => {
+            let models = writer.models();
+            (models.into_iter().any(|(_, model)| predicts(model)), false)
+        }
+    };
+    let (there, lacks, remedy) = match taken {
+        Taken::Depths => (
+            depths,
+            "depths",
+            "name a demultiplex stage, or an infer stage with a \"tof\" model",
+        ),
+        Taken::Evidence => (
+            evidence,
+            "evidence",
+            "name a demultiplex stage, and give it demultiplex.evidence = true",
+        ),
+        Taken::Unknown => (
+            depths || evidence,
+            "depths and no evidence",
+            "name a demultiplex stage, or an infer stage with a \"tof\" model",
+        ),
+    };
+    if there {
         return Ok(());
     }
-    let what = format!(
-        "{folder:?} is written by a stage before this one, and holds no depths; name a demultiplex stage, or an infer stage with a \"tof\" model"
-    );
+    let what =
+        format!("{folder:?} is written by a stage before this one, and holds no {lacks}; {remedy}");
     Err(SpecError::new(field, what))
 }

@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use super::{
     fields::Fields,
     io::{Io, IoMut, Makes},
-    kind::{Declared, Dispatch, Manifest, Results, TaskKind, predicts_depth},
+    kind::{Declared, Dispatch, Manifest, Results, Taken, TaskKind, holds},
     scenes::SceneSource,
 };
 use crate::spec::{
@@ -137,14 +137,26 @@ impl TaskKind for TrainTask {
         let sums = f64::from(waiting + exchanged + average) * ours.weights();
         // The output of a sensor takes the same memory as the scene.
         let sensed = self.train.sensor.as_ref().map_or(0.0, |_| source.two());
-        Some(BASE + source.two() + sensed + learns + sums + others.fold(0.0, f64::max))
+        let evidence = match self.train.takes_evidence() {
+            true => source.evidence(),
+            false => 0.0,
+        };
+        Some(
+            BASE + source.two()
+                + sensed
+                + 2.0 * evidence
+                + learns
+                + sums
+                + others.fold(0.0, f64::max),
+        )
     }
 
-    /// Predicted depths must come from a depth network, and spots that are known by their number
-    /// must be at the same places in all scenes.
+    /// The folder of two-bounce times must have depths or evidence. Spots that are known by their
+    /// number must be at the same places in all scenes.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
-        predicts_depth(self, before)?;
-        let numbered = self.train.target == Target::Shadow && !self.train.shadow.variant.is_timed();
+        holds(self, Taken::of(&self.train), before)?;
+        let numbered =
+            self.train.target == Target::Shadow && self.train.shadow.variant.is_numbered();
         let spots = scenes_of(&self.source, before).map(|scenes| &scenes.spots);
         match spots {
             Some(Spots::Random(_)) if numbered => {

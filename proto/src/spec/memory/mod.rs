@@ -18,7 +18,7 @@ pub use network::Network;
 pub(super) use rendering::LIGHT_PATHS;
 pub use rendering::Rendering;
 pub(super) use shape::BASE;
-pub use shape::{Shape, gib};
+pub use shape::{EVIDENCE_PLANES, Shape, gib};
 
 #[cfg(test)]
 mod tests;

@@ -12,6 +12,9 @@ pub(super) const BIN: f64 = 4.0;
 /// Bytes of a pixel for the ground truth, the view of its centre, and error sums.
 const TRUTH: f64 = 260.0;
 
+/// Planes of evidence of a spot, a byte each.
+pub const EVIDENCE_PLANES: u32 = 45;
+
 /// The size of scenes that a task reads or makes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shape {
@@ -33,6 +36,11 @@ impl Shape {
     /// Returns the bytes of one histogram of every pixel.
     pub(in crate::spec) fn histogram(&self) -> f64 {
         BIN * self.pixels() * f64::from(self.bins)
+    }
+
+    /// Returns the bytes of the evidence of all pairs of pixel and spot.
+    pub(in crate::spec) fn evidence(&self) -> f64 {
+        f64::from(EVIDENCE_PLANES) * self.pixels() * f64::from(self.spots)
     }
 
     /// Returns the bytes stored for all pixels in addition to histograms.

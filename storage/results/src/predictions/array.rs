@@ -8,6 +8,9 @@ use picofarm_dataset::Element;
 use picofarm_dataset::image_codecs;
 use picofarm_store::sealed::ObjectEntry;
 
+/// Name of the array of evidence.
+pub(super) const EVIDENCE: &str = "evidence";
+
 /// An array with one object per scene.
 #[derive(Debug)]
 pub(super) struct PredictedArray {
@@ -79,6 +82,21 @@ pub(super) fn arrays(spec: &PredictionSpec) -> Vec<PredictedArray> {
             Element::U8,
             vec![h, w],
             IMAGE,
+            a,
+        ));
+    }
+    if let Some(form) = &spec.evidence {
+        let a = json!({
+            "long_name": "what is known of each pair of pixel and spot: ranks times 255, and log odds in sixteenths above 128",
+            "planes": form.planes,
+            "version": form.version,
+            "spots": spec.spots,
+        });
+        arrays.push(PredictedArray::new(
+            EVIDENCE,
+            Element::U8,
+            vec![n, form.planes.len() as u64, h, w],
+            &["scene", "spot", "plane", "row", "column"],
             a,
         ));
     }

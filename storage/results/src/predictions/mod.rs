@@ -1,6 +1,6 @@
 //! Predictions of scenes by models: a separate Zarr v3 group in a store, next to the data set of
 //! the input scenes. It has the same number of scenes, and one object per scene and array: `depth`,
-//! `lit`, `specular` and `confidence`, as far as they are predicted.
+//! `lit`, `specular`, `confidence` and `evidence`, as far as they are predicted.
 //!
 //! A scene's predictions are published like scenes: objects first, `manifests/<scene>.json` last,
 //! all create-only and pure functions of the task.
@@ -42,6 +42,8 @@ pub struct Predicted {
     pub specular: Vec<u8>,
     /// Confidence of the depth, times 255: `[row][column]`.
     pub confidence: Vec<u8>,
+    /// Codes of the evidence: `[spot][plane][row][column]`; empty if none is stored.
+    pub evidence: Vec<u8>,
 }
 
 /// Encoded predictions of one scene, ready to be published.

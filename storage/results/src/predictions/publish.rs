@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 
+use super::array::EVIDENCE;
 use super::manifest::FORMAT;
 use super::{EncodedPredictions, Predicted, PredictionManifest, Predictions};
 use picofarm_store::{ObjectEntry, StorageError, VerifyMode};
@@ -54,6 +55,7 @@ impl Predictions {
                 "depth" => bytemuck::cast_slice(&predicted.depth_m),
                 "lit" => &predicted.lit,
                 "confidence" => &predicted.confidence,
+                EVIDENCE => &predicted.evidence,
                 _ => &predicted.specular,
             };
             if values.len() != array.bytes() {

@@ -1,6 +1,6 @@
 //! Reads predictions, and pins their bytes for keys of tasks.
 
-use super::array::PredictedArray;
+use super::array::{EVIDENCE, PredictedArray};
 use super::{ModelUsed, Predicted, PredictionManifest, Predictions};
 use picofarm_store::StorageError;
 
@@ -53,6 +53,43 @@ impl Predictions {
         Ok(bytemuck::pod_collect_to_vec(&values))
     }
 
+    /// Returns a hash that pins every byte of the evidence of these scenes, in order, as
+    /// [`Self::pin_depths`] does.
+    ///
+    /// # Errors
+    /// [`StorageError::Invalid`] if there is no evidence; those of [`Self::pin_depths`].
+    pub async fn pin_evidence(
+        &self,
+        scenes: &[u64],
+        seen: &[[u8; 32]],
+    ) -> Result<PinnedDepths, StorageError> {
+        if self.spec.evidence.is_none() {
+            return Err(self.no_evidence());
+        }
+        self.pin("shadow", scenes, seen).await
+    }
+
+    /// Returns the codes of a scene's evidence, `[spot][plane][row][column]`, checked against its
+    /// manifest.
+    ///
+    /// # Errors
+    /// Those of [`Self::read`]; [`StorageError::Invalid`] if there is no evidence.
+    pub async fn read_evidence(&self, scene: u64) -> Result<Vec<u8>, StorageError> {
+        let Some(array) = self.arrays.iter().find(|array| array.name == EVIDENCE) else {
+            return Err(self.no_evidence());
+        };
+        let manifest = self.manifest(scene).await?;
+        self.values(array, &manifest).await
+    }
+
+    fn no_evidence(&self) -> StorageError {
+        let what = format!(
+            "{} holds no evidence; name a demultiplex stage with evidence = true",
+            self.place()
+        );
+        StorageError::invalid("predictions", what)
+    }
+
     /// Returns a scene's values of an array, checked against its manifest.
     async fn values(
         &self,
@@ -70,7 +107,8 @@ impl Predictions {
         array.codec.decode(&bytes)
     }
 
-    /// Returns the predictions of a scene, checked against its manifest.
+    /// Returns the predictions of a scene, checked against its manifest. The evidence, which is
+    /// much larger, is not read ([`Self::read_evidence`]).
     ///
     /// # Errors
     /// [`StorageError::NotPublished`], [`StorageError::Damaged`], [`StorageError::Codec`],
@@ -78,7 +116,7 @@ impl Predictions {
     pub async fn read(&self, scene: u64) -> Result<Predicted, StorageError> {
         let manifest = self.manifest(scene).await?;
         let mut predicted = Predicted::default();
-        for array in self.arrays.iter() {
+        for array in self.arrays.iter().filter(|array| array.name != EVIDENCE) {
             let values = self.values(array, &manifest).await?;
             match array.name {
                 "depth" => predicted.depth_m = bytemuck::pod_collect_to_vec(&values),

@@ -1,5 +1,6 @@
 //! The properties of a group of predictions, and the group's root metadata.
 
+use picofarm_settings::EvidenceForm;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
@@ -26,6 +27,9 @@ pub struct PredictionSpec {
     /// Whether the confidence of the depth is stored.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub confidence: bool,
+    /// The planes of evidence of each spot, if they are stored.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evidence: Option<EvidenceForm>,
 }
 
 /// Returns the `zarr.json` of the group with these arrays.
@@ -62,6 +66,7 @@ pub(super) fn difference(
             text(&stored.confidence),
             text(&asked.confidence),
         ),
+        ("evidence", text(&stored.evidence), text(&asked.evidence)),
     ]
     .into_iter()
     .find(|(_, stored, asked)| stored != asked)

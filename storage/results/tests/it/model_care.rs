@@ -290,6 +290,7 @@ async fn who_builds_on_a_model_is_found() {
         spots: vec![],
         specular: false,
         confidence: false,
+        evidence: None,
     };
     for (group, model) in [("seen", "m"), ("others", "n")] {
         let prefix = Path::from("a/store").join(group);

@@ -25,6 +25,10 @@ fn spec(scenes: u64) -> PredictionSpec {
         spots: vec![3, 5],
         specular: true,
         confidence: true,
+        evidence: Some(picofarm_settings::EvidenceForm {
+            version: "apart-1".into(),
+            planes: vec!["near".into(), "far".into(), "log odds".into()],
+        }),
     }
 }
 
@@ -38,6 +42,7 @@ fn predicted(scene: u64) -> Predicted {
         lit: (0..2 * n).map(byte).collect(),
         specular: (0..n).map(|i| byte(i * 3)).collect(),
         confidence: (0..n).map(|i| byte(i * 5)).collect(),
+        evidence: (0..6 * n).map(|i| byte(i * 7)).collect(),
     }
 }
 
@@ -96,7 +101,9 @@ async fn what_was_published_reads_back_and_is_known_again_by_its_task() {
     let there = open(folder.path(), &spec(4)).await.unwrap();
     assert_eq!(there.finished(2, "k").await.unwrap(), None);
     let made = publish(&there, 2, "k").await;
-    assert_eq!(there.read(2).await.unwrap(), predicted(2));
+    let mut read = there.read(2).await.unwrap();
+    read.evidence = there.read_evidence(2).await.unwrap();
+    assert_eq!(read, predicted(2));
     assert_eq!(there.scenes_present().await.unwrap(), [2]);
     assert_eq!(there.finished(2, "k").await.unwrap().unwrap(), made);
     let keys: Vec<&str> = made.objects.iter().map(|o| &*o.key).collect();
@@ -106,7 +113,8 @@ async fn what_was_published_reads_back_and_is_known_again_by_its_task() {
             "depth/c/2/0/0",
             "lit/c/2/0/0/0",
             "specular/c/2/0/0",
-            "confidence/c/2/0/0"
+            "confidence/c/2/0/0",
+            "evidence/c/2/0/0/0/0"
         ]
     );
     // A second publication, by any process, changes nothing.
@@ -161,7 +169,7 @@ async fn a_check_names_what_is_broken_and_what_is_missing() {
     let check = async |mode, complete| there.verify(mode, complete, &|_, _| {}).await.unwrap();
     let whole = check(VerifyMode::Full, false).await;
     assert!(whole.is_sound(), "{:?}", whole.problems);
-    assert_eq!((whole.scenes, whole.objects), (2, 8));
+    assert_eq!((whole.scenes, whole.objects), (2, 10));
     let lit = folder.path().join("lit/c/0/0/0/0");
     let mut bytes = std::fs::read(&lit).unwrap();
     bytes[20] ^= 1;
@@ -264,12 +272,13 @@ async fn zarr_python_and_xarray_read_the_same_predictions() {
         ("lit", &values.lit),
         ("specular", &values.specular),
         ("confidence", &values.confidence),
+        ("evidence", &values.evidence),
     ] {
         std::fs::write(expected.join(format!("{name}.bin")), bytes).unwrap();
     }
     let shapes = json!({
         "depth": ["<f4", [8, 8]], "lit": ["|u1", [2, 8, 8]], "specular": ["|u1", [8, 8]],
-        "confidence": ["|u1", [8, 8]],
+        "confidence": ["|u1", [8, 8]], "evidence": ["|u1", [2, 3, 8, 8]],
     });
     std::fs::write(expected.join("shapes.json"), shapes.to_string()).unwrap();
     let script = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())

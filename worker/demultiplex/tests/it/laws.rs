@@ -4,12 +4,12 @@ use crate::common;
 
 use common::{Plate, Room, Shape, grid, scattered};
 use picofarm_demultiplex::{
-    Capture, Demultiplexed, Ground, Settings, Shading, Truth, demultiplex, residual, score,
-    shadows_at,
+    Capture, Demultiplexed, Evidence, Ground, Settings, Shading, Truth, demultiplex, residual,
+    score, shadows_at, with_evidence,
 };
 use picofarm_scene::Vec3;
 use picofarm_sensor::{Draws, poisson};
-use picofarm_settings::Gate;
+use picofarm_settings::{EvidenceForm, Gate};
 
 const SIDE: u32 = 48;
 
@@ -312,4 +312,54 @@ fn a_capture_without_light_is_taken_apart_in_both_ways() {
         let found = demultiplex(&room.capture(&beams), &settings).expect("no error");
         assert!(found.lit.iter().all(|p| (0.0..=1.0).contains(p)));
     }
+}
+
+#[test]
+fn the_evidence_changes_no_answer_and_its_last_plane_has_the_sign_of_each() {
+    let room = occluded(32);
+    let beams = room.beams(true);
+    let (capture, settings) = (room.capture(&beams), Settings::default());
+    let pixels = capture.pixels();
+    assert_eq!(Evidence::form().planes.len(), Evidence::PLANES);
+    for depth in [None, Some(&room.depth[..])] {
+        let plain = match depth {
+            Some(depth) => shadows_at(&capture, depth, &settings).unwrap(),
+            None => demultiplex(&capture, &settings).unwrap(),
+        };
+        let (found, evidence) = with_evidence(&capture, depth, &settings).unwrap();
+        assert_eq!(found, plain);
+        assert_eq!(
+            evidence.codes.len(),
+            beams.len() * Evidence::PLANES * pixels
+        );
+        let spots = evidence.codes.chunks_exact(Evidence::PLANES * pixels);
+        for (spot, lit) in spots.zip(found.lit.chunks_exact(pixels)) {
+            let odds = &spot[(Evidence::PLANES - 1) * pixels..];
+            for (code, p) in odds.iter().zip(lit) {
+                assert_eq!(
+                    EvidenceForm::log_odds(*code) > 0.0,
+                    *p >= 0.5,
+                    "{code}, {p}"
+                );
+            }
+        }
+        let one = rayon::ThreadPoolBuilder::new()
+            .num_threads(1)
+            .build()
+            .unwrap();
+        let again = one.install(|| with_evidence(&capture, depth, &settings).unwrap());
+        assert_eq!(again, (found, evidence));
+    }
+}
+
+#[test]
+fn evidence_needs_the_learned_shadows() {
+    let room = Room::new(16, &grid(3), None);
+    let beams = room.beams(true);
+    let settings = Settings {
+        shadows: Shading::Physics,
+        ..Settings::default()
+    };
+    let error = with_evidence(&room.capture(&beams), None, &settings).unwrap_err();
+    assert!(error.to_string().contains("settings.shadows"), "{error}");
 }

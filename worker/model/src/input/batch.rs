@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-use super::{Question, ShadowVariant, Target, intensity, merged, planes, planes_of};
+use super::{EvidenceForm, Question, ShadowVariant, Target, intensity, merged, planes, planes_of};
 use crate::{ModelError, net::Input, scene::Scene};
 
 /// The parameters of one visit to a scene.
@@ -61,7 +61,9 @@ pub(crate) fn example_of(
     visit: Visit,
 ) -> Result<(), ModelError> {
     check(batch, question, scene)?;
-    let nothing_else = question.channels().0 == question.bins && !question.intensity_only;
+    let nothing_else = question.channels().0 == question.bins
+        && !question.intensity_only
+        && !question.sees_evidence();
     let ready = batch.images == 0 && nothing_else;
     if ready {
         planes_of(scene, question.bins, question.normalise, &mut batch.dense);
@@ -84,7 +86,14 @@ fn add(batch: &mut Batch, question: &Question, scene: &Scene, visit: Visit, read
     batch.images += 1;
     batch.dense.resize(at + channels * pixels, 0.0);
     let dense = &mut batch.dense[at..];
-    let seen = if question.intensity_only {
+    let seen = if question.sees_evidence() {
+        evidence(
+            &scene.evidence[visit.spot * dense.len()..][..dense.len()],
+            dense,
+            pixels,
+        );
+        channels
+    } else if question.intensity_only {
         intensity(scene, &mut dense[..pixels]);
         1
     } else {
@@ -117,7 +126,7 @@ fn add(batch: &mut Batch, question: &Question, scene: &Scene, visit: Visit, read
                 let from = (seen + visit.spot) * pixels;
                 dense[from..from + pixels].fill(1.0);
             }
-            ShadowVariant::All => {}
+            ShadowVariant::All | ShadowVariant::Evidence => {}
         }
     }
     for plane in dense.chunks_exact_mut(pixels) {
@@ -144,6 +153,18 @@ fn add(batch: &mut Batch, question: &Question, scene: &Scene, visit: Visit, read
     }
     for plane in batch.target[at..].chunks_exact_mut(pixels) {
         flip(plane, scene.width, visit);
+    }
+}
+
+/// Decodes the planes of a spot: ranks to −1..1, and the log odds of the last plane.
+fn evidence(codes: &[u8], planes: &mut [f32], pixels: usize) {
+    let (ranks, odds) = planes.split_at_mut(codes.len() - pixels);
+    for (rank, code) in ranks.iter_mut().zip(codes) {
+        *rank = f32::from(*code) / 127.5 - 1.0;
+    }
+    let codes = &codes[ranks.len()..];
+    for (odds, code) in odds.iter_mut().zip(codes) {
+        *odds = EvidenceForm::log_odds(*code);
     }
 }
 
@@ -183,11 +204,19 @@ fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelE
     if batch.images > 0 {
         check_size((batch.height, batch.width), (scene.height, scene.width))?;
     }
+    let (light, evidence) = match question.sees_evidence() {
+        true => (
+            scene.histogram.len(),
+            question.planes() * question.spots * pixels,
+        ),
+        false => (pixels * scene.bins, scene.evidence.len()),
+    };
     if let Err(what) = merged(scene.bins, question.bins) {
         return Err(ModelError::invalid("input.bins", what));
     }
     let wanted = [
-        ("histogram", scene.histogram.len(), pixels * scene.bins),
+        ("histogram", scene.histogram.len(), light),
+        ("evidence", scene.evidence.len(), evidence),
         ("depth", scene.depth_m.len(), pixels),
         (
             "depth by a network",

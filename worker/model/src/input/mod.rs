@@ -4,7 +4,7 @@
 mod batch;
 mod normalise;
 
-pub use picofarm_settings::{ShadowVariant, Target};
+pub use picofarm_settings::{EvidenceForm, ShadowVariant, Target};
 use serde::{Deserialize, Serialize};
 
 pub(crate) use batch::example_of;
@@ -63,6 +63,9 @@ pub struct Question {
     /// For depths: the divisor in metres that scales depths to 0..1.
     #[serde(default = "of_rooms", skip_serializing_if = "is_of_rooms")]
     pub depth_scale_m: f32,
+    /// For [`ShadowVariant::Evidence`]: the planes of a spot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evidence: Option<EvidenceForm>,
 }
 
 impl Question {
@@ -77,6 +80,7 @@ impl Question {
             (Target::Shadow, ShadowVariant::Concat) => (seen, self.bins, 1),
             (Target::Shadow, ShadowVariant::Index) => (seen + self.spots, 0, 1),
             (Target::Shadow, ShadowVariant::All) => (seen, 0, self.spots),
+            (Target::Shadow, ShadowVariant::Evidence) => (self.planes(), 0, 1),
         }
     }
 
@@ -93,6 +97,16 @@ impl Question {
         self.target == Target::Shadow && self.variant != ShadowVariant::All
     }
 
+    /// Returns whether the input is evidence, and no histogram.
+    pub fn sees_evidence(&self) -> bool {
+        self.target == Target::Shadow && self.variant == ShadowVariant::Evidence
+    }
+
+    /// Returns the number of planes of evidence of a spot.
+    pub(crate) fn planes(&self) -> usize {
+        self.evidence.as_ref().map_or(0, |form| form.planes.len())
+    }
+
     /// Returns whether the input includes two-bounce times.
     pub fn timed(&self) -> bool {
         self.target == Target::Shadow && self.variant.is_timed()
@@ -101,8 +115,7 @@ impl Question {
     /// Returns whether mirrored scenes may be used. They may not if spots are identified by their
     /// number, because a mirrored spot is at the position of another spot.
     pub fn may_flip(&self) -> bool {
-        let numbered = matches!(self.variant, ShadowVariant::Index | ShadowVariant::All);
-        self.target != Target::Shadow || !numbered
+        self.target != Target::Shadow || !self.variant.is_numbered()
     }
 
     /// Checks the question for consistency, and against the network.
@@ -122,6 +135,10 @@ impl Question {
             && self.intensity_only
         {
             let what = "\"difference\" needs histograms; use \"index\" with input.intensity_only";
+            return Err(ModelError::invalid("shadow.variant", what));
+        }
+        if self.sees_evidence() != (self.planes() > 0) || self.sees_evidence() != net.added {
+            let what = "\"evidence\" has planes, the last of which is added to the output; other variants have none";
             return Err(ModelError::invalid("shadow.variant", what));
         }
         let (dense, one_hot, outputs) = self.channels();

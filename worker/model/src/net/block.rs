@@ -190,8 +190,12 @@ pub(super) struct Final {
 }
 
 impl Final {
-    pub(super) fn declare(d: &mut Declarations, inputs: usize, outputs: usize) -> Self {
-        let begin = Begin::FanIn(inputs);
+    /// Declares the layer. With `zero` it begins with zeros.
+    pub(super) fn declare(d: &mut Declarations, inputs: usize, outputs: usize, zero: bool) -> Self {
+        let begin = match zero {
+            true => Begin::Constant(0.0),
+            false => Begin::FanIn(inputs),
+        };
         Self {
             weight: d.add(
                 "final_conv.weight".into(),

@@ -30,7 +30,21 @@ impl Conv {
         [inputs, one_hot]: [usize; 2],
         outputs: usize,
     ) -> Self {
-        let begin = Begin::FanIn((inputs + one_hot) * 9);
+        Self::beginning(d, at, [inputs, one_hot], outputs, false)
+    }
+
+    /// Declares a convolution that begins with zeros if `zero` is set.
+    pub(super) fn beginning(
+        d: &mut Declarations,
+        at: &str,
+        [inputs, one_hot]: [usize; 2],
+        outputs: usize,
+        zero: bool,
+    ) -> Self {
+        let begin = match zero {
+            true => Begin::Constant(0.0),
+            false => Begin::FanIn((inputs + one_hot) * 9),
+        };
         let weight = format!("{at}.weight");
         Self {
             weight: d.add(weight.clone(), &[outputs, inputs, 3, 3], begin, true),

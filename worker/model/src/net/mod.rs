@@ -90,6 +90,10 @@ impl Net {
         );
         assert_eq!(input.one_hot.is_some(), self.spec.one_hot > 0);
         pass.compute_in(self.spec.precision);
-        self.network.forward(pass, input)
+        if !self.spec.added {
+            return self.network.forward(pass, input);
+        }
+        let last = input.dense.clone().narrow(1, channels - 1, 1);
+        self.network.forward(pass, input) + last
     }
 }

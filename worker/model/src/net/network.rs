@@ -22,6 +22,8 @@ pub(super) trait Network: fmt::Debug + Send + Sync {
     const HAS_ENCODER: bool = false;
     /// Whether a convolution may be in front of the first level.
     const HAS_STEM: bool = false;
+    /// Whether the last layer may begin with zeros ([`NetSpec::added`]).
+    const ADDS: bool = false;
     /// Whether time is a dimension. Both streams of the input then have the same bins.
     const OVER_TIME: bool;
 
@@ -65,6 +67,7 @@ pub(super) trait Network: fmt::Debug + Send + Sync {
 pub(super) struct Row {
     pub has_encoder: bool,
     pub has_stem: bool,
+    pub adds: bool,
     pub over_time: bool,
     pub build: fn(&mut Declarations, &NetSpec) -> Arc<dyn AnyNetwork>,
     pub multiple: fn(&NetSpec) -> (usize, &'static str, String),
@@ -90,6 +93,7 @@ impl Row {
         Self {
             has_encoder: N::HAS_ENCODER,
             has_stem: N::HAS_STEM,
+            adds: N::ADDS,
             over_time: N::OVER_TIME,
             build: |d, spec| Arc::new(N::build(d, spec)),
             multiple: N::multiple,

@@ -37,6 +37,10 @@ pub struct NetSpec {
     /// For `Swinir`: groups, blocks, heads and windows.
     #[serde(default, skip_serializing_if = "is_default")]
     pub swin: Swin,
+    /// Whether the last dense channel is added to the output, and the last layer begins with zeros,
+    /// so that an untrained network returns that channel.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub added: bool,
     /// Whether the encoder is fixed, its batch norms included. A decoder is then trained on another
     /// network's features.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -66,6 +70,7 @@ impl NetSpec {
             time: 160,
             time_projection: TimeProjection::Shared,
             swin: Swin::default(),
+            added: false,
             frozen: false,
             precision: Precision::F32,
         }
@@ -120,6 +125,10 @@ impl NetSpec {
         if self.frozen && !network.has_encoder {
             let what = "a frozen encoder with a decoder of its own is for unet2d and unet25d";
             return Err(ModelError::invalid("net.frozen", what));
+        }
+        if self.added && (!network.adds || self.outputs != 1) {
+            let what = "the sum of a channel and one output is for unet2d and swinir";
+            return Err(ModelError::invalid("net.added", what));
         }
         (network.check)(self)
     }

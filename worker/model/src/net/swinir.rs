@@ -75,7 +75,7 @@ impl Swinir {
             groups: groups.collect(),
             norm: LayerNorm::declare(d, "norm", width),
             after: conv(d, "conv_after_body", width),
-            last: conv(d, "conv_last", spec.outputs),
+            last: Conv::beginning(d, "conv_last", [width, 0], spec.outputs, spec.added),
             window: swin.window as usize,
         }
     }
@@ -107,6 +107,7 @@ impl Swinir {
 }
 
 impl Network for Swinir {
+    const ADDS: bool = true;
     const OVER_TIME: bool = false;
 
     fn build(d: &mut Declarations, spec: &NetSpec) -> Self {

@@ -88,7 +88,7 @@ impl Unet25d {
             encoders,
             skips,
             frozen: spec.frozen,
-            decoder: Decoder::declare(d, &spec.widths(), spec.outputs),
+            decoder: Decoder::declare(d, spec),
         }
     }
 

@@ -59,7 +59,7 @@ impl Unet2d {
             stem,
             encoders,
             frozen: spec.frozen,
-            decoder: Decoder::declare(d, &spec.widths(), spec.outputs),
+            decoder: Decoder::declare(d, spec),
         }
     }
 
@@ -99,6 +99,7 @@ impl Unet2d {
 impl Network for Unet2d {
     const HAS_ENCODER: bool = true;
     const HAS_STEM: bool = true;
+    const ADDS: bool = true;
     const OVER_TIME: bool = false;
 
     fn build(d: &mut Declarations, spec: &NetSpec) -> Self {
@@ -200,7 +201,8 @@ impl Stem {
 }
 
 impl Decoder {
-    pub(super) fn declare(d: &mut Declarations, widths: &[usize], outputs: usize) -> Self {
+    pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
+        let widths = spec.widths();
         let mut blocks = Vec::new();
         for (i, level) in (0..widths.len() - 1).rev().enumerate() {
             let (fine, coarse) = (widths[level], widths[level + 1]);
@@ -213,7 +215,7 @@ impl Decoder {
         }
         Self {
             blocks,
-            last: Final::declare(d, widths[0], outputs),
+            last: Final::declare(d, widths[0], spec.outputs, spec.added),
         }
     }
 

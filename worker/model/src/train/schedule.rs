@@ -126,6 +126,7 @@ mod tests {
                 intensity_only: false,
                 spots: 0,
                 depth_scale_m: 4.5,
+                evidence: None,
             },
             net: NetSpec::released(8, 0, 1),
             epochs,

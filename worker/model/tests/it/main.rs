@@ -3,6 +3,7 @@
 mod answers;
 mod architectures;
 mod common;
+mod evidence;
 mod gpu;
 mod operations;
 mod optimiser;

@@ -15,13 +15,14 @@ use picofarm_model::{
 };
 use proptest::prelude::*;
 
-const ALL: [(Target, ShadowVariant); 6] = [
+const ALL: [(Target, ShadowVariant); 7] = [
     (Target::Tof, ShadowVariant::Concat),
     (Target::Specular, ShadowVariant::Concat),
     (Target::Shadow, ShadowVariant::Concat),
     (Target::Shadow, ShadowVariant::Difference),
     (Target::Shadow, ShadowVariant::Index),
     (Target::Shadow, ShadowVariant::All),
+    (Target::Shadow, ShadowVariant::Evidence),
 ];
 
 fn whole(plan: &Plan, sources: Sources) -> Trained {

@@ -45,6 +45,10 @@ pub(crate) struct Examples {
     sensor: Option<(Sensing, u64)>,
     /// Predicted depths that two-bounce times are derived from; `None` = the true depths.
     depths: Option<Predictions>,
+    /// Predictions whose evidence is read, and no histograms.
+    evidence: Option<Predictions>,
+    /// Whether histograms are read although the network sees evidence.
+    light: bool,
     kept: Mutex<LoadedScenes>,
     /// Scenes with checked histograms: these contain light and only finite numbers.
     sound: Mutex<HashSet<u64>>,
@@ -124,6 +128,8 @@ impl Examples {
             scenes,
             sensor: None,
             depths: None,
+            evidence: None,
+            light: false,
             kept: Mutex::default(),
             sound: Mutex::default(),
             spare: Mutex::default(),
@@ -147,6 +153,40 @@ impl Examples {
     #[must_use]
     pub(crate) fn timed_by(self, depths: Option<Predictions>) -> Self {
         Self { depths, ..self }
+    }
+
+    /// Reads the evidence of these predictions, and no histograms, if there are any.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] at `field` if the evidence is of other spots.
+    pub(crate) fn seeing(
+        self,
+        evidence: Option<Predictions>,
+        field: &str,
+    ) -> Result<Self, TaskError> {
+        if let Some(predictions) = &evidence {
+            let (theirs, ours) = (&predictions.spec().spots, self.spot_numbers());
+            if *theirs != ours {
+                return Err(TaskError::User(format!(
+                    "{field}: {} has evidence of {} spots, but the histogram {:?} has the light of {}; give \
+                     demultiplex.histogram and the network's histogram the same spots",
+                    predictions.place(),
+                    theirs.len(),
+                    self.quantity.name(),
+                    ours.len()
+                )));
+            }
+        }
+        Ok(Self { evidence, ..self })
+    }
+
+    /// Reads histograms even if the network sees evidence, for pictures.
+    #[must_use]
+    pub(crate) fn with_light(self) -> Self {
+        Self {
+            light: true,
+            ..self
+        }
     }
 
     /// Passes histograms through a sensor with a noise seed.
@@ -222,6 +262,9 @@ impl Examples {
     /// Reads a scene's histogram and its element order, in the order that networks expect if there
     /// is no sensor.
     async fn histogram(&self, scene: u64) -> Result<(Vec<f32>, Order), StorageError> {
+        if self.evidence.is_some() && !self.light {
+            return Ok((Vec::new(), Order::default()));
+        }
         let Some(spots) = self
             .spots
             .as_ref()
@@ -258,18 +301,26 @@ impl Examples {
                 None => Ok(None),
             }
         };
-        let ((histogram, order), seen_depth_m, depth, specular, lit, spots, intrinsics) = futures::try_join!(
-            self.histogram(scene),
-            seen,
-            dataset.read::<f32>(scene, Quantity::Depth),
-            dataset.read::<u8>(scene, Quantity::Specular),
-            dataset.read_visibility(scene),
-            dataset.read_spots(scene),
-            dataset.read_intrinsics(scene),
-        )?;
+        let evidence = async {
+            match &self.evidence {
+                Some(evidence) => evidence.read_evidence(scene).await,
+                None => Ok(Vec::new()),
+            }
+        };
+        let ((histogram, order), seen_depth_m, evidence, depth, specular, lit, spots, intrinsics) =
+            futures::try_join!(
+                self.histogram(scene),
+                seen,
+                evidence,
+                dataset.read::<f32>(scene, Quantity::Depth),
+                dataset.read::<u8>(scene, Quantity::Specular),
+                dataset.read_visibility(scene),
+                dataset.read_spots(scene),
+                dataset.read_intrinsics(scene),
+            )?;
         // A sound histogram is not checked again at each visit.
         let sound = || self.sound.lock().expect("no panic while locked");
-        if !sound().contains(&scene) {
+        if !histogram.is_empty() && !sound().contains(&scene) {
             check_light(&dataset.place(), scene, &histogram)?;
             sound().insert(scene);
         }
@@ -298,6 +349,7 @@ impl Examples {
             bin_width_m: spec.gate.bin_width_m,
             depth_m,
             seen_depth_m,
+            evidence,
             specular,
             spots: spots
                 .iter()

@@ -16,6 +16,8 @@ pub(crate) enum Need {
     Depth,
     /// z-depth from which two-bounce times are derived.
     DepthOfTimes,
+    /// z-depth at which shadows are judged.
+    DepthOfShadows,
     /// The pixels that each spot lights.
     Visibility,
     /// The pixels that are mirrors.
@@ -28,7 +30,7 @@ impl Need {
     /// Returns its name in a manifest's list of missing quantities.
     fn name(self) -> &'static str {
         match self {
-            Self::Depth | Self::DepthOfTimes => "depth",
+            Self::Depth | Self::DepthOfTimes | Self::DepthOfShadows => "depth",
             Self::Visibility => "visibility",
             Self::Specular => "specular",
             Self::Paths => "spots.path",
@@ -43,6 +45,10 @@ impl Need {
             Self::DepthOfTimes => (
                 "the shadow network is given two-bounce times that follow from it",
                 "import these scenes with it, or take the times from what a \"tof\" model predicts",
+            ),
+            Self::DepthOfShadows => (
+                "shadows are judged at it",
+                "import these scenes with it, or remove demultiplex.depth",
             ),
             Self::Visibility => ("a \"shadow\" network learns it and is judged by it", own),
             Self::Specular => ("a \"specular\" network learns it and is judged by it", own),

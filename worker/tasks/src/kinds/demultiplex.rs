@@ -4,13 +4,20 @@
 
 mod flash;
 
-use picofarm_dataset::{Dataset, ENCODER_VERSION, Manifest};
-use picofarm_demultiplex::{Settings, VERSION, demultiplex};
+use picofarm_dataset::{Dataset, ENCODER_VERSION, Manifest, Quantity};
+use picofarm_demultiplex::{
+    DemultiplexError, Demultiplexed, Evidence, Settings, VERSION, demultiplex, shadows_at,
+    with_evidence,
+};
 use picofarm_proto::{
     key::TaskKey,
     spec::{
         TaskSpec,
-        kinds::{DemultiplexTask, demultiplex::DemultiplexSettings},
+        kinds::{
+            DemultiplexTask,
+            demultiplex::{DemultiplexSettings, DepthSource},
+        },
+        memory::EVIDENCE_PLANES,
     },
 };
 use picofarm_results::{
@@ -22,7 +29,10 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     errors::dataset_error,
-    input::source_manifest,
+    input::{
+        source_manifest,
+        truth::{self, Need},
+    },
     making::predicted::{self, agreement},
     stores::manifest_sha256,
     task::{Context, Control, Output, RunTask, Task, TaskError, proceed},
@@ -33,6 +43,8 @@ use flash::{byte, check_gate, numbers, quantity};
 
 /// Name of the method in manifests, in place of a model's.
 const METHOD: &str = "demultiplex";
+/// The memory of tasks is estimated from this number.
+const _: () = assert!(Evidence::PLANES == EVIDENCE_PLANES as usize);
 /// Progress of the task after reading and after the method.
 const READ: f32 = 0.1;
 const APART: f32 = 0.95;
@@ -55,10 +67,14 @@ impl RunTask for DemultiplexTask {
         let histogram = quantity(&dataset, self.demultiplex.histogram)?;
         check_gate(&dataset)?;
         let found = source_manifest(stores, &dataset, index, control)?;
+        if self.demultiplex.depth == DepthSource::Truth {
+            let place = dataset.place();
+            truth::check(&place, &[Need::DepthOfShadows], &[(index, found.missing())])?;
+        }
         let mut manifest = manifest(self, index, &found);
         let (store, prefix) = stores.probed(&self.output.store, control)?;
         let prefix = prefix.join(&*self.output.dataset);
-        let spec = spec(&dataset, numbers(&dataset, histogram));
+        let spec = self.spec(&dataset, numbers(&dataset, histogram));
         let opened = Predictions::create_or_open(store, prefix, &spec);
         let predictions = stores.wait(control, opened)?;
         if !task.spec.force
@@ -74,20 +90,32 @@ impl RunTask for DemultiplexTask {
             control,
         )?;
         proceed(control, READ)?;
+        let depth = match self.demultiplex.depth {
+            DepthSource::Own => None,
+            DepthSource::Truth => {
+                let read = dataset.read::<f32>(index, Quantity::Depth);
+                Some(stores.wait(control, read)?)
+            }
+        };
         control.say("takes the flash apart".into(), &[]);
-        let made = demultiplex(&flash.capture(), &Settings::default()).map_err(|e| {
+        let (made, evidence) = self.apart(&flash, depth.as_deref()).map_err(|e| {
             TaskError::User(format!(
                 "source: scene {index} of {place}: {e}",
                 place = dataset.place()
             ))
         })?;
         proceed(control, APART)?;
-        let answers = Predicted {
-            lit: flash.of_all(spec.spots.len(), &made.lit),
-            depth_m: made.depth_m,
-            specular: made.mirror_probability.iter().map(|m| byte(*m)).collect(),
-            confidence: made.confidence.iter().map(|c| byte(*c)).collect(),
+        let spots = spec.spots.len();
+        let mut answers = Predicted {
+            lit: flash.of_all(spots, &made.lit),
+            evidence: evidence.map_or_else(Vec::new, |e| flash.evidence_of_all(spots, &e)),
+            ..Predicted::default()
         };
+        if depth.is_none() {
+            answers.depth_m = made.depth_m;
+            answers.specular = made.mirror_probability.iter().map(|m| byte(*m)).collect();
+            answers.confidence = made.confidence.iter().map(|c| byte(*c)).collect();
+        }
         manifest.agreement =
             agreement::measure(stores, (&dataset, index), &answers, &spec.spots, control)?;
         let encoded = predictions
@@ -97,17 +125,51 @@ impl RunTask for DemultiplexTask {
     }
 }
 
-/// Returns the layout of the group of predictions.
-fn spec(dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec {
-    let source = dataset.spec();
-    PredictionSpec {
-        scenes: source.scenes,
-        height: source.height,
-        width: source.width,
-        depth: true,
-        spots,
-        specular: true,
-        confidence: true,
+/// How one task takes a flash apart.
+trait Method {
+    /// Returns the layout of the group of predictions.
+    fn spec(&self, dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec;
+
+    /// Takes a flash apart, at known depths if there are any, and returns the evidence if it is to
+    /// be stored.
+    fn apart(
+        &self,
+        flash: &Flash,
+        depth_m: Option<&[f32]>,
+    ) -> Result<(Demultiplexed, Option<Evidence>), DemultiplexError>;
+}
+
+impl Method for DemultiplexTask {
+    fn spec(&self, dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec {
+        let source = dataset.spec();
+        let own = self.demultiplex.depth == DepthSource::Own;
+        PredictionSpec {
+            scenes: source.scenes,
+            height: source.height,
+            width: source.width,
+            depth: own,
+            spots,
+            specular: own,
+            confidence: own,
+            evidence: self.demultiplex.evidence.then(Evidence::form),
+        }
+    }
+
+    fn apart(
+        &self,
+        flash: &Flash,
+        depth_m: Option<&[f32]>,
+    ) -> Result<(Demultiplexed, Option<Evidence>), DemultiplexError> {
+        let (capture, settings) = (flash.capture(), Settings::default());
+        if self.demultiplex.evidence {
+            let (made, evidence) = with_evidence(&capture, depth_m, &settings)?;
+            return Ok((made, Some(evidence)));
+        }
+        let made = match depth_m {
+            Some(depth_m) => shadows_at(&capture, depth_m, &settings)?,
+            None => demultiplex(&capture, &settings)?,
+        };
+        Ok((made, None))
     }
 }
 
@@ -131,13 +193,17 @@ fn manifest(task: &DemultiplexTask, scene: u64, found: &Manifest) -> PredictionM
     };
     let named = json!([source.manifest_sha256, method]);
     let key = TaskKey(Sha256::digest(named.to_string()).into());
-    let kinds = ["tof", "shadow", "specular"].map(|kind| (kind.to_owned(), used.clone()));
+    let kinds: &[&str] = match task.demultiplex.depth {
+        DepthSource::Own => &["tof", "shadow", "specular"],
+        DepthSource::Truth => &["shadow"],
+    };
+    let kinds = kinds.iter().map(|kind| ((*kind).to_owned(), used.clone()));
     PredictionManifest {
         scene,
         task_key: key.to_string(),
         code: version(),
         source,
-        models: kinds.into(),
+        models: kinds.collect(),
         ..PredictionManifest::default()
     }
 }

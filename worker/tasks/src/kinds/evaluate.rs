@@ -28,6 +28,7 @@ use crate::{
         examples::Examples,
         models::{model_version, pin},
         sides::{first, sides},
+        times::Times,
     },
     stores::{Stores, saying},
     task::{Context, Control, Output, RunTask, Task, TaskError},
@@ -336,9 +337,11 @@ impl<'a> EvaluationRun<'a> {
             .and_then(|examples| examples.through(asked.sensor.clone()))
             .map(|examples| examples.staying(self.left_mib))
         };
-        let depths = asked.times.as_ref();
-        let depths = depths.and_then(|times| times.predictions.clone());
-        let scenes = examples(&self.scenes[self.range(shard)])?.timed_by(depths);
+        let times = asked.times.as_ref();
+        let field = format!("evaluate.models[{which}]");
+        let scenes = examples(&self.scenes[self.range(shard)])?
+            .timed_by(times.and_then(Times::depths))
+            .seeing(times.and_then(Times::evidence), &field)?;
         let spots = model.model.question().spots;
         if spots > 0 && spots != scenes.spots() {
             return Err(TaskError::User(format!(

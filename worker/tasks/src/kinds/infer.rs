@@ -122,21 +122,33 @@ impl Panel {
             asked.proceed(0.3)?;
         }
         if let Some(shadow) = &self.shadow {
-            let depth = match &self.times {
-                None | Some(Times::Truth) => None,
-                Some(Times::Own) => Some(predicted.depth_m.clone()),
+            let sees = shadow.checked.plan.question.sees_evidence();
+            let taken = match &self.times {
+                None | Some(Times::Truth) => Seen::Scene,
+                Some(Times::Own) => Seen::Depth(predicted.depth_m.clone()),
+                Some(Times::Stored(stored)) if sees => Seen::Evidence(&stored.0),
                 Some(Times::Stored(stored)) => {
-                    Some(stores.wait(control, stored.0.read_depth(index))?)
+                    Seen::Depth(stores.wait(control, stored.0.read_depth(index))?)
                 }
             };
-            predicted.lit = asked.masks(shadow, depth, 0.3..0.8)?;
+            predicted.lit = asked.masks(shadow, taken, 0.3..0.8)?;
         }
         if let Some(specular) = &self.specular {
-            predicted.specular = asked.masks(specular, None, 0.8..ASKED)?;
+            predicted.specular = asked.masks(specular, Seen::Scene, 0.8..ASKED)?;
         }
         cache.set(asked.used);
         Ok(predicted)
     }
+}
+
+/// What a mask's network sees.
+enum Seen<'a> {
+    /// A scene as it is stored.
+    Scene,
+    /// The same, with two-bounce times from these depths.
+    Depth(Vec<f32>),
+    /// The evidence in these predictions.
+    Evidence(&'a Predictions),
 }
 
 /// Models in use for one scene.
@@ -173,6 +185,29 @@ impl Inference<'_> {
         Ok(model)
     }
 
+    /// Returns the scene with its evidence, and no histogram.
+    fn evidence(&self, member: &Member, of: &Predictions) -> Result<Arc<Scene>, TaskError> {
+        let histogram = (member.histogram, &*member.spots);
+        let scenes = Examples::new(
+            self.stores,
+            self.dataset,
+            histogram,
+            vec![self.index],
+            "infer",
+        )?
+        .seeing(Some(of.clone()), &member.field)?;
+        self.load(&scenes)
+    }
+
+    fn load(&self, scenes: &Examples) -> Result<Arc<Scene>, TaskError> {
+        scenes.load(0).map_err(|source| {
+            model_error(ModelError::Scene {
+                scene: self.index as usize,
+                source,
+            })
+        })
+    }
+
     fn scene(&mut self, member: &Member) -> Result<Arc<Scene>, TaskError> {
         let shown = (member.histogram, member.spots.clone());
         if let Some((_, scene)) = self.seen.iter().find(|(other, _)| *other == shown) {
@@ -181,12 +216,7 @@ impl Inference<'_> {
         let (stores, dataset) = (self.stores, self.dataset);
         let histogram = (shown.0, &*shown.1);
         let scenes = Examples::new(stores, dataset, histogram, vec![self.index], "infer")?;
-        let scene = scenes.load(0).map_err(|source| {
-            model_error(ModelError::Scene {
-                scene: self.index as usize,
-                source,
-            })
-        })?;
+        let scene = self.load(&scenes)?;
         self.seen.push((shown, scene.clone()));
         Ok(scene)
     }
@@ -201,18 +231,22 @@ impl Inference<'_> {
         model.depth_m(&scene).map_err(fault)
     }
 
-    /// Predicts masks. Two-bounce times are derived from `depth_m`, if given.
+    /// Predicts masks.
     fn masks(
         &mut self,
         member: &Member,
-        depth_m: Option<Vec<f32>>,
+        sees: Seen<'_>,
         share: std::ops::Range<f32>,
     ) -> Result<Vec<u8>, TaskError> {
-        let (model, mut scene) = (self.model(member)?, self.scene(member)?);
-        if depth_m.is_some() {
+        let model = self.model(member)?;
+        let mut scene = match sees {
+            Seen::Evidence(of) => self.evidence(member, of)?,
+            Seen::Scene | Seen::Depth(_) => self.scene(member)?,
+        };
+        if let Seen::Depth(depth_m) = sees {
             // The scene is not copied, because nothing else refers to it.
             self.seen.retain(|(_, other)| !Arc::ptr_eq(other, &scene));
-            Arc::make_mut(&mut scene).seen_depth_m = depth_m;
+            Arc::make_mut(&mut scene).seen_depth_m = Some(depth_m);
             let shown = (member.histogram, member.spots.clone());
             self.seen.push((shown, scene.clone()));
         }

@@ -16,6 +16,7 @@ use picofarm_dataset::DatasetSpec;
 use picofarm_members::Members;
 use picofarm_model::{
     Device, ModelError,
+    input::EvidenceForm,
     memory::RetainedMemory,
     scene::Scenes,
     train::{Ended, Event, Line, Plan, Sources, Trained, Training},
@@ -92,6 +93,8 @@ impl RunTask for TrainTask {
 struct TrainingRun<'a> {
     task: &'a TrainTask,
     spec: DatasetSpec,
+    /// The form of the evidence, if the network takes it.
+    evidence: Option<EvidenceForm>,
     models: Models,
     training: Arc<Examples>,
     validation: Arc<Examples>,
@@ -117,7 +120,12 @@ impl TrainingRun<'_> {
             (Normalise::Log, 0.0) => plan::largest_bin(&*self.training, control)?,
             (_, max) => max as f32,
         };
-        let plan = plan::plan(settings, &self.spec, self.training.spots(), greatest)?;
+        let plan = plan::plan(
+            settings,
+            &self.spec,
+            (self.training.spots(), self.evidence.clone()),
+            greatest,
+        )?;
         if let Some(on) = self.built.get("train.specular.on") {
             plan::check_on(&plan, on)?;
         }

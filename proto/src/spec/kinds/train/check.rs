@@ -90,7 +90,9 @@ impl TrainSettings {
             return fail("from", what.into());
         }
         check_times("train.shadow.times", &self.shadow.times)?;
-        if self.times().is_some() && !self.shadow.variant.is_timed() {
+        if self.takes_evidence() {
+            self.check_evidence()?;
+        } else if self.times().is_some() && !self.shadow.variant.is_timed() {
             let what = format!(
                 "is {:?}, but a network of variant {:?} is given no times; leave it out",
                 self.shadow.times,
@@ -140,6 +142,38 @@ impl TrainSettings {
             (0.0, 10_000.0),
             "minutes; 0 is after each step",
         )
+    }
+}
+
+impl TrainSettings {
+    /// Checks a network that takes the evidence of a demultiplex stage in place of histograms.
+    fn check_evidence(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: &str| Err(SpecError::new(format!("train.{field}"), what));
+        if self.times().is_none() {
+            let what = "is \"truth\", but variant = \"evidence\" takes what a demultiplex stage knows; name one with \
+                        demultiplex.evidence = true";
+            return fail("shadow.times", what);
+        }
+        if !matches!(
+            self.net.architecture,
+            Architecture::Unet2d | Architecture::Swinir
+        ) {
+            let what = format!(
+                "is {:?}, which sees histograms over time; for variant = \"evidence\", take \"unet2d\" or \"swinir\"",
+                self.net.architecture.name()
+            );
+            return fail("net.architecture", &what);
+        }
+        if self.input != InputSettings::default() {
+            let what = "is for histograms, which a network of variant \"evidence\" does not see; remove it";
+            return fail("input", what);
+        }
+        if self.sensor.is_some() {
+            let what = "is for histograms, which a network of variant \"evidence\" does not see; let the demultiplex stage \
+                        read the output of a sensor";
+            return fail("sensor", what);
+        }
+        Ok(())
     }
 }
 

@@ -12,7 +12,7 @@ use crate::spec::{
         io::{IoMut, ModelNames},
         reprocess::Histogram,
     },
-    memory::{Network, Shape},
+    memory::{EVIDENCE_PLANES, Network, Shape},
     trial::Trial,
 };
 
@@ -157,8 +157,9 @@ pub struct NetSettings {
 pub struct ShadowSettings {
     /// The network's input for a spot.
     pub variant: ShadowVariant,
-    /// Source of two-bounce times: the depths of the `truth`, an infer stage, or the folder in the
-    /// source's store that an infer stage wrote.
+    /// Source of two-bounce times: the depths of the `truth`, an infer or demultiplex stage, or the
+    /// folder in the source's store that one wrote. For `evidence`, a demultiplex stage with
+    /// `evidence = true`, or its folder.
     pub times: String,
 }
 
@@ -341,6 +342,7 @@ impl TrainSettings {
         let (dense, one_hot) = match (self.target, self.shadow.variant) {
             (Target::Shadow, ShadowVariant::Concat) => (seen, f64::from(bins)),
             (Target::Shadow, ShadowVariant::Index) => (seen + f64::from(source.spots), 0.0),
+            (Target::Shadow, ShadowVariant::Evidence) => (f64::from(EVIDENCE_PLANES), 0.0),
             _ => (seen, 0.0),
         };
         let net = &self.net;
@@ -376,6 +378,11 @@ impl TrainSettings {
         table.remove("processes");
         table.remove("trial");
         settings
+    }
+
+    /// Returns whether the network takes the evidence of a demultiplex stage.
+    pub fn takes_evidence(&self) -> bool {
+        self.target == Target::Shadow && self.shadow.variant == ShadowVariant::Evidence
     }
 
     /// Returns the folder of predictions that two-bounce times come from, if any.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use picofarm_model::{
     Random,
-    input::{Normalise, Question, ShadowVariant, Target},
+    input::{EvidenceForm, Normalise, Question, ShadowVariant, Target},
     net::{Architecture, NetSpec, StemForm, Swin, TimeProjection},
     scene::Scene,
     train::{Plan, Schedule, Sources},
@@ -50,7 +50,23 @@ pub fn sized(seed: u64, side: usize) -> Arc<Scene> {
         }
     }
     scene.histogram = histogram;
+    scene.evidence = evidence(&scene, &mut random);
     Arc::new(scene)
+}
+
+/// Returns planes of evidence: one that tells light from shadow, one that does not, and log odds
+/// that are right for three quarters of the pairs.
+fn evidence(scene: &Scene, random: &mut Random) -> Vec<u8> {
+    let mut codes = Vec::new();
+    for lit in scene.lit.chunks_exact(scene.pixels()) {
+        codes.extend(lit.iter().map(|lit| 40 + 170 * lit));
+        codes.extend(lit.iter().map(|_| random.below(256) as u8));
+        codes.extend(lit.iter().map(|lit| {
+            let right = random.below(4) > 0;
+            EvidenceForm::code(if (*lit > 0) == right { 1.5 } else { -1.5 })
+        }));
+    }
+    codes
 }
 
 pub fn scenes(from: u64, count: u64) -> Vec<Arc<Scene>> {
@@ -73,6 +89,10 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
         intensity_only: false,
         spots: 2,
         depth_scale_m: 4.5,
+        evidence: (variant == ShadowVariant::Evidence).then(|| EvidenceForm {
+            version: "apart-1".into(),
+            planes: ["near", "noise", "log odds"].map(str::to_owned).into(),
+        }),
     };
     let (dense, one_hot, outputs) = question.channels();
     Plan {
@@ -89,6 +109,7 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
             time: 0,
             time_projection: TimeProjection::Shared,
             swin: Swin::default(),
+            added: variant == ShadowVariant::Evidence,
             frozen: false,
             precision: picofarm_model::net::Precision::F32,
         },

@@ -2,7 +2,7 @@
 //! coordinates.
 
 use picofarm_dataset::{Dataset, Manifest, Quantity};
-use picofarm_demultiplex::{Capture, Place, Spot};
+use picofarm_demultiplex::{Capture, Evidence, Place, Spot};
 use picofarm_proto::spec::{Histogram, kinds::demultiplex::Places};
 use picofarm_scene::{Camera, Intrinsics, Vec3};
 use picofarm_settings::Gate;
@@ -175,6 +175,17 @@ impl Flash {
     /// Returns the index of each of the capture's spots among those of the histogram.
     pub fn beams(&self) -> &[usize] {
         &self.which
+    }
+
+    /// Returns the evidence of all `count` spots of the histogram. Beams that hit nothing have
+    /// zeros.
+    pub(super) fn evidence_of_all(&self, count: usize, evidence: &Evidence) -> Vec<u8> {
+        let each = Evidence::PLANES * self.capture().pixels();
+        let mut all = vec![0; count * each];
+        for (k, part) in self.which.iter().zip(evidence.codes.chunks_exact(each)) {
+            all[k * each..][..each].copy_from_slice(part);
+        }
+        all
     }
 
     /// Returns the probabilities of all `count` spots of the histogram, times 255 and rounded.

@@ -8,7 +8,7 @@ use super::EvaluationRun;
 use crate::{
     input::{
         models::{Known, trained},
-        times::Times,
+        times::{Taken, Times},
         truth,
     },
     task::{Control, TaskError},
@@ -65,9 +65,11 @@ impl EvaluationRun<'_> {
             ),
             name => ("evaluate.times".to_owned(), name),
         };
-        let (store, timed) = (&self.task.source.store, model.model.question().timed());
+        let store = &self.task.source.store;
         let at_times = (&*at_times.0, at_times.1);
-        let times = timed.then(|| Times::open(stores, store, &self.dataset, at_times, control));
+        let times = Taken::by(model.model.question());
+        let times =
+            times.map(|taken| Times::open(stores, store, &self.dataset, at_times, taken, control));
         let times = times.transpose()?;
         let from_truth = times.as_ref().is_some_and(Times::are_true);
         truth::check(

@@ -114,6 +114,7 @@ impl EvaluationRun<'_> {
             intensity_only: true,
             spots: there.spec().spots.len(),
             depth_scale_m: DEPTH_SCALE_M,
+            evidence: None,
         };
         // The truth of the spots that the predictions are about, in their order.
         let shown = (histogram, &*model.spots);

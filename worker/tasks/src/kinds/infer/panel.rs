@@ -21,7 +21,7 @@ use crate::{
     input::{
         examples::Examples,
         models::{CheckedModel, trained},
-        times,
+        times::{self, Taken},
         truth::{self, Need},
     },
     stores::{Stores, manifest_sha256},
@@ -56,7 +56,7 @@ pub(super) enum Times {
     Truth,
     /// Depths of the stage's own ToF model.
     Own,
-    /// Depths of stored predictions, with which the shadow network was trained.
+    /// Stored predictions, with whose depths or evidence the shadow network was trained.
     Stored(Box<(Predictions, PinnedDepths)>),
 }
 
@@ -102,18 +102,21 @@ impl Panel {
             take(Target::Shadow),
             take(Target::Specular),
         );
-        let timed = |member: &&Member| member.checked.plan.question.timed();
-        let times = match (shadow.as_ref().filter(timed), &tof) {
+        let taking = shadow.as_ref().and_then(|shadow| {
+            let taken = Taken::by(&shadow.checked.plan.question)?;
+            Some((shadow, taken))
+        });
+        let times = match (taking, &tof) {
             (None, _) => None,
-            (Some(_), Some(_)) => Some(Times::Own),
-            (Some(_), None) if times_of_shadow == TRUTH => Some(Times::Truth),
-            (Some(shadow), None) => {
+            (Some((_, Taken::Times)), Some(_)) => Some(Times::Own),
+            (Some((_, Taken::Times)), None) if times_of_shadow == TRUTH => Some(Times::Truth),
+            (Some((shadow, taken)), _) => {
                 let field = format!(
                     "{}: its two-bounce times (a \"tof\" model in infer.models gives others)",
                     shadow.field
                 );
                 let (store, named) = (&task.source.store, (&*field, &*times_of_shadow));
-                let times = times::Times::open(stores, store, dataset, named, control)?;
+                let times = times::Times::open(stores, store, dataset, named, taken, control)?;
                 let scene = [found.scene];
                 let seen = stores.wait(control, dataset.pin(&scene))?;
                 let pinned = times.pin(stores, &field, &scene, &seen, control)?;
@@ -144,7 +147,11 @@ impl Panel {
     /// Returns the quantities that the scenes must have.
     pub(super) fn needs(&self) -> Vec<Need> {
         let from_truth = matches!(self.times, Some(Times::Truth));
-        truth::of_times(self.times.is_some(), from_truth)
+        let timed = self
+            .shadow
+            .as_ref()
+            .is_some_and(|m| m.checked.plan.question.timed());
+        truth::of_times(timed, from_truth)
     }
 
     /// Returns the layout of the group of predictions.
@@ -161,6 +168,7 @@ impl Panel {
                 .map_or(Vec::new(), |m| m.lit_by.clone()),
             specular: self.specular.is_some(),
             confidence: false,
+            evidence: None,
         }
     }
 

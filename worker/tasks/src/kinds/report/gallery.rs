@@ -14,7 +14,7 @@ use crate::{
         examples::Examples,
         models::{Known, pin, trained},
         sides::sides,
-        times::Times,
+        times::{Taken, Times},
         truth,
     },
     stores::Stores,
@@ -53,29 +53,25 @@ pub(super) fn show(
     let settings = trained(&known.manifest.settings)
         .map_err(|what| TaskError::User(format!("{}: its settings: {what}", evaluation.model)))?;
     let pinned = pin(stores, &dataset, &scenes, control)?;
-    let times = match &*evaluation.times {
-        "" => None,
-        name => Some(Times::open(
-            stores,
-            store,
-            &dataset,
-            ("report", name),
-            control,
-        )?),
-    };
+    let at_times = ("report", &*evaluation.times);
+    let times = Taken::by(known.model.question())
+        .map(|taken| Times::open(stores, store, &dataset, at_times, taken, control))
+        .transpose()?;
     truth::check(
         &dataset.place(),
         &truth::of_training(&settings, times.as_ref().is_some_and(Times::are_true)),
         &pinned.missing,
     )?;
-    let depths = times.and_then(|times| times.predictions);
+    let times = times.as_ref();
     let histogram = Histogram::parse(&evaluation.histogram).map_err(TaskError::User)?;
     let indices: Vec<usize> = (0..scenes.len()).collect();
     let histogram = (histogram, &*settings.spots);
     let sensor = settings.sensor.filter(|_| evaluation.sensor);
     let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?
         .through(sensor.map(|sensor| (*sensor, settings.seed)))?
-        .timed_by(depths);
+        .timed_by(times.and_then(Times::depths))
+        .seeing(times.and_then(Times::evidence), "report")?
+        .with_light();
     let pictures = pictures(&known.model, &examples, &indices, 2).map_err(model_error)?;
     Ok(ExampleScenes {
         side: dataset.spec().height as usize,

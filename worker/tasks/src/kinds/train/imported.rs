@@ -69,6 +69,11 @@ pub fn imported(
     let unusable = NotImported::Settings;
     let settings: TrainSettings =
         serde_json::from_value(settings).map_err(|e| unusable(e.to_string()))?;
+    if settings.takes_evidence() {
+        let what = "train.shadow.variant: networks of variant \"evidence\" begin from a demultiplex stage, and none made \
+                    elsewhere does; train one";
+        return Err(unusable(what.into()));
+    }
     settings.check().map_err(|e| unusable(e.to_string()))?;
     for (field, given) in [
         ("from", !settings.from.is_empty()),
@@ -104,10 +109,11 @@ pub fn imported(
         }
         (_, max) => max as f32,
     };
-    let plan: Plan = plan::plan(&settings, of.spec, spots, greatest).map_err(|e| match e {
-        TaskError::User(what) => unusable(what),
-        other => unusable(other.to_string()),
-    })?;
+    let plan: Plan =
+        plan::plan(&settings, of.spec, (spots, None), greatest).map_err(|e| match e {
+            TaskError::User(what) => unusable(what),
+            other => unusable(other.to_string()),
+        })?;
     let ours = Model::import(weights, &plan, &cpu()).map_err(|e| match e {
         ModelError::File { what } => NotImported::File(what),
         ModelError::Weights { what } => NotImported::Tensors(what),

@@ -19,7 +19,7 @@ use crate::{
         examples::Examples,
         models::{Known, pin},
         sides::{first, sides},
-        times::Times,
+        times::{Taken, Times},
         truth,
     },
     stores::Stores,
@@ -55,7 +55,11 @@ impl<'a> TrainingRun<'a> {
         let pin = |scenes: &[u64]| pin(stores, &dataset, scenes, control);
         let pins = [pin(&training)?, pin(&validation)?];
         let named = ("train.shadow.times", &*settings.shadow.times);
-        let times = Times::open(stores, &place.store, &dataset, named, control)?;
+        let taken = match settings.takes_evidence() {
+            true => Taken::Evidence(None),
+            false => Taken::Times,
+        };
+        let times = Times::open(stores, &place.store, &dataset, named, taken, control)?;
         let needs = truth::of_training(settings, times.are_true());
         for pinned in &pins {
             truth::check(&dataset.place(), &needs, &pinned.missing)?;
@@ -69,7 +73,9 @@ impl<'a> TrainingRun<'a> {
             let sensor = settings.sensor.clone();
             let scenes = Examples::new(stores, &dataset, histogram, scenes, "train")?
                 .through(sensor.map(|sensor| (*sensor, settings.seed)))?;
-            let scenes = scenes.timed_by(times.predictions.clone());
+            let scenes = scenes
+                .timed_by(times.depths())
+                .seeing(times.evidence(), named.0)?;
             Ok(Arc::new(scenes.staying(left_mib)))
         };
         let shown = training.first().copied();
@@ -109,6 +115,9 @@ impl<'a> TrainingRun<'a> {
         Ok(Self {
             task,
             spec,
+            evidence: times
+                .evidence()
+                .and_then(|there| there.spec().evidence.clone()),
             models,
             training,
             validation,

@@ -3,7 +3,7 @@
 use picofarm_dataset::DatasetSpec;
 use picofarm_model::{
     ModelError,
-    input::{self, Question},
+    input::{self, EvidenceForm, Question},
     net::NetSpec,
     scene::Scenes,
     train::Plan,
@@ -20,14 +20,15 @@ use crate::{
 };
 
 /// Returns the plan of a network for scenes of a data set. `spots` is the number of spots that
-/// contribute to the histogram. `greatest` is the largest bin, for the logarithm.
+/// contribute to the histogram, `evidence` the form of evidence that is read instead. `greatest` is
+/// the largest bin, for the logarithm.
 ///
 /// # Errors
 /// [`TaskError::User`] naming the setting that does not fit the data set.
 pub(super) fn plan(
     settings: &TrainSettings,
     spec: &DatasetSpec,
-    spots: usize,
+    (spots, evidence): (usize, Option<EvidenceForm>),
     greatest: f32,
 ) -> Result<Plan, TaskError> {
     let (input, optimise) = (&settings.input, &settings.optimise);
@@ -53,6 +54,7 @@ pub(super) fn plan(
             _ => 0,
         },
         depth_scale_m: settings.depth_scale_m as f32,
+        evidence,
     };
     let (dense, one_hot, outputs) = question.channels();
     let wanted = &settings.net;
@@ -68,6 +70,7 @@ pub(super) fn plan(
         time: wanted.time_features as usize,
         time_projection: wanted.time_projection,
         swin: wanted.swin,
+        added: question.sees_evidence(),
         frozen: !settings.specular.on.is_empty(),
         precision: optimise.precision,
     };
