@@ -7,7 +7,7 @@ use picofarm_scene::{
     Aim, Scene, SceneError, Vec3,
     import::{self, Bounds, ImportOptions, Unit, View},
 };
-use picofarm_settings::Spots;
+use picofarm_settings::{Resolution, Spots};
 
 use super::ranges;
 
@@ -57,6 +57,14 @@ impl SceneInput {
     /// # Errors
     /// Those of [`import::read_scene_with`].
     pub fn read(&self, file: &Path) -> Result<Scene, SceneError> {
+        self.read_sized(file, None)
+    }
+
+    /// Like [`Self::read`], with an image of the given size.
+    ///
+    /// # Errors
+    /// Those of [`import::read_scene_with`].
+    pub fn read_sized(&self, file: &Path, size: Option<Resolution>) -> Result<Scene, SceneError> {
         let view = &self.view;
         let options = ImportOptions {
             view: View {
@@ -69,6 +77,7 @@ impl SceneInput {
             // The parser has checked the spots.
             laser: self.spots.as_ref().and_then(|s| Aim::of(s, 0).ok()),
             unit: self.unit,
+            size,
             ..ImportOptions::default()
         };
         let bounds = Bounds {

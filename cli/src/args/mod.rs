@@ -38,7 +38,7 @@ pub use integrity::{DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapsh
 pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
 pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
-pub use render::{GateArgs, GateChoice, RenderArgs, ScenePlan, SceneRender};
+pub use render::{GateArgs, GateChoice, ImageSize, RenderArgs, ScenePlan, SceneRender};
 pub use scene::{FormatArg, GeneratorArg, PlatoArg, Scene, SceneExport, SceneSense};
 pub use secrets::without_secrets;
 pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
@@ -221,6 +221,12 @@ pub enum Assets {
     Install,
     /// List the installed furniture
     List,
+    /// Make the list of a folder of .glb models, assets.csv: categories come from the names of
+    /// folders and files, or from the metadata of the Amazon Berkeley Objects
+    Scan {
+        /// Folder of models [default: the assets folder]
+        folder: Option<PathBuf>,
+    },
 }
 
 #[derive(Args)]

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use picofarm_settings::Resolution;
 use picofarm_transient::{BeamWidth, Gate, Optics, Wavelength};
 
 use super::SceneInput;
@@ -25,7 +26,7 @@ pub struct RenderArgs {
     /// Image width in pixels, or width and height as 320x240; the height follows from the camera
     /// [default: the scene's own]
     #[arg(long, value_name = "PX|WxH", value_parser = resolution)]
-    pub resolution: Option<Resolution>,
+    pub resolution: Option<ImageSize>,
     /// Render until the median error of a pixel is this share, e.g. 10%
     #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::spec::parse_share)]
     pub error: Option<f64>,
@@ -67,14 +68,22 @@ pub struct RenderArgs {
 
 /// A size of the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Resolution {
+pub struct ImageSize {
     pub width: u32,
     /// The height; `None` follows from the camera.
     pub height: Option<u32>,
 }
 
+impl ImageSize {
+    /// Returns the size if the height is stated.
+    pub fn whole(self) -> Option<Resolution> {
+        let Self { width, height } = self;
+        height.map(|height| Resolution { width, height })
+    }
+}
+
 /// Parses a width, or a width and a height.
-fn resolution(text: &str) -> std::result::Result<Resolution, String> {
+fn resolution(text: &str) -> std::result::Result<ImageSize, String> {
     let side = |text: &str| -> Option<u32> {
         let side = text.trim().parse().ok()?;
         (1..=4096).contains(&side).then_some(side)
@@ -85,7 +94,7 @@ fn resolution(text: &str) -> std::result::Result<Resolution, String> {
     };
     let (width, height) =
         parsed.ok_or("expected 1 to 4096 pixels, or width and height such as 320x240")?;
-    Ok(Resolution { width, height })
+    Ok(ImageSize { width, height })
 }
 
 /// A time gate as a whole.

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use picofarm_proto::show;
 use picofarm_scene::AssetLibrary;
 use serde_json::json;
 
@@ -37,6 +38,24 @@ pub async fn run(command: Assets, settings: &Settings, output: Output) -> Result
             output.result(
                 &json!({"dir": installed, "fingerprint": fingerprint}),
                 || format!("installed {fingerprint} in {}", settings.assets.display()),
+            );
+        }
+        Assets::Scan { folder } => {
+            let dir = folder.unwrap_or_else(|| settings.assets.clone());
+            let scanned = tokio::task::spawn_blocking(move || picofarm_scene::scan(&dir))
+                .await
+                .expect("the scan does not panic")?;
+            output.result(
+                &json!({"list": scanned.list, "listed": scanned.listed, "refused": scanned.refused}),
+                || {
+                    let refused = scanned.refused.iter().map(|(path, why)| {
+                        show::line(&format!("refused: {path}: {why}")).to_string() + "\n"
+                    });
+                    let listed = scanned.listed.iter().map(|(label, n)| format!("{n} {label}"));
+                    let listed: Vec<String> = listed.collect();
+                    let all = format!("{}: {}\n", scanned.list.display(), listed.join(", "));
+                    refused.collect::<String>() + &all
+                },
             );
         }
         Assets::List => {

@@ -12,6 +12,7 @@ use picofarm_proto::{
     show,
     spec::{Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource},
 };
+use picofarm_settings::Resolution;
 use picofarm_tasks::Access;
 use serde_json::json;
 
@@ -44,12 +45,12 @@ fn task(args: &Demo) -> RenderTask {
             },
             count: args.scenes,
             seed: args.seed,
-            fov_deg: 90.0,
+            fov_deg: Some(90.0),
             spots: args.spots.clone(),
             laser_m: [0.0; 3],
         },
         render: RenderSettings {
-            resolution: args.resolution,
+            resolution: Resolution::square(args.resolution),
             budget: Budget::Samples(args.samples),
             ..RenderSettings::default()
         },

@@ -60,7 +60,7 @@ fn work(stage: &StageSpec) -> f64 {
                 Budget::Samples(n) => f64::from(n),
                 Budget::Error(e) => ROOM_PATHS * (0.1_f64 / e).powi(2),
             };
-            f64::from(task.render.resolution).powi(2) * paths
+            task.render.resolution.pixels() as f64 * paths
         }
         _ => 1.0,
     }
@@ -70,7 +70,7 @@ fn work(stage: &StageSpec) -> f64 {
 fn size(stage: &StageSpec) -> f64 {
     match &stage.task {
         TaskSpec::Render(task) => {
-            f64::from(task.render.resolution).powi(2) * f64::from(task.render.bins)
+            task.render.resolution.pixels() as f64 * f64::from(task.render.bins)
         }
         _ => 1.0,
     }

@@ -9,6 +9,7 @@ mod optics;
 pub mod random;
 mod reconstruct;
 mod render;
+mod resolution;
 mod rooms;
 pub mod sensor;
 mod spots;
@@ -23,6 +24,7 @@ pub use network::{
 pub use optics::Optics;
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
 pub use render::{BeamWidth, Budget, Choice, Strategy};
+pub use resolution::Resolution;
 pub use rooms::{MirrorWall, PrimitiveRooms, Sizes};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
 pub use spots::Spots;

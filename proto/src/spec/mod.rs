@@ -35,7 +35,7 @@ pub use kinds::{
     render::{self, RenderSettings, parse_share},
     report::{self, ReportSettings},
     reprocess::{self, Histogram, ReprocessSettings},
-    scenes::{SceneFile, SceneKind, SceneSource},
+    scenes::{FileView, SceneFile, SceneKind, SceneSource},
     train::{self, TrainSettings},
 };
 pub use limits::{Limits, Resources, check_label, check_project};

@@ -4,7 +4,9 @@ use std::collections::BTreeSet;
 
 use picofarm_proto::{
     key::{StageKey, stage_key, task_key},
-    spec::{JobSpec, PrimitiveRooms, SceneKind, SceneSource, Spots, StageSpec, TaskSpec},
+    spec::{
+        JobSpec, PrimitiveRooms, RenderSettings, SceneKind, SceneSource, Spots, StageSpec, TaskSpec,
+    },
     wire,
 };
 
@@ -60,7 +62,10 @@ fn what_is_said_of_scenes_comes_back_from_wire_and_catalog_and_each_has_a_key_of
 #[test]
 fn what_is_left_out_is_what_the_kind_has() {
     let desktop = scenes("kind = \"desktop\"");
-    assert_eq!((desktop.fov_deg, desktop.spots), (46.0, Spots::Grid(16)));
+    assert_eq!(
+        (desktop.fov_deg, desktop.spots),
+        (Some(46.0), Spots::Grid(16))
+    );
     let rooms = PrimitiveRooms::DESKTOP;
     assert_eq!(desktop.kind, SceneKind::Primitive { rooms });
     let some = scenes("kind = \"desktop\"\nspots = 4\nrooms = { depth_m = [0.2, 1.2] }");
@@ -173,4 +178,94 @@ fn a_scene_of_a_file_is_named_by_its_own_file_and_position_and_by_no_other_file(
     let made = read(ALL[0]).unwrap().stages[0].clone();
     assert_eq!(made.task.scene_key(2), Some(task_key(&stage_key(&made), 2)));
     assert_eq!(made.task.files_key(), None);
+}
+
+#[test]
+fn files_have_the_options_of_the_command_line_and_other_kinds_do_not() {
+    let files = "kind = \"files\"\nfiles = [\"models/*.glb\", \"b\", \"c.glb\"]\n";
+    let view = "camera = \"0\"\nlook_from = [0, 1.5, 4]\nlook_at = [0, 1, 0]\nup = [0, 0, 1]\nfov_deg = 40\nunit = \"mm\"\nreplace_laser = true\n";
+    let source = scenes(&format!("{files}{view}"));
+    let again: SceneSource =
+        serde_json::from_value(serde_json::to_value(&source).unwrap()).unwrap();
+    assert_eq!(again, source);
+    let SceneKind::Files { view, .. } = &source.kind else {
+        panic!("files stay files");
+    };
+    assert_eq!(view.look_from, Some([0.0, 1.5, 4.0]));
+    // Spots that the job does not state are spread over what the camera sees.
+    assert!(view.spread_spots);
+    let stated = scenes(&format!("{files}spots = 25"));
+    assert!(matches!(&stated.kind, SceneKind::Files { view, .. } if !view.spread_spots));
+    for (field, text) in [
+        (
+            "scenes.look_at",
+            "look_from = [0, 0, 0]\nlook_at = [0, 0, 0]",
+        ),
+        ("scenes.up", "up = [0, 0, 0]"),
+        ("scenes.unit", "unit = \"furlong\""),
+        ("scenes.fov_deg", "fov_deg = 175"),
+        ("scenes.spread_spots", "spots = 4\nspread_spots = true"),
+    ] {
+        let said = read(&format!("{files}{text}")).unwrap_err();
+        assert!(said.contains(field), "{field}: {said}");
+    }
+    let said = read("kind = \"primitive\"\nlook_at = [0, 0, 0]").unwrap_err();
+    assert!(
+        said.contains("scenes.look_at") && said.contains("files"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_view_names_other_scenes_and_its_absence_the_old_ones() {
+    let file = format!("{{ path = \"/a.glb\", sha256 = \"{}\" }}", "a".repeat(64));
+    let stage = |more: &str| {
+        let text = format!("kind = \"files\"\nfiles = [{file}, {file}, {file}]\nspots = 4\n{more}");
+        stage_key(&read(&text).unwrap().stages[0])
+    };
+    let keys = [
+        "",
+        "look_at = [0, 0, 0]",
+        "fov_deg = 90",
+        "fov_deg = 60",
+        "unit = \"m\"",
+        "replace_laser = true",
+    ];
+    let keys = keys.map(stage);
+    for (k, key) in keys.iter().enumerate() {
+        assert!(!keys[..k].contains(key), "{k}");
+    }
+}
+
+#[test]
+fn a_gate_is_stated_in_one_of_two_forms_and_an_automatic_one_needs_files() {
+    let render = |text: &str| toml::from_str::<RenderSettings>(text).map_err(|e| e.to_string());
+    let stated = render("gate = [2, 12]\nbins = 100").unwrap();
+    assert_eq!(
+        (stated.gate_start_m, stated.bin_width_m, stated.bins),
+        (2.0, 0.1, 100)
+    );
+    let auto = render("gate = \"auto\"").unwrap();
+    assert!(auto.fit_gate);
+    let again = serde_json::from_value(serde_json::to_value(&auto).unwrap());
+    assert_eq!(auto, again.unwrap());
+    for wrong in [
+        "gate = \"automatic\"",
+        "gate = [12, 2]",
+        "gate = [1, 25]\nbin_width_m = 0.1",
+        "gate = \"auto\"\ngate_start_m = 0.5",
+    ] {
+        let said = render(wrong).unwrap_err();
+        assert!(said.contains("render.gate"), "{wrong}: {said}");
+    }
+    let mut spec = read("kind = \"primitive\"").unwrap();
+    let TaskSpec::Render(task) = &mut spec.stages[0].task else {
+        unreachable!("the job renders");
+    };
+    task.render.fit_gate = true;
+    let said = spec.check().unwrap_err().to_string();
+    assert!(
+        said.contains("render.gate") && said.contains("files"),
+        "{said}"
+    );
 }

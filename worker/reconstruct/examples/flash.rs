@@ -1,13 +1,14 @@
-//! Rooms in 3D from one flash, next to the same rooms from true times and masks: a line each with
-//! the errors of 24 novel views, and their mean. Rooms are furnished, parametric, of seeds 93001
-//! and on; nothing is read or written.
+//! Rooms in 3D from one flash, next to the same rooms from true times and masks, from the flash's
+//! depth with true masks, and from true depth with the flash's masks: a line each with the errors
+//! of 24 novel views, and their mean. This shows what limits a room from one flash. Rooms are
+//! furnished, parametric, of seeds 93001 and on; nothing is read or written.
 //!
-//! In the environment, `ROOMS` (6), `FIRST` (93001), `SIDE` (128 pixels), `NODES` (96), `WIDTH`
-//! (0.0768, of a bin, metres).
+//! In the environment, `ROOMS` (6), `FIRST` (93001), `SPOTS` (25), `SIDE` (128 pixels), `NODES`
+//! (96), `WIDTH` (0.0768, of a bin, metres).
 
 use std::{env, time::Instant};
 
-use picofarm_demultiplex::{Capture, Place, Settings as Method, Spot, demultiplex};
+use picofarm_demultiplex::{Capture, Place, Settings as Method, Spot, demultiplex, shadows_at};
 use picofarm_reconstruct::{
     Measured, Settings, Unwatched, World, reconstruct,
     render::Renderer,
@@ -62,10 +63,13 @@ fn score_of(measured: Measured, scene: &Scene, seconds: f64) -> Row {
     ]
 }
 
-fn room(seed: u64) -> [Row; 2] {
+/// The inputs of the rows of a room.
+const INPUTS: [&str; 4] = ["truth", "flash", "flash, true masks", "true depth"];
+
+fn room(seed: u64) -> [Row; 4] {
     let side = number("SIDE", 128.0) as u32;
     let settings = furnished::FurnishedSettings {
-        spots: Spots::Grid(25),
+        spots: Spots::Grid(number("SPOTS", 25.0) as u32),
         width: side,
         height: side,
         ..Default::default()
@@ -109,14 +113,28 @@ fn room(seed: u64) -> [Row; 2] {
     let seconds = start.elapsed().as_secs_f64();
     let flash = from_flash(&capture, &found, &beams).expect("sizes that fit");
     let truth = from_truth(&scene, &rendered, &Disturbed::default()).expect("a truth");
+    let pixels = capture.pixels();
+    let mut masks = found;
+    masks.lit = beams
+        .iter()
+        .flat_map(|beam| &rendered.truth.visibility[beam * pixels..][..pixels])
+        .map(|v| f32::from(*v))
+        .collect();
+    let masks = from_flash(&capture, &masks, &beams).expect("sizes that fit");
+    let mut depth =
+        shadows_at(&capture, &rendered.truth.depth, &Method::default()).expect("depths");
+    depth.mirror = Some(rendered.truth.specular.clone());
+    let depth = from_flash(&capture, &depth, &beams).expect("sizes that fit");
     [
         score_of(truth, &scene, 0.0),
         score_of(flash, &scene, seconds),
+        score_of(masks, &scene, seconds),
+        score_of(depth, &scene, seconds),
     ]
 }
 
-fn show(name: &str, rows: &[Row; 2]) {
-    for (input, row) in ["truth", "flash"].iter().zip(rows) {
+fn show(name: &str, rows: &[Row; 4]) {
+    for (input, row) in INPUTS.iter().zip(rows) {
         let figures: Vec<String> = row.iter().map(|x| format!("{x:.3}")).collect();
         println!("| {name} | {input} | {} |", figures.join(" | "));
     }

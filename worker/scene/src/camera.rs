@@ -49,6 +49,21 @@ impl Intrinsics {
         }
     }
 
+    /// Returns an image of another size and shape with the same width of the view and square
+    /// pixels.
+    pub fn reshaped(&self, width: u32, height: u32) -> Self {
+        let scale = width as f32 / self.width as f32;
+        let (cx, cy) = (self.cx / self.width as f32, self.cy / self.height as f32);
+        Self {
+            fx: self.fx * scale,
+            fy: self.fx * scale,
+            cx: cx * width as f32,
+            cy: cy * height as f32,
+            width,
+            height,
+        }
+    }
+
     /// Returns the same field of view at another resolution.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (

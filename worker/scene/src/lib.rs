@@ -30,7 +30,7 @@ mod vec3;
 mod view;
 mod viewpoint;
 
-pub use assets::{AssetLibrary, install};
+pub use assets::{AssetLibrary, Scanned, install, scan};
 pub use camera::{Camera, Intrinsics};
 pub use label::LABELS;
 pub use laser::{Aim, Beam, Laser, Spot};

@@ -76,12 +76,19 @@ impl Scene {
     /// # Ok::<(), picofarm_scene::SceneError>(())
     /// ```
     pub fn fitted_gate(&self, usual: Gate) -> Option<FittedGate> {
-        let [first, last] = self.path_range_m()?;
+        Some(FittedGate::new(self.path_range_m()?, usual))
+    }
+}
+
+impl FittedGate {
+    /// Returns a gate with the bins of `usual` for a range of optical paths of one and two bounces,
+    /// metres.
+    pub fn new([first, last]: [f64; 2], usual: Gate) -> Self {
         let start = 0.9 * first;
         let width = BEYOND * (last - start) / f64::from(usual.bins);
         // Three digits, rounded up.
         let digits = 10f64.powf(2.0 - width.log10().floor());
-        Some(FittedGate {
+        Self {
             gate: Gate {
                 start_m: (start * digits).floor() / digits,
                 bin_width_m: (width * digits).ceil() / digits,
@@ -91,6 +98,6 @@ impl Scene {
             usual_fits: first >= usual.start_m
                 && last <= usual.end_m()
                 && last - first >= LEAST_BINS * usual.bin_width_m,
-        })
+        }
     }
 }

@@ -4,11 +4,13 @@
 //! which a scene is accepted are the same on every machine. Each mesh has its own tree, independent
 //! of the scene.
 
-use std::{sync::Arc, time::Duration};
+use std::sync::Arc;
 
 use obvhs::{
     BvhBuildParams,
-    cwbvh::{CwBvh, builder::build_cwbvh_from_tris},
+    bvh2::reinsertion::ReinsertionOptimizer,
+    cwbvh::{CwBvh, bvh2_to_cwbvh::bvh2_to_cwbvh},
+    ploc::PlocBuilder,
     ray::{Ray, RayHit},
     triangle::Triangle,
 };
@@ -59,10 +61,48 @@ pub(crate) fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> 
     (inside && t.is_finite()).then_some(t)
 }
 
+/// The depth of a tree up to which obvhs searches it.
+const DEEPEST: usize = 31;
+
+/// Builds a tree as obvhs's own `build_cwbvh_from_tris`, which does not check the depth. Returns
+/// `None` for a tree that is too deep.
+fn built(triangles: &[Triangle]) -> Option<CwBvh> {
+    let params = BvhBuildParams::fast_build();
+    let mut binary = PlocBuilder::with_capacity(triangles.len()).build(
+        params.ploc_search_distance,
+        triangles,
+        (0..triangles.len() as u32).collect(),
+        params.sort_precision,
+        params.search_depth_threshold,
+    );
+    ReinsertionOptimizer::default().run(&mut binary, params.reinsertion_batch_ratio, None);
+    let tree = bvh2_to_cwbvh(&binary, params.max_prims_per_leaf.clamp(1, 3), true, false);
+    let mut open = vec![(0, 0)];
+    while let Some((node, depth)) = open.pop() {
+        if depth > DEEPEST {
+            return None;
+        }
+        let node = tree.nodes.get(node)?;
+        let inner = (0..8).filter(|child| !node.is_child_empty(*child) && !node.is_leaf(*child));
+        open.extend(inner.map(|child| (node.child_node_index(child) as usize, depth + 1)));
+    }
+    Some(tree)
+}
+
 impl Model {
-    /// Builds the tree. Returns `None` for a mesh without triangles or with a non-finite vertex.
+    /// The greatest coordinate of a vertex, metres. The areas of obvhs's boxes overflow far beyond
+    /// it, which makes obvhs panic.
+    pub(crate) const FARTHEST_M: f32 = 1e6;
+
+    /// Builds the tree. Returns `None` for a mesh without triangles, with a vertex beyond
+    /// [`Self::FARTHEST_M`], or with so many triangles in the same place that no tree divides them.
     pub(crate) fn new(mesh: Mesh) -> Option<Self> {
-        if mesh.triangles.is_empty() || !mesh.positions.iter().all(|p| p.is_finite()) {
+        let near = |p: &Vec3| {
+            <[f32; 3]>::from(*p)
+                .iter()
+                .all(|x| x.abs() <= Self::FARTHEST_M)
+        };
+        if mesh.triangles.is_empty() || !mesh.positions.iter().all(near) {
             return None;
         }
         let (lo, hi) = mesh.bounds()?;
@@ -76,16 +116,11 @@ impl Model {
                 v2: corner(c),
             })
             .collect();
-        let tree = build_cwbvh_from_tris(
-            &triangles,
-            BvhBuildParams::fast_build(),
-            &mut Duration::default(),
-        );
         Some(Self {
             mesh: Arc::new(mesh),
             lo,
             hi,
-            tree,
+            tree: built(&triangles)?,
         })
     }
 
@@ -280,6 +315,52 @@ mod tests {
             let down = Vec3::new(zero, -1.0, zero);
             let hit = model.closest(Vec3::new(0.63, 1.5, 0.04), down, f32::MAX);
             assert_eq!(hit.map(|(t, _)| t), Some(0.5));
+        }
+    }
+
+    #[test]
+    fn meshes_of_any_triangles_are_searched_or_refused() {
+        use proptest::prelude::*;
+        let number = prop_oneof![
+            Just(0.0f32),
+            Just(-0.0f32),
+            Just(1.0f32),
+            Just(f32::MAX),
+            Just(f32::MIN_POSITIVE),
+            -1.0f32..1.0,
+            any::<f32>().prop_filter("finite", |x| x.is_finite()),
+        ];
+        let point = [number.clone(), number.clone(), number];
+        let points = proptest::collection::vec(point, 1..6);
+        let corners = proptest::collection::vec((0..6usize, 0..6usize, 0..6usize), 1..300);
+        let mut runner = proptest::test_runner::TestRunner::new(ProptestConfig {
+            failure_persistence: None,
+            cases: 500,
+            ..ProptestConfig::default()
+        });
+        let outcome = runner.run(&(points, corners), |(points, corners)| {
+            let count = points.len();
+            let mesh = Mesh {
+                positions: points.into_iter().map(Vec3::from).collect(),
+                triangles: corners
+                    .iter()
+                    .map(|&(a, b, c)| [a, b, c].map(|v| (v % count) as u32))
+                    .collect(),
+                triangle_material: vec![0; corners.len()],
+                materials: vec![Material::diffuse("grey", [0.5; 3])],
+                ..Mesh::default()
+            };
+            if let Some(model) = Model::new(mesh) {
+                for direction in [[0.0, 0.0, 1.0], [1.0, 0.5, -0.25]] {
+                    let origin = Vec3::new(0.1, 0.2, -3.0);
+                    let hit = model.closest(origin, Vec3::from(direction), f32::MAX);
+                    prop_assert!(hit.is_none_or(|(t, _)| t.is_finite()));
+                }
+            }
+            Ok(())
+        });
+        if let Err(e) = outcome {
+            panic!("{e}");
         }
     }
 }

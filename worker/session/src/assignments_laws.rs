@@ -86,7 +86,7 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
                 },
                 count: 5,
                 seed: 0,
-                fov_deg: 90.0,
+                fov_deg: Some(90.0),
                 spots: Spots::Grid(1),
                 laser_m: [0.0; 3],
             },

@@ -382,8 +382,8 @@ pub(crate) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
     let render = &spec.render;
     Ok(DatasetSpec {
         scenes: spec.scenes.count,
-        height: render.resolution,
-        width: render.resolution,
+        height: render.resolution.height,
+        width: render.resolution.width,
         spots: spec.scenes.spots.count(),
         subsets: Subsets::of(&render.subsets)
             .map_err(|e| TaskError::User(format!("render.subsets: {e}")))?,

@@ -1,6 +1,8 @@
 //! The environment in which a job is submitted. Submission fills in the inputs of its tasks that
 //! are only known there.
 
+mod listed;
+
 use std::path::{Component, Path, PathBuf};
 
 use picofarm_dataset::Profile;
@@ -64,6 +66,16 @@ impl Submission<'_> {
             *root = self.path("scenes.root", root)?.display().to_string();
         }
         let bounds = within(root.as_deref());
+        let mut all = Vec::with_capacity(files.len());
+        for (i, file) in std::mem::take(files).into_iter().enumerate() {
+            let field = format!("scenes.files[{i}]");
+            match file.sha256.is_empty() {
+                true => all.extend(listed::files(&field, &self.path(&field, &file.path)?)?),
+                false => all.push(file),
+            }
+        }
+        *files = all;
+        source.count = files.len() as u64;
         for (i, file) in files.iter_mut().enumerate() {
             let field = format!("scenes.files[{i}]");
             let path = self.path(&field, &file.path)?;

@@ -42,9 +42,13 @@ pub fn template(kind: JobKind) -> String {
              # mirror_from_m = [0.05, 0.2]   # height of its lower edge\n"
         }
         JobKind::Files => {
-            "kind = \"files\"            # .glb, .gltf, .xml or .json scenes, one task each\n\
-             files = [\"scene.glb\"]     # relative to this file\n\
-             spots = 25                # for files without a laser\n"
+            "kind = \"files\"            # .glb, .gltf, .xml, .json, .obj, .ply or .stl, one task each\n\
+             files = [\"scene.glb\"]     # relative to this file; also patterns such as \"models/*.glb\", and folders\n\
+             # spots = 25              # for files without a laser; omitted: 25, spread over what the camera sees\n\
+             # replace_laser = true    # use the spots instead of the files' lasers\n\
+             # camera = \"0\"            # the file's camera by name or number\n\
+             # look_from = [0.0, 1.5, 4.0]   # or a view of your own, metres; also: look_at, up, fov_deg\n\
+             # unit = \"mm\"             # unit of the files: m, cm, mm, in or ft\n"
         }
     };
     format!(
@@ -53,7 +57,7 @@ pub fn template(kind: JobKind) -> String {
          # parts = 8               # divides each scene among this many tasks; the bytes are the same\n\n\
          [scenes]\n{scenes}\n\
          [render]\n\
-         resolution = 256          # pixels, square\n\
+         resolution = 256          # pixels, square; or width and height: \"320x240\"\n\
          gate_start_m = 1.0        # start of the time gate, metres of optical path\n\
          bin_width_m = 0.0384      # metres of optical path (128 ps)\n\
          bins = 637\n\

@@ -1,6 +1,7 @@
 //! Chooses the time gate of a render.
 
 use picofarm_figures::number::short;
+use picofarm_proto::spec::RenderSettings;
 use picofarm_scene::Scene;
 
 use crate::args::{GateArgs, GateChoice, RenderArgs};
@@ -31,13 +32,18 @@ pub fn choose(args: &RenderArgs, scene: &mut Scene) -> GateArgs {
     let [first, last] = fitted.path_range_m;
     let chosen = GateArgs {
         gate_start_m: fitted.gate.start_m,
-        bin_width_m: fitted.gate.bin_width_m,
+        // A scene of kilometres is most likely in another unit; it is rendered all the same.
+        bin_width_m: fitted.gate.bin_width_m.min(RenderSettings::MAX_BIN_M),
         bins,
+    };
+    let unit = match chosen.bin_width_m < fitted.gate.bin_width_m {
+        true => ", and --unit mm reads the file in millimetres",
+        false => "",
     };
     scene.provenance.notes.insert(
         "chosen.gate".into(),
         format!(
-            "{} bins of {} m from {} m, because light of one and two bounces arrives between {} and {} m; --gate changes it",
+            "{} bins of {} m from {} m, because light of one and two bounces arrives between {} and {} m; --gate changes it{unit}",
             bins,
             short(chosen.bin_width_m),
             short(chosen.gate_start_m),

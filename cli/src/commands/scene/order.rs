@@ -1,14 +1,15 @@
 //! A scene file and its render settings, as `scene render` and `scene plan` read them.
 
 use picofarm_proto::{show, spec::RenderSettings};
-use picofarm_scene::{Intrinsics, Scene};
+use picofarm_scene::Scene;
+use picofarm_settings::Resolution;
 use picofarm_tasks::SceneSize;
 use picofarm_transient::{Budget, Settings};
 
 use super::gate;
 use crate::{
     args::{
-        RenderArgs,
+        ImageSize, RenderArgs,
         groups::{self, Wanted},
         strategy,
     },
@@ -27,26 +28,27 @@ pub struct Order {
 impl Order {
     /// Reads the scene and checks the arguments against it.
     pub fn new(args: &RenderArgs, split: bool) -> Result<Self> {
-        let mut scene = args.input.read(&args.file)?;
-        if let Some(size) = args.resolution {
+        let size = args.resolution.and_then(ImageSize::whole);
+        let mut scene = args.input.read_sized(&args.file, size)?;
+        if let Some(ImageSize {
+            width,
+            height: None,
+        }) = args.resolution
+        {
             let i = &mut scene.camera.intrinsics;
-            let ratio = f64::from(i.height) / f64::from(i.width);
-            let height = size.height.unwrap_or_else(|| {
-                let height = (f64::from(size.width) * ratio).round();
-                height.clamp(1.0, f64::from(RenderSettings::MAX_SIDE)) as u32
-            });
-            *i = match size.height {
-                None => i.resized(size.width, height),
-                // Square pixels: the width of the view is kept.
-                Some(_) => reshaped(i, size.width, height),
-            };
+            let height = f64::from(width) * f64::from(i.height) / f64::from(i.width);
+            let height = height
+                .round()
+                .clamp(1.0, f64::from(RenderSettings::MAX_SIDE)) as u32;
+            *i = i.resized(width, height);
         }
         let gate = gate::choose(args, &mut scene);
         let samples = args.samples.unwrap_or(64);
         let asked = RenderSettings {
-            resolution: args
-                .resolution
-                .map_or(RenderSettings::MAX_SIDE, |r| r.width),
+            resolution: Resolution {
+                width: scene.camera.intrinsics.width.min(RenderSettings::MAX_SIDE),
+                height: scene.camera.intrinsics.height.min(RenderSettings::MAX_SIDE),
+            },
             gate_start_m: gate.gate_start_m,
             bin_width_m: gate.bin_width_m,
             bins: gate.bins,
@@ -115,20 +117,6 @@ pub fn decisions(plan: &picofarm_transient::Plan) -> String {
     strategies
         .chain(approximations.map(|line| format!("  approximated: {line}\n")))
         .collect()
-}
-
-/// Returns intrinsics of another size and shape with the same width of the view and square pixels.
-fn reshaped(i: &Intrinsics, width: u32, height: u32) -> Intrinsics {
-    let scale = width as f32 / i.width as f32;
-    let (cx, cy) = (i.cx / i.width as f32, i.cy / i.height as f32);
-    Intrinsics {
-        fx: i.fx * scale,
-        fy: i.fx * scale,
-        cx: cx * width as f32,
-        cy: cy * height as f32,
-        width,
-        height,
-    }
 }
 
 /// Returns a line for each choice, change or omission made while the scene was read.

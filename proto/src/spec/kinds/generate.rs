@@ -9,7 +9,8 @@ use super::{
     io::{Io, IoMut},
     kind::{Declared, Dispatch, Manifest, Results, TaskKind},
     render::RenderSettings,
-    scenes::{FilesIn, SceneKind, SceneSource},
+    scene_files::FilesIn,
+    scenes::{SceneKind, SceneSource},
 };
 use crate::{
     show,
@@ -119,7 +120,7 @@ impl TaskKind for GenerateTask {
             "stage": "generate",
             "scenes": self.scenes.shaping(FilesIn::All),
             "seed": self.scenes.seed,
-            "fov_deg": self.scenes.fov_deg,
+            "fov_deg": self.scenes.shaping_fov(),
             "spots": self.scenes.spots,
             "format": self.generate.format,
             "resolution": self.generate.resolution,

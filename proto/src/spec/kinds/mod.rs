@@ -22,6 +22,7 @@ pub mod reconstruct;
 pub mod render;
 pub mod report;
 pub mod reprocess;
+mod scene_files;
 pub mod scenes;
 mod split;
 pub mod train;

@@ -8,7 +8,7 @@ use super::{
     fields::Fields,
     io::{Io, IoMut, Makes},
     kind::{Declared, Dispatch, Results, TaskKind},
-    scenes::FilesIn,
+    scene_files::FilesIn,
 };
 use crate::{
     key::hash::{StageKey, TaskKey, task_key},
@@ -21,7 +21,7 @@ use crate::{
 
 mod settings;
 
-pub use super::scenes::{SceneFile, SceneKind, SceneSource};
+pub use super::scenes::{FileView, SceneFile, SceneKind, SceneSource};
 pub use settings::{RenderSettings, parse_share};
 
 /// Renders scenes into a data set: one task a scene.
@@ -51,13 +51,19 @@ impl RenderTask {
     /// Returns the task with its list of files reduced to those of tasks `lo..hi`.
     pub(super) fn some(&self, lo: u64, hi: u64) -> Self {
         let kind = match &self.scenes.kind {
-            SceneKind::Files { files, first, root } => {
+            SceneKind::Files {
+                files,
+                first,
+                root,
+                view,
+            } => {
                 let at = |i: u64| usize::try_from(i.saturating_sub(*first)).unwrap_or(usize::MAX);
                 let own = files.get(at(lo)..at(hi).min(files.len()));
                 SceneKind::Files {
                     files: own.unwrap_or_default().to_vec(),
                     first: lo.max(*first),
                     root: root.clone(),
+                    view: view.clone(),
                 }
             }
             other => other.clone(),
@@ -79,8 +85,8 @@ impl RenderTask {
         let spots = self.scenes.spots.count();
         Rendering {
             shape: Shape {
-                height: render.resolution,
-                width: render.resolution,
+                height: render.resolution.height,
+                width: render.resolution.width,
                 bins: render.bins,
                 spots,
             },
@@ -104,7 +110,7 @@ impl RenderTask {
             "task": "render",
             "scenes": self.scenes.shaping(files),
             "seed": self.scenes.seed,
-            "fov_deg": self.scenes.fov_deg,
+            "fov_deg": self.scenes.shaping_fov(),
             "spots": self.scenes.spots,
             "render": self.render,
             "profile": self.output.profile,
@@ -152,6 +158,10 @@ impl TaskKind for RenderTask {
     fn check(&self) -> Result<(), SpecError> {
         self.scenes.check()?;
         self.render.check()?;
+        if self.render.fit_gate && !matches!(self.scenes.kind, SceneKind::Files { .. }) {
+            let what = "\"auto\" is for scenes.kind = \"files\"; generated rooms fit the default gate, so leave it out";
+            return Err(SpecError::new("render.gate", what));
+        }
         let unit = "parts of a scene; 1 leaves it whole";
         within("parts", self.parts, (1, Self::MAX_PARTS), unit)?;
         if self.parts > 1 && matches!(self.render.budget, Budget::Error(_)) {
@@ -177,6 +187,16 @@ impl TaskKind for RenderTask {
             ));
         }
         self.output.check()
+    }
+
+    fn check_resolved(&self) -> Result<(), SpecError> {
+        match self.render.fit_gate {
+            true => Err(SpecError::new(
+                "render.gate",
+                "is \"auto\"; the client must fit the gate to the files before it submits",
+            )),
+            false => Ok(()),
+        }
     }
 
     fn remarks(&self) -> Vec<String> {
@@ -220,8 +240,8 @@ impl TaskKind for RenderTask {
 
     fn shape(&self, _source: Option<Shape>) -> Option<Shape> {
         Some(Shape {
-            height: self.render.resolution,
-            width: self.render.resolution,
+            height: self.render.resolution.height,
+            width: self.render.resolution.width,
             bins: self.render.bins,
             spots: self.scenes.spots.count(),
         })

@@ -5,6 +5,8 @@ use picofarm_settings::{MirrorWall, PrimitiveRooms, Sizes, Spots};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use super::scene_files::FilesIn;
+pub use super::scene_files::{FileView, SceneFile};
 use crate::{
     show,
     spec::{
@@ -15,6 +17,8 @@ use crate::{
 
 /// Names of furniture that stand for any installed library.
 const LIBRARIES: [&str; 5] = ["", "auto", "parametric", "sweethome3d", "gltf"];
+/// Field of view of generated rooms, degrees.
+const FOV_DEG: f64 = 90.0;
 /// The kinds of scenes.
 const KINDS: [&str; 4] = ["furnished", "primitive", "desktop", "files"];
 
@@ -29,10 +33,12 @@ pub struct SceneSource {
     pub count: u64,
     /// Seed (default 0). Scene i derives its own from (seed, i).
     pub seed: u64,
-    /// Horizontal field of view in degrees (generated scenes; default 90, for boxes on a desk 46).
-    pub fov_deg: f64,
+    /// Horizontal field of view in degrees (default 90, for boxes on a desk 46; `None` = that of
+    /// the files' cameras).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fov_deg: Option<f64>,
     /// Laser spots (generated scenes, and files without a laser; default a grid of 25, for boxes on
-    /// a desk 16).
+    /// a desk 16; for files see also [`FileView`]).
     pub spots: Spots,
     /// Position of the laser in the camera's frame: x right, y down, z forward, metres (generated
     /// scenes; default the camera's centre). Its beams go to the points that the camera sees at the
@@ -64,9 +70,9 @@ pub enum SceneKind {
         #[serde(skip_serializing_if = "is_living")]
         rooms: PrimitiveRooms,
     },
-    /// Scene files (.glb, .gltf, .json), one scene each.
+    /// Scene files (.glb, .gltf, .xml, .json, .obj, .ply, .stl), one scene each.
     Files {
-        /// The files; plain paths in a job file.
+        /// The files. In a job file: paths, patterns such as `models/*.glb`, and folders.
         files: Vec<SceneFile>,
         /// Index of the first file: 0 except in a lease, which contains only its own files.
         #[serde(skip_serializing_if = "is_zero")]
@@ -75,6 +81,9 @@ pub enum SceneKind {
         /// defaults to each scene file's own folder.
         #[serde(skip_serializing_if = "Option::is_none")]
         root: Option<String>,
+        /// How the files are read.
+        #[serde(flatten)]
+        view: FileView,
     },
 }
 
@@ -94,7 +103,10 @@ const FURNISHED: u64 = 450_000;
 impl SceneKind {
     /// Returns the paths that are read, each with its field: of one scene, or of all.
     pub(super) fn inputs(&self, scene: Option<u64>) -> Vec<(String, &str)> {
-        let Self::Files { files, first, root } = self else {
+        let Self::Files {
+            files, first, root, ..
+        } = self
+        else {
             return Vec::new();
         };
         let root = root.iter().map(|root| ("scenes.root".to_owned(), &**root));
@@ -124,46 +136,6 @@ impl SceneKind {
     }
 }
 
-/// Which scene files a key counts, where scenes are files.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum FilesIn<'a> {
-    /// All of the job's: the key of a stage.
-    All,
-    /// A scene's own: the key of a scene, which the other files do not shape.
-    One(&'a SceneFile),
-    /// None: what the scenes of a list and of its corrected form have in common.
-    None,
-}
-
-/// A scene file, pinned by its content.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "SceneFileText")]
-pub struct SceneFile {
-    /// Path on the workers.
-    pub path: String,
-    /// SHA-256 of the content in hexadecimal; empty until submission fills it in.
-    pub sha256: String,
-}
-
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum SceneFileText {
-    Path(String),
-    Pinned { path: String, sha256: String },
-}
-
-impl From<SceneFileText> for SceneFile {
-    fn from(text: SceneFileText) -> Self {
-        match text {
-            SceneFileText::Path(path) => Self {
-                path,
-                sha256: String::new(),
-            },
-            SceneFileText::Pinned { path, sha256 } => Self { path, sha256 },
-        }
-    }
-}
-
 impl SceneSource {
     /// What shapes the scenes, but for seed, field of view and spots, as keys know it. Files count
     /// by `files`.
@@ -172,7 +144,17 @@ impl SceneSource {
         if !is_centre(&self.laser_m) {
             value["laser_m"] = json!(self.laser_m);
         }
+        if let SceneKind::Files { view, .. } = &self.kind
+            && (*view != FileView::default() || self.fov_deg.is_some())
+        {
+            value["view"] = json!({"with": view, "fov_deg": self.fov_deg});
+        }
         value
+    }
+
+    /// Returns the field of view as keys know it.
+    pub(super) fn shaping_fov(&self) -> f64 {
+        self.fov_deg.unwrap_or(FOV_DEG)
     }
 
     fn kind_shaping(&self, counted: FilesIn<'_>) -> Value {
@@ -244,7 +226,13 @@ impl SceneSource {
         }
         // The limits of the generators: beyond them, walls or furniture leave the view.
         let degrees = "degrees from left to right";
-        within("scenes.fov_deg", self.fov_deg, (20.0, 120.0), degrees)?;
+        let limits = match self.kind {
+            SceneKind::Files { .. } => (1.0, 170.0),
+            _ => (20.0, 120.0),
+        };
+        if let Some(fov_deg) = self.fov_deg {
+            within("scenes.fov_deg", fov_deg, limits, degrees)?;
+        }
         let spots = self.spots.check();
         spots.map_err(|what| SpecError::new("scenes.spots", what))?;
         let metres = "metres from the camera's centre";
@@ -261,7 +249,7 @@ impl SceneSource {
             SceneKind::Primitive { rooms } => {
                 let named = |(field, what)| SpecError::new(format!("scenes.rooms.{field}"), what);
                 rooms.check().map_err(named)?;
-                let (fov, jitter) = (self.fov_deg, rooms.fov_jitter_deg);
+                let (fov, jitter) = (self.shaping_fov(), rooms.fov_jitter_deg);
                 let degrees =
                     "degrees less and more than scenes.fov_deg, which must stay within 1 and 170";
                 let most = (fov - 1.0).min(170.0 - fov);
@@ -271,7 +259,7 @@ impl SceneSource {
                 "scenes.laser_m",
                 "is of generated scenes; a file says itself where its laser stands",
             )),
-            SceneKind::Files { .. } => Ok(()),
+            SceneKind::Files { view, .. } => view.check(),
         }
     }
 }
@@ -295,6 +283,15 @@ struct SceneSourceText {
     spots: Option<Spots>,
     laser_m: Option<[f64; 3]>,
     rooms: Option<RoomsText>,
+    camera: Option<String>,
+    look_from: Option<[f64; 3]>,
+    look_at: Option<[f64; 3]>,
+    up: Option<[f64; 3]>,
+    unit: Option<String>,
+    #[serde(default)]
+    replace_laser: bool,
+    #[serde(default)]
+    spread_spots: bool,
 }
 
 /// The written form of `scenes.rooms`. Omitted fields default to the kind's values.
@@ -355,6 +352,23 @@ impl TryFrom<SceneSourceText> for SceneSource {
         only("files", "files", text.files.is_some())?;
         only("root", "files", text.root.is_some())?;
         only("first", "files", text.first != 0)?;
+        let view = FileView {
+            camera: text.camera,
+            look_from: text.look_from,
+            look_at: text.look_at,
+            up: text.up,
+            unit: text.unit,
+            replace_laser: text.replace_laser,
+            // Spots that the job does not state are chosen as on a command line.
+            spread_spots: text.spread_spots || (text.kind == "files" && text.spots.is_none()),
+        };
+        if let Some(field) = view.given() {
+            only(field, "files", true)?;
+        }
+        if view.spread_spots && text.spots.as_ref().is_some_and(|s| *s != Spots::Grid(25)) {
+            let what = "spreads 25 spots; remove it, or remove scenes.spots";
+            return Err(SpecError::new("scenes.spread_spots", what));
+        }
         if text.rooms.is_some() && !matches!(&*text.kind, "primitive" | "desktop") {
             let what = format!(
                 "belongs to kind = \"primitive\" or \"desktop\"; remove it from kind = {:?}",
@@ -383,6 +397,7 @@ impl TryFrom<SceneSourceText> for SceneSource {
                     files,
                     first: text.first,
                     root: text.root,
+                    view,
                 }
             }
         };
@@ -391,7 +406,11 @@ impl TryFrom<SceneSourceText> for SceneSource {
             count: count
                 .ok_or_else(|| SpecError::new("scenes.count", "is missing; say how many scenes"))?,
             seed: text.seed,
-            fov_deg: text.fov_deg.unwrap_or(if desktop { 46.0 } else { 90.0 }),
+            fov_deg: text.fov_deg.or(match &*text.kind {
+                "files" => None,
+                "desktop" => Some(46.0),
+                _ => Some(FOV_DEG),
+            }),
             spots: text
                 .spots
                 .unwrap_or(Spots::Grid(if desktop { 16 } else { 25 })),

@@ -6,6 +6,7 @@ use picofarm_dataset::{Dataset, Profile};
 use picofarm_proto::spec::{
     Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, Spots,
 };
+use picofarm_settings::Resolution;
 use picofarm_tasks::Access;
 use tokio_util::sync::CancellationToken;
 
@@ -56,12 +57,12 @@ pub async fn source(
             },
             count: args.scenes,
             seed: args.seed,
-            fov_deg: 90.0,
+            fov_deg: Some(90.0),
             spots: Spots::Grid(25),
             laser_m: [0.0; 3],
         },
         render: RenderSettings {
-            resolution: args.resolution,
+            resolution: Resolution::square(args.resolution),
             budget: Budget::Samples(args.samples),
             ..RenderSettings::default()
         },

@@ -19,7 +19,7 @@ use picofarm_model::{
 };
 
 /// The number of AdamW steps that are compared.
-const STEPS: usize = 20;
+const STEPS: usize = 10;
 
 /// Returns all devices that can be opened. Prints a note if there are none.
 fn opened() -> Vec<OpenGpu> {
@@ -30,18 +30,27 @@ fn opened() -> Vec<OpenGpu> {
     listed.iter().map(|gpu| gpu.open().unwrap()).collect()
 }
 
-/// Returns a trial for each target and architecture.
+/// Returns a trial for each architecture and number of inputs, and one for each loss.
 fn networks() -> impl Iterator<Item = Trial> {
-    let targets = [Target::Tof, Target::Shadow, Target::Specular];
-    targets.into_iter().flat_map(|target| {
-        [
-            Architecture::Unet2d,
-            Architecture::Unet25d,
-            Architecture::Swinir,
-            Architecture::Embeddings,
-            Architecture::Nlost,
-        ]
-        .map(|architecture| Trial {
+    let all = [
+        Architecture::Unet2d,
+        Architecture::Unet25d,
+        Architecture::Swinir,
+        Architecture::Embeddings,
+        Architecture::Nlost,
+    ];
+    let targets = [
+        (Target::Tof, &all[..]),
+        (Target::Shadow, &all[..]),
+        // Its network is that of `Tof`, with another loss.
+        (Target::Specular, &all[..1]),
+    ];
+    let trials: Vec<_> = targets
+        .into_iter()
+        .flat_map(|(target, some)| some.iter().map(move |net| (target, *net)))
+        .collect();
+    trials.into_iter().map(|(target, architecture)| {
+        Trial {
             target,
             net: NetSpec {
                 architecture,
@@ -74,7 +83,7 @@ fn networks() -> impl Iterator<Item = Trial> {
             learning_rate: 2e-4,
             decay: 1e-3,
             seed: 1,
-        })
+        }
     })
 }
 

@@ -8,7 +8,7 @@ use std::{
 use picofarm_files::{FileError, Opener};
 use sha2::{Digest, Sha256};
 
-use crate::{LABELS, Mesh, SceneError, Vec3, body, import};
+use crate::{LABELS, Mesh, SceneError, Vec3, body, import, trace::Model};
 
 use super::obj::drop_degenerate;
 
@@ -266,6 +266,23 @@ fn axis(name: &str) -> Option<Vec3> {
     })
 }
 
+impl Row {
+    /// Returns a model that is y up and faces +z, in metres, as glTF defines.
+    pub(super) fn upright(file: PathBuf, files: &Opener) -> Self {
+        Self {
+            file,
+            files: files.clone(),
+            name: String::new(),
+            label: LABELS[0],
+            elevation: 0.0,
+            attribution: None,
+            up: Vec3::new(0.0, 1.0, 0.0),
+            front: Vec3::new(0.0, 0.0, 1.0),
+            scale: 1.0,
+        }
+    }
+}
+
 /// Reads, turns and scales a model, and returns whether a transparent material was made opaque.
 /// Returns `None` if the model cannot be used.
 pub(super) fn load(row: &Row) -> Option<(Mesh, bool)> {
@@ -276,7 +293,8 @@ pub(super) fn load(row: &Row) -> Option<(Mesh, bool)> {
     loaded.ok()
 }
 
-fn parse(row: &Row) -> Result<(Mesh, bool), String> {
+/// Reads, turns and scales a model. The error is why it cannot be used.
+pub(super) fn parse(row: &Row) -> Result<(Mesh, bool), String> {
     let (mut mesh, notes) = import::read_model(&row.file, &row.files).map_err(|e| e.to_string())?;
     if mesh.triangles.len() > MAX_TRIANGLES {
         let count = mesh.triangles.len();
@@ -288,6 +306,12 @@ fn parse(row: &Row) -> Result<(Mesh, bool), String> {
         *p = turned * row.scale;
         if !p.is_finite() {
             return Err("a vertex is not finite".into());
+        }
+        if <[f32; 3]>::from(*p)
+            .iter()
+            .any(|x| x.abs() > Model::FARTHEST_M)
+        {
+            return Err("a vertex is more than 1000 km from the origin; correct the scale".into());
         }
     }
     if mesh.uv.iter().flatten().any(|x| !x.is_finite()) {
@@ -304,18 +328,24 @@ fn parse(row: &Row) -> Result<(Mesh, bool), String> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::{AssetLibrary, rng::Rng};
 
     /// Writes a model of 10 × 30 × 20 units, up along z and its front along −y, as a .glb with
     /// textures.
-    fn model(path: &Path) {
+    fn crate_of(path: &Path) {
+        model(path, 30.0);
+    }
+
+    /// Writes a box of this height as a .glb.
+    pub(in crate::assets) fn model(path: &Path, height: f32) {
         use crate::{Aim, Camera, Intrinsics, Material, Object, Provenance, Scene, shape::Shape};
         let mut shape = Shape::new("crate");
         let m = shape.material(Material::diffuse("wood", [0.6, 0.4, 0.2]));
         // The front bulges: 15 units towards −y, 5 towards +y.
-        shape.cuboid([-5.0, -15.0, 0.0], [5.0, 5.0, 30.0], m);
+        let [w, d] = [height / 6.0, height / 2.0];
+        shape.cuboid([-w, -d, 0.0], [w, w, height], m);
         let camera = Camera::look_at(
             Vec3::new(0.0, 0.0, 90.0),
             Vec3::ZERO,
@@ -339,7 +369,7 @@ mod tests {
 
     fn library(list: &str) -> Result<AssetLibrary, SceneError> {
         let dir = tempfile::tempdir().unwrap();
-        model(&dir.path().join("a b.glb"));
+        crate_of(&dir.path().join("a b.glb"));
         std::fs::write(dir.path().join(LIST), list).unwrap();
         let library = AssetLibrary::gltf(dir.path());
         if let Ok(library) = &library {
@@ -374,7 +404,7 @@ mod tests {
             let found = AssetLibrary::find("gltf", &[dir.path().to_path_buf()]).unwrap();
             found.fingerprint().to_owned()
         };
-        model(&dir.path().join("a b.glb"));
+        crate_of(&dir.path().join("a b.glb"));
         write(GOOD);
         let first = print();
         assert_eq!(first, print());

@@ -8,6 +8,7 @@ mod install;
 mod materials;
 mod obj;
 mod parametric;
+mod scan;
 mod small;
 mod storage;
 mod upholstery;
@@ -24,6 +25,7 @@ use crate::{Mesh, SceneError, rng::Rng, trace::Model};
 use catalogue::{Archive, Item};
 
 pub use install::install;
+pub use scan::{Scanned, scan};
 
 /// Changes whenever a parametric model changes shape.
 const PARAMETRIC_VERSION: &str = "parametric-1";
@@ -358,8 +360,15 @@ impl Asset {
                     (mesh, made_opaque, false)
                 }
             };
+            let model = Model::new(standing(mesh));
+            if model.is_none() {
+                tracing::warn!(
+                    model = self.name,
+                    "furniture model left out: no ray finds its triangles"
+                );
+            }
             Some(Loaded {
-                model: Arc::new(Model::new(standing(mesh))?),
+                model: Arc::new(model?),
                 made_opaque,
                 untextured,
             })

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use base64::{Engine, engine::general_purpose::STANDARD};
 use gltf::{
-    Accessor, Document,
+    Accessor,
     accessor::{DataType, Dimensions},
-    buffer::Source,
+    json,
 };
 
 use crate::SceneError;
@@ -15,28 +15,32 @@ use super::{Opener, format_error, of_file, read_file};
 
 /// The bytes of every buffer, by index.
 #[derive(Debug)]
-pub(super) struct Buffers(Vec<Vec<u8>>);
+pub(super) struct Buffers(pub(super) Vec<Vec<u8>>);
 
 impl Buffers {
     /// Reads or decodes every buffer.
     pub(super) fn read(
         path: &Path,
-        document: &Document,
+        root: &json::Root,
         mut blob: Option<Vec<u8>>,
         files: &Opener,
     ) -> Result<Self, SceneError> {
-        let read = |buffer: gltf::Buffer<'_>| {
-            let at = format!("buffers[{}]", buffer.index());
-            let source = buffer.source();
-            if let Source::Uri(uri) = source
+        let fallbacks = fallbacks(root);
+        let read = |(index, buffer): (usize, &json::Buffer)| {
+            let at = format!("buffers[{index}]");
+            let length = usize::try_from(buffer.byte_length.0).unwrap_or(usize::MAX);
+            // The binary chunk is the first buffer.
+            if fallbacks[index] && (index > 0 || blob.is_none()) {
+                return Ok(Vec::new());
+            }
+            if let Some(uri) = &buffer.uri
                 && let Some(file) = buffer_file(path, uri)?
             {
-                return read_file(files, &file)
-                    .and_then(|data| checked(path, &at, data, buffer.length()));
+                return read_file(files, &file).and_then(|data| checked(path, &at, data, length));
             }
-            let data = match source {
-                Source::Uri(uri) => data_uri(uri),
-                Source::Bin => blob
+            let data = match &buffer.uri {
+                Some(uri) => data_uri(uri),
+                None => blob
                     .take()
                     .ok_or_else(|| "the file has no binary chunk".into()),
             };
@@ -44,13 +48,10 @@ impl Buffers {
                 let what = format!("{at}: cannot be read ({why}); export the file again");
                 format_error(path, what)
             })?;
-            checked(path, &at, data, buffer.length())
+            checked(path, &at, data, length)
         };
-        document
-            .buffers()
-            .map(read)
-            .collect::<Result<_, _>>()
-            .map(Self)
+        let all = root.buffers.iter().enumerate();
+        all.map(read).collect::<Result<_, _>>().map(Self)
     }
 
     /// Returns a buffer's bytes, for the readers of the `gltf` crate.
@@ -91,13 +92,8 @@ impl Buffers {
             ));
         }
         let Some(view) = accessor.view() else {
-            return Err(format!(
-                "{at}: has no bufferView (sparse only); export it as plain data"
-            ));
+            return Err(format!("{at}: has no bufferView; export the file again"));
         };
-        if accessor.sparse().is_some() {
-            return Err(format!("{at}: is sparse; export it as plain data"));
-        }
         let size = accessor.size();
         let stride = view.stride().unwrap_or(size);
         let need = accessor.count().checked_sub(1).and_then(|n| {
@@ -118,6 +114,29 @@ impl Buffers {
             )),
         }
     }
+}
+
+/// Returns for each buffer whether it only serves readers without meshopt's extension: it says so,
+/// or it has no content and all of its views are compressed.
+fn fallbacks(root: &json::Root) -> Vec<bool> {
+    const NAME: &str = "meshopt_compression";
+    // The numbers of views and of compressed views.
+    let mut views = vec![(0u32, 0u32); root.buffers.len()];
+    for view in &root.buffer_views {
+        let mut extensions = view.extensions.iter().flat_map(|e| e.others.keys());
+        let compressed = extensions.any(|name| name.ends_with(NAME));
+        if let Some((all, packed)) = views.get_mut(view.buffer.value()) {
+            (*all, *packed) = (*all + 1, *packed + u32::from(compressed));
+        }
+    }
+    let buffers = root.buffers.iter().zip(views);
+    let fallback = |(buffer, (all, packed)): (&json::Buffer, (u32, u32))| {
+        let extensions = buffer.extensions.iter().flat_map(|e| &e.others);
+        let mut stated = extensions.filter(|(name, _)| name.ends_with(NAME));
+        stated.any(|(_, e)| e.get("fallback") == Some(&serde_json::Value::Bool(true)))
+            || (buffer.uri.is_none() && all > 0 && all == packed)
+    };
+    buffers.map(fallback).collect()
 }
 
 fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8>, SceneError> {

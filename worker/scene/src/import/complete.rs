@@ -1,7 +1,7 @@
 //! Completes scenes from files: chooses the unit, the camera and the laser that a file does not
 //! state, and notes each choice with the option that changes it.
 
-use picofarm_settings::Spots;
+use picofarm_settings::{Resolution, Spots};
 
 use crate::{
     Affine, Aim, Camera, Intrinsics, Laser, Object, Provenance, Scene, Vec3,
@@ -115,24 +115,34 @@ impl Draft {
         }
     }
 
-    /// Returns the stated camera, one of the file's, or a chosen one.
+    /// Returns the stated camera, one of the file's, or a chosen one, with an image of the stated
+    /// size.
     fn camera(&mut self, options: &ImportOptions) -> Result<Camera, String> {
+        let sized = |mut camera: Camera| {
+            if let Some(size) = options.size {
+                camera.intrinsics = camera.intrinsics.reshaped(size.width, size.height);
+            }
+            camera
+        };
         if let Some(camera) = options.camera {
-            return Ok(camera);
+            return Ok(sized(camera));
         }
         let view = &options.view;
         let own = match &view.camera {
             Some(wanted) => Some(self.named_camera(wanted)?),
             None => self.cameras.first().map(|(_, camera)| camera.clone()),
         };
-        let own = own.transpose()?;
+        let own = own.transpose()?.map(sized);
         let mut camera = match (own, view.from, view.at) {
             (Some(camera), None, None) => camera,
             (own, from, at) => {
                 let fov_deg = view.fov_deg.unwrap_or(FOV_DEG);
                 let intrinsics = match own {
                     Some(camera) => camera.intrinsics,
-                    None => Intrinsics::from_fov(fov_deg, PIXELS, PIXELS),
+                    None => {
+                        let size = options.size.unwrap_or(Resolution::square(PIXELS));
+                        Intrinsics::from_fov(fov_deg, size.width, size.height)
+                    }
                 };
                 let viewpoint = Viewpoint {
                     from: from.or(own.map(|c| c.origin)),
@@ -266,8 +276,8 @@ fn spread(seen: &[bool]) -> Option<Aim> {
 }
 
 /// Returns the smallest and largest world coordinates of all finite vertices.
-fn bounds(objects: &[Object]) -> Option<(Vec3, Vec3)> {
-    let points = objects.iter().flat_map(|o| {
+pub(super) fn bounds<'a>(objects: impl IntoIterator<Item = &'a Object>) -> Option<(Vec3, Vec3)> {
+    let points = objects.into_iter().flat_map(|o| {
         let vertices = o.mesh.triangles.iter().flatten();
         vertices.map(|&v| o.to_world.point(o.mesh.positions[v as usize]))
     });

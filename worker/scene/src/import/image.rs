@@ -1,7 +1,11 @@
-//! Images in imported files: PNG and JPEG as textures. They are decoded once, and limits are
-//! checked before any texel is decoded.
+//! Images in imported files: PNG, JPEG, WebP and uncompressed KTX2 as textures. They are decoded
+//! once, and limits are checked before any texel is decoded.
 
-use std::{collections::BTreeMap, io::Cursor, sync::Arc};
+use std::{
+    collections::BTreeMap,
+    io::{Cursor, Read},
+    sync::Arc,
+};
 
 use zune_jpeg::{
     JpegDecoder,
@@ -53,15 +57,15 @@ impl<K: Ord> Images<K> {
     }
 }
 
-/// Decodes a PNG or JPEG image as a texture. An alpha channel is dropped, grey is copied to all
-/// channels, and 16 bits are rounded to 8.
+/// Decodes a PNG, JPEG, WebP or KTX2 image as a texture. An alpha channel is dropped, grey is
+/// copied to all channels, and 16 bits are rounded to 8.
 pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, String> {
-    let decoded = if bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
-        png(bytes)
-    } else if bytes.starts_with(&[0xff, 0xd8, 0xff]) {
-        jpeg(bytes)
-    } else {
-        Err(Refused::Damaged("it is neither a PNG nor a JPEG".into()))
+    let decoded = match samples(bytes) {
+        Some(read) => read.map(|(size, samples, each)| (size, texels(&samples, each))),
+        None if bytes.starts_with(&[0xff, 0xd8, 0xff]) => jpeg(bytes),
+        None => Err(Refused::Damaged(
+            "it is neither PNG, JPEG, WebP nor KTX2".into(),
+        )),
     };
     let (size, texels) = decoded.map_err(|refused| match refused {
         Refused::Damaged(why) => {
@@ -70,7 +74,7 @@ pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, St
                 quoted(name)
             )
         }
-        Refused::TooLarge(why) => format!("image {}: {why}", quoted(name)),
+        Refused::Unusable(why) => format!("image {}: {why}", quoted(name)),
     })?;
     Texture::new(name, size.0, size.1, texels, wrap)
 }
@@ -80,11 +84,11 @@ pub(super) fn decode(name: &str, bytes: &[u8], wrap: Wrap) -> Result<Texture, St
 /// # Errors
 /// An image that cannot be read.
 pub(super) fn alpha(bytes: &[u8]) -> Result<Option<Alpha>, String> {
-    if !bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
+    let Some(read) = samples(bytes) else {
         return Ok(None);
-    }
-    let (size, samples, each) = png_samples(bytes).map_err(|refused| match refused {
-        Refused::Damaged(why) | Refused::TooLarge(why) => format!("image is not readable ({why})"),
+    };
+    let (size, samples, each) = read.map_err(|refused| match refused {
+        Refused::Damaged(why) | Refused::Unusable(why) => format!("image is not readable ({why})"),
     })?;
     let alpha = samples.chunks_exact(each).map(|p| p[each - 1]);
     Ok(matches!(each, 2 | 4).then(|| (size, alpha.collect())))
@@ -95,19 +99,97 @@ pub(super) type Alpha = ((u32, u32), Vec<u8>);
 
 enum Refused {
     Damaged(String),
-    TooLarge(String),
+    Unusable(String),
 }
 
 /// Width and height, and 8-bit RGB row by row.
 type Decoded = ((u32, u32), Vec<[u8; 3]>);
 
-fn png(bytes: &[u8]) -> Result<Decoded, Refused> {
-    let (size, samples, each) = png_samples(bytes)?;
-    Ok((size, texels(&samples, each)))
-}
-
 /// Width and height, 8-bit samples row by row, and the number of samples of a pixel.
 type Samples = ((u32, u32), Vec<u8>, usize);
+
+/// Returns the samples of an image that may have an alpha channel, or `None` for other formats.
+fn samples(bytes: &[u8]) -> Option<Result<Samples, Refused>> {
+    if bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
+        Some(png_samples(bytes))
+    } else if bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
+        Some(webp(bytes))
+    } else if bytes.starts_with(b"\xabKTX 20\xbb\r\n\x1a\n") {
+        Some(ktx(bytes))
+    } else {
+        None
+    }
+}
+
+fn webp(bytes: &[u8]) -> Result<Samples, Refused> {
+    let damaged = |e: image_webp::DecodingError| Refused::Damaged(e.to_string());
+    let mut decoder = image_webp::WebPDecoder::new(Cursor::new(bytes)).map_err(damaged)?;
+    let size = decoder.dimensions();
+    Texture::check_size(size.0, size.1).map_err(Refused::Unusable)?;
+    decoder.set_memory_limit(16 * Texture::MAX_TEXELS as usize);
+    let mut samples = vec![0; decoder.output_buffer_size().unwrap_or(0)];
+    decoder.read_image(&mut samples).map_err(damaged)?;
+    Ok((size, samples, if decoder.has_alpha() { 4 } else { 3 }))
+}
+
+/// Returns the largest image of a KTX2 file with 8-bit samples, plain or deflated.
+fn ktx(bytes: &[u8]) -> Result<Samples, Refused> {
+    let refused = |what: &str| {
+        Err(Refused::Unusable(format!(
+            "{what} is not supported; `gltf-transform ktxdecompress IN OUT` converts it to PNG"
+        )))
+    };
+    let file = ktx2::Reader::new(bytes).map_err(|e| Refused::Damaged(e.to_string()))?;
+    let header = file.header();
+    let (each, blue_first) = match header.format.map(|f| f.value()) {
+        Some(9 | 15) => (1, false),
+        Some(16 | 22) => (2, false),
+        Some(23 | 29) => (3, false),
+        Some(30 | 36) => (3, true),
+        Some(37 | 43) => (4, false),
+        Some(44 | 50) => (4, true),
+        None => return refused("KTX2 with Basis Universal"),
+        Some(other) => return refused(&format!("KTX2 of Vulkan format {other}")),
+    };
+    if header.pixel_depth > 1 || header.layer_count > 1 || header.face_count > 1 {
+        return refused("KTX2 of more than one image");
+    }
+    let size = (header.pixel_width, header.pixel_height.max(1));
+    Texture::check_size(size.0, size.1).map_err(Refused::Unusable)?;
+    let length = size.0 as usize * size.1 as usize * each;
+    let Some(level) = file.levels().next() else {
+        return Err(Refused::Damaged("it has no image".into()));
+    };
+    let mut samples = match header.supercompression_scheme.map(|s| s.value()) {
+        None => level.data.to_vec(),
+        // Deflate, after a zlib header.
+        Some(3) => {
+            let mut inflated = Vec::with_capacity(length);
+            flate2::read::ZlibDecoder::new(level.data)
+                .take(length as u64)
+                .read_to_end(&mut inflated)
+                .map_err(|e| Refused::Damaged(e.to_string()))?;
+            inflated
+        }
+        Some(_) => return refused("KTX2 with Zstandard"),
+    };
+    if samples.len() < length {
+        return Err(Refused::Damaged("it is cut short".into()));
+    }
+    samples.truncate(length);
+    if blue_first {
+        samples.chunks_exact_mut(each).for_each(|p| p.swap(0, 2));
+    }
+    // Two samples are red and green here, but grey and alpha in other formats.
+    if each == 2 {
+        samples = samples
+            .chunks_exact(2)
+            .flat_map(|p| [p[0], p[1], 0])
+            .collect();
+        return Ok((size, samples, 3));
+    }
+    Ok((size, samples, each))
+}
 
 fn png_samples(bytes: &[u8]) -> Result<Samples, Refused> {
     let damaged = |e: png::DecodingError| Refused::Damaged(e.to_string());
@@ -118,7 +200,7 @@ fn png_samples(bytes: &[u8]) -> Result<Samples, Refused> {
     decoder.set_transformations(png::Transformations::EXPAND);
     let mut reader = decoder.read_info().map_err(damaged)?;
     let size = reader.info().size();
-    Texture::check_size(size.0, size.1).map_err(Refused::TooLarge)?;
+    Texture::check_size(size.0, size.1).map_err(Refused::Unusable)?;
     let length = reader.output_buffer_size().unwrap_or(0);
     let mut samples = vec![0; length];
     let info = reader.next_frame(&mut samples).map_err(damaged)?;
@@ -143,7 +225,7 @@ fn jpeg(bytes: &[u8]) -> Result<Decoded, Refused> {
         .info()
         .ok_or_else(|| Refused::Damaged("it has no size".into()))?;
     let size = (u32::from(info.width), u32::from(info.height));
-    Texture::check_size(size.0, size.1).map_err(Refused::TooLarge)?;
+    Texture::check_size(size.0, size.1).map_err(Refused::Unusable)?;
     let samples = decoder.decode().map_err(damaged)?;
     Ok((size, texels(&samples, 3)))
 }
@@ -207,6 +289,61 @@ mod tests {
         }
     }
 
+    /// Returns a KTX2 file of 3×2 texels in a Vulkan format, with an alignment byte of 16.
+    fn ktx2(format: u32, scheme: u32, data: &[u8]) -> Vec<u8> {
+        let mut bytes = b"\xabKTX 20\xbb\r\n\x1a\n".to_vec();
+        for number in [format, 1, 3, 2, 0, 0, 1, 1, scheme] {
+            bytes.extend(number.to_le_bytes());
+        }
+        // The descriptor of 4 bytes, no keys, no global data, and one level.
+        for number in [104u32, 4, 0, 0] {
+            bytes.extend(number.to_le_bytes());
+        }
+        for number in [0u64, 0, 108, data.len() as u64, 24] {
+            bytes.extend(number.to_le_bytes());
+        }
+        bytes.extend(4u32.to_le_bytes());
+        bytes.extend(data);
+        bytes
+    }
+
+    #[test]
+    fn webp_and_ktx2_have_the_texels_that_were_written() {
+        let rgba: Vec<u8> = (0..24).map(|k| k * 9).collect();
+        let expected: Vec<[u8; 3]> = rgba.chunks(4).map(|p| [p[0], p[1], p[2]]).collect();
+        let alphas: Vec<u8> = rgba.chunks(4).map(|p| p[3]).collect();
+        let mut webp = Vec::new();
+        let encoder = image_webp::WebPEncoder::new(&mut webp);
+        let kind = image_webp::ColorType::Rgba8;
+        encoder.encode(&rgba, 3, 2, kind).unwrap();
+        let swapped: Vec<u8> = rgba
+            .chunks(4)
+            .flat_map(|p| [p[2], p[1], p[0], p[3]])
+            .collect();
+        let mut deflated = Vec::new();
+        let level = flate2::Compression::fast();
+        let mut encoder = flate2::write::ZlibEncoder::new(&mut deflated, level);
+        std::io::Write::write_all(&mut encoder, &rgba).unwrap();
+        encoder.finish().unwrap();
+        for bytes in [
+            webp,
+            ktx2(37, 0, &rgba),
+            ktx2(50, 0, &swapped),
+            ktx2(43, 3, &deflated),
+        ] {
+            let read = decode("a", &bytes, Wrap::Repeat).unwrap();
+            assert_eq!((read.width(), read.height()), (3, 2));
+            assert_eq!(read.texels(), expected);
+            assert_eq!(alpha(&bytes).unwrap(), Some(((3, 2), alphas.clone())));
+            for length in 0..bytes.len() {
+                let _ = decode("a", &bytes[..length], Wrap::Repeat);
+            }
+        }
+        let refused = |bytes: &[u8]| decode("a", bytes, Wrap::Repeat).unwrap_err();
+        assert!(refused(&ktx2(0, 1, &rgba)).contains("Basis Universal"));
+        assert!(refused(&ktx2(37, 0, &rgba[1..])).contains("cut short"));
+    }
+
     #[test]
     fn a_header_that_promises_too_much_is_refused_before_decoding() {
         let small = DynamicImage::new_rgb8(1, 1);
@@ -217,7 +354,10 @@ mod tests {
         // allocated.
         assert!(decode("a", &png, Wrap::Repeat).is_err());
         let error = decode("a", b"no image", Wrap::Repeat).unwrap_err();
-        assert!(error.contains("neither a PNG nor a JPEG"), "{error}");
+        assert!(
+            error.contains("neither PNG, JPEG, WebP nor KTX2"),
+            "{error}"
+        );
         let mut jpeg = written(&small, ImageFormat::Jpeg);
         let frame = jpeg.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
         jpeg[frame + 5..frame + 9].copy_from_slice(&[0xff; 4]);

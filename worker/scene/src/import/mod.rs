@@ -22,6 +22,7 @@ use std::{
 };
 
 use picofarm_files::{FileError, Opener};
+use picofarm_settings::Resolution;
 
 use crate::{Aim, Camera, Object, Provenance, Scene, SceneError, Vec3};
 
@@ -39,6 +40,8 @@ pub struct ImportOptions {
     pub laser: Option<Aim>,
     /// The aim of beams for a file without a laser; `None` = a grid of 25 spots.
     pub spots_if_none: Option<Aim>,
+    /// The size of the image; `None` = the camera's own. The width of the view is kept.
+    pub size: Option<Resolution>,
     /// The unit of length of the file; `None` = the format's own. For formats without a unit (PLY),
     /// `None` means metres, or millimetres if the scene would measure more than 50 m.
     pub unit: Option<Unit>,

@@ -1,7 +1,10 @@
 //! Damaged and hostile files of every format: no panic, no scene that fails validation, bounded
 //! memory.
 
-use crate::common;
+use crate::{
+    common::{self, gltf::Gltf},
+    compressed::{draco, meshopt, with_draco, with_meshopt},
+};
 
 use std::{io::Write, path::Path, sync::OnceLock};
 
@@ -207,7 +210,7 @@ fn serialized(content: &[u8]) -> Vec<u8> {
     bytes
 }
 
-const FILES: [&str; 14] = [
+const FILES: [&str; 20] = [
     "room.glb",
     "room.gltf",
     "room.xml",
@@ -222,6 +225,12 @@ const FILES: [&str; 14] = [
     "text.stl",
     "mesh.obj",
     "mesh.mtl",
+    "packed.gltf",
+    "draco.drc",
+    "meshopt.vertices",
+    "meshopt.triangles",
+    "texture.webp",
+    "texture.ktx2",
 ];
 
 /// Returns the file that is written, what is written, and the scene that is read, if a file is read
@@ -234,6 +243,9 @@ fn written(name: &'static str, bytes: Vec<u8>) -> (&'static str, Vec<u8>, Option
         // Damage before compression, which would hide it.
         "inside.serialized" => ("shape.serialized", serialized(&bytes), Some("shapes.xml")),
         "mesh.mtl" => (name, bytes, Some("mesh.obj")),
+        // Damage before the text of base64, which would hide it.
+        "draco.drc" | "meshopt.vertices" | "meshopt.triangles" | "texture.webp"
+        | "texture.ktx2" => ("packed.gltf", packed(name, bytes), None),
         _ => (name, bytes, None),
     }
 }
@@ -243,6 +255,62 @@ fn room() -> picofarm_scene::Scene {
     let mut scene = common::spectral_room();
     scene.objects.truncate(4);
     scene
+}
+
+/// Returns a glTF file with this content.
+fn packed(name: &str, bytes: Vec<u8>) -> Vec<u8> {
+    let mut file = Gltf::new();
+    let [vertices, triangles] = meshopt();
+    match name {
+        "draco.drc" => with_draco(&mut file, &bytes),
+        "meshopt.vertices" => with_meshopt(&mut file, &[bytes, triangles]),
+        "meshopt.triangles" => with_meshopt(&mut file, &[vertices, bytes]),
+        "texture.webp" => file.textured(&bytes, "image/webp"),
+        _ => file.textured(&bytes, "image/ktx2"),
+    }
+    file.bytes()
+}
+
+/// Returns a glTF file with Draco's and meshopt's meshes, and sparse places.
+fn packed_file() -> Vec<u8> {
+    let mut file = Gltf::new();
+    with_draco(&mut file, &draco(7));
+    let first = file.primitive().clone();
+    with_meshopt(&mut file, &meshopt());
+    let primitives = file.json["meshes"][1]["primitives"].as_array_mut();
+    primitives.expect("a list").push(first);
+    file.json["extensionsRequired"] = serde_json::json!([]);
+    file.json["accessors"][0]["sparse"] = serde_json::json!({"count": 1,
+        "indices": {"bufferView": 1, "componentType": 5123}, "values": {"bufferView": 0}});
+    file.bytes()
+}
+
+/// Returns a WebP image of 3×2 texels.
+fn webp() -> Vec<u8> {
+    let texels: Vec<u8> = (0..24).map(|k| k * 9).collect();
+    let mut bytes = Vec::new();
+    let encoder = image_webp::WebPEncoder::new(&mut bytes);
+    let kind = image_webp::ColorType::Rgba8;
+    encoder.encode(&texels, 3, 2, kind).expect("encodes");
+    bytes
+}
+
+/// Returns a KTX2 image of 3×2 texels, deflated.
+fn ktx2() -> Vec<u8> {
+    let mut deflated = Vec::new();
+    let mut encoder = flate2::write::ZlibEncoder::new(&mut deflated, flate2::Compression::fast());
+    encoder.write_all(&[7; 24]).expect("memory takes it");
+    encoder.finish().expect("memory takes it");
+    let mut bytes = b"\xabKTX 20\xbb\r\n\x1a\n".to_vec();
+    for number in [37u32, 1, 3, 2, 0, 0, 1, 1, 3, 104, 4, 0, 0] {
+        bytes.extend(number.to_le_bytes());
+    }
+    for number in [0u64, 0, 108, deflated.len() as u64, 24] {
+        bytes.extend(number.to_le_bytes());
+    }
+    bytes.extend(4u32.to_le_bytes());
+    bytes.extend(deflated);
+    bytes
 }
 
 /// Returns the undamaged files, in the order of [`FILES`].
@@ -276,6 +344,12 @@ fn files() -> &'static [Vec<u8>] {
             ASCII_STL.into(),
             MESH_OBJ.into(),
             MTL.into(),
+            packed_file(),
+            draco(7),
+            meshopt()[0].clone(),
+            meshopt()[1].clone(),
+            webp(),
+            ktx2(),
         ]
     })
 }
@@ -405,7 +479,8 @@ fn the_undamaged_files_are_read() {
         ..ImportOptions::default()
     };
     for (name, bytes) in FILES.iter().zip(files()) {
-        let path = folder.path().join(name);
+        let (file, bytes, _) = written(name, bytes.clone());
+        let path = folder.path().join(file);
         std::fs::write(&path, bytes).expect("writes");
         // Meshes are read through the scenes that name them; one may be edge-on to a framing
         // camera.

@@ -2,6 +2,7 @@
 //! crate.
 
 mod common;
+mod compressed;
 mod furnished;
 mod glass;
 mod gltf_materials;

@@ -6,14 +6,15 @@ use std::path::{Path, PathBuf};
 use picofarm_files::Opener;
 use picofarm_proto::{
     key::scene_seed,
-    spec::{SceneFile, SceneKind, SceneSource},
+    spec::{FileView, SceneFile, SceneKind, SceneSource},
 };
 use picofarm_scene::{
-    Aim, AssetLibrary, Scene, SceneError,
+    Aim, AssetLibrary, Scene, SceneError, Vec3,
     furnished::{self, FurnishedSettings},
-    import::{self, Bounds, ImportOptions},
+    import::{self, Bounds, ImportOptions, View},
     primitive::{self, PrimitiveSettings},
 };
+use picofarm_settings::Resolution;
 use tracing::info;
 
 use crate::{errors::scene_error, task::TaskError};
@@ -47,14 +48,16 @@ pub(crate) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
         .collect()
 }
 
-/// Returns the scene of task `index`, with an image of `side` pixels and the job's spots.
+/// Returns the scene of task `index`, with an image of the given size and the job's spots.
 pub(crate) fn scene(
     source: &SceneSource,
-    side: u32,
+    size: Resolution,
     index: u64,
     (libraries, files): With<'_>,
 ) -> Result<Scene, TaskError> {
     let seed = scene_seed(source.seed, index);
+    let Resolution { width, height } = size;
+    let fov_deg = source.fov_deg.unwrap_or(90.0) as f32;
     match &source.kind {
         SceneKind::Furnished {
             assets,
@@ -64,9 +67,9 @@ pub(crate) fn scene(
             let settings = FurnishedSettings {
                 spots: source.spots.clone(),
                 laser_m: source.laser_m.map(|x| x as f32),
-                width: side,
-                height: side,
-                fov_deg: source.fov_deg as f32,
+                width,
+                height,
+                fov_deg,
                 assets: library.name().to_owned(),
                 specular_at_least: *min_specular,
             };
@@ -76,14 +79,14 @@ pub(crate) fn scene(
             let settings = PrimitiveSettings {
                 spots: source.spots.clone(),
                 laser_m: source.laser_m.map(|x| x as f32),
-                width: side,
-                height: side,
-                fov_deg: source.fov_deg as f32,
+                width,
+                height,
+                fov_deg,
                 rooms: *rooms,
             };
             primitive::generate(seed, &settings).map_err(scene_error)
         }
-        SceneKind::Files { root, .. } => {
+        SceneKind::Files { root, view, .. } => {
             let bounds = Bounds {
                 files: files.clone(),
                 root: root.as_ref().map(PathBuf::from),
@@ -92,7 +95,13 @@ pub(crate) fn scene(
             let file = source.kind.file(index).ok_or_else(|| not_listed(&at))?;
             let aim = Aim::of(&source.spots, seed)
                 .map_err(|what| TaskError::User(format!("scenes.spots: {what}")))?;
-            read(file, &at, (&aim, side), &bounds)
+            let mut options = options(view, source.fov_deg, aim);
+            // A square image shows the whole view of the camera, whatever its shape.
+            options.size = (!size.is_square()).then_some(size);
+            let mut scene = read(file, &at, source.spots.count(), &options, &bounds)?;
+            let i = &mut scene.camera.intrinsics;
+            *i = i.resized(width, height);
+            Ok(scene)
         }
     }
 }
@@ -117,11 +126,36 @@ fn library<'a>(
     })
 }
 
-/// Reads a scene file after checking its hash, and sets the job's resolution.
+/// Returns how a job's files are read.
+fn options(view: &FileView, fov_deg: Option<f64>, aim: Aim) -> ImportOptions {
+    let point = |p: [f64; 3]| Vec3::new(p[0] as f32, p[1] as f32, p[2] as f32);
+    let (laser, spots_if_none) = match (view.replace_laser, view.spread_spots) {
+        (true, _) => (Some(aim), None),
+        (false, false) => (None, Some(aim)),
+        (false, true) => (None, None),
+    };
+    ImportOptions {
+        view: View {
+            camera: view.camera.clone(),
+            from: view.look_from.map(point),
+            at: view.look_at.map(point),
+            fov_deg: fov_deg.map(|x| x as f32),
+            up: view.up.map(point),
+        },
+        laser,
+        spots_if_none,
+        // The job's check knows the same units.
+        unit: view.unit.as_ref().and_then(|unit| unit.parse().ok()),
+        ..ImportOptions::default()
+    }
+}
+
+/// Reads a scene file after checking its hash.
 fn read(
     file: &SceneFile,
     at: &str,
-    (aim, side): (&Aim, u32),
+    spots: u32,
+    options: &ImportOptions,
     bounds: &Bounds,
 ) -> Result<Scene, TaskError> {
     let path = Path::new(&file.path);
@@ -133,26 +167,24 @@ fn read(
             file.path, file.sha256
         )));
     }
-    let mut scene = with_laser(path, aim, bounds).map_err(|e| named(at, e))?;
-    scene.camera.intrinsics = scene.camera.intrinsics.resized(side, side);
-    let (beams, spots) = (scene.laser.beams.len(), aim.film().len());
-    if beams != spots {
-        return Err(TaskError::User(format!(
-            "{at}: {} has a laser of {beams} beams, but the job says scenes.spots = {spots}; set scenes.spots to {beams}, \
-             or remove the laser from the file to use the job's spots",
-            file.path
-        )));
+    let scene = import::read_scene_with(path, options, bounds).map_err(|e| named(at, e))?;
+    let beams = scene.laser.beams.len();
+    if beams == spots as usize {
+        return Ok(scene);
     }
-    Ok(scene)
-}
-
-/// Reads a scene with its own laser, or with a laser aimed as the job specifies if it has none.
-fn with_laser(path: &Path, aim: &Aim, bounds: &Bounds) -> Result<Scene, SceneError> {
-    let options = ImportOptions {
-        spots_if_none: Some(aim.clone()),
-        ..ImportOptions::default()
-    };
-    import::read_scene_with(path, &options, bounds)
+    let path = &file.path;
+    Err(TaskError::User(
+        match scene.provenance.notes.contains_key("chosen.laser") {
+            true => format!(
+                "{at}: the camera sees so little of {path} that {beams} of {spots} spots find a place; set scenes.look_from, \
+                 scenes.look_at or scenes.fov_deg, or leave the file out"
+            ),
+            false => format!(
+                "{at}: {path} has a laser of {beams} beams, but the job says scenes.spots = {spots}; set scenes.spots to \
+                 {beams}, or scenes.replace_laser = true to use the job's spots"
+            ),
+        },
+    ))
 }
 
 /// Adds the scene's field in the job to an error.

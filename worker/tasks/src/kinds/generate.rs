@@ -5,6 +5,7 @@ use bytes::Bytes;
 use picofarm_files::Opener;
 use picofarm_proto::spec::{GenerateTask, SceneSource, SpecError};
 use picofarm_scene::{Scene, SceneError, export};
+use picofarm_settings::Resolution;
 use picofarm_store::publish_files;
 use sha2::{Digest, Sha256};
 use tracing::info;
@@ -40,7 +41,7 @@ impl RunTask for GenerateTask {
         let source: &SceneSource = &spec.scenes;
         let scene = scenes::scene(
             source,
-            settings.resolution,
+            Resolution::square(settings.resolution),
             task.index,
             // Generated scenes refer to no files.
             (libraries, &Opener::anywhere()),

@@ -39,8 +39,8 @@ pub(crate) fn scene(
                     if recipe::made(&stage, &task, index, &manifest.provenance.task_key)
                         .is_some() =>
                 {
-                    let side = task.render.resolution;
-                    return scenes::scene(&task.scenes, side, index, context.scenes());
+                    let size = task.render.resolution;
+                    return scenes::scene(&task.scenes, size, index, context.scenes());
                 }
                 (_, TaskSpec::Reprocess(task))
                     if manifest.provenance.plan["kind"] == "reprocess" =>

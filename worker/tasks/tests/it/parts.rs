@@ -15,7 +15,7 @@ use picofarm_proto::{
     key::stage_key,
     spec::{Budget, PartTask, RenderTask, StageSpec, TaskSpec},
 };
-use picofarm_settings::Wavelength;
+use picofarm_settings::{Resolution, Wavelength};
 use picofarm_tasks::{Control, Executor, Output, Task, TaskError, TaskExecutor};
 use tokio::runtime::Handle;
 use uuid::Uuid;
@@ -24,7 +24,7 @@ const PARTS: u32 = 3;
 
 fn heavy(store: &Path) -> RenderTask {
     let mut spec = spec(store.to_str().unwrap());
-    spec.render.resolution = 40;
+    spec.render.resolution = Resolution::square(40);
     spec.render.budget = Budget::Samples(3);
     spec.render.max_bounces = 0;
     spec.render.optics.wavelengths_nm = Wavelength::of(&[611.4]).unwrap();

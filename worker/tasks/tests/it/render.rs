@@ -17,7 +17,7 @@ use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::stage_key,
-    spec::{RenderTask, SceneFile, SceneKind},
+    spec::{FileView, RenderTask, SceneFile, SceneKind},
 };
 use picofarm_scene::{export, primitive};
 use picofarm_settings::Spots;
@@ -205,6 +205,7 @@ fn of_file(name: &str, content: &[u8]) -> Place {
         }],
         first: 0,
         root: None,
+        view: FileView::default(),
     };
     place.spec.scenes.count = 1;
     place

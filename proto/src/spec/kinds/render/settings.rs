@@ -2,8 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Optics, Strategy, Wavelength};
-use serde::{Deserialize, Serialize};
+use picofarm_settings::{
+    BeamWidth, Budget, Choice, Gate, Optics, Resolution, Strategy, Wavelength,
+};
+use serde::{Deserialize, Serialize, Serializer};
 
 use crate::spec::{
     SceneKind,
@@ -14,14 +16,22 @@ use crate::spec::{
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "RenderSettingsText")]
 pub struct RenderSettings {
-    /// Image width and height in pixels.
-    pub resolution: u32,
+    /// Image width and height in pixels: a number, or width and height as `"320x240"`.
+    pub resolution: Resolution,
     /// ℓ_min, metres of optical path.
     pub gate_start_m: f64,
     /// Δ, metres.
     pub bin_width_m: f64,
     /// Number of bins.
     pub bins: u32,
+    /// Whether start and width of the bins are still to be fitted to the scenes' files, which
+    /// submission does: written as `gate = "auto"`.
+    #[serde(
+        rename = "gate",
+        skip_serializing_if = "std::ops::Not::not",
+        serialize_with = "auto"
+    )]
+    pub fit_gate: bool,
     /// Multi-bounce work: `samples = N` (paths per pixel) or `error = 0.1` (target).
     #[serde(flatten)]
     pub budget: Budget,
@@ -44,15 +54,24 @@ pub struct RenderSettings {
     pub optics: Optics,
 }
 
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn auto<S: Serializer>(_fit: &bool, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(AUTO)
+}
+
+/// The gate that submission fits to the files.
+const AUTO: &str = "auto";
+
 impl Default for RenderSettings {
     /// Returns the measurement contract's default gate: [1.0, 25.45584) m in 637 bins of 0.0384 m,
     /// 256×256 px.
     fn default() -> Self {
         Self {
-            resolution: 256,
+            resolution: Resolution::square(256),
             gate_start_m: 1.0,
             bin_width_m: 0.0384,
             bins: 637,
+            fit_gate: false,
             budget: Budget::Samples(32),
             max_bounces: 0,
             renderer: String::new(),
@@ -79,6 +98,9 @@ impl RenderSettings {
     /// The available subsets of the 10×10 grid of spots.
     pub const SUBSETS: [u32; 2] = [4, 25];
 
+    /// Widest bin, metres of optical path.
+    pub const MAX_BIN_M: f64 = 10.0;
+
     /// Most pixels of an image's side.
     pub const MAX_SIDE: u32 = 4096;
 
@@ -88,19 +110,18 @@ impl RenderSettings {
     /// Returns a [`SpecError`] for the first invalid field.
     pub fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("render.{field}"), what));
-        within(
-            "render.resolution",
-            self.resolution,
-            (1, Self::MAX_SIDE),
-            "pixels a side",
-        )?;
+        for side in [self.resolution.width, self.resolution.height] {
+            let sides = (1, Self::MAX_SIDE);
+            within("render.resolution", side, sides, "pixels a side")?;
+        }
         // No room returns light after 10 km.
         let start = "metres of optical path (there and back); 1 ns of delay is 0.3 m";
         within("render.gate_start_m", self.gate_start_m, (0.0, 1e4), start)?;
         // From a hundredth of a picosecond to 33 ns, beyond any detector on either side.
         // Picoseconds mistaken for metres are outside this range.
         let width = "metres of optical path; 1 ps is 0.0002998 m, so 128 ps are 0.0384";
-        within("render.bin_width_m", self.bin_width_m, (1e-6, 10.0), width)?;
+        let widths = (1e-6, Self::MAX_BIN_M);
+        within("render.bin_width_m", self.bin_width_m, widths, width)?;
         within("render.bins", self.bins, (1, 65_536), "bins")?;
         if let Some(n) = self.subsets.iter().find(|n| !Self::SUBSETS.contains(n)) {
             return fail(
@@ -196,10 +217,11 @@ impl RenderSettings {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RenderSettingsText {
-    resolution: Option<u32>,
+    resolution: Option<Resolution>,
     gate_start_m: Option<f64>,
     bin_width_m: Option<f64>,
     bins: Option<u32>,
+    gate: Option<GateText>,
     samples: Option<u32>,
     error: Option<Share>,
     max_bounces: Option<u32>,
@@ -214,6 +236,17 @@ struct RenderSettingsText {
     fill_factor: Option<f64>,
     #[serde(default)]
     wavelengths_nm: Vec<f64>,
+}
+
+/// A gate as a whole: `"auto"`, or start and end in metres of optical path.
+#[derive(Deserialize)]
+#[serde(
+    untagged,
+    expecting = "expected \"auto\", or start and end in metres such as [1, 25]"
+)]
+enum GateText {
+    Named(String),
+    Range([f64; 2]),
 }
 
 #[derive(Deserialize)]
@@ -257,11 +290,45 @@ fn check_share(share: f64) -> Result<(), String> {
     ))
 }
 
+impl RenderSettingsText {
+    /// Returns the gate, and whether it is still to be fitted to the files.
+    fn gate(&self, usual: Gate) -> Result<(Gate, bool), SpecError> {
+        const EXPECTED: &str = "expected \"auto\", or start and end in metres such as [1, 25]";
+        let fail = |what: String| Err(SpecError::new("render.gate", what));
+        let stated = Gate {
+            start_m: self.gate_start_m.unwrap_or(usual.start_m),
+            bin_width_m: self.bin_width_m.unwrap_or(usual.bin_width_m),
+            bins: self.bins.unwrap_or(usual.bins),
+        };
+        let others = (stated.start_m, stated.bin_width_m) != (usual.start_m, usual.bin_width_m);
+        match &self.gate {
+            None => Ok((stated, false)),
+            Some(_) if others => {
+                fail("replaces gate_start_m and bin_width_m; keep one of the two forms".into())
+            }
+            Some(GateText::Named(name)) if name == AUTO => Ok((stated, true)),
+            Some(GateText::Named(name)) => fail(format!("{name:?}: {EXPECTED}")),
+            Some(GateText::Range([start, end])) => {
+                if !(*start >= 0.0 && end > start && end.is_finite()) {
+                    return fail(format!("[{start}, {end}]: {EXPECTED}"));
+                }
+                let fitted = Gate {
+                    start_m: *start,
+                    bin_width_m: (end - start) / f64::from(stated.bins),
+                    ..stated
+                };
+                Ok((fitted, false))
+            }
+        }
+    }
+}
+
 impl TryFrom<RenderSettingsText> for RenderSettings {
     type Error = SpecError;
 
     fn try_from(text: RenderSettingsText) -> Result<Self, SpecError> {
         let default = RenderSettings::default();
+        let (gate, fit_gate) = text.gate(default.gate())?;
         let budget = match (text.samples, text.error) {
             (Some(_), Some(_)) => {
                 return Err(SpecError::new(
@@ -287,9 +354,10 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
         subsets.sort_unstable();
         Ok(RenderSettings {
             resolution: text.resolution.unwrap_or(default.resolution),
-            gate_start_m: text.gate_start_m.unwrap_or(default.gate_start_m),
-            bin_width_m: text.bin_width_m.unwrap_or(default.bin_width_m),
-            bins: text.bins.unwrap_or(default.bins),
+            gate_start_m: gate.start_m,
+            bin_width_m: gate.bin_width_m,
+            bins: gate.bins,
+            fit_gate,
             budget,
             max_bounces: text.max_bounces.unwrap_or(default.max_bounces),
             renderer: text.renderer.unwrap_or_default(),

@@ -13,12 +13,24 @@ use crate::import::quoted;
 
 /// The extensions that a file may require: those that are read, and those that only change the
 /// appearance and are noted.
-const REQUIRED: [&str; 5] = [
+const REQUIRED: [&str; 17] = [
     "KHR_texture_transform",
     "KHR_lights_punctual",
     "KHR_node_visibility",
     "EXT_mesh_gpu_instancing",
     "KHR_xmp_json_ld",
+    "KHR_animation_pointer",
+    "KHR_techniques_webgl",
+    "EXT_lights_image_based",
+    "EXT_mesh_features",
+    "EXT_instance_features",
+    "EXT_structural_metadata",
+    "KHR_mesh_quantization",
+    "KHR_draco_mesh_compression",
+    "EXT_meshopt_compression",
+    "KHR_meshopt_compression",
+    "EXT_texture_webp",
+    "KHR_texture_basisu",
 ];
 
 /// A parsed file.
@@ -82,16 +94,12 @@ fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
 }
 
 impl Parsed {
-    /// Returns the validated document.
+    /// Checks the extensions that the file requires.
     ///
     /// # Errors
-    /// The fault in the file.
-    pub(super) fn document(
-        mut self,
-        bytes: &[u8],
-    ) -> Result<(gltf::Document, Option<Vec<u8>>, Facts), String> {
-        let (root, facts) = (&mut self.root, &mut self.facts);
-        for name in &root.extensions_required {
+    /// The first unsupported one.
+    pub(super) fn check(&self) -> Result<(), String> {
+        for name in &self.root.extensions_required {
             if !REQUIRED.contains(&name.as_str()) && !name.starts_with("KHR_materials_") {
                 return Err(format!(
                     "extensionsRequired: {} is not supported; export the file without it",
@@ -99,10 +107,24 @@ impl Parsed {
                 ));
             }
         }
+        Ok(())
+    }
+
+    /// Returns the validated document.
+    ///
+    /// # Errors
+    /// The fault in the file.
+    pub(super) fn document(mut self, bytes: &[u8]) -> Result<(gltf::Document, Facts), String> {
+        let (root, facts) = (&mut self.root, &mut self.facts);
         root.extensions_required.clear();
         facts.animated = !root.animations.is_empty() || (facts.animated && has_animations(bytes));
         root.animations.clear();
         for (k, texture) in root.textures.iter_mut().enumerate() {
+            if texture.source.value() == u32::MAX as usize
+                && let Some(image) = other_image(texture)
+            {
+                texture.source = Index::new(image);
+            }
             if texture.source.value() == u32::MAX as usize {
                 facts.sourceless.insert(k);
                 texture.source = Index::new(0);
@@ -128,8 +150,21 @@ impl Parsed {
         positions(root)?;
         let document = gltf::Document::from_json(self.root)
             .map_err(|e| format!("is not readable glTF 2.0 ({e}); copy or export it again"))?;
-        Ok((document, self.blob, self.facts))
+        Ok((document, self.facts))
     }
+}
+
+/// Returns the image of a texture whose format an extension allows: WebP or KTX2.
+fn other_image(texture: &json::Texture) -> Option<u32> {
+    let extensions = &texture.extensions.as_ref()?.others;
+    let named = ["EXT_texture_webp", "KHR_texture_basisu"].map(|name| extensions.get(name));
+    let source = named
+        .into_iter()
+        .flatten()
+        .next()?
+        .get("source")?
+        .as_u64()?;
+    u32::try_from(source).ok()
 }
 
 /// Checks the accessors of positions, on which the crate relies before it validates them.
@@ -146,6 +181,19 @@ fn positions(root: &json::Root) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// Returns whether a file that cannot be parsed is of version 1.
+pub(super) fn is_version_1(bytes: &[u8]) -> bool {
+    if bytes.starts_with(b"glTF") {
+        return bytes.get(4..8) == Some(&1u32.to_le_bytes());
+    }
+    let value = serde_json::from_slice::<serde_json::Value>(bytes).unwrap_or_default();
+    // Its lists are objects, and it may leave out its version.
+    value["meshes"].is_object()
+        && value["asset"]["version"]
+            .as_str()
+            .is_none_or(|v| v.starts_with('1'))
 }
 
 /// Returns the text of the JSON.

@@ -27,7 +27,7 @@ const DIELECTRIC: f32 = 0.08;
 /// The format of a spectrum in extras.
 const SPECTRUM: &str = r#"[{"nm": 905, "reflectance": 0.7}, …], by ascending nm"#;
 /// Extensions that are used, or noted by name below.
-const KNOWN: [&str; 11] = [
+const KNOWN: [&str; 17] = [
     "KHR_node_visibility",
     "EXT_mesh_gpu_instancing",
     "KHR_texture_transform",
@@ -39,6 +39,12 @@ const KNOWN: [&str; 11] = [
     "KHR_materials_unlit",
     "KHR_materials_volume",
     "KHR_lights_punctual",
+    "KHR_mesh_quantization",
+    "KHR_draco_mesh_compression",
+    "EXT_meshopt_compression",
+    "KHR_meshopt_compression",
+    "EXT_texture_webp",
+    "KHR_texture_basisu",
 ];
 
 /// The texture coordinates that a material uses, and their transform: (offset, rotation, scale).

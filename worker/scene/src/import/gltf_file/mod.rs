@@ -3,11 +3,14 @@
 
 mod deform;
 pub(super) mod document;
+mod draco;
 mod mask;
 mod material;
 mod mesh;
+mod meshopt;
 mod nodes;
 mod parts;
+mod plain;
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
@@ -121,12 +124,17 @@ fn open(
 ) -> Result<(gltf::Document, Buffers, Facts), SceneError> {
     let fail = |what: String| format_error(path, what);
     let parsed = document::parse(bytes).map_err(|e| {
-        fail(format!(
-            "is not readable glTF 2.0 ({e}); copy or export it again"
-        ))
+        fail(match document::is_version_1(bytes) {
+            true => "is glTF 1.0; `gltf-pipeline -i IN -o OUT` converts it to 2.0".into(),
+            false => format!("is not readable glTF 2.0 ({e}); copy or export it again"),
+        })
     })?;
-    let (document, blob, facts) = parsed.document(bytes).map_err(fail)?;
-    let buffers = Buffers::read(path, &document, blob, files)?;
+    let mut parsed = parsed;
+    parsed.check().map_err(fail)?;
+    let blob = parsed.blob.take();
+    let mut buffers = Buffers::read(path, &parsed.root, blob, files)?;
+    plain::convert(&mut parsed.root, &mut buffers.0).map_err(fail)?;
+    let (document, facts) = parsed.document(bytes).map_err(fail)?;
     Ok((document, buffers, facts))
 }
 
@@ -226,6 +234,8 @@ struct Walk<'a> {
     known_labels: BTreeMap<String, usize>,
     /// The perspective cameras with their names; an error is reported only if the camera is used.
     cameras: Vec<(String, Result<Camera, String>)>,
+    /// The orthographic cameras with their names.
+    parallel: Vec<(String, Affine, [f32; 2])>,
     laser: Option<(Affine, NodeExtras)>,
     notes: BTreeMap<String, String>,
 }
@@ -258,6 +268,7 @@ impl<'a> Walk<'a> {
             labels: Vec::new(),
             known_labels: BTreeMap::new(),
             cameras: Vec::new(),
+            parallel: Vec::new(),
             laser: None,
             notes: BTreeMap::new(),
         })
@@ -338,10 +349,13 @@ impl<'a> Walk<'a> {
             }
         }
         if let Some(camera) = node.camera() {
-            match is_perspective(&camera) {
-                false => self.note("cameras", "orthographic ones ignored"),
-                true => {
-                    let name = node.name().or(camera.name()).unwrap_or_default().to_owned();
+            let name = node.name().or(camera.name()).unwrap_or_default().to_owned();
+            match camera.projection() {
+                Projection::Orthographic(lens) => {
+                    let half = [lens.xmag().abs(), lens.ymag().abs()];
+                    self.parallel.push((name, to_world.affine(), half));
+                }
+                Projection::Perspective(_) => {
                     let read = camera_of(&to_world.affine(), &camera);
                     self.cameras.push((name, read));
                 }
@@ -443,6 +457,7 @@ impl<'a> Walk<'a> {
                 format!("ids in extras are not 0..{count}; objects are numbered in file order"),
             );
         }
+        self.parallel_cameras();
         let (cameras, laser, mut provenance, name) = match ours {
             Some(e) => (
                 vec![(String::new(), Ok(e.camera))],

@@ -8,8 +8,13 @@ use picofarm_settings::Spots;
 use crate::{
     Affine, Aim, Beam, Camera, Intrinsics, Laser, SceneError, Vec3,
     extras::NodeExtras,
-    import::{complete::FileLaser, format_error},
+    import::{
+        complete::{FileLaser, bounds},
+        format_error,
+    },
 };
+
+use super::Walk;
 
 /// The number of rows of a camera if the file has no resolution; callers resize it.
 const DEFAULT_ROWS: u32 = 64;
@@ -18,15 +23,50 @@ const DEFAULT_ROWS: u32 = 64;
 pub(super) fn camera_of(to_world: &Affine, file: &gltf::Camera<'_>) -> Result<Camera, String> {
     let field = format!("cameras[{}]", file.index());
     let Projection::Perspective(lens) = file.projection() else {
-        return Err(format!(
-            "{field}: is orthographic; use a perspective camera"
-        ));
+        return Err(format!("{field}: expected a perspective camera"));
     };
     let aspect = lens.aspect_ratio().unwrap_or(1.0);
     let half = libm::tan(f64::from(lens.yfov()) * 0.5) as f32;
+    placed(to_world, half, aspect)
+        .ok_or_else(|| format!("{field}: yfov and aspectRatio must be positive"))
+}
+
+impl Walk<'_> {
+    /// Replaces orthographic cameras, which follow the others. Their pixels look along parallel
+    /// lines, which those of a lidar do not.
+    pub(super) fn parallel_cameras(&mut self) {
+        let all = self.objects.iter().map(|(_, object)| object);
+        let Some((lo, hi)) = bounds(all) else { return };
+        for (name, to_world, half) in std::mem::take(&mut self.parallel) {
+            self.note(
+                "cameras",
+                "orthographic ones are pinholes at the same place, with the same width of view at the middle of the \
+                 objects; --look-from, --look-at and --fov change it",
+            );
+            let read = pinhole(&to_world, half, (lo + hi) * 0.5);
+            self.cameras.push((name, read));
+        }
+    }
+}
+
+/// Returns the pinhole camera for an orthographic one: it sees the same width at the distance of
+/// `middle`. `half` is half of the view's width and height. The error is a fault of the camera.
+fn pinhole(to_world: &Affine, half: [f32; 2], middle: Vec3) -> Result<Camera, String> {
+    let linear = &to_world.linear;
+    let back = Vec3::new(linear[0][2], linear[1][2], linear[2][2]).normalized();
+    let away = (to_world.translation - middle).dot(back);
+    // From within the objects, the view is 90° wide at most.
+    let distance = away.max(half[0]);
+    placed(to_world, half[1] / distance, half[0] / half[1])
+        .ok_or_else(|| "xmag and ymag of an orthographic camera must not be 0".into())
+}
+
+/// Returns a camera with half of its height at a distance of 1, and its width for its height;
+/// `None` if these are unusable.
+fn placed(to_world: &Affine, half: f32, aspect: f32) -> Option<Camera> {
     let width = (DEFAULT_ROWS as f32 * aspect).round();
     if !(half > 0.0 && half.is_finite() && (1.0..=65536.0).contains(&width)) {
-        return Err(format!("{field}: yfov and aspectRatio must be positive"));
+        return None;
     }
     let column = |k: usize| {
         Vec3::new(
@@ -38,7 +78,7 @@ pub(super) fn camera_of(to_world: &Affine, file: &gltf::Camera<'_>) -> Result<Ca
     };
     let (height, width) = (DEFAULT_ROWS as f32, width as u32);
     let fx = width as f32 * 0.5 / (half * aspect);
-    Ok(Camera {
+    Some(Camera {
         intrinsics: Intrinsics {
             fx,
             fy: height * 0.5 / half,

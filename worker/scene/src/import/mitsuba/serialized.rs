@@ -15,7 +15,11 @@ const HAS_UV: u32 = 0x0002;
 const HAS_COLOURS: u32 = 0x0008;
 const DOUBLE: u32 = 0x2000;
 /// The greatest number of vertices and of triangles of a mesh.
-const MAX_COUNT: u64 = 200_000_000;
+const MAX_COUNT: u64 = 50_000_000;
+/// A mesh of more bytes than this must not be more than this many times as large as its compressed
+/// form: the coordinates of a real mesh never compress so well.
+const LARGE: u64 = 64 << 20;
+const MAX_RATIO: u64 = 100;
 /// The longest name of a mesh, bytes.
 const MAX_NAME: usize = 4096;
 
@@ -70,6 +74,18 @@ fn mesh(compressed: &[u8], version: u16) -> Result<Geometry, String> {
         return Err(format!("has more than {MAX_COUNT} vertices or triangles"));
     }
     let double = flags & DOUBLE != 0;
+    let reals = [(HAS_NORMALS, 3), (HAS_UV, 2), (HAS_COLOURS, 3)].into_iter();
+    let reals = 3 + reals
+        .map(|(flag, n)| if flags & flag != 0 { n } else { 0 })
+        .sum::<u64>();
+    let bytes = vertices * reals * if double { 8 } else { 4 } + triangles * 12;
+    if bytes > LARGE && bytes > MAX_RATIO * compressed.len() as u64 {
+        return Err(format!(
+            "says that it has {vertices} vertices and {triangles} triangles, which {} bytes cannot contain; export the \
+             mesh again",
+            compressed.len()
+        ));
+    }
     let mut positions = Vec::new();
     for _ in 0..vertices {
         positions.push([
@@ -155,5 +171,44 @@ impl Stream<'_> {
             }
         }
         Err(format!("a name is longer than {MAX_NAME} bytes"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    /// Returns a file whose only mesh says that it has this many vertices, all at the origin.
+    fn zeros(vertices: u64, written: usize) -> Vec<u8> {
+        let mut bytes = vec![0x1c, 0x04, 4, 0];
+        let mut encoder = flate2::write::ZlibEncoder::new(&mut bytes, flate2::Compression::best());
+        encoder.write_all(&0x1000u32.to_le_bytes()).unwrap();
+        encoder.write_all(b"\0").unwrap();
+        encoder.write_all(&vertices.to_le_bytes()).unwrap();
+        encoder.write_all(&1u64.to_le_bytes()).unwrap();
+        encoder.write_all(&vec![0; written]).unwrap();
+        encoder.finish().unwrap();
+        bytes.extend(0u64.to_le_bytes());
+        bytes.extend(1u32.to_le_bytes());
+        bytes
+    }
+
+    #[test]
+    fn a_small_file_of_very_many_vertices_is_refused_before_they_are_read() {
+        let refused = |n| {
+            read(&zeros(n, 12 << 20), 0)
+                .map(|_| ())
+                .expect_err("too many")
+        };
+        let said = refused(49_000_000);
+        assert!(said.contains("49000000 vertices"), "{said}");
+        let said = refused(200_000_000);
+        assert!(said.contains("more than 50000000"), "{said}");
+        let said = refused(u64::MAX);
+        assert!(said.contains("more than 50000000"), "{said}");
+        // A mesh that is large for its file but small in itself is read.
+        assert!(read(&zeros(1 << 20, (12 << 20) + 12), 0).is_ok());
     }
 }

@@ -1,5 +1,7 @@
 //! Helpers for several tests of files.
 
+pub mod gltf;
+
 use picofarm_scene::{
     Bsdf, Distribution, Scene, SpectrumPoint, Texture, Wrap,
     primitive::{self, PrimitiveSettings},

@@ -4,7 +4,7 @@
 use std::fs;
 
 use picofarm_proto::spec::SpecError;
-use picofarm_scene::export::glb_bytes;
+use picofarm_scene::{Intrinsics, export::glb_bytes};
 use serde_json::{Value, json};
 
 use super::*;
@@ -46,7 +46,8 @@ impl Place {
     }
 
     fn scene(&self, source: &SceneSource, side: u32, index: u64) -> Result<Scene, TaskError> {
-        scene(source, side, index, (&self.libraries, &Opener::anywhere()))
+        let size = Resolution::square(side);
+        scene(source, size, index, (&self.libraries, &Opener::anywhere()))
     }
 
     fn glb(&self, source: &SceneSource, side: u32, index: u64) -> Vec<u8> {
@@ -207,4 +208,40 @@ fn resolving_twice_changes_nothing_and_pins_what_may_change() {
             }
         }
     }
+}
+
+#[test]
+fn a_jobs_view_and_size_replace_those_of_its_files() {
+    let place = Place::new();
+    let _ = place.sources();
+    let size = Resolution {
+        width: 32,
+        height: 24,
+    };
+    let read = |more: Value| {
+        let mut text = json!({"kind": "files", "files": ["room*.glb"], "spots": SPOTS});
+        for (name, value) in more.as_object().unwrap() {
+            text[name] = value.clone();
+        }
+        let source = place.resolved(text)?;
+        assert_eq!(source.count, COUNT);
+        let with = (&place.libraries[..], &Opener::anywhere());
+        Ok::<_, SpecError>(scene(&source, size, 1, with).unwrap())
+    };
+    let own = read(json!({})).unwrap();
+    let i = own.camera.intrinsics;
+    assert_eq!((i.width, i.height), (32, 24));
+    assert!((i.fx - i.fy).abs() < 1e-4, "square pixels: {i:?}");
+    let moved = json!({"look_from": [0.5, 1.5, 1], "look_at": [0, 1, 0], "fov_deg": 40});
+    let moved = read(moved).unwrap();
+    assert_eq!(moved.camera.origin, Vec3::new(0.5, 1.5, 1.0));
+    let wide = Intrinsics::from_fov(40.0, 32, 24);
+    assert!((moved.camera.intrinsics.fx - wide.fx).abs() < 1e-3);
+    // The files' beams stay where they are, unless the job replaces them.
+    assert_eq!(moved.laser.origin, own.laser.origin);
+    let replaced = read(json!({"replace_laser": true, "look_from": [0.5, 1.5, 1]})).unwrap();
+    assert_eq!(replaced.laser.origin, replaced.camera.origin);
+    let small = read(json!({"unit": "mm"})).unwrap();
+    let wide = |scene: &Scene| scene.path_range_m().unwrap()[1];
+    assert!((wide(&small) / wide(&own) - 1e-3).abs() < 1e-4);
 }

@@ -18,7 +18,7 @@ use picofarm_proto::{
         session_response::Message as Answer,
     },
 };
-use picofarm_settings::{PrimitiveRooms, Spots};
+use picofarm_settings::{PrimitiveRooms, Resolution, Spots};
 use picofarm_tasks::{
     AgentConfig, AgentError, Control, Executor, Output, Summary, Task, TaskError,
 };
@@ -264,12 +264,12 @@ pub fn spec(store: &str) -> RenderTask {
             },
             count: 100,
             seed: 7,
-            fov_deg: 90.0,
+            fov_deg: Some(90.0),
             spots: Spots::Grid(1),
             laser_m: [0.0; 3],
         },
         render: RenderSettings {
-            resolution: 16,
+            resolution: Resolution::square(16),
             gate_start_m: 0.0,
             bin_width_m: 0.5,
             bins: 40,
