@@ -121,9 +121,7 @@ fn room(seed: u64) -> [Row; 4] {
         .map(|v| f32::from(*v))
         .collect();
     let masks = from_flash(&capture, &masks, &beams).expect("sizes that fit");
-    let mut depth =
-        shadows_at(&capture, &rendered.truth.depth, &Method::default()).expect("depths");
-    depth.mirror = Some(rendered.truth.specular.clone());
+    let depth = shadows_at(&capture, &rendered.truth.depth, &Method::default()).expect("depths");
     let depth = from_flash(&capture, &depth, &beams).expect("sizes that fit");
     [
         score_of(truth, &scene, 0.0),

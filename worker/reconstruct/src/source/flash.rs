@@ -46,7 +46,8 @@ pub fn from_flash(
         beams: &numbers,
         times: Times::Range(&range),
         lit: &found.mask(),
-        mirror: found.mirror.as_deref().unwrap_or(&none),
+        // A mirror has its own depth here, and its light that of a wall. To leave it out costs more.
+        mirror: &none,
     })?;
     weigh(&mut measured, &numbers, &found.lit, &found.confidence)?;
     for spot in &mut measured.spots {
