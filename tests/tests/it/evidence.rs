@@ -16,7 +16,7 @@ name = "evidence"
 max_crashes = 1000
 [[stage]]
 name = "rooms"
-scenes = {{ kind = "primitive", count = 12, seed = 9, spots = 9 }}
+scenes = {{ kind = "primitive", count = 12, seed = 9, spots = 16 }}
 render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
 output = {{ store = {store:?}, dataset = "rooms" }}
 [[stage]]
