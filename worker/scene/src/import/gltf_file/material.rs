@@ -453,9 +453,16 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// Returns a factor times the colour of vertices.
+/// Returns a factor times the colour of vertices. Factors that rounding has put just above 1 are 1.
 fn tinted([r, g, b, _]: [f32; 4], tint: [f32; 3]) -> [f32; 3] {
-    [r * tint[0], g * tint[1], b * tint[2]]
+    let rounded = |x: f32| {
+        if (1.0..1.0 + 1e-5).contains(&x) {
+            1.0
+        } else {
+            x
+        }
+    };
+    [r * tint[0], g * tint[1], b * tint[2]].map(rounded)
 }
 
 /// Returns how a texture continues beyond its image, along u.
