@@ -16,7 +16,7 @@ name = "evidence"
 max_crashes = 1000
 [[stage]]
 name = "rooms"
-scenes = {{ kind = "primitive", count = 12, seed = 9, spots = 9 }}
+scenes = {{ kind = "primitive", count = 12, seed = 9, spots = 16 }}
 render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
 output = {{ store = {store:?}, dataset = "rooms" }}
 [[stage]]
@@ -84,13 +84,7 @@ fn submit(farm: &Farm, text: &str) -> String {
 }
 
 fn made(farm: &Farm) -> Vec<BTreeMap<String, String>> {
-    let folders = [
-        "rooms-apart",
-        "rooms-truth",
-        "rooms-masks",
-        "models/sh",
-        "reports",
-    ];
+    let folders = ["rooms-apart", "rooms-truth", "rooms-masks", "models/sh"];
     let all = folders.map(|f| {
         let mut all = store::hashes(&farm.store().join(f));
         // How fast a training was is no result.
@@ -104,7 +98,10 @@ fn made(farm: &Farm) -> Vec<BTreeMap<String, String>> {
 fn ious(farm: &Farm, args: &[&str]) -> Vec<f64> {
     let info: Value = farm.json(args);
     let all = info["evaluations"].as_array().unwrap();
-    let masks = all.iter().filter(|e| e["predicts"] == "shadow");
+    // Those of predictions name the quantity.
+    let masks = all
+        .iter()
+        .filter(|e| e["predicts"].is_null() || e["predicts"] == "shadow");
     masks
         .map(|e| e["metrics"]["iou"].as_f64().unwrap())
         .collect()
