@@ -209,8 +209,8 @@ pub(crate) fn demultiplex<'py>(
 }
 
 /// Reconstructs a room from a histogram `[row, column, bin]` of all spots. Returns a dict of
-/// `vertices`, `triangles`, `glb` (a file), and `facts` (JSON). With a scene, `facts` has the errors
-/// against it.
+/// `vertices`, `triangles`, `glb` (a file), and `facts` (JSON), which include the errors against a
+/// given scene.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "a function of another language")]
 pub(crate) fn reconstruct<'py>(

@@ -46,7 +46,7 @@ pub fn from_flash(
         beams: &numbers,
         times: Times::Range(&range),
         lit: &found.mask(),
-        // A mirror has its own depth here, and its light that of a wall. To leave it out costs more.
+        // A mirror has its own depth. To leave it out costs more than its wrong shadows.
         mirror: &none,
     })?;
     weigh(&mut measured, &numbers, &found.lit, &found.confidence)?;

@@ -1,5 +1,5 @@
-//! Makes the list of a folder of models: categories from the metadata of the Amazon Berkeley Objects
-//! (Collins et al. 2022), or from the names of folders and files.
+//! Makes the list of a folder of models: categories from the metadata of the Amazon Berkeley
+//! Objects (Collins et al. 2022), or from the names of folders and files.
 
 use std::{
     collections::BTreeMap,
@@ -35,7 +35,7 @@ pub struct Scanned {
     pub refused: Vec<(String, String)>,
 }
 
-/// What is known of a model without reading it.
+/// Facts about a model file that is not read.
 struct Entry {
     path: String,
     name: String,
