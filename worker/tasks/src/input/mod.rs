@@ -10,7 +10,10 @@ pub(crate) mod scenes;
 pub(crate) mod sides;
 #[cfg(feature = "networks")]
 pub(crate) mod times;
-#[cfg(feature = "networks")]
+#[cfg_attr(
+    not(feature = "networks"),
+    expect(dead_code, reason = "stages of networks need the rest")
+)]
 pub(crate) mod truth;
 
 use picofarm_dataset::{Dataset, Manifest, Quantity};
