@@ -149,6 +149,46 @@ def optional(module: str, extra: str) -> Any:
         raise ImportError(f"{e}; pip install 'picofarm[{extra}]'") from None
 
 
+IMAGE = ("row", "column")
+DIMENSIONS: dict[str, tuple[tuple[str, ...], str]] = {
+    "transient": ((*IMAGE, "bin"), "1/(m2 sr)"),
+    "intensity": (IMAGE, "1/(m2 sr)"),
+    "depth": (IMAGE, "m"),
+    "range": (IMAGE, "m"),
+    "normal": ((*IMAGE, "axis"), "1"),
+    "instance": (IMAGE, "1"),
+    "label": (IMAGE, "1"),
+    "specular": (IMAGE, "1"),
+    "visibility": (("spot", *IMAGE), "1"),
+    "two_bounce_path": (("spot", *IMAGE), "m"),
+    "rgb": ((*IMAGE, "channel"), "1"),
+    "spots": (("spot", "spot_field"), "m"),
+    "intrinsics": (("intrinsic",), "pixel"),
+}
+"""Dimensions and unit of each array of a scene."""
+
+
+def to_xarray(
+    arrays: Mapping[str, NDArray[Any]], gate: Gate, first_bin: int, attributes: Mapping[str, Any]
+) -> Any:
+    """Returns arrays of a scene as an `xarray.Dataset` with coordinates and units."""
+    xarray = optional("xarray", "xarray")
+    shown: dict[str, Any] = {}
+    for name, array in arrays.items():
+        if name in DIMENSIONS:
+            axes, units = DIMENSIONS[name]
+            shown[name] = (axes, array, {"units": units})
+    coordinates: dict[str, Any] = {}
+    if "transient" in shown:
+        end = first_bin + arrays["transient"].shape[-1]
+        path, time = gate.paths_m[first_bin:end], gate.times_ns[first_bin:end]
+        coordinates = {
+            "path": ("bin", path, {"units": "m"}),
+            "time": ("bin", time, {"units": "ns"}),
+        }
+    return xarray.Dataset(shown, coords=coordinates, attrs=dict(attributes))
+
+
 def watcher(
     progress: bool | Callable[[float], object], what: str
 ) -> Callable[[float], object] | None:

@@ -7,13 +7,16 @@ import os
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import _native
-from ._arguments import Gate
+from ._arguments import Gate, to_xarray
+
+if TYPE_CHECKING:
+    import xarray
 
 _Window = tuple[int, int, int, int]
 _IMAGES = frozenset(
@@ -124,6 +127,13 @@ class Dataset:
         for name in self.arrays:
             made[name] = self._array(scene, name, window, span)
         return made
+
+    def to_xarray(self, scene: int) -> xarray.Dataset:
+        """Returns a scene, by its index in the data set, with dimensions, coordinates and units.
+        Needs xarray."""
+        arrays = self.read(scene)
+        attributes = {name: arrays.pop(name) for name in ("scene", "scale")}
+        return to_xarray(arrays, self.gate, self._bins[0], attributes)
 
     def stream(
         self,

@@ -185,6 +185,29 @@ class Flash:
     """What `lit` rests on: 0 = light, 1 = geometry alone, 2 = light of other spots arrives at the
     same time; `[spot, row, column]`."""
 
+    def plot(self, spot: int = 0) -> matplotlib.figure.Figure:
+        """Draws depth, confidence, mirrors, and what a spot lights. Needs matplotlib.
+
+        Args:
+            spot: Index in `beams`.
+        """
+        plt = optional("matplotlib.pyplot", "plot")
+        if not 0 <= spot < len(self.beams):
+            raise ValueError(f"spot: expected 0 to {len(self.beams) - 1}, found {spot}")
+        images = {
+            "depth, m": self.depth,
+            "confidence": self.confidence,
+            "mirror": self.mirror,
+            f"lit by spot {self.beams[spot]}": self.lit[spot],
+        }
+        figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), layout="constrained")
+        for panel, (title, image) in zip(axes, images.items(), strict=True):
+            most = None if title.startswith("depth") else 1
+            figure.colorbar(panel.imshow(image, vmin=0, vmax=most), ax=panel)
+            panel.set_title(title)
+            panel.set_axis_off()
+        return figure
+
     def __repr__(self) -> str:
         height, width = self.depth.shape
         return f"<picofarm.Flash {width}x{height} pixels, {len(self.beams)} spots>"

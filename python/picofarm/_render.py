@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _native
-from ._arguments import Floats, Gate, count, optional, whole
+from ._arguments import DIMENSIONS, Floats, Gate, count, optional, to_xarray, whole
 from ._flash import Capture, Flash, Reconstruction
 
 if TYPE_CHECKING:
@@ -175,28 +175,8 @@ class Render:
 
     def to_xarray(self) -> xarray.Dataset:
         """Returns the arrays with dimensions, coordinates and units. Needs xarray."""
-        xarray = optional("xarray", "xarray")
-        image = ("row", "column")
-        dims: dict[str, tuple[tuple[str, ...], str]] = {
-            "transient": ((*image, "bin"), "1/(m2 sr)"),
-            "depth": (image, "m"),
-            "range": (image, "m"),
-            "normal": ((*image, "axis"), "1"),
-            "instance": (image, "1"),
-            "label": (image, "1"),
-            "specular": (image, "1"),
-            "visibility": (("spot", *image), "1"),
-            "rgb": ((*image, "channel"), "1"),
-        }
-        arrays = {
-            name: (axes, getattr(self, name), {"units": units})
-            for name, (axes, units) in dims.items()
-        }
-        coordinates = {
-            "path": ("bin", self.gate.paths_m, {"units": "m"}),
-            "time": ("bin", self.gate.times_ns, {"units": "ns"}),
-        }
-        return xarray.Dataset(arrays, coords=coordinates, attrs={"scene": self.scene.name})
+        arrays = {name: value for name, value in vars(self).items() if name in DIMENSIONS}
+        return to_xarray(arrays, self.gate, 0, {"scene": self.scene.name})
 
     def plot(self, pixel: tuple[int, int] | None = None) -> matplotlib.figure.Figure:
         """Draws the light summed over time, the depth and the histogram of a pixel. Needs

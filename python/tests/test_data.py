@@ -125,6 +125,16 @@ def test_a_stream_continues_at_its_position(dataset: str) -> None:
     assert rest == [scene for scene, _ in expected[1:]]
 
 
+def test_a_scene_becomes_an_xarray_with_units(dataset: str) -> None:
+    pytest.importorskip("xarray")
+    data = picofarm.open(dataset, bins=(10, 30))
+    scene = data.to_xarray(1)
+    assert scene["transient"].dims == ("row", "column", "bin")
+    assert np.allclose(scene["path"], data.gate.paths_m[10:30])
+    assert scene["depth"].attrs["units"] == "m"
+    assert scene.attrs["scene"] == 1
+
+
 def test_unusable_streams_are_refused_by_name(dataset: str) -> None:
     data = picofarm.open(dataset)
     for name, value in {"rank": 1, "crop": 10_000, "ahead": 0, "seed": -1}.items():

@@ -244,7 +244,12 @@ def test_a_sensor_counts_photons(render: picofarm.Render) -> None:
     pairs = render.transient.reshape(*render.depth.shape, -1, 2).sum(axis=3)
     assert np.allclose(expected.counts, expected.scale * pairs, rtol=1e-4, atol=1e-4)
     assert "photons each" in repr(sensed)
-    assert sensed.demultiplex().depth.shape == render.depth.shape
+    flash = sensed.demultiplex()
+    assert flash.depth.shape == render.depth.shape
+    pytest.importorskip("matplotlib").use("agg")
+    assert len(flash.plot(spot=1).axes) == 8
+    with pytest.raises(ValueError, match="spot"):
+        flash.plot(spot=99)
     for bad in ({"dark": 1}, {"rebin": 0}, {"dark_per_bin": -1}):
         with pytest.raises(ValueError, match="sensor: "):
             render.sense(bad)
