@@ -75,6 +75,9 @@ fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
+/// Number of rooms in the folders `truth-3d` and `seen-3d`.
+const COUNT: u64 = 6;
+
 /// Checks the output of commands about the folders `truth-3d` and `seen-3d`.
 fn looked_at(farm: &Farm) {
     let place = |name: &str| farm.store().join(name).to_str().unwrap().to_owned();
@@ -91,7 +94,7 @@ fn looked_at(farm: &Farm) {
 
     let page = place("rooms.html");
     let written = farm.json(&["dataset", "report", &truth, &seen, "--out", &page]);
-    assert_eq!(written["scenes"], 24, "{written}");
+    assert_eq!(written["scenes"], 2 * COUNT, "{written}");
     let html = fs::read_to_string(&page).unwrap();
     for said in [
         "truth-3d",
@@ -164,7 +167,6 @@ fn reconstructions_without_views_have_no_pictures_and_say_so() {
 
 #[test]
 fn rooms_come_from_predictions_and_truth_alike_and_what_is_missing_is_named() {
-    const COUNT: u64 = 6;
     let farm = Farm::start("rooms-predicted");
     let store = farm.store();
     let network = "net = { width = 4, levels = 3 }\noptimise = { epochs = 30, batch = 2 }\ninput = { bins = 40 }";
@@ -294,7 +296,7 @@ output = {{ store = {store:?}, dataset = "captures-3d" }}
     let others = Rooms {
         name: "others".into(),
         seed: 9,
-        ..Rooms::fine(12)
+        ..Rooms::fine(COUNT)
     };
     let others = others.stage(&store);
     fails(
