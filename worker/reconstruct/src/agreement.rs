@@ -269,7 +269,7 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
         .filter(|s| *s > LIGHT.doubtful(0.0))
     {
         let text = format!(
-            "{:.0} % of lit paths go through a surface that the camera sees; check the masks' polarity, and the spots",
+            "{:.0} % of lit paths go through a surface that the camera sees; check the masks' polarity, the spots, and mirrors that were not found",
             100.0 * share
         );
         say(share > LIGHT.refused(0.0), text);
