@@ -287,8 +287,8 @@ fn blends_that_cannot_be_are_refused_by_element() {
             "expected two BSDFs, found 1",
         ),
         (
-            blend(0.0, &diffuse("1"), "<bsdf type=\"hair\"/>"),
-            "bsdf \"hair\" is not supported",
+            blend(0.0, &diffuse("1"), "<bsdf type=\"velvet\"/>"),
+            "bsdf \"velvet\" is not supported",
         ),
         (
             blend(0.5, &diffuse("1"), "<bsdf type=\"thindielectric\"/>"),

@@ -263,6 +263,20 @@ fn bsdfs_without_an_equal_are_approximated_with_a_note() {
     };
     assert!((reflectance - 0.70).abs() < 0.02, "{reflectance}");
     assert!(noted(&notes, "metals"));
+    // Gold by spectra, whose values exceed 1.
+    let (bsdf, _) = of(
+        "<bsdf type=\"conductor\"><spectrum name=\"eta\" value=\"450:1.4, 550:0.4, 650:0.2\"/>\
+                            <spectrum name=\"k\" value=\"450:1.9, 550:2.6, 650:3.7\"/></bsdf>",
+    );
+    let Bsdf::RoughConductor { reflectance, .. } = bsdf else {
+        panic!("{bsdf:?}")
+    };
+    assert!((reflectance - 0.72).abs() < 0.03, "{reflectance}");
+    let (bsdf, notes) = of(
+        "<bsdf type=\"measured_polarized\"><string name=\"filename\" value=\"none.pbsdf\"/></bsdf>",
+    );
+    assert_eq!(bsdf, Bsdf::Diffuse { reflectance: 0.5 });
+    assert!(noted(&notes, "bsdf.measured_polarized"));
     let (bsdf, notes) = of(
         "<bsdf type=\"diffuse\"><texture type=\"checkerboard\" name=\"reflectance\"><rgb name=\"color0\" value=\"0.1\"/>\
          <rgb name=\"color1\" value=\"0.5\"/></texture></bsdf>",
@@ -302,14 +316,16 @@ fn lenses_and_crop_windows_give_the_view_of_the_image() {
 fn media_and_their_references_are_left_out_with_a_note() {
     let scene = read_text(&format!(
         "{SENSOR}<medium type=\"homogeneous\" id=\"fog\"/><shape type=\"cube\"><ref name=\"interior\" id=\"fog\"/></shape>\
-         <shape type=\"sphere\"><bsdf type=\"null\"/></shape>"
+         <shape type=\"sphere\"><bsdf type=\"null\"/></shape><shape type=\"disk\"><bsdf type=\"polarizer\"/></shape>"
     ));
     assert_eq!(scene.objects.len(), 1);
     let notes = &scene.provenance.notes;
-    assert!(
-        notes.contains_key("import.media") && notes.contains_key("import.null"),
-        "{notes:?}"
-    );
+    for left_out in ["media", "null", "polarizers"] {
+        assert!(
+            notes.contains_key(&format!("import.{left_out}")),
+            "{notes:?}"
+        );
+    }
 }
 
 #[test]
@@ -317,4 +333,42 @@ fn a_sensor_that_is_no_pinhole_leaves_the_choice_of_the_camera() {
     let scene = read_text("<sensor type=\"orthographic\"/><shape type=\"cube\"/>");
     let notes = &scene.provenance.notes;
     assert!(notes.contains_key("import.sensors.kind") && notes.contains_key("chosen.camera"));
+}
+
+#[test]
+fn a_sensor_at_a_shape_is_ignored_with_a_note() {
+    let scene = read_text(&format!(
+        "{SENSOR}<shape type=\"rectangle\"><sensor type=\"irradiancemeter\"/></shape>"
+    ));
+    assert!(scene.provenance.notes.contains_key("import.sensors.shapes"));
+}
+
+#[test]
+fn gates_of_older_transient_films_are_stated_as_options() {
+    let gate = |film: &str| {
+        let sensor = SENSOR.replace("</film>", &format!("{film}</film>"));
+        let scene = read_text(&format!("{sensor}<shape type=\"cube\"/>"));
+        scene
+            .provenance
+            .notes
+            .get("import.gate")
+            .cloned()
+            .unwrap_or_default()
+    };
+    let of_bounds = gate(
+        "<float name=\"min_bound\" value=\"2\"/><float name=\"max_bound\" value=\"12\"/>\
+         <float name=\"bin_width\" value=\"0.5\"/><string name=\"decomposition\" value=\"transient\"/>",
+    );
+    assert!(
+        of_bounds.contains("--bins 20 --bin-width-m 0.5 --gate-start-m 2"),
+        "{of_bounds}"
+    );
+    let of_streak = gate(
+        "<integer name=\"time\" value=\"400\"/><float name=\"exposure_time\" value=\"8\"/>\
+         <float name=\"time_offset\" value=\"500\"/>",
+    );
+    assert!(
+        of_streak.contains("--bins 400 --bin-width-m 8 --gate-start-m 500"),
+        "{of_streak}"
+    );
 }

@@ -381,7 +381,7 @@ fn scenes_in_mitsubas_xml() {
         (
             "a gate without bins",
             film("<integer name=\"temporal_bins\" value=\"0\"/>"),
-            Refused("temporal_bins: 0"),
+            Refused("0 time bins"),
         ),
         (
             "an include",

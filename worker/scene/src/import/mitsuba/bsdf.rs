@@ -3,60 +3,29 @@
 use std::rc::Rc;
 
 use crate::{
-    Bsdf, Distribution, Material,
+    Bsdf, Distribution, Material, SpectrumPoint,
     export::mitsuba::text::{MaterialExtras, bsdf_text},
     import::quoted,
+    spectrum::{PRIMARIES_NM, interpolated},
 };
 
 use super::{
     Reader,
     blend::{Leaf, Mix},
     colour::Colour,
-    node::Node,
+    glass::is_glass,
+    metal,
+    node::{Node, Value},
     properties,
     transform::Matrix,
 };
 
 /// The deepest nesting of BSDFs, references included.
 const MAX_DEPTH: usize = 8;
-/// The normal-incidence reflectance (linear RGB) of the most common metals.
-const METALS: [(&str, [f32; 3]); 5] = [
-    ("Ag", [0.972, 0.960, 0.915]),
-    ("Al", [0.913, 0.922, 0.924]),
-    ("Au", [1.0, 0.766, 0.336]),
-    ("Cr", [0.550, 0.556, 0.554]),
-    ("Cu", [0.955, 0.638, 0.538]),
-];
 const SUBSET: &str = "use diffuse, plastic, roughplastic, principled, roughconductor, conductor, or twosided, mask, bumpmap, \
                       normalmap or blendbsdf of these, or dielectric, roughdielectric or thindielectric by itself";
 /// The text in exports of thin glass from the time when its reflections were not rendered.
 const UNREFLECTED: &str = r#"<rgb name="specular_reflectance" value="0 0 0"/>"#;
-
-/// Mitsuba's names of media, with their indices of refraction.
-const MEDIA: [(&str, f64); 22] = [
-    ("vacuum", 1.0),
-    ("helium", 1.000_04),
-    ("hydrogen", 1.000_13),
-    ("air", 1.000_277),
-    ("carbon dioxide", 1.000_45),
-    ("water", 1.333),
-    ("water ice", 1.31),
-    ("acetone", 1.36),
-    ("ethanol", 1.361),
-    ("fused quartz", 1.458),
-    ("carbon tetrachloride", 1.461),
-    ("pyrex", 1.47),
-    ("glycerol", 1.4729),
-    ("acrylic glass", 1.49),
-    ("polypropylene", 1.49),
-    ("benzene", 1.501),
-    ("bk7", 1.5046),
-    ("silicone oil", 1.520_45),
-    ("sodium chloride", 1.544),
-    ("amber", 1.55),
-    ("pet", 1.575),
-    ("diamond", 2.419),
-];
 
 /// A material, and the transform that its textures apply to texture coordinates.
 #[derive(Debug, Clone)]
@@ -178,6 +147,17 @@ impl Reader<'_> {
                 let inner = self.inner(node)?;
                 self.mix(&inner, depth + 1)
             }
+            // Their properties describe measurements or fibres, so no colour can be read from them.
+            kind @ ("measured" | "measured_polarized" | "hair") => {
+                self.note(
+                    &format!("bsdf.{kind}"),
+                    "replaced by a Lambertian of reflectance 0.5",
+                );
+                Ok(Mix::of(Rc::new(Leaf {
+                    colour: Colour::grey(0.5),
+                    metal: None,
+                })))
+            }
             other => Err(node.fail(format!("bsdf {} is not supported; {SUBSET}", quoted(other)))),
         }
     }
@@ -280,60 +260,6 @@ impl Reader<'_> {
         Ok(leaf)
     }
 
-    /// Returns a material of glass, thin or solid.
-    fn glass(&mut self, node: &Node) -> Result<Material, String> {
-        if node.kind == "roughdielectric" {
-            self.only(node, &properties::ROUGH_GLASS)?;
-            self.note("rough_glass", "is smooth");
-        } else {
-            self.only(node, &properties::GLASS)?;
-        }
-        let ior = index(node, "int_ior", "bk7")? / index(node, "ext_ior", "air")?;
-        if !(1.0..=f64::from(Material::MAX_IOR)).contains(&ior) {
-            let hint = match node.kind.as_str() {
-                "dielectric" | "roughdielectric" => {
-                    "; a cavity belongs into the mesh of the body around it, with facets that face the cavity"
-                }
-                _ => "; int_ior is that of the glass",
-            };
-            return Err(node.fail(format!(
-                "int_ior / ext_ior = {ior} lies outside [1, 4]{hint}"
-            )));
-        }
-        let plain = |colour: Option<Colour>, name: &str| match colour {
-            Some(c) if c.texture.is_some() => {
-                Err(node.fail(format!("{name}: textures on glass are not supported")))
-            }
-            Some(c) if !c.spectrum.is_empty() => Err(node.fail(format!(
-                "{name}: spectra on glass are not supported; use rgb"
-            ))),
-            colour => Ok(colour.unwrap_or(Colour::grey(1.0))),
-        };
-        let reflected = self.colour(node, "specular_reflectance")?;
-        if plain(reflected, "specular_reflectance")?.rgb != [1.0; 3] {
-            self.note(
-                "glass",
-                "specular_reflectance is not used: glass reflects what Fresnel's equations say",
-            );
-        }
-        let tint = self.colour(node, "specular_transmittance")?;
-        let tint = plain(tint, "specular_transmittance")?;
-        let (ior, transmittance) = (ior as f32, tint.mean());
-        let bsdf = match node.kind.as_str() {
-            "dielectric" | "roughdielectric" => Bsdf::Dielectric { ior, transmittance },
-            _ => Bsdf::ThinDielectric {
-                ior,
-                transmittance,
-                face: false,
-            },
-        };
-        Ok(Material {
-            rgb: tint.rgb,
-            bsdf,
-            ..Material::glass(named(node))
-        })
-    }
-
     fn conductor(&mut self, node: &Node) -> Result<(Colour, f32, Distribution), String> {
         let smooth = node.kind == "conductor";
         self.only(
@@ -399,17 +325,15 @@ impl Reader<'_> {
             (Some("none"), _) => [1.0; 3],
             (name, _) => {
                 let name = name.unwrap_or("Cu");
-                let known = METALS.iter().find(|(known, _)| *known == name);
-                let Some((_, reflectance)) = known else {
-                    let names: Vec<&str> = METALS.iter().map(|m| m.0).collect();
+                let Some(reflectance) = metal::reflectance(name) else {
                     return Err(node.fail(format!(
                         "material: {} is not known; use \"none\" with specular_reflectance, or one of {}",
                         quoted(name),
-                        names.join(", ")
+                        metal::names().join(", ")
                     )));
                 };
                 self.note("metals", "Fresnel reflectance at normal incidence used");
-                *reflectance
+                reflectance
             }
         };
         let mut colour = self
@@ -431,23 +355,33 @@ impl Reader<'_> {
     /// Returns the reflectance at normal incidence of the complex index of refraction `eta` + i
     /// `k`, if the file states it in numbers.
     fn fresnel_of_index(&mut self, node: &Node) -> Result<Option<[f32; 3]>, String> {
-        let (Some(eta), Some(k)) = (self.colour(node, "eta")?, self.colour(node, "k")?) else {
+        let (Some(eta), Some(k)) = (self.index(node, "eta")?, self.index(node, "k")?) else {
             return Ok(None);
         };
         self.note("metals", "Fresnel reflectance at normal incidence used");
-        let reflectance = |c: usize| {
-            let (n, k) = (eta.rgb[c], k.rgb[c]);
-            ((n - 1.0) * (n - 1.0) + k * k) / ((n + 1.0) * (n + 1.0) + k * k)
-        };
-        Ok(Some([0, 1, 2].map(reflectance)))
+        Ok(Some(std::array::from_fn(|c| metal::fresnel(eta[c], k[c]))))
     }
-}
 
-fn is_glass(node: &Node) -> bool {
-    matches!(
-        node.kind.as_str(),
-        "dielectric" | "thindielectric" | "roughdielectric"
-    )
+    /// Returns a part of a complex index of refraction at red, green and blue. Unlike a
+    /// reflectance, it may exceed 1.
+    fn index(&mut self, node: &Node, name: &str) -> Result<Option<[f32; 3]>, String> {
+        let Some(Value::Spectrum(points)) = node.parameters.get(name) else {
+            return Ok(self.colour(node, name)?.map(|colour| colour.rgb));
+        };
+        let ascending = points.windows(2).all(|w| w[0].nm < w[1].nm);
+        let valid = |p: &SpectrumPoint| p.reflectance.is_finite() && p.reflectance >= 0.0;
+        if !ascending || !points.iter().all(valid) {
+            return Err(node.fail(format!(
+                "{name}: expected values from 0 at ascending wavelengths"
+            )));
+        }
+        let [blue, green, red] =
+            PRIMARIES_NM.map(|nm| interpolated(points, nm, |p| [p.reflectance]));
+        Ok(match (red, green, blue) {
+            (Some([r]), Some([g]), Some([b])) => Some([r, g, b]),
+            _ => None,
+        })
+    }
 }
 
 /// Returns the name of a material.
@@ -456,23 +390,4 @@ pub(super) fn named(node: &Node) -> String {
         true => node.kind.clone(),
         false => node.id.clone(),
     }
-}
-
-/// Parses an index of refraction: a number, or one of Mitsuba's names.
-fn index(node: &Node, name: &str, default: &str) -> Result<f64, String> {
-    if let Ok(Some(number)) = node.number(name) {
-        return match number.is_finite() && number > 0.0 {
-            true => Ok(number),
-            false => Err(node.fail(format!("{name}: {number} is no index of refraction"))),
-        };
-    }
-    let medium = node.text(name)?.unwrap_or(default);
-    let known = MEDIA.iter().find(|(known, _)| *known == medium);
-    known.map(|(_, ior)| *ior).ok_or_else(|| {
-        node.fail(format!(
-            "{name}: {} is not known; use a number, or one of {}",
-            quoted(medium),
-            MEDIA.map(|m| m.0).join(", ")
-        ))
-    })
 }

@@ -34,6 +34,8 @@ mod blend;
 mod bsdf;
 mod colour;
 mod dictionary;
+mod glass;
+mod metal;
 mod node;
 mod old;
 mod properties;
@@ -456,9 +458,7 @@ impl<'a> Reader<'a> {
                         return Err(shape.fail(format!("more than {MAX_OBJECTS} objects in all")));
                     }
                 }
-                _ if self.is_null(shape)? => {
-                    self.note("null", "shapes with the BSDF null left out");
-                }
+                _ if self.lets_light_pass(shape)? => {}
                 _ => all.push(Placed {
                     shape: shape.clone(),
                     to_world: Matrix::IDENTITY,
@@ -469,10 +469,22 @@ impl<'a> Reader<'a> {
         Ok(all)
     }
 
-    /// Returns whether light passes a shape unchanged.
-    fn is_null(&self, shape: &Node) -> Result<bool, String> {
+    /// Returns whether light passes a shape, and adds a note of what is left out.
+    fn lets_light_pass(&mut self, shape: &Node) -> Result<bool, String> {
         let bsdfs = self.children(shape, "bsdf")?;
-        Ok(matches!(bsdfs.as_slice(), [bsdf] if bsdf.kind == "null"))
+        match bsdfs.as_slice() {
+            [bsdf] if bsdf.kind == "null" => {
+                self.note("null", "shapes with the BSDF null left out");
+            }
+            [bsdf] if matches!(bsdf.kind.as_str(), "polarizer" | "retarder" | "circular") => {
+                self.note(
+                    "polarizers",
+                    "and retarders left out, because light has no polarization here",
+                );
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
     }
 
     /// Returns the key by which shapes of our own files have the same mesh: file and material.
@@ -518,6 +530,9 @@ impl<'a> Reader<'a> {
                     "emitters",
                     "other than beams are ignored; only the laser shines",
                 );
+            }
+            if !self.children(part, "sensor")?.is_empty() {
+                self.note("sensors.shapes", "of shapes ignored");
             }
             let look = match self.children(part, "bsdf")?.as_slice() {
                 [] => Look {

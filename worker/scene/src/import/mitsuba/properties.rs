@@ -35,7 +35,7 @@ const fn with(
     }
 }
 
-const IN_SHAPES: &[&str] = &["bsdf", "emitter"];
+const IN_SHAPES: &[&str] = &["bsdf", "emitter", "sensor"];
 
 pub(super) const SCENE: Properties = with(
     &[],
@@ -192,6 +192,14 @@ pub(super) const FILM: Properties = with(
         "temporal_bins",
         "bin_width_opl",
         "start_opl",
+        // MitsubaToF's names of the gate.
+        "min_bound",
+        "max_bound",
+        "bin_width",
+        // The names of the gate in the streak film, mitransient's forerunner.
+        "time",
+        "exposure_time",
+        "time_offset",
     ],
     &[
         "file_format",
@@ -214,6 +222,13 @@ pub(super) const FILM: Properties = with(
         "wl_sigma",
         "temporal_filter",
         "gaussian_stddev",
+        "decomposition",
+        "channel_names",
+        "calibrated_transient",
+        "auto_detect_bins",
+        "path_min",
+        "path_max",
+        "path_samples",
     ],
     &[],
 );

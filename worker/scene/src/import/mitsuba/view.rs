@@ -139,21 +139,15 @@ impl Reader<'_> {
         } else {
             self.only(node, &properties::FILM)?;
         }
-        let gated = ["temporal_bins", "bin_width_opl", "start_opl"];
-        let stated = gated.iter().any(|name| node.parameters.contains_key(*name));
-        if !stated && !node.kind.starts_with("transient") && !node.kind.starts_with("phasor") {
+        let Some((bins, width, start)) = gate(node)? else {
             return Ok(());
-        }
-        // The default values are mitransient's.
-        let bins = node.number(gated[0])?.unwrap_or(2048.0);
-        let width = node.number(gated[1])?.unwrap_or(0.003);
-        let start = node.number(gated[2])?.unwrap_or(0.0);
+        };
         if !(1.0..=65536.0).contains(&bins) || bins.fract() != 0.0 {
-            let what = format!("temporal_bins: {bins}; expected a whole number from 1 to 65536");
+            let what = format!("{bins} time bins; expected a whole number from 1 to 65536");
             return Err(node.fail(what));
         }
         if width.partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
-            return Err(node.fail(format!("bin_width_opl: {width}; expected metres above 0")));
+            return Err(node.fail(format!("time bins of {width}; expected metres above 0")));
         }
         self.note(
             "gate",
@@ -245,4 +239,35 @@ impl Reader<'_> {
             beams: beams.collect(),
         }))
     }
+}
+
+/// Returns the time gate of a film: bins, metres of optical path of a bin, and of the start.
+fn gate(node: &Node) -> Result<Option<(f64, f64, f64)>, String> {
+    let states = |names: &[&str]| names.iter().any(|name| node.parameters.contains_key(*name));
+    let transient = node.kind.starts_with("transient") || node.kind.starts_with("phasor");
+    if transient || states(&["temporal_bins", "bin_width_opl", "start_opl"]) {
+        // The default values are mitransient's.
+        let bins = node.number("temporal_bins")?.unwrap_or(2048.0);
+        let width = node.number("bin_width_opl")?.unwrap_or(0.003);
+        return Ok(Some((
+            bins,
+            width,
+            node.number("start_opl")?.unwrap_or(0.0),
+        )));
+    }
+    if let (Some(first), Some(last), Some(width)) = (
+        node.number("min_bound")?,
+        node.number("max_bound")?,
+        node.number("bin_width")?,
+    ) {
+        return Ok(Some((((last - first) / width).ceil(), width, first)));
+    }
+    if let (Some(bins), Some(width)) = (node.number("time")?, node.number("exposure_time")?) {
+        return Ok(Some((
+            bins,
+            width,
+            node.number("time_offset")?.unwrap_or(0.0),
+        )));
+    }
+    Ok(None)
 }
