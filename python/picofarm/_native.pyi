@@ -78,7 +78,13 @@ class Scene:
     ) -> Scene: ...
     @staticmethod
     def furnished(
-        seed: int, resolution: int, spots: _Spots, fov: float, mirrors: int, assets: str
+        seed: int,
+        resolution: int,
+        spots: _Spots,
+        fov: float,
+        mirrors: int,
+        assets: str,
+        floor_plan: str,
     ) -> Scene: ...
     @staticmethod
     def from_meshes(meshes: Sequence[_Mesh], view: _View, spots: _Spots) -> Scene: ...

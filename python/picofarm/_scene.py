@@ -222,6 +222,7 @@ def furnished(
     fov: float = 90.0,
     mirrors: int = 0,
     assets: str = "parametric",
+    floor_plan: str = "box",
 ) -> Scene:
     """Returns the furnished room of a seed: the same room on every machine.
 
@@ -231,8 +232,10 @@ def furnished(
         fov: Width of the view, degrees.
         mirrors: Least number of mirrors in view, 0 to 4.
         assets: Library of furniture: `parametric` or `sweethome3d`.
+        floor_plan: `box`, or `varied` for L-shaped rooms, open doors and glazed windows.
     """
     side = whole("resolution", resolution)
     least = whole("mirrors", mirrors)
     seed = whole("seed", seed)
-    return Scene._of(_native.Scene.furnished(seed, side, spots, float(fov), least, assets))
+    made = _native.Scene.furnished(seed, side, spots, float(fov), least, assets, floor_plan)
+    return Scene._of(made)

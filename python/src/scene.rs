@@ -8,7 +8,7 @@ use picofarm_scene::{
     furnished::{self, FurnishedSettings},
     import::{self, Bounds, ImportOptions, View},
 };
-use picofarm_settings::Spots;
+use picofarm_settings::{FloorPlan, Spots};
 use pyo3::prelude::*;
 
 use crate::errors::{self, argument};
@@ -83,7 +83,16 @@ impl Scene {
         fov: f32,
         mirrors: u32,
         assets: &str,
+        floor_plan: &str,
     ) -> PyResult<Self> {
+        let floor_plan = match floor_plan {
+            "box" => FloorPlan::Box,
+            "varied" => FloorPlan::Varied,
+            other => {
+                let what = format!("{other:?}: expected box or varied");
+                return Err(argument("floor_plan", what));
+            }
+        };
         let settings = FurnishedSettings {
             spots: self::spots(spots)?,
             width: resolution,
@@ -91,6 +100,7 @@ impl Scene {
             fov_deg: fov,
             specular_at_least: mirrors,
             assets: assets.to_owned(),
+            floor_plan,
             ..FurnishedSettings::default()
         };
         let scene = py.detach(|| {

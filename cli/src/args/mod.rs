@@ -39,7 +39,9 @@ pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
 pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
 pub use render::{GateArgs, GateChoice, ImageSize, RenderArgs, ScenePlan, SceneRender};
-pub use scene::{FormatArg, GeneratorArg, PlatoArg, Scene, SceneExport, SceneSense};
+pub use scene::{
+    FloorPlanArg, FormatArg, GeneratorArg, PlatoArg, Scene, SceneExport, SceneGenerate, SceneSense,
+};
 pub use secrets::without_secrets;
 pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
 

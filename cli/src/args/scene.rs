@@ -10,32 +10,7 @@ use super::{SceneInput, ScenePlan, SceneRender, SensorArgs, ranges};
 #[derive(Subcommand)]
 pub enum Scene {
     /// Generate a scene from a seed and write it as .glb
-    Generate {
-        /// Kind of scene; desktop is a box on a desk, plato the room of the reconstruction
-        /// benchmarks
-        #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
-        kind: GeneratorArg,
-        /// Seed
-        #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
-        seed: u64,
-        /// File to write
-        #[arg(long, default_value = "scene.glb", value_name = "FILE")]
-        out: PathBuf,
-        /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1,
-        /// right and down) [default: 25; 16 in desktop and plato rooms; plato rooms take a number
-        /// up to 16]
-        #[arg(long, value_parser = ranges::spots)]
-        spots: Option<Spots>,
-        /// Image width and height in pixels
-        #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
-        resolution: u32,
-        /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
-        #[arg(long, default_value = "auto")]
-        assets: String,
-        /// Object in a plato room
-        #[arg(long, value_enum, default_value_t = PlatoArg::Chair)]
-        object: PlatoArg,
-    },
+    Generate(SceneGenerate),
     /// Show the contents of a scene file
     Show {
         /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
@@ -51,6 +26,37 @@ pub enum Scene {
     Plan(ScenePlan),
     /// Measure a rendered scene with a sensor: pulse, jitter, photon noise, wider bins
     Sense(SceneSense),
+}
+
+#[derive(Args)]
+pub struct SceneGenerate {
+    /// Kind of scene; desktop is a box on a desk, plato the room of the reconstruction
+    /// benchmarks
+    #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
+    pub kind: GeneratorArg,
+    /// Seed
+    #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
+    pub seed: u64,
+    /// File to write; a file with another scene is kept
+    #[arg(long, default_value = "scene.glb", value_name = "FILE")]
+    pub out: PathBuf,
+    /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1,
+    /// right and down) [default: 25; 16 in desktop and plato rooms; plato rooms take a number
+    /// up to 16]
+    #[arg(long, value_parser = ranges::spots)]
+    pub spots: Option<Spots>,
+    /// Image width and height in pixels
+    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub resolution: u32,
+    /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
+    #[arg(long, default_value = "auto")]
+    pub assets: String,
+    /// Shapes of furnished rooms: varied has L-shaped rooms, open doors and glazed windows
+    #[arg(long, value_enum, default_value_t = FloorPlanArg::Box)]
+    pub floor_plan: FloorPlanArg,
+    /// Object in a plato room
+    #[arg(long, value_enum, default_value_t = PlatoArg::Chair)]
+    pub object: PlatoArg,
 }
 
 #[derive(Args)]
@@ -80,6 +86,12 @@ pub enum GeneratorArg {
     Primitive,
     Desktop,
     Plato,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum FloorPlanArg {
+    Box,
+    Varied,
 }
 
 #[derive(Clone, Copy, ValueEnum)]

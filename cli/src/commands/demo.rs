@@ -12,7 +12,7 @@ use picofarm_proto::{
     show,
     spec::{Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource},
 };
-use picofarm_settings::Resolution;
+use picofarm_settings::{FloorPlan, Resolution};
 use picofarm_tasks::Access;
 use serde_json::json;
 
@@ -42,6 +42,7 @@ fn task(args: &Demo) -> RenderTask {
             kind: SceneKind::Furnished {
                 assets: args.assets.clone(),
                 min_specular: 1,
+                floor_plan: FloorPlan::Box,
             },
             count: args.scenes,
             seed: args.seed,

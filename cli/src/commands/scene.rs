@@ -1,6 +1,7 @@
 //! `picofarm scene …`: single scenes without a farm.
 
 mod gate;
+mod generate;
 mod group;
 mod order;
 mod plan;
@@ -12,17 +13,11 @@ pub mod sensor;
 use std::collections::BTreeMap;
 
 use picofarm_proto::show;
-use picofarm_scene::{
-    AssetLibrary, Scene, export,
-    furnished::{self, FurnishedSettings},
-    plato::{self, PlatoObject, PlatoSettings},
-    primitive::{self, PrimitiveSettings},
-};
-use picofarm_settings::Spots;
+use picofarm_scene::{Scene, export};
 use serde_json::json;
 
 use crate::{
-    args::{FormatArg, GeneratorArg, PlatoArg, Scene as Command, SceneExport},
+    args::{FormatArg, Scene as Command, SceneExport},
     error::{CliError, Result, io},
     output::Output,
     settings::Settings,
@@ -30,26 +25,7 @@ use crate::{
 
 pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
     match command {
-        Command::Generate {
-            kind,
-            seed,
-            out,
-            spots,
-            resolution,
-            assets: name,
-            object,
-        } => {
-            let scene = generate(kind, seed, spots, resolution, object, &name, settings)?;
-            export::write_glb(&scene, &out)?;
-            output.result(
-                &json!({"file": out, "name": scene.name, "objects": scene.objects.len(), "triangles": scene.triangle_count()}),
-                || format!(
-                    "wrote {}: {} objects, {} triangles; next: picofarm scene render {} --out render",
-                    out.display(), scene.objects.len(), scene.triangle_count(), show::path(&out)
-                ),
-            );
-            Ok(())
-        }
+        Command::Generate(args) => generate::run(&args, settings, output),
         Command::Show { file, input } => {
             let scene = input.read(&file)?;
             scene.validate()?;
@@ -105,65 +81,6 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
         },
     );
     Ok(())
-}
-
-fn generate(
-    kind: GeneratorArg,
-    seed: u64,
-    spots: Option<Spots>,
-    resolution: u32,
-    object: PlatoArg,
-    assets: &str,
-    settings: &Settings,
-) -> Result<Scene> {
-    match kind {
-        GeneratorArg::Furnished => {
-            let library = AssetLibrary::named(assets, std::slice::from_ref(&settings.assets))?;
-            let settings = FurnishedSettings {
-                assets: library.name().to_owned(),
-                specular_at_least: 1,
-                spots: spots.unwrap_or(Spots::Grid(25)),
-                width: resolution,
-                height: resolution,
-                ..Default::default()
-            };
-            Ok(furnished::generate(seed, &settings, &library)?)
-        }
-        GeneratorArg::Primitive | GeneratorArg::Desktop => {
-            let preset = match kind {
-                GeneratorArg::Desktop => PrimitiveSettings::desktop(),
-                _ => PrimitiveSettings::default(),
-            };
-            let settings = PrimitiveSettings {
-                spots: spots.unwrap_or(preset.spots),
-                width: resolution,
-                height: resolution,
-                ..preset
-            };
-            Ok(primitive::generate(seed, &settings)?)
-        }
-        GeneratorArg::Plato => {
-            let object = match object {
-                PlatoArg::Chair => PlatoObject::Chair,
-                PlatoArg::Armchair => PlatoObject::Armchair,
-                PlatoArg::HiddenBox => PlatoObject::HiddenBox,
-                PlatoArg::Empty => PlatoObject::Empty,
-            };
-            let spots = spots.unwrap_or(Spots::Grid(16));
-            if !spots.is_grid() {
-                let what = format!(
-                    "--spots {spots}: plato rooms have spots of their own; give a number of them, up to 16"
-                );
-                return Err(CliError::input(what));
-            }
-            let spots = spots.count() as usize;
-            Ok(plato::generate(&PlatoSettings {
-                object,
-                spots,
-                resolution,
-            })?)
-        }
-    }
 }
 
 fn facts(scene: &Scene) -> serde_json::Value {

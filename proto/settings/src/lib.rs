@@ -25,7 +25,7 @@ pub use optics::Optics;
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
 pub use render::{BeamWidth, Budget, Choice, Strategy};
 pub use resolution::Resolution;
-pub use rooms::{MirrorWall, PrimitiveRooms, Sizes};
+pub use rooms::{FloorPlan, MirrorWall, PrimitiveRooms, Sizes};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
 pub use spots::Spots;
 pub use wavelengths::{WAVELENGTHS_NM, Wavelength};

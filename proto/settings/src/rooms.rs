@@ -1,7 +1,19 @@
-//! Primitive rooms: a cube, a cylinder and a mirror in a bare room (Shoot-Bounce-3D, appendices B
+//! Shapes of furnished rooms, and primitive rooms: a cube, a cylinder and a mirror in a bare room (Shoot-Bounce-3D, appendices B
 //! and F.1).
 
 use serde::{Deserialize, Serialize};
+
+/// The shapes of furnished rooms.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FloorPlan {
+    /// Boxes with closed doors and opaque windows.
+    #[default]
+    Box,
+    /// Half of the rooms are L-shaped. Three of five have an open door to a second room, and three
+    /// of five a glazed window.
+    Varied,
+}
 
 /// The ranges of an object's size, metres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -11,19 +11,29 @@ const GAP: usize = 4;
 const HEAD: usize = TEXT + 8;
 const BACKGROUND: [u8; 3] = [16, 16, 20];
 const INK: [u8; 3] = [210, 210, 215];
+/// The colour of a pixel that is in shadow but found lit.
+const MISSED: [u8; 3] = [220, 60, 50];
+/// The colour of a pixel that is lit but found in shadow.
+const ADDED: [u8; 3] = [60, 90, 220];
 /// Spots whose masks are shown.
 const MASKS: usize = 4;
 /// Error of depth that is drawn brightest, metres.
 const ERROR_M: f32 = 0.2;
 
-/// Draws it. The lower row has masks: white and grey where truth and answer agree, red where a
-/// shadow was missed, blue where one was made up.
+/// Draws it. The lower row has masks: white and grey where truth and answer agree, and the colours
+/// of the legend where they do not.
 pub fn draw(flash: &Flash, found: &Demultiplexed, truth: Option<&Truth>) -> Canvas {
     let i = &flash.camera.intrinsics;
     let size = (i.width as usize, i.height as usize);
     let pixels = size.0 * size.1;
     let width = GAP + MASKS * (CELL + GAP);
-    let mut canvas = Canvas::new(width, 2 * (HEAD + CELL + GAP), BACKGROUND);
+    let true_mask = truth.filter(|t| t.visibility.len() == found.lit.len());
+    let rows = 2 * (HEAD + CELL + GAP);
+    let mut canvas = Canvas::new(
+        width,
+        rows + if true_mask.is_some() { HEAD } else { 0 },
+        BACKGROUND,
+    );
     let mut cell = |n: usize, title: &str, colour: &dyn Fn(usize) -> [u8; 3]| {
         let at = (
             GAP + n % MASKS * (CELL + GAP),
@@ -59,17 +69,22 @@ pub fn draw(flash: &Flash, found: &Demultiplexed, truth: Option<&Truth>) -> Canv
     });
     for n in 0..MASKS.min(found.places.len()) {
         let k = (2 * n + 1) * found.places.len() / (2 * MASKS.min(found.places.len()));
-        let true_mask = truth.filter(|t| t.visibility.len() == found.lit.len());
         let title = format!("lit by beam {}", flash.beams[k]);
         cell(MASKS + n, &title, &|p| {
             let q = k * pixels + p;
             let grey = (found.lit[q] * 255.0) as u8;
             match true_mask.map(|t| (t.visibility[q] != 0, found.lit[q] >= 0.5)) {
-                Some((false, true)) => [220, 60, 50],
-                Some((true, false)) => [60, 90, 220],
+                Some((false, true)) => MISSED,
+                Some((true, false)) => ADDED,
                 _ => [grey; 3],
             }
         });
+    }
+    if true_mask.is_some() {
+        let legend = [("shadow missed", MISSED), ("shadow that is none", ADDED)];
+        for (k, (text, colour)) in legend.into_iter().enumerate() {
+            canvas.text(GAP + k * (CELL + GAP), rows + 2, text, colour);
+        }
     }
     canvas
 }

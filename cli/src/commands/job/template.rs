@@ -15,7 +15,8 @@ pub fn template(kind: JobKind) -> String {
              spots = 25                # laser spots: a grid of 1, 4, 16, 25 or 100; or { random = 16 } or { at = [[0.5, 0.5]] }\n\
              fov_deg = 90.0            # horizontal field of view\n\
              assets = \"auto\"           # sweethome3d if installed, otherwise parametric\n\
-             min_specular = 1          # least number of mirrors in a room\n"
+             min_specular = 1          # least number of mirrors in a room\n\
+             floor_plan = \"box\"        # varied: also L-shaped rooms, open doors and glazed windows\n"
         }
         JobKind::Primitive => {
             "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\

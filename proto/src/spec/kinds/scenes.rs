@@ -1,7 +1,7 @@
 //! The scenes of a render or generate stage: their source, their form in a job file, and the
 //! checks.
 
-use picofarm_settings::{MirrorWall, PrimitiveRooms, Sizes, Spots};
+use picofarm_settings::{FloorPlan, MirrorWall, PrimitiveRooms, Sizes, Spots};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -47,6 +47,10 @@ pub struct SceneSource {
     pub laser_m: [f64; 3],
 }
 
+fn is_box(plan: &FloorPlan) -> bool {
+    *plan == FloorPlan::Box
+}
+
 fn is_centre(place: &[f64; 3]) -> bool {
     *place == [0.0; 3]
 }
@@ -62,6 +66,9 @@ pub enum SceneKind {
         assets: String,
         /// Fewest mirrors in a room (default 1).
         min_specular: u32,
+        /// Shapes of the rooms.
+        #[serde(skip_serializing_if = "is_box")]
+        floor_plan: FloorPlan,
     },
     /// Primitive rooms: cube, cylinder and mirror in a room of varying scale. `kind = "desktop"`
     /// stands for [`PrimitiveRooms::DESKTOP`].
@@ -162,7 +169,15 @@ impl SceneSource {
             SceneKind::Furnished {
                 assets,
                 min_specular,
-            } => json!({"kind": "furnished", "assets": assets, "min_specular": min_specular}),
+                floor_plan,
+            } => {
+                let mut known =
+                    json!({"kind": "furnished", "assets": assets, "min_specular": min_specular});
+                if !is_box(floor_plan) {
+                    known["floor_plan"] = json!(floor_plan);
+                }
+                known
+            }
             SceneKind::Primitive { rooms } if is_living(rooms) => json!({"kind": "primitive"}),
             SceneKind::Primitive { rooms } => json!({"kind": "primitive", "rooms": rooms}),
             SceneKind::Files { files, .. } => match counted {
@@ -271,6 +286,7 @@ struct SceneSourceText {
     kind: String,
     assets: Option<String>,
     min_specular: Option<u32>,
+    floor_plan: Option<FloorPlan>,
     files: Option<Vec<SceneFile>>,
     root: Option<String>,
     /// Only in a lease.
@@ -349,6 +365,7 @@ impl TryFrom<SceneSourceText> for SceneSource {
         };
         only("assets", "furnished", text.assets.is_some())?;
         only("min_specular", "furnished", text.min_specular.is_some())?;
+        only("floor_plan", "furnished", text.floor_plan.is_some())?;
         only("files", "files", text.files.is_some())?;
         only("root", "files", text.root.is_some())?;
         only("first", "files", text.first != 0)?;
@@ -383,6 +400,7 @@ impl TryFrom<SceneSourceText> for SceneSource {
             "furnished" => SceneKind::Furnished {
                 assets: text.assets.unwrap_or_else(|| "auto".into()),
                 min_specular: text.min_specular.unwrap_or(1),
+                floor_plan: text.floor_plan.unwrap_or_default(),
             },
             "primitive" => SceneKind::Primitive {
                 rooms: rooms.over(PrimitiveRooms::LIVING),

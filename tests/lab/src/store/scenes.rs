@@ -6,7 +6,7 @@ use picofarm_dataset::{Dataset, Profile};
 use picofarm_proto::spec::{
     Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, Spots,
 };
-use picofarm_settings::Resolution;
+use picofarm_settings::{FloorPlan, Resolution};
 use picofarm_tasks::Access;
 use tokio_util::sync::CancellationToken;
 
@@ -54,6 +54,7 @@ pub async fn source(
             kind: SceneKind::Furnished {
                 assets: "parametric".into(),
                 min_specular: 1,
+                floor_plan: FloorPlan::Box,
             },
             count: args.scenes,
             seed: args.seed,

@@ -59,6 +59,7 @@ pub(super) fn choose(
             .placed
             .iter()
             .filter_map(|p| p.foot.as_ref())
+            .chain(&plan.solid)
             .any(blocked)
         {
             continue;

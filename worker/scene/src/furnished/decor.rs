@@ -2,13 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::{
-    Material, Mesh,
-    layout::{Footprint, Room},
-    rng::Rng,
-    shape::Shape,
-    trace::Model,
-};
+use crate::{Material, Mesh, layout::Footprint, rng::Rng, shape::Shape, trace::Model};
 
 use super::plan::{Plan, half_of};
 
@@ -54,9 +48,18 @@ fn hang(rng: &mut Rng, plan: &mut Plan<'_>, label: &'static str, mesh: Mesh, y: 
     })
 }
 
-/// Places a door with free floor in front of it, and usually a window.
-pub(super) fn openings(rng: &mut Rng, plan: &mut Plan<'_>) {
-    let room: Room = plan.room;
+/// Hangs a closed door with free floor in front of it, and usually a window with an opaque pane,
+/// unless the room has an open door or a glazed window.
+pub(super) fn doors_and_windows(rng: &mut Rng, plan: &mut Plan<'_>, [open, glazed]: [bool; 2]) {
+    if !open {
+        door(rng, plan);
+    }
+    if !glazed && rng.chance(0.75) {
+        window(rng, plan);
+    }
+}
+
+fn door(rng: &mut Rng, plan: &mut Plan<'_>) {
     let size = [rng.range(0.8, 0.95), rng.range(1.98, 2.1), 0.05];
     let mesh = framed(
         "door",
@@ -74,18 +77,19 @@ pub(super) fn openings(rng: &mut Rng, plan: &mut Plan<'_>) {
         let at = [door.at[0] + s * off, 0.0, door.at[2] + c * off];
         plan.reserved.push(Footprint::new(at, door.yaw, half, 2.0));
     }
-    if rng.chance(0.75) {
-        let size = [rng.range(0.7, 1.3), rng.range(0.8, 1.2), 0.06];
-        let y = rng.range(0.85, 1.05).min(room.height - size[1] - 0.1);
-        let mesh = framed(
-            "window",
-            size,
-            0.06,
-            tone(rng, "frame", 0.75, 0.9),
-            tone(rng, "pane", 0.3, 0.6),
-        );
-        hang(rng, plan, "window", mesh, y);
-    }
+}
+
+fn window(rng: &mut Rng, plan: &mut Plan<'_>) {
+    let size = [rng.range(0.7, 1.3), rng.range(0.8, 1.2), 0.06];
+    let y = rng.range(0.85, 1.05).min(plan.room.height - size[1] - 0.1);
+    let mesh = framed(
+        "window",
+        size,
+        0.06,
+        tone(rng, "frame", 0.75, 0.9),
+        tone(rng, "pane", 0.3, 0.6),
+    );
+    hang(rng, plan, "window", mesh, y);
 }
 
 /// Hangs two to six flat objects on the walls. Mirrors are near-mirrors, and so are half of the

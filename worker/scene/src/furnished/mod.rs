@@ -5,13 +5,14 @@ mod camera;
 mod decor;
 mod furniture;
 mod plan;
+mod shell;
 #[cfg(test)]
 mod tests;
 mod tops;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_settings::Spots;
+use picofarm_settings::{FloorPlan, Spots};
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -44,6 +45,8 @@ pub struct FurnishedSettings {
     pub assets: String,
     /// The least number of specular objects in view, 0 to 4.
     pub specular_at_least: u32,
+    /// The shapes of the rooms.
+    pub floor_plan: FloorPlan,
 }
 
 impl Default for FurnishedSettings {
@@ -56,6 +59,7 @@ impl Default for FurnishedSettings {
             fov_deg: 90.0,
             assets: "parametric".into(),
             specular_at_least: 0,
+            floor_plan: FloorPlan::Box,
         }
     }
 }
@@ -161,10 +165,16 @@ fn furnish<'a>(
         surface(rng, "ceiling", 0.75, 0.9),
         surface(rng, "wall", 0.45, 0.9),
     );
-    for (label, mesh) in room.shell(floor, ceiling, wall) {
-        plan.fix(mesh, label);
-    }
-    decor::openings(rng, &mut plan);
+    let [door, window] = match settings.floor_plan {
+        FloorPlan::Box => {
+            for (label, mesh) in room.shell(floor, ceiling, wall) {
+                plan.fix(mesh, label);
+            }
+            [false; 2]
+        }
+        FloorPlan::Varied => shell::varied(rng, &mut plan, [floor, ceiling, wall]),
+    };
+    decor::doors_and_windows(rng, &mut plan, [door, window]);
     furniture::anchors(rng, &mut plan, kind);
     furniture::groups(rng, &mut plan, kind);
     furniture::clutter(rng, &mut plan);

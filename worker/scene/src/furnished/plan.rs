@@ -38,6 +38,8 @@ pub(super) struct Plan<'a> {
     pub(super) placed: Vec<Placed>,
     /// Reserved free space, in front of the door.
     pub(super) reserved: Vec<Footprint>,
+    /// The corner that an L-shaped room lacks.
+    pub(super) solid: Option<Footprint>,
 }
 
 /// Returns half of a model's extents on the plan.
@@ -53,6 +55,7 @@ impl<'a> Plan<'a> {
             assets,
             placed: Vec::new(),
             reserved: Vec::new(),
+            solid: None,
         }
     }
 
@@ -136,7 +139,8 @@ impl<'a> Plan<'a> {
         let taken = self.placed.iter().enumerate().any(|(k, p)| {
             Some(k) != support && p.foot.as_ref().is_some_and(|other| other.overlaps(foot))
         });
-        self.room.holds(foot) && !taken && !self.reserved.iter().any(|r| r.overlaps(foot))
+        let mut closed = self.reserved.iter().chain(&self.solid);
+        self.room.holds(foot) && !taken && !closed.any(|r| r.overlaps(foot))
     }
 
     /// Returns all placed objects, ready for rays; indices are those of `placed`.

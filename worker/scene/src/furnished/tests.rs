@@ -2,10 +2,19 @@
 
 use super::{FurnishedSettings, furnish, plan::Plan, tops::TOPS};
 use crate::{AssetLibrary, Vec3, rng::Rng};
+use picofarm_settings::FloorPlan;
 
 fn for_each_room(check: impl Fn(u64, &Plan<'_>)) {
+    for_each_room_of(FloorPlan::Box, &check);
+    for_each_room_of(FloorPlan::Varied, &check);
+}
+
+fn for_each_room_of(floor_plan: FloorPlan, check: impl Fn(u64, &Plan<'_>)) {
     let assets = AssetLibrary::parametric();
-    let settings = FurnishedSettings::default();
+    let settings = FurnishedSettings {
+        floor_plan,
+        ..FurnishedSettings::default()
+    };
     for seed in 0..30 {
         let (plan, _) = furnish(&mut Rng::new(seed, 0), &settings, &assets);
         check(seed, &plan);
@@ -81,4 +90,77 @@ fn rooms_are_furnished_and_differ() {
             .extend(plan.placed.iter().map(|p| p.label));
     });
     assert!(kinds.borrow().len() >= 40, "{:?}", kinds.borrow());
+}
+
+#[test]
+fn varied_rooms_are_closed_and_furniture_stays_out_of_the_missing_corner() {
+    let (mut l_shaped, mut open, mut glazed) = (0, 0, 0);
+    let is_glass = |p: &super::plan::Placed| {
+        let bsdf = p.model.mesh.materials[0].bsdf;
+        matches!(bsdf, crate::Bsdf::ThinDielectric { .. })
+    };
+    let assets = AssetLibrary::parametric();
+    let settings = FurnishedSettings {
+        floor_plan: FloorPlan::Varied,
+        ..FurnishedSettings::default()
+    };
+    for seed in 0..60 {
+        let (plan, _) = furnish(&mut Rng::new(seed, 0), &settings, &assets);
+        let world = plan.world();
+        // Rays from the air of the room, in every direction: none leaves, through no gap.
+        let mut rng = Rng::new(seed, 99);
+        let mut rays = 0;
+        while rays < 2000 {
+            let [w, d, h] = [plan.room.width, plan.room.depth, plan.room.height];
+            let from = Vec3::new(
+                rng.range(-0.49, 0.49) * w,
+                rng.range(0.01, 0.99) * h,
+                rng.range(-0.49, 0.49) * d,
+            );
+            if plan.solid.is_some_and(|s| s.contains(from, 0.01)) {
+                continue;
+            }
+            rays += 1;
+            let mut along = || rng.range(-1.0, 1.0);
+            let direction = Vec3::new(along(), along(), along()).normalized();
+            let mut at = from;
+            // Glass lets light pass.
+            let hit = loop {
+                let hit = world.closest(at, direction);
+                match hit {
+                    Some(h) if is_glass(&plan.placed[h.object]) => {
+                        at += direction * (h.t + 1e-4);
+                    }
+                    other => break other,
+                }
+            };
+            let hit = hit.unwrap_or_else(|| panic!("seed {seed}: {from:?} {direction:?} escapes"));
+            let end = at + direction * hit.t;
+            let corner = plan.solid.is_some_and(|s| s.contains(end, -0.01));
+            assert!(!corner, "seed {seed}: light enters the missing corner");
+        }
+        if let Some(solid) = &plan.solid {
+            l_shaped += 1;
+            let inside = |f: &crate::layout::Footprint| f.overlaps(solid);
+            assert!(
+                !plan
+                    .placed
+                    .iter()
+                    .any(|p| p.foot.as_ref().is_some_and(inside))
+            );
+        }
+        let has = |label| {
+            let of_room = |p: &&super::plan::Placed| p.label == label && p.foot.is_none();
+            usize::from(plan.placed.iter().any(|p| of_room(&p)))
+        };
+        open += has("door");
+        glazed += has("window");
+    }
+    for (what, rooms) in [
+        ("L-shaped", l_shaped),
+        ("open door", open),
+        ("glazed", glazed),
+    ] {
+        assert!((15..=50).contains(&rooms), "{what}: {rooms} of 60 rooms");
+    }
 }

@@ -62,6 +62,7 @@ pub(crate) fn scene(
         SceneKind::Furnished {
             assets,
             min_specular,
+            floor_plan,
         } => {
             let library = library(assets, libraries)?;
             let settings = FurnishedSettings {
@@ -72,6 +73,7 @@ pub(crate) fn scene(
                 fov_deg,
                 assets: library.name().to_owned(),
                 specular_at_least: *min_specular,
+                floor_plan: *floor_plan,
             };
             furnished::generate(seed, &settings, library).map_err(scene_error)
         }

@@ -174,6 +174,7 @@ async fn a_furnished_room_is_generated_with_the_furniture_that_the_job_names() {
     place.spec.scenes.kind = SceneKind::Furnished {
         assets: "parametric-1".into(),
         min_specular: 1,
+        floor_plan: picofarm_settings::FloorPlan::Box,
     };
     let output = place.run(0).await.unwrap();
     assert!(!output.adopted && output.bytes > 0);
@@ -185,6 +186,7 @@ async fn furniture_that_is_not_here_fails_the_task_and_says_how_to_get_it() {
     place.spec.scenes.kind = SceneKind::Furnished {
         assets: "sweethome3d-0000".into(),
         min_specular: 1,
+        floor_plan: picofarm_settings::FloorPlan::Box,
     };
     let text = place.complaint(0).await;
     assert!(

@@ -75,7 +75,7 @@ impl Place {
         }
         let furnished = made(
             "furnished",
-            json!({"assets": "parametric", "min_specular": 2}),
+            json!({"assets": "parametric", "min_specular": 2, "floor_plan": "varied"}),
         );
         let files = made("files", json!({"files": names}));
         let mut all = vec![furnished, primitive, files];
