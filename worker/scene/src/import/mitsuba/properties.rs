@@ -228,7 +228,7 @@ pub(super) const FILM: Properties = with(
         "auto_detect_bins",
         "path_min",
         "path_max",
-        "path_samples",
+        "path_sample",
     ],
     &[],
 );
