@@ -68,18 +68,14 @@ impl JobText {
             )
         };
         if self.stage.is_empty() {
-            let task = RenderTask {
-                scenes: self
-                    .scenes
-                    .take()
-                    .ok_or_else(|| missing("scenes", "say which scenes are rendered"))?,
-                render: self.render.take().unwrap_or_default(),
-                output: self
-                    .output
-                    .take()
-                    .ok_or_else(|| missing("output", "say where results go"))?,
-                parts: self.parts.unwrap_or(1),
-            };
+            let scenes = self.scenes.take();
+            let output = self.output.take();
+            let task = RenderTask::new(
+                scenes.ok_or_else(|| missing("scenes", "say which scenes are rendered"))?,
+                self.render.take().unwrap_or_default(),
+                output.ok_or_else(|| missing("output", "say where results go"))?,
+                self.parts,
+            );
             stages.push(StageSpec {
                 resources: std::mem::take(&mut self.resources),
                 ..StageSpec::new(TaskSpec::Render(task))

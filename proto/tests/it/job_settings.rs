@@ -178,3 +178,23 @@ fn settings_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() 
         assert!(error.what.contains(word), "{error}");
     }
 }
+
+#[test]
+fn the_automatic_profile_is_as_coarse_as_the_error_of_the_render_allows() {
+    let profile = |budget: &str| {
+        let spec: JobSpec = toml::from_str(&format!(
+            "name = \"test\"\n[scenes]\nkind = \"primitive\"\ncount = 3\nseed = 1\n[render]\nresolution = 16\n\
+             {budget}\n[output]\nstore = \"/store\"\ndataset = \"rooms\"\nprofile = \"auto\"\n"
+        ))
+        .unwrap();
+        spec.check().unwrap();
+        let TaskSpec::Render(task) = &spec.stages[0].task else {
+            panic!("a render stage")
+        };
+        task.output.profile.clone()
+    };
+    assert_eq!(profile("samples = 64"), "sqrt-u16");
+    assert_eq!(profile("error = \"2%\""), "sqrt-u16");
+    assert_eq!(profile("error = \"10%\""), "balanced");
+    assert_eq!(profile("error = \"20%\""), "coarse");
+}

@@ -73,7 +73,7 @@ pub fn template(kind: JobKind) -> String {
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\
-         profile = \"sqrt-u16\"            # or: coarse, plain-f32, lossless\n\n\
+         profile = \"sqrt-u16\"            # or: auto (as coarse as render.error allows), balanced, coarse, plain-f32, lossless\n\n\
          [limits]\n\
          max_failures = 3          # failures of a task before it is given up\n\
          max_crashes = 3           # losses of its worker before a task is given up\n\

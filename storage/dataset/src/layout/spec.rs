@@ -148,6 +148,8 @@ impl From<Subsets> for Vec<u32> {
 }
 
 impl Profile {
+    /// The square-root code with Δ = 0.5: a rms error of an eighth of the photon noise.
+    pub const BALANCED: Self = Self::SqrtU16 { delta: 0.5 };
     /// The square-root code with Δ = 1: half the bytes, with an error still below the photon noise.
     pub const COARSE: Self = Self::SqrtU16 { delta: 1.0 };
     /// Floats rounded to a quarter of the photon noise.
@@ -155,11 +157,19 @@ impl Profile {
     /// Floats without rounding.
     pub const LOSSLESS: Self = Self::PlainF32 { round: 0.0 };
     /// The names accepted by [`Self::parse`].
-    pub const NAMES: [&str; 5] = ["sqrt-u16", "coarse", "plain-f32", "lossless", "counts-u16"];
+    pub const NAMES: [&str; 6] = [
+        "sqrt-u16",
+        "balanced",
+        "coarse",
+        "plain-f32",
+        "lossless",
+        "counts-u16",
+    ];
 
     /// Returns the profile's name in job specifications.
     pub fn name(&self) -> &'static str {
         match self {
+            Self::SqrtU16 { delta: 0.5 } => "balanced",
             Self::SqrtU16 { delta: 1.0 } => "coarse",
             Self::SqrtU16 { .. } => "sqrt-u16",
             Self::PlainF32 { round: 0.0 } => "lossless",
@@ -185,6 +195,7 @@ impl Profile {
     pub fn parse(name: &str) -> Result<Self, String> {
         match name {
             "sqrt-u16" => Ok(Self::default()),
+            "balanced" => Ok(Self::BALANCED),
             "coarse" => Ok(Self::COARSE),
             "plain-f32" => Ok(Self::PLAIN),
             "lossless" => Ok(Self::LOSSLESS),

@@ -31,6 +31,7 @@ async fn errors_stay_within_the_promise_and_the_manifest_states_them() {
     // The square root's bound is Δ/2 + Δ²/16.
     let promised = [
         ("sqrt-u16", 0.1 + 0.0025),
+        ("balanced", 0.25 + 0.0156),
         ("coarse", 0.5 + 0.0625),
         ("plain-f32", 0.25),
         ("lossless", 0.0),
