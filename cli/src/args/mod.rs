@@ -20,6 +20,7 @@ mod scene;
 mod secrets;
 pub mod strategy;
 mod sweep;
+mod web;
 
 use std::{ffi::OsString, path::PathBuf};
 
@@ -42,6 +43,7 @@ pub use render::{GateArgs, GateChoice, ImageSize, RenderArgs, ScenePlan, SceneRe
 pub use scene::{FormatArg, GeneratorArg, PlatoArg, Scene, SceneExport, SceneSense};
 pub use secrets::without_secrets;
 pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
+pub use web::{WEB, Web};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]
@@ -153,6 +155,8 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Run a worker
     Worker(Worker),
+    /// Show a farm, its data sets and light in flight in a browser
+    Web(Web),
     /// The process of a worker that `up` or `demo` starts
     #[command(hide = true)]
     LocalWorker,
