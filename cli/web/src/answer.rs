@@ -9,7 +9,7 @@ use std::{
 
 use bytes::Bytes;
 use flate2::{Compression, write::GzEncoder};
-use http::{HeaderName, HeaderValue, Response, StatusCode, header};
+use http::{HeaderMap, HeaderName, HeaderValue, Response, StatusCode, header};
 use http_body::{Frame, SizeHint};
 use tokio::sync::mpsc;
 
@@ -134,19 +134,34 @@ pub fn answer(status: StatusCode, media: &'static str, body: impl Into<Bytes>) -
     answer
 }
 
-/// Like [`answer`] with status 200, compressed.
-pub fn compressed(media: &'static str, body: &[u8], level: u32) -> Answer {
-    let mut answer = answer(StatusCode::OK, media, gzip(body, level));
-    let gzip = HeaderValue::from_static("gzip");
-    answer.headers_mut().insert(header::CONTENT_ENCODING, gzip);
+/// The level of gzip for a body, from 1 to 9.
+#[derive(Clone, Copy)]
+struct Level(u32);
+
+/// Like [`answer`] with status 200, for bodies that are worth to be compressed.
+pub fn compressed(media: &'static str, body: impl Into<Bytes>, level: u32) -> Answer {
+    let mut answer = answer(StatusCode::OK, media, body);
+    answer.extensions_mut().insert(Level(level));
     answer
 }
 
-/// Compresses bytes; every browser expands them.
-pub fn gzip(body: &[u8], level: u32) -> Vec<u8> {
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::new(level));
-    let written = encoder.write_all(body).and_then(|()| encoder.finish());
-    written.expect("memory takes all bytes")
+/// Compresses the body where that is worth it and the client accepts it.
+pub fn encode(headers: &HeaderMap, mut answer: Answer) -> Answer {
+    let Some(Level(level)) = answer.extensions_mut().remove() else {
+        return answer;
+    };
+    let accepts = headers.get(header::ACCEPT_ENCODING);
+    let accepts = accepts.and_then(|accepts| accepts.to_str().ok());
+    let mut codings = accepts.unwrap_or_default().split(',');
+    let gzip = codings.any(|coding| coding.trim() == "gzip");
+    if let (true, Body::Whole(Some(body))) = (gzip, answer.body_mut()) {
+        let mut encoder = GzEncoder::new(Vec::new(), Compression::new(level));
+        let written = encoder.write_all(body).and_then(|()| encoder.finish());
+        *body = written.expect("memory takes all bytes").into();
+        let gzip = HeaderValue::from_static("gzip");
+        answer.headers_mut().insert(header::CONTENT_ENCODING, gzip);
+    }
+    answer
 }
 
 /// Returns an answer whose parts are sent as they are made.

@@ -87,30 +87,30 @@ pub async fn bytes(app: &Arc<App>, what: &str, query: &Query) -> Result<Answer, 
         "value" => {
             let pixel = pixel()?;
             let truth = app.stores.truth(app, &id).await?;
-            compressed(JSON, truth.values(pixel)?.to_string().as_bytes(), 1)
+            compressed(JSON, truth.values(pixel)?.to_string(), 1)
         }
         "flight" => {
             let light = Light::of(query)?;
             let truth = app.stores.truth(app, &id).await?;
             let volume = app.stores.volume(app, &id, light).await?;
             let facts = json!({"volume": volume.facts(), "scene": truth.facts()});
-            compressed(JSON, facts.to_string().as_bytes(), 1)
+            compressed(JSON, facts.to_string(), 1)
         }
         "coarse" => {
             let volume = app.stores.volume(app, &id, Light::of(query)?).await?;
-            compressed(BINARY, volume.coarse(), 1)
+            compressed(BINARY, volume.coarse().to_vec(), 1)
         }
         "slab" => {
             let (from, to) = (query.required("from")?, query.required("to")?);
             let volume = app.stores.volume(app, &id, Light::of(query)?).await?;
-            compressed(BINARY, volume.slab(from, to)?, 1)
+            compressed(BINARY, volume.slab(from, to)?.to_vec(), 1)
         }
         "pixel" => {
             let pixel = pixel()?;
             let truth = app.stores.truth(app, &id).await?;
             let volume = app.stores.volume(app, &id, Light::of(query)?).await?;
             let found = histogram::of_pixel(&truth, &volume, pixel)?;
-            compressed(JSON, found.to_string().as_bytes(), 1)
+            compressed(JSON, found.to_string(), 1)
         }
         _ => return Err(Problem::missing(format!("there is no /bytes/{what}"))),
     })

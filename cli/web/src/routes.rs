@@ -20,6 +20,10 @@ const ACTS: [&str; 4] = ["cancel", "pause", "resume", "retry"];
 
 /// Answers a request. `form` is the body of a POST.
 pub async fn answer(app: &Arc<App>, head: &Parts, form: &str) -> Answer {
+    answer::encode(&head.headers, find(app, head, form).await)
+}
+
+async fn find(app: &Arc<App>, head: &Parts, form: &str) -> Answer {
     if let Err(why) = app.guard.check_host(&head.headers) {
         let status = StatusCode::MISDIRECTED_REQUEST;
         return answer::answer(status, TEXT, why + "\n");
@@ -90,7 +94,7 @@ fn admit(app: &App, head: &Parts) -> Answer {
 
 fn page(app: &App, status: StatusCode, page: &pages::Page) -> Answer {
     let html = pages::layout(app, page).into_string();
-    let mut answer = compressed(HTML, html.as_bytes(), 5);
+    let mut answer = compressed(HTML, html, 5);
     *answer.status_mut() = status;
     answer
 }
