@@ -91,8 +91,8 @@ pub async fn bytes(app: &Arc<App>, what: &str, query: &Query) -> Result<Answer, 
         }
         "flight" => {
             let light = Light::of(query)?;
-            let truth = app.stores.truth(app, &id).await?;
-            let volume = app.stores.volume(app, &id, light).await?;
+            let truth = app.stores.truth(app, &id);
+            let (truth, volume) = tokio::try_join!(truth, app.stores.volume(app, &id, light))?;
             let facts = json!({"volume": volume.facts(), "scene": truth.facts()});
             compressed(JSON, facts.to_string(), 1)
         }
@@ -109,7 +109,11 @@ pub async fn bytes(app: &Arc<App>, what: &str, query: &Query) -> Result<Answer, 
             let pixel = pixel()?;
             let truth = app.stores.truth(app, &id).await?;
             let volume = app.stores.volume(app, &id, Light::of(query)?).await?;
-            let found = histogram::of_pixel(&truth, &volume, pixel)?;
+            let parts = app.stores.parts(app, &id).await?;
+            let parts = parts
+                .as_ref()
+                .map(|parts| parts.each_ref().map(|part| &**part));
+            let found = histogram::of_pixel(&truth, &volume, parts, pixel)?;
             compressed(JSON, found.to_string(), 1)
         }
         _ => return Err(Problem::missing(format!("there is no /bytes/{what}"))),

@@ -19,8 +19,8 @@ use crate::{
 const CONNECTIONS: usize = 128;
 /// Most pages that get events.
 const LIVE: usize = 48;
-/// Most volumes and pictures that are made at a time; further requests wait.
-const HEAVY: usize = 2;
+/// Most scenes whose images are read at a time; further requests wait.
+const IMAGES: usize = 2;
 /// The longest request head, bytes.
 const HEAD: usize = 16 << 10;
 /// The longest body of a form, bytes.
@@ -32,15 +32,19 @@ const PATIENCE: Duration = Duration::from_secs(10);
 pub struct Limits {
     /// Pages that get events.
     pub live: Arc<Semaphore>,
-    /// Work with whole scenes.
-    pub heavy: Semaphore,
+    /// Scenes whose images are read.
+    pub images: Semaphore,
+    /// Volumes that are read: one at a time, because each may need a gigabyte, and so that requests
+    /// for parts of the same one wait for it.
+    pub volumes: Semaphore,
 }
 
 impl Default for Limits {
     fn default() -> Self {
         Self {
             live: Arc::new(Semaphore::new(LIVE)),
-            heavy: Semaphore::new(HEAVY),
+            images: Semaphore::new(IMAGES),
+            volumes: Semaphore::new(1),
         }
     }
 }

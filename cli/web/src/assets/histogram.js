@@ -40,6 +40,9 @@ export class Histogram {
     for (const spot of pixel.two) if (spot.lit) mark(spot.path_m, 1);
     if (pixel.one) mark(pixel.one.path_m, 2);
     this.kinds = kinds;
+    // What the render tells apart needs no prediction.
+    this.parts = pixel.parts && [pixel.parts[1], pixel.parts[0],
+      h.map((v, b) => { const one = v - pixel.parts[0][b] - pixel.parts[1][b]; return one > 0.05 * v ? one : 0; })];
     const first = h.findIndex((v) => v > 0), end = h.length - [...h].reverse().findIndex((v) => v > 0);
     this.lit = first < 0 ? [0, h.length] : [Math.max(0, first - 4), Math.min(h.length, end + 4)];
   }
@@ -52,9 +55,12 @@ export class Histogram {
     let peak = 0;
     for (let b = 1; b < h.length; b++) if (h[b] > h[peak]) peak = b;
     const of = [0, 0, 0];
-    h.forEach((v, b) => { of[this.kinds[b]] += v; });
+    if (this.parts) this.parts.forEach((part, kind) => { of[kind] = part.reduce((a, b) => a + b, 0); });
+    else h.forEach((v, b) => { of[this.kinds[b]] += v; });
     const share = (x) => `${(100 * x / sum).toFixed(0)} %`;
     const lit = two.filter((spot) => spot.lit).length;
+    if (this.parts) return `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns · rendered apart: ${share(of[2])} one bounce, ` +
+      `${share(of[1])} two bounces from ${lit} of ${two.length} spots, ${share(of[0])} three and more`;
     return `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns` +
       (one ? ` · ${share(of[2])} at the time of one bounce (spot ${one.spot})` : '') +
       ` · ${share(of[1])} at times of two bounces, from ${lit} of ${two.length} spots`;
@@ -90,11 +96,16 @@ export class Histogram {
     c.fillRect(x(time), top, Math.max(1.5, x(time + shutter) - x(time)), bottom - top);
     c.globalAlpha = 1;
     const colours = [css('--more'), css('--two'), css('--one')];
+    const bar = (b, v, colour) => {
+      if (v <= floor) return;
+      c.fillStyle = colour;
+      c.fillRect(x(b), y(v), Math.max(0.75, x(b + 1) - x(b)), bottom - y(v));
+    };
     for (let b = lo; b < hi; b++) {
-      if (h[b] <= 0) continue;
-      c.fillStyle = colours[this.kinds[b]];
-      const left = x(b);
-      c.fillRect(left, y(h[b]), Math.max(0.75, x(b + 1) - left), bottom - y(h[b]));
+      if (!this.parts) { bar(b, h[b], colours[this.kinds[b]]); continue; }
+      // The greatest part is behind the others.
+      const parts = this.parts.map((part, kind) => [part[b], kind]).sort((p, q) => q[0] - p[0]);
+      for (const [v, kind] of parts) bar(b, v, colours[kind]);
     }
     c.lineWidth = 1;
     const line = (path, colour, dash, name) => {

@@ -5,13 +5,19 @@ use serde_json::{Value, json};
 use super::{Truth, truth::METRES_PER_NS, volume::Volume};
 use crate::answer::Problem;
 
-/// Returns h of each bin, the time of the pixel's own spot, and for each spot the time of its
+/// Returns h of each bin, h of two bounces and of three and more where the render has these `parts`,
+/// the time of the pixel's own spot, and for each spot the time of its
 /// two-bounce light: laser to spot, spot to the pixel's surface point, and from there to the camera
 /// (the two-bounce time of flight of PlatoNeRF, Klinghoffer et al., CVPR 2024).
 ///
 /// # Errors
 /// Fails outside of the image.
-pub fn of_pixel(truth: &Truth, volume: &Volume, at: [u64; 2]) -> Result<Value, Problem> {
+pub fn of_pixel(
+    truth: &Truth,
+    volume: &Volume,
+    parts: Option<[&Volume; 2]>,
+    at: [u64; 2],
+) -> Result<Value, Problem> {
     let pixel = truth.pixel(at)?;
     let lit = truth.lit_by(pixel);
     let point = truth.point(pixel);
@@ -37,7 +43,8 @@ pub fn of_pixel(truth: &Truth, volume: &Volume, at: [u64; 2]) -> Result<Value, P
         inside.then(|| json!({"spot": i, "path_m": path, "ns": path / METRES_PER_NS}))
     });
     Ok(json!({
-        "h": volume.histogram(pixel), "one": own, "two": two, "values": truth.values(at)?,
+        "h": volume.histogram(pixel), "parts": parts.map(|parts| parts.map(|p| p.histogram(pixel))),
+        "one": own, "two": two, "values": truth.values(at)?,
     }))
 }
 

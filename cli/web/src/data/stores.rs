@@ -14,7 +14,7 @@ use tokio::sync::Mutex;
 use super::{
     SceneId, Truth,
     cache::Cache,
-    volume::{Light, Volume},
+    volume::{Light, Volume, has_parts},
 };
 use crate::{App, answer::Problem};
 
@@ -154,7 +154,7 @@ impl Stores {
         if let Some(truth) = self.truths.get(id) {
             return Ok(truth);
         }
-        let _place = app.limits.heavy.acquire().await;
+        let _place = app.limits.images.acquire().await;
         if let Some(truth) = self.truths.get(id) {
             return Ok(truth);
         }
@@ -179,7 +179,7 @@ impl Stores {
         if let Some(volume) = self.volumes.get(&key) {
             return Ok(volume);
         }
-        let _place = app.limits.heavy.acquire().await;
+        let _place = app.limits.volumes.acquire().await;
         // Another request may have read it meanwhile.
         if let Some(volume) = self.volumes.get(&key) {
             return Ok(volume);
@@ -190,6 +190,26 @@ impl Stores {
         self.volumes
             .insert(key, Arc::clone(&volume), volume.bytes());
         Ok(volume)
+    }
+}
+
+impl Stores {
+    /// Returns the light of two bounces, and that of three and more, of a render that has them
+    /// apart; `None` otherwise.
+    ///
+    /// # Errors
+    /// Fails if the scene cannot be read.
+    pub async fn parts(
+        &self,
+        app: &App,
+        id: &SceneId,
+    ) -> Result<Option<[Arc<Volume>; 2]>, Problem> {
+        let folder = self.folder(&id.set)?;
+        if folder.as_deref().is_none_or(|folder| !has_parts(folder)) {
+            return Ok(None);
+        }
+        let two = self.volume(app, id, Light::Two).await?;
+        Ok(Some([two, self.volume(app, id, Light::More).await?]))
     }
 }
 

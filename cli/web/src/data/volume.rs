@@ -83,10 +83,7 @@ pub fn lights(spec: &DatasetSpec, folder: Option<&std::path::Path>) -> Vec<(Ligh
     if has(Q::Transient4) {
         all.push((Light::Four, "4 of 100 spots".into()));
     }
-    if let Some(group) = folder.and_then(parts)
-        && group.has("two")
-        && group.has("multi")
-    {
+    if folder.is_some_and(has_parts) {
         all.push((Light::Two, "two bounces".into()));
         all.push((Light::More, "three bounces and more".into()));
     }
@@ -95,6 +92,11 @@ pub fn lights(spec: &DatasetSpec, folder: Option<&std::path::Path>) -> Vec<(Ligh
         all.extend(spots);
     }
     all
+}
+
+/// Returns whether a folder has a render with the light of two bounces and of more apart.
+pub fn has_parts(folder: &std::path::Path) -> bool {
+    parts(folder).is_some_and(|group| group.has("two") && group.has("multi"))
 }
 
 /// The group with the parts of a single render.

@@ -91,16 +91,16 @@ fn summary(job: &JobStatus) -> Markup {
     html! {
         (bar(&job.tasks))
         dl.line {
-            dt { "tasks" } dd { (count(&job.tasks)) }
-            dt { "reused" } dd { (job.tasks.reused) }
-            dt { "dead" } dd { (job.tasks.dead) }
-            dt { "took" } dd { (seconds((end - job.submitted_at_ms) as f64 / 1000.0)) }
-            @if let Some(left) = left { dt { "left" } dd { "about " (seconds(left)) } }
-            @if let Some(mean) = job.mean_task_seconds { dt { "per task" } dd { (seconds(mean)) } }
-            @if job.workers > 0 { dt { "workers" } dd { (job.workers) } }
-            @if !job.user.is_empty() { dt { "user" } dd { (safe(&job.user)) } }
-            dt { "submitted" } dd { (time(job.submitted_at_ms)) }
-            dt { "id" } dd { code { (job.id) } }
+            div { dt { "tasks" } dd { (count(&job.tasks)) } }
+            div { dt { "reused" } dd { (job.tasks.reused) } }
+            div { dt { "dead" } dd { (job.tasks.dead) } }
+            div { dt { "took" } dd { (seconds((end - job.submitted_at_ms) as f64 / 1000.0)) } }
+            @if let Some(left) = left { div { dt { "left" } dd { "about " (seconds(left)) } } }
+            @if let Some(mean) = job.mean_task_seconds { div { dt { "per task" } dd { (seconds(mean)) } } }
+            @if job.workers > 0 { div { dt { "workers" } dd { (job.workers) } } }
+            @if !job.user.is_empty() { div { dt { "user" } dd { (safe(&job.user)) } } }
+            div { dt { "submitted" } dd { (time(job.submitted_at_ms)) } }
+            div { dt { "id" } dd { code { (job.id) } } }
         }
         @if job.unverified > 0 {
             p.hint { (job.unverified) " results were reported and not found in their store yet." }

@@ -44,7 +44,7 @@ pub async fn farm(app: &App) -> Result<Page, Problem> {
     let ((jobs, _), workers, events) = (jobs?, workers?, events?);
     let all = &workers.workers;
     let cores: u32 = all.iter().map(|w| w.cores).sum();
-    let running: u64 = jobs.iter().map(|job| job.tasks.leased).sum();
+    let leased: u64 = jobs.iter().map(|job| job.tasks.leased).sum();
     let waiting = jobs.iter().filter(|job| {
         job.state == JobState::Active && job.tasks.leased == 0 && job.tasks.pending > 0
     });
@@ -59,7 +59,7 @@ pub async fn farm(app: &App) -> Result<Page, Problem> {
         section #facts.facts aria-label="Summary" {
             (fact("workers", &(all.len() as u64 + u64::from(workers.elsewhere)).to_string()))
             (fact("cores", &cores.to_string()))
-            (fact("tasks running", &thousands(running)))
+            (fact("tasks leased", &thousands(leased)))
             (fact(&format!("tasks done, {}", hour.span()), &hour.done_text()))
             figure.hour {
                 figcaption { "tasks done per 2 minutes, last hour" }
@@ -228,9 +228,9 @@ impl Hour {
         html! {
             svg.chart viewBox="0 0 120 24" preserveAspectRatio="none" role="img" aria-label=(label) {
                 @for (i, n) in self.slots.iter().enumerate() {
-                    @let height = 23.0 * *n as f64 / most.max(1) as f64;
-                    rect x=(4 * i) width="3" y=(format!("{:.2}", 23.0 - height))
-                        height=(format!("{:.2}", height + 1.0)) {}
+                    @let height = if *n == 0 { 0.0 } else { 1.0 + 22.0 * *n as f64 / most as f64 };
+                    rect x=(4 * i) width="3" y=(format!("{:.2}", 24.0 - height))
+                        height=(format!("{height:.2}")) {}
                 }
             }
             span.most { (most) }

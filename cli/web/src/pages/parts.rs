@@ -73,7 +73,8 @@ pub fn bytes(count: u64) -> String {
 /// The beginning of a job's id, as a link.
 pub fn job_link(job: JobId) -> Markup {
     let id = job.to_string();
-    let short = id.get(..8).unwrap_or(&id);
+    // The first twelve digits are a time, so that fewer would be equal within a minute.
+    let short = id.get(..13).unwrap_or(&id);
     html! { a.id href={ "/jobs/" (id) } title=(id) { (short) } }
 }
 
