@@ -91,9 +91,10 @@ pub async fn bytes(app: &Arc<App>, what: &str, query: &Query) -> Result<Answer, 
         }
         "flight" => {
             let light = Light::of(query)?;
-            let truth = app.stores.truth(app, &id);
-            let (truth, volume) = tokio::try_join!(truth, app.stores.volume(app, &id, light))?;
-            let facts = json!({"volume": volume.facts(), "scene": truth.facts()});
+            let dataset = app.stores.dataset(&id.set).await?;
+            let scene = truth::facts(&dataset, id.scene).await?;
+            let volume = app.stores.volume(app, &id, light).await?;
+            let facts = json!({"volume": volume.facts(), "scene": scene});
             compressed(JSON, facts.to_string(), 1)
         }
         "coarse" => {

@@ -141,7 +141,9 @@ fn a_browser_cancels_a_job_by_its_form_and_not_by_a_link() {
 
     visit(&browser, &page);
     browser.run("document.getElementById('act-pause').click()");
-    browser.until("document.getElementById('act-resume')");
+    browser.until("document.getElementById('act-resume') || document.querySelector('.problem')");
+    let problem = browser.run("return document.querySelector('.problem')?.textContent ?? ''");
+    assert_eq!(problem, "", "the form is accepted");
     assert_eq!(farm.status(&job)["paused"], true);
     // The page follows what others do.
     farm.json(&["job", "resume", &job]);

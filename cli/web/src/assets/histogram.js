@@ -40,9 +40,10 @@ export class Histogram {
     for (const spot of pixel.two) if (spot.lit) mark(spot.path_m, 1);
     if (pixel.one) mark(pixel.one.path_m, 2);
     this.kinds = kinds;
-    // What the render tells apart needs no prediction.
+    // What the render tells apart needs no prediction. The remainder of rounding is no light.
+    const most = h.reduce((a, b) => Math.max(a, b), 0);
     this.parts = pixel.parts && [pixel.parts[1], pixel.parts[0],
-      h.map((v, b) => { const one = v - pixel.parts[0][b] - pixel.parts[1][b]; return one > 0.05 * v ? one : 0; })];
+      h.map((v, b) => { const one = v - pixel.parts[0][b] - pixel.parts[1][b]; return one > 0.02 * most ? one : 0; })];
     const first = h.findIndex((v) => v > 0), end = h.length - [...h].reverse().findIndex((v) => v > 0);
     this.lit = first < 0 ? [0, h.length] : [Math.max(0, first - 4), Math.min(h.length, end + 4)];
   }

@@ -37,8 +37,6 @@ pub struct Truth {
     pub intrinsics: Intrinsics,
     /// Names of the labels; empty if they are not known.
     pub names: Vec<String>,
-    /// Origin of the laser, camera frame, metres.
-    pub laser: Vec<f32>,
 }
 
 impl Truth {
@@ -66,7 +64,6 @@ impl Truth {
             names: names
                 .map(|name| name.as_str().unwrap_or_default().to_owned())
                 .collect(),
-            laser: dataset.read(scene, Q::Laser).await?,
         })
     }
 
@@ -111,9 +108,7 @@ impl Truth {
 
     /// Returns where a spot is in the image, in pixels; `None` behind the camera.
     pub fn film(&self, spot: &Spot) -> Option<[f32; 2]> {
-        let [x, y, z] = spot.position;
-        let i = &self.intrinsics;
-        (z > 0.0).then(|| [i.fx * x / z + i.cx, i.fy * y / z + i.cy])
+        film(&self.intrinsics, spot)
     }
 
     /// Returns the spots that light a pixel.
@@ -141,17 +136,23 @@ impl Truth {
             "rgb": &self.rgb[3 * pixel..][..3], "lit_by": self.lit_by(pixel),
         }))
     }
+}
 
-    /// Returns what the page of light in flight needs.
-    pub fn facts(&self) -> Value {
-        let spots = self.spots.iter().map(|spot| {
-            spot.as_ref().map(|spot| {
-                json!({"film": self.film(spot), "position_m": spot.position, "path_m": spot.path_m})
-            })
-        });
-        json!({
-            "spots": spots.collect::<Vec<_>>(), "laser_m": self.laser,
-            "width": self.spec.width, "height": self.spec.height,
-        })
-    }
+fn film(i: &Intrinsics, spot: &Spot) -> Option<[f32; 2]> {
+    let [x, y, z] = spot.position;
+    (z > 0.0).then(|| [i.fx * x / z + i.cx, i.fy * y / z + i.cy])
+}
+
+/// Returns what the player of light in flight needs besides the volume.
+///
+/// # Errors
+/// Fails if the scene is not there or is damaged.
+pub async fn facts(dataset: &Dataset, scene: u64) -> Result<Value, StorageError> {
+    let (spots, i) = (dataset.read_spots(scene), dataset.read_intrinsics(scene));
+    let (spots, i) = futures::try_join!(spots, i)?;
+    let spots = spots.iter().map(|spot| {
+        let spot = spot.as_ref()?;
+        Some(json!({"film": film(&i, spot), "path_m": spot.path_m}))
+    });
+    Ok(json!({"spots": spots.collect::<Vec<_>>()}))
 }

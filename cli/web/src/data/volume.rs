@@ -88,7 +88,7 @@ pub fn lights(spec: &DatasetSpec, folder: Option<&std::path::Path>) -> Vec<(Ligh
         all.push((Light::More, "three bounces and more".into()));
     }
     if has(Q::TransientSpots) {
-        let spots = (0..spec.spots).map(|s| (Light::Spot(s), format!("spot {}", s + 1)));
+        let spots = (0..spec.spots).map(|s| (Light::Spot(s), format!("spot {s}")));
         all.extend(spots);
     }
     all
@@ -171,17 +171,21 @@ impl Volume {
             }
         };
         let pixels = spec.pixels().max(1);
+        let (shape, small) = Small::shape(&spec);
         let mut codes = vec![0; 2 * planes.len()];
-        let slabs = codes
-            .par_chunks_mut(2 * pixels)
-            .zip(planes.par_chunks(pixels));
-        slabs.for_each(|(codes, values)| {
-            for (code, value) in codes.chunks_exact_mut(2).zip(values) {
-                code.copy_from_slice(&encode(*value, factor as f32));
-            }
-        });
+        let mut means = vec![0.0; small * planes.len() / pixels];
+        let bins = codes.par_chunks_mut(2 * pixels);
+        let bins = bins.zip(means.par_chunks_mut(small));
+        // One pass over each image, while it is in the cache.
+        bins.zip(planes.par_chunks(pixels))
+            .for_each(|((codes, means), values)| {
+                for (code, value) in codes.chunks_exact_mut(2).zip(values) {
+                    code.copy_from_slice(&encode(*value, factor as f32));
+                }
+                shape.means(values, means);
+            });
         Self {
-            small: Small::of(&spec, factor as f32, planes),
+            small: Small::of(&shape, factor as f32, &means),
             spec,
             factor,
             codes,
@@ -292,25 +296,54 @@ fn by_bin(values: &[f32], spec: &DatasetSpec) -> Vec<f32> {
     planes
 }
 
+/// Blocks of pixels.
+struct Blocks {
+    /// Of the full image.
+    size: [usize; 2],
+    step: usize,
+    width: usize,
+    height: usize,
+}
+
+impl Blocks {
+    /// Sets `means` to the mean of each block of an image.
+    fn means(&self, image: &[f32], means: &mut [f32]) {
+        let [w, h] = self.size;
+        for (y, line) in means.chunks_exact_mut(self.width).enumerate() {
+            let rows = y * self.step..h.min((y + 1) * self.step);
+            line.fill(0.0);
+            for row in rows.clone() {
+                let parts = image[row * w..][..w].chunks(self.step);
+                for (mean, part) in line.iter_mut().zip(parts) {
+                    *mean += part.iter().sum::<f32>();
+                }
+            }
+            for (x, mean) in line.iter_mut().enumerate() {
+                let columns = w.min((x + 1) * self.step) - x * self.step;
+                *mean /= (rows.len() * columns) as f32;
+            }
+        }
+    }
+}
+
 impl Small {
-    fn of(spec: &DatasetSpec, factor: f32, planes: &[f32]) -> Self {
+    /// Returns the blocks, and their number.
+    fn shape(spec: &DatasetSpec) -> (Blocks, usize) {
         let (w, h) = (spec.width as usize, spec.height as usize);
         let step = w.max(h).div_ceil(SMALL).max(1);
-        let (width, height) = (w.div_ceil(step), h.div_ceil(step));
-        let means: Vec<f32> = planes
-            .par_chunks((w * h).max(1))
-            .flat_map_iter(|image| {
-                (0..width * height).map(move |at| {
-                    let rows = at / width * step..h.min((at / width + 1) * step);
-                    let columns = at % width * step..w.min((at % width + 1) * step);
-                    let count = rows.len() * columns.len();
-                    let sum: f32 = rows
-                        .map(|row| image[row * w..][columns.clone()].iter().sum::<f32>())
-                        .sum();
-                    sum / count as f32
-                })
-            })
-            .collect();
+        let blocks = Blocks {
+            size: [w, h],
+            step,
+            width: w.div_ceil(step),
+            height: h.div_ceil(step),
+        };
+        let count = (blocks.width * blocks.height).max(1);
+        (blocks, count)
+    }
+
+    /// Makes the level from the means of the blocks, `[bin][row][column]`.
+    fn of(blocks: &Blocks, factor: f32, means: &[f32]) -> Self {
+        let (width, height) = (blocks.width, blocks.height);
         let pixels = (width * height).max(1);
         let mut total = vec![0.0f32; pixels];
         for image in means.chunks_exact(pixels) {
