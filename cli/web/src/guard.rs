@@ -2,9 +2,9 @@
 //!
 //! Every user of this machine can reach its loopback interface, and every web page can make a
 //! browser send requests to it. Therefore each start makes a random key. The printed link has it,
-//! and the first request exchanges it for a cookie that scripts cannot read and that browsers do
-//! not send with forms, pictures or scripts of other sites. `Host` must be a known name, so that a site whose name
-//! resolves to 127.0.0.1 (DNS rebinding) gets no answer.
+//! and the first request exchanges it for a cookie. Scripts cannot read the cookie, and browsers do
+//! not send it with forms, pictures or scripts of other sites. `Host` must be a known name, so that
+//! a site whose name resolves to 127.0.0.1 (DNS rebinding) gets no answer.
 
 use http::{
     HeaderMap,

@@ -84,7 +84,8 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     browser.until("document.documentElement.dataset.flight === 'full'");
     let seek = |bin: &str| {
         browser.run(&format!(
-            "const t = document.getElementById('time'); t.value = {bin}; t.dispatchEvent(new Event('input'))"
+            "const t = document.getElementById('time'); t.value = {bin}; \
+             t.dispatchEvent(new Event('input')); t.dispatchEvent(new Event('change'))"
         ));
         browser
             .run("return new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))");
@@ -119,6 +120,16 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     );
     browser.until("document.documentElement.dataset.flight === 'full'");
     assert_ne!(seek("40"), all);
+    // The address has the state: a new page shows the same.
+    let there = browser.run("return location.href");
+    let shown = browser.run("return document.getElementById('clock').textContent");
+    visit(&browser, there.as_str().unwrap());
+    browser.until("document.documentElement.dataset.flight === 'full'");
+    assert_eq!(
+        browser.run("return document.getElementById('light').value"),
+        "spot-2"
+    );
+    assert_eq!(browser.run(time), shown);
     let lines = browser.console();
     assert!(lines.is_empty(), "{lines:?}");
     drop(web.process);

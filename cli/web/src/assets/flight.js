@@ -43,6 +43,8 @@ function address() {
   return `${location.pathname}?${now}`;
 }
 
+const keep = () => history.replaceState(null, '', address());
+
 const settings = () => ({
   time,
   shutter: Number($('shutter').value),
@@ -142,7 +144,7 @@ function frame(now) {
 function play(on = !playing) {
   playing = on;
   $('play').textContent = on ? 'Pause' : 'Play';
-  if (!on) history.replaceState(null, '', address());
+  if (!on) keep();
   touch();
 }
 
@@ -159,7 +161,7 @@ async function pick(column, row) {
     $('picked').textContent = `Column ${picked[0]}, row ${picked[1]}: ${v.label_name ?? 'nothing'}, ${v.range_m.toFixed(2)} m · ${histogram.words()}`;
     $('histogram').setAttribute('aria-label', $('picked').textContent);
     document.documentElement.dataset.picked = picked.join(',');
-    history.replaceState(null, '', address());
+    keep();
   } catch (error) {
     $('picked').textContent = `No histogram: ${error.message}`;
   }
@@ -254,31 +256,39 @@ function save() {
 
 $('play').addEventListener('click', () => play());
 $('time').addEventListener('input', () => { playing && play(false); seek(Number($('time').value)); });
+$('time').addEventListener('change', keep);
 $('controls').addEventListener('submit', (event) => event.preventDefault());
 $('controls').addEventListener('input', (event) => {
-  if (event.target.id !== 'light') { touch(); history.replaceState(null, '', address()); }
+  if (event.target.id !== 'light') { touch(); keep(); }
 });
-$('light').addEventListener('change', () => { light = $('light').value; history.replaceState(null, '', address()); load(); });
+$('light').addEventListener('change', () => { light = $('light').value; keep(); load(); });
 for (const id of ['hlog', 'zoom']) $(id).addEventListener('input', touch);
 $('export').addEventListener('click', save);
 $('link').addEventListener('click', async () => {
-  history.replaceState(null, '', address());
+  keep();
   try {
     await navigator.clipboard.writeText(location.href);
     $('link').textContent = 'Copied';
   } catch { $('link').textContent = 'See address bar'; }
   setTimeout(() => { $('link').textContent = 'Copy link'; }, 1500);
 });
+// With marks of the spots, a click on one selects its light, where that is stored.
+function pickSpot(u, v) {
+  const away = (spot) => spot?.film ? Math.hypot(spot.film[0] / facts.width - u, spot.film[1] / facts.height - v) : Infinity;
+  const all = spots.map(away), near = Math.min(...all);
+  const name = `spot-${all.indexOf(near)}`;
+  if (near > 0.02 || ![...$('light').options].some((option) => option.value === name)) return false;
+  $('light').value = light = name;
+  keep();
+  load();
+  return true;
+}
+
 $('screen').addEventListener('pointerdown', (event) => {
   if (!facts || event.button !== 0) return;
   const box = $('view').getBoundingClientRect();
   const [u, v] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
-  // With marks of the spots, a click near one selects its light where that is stored.
-  if ($('spots').checked && event.shiftKey) {
-    const near = spots.map((s, i) => [s?.film ? Math.hypot(s.film[0] / facts.width - u, s.film[1] / facts.height - v) : 9, i]).sort((a, b) => a[0] - b[0])[0];
-    const option = near && [...$('light').options].find((o) => o.value === `spot-${near[1]}`);
-    if (option && near[0] < 0.05) { $('light').value = option.value; light = option.value; load(); return; }
-  }
+  if ($('spots').checked && pickSpot(u, v)) return;
   pick(Math.floor(u * facts.width), Math.floor(v * facts.height));
 });
 $('histogram').addEventListener('pointerdown', (event) => {

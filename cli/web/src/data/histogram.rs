@@ -5,8 +5,8 @@ use serde_json::{Value, json};
 use super::{Truth, truth::METRES_PER_NS, volume::Volume};
 use crate::answer::Problem;
 
-/// Returns h of each bin, h of two bounces and of three and more where the render has these `parts`,
-/// the time of the pixel's own spot, and for each spot the time of its
+/// Returns h of each bin, h of two bounces and of three and more where the render has these
+/// `parts`, the time of the pixel's own spot, and for each spot the time of its
 /// two-bounce light: laser to spot, spot to the pixel's surface point, and from there to the camera
 /// (the two-bounce time of flight of PlatoNeRF, Klinghoffer et al., CVPR 2024).
 ///

@@ -127,7 +127,7 @@ impl Picture {
                     let n = &truth.normal[3 * p..][..3];
                     match n.iter().all(|x| *x == 0.0) {
                         true => NOTHING,
-                        // y and z point down and away; their colours grow up and towards the camera.
+                        // y and z point down and away; their colours grow the other way.
                         false => [n[0], -n[1], -n[2]].map(|x| (127.5 + 127.5 * x) as u8),
                     }
                 };

@@ -1,6 +1,6 @@
 //! The images of a scene.
 
-use picofarm_dataset::{Dataset, DatasetSpec, Intrinsics, Quantity as Q, Spot};
+use picofarm_dataset::{Dataset, DatasetSpec, Intrinsics, Manifest, Quantity as Q, Spot};
 use picofarm_store::StorageError;
 use serde_json::{Value, json};
 
@@ -37,6 +37,8 @@ pub struct Truth {
     pub intrinsics: Intrinsics,
     /// Names of the labels; empty if they are not known.
     pub names: Vec<String>,
+    /// Who made it from what, and its objects.
+    pub manifest: Manifest,
 }
 
 impl Truth {
@@ -48,6 +50,8 @@ impl Truth {
         let manifest = dataset.manifest(scene).await?;
         let names = manifest.provenance.plan["labels"].as_array();
         let names = names.into_iter().flatten();
+        let names = names.map(|name| name.as_str().unwrap_or_default().to_owned());
+        let names = names.collect();
         Ok(Self {
             spec: *dataset.spec(),
             rgb: dataset.read(scene, Q::Rgb).await?,
@@ -61,9 +65,8 @@ impl Truth {
             intensity: dataset.read(scene, Q::Intensity).await?,
             spots: dataset.read_spots(scene).await?,
             intrinsics: dataset.read_intrinsics(scene).await?,
-            names: names
-                .map(|name| name.as_str().unwrap_or_default().to_owned())
-                .collect(),
+            names,
+            manifest,
         })
     }
 

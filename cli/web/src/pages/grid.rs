@@ -101,7 +101,7 @@ pub fn draw(job: &JobStatus, position: u32, stage: &StageStatus, history: &[Even
                 (super::parts::safe(&stage.name))
                 @if each > 1 { " · a cell is " (each) " tasks and shows the most notable" }
             }
-            svg viewBox={ "0 0 " (size) " " (rows * 12) } width=(size) height=(rows * 12) role="img" aria-label=(label) {
+            svg viewBox={ "0 0 " (size) " " (rows * 12) } width=(size) height=(rows * 12) role="group" aria-label=(label) {
                 @for (i, cell) in cells.iter().enumerate() {
                     @let i = i as u64;
                     a href={ "/jobs/" (job.id) "/tasks/" (position) "/" (i * each) } tabindex="-1" {

@@ -2,8 +2,13 @@
 
 use maud::{Markup, html};
 use picofarm_figures::number::digits;
+use picofarm_store::published::Manifest as _;
 
-use super::{Page, gallery::describe, parts::safe};
+use super::{
+    Page,
+    gallery::describe,
+    parts::{bytes, safe},
+};
 use crate::{
     App,
     answer::Problem,
@@ -85,8 +90,29 @@ fn column(truth: &Truth, id: &SceneId, spot: u64) -> Result<Markup, Problem> {
                     }
                 }
             }
+            (origin(truth))
         }
     })
+}
+
+/// Where the scene comes from.
+fn origin(truth: &Truth) -> Markup {
+    let manifest = &truth.manifest;
+    let made = &manifest.provenance;
+    let plan = serde_json::to_string_pretty(&made.plan).unwrap_or_default();
+    html! {
+        details.origin {
+            summary { "Origin" }
+            dl.facts-list {
+                dt { "made by" } dd { (safe(made.plan["kind"].as_str().unwrap_or("render"))) " of " (safe(&made.renderer)) }
+                dt { "task key" } dd { code { (safe(&made.task_key)) } }
+                dt { "seed" } dd { (made.seed) }
+                dt { "stored" } dd { (manifest.objects.len()) " objects, " (bytes(manifest.total_bytes())) }
+                @if !made.plan["source"].is_null() { dt { "parent" } dd { code { (safe(&made.plan["source"])) } } }
+                dt { "plan" } dd { pre { (safe(plan)) } }
+            }
+        }
+    }
 }
 
 /// The colour bar.

@@ -83,6 +83,10 @@ fn a_scene_is_shown_with_all_images_also_next_to_another() {
         let picture = web.get(&path);
         assert!(picture.body.starts_with(b"\x89PNG"), "{path}");
     }
+    assert!(
+        one.contains("<dt>task key</dt><dd><code>task</code>"),
+        "{one}"
+    );
     let two = web.get("/data/scene?set=0%2Frooms&scene=0&scene2=2").text();
     assert_eq!(two.matches("class=\"column\"").count(), 2, "{two}");
     assert_eq!(web.get("/data/scene?set=0%2Frooms&scene=1").status, 404);
