@@ -3,8 +3,8 @@
 use std::{path::Path, process::Command};
 
 /// Features listed by `picofarm --version`, in the order of `Cargo.toml`.
-const FEATURES: [&str; 8] = [
-    "clouds", "figures", "formats", "postgres", "networks", "cuda", "wgpu", "traces",
+const FEATURES: [&str; 9] = [
+    "clouds", "figures", "formats", "postgres", "networks", "cuda", "wgpu", "traces", "web",
 ];
 
 /// Returns the output of git, or `None` outside a checkout or without git.

@@ -6,6 +6,7 @@
 //! own, which is retained if the test fails.
 
 pub mod binary;
+pub mod browser;
 pub mod cli;
 pub mod cloud;
 pub mod cluster;
@@ -28,6 +29,7 @@ pub mod slurm;
 pub mod store;
 pub mod wait;
 
+pub use browser::Browser;
 pub use cli::{Cli, Ended};
 pub use cluster::Cluster;
 pub use farm::Farm;

@@ -57,6 +57,10 @@ pub struct Up {
     /// devices`
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
+    /// Serve no pages for a browser. Otherwise they are at 127.0.0.1:7421, or at a free port if
+    /// that is in use
+    #[arg(long)]
+    pub no_web: bool,
     #[command(flatten)]
     pub http: Http,
     #[command(flatten)]

@@ -20,6 +20,7 @@ mod scene;
 mod secrets;
 pub mod strategy;
 mod sweep;
+mod web;
 
 use std::{ffi::OsString, path::PathBuf};
 
@@ -44,6 +45,7 @@ pub use scene::{
 };
 pub use secrets::without_secrets;
 pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepRun, WhichSweep};
+pub use web::{WEB, Web};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]
@@ -155,6 +157,8 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Run a worker
     Worker(Worker),
+    /// Show a farm, its data sets and light in flight in a browser
+    Web(Web),
     /// The process of a worker that `up` or `demo` starts
     #[command(hide = true)]
     LocalWorker,

@@ -285,6 +285,7 @@ async fn tell(
              light in flight  {}\n\
              {}{}\
              next:\n  \
+             {program} web --store {}\n  \
              {program} dataset info {}\n  \
              {}\
              {program} scene generate --kind furnished --seed 7 --out room.glb\n  \
@@ -298,6 +299,7 @@ async fn tell(
             pictures.flight.display(),
             room.told(),
             rooms.as_ref().map(Rooms::summary).unwrap_or_default(),
+            show::argument(&dir.display().to_string()),
             show::argument(place),
             rooms.as_ref().map(Rooms::next).unwrap_or_default(),
         )

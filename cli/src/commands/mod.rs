@@ -22,6 +22,8 @@ mod scene;
 mod sweep;
 mod token;
 mod up;
+#[cfg(feature = "web")]
+mod web;
 mod worker;
 mod workers;
 
@@ -36,6 +38,10 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
         Command::Up(args) => up::run(args, settings, output).await,
         Command::Coordinator(args) => coordinator::run(args, output).await,
         Command::Worker(args) => worker::run(args, settings, output).await,
+        #[cfg(feature = "web")]
+        Command::Web(args) => web::run(args, settings, output).await,
+        #[cfg(not(feature = "web"))]
+        Command::Web(_) => Err(crate::error::not_built("web", "pages for a browser")),
         Command::LocalWorker => unreachable!("it is started before settings are resolved"),
         Command::Job(command) => job::run(command, settings, output).await,
         Command::Workers { what } => workers::run(what, settings, output).await,

@@ -2,6 +2,7 @@
 
 use picofarm_settings::Gpus;
 use serde_json::json;
+use tokio_util::sync::CancellationToken;
 
 use crate::{
     args::Up,
@@ -21,6 +22,7 @@ use crate::{
 /// Fails if the address or catalog is in use, or if a worker ends.
 pub async fn run(args: Up, settings: &Settings, output: Output) -> Result<()> {
     let guarded = Guarded::from_args(&args.guard);
+    let open = guarded.is_open();
     refuse_unguarded(args.listen, &args.guard, true)?;
     let gpus = gpu_names(&args.gpus)?;
     std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
@@ -36,9 +38,18 @@ pub async fn run(args: Up, settings: &Settings, output: Output) -> Result<()> {
         args.traces.url(),
     )
     .await?;
-    output.result(&json!({"coordinator": farm.url, "workers": args.workers, "http": farm.http}), || {
+    let web = match args.no_web {
+        true => None,
+        false => pages(&args, &farm.url, open, settings, &stop).await?,
+    };
+    let told = json!({
+        "coordinator": farm.url, "workers": args.workers, "http": farm.http, "web": web,
+    });
+    output.result(&told, || {
+        let web = web.as_deref();
+        let web = web.map_or(String::new(), |link| format!("\nin a browser: {link}"));
         format!(
-            "coordinator at {} with {} worker(s); submit with `{} --coordinator {} job submit FILE`",
+            "coordinator at {} with {} worker(s); submit with `{} --coordinator {} job submit FILE`{web}",
             farm.url, args.workers, program(), farm.url
         )
     });
@@ -46,8 +57,42 @@ pub async fn run(args: Up, settings: &Settings, output: Output) -> Result<()> {
         lost = farm.worker_lost() => Some(lost),
         () = stop.cancelled() => None,
     };
+    stop.cancel();
     farm.stop().await?;
     lost.map_or(Ok(()), Err)
+}
+
+/// Serves the pages in the background, and returns their link; `None` if the program is built
+/// without them.
+#[cfg(feature = "web")]
+async fn pages(
+    args: &Up,
+    url: &str,
+    open: bool,
+    settings: &Settings,
+    stop: &CancellationToken,
+) -> Result<Option<String>> {
+    let access = match open {
+        true => picofarm_tasks::Access::default(),
+        false => settings.access()?,
+    };
+    let farm = super::web::Coordinator::new(url, access);
+    let store = args.dir.display().to_string();
+    let server = super::web::start_for_up(store, farm).await?;
+    let link = server.link("/");
+    tokio::spawn(server.serve(stop.clone()));
+    Ok(Some(link))
+}
+
+#[cfg(not(feature = "web"))]
+async fn pages(
+    _: &Up,
+    _: &str,
+    _: bool,
+    _: &Settings,
+    _: &CancellationToken,
+) -> Result<Option<String>> {
+    Ok(None)
 }
 
 /// Returns the names of the GPUs, which workers open.

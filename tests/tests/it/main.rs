@@ -41,4 +41,5 @@ mod sweeps;
 mod traces;
 mod training;
 mod versions;
+mod web;
 mod worker_process;

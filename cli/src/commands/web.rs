@@ -1,0 +1,236 @@
+//! `picofarm web`: the farm, its data sets and light in flight in a browser. `up` serves the same
+//! pages.
+
+use std::{net::SocketAddr, sync::Arc};
+
+use async_trait::async_trait;
+use picofarm_proto::{
+    ids::JobId,
+    messages::{AuditEntry, Event, JobStatus, JobSummary, Reason, TaskExplanation},
+    spec::JobSpec,
+};
+use picofarm_tasks::Access;
+use picofarm_web::{
+    Events, Farm, JobFilter, Refusal, Server, Settings as Shown, StartError, Workers,
+};
+use serde_json::json;
+use tokio::sync::Mutex;
+
+use crate::{
+    args::Web,
+    client::{Client, Listing, Page},
+    error::{CliError, Code, Result, io},
+    output::Output,
+    settings::Settings,
+    signals,
+};
+
+/// Serves the pages until a signal.
+///
+/// # Errors
+/// Fails if the address is in use or reachable from elsewhere without a name, or if a store or the
+/// access to the coordinator is not usable.
+pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
+    for host in &args.host {
+        if !picofarm_web::is_host(host) {
+            return Err(CliError::input(format!(
+                "--host {host}: expected a name or an address without a port"
+            )));
+        }
+    }
+    let farm = Coordinator::new(&settings.coordinator, settings.access()?);
+    let shown = Shown {
+        listen: args.listen,
+        hosts: args.host,
+        stores: args.store,
+    };
+    let server = start(shown, farm).await?;
+    let stop = signals::stop_on_signal()?;
+    let link = server.link("/");
+    let flight = server.first_flight().await.map(|path| server.link(&path));
+    output.result(&json!({"web": link, "flight": flight}), || {
+        let flight = flight.as_deref();
+        let flight = flight.map_or(String::new(), |link| format!("\nlight in flight  {link}"));
+        format!(
+            "farm             {link}{flight}\nCtrl-C stops the server; a new start has a new link"
+        )
+    });
+    server.serve(stop).await;
+    Ok(())
+}
+
+/// Starts to listen.
+///
+/// # Errors
+/// Fails as [`Server::bind`] does.
+pub async fn start(shown: Shown, farm: Coordinator) -> Result<Server> {
+    Server::bind(shown, Arc::new(farm)).await.map_err(|e| match e {
+        StartError::Listen(address, e) => {
+            io(format!("cannot listen on {address}"), &e).hint("choose another --listen, e.g. 127.0.0.1:0 for any free port")
+        }
+        StartError::Open(address) => CliError::input(format!(
+            "--listen {address}: other machines reach this address, and the pages are not encrypted"
+        ))
+        .hint(
+            "listen on 127.0.0.1 and use a tunnel (`ssh -L 7421:127.0.0.1:7421 HOST`), or allow it with --host NAME",
+        ),
+        StartError::Store(e) => CliError::input(format!("--store: {e}")),
+    })
+}
+
+/// The coordinator, connected when it is first needed and again after it was away.
+pub struct Coordinator {
+    urls: String,
+    access: Access,
+    client: Mutex<Option<Client>>,
+}
+
+impl Coordinator {
+    /// Names the coordinators, separated by commas, and the user's rights.
+    pub fn new(urls: &str, access: Access) -> Self {
+        Self {
+            urls: urls.to_owned(),
+            access,
+            client: Mutex::default(),
+        }
+    }
+
+    async fn call<T>(&self, ask: impl AsyncFnOnce(&mut Client) -> Result<T>) -> Result<T, Refusal> {
+        let asked = async {
+            let mut client = {
+                let mut held = self.client.lock().await;
+                match &*held {
+                    Some(client) => client.clone(),
+                    None => {
+                        let fresh = Client::connect(&self.urls, &self.access).await?;
+                        held.insert(fresh).clone()
+                    }
+                }
+            };
+            ask(&mut client).await
+        };
+        let answered = asked.await;
+        if let Err(e) = &answered
+            && e.code == Code::Coordinator
+            && !e.denied
+        {
+            *self.client.lock().await = None;
+        }
+        answered.map_err(|e| Refusal {
+            message: e.message,
+            hint: e.hint,
+            denied: e.denied,
+        })
+    }
+}
+
+#[async_trait]
+impl Farm for Coordinator {
+    fn url(&self) -> String {
+        crate::args::without_secrets(&self.urls)
+    }
+
+    async fn jobs(&self, filter: &JobFilter) -> Result<(Vec<JobSummary>, Option<String>), Refusal> {
+        let given = |text: &'_ str| (!text.is_empty()).then(|| text.to_owned());
+        let (page, user, find) = (
+            given(&filter.page),
+            given(&filter.user),
+            given(&filter.find),
+        );
+        let (limit, state) = (filter.limit, filter.state);
+        self.call(async |client: &mut Client| {
+            let listing = Listing {
+                limit,
+                page: page.as_deref(),
+                state,
+                user: user.as_deref(),
+                find: find.as_deref(),
+            };
+            client.list(&listing).await
+        })
+        .await
+    }
+
+    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal> {
+        self.call(async |client: &mut Client| client.status(job).await)
+            .await
+    }
+
+    async fn spec(&self, job: JobId) -> Result<JobSpec, Refusal> {
+        self.call(async |client: &mut Client| client.spec(job).await)
+            .await
+    }
+
+    async fn events(&self, ask: Events) -> Result<Vec<Event>, Refusal> {
+        let page = Page {
+            job: ask.job,
+            stage: None,
+            task: None,
+            after: ask.after,
+            limit: ask.limit,
+            newest: ask.newest,
+            logs: ask.logs,
+        };
+        let events = self.call(async |client: &mut Client| client.history(page).await);
+        Ok(events.await?.0)
+    }
+
+    async fn explain(
+        &self,
+        job: JobId,
+        task: Option<(u32, u64)>,
+    ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal> {
+        let (stage, index) = task.map_or((0, None), |(stage, task)| (stage, Some(task)));
+        let told = self.call(async |client: &mut Client| client.explain(job, stage, index).await);
+        let told = told.await?;
+        Ok((told.reasons, told.task))
+    }
+
+    async fn workers(&self) -> Result<Workers, Refusal> {
+        let all = self.call(async |client: &mut Client| client.workers().await);
+        let all = all.await?;
+        Ok(Workers {
+            coordinator: all.coordinator,
+            workers: all.workers,
+            elsewhere: all.elsewhere,
+        })
+    }
+
+    async fn audit(&self, before: Option<u64>, limit: u32) -> Result<Vec<AuditEntry>, Refusal> {
+        self.call(async |client: &mut Client| client.audit(before, limit, None, None).await)
+            .await
+    }
+
+    async fn cancel(&self, job: JobId) -> Result<(), Refusal> {
+        self.call(async |client: &mut Client| client.cancel(job).await.map(drop))
+            .await
+    }
+
+    async fn pause(&self, job: JobId, paused: bool) -> Result<(), Refusal> {
+        self.call(async |client: &mut Client| client.pause(job, paused).await.map(drop))
+            .await
+    }
+
+    async fn retry(&self, job: JobId) -> Result<(), Refusal> {
+        self.call(async |client: &mut Client| client.retry(job).await.map(drop))
+            .await
+    }
+}
+
+/// Starts the pages of `up`: at its usual address, or at a free port if that is in use.
+///
+/// # Errors
+/// Fails if no address can be used.
+pub async fn start_for_up(store: String, farm: Coordinator) -> Result<Server> {
+    let usual: SocketAddr = crate::args::WEB.parse().expect("a constant address");
+    let free = match tokio::net::TcpListener::bind(usual).await {
+        Ok(_) => usual,
+        Err(_) => SocketAddr::new(usual.ip(), 0),
+    };
+    let shown = Shown {
+        listen: free,
+        hosts: Vec::new(),
+        stores: vec![store],
+    };
+    start(shown, farm).await
+}

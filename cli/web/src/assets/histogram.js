@@ -1,0 +1,148 @@
+// A pixel's histogram on a canvas: bars of one, two, and three and more bounces, the predicted times
+// of each spot, and the time that the player shows.
+const METRES_PER_NS = 0.299792458;
+
+function css(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+/** Fits the canvas to its place on the screen, and returns its context and size in CSS pixels. */
+export function fit(canvas) {
+  const ratio = Math.min(3, devicePixelRatio || 1);
+  const width = canvas.clientWidth, height = canvas.clientHeight;
+  const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
+  if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
+  const context = canvas.getContext('2d');
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return { context, width, height };
+}
+
+export class Histogram {
+  constructor(canvas, facts) {
+    this.canvas = canvas;
+    this.facts = facts;
+    this.pixel = null;
+  }
+
+  bin(path) { return (path - this.facts.start_m) / this.facts.bin_m; }
+  ns(bin) { return (this.facts.start_m + bin * this.facts.bin_m) / METRES_PER_NS; }
+
+  /** Sets the answer of the server for a pixel, and classifies its bins. */
+  set(pixel) {
+    this.pixel = pixel;
+    const { h } = pixel;
+    const kinds = new Uint8Array(h.length);
+    const mark = (path, kind) => {
+      const bin = Math.floor(this.bin(path));
+      for (let b = bin - 1; b <= bin + 1; b++) if (b >= 0 && b < h.length && kinds[b] < kind) kinds[b] = kind;
+    };
+    for (const spot of pixel.two) if (spot.lit) mark(spot.path_m, 1);
+    if (pixel.one) mark(pixel.one.path_m, 2);
+    this.kinds = kinds;
+    // What the render tells apart needs no prediction. The remainder of rounding is no light.
+    const most = h.reduce((a, b) => Math.max(a, b), 0);
+    this.parts = pixel.parts && [pixel.parts[1], pixel.parts[0],
+      h.map((v, b) => { const one = v - pixel.parts[0][b] - pixel.parts[1][b]; return one > 0.02 * most ? one : 0; })];
+    const first = h.findIndex((v) => v > 0), end = h.length - [...h].reverse().findIndex((v) => v > 0);
+    this.lit = first < 0 ? [0, h.length] : [Math.max(0, first - 4), Math.min(h.length, end + 4)];
+  }
+
+  /** A summary for the page and for screen readers. */
+  words() {
+    const { h, one, two } = this.pixel;
+    const sum = h.reduce((a, b) => a + b, 0);
+    if (sum === 0) return 'no light';
+    let peak = 0;
+    for (let b = 1; b < h.length; b++) if (h[b] > h[peak]) peak = b;
+    const of = [0, 0, 0];
+    if (this.parts) this.parts.forEach((part, kind) => { of[kind] = part.reduce((a, b) => a + b, 0); });
+    else h.forEach((v, b) => { of[this.kinds[b]] += v; });
+    const share = (x) => `${(100 * x / sum).toFixed(0)} %`;
+    const lit = two.filter((spot) => spot.lit).length;
+    if (this.parts) return `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns · rendered apart: ${share(of[2])} one bounce, ` +
+      `${share(of[1])} two bounces from ${lit} of ${two.length} spots, ${share(of[0])} three and more`;
+    return `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns` +
+      (one ? ` · ${share(of[2])} at the time of one bounce (spot ${one.spot})` : '') +
+      ` · ${share(of[1])} at times of two bounces, from ${lit} of ${two.length} spots`;
+  }
+
+  range(zoom) { return zoom && this.pixel ? this.lit : [0, this.facts.bins]; }
+
+  /** The bin under a horizontal place on the canvas. */
+  binAt(x, zoom) {
+    const [lo, hi] = this.range(zoom);
+    return lo + (x - LEFT) / Math.max(1, this.canvas.clientWidth - LEFT - 4) * (hi - lo);
+  }
+
+  draw({ log, zoom, time, shutter }) {
+    const { context: c, width, height } = fit(this.canvas);
+    c.font = '11px system-ui, sans-serif';
+    c.fillStyle = css('--dim');
+    if (!this.pixel) return;
+    const { h, two, one } = this.pixel;
+    const [lo, hi] = this.range(zoom);
+    const bottom = height - 18, top = 16, wide = width - LEFT - 4;
+    const x = (bin) => LEFT + (bin - lo) / (hi - lo) * wide;
+    let most = 0;
+    for (let b = lo; b < hi; b++) most = Math.max(most, h[b]);
+    const floor = most / 1e4;
+    const y = (v) => {
+      if (most === 0) return bottom;
+      const t = log ? Math.log(Math.max(v, floor) / floor) / Math.log(most / floor) : v / most;
+      return bottom - t * (bottom - top);
+    };
+    c.globalAlpha = 0.2;
+    c.fillStyle = css('--text');
+    c.fillRect(x(time), top, Math.max(1.5, x(time + shutter) - x(time)), bottom - top);
+    c.globalAlpha = 1;
+    const colours = [css('--more'), css('--two'), css('--one')];
+    const bar = (b, v, colour) => {
+      if (v <= floor) return;
+      c.fillStyle = colour;
+      c.fillRect(x(b), y(v), Math.max(0.75, x(b + 1) - x(b)), bottom - y(v));
+    };
+    for (let b = lo; b < hi; b++) {
+      if (!this.parts) { bar(b, h[b], colours[this.kinds[b]]); continue; }
+      // The greatest part is behind the others.
+      const parts = this.parts.map((part, kind) => [part[b], kind]).sort((p, q) => q[0] - p[0]);
+      for (const [v, kind] of parts) bar(b, v, colours[kind]);
+    }
+    c.lineWidth = 1;
+    const line = (path, colour, dash, name) => {
+      const bin = this.bin(path);
+      if (bin < lo || bin > hi) return;
+      c.strokeStyle = colour;
+      c.setLineDash(dash);
+      c.beginPath();
+      c.moveTo(x(bin), top - 3);
+      c.lineTo(x(bin), bottom);
+      c.stroke();
+      c.setLineDash([]);
+      c.fillStyle = colour;
+      if (name !== null) c.fillText(name, x(bin) - c.measureText(name).width / 2, top - 5);
+    };
+    c.globalAlpha = 0.9;
+    let named = -Infinity;
+    for (const spot of [...two].sort((a, b) => a.path_m - b.path_m)) {
+      const place = x(this.bin(spot.path_m));
+      const name = spot.lit && place - named > 16 ? String(spot.spot) : null;
+      if (name !== null) named = place;
+      line(spot.path_m, spot.lit ? css('--two') : css('--faint'), spot.lit ? [2, 2] : [1, 4], name);
+    }
+    if (one) line(one.path_m, css('--one'), [], null);
+    c.globalAlpha = 1;
+    c.strokeStyle = css('--line');
+    c.strokeRect(LEFT - 0.5, top + 0.5, wide + 1, bottom - top);
+    c.fillStyle = css('--dim');
+    for (let i = 0; i <= 4; i++) {
+      const text = `${this.ns(lo + (hi - lo) * i / 4).toFixed(1)}${i === 4 ? ' ns' : ''}`;
+      const place = LEFT + wide * i / 4 - (i === 0 ? 0 : i === 4 ? c.measureText(text).width : c.measureText(text).width / 2);
+      c.fillText(text, place, height - 4);
+    }
+    c.fillText(most.toPrecision(2), 0, top + 8);
+    c.fillText(log ? floor.toPrecision(2) : '0', 0, bottom);
+  }
+}
+
+const LEFT = 48;

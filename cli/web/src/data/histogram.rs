@@ -1,0 +1,57 @@
+//! A pixel's histogram, with the times at which light of one and two bounces must arrive.
+
+use serde_json::{Value, json};
+
+use super::{Truth, truth::METRES_PER_NS, volume::Volume};
+use crate::answer::Problem;
+
+/// Returns h of each bin, h of two bounces and of three and more where the render has these
+/// `parts`, the time of the pixel's own spot, and for each spot the time of its
+/// two-bounce light: laser to spot, spot to the pixel's surface point, and from there to the camera
+/// (the two-bounce time of flight of PlatoNeRF, Klinghoffer et al., CVPR 2024).
+///
+/// # Errors
+/// Fails outside of the image.
+pub fn of_pixel(
+    truth: &Truth,
+    volume: &Volume,
+    parts: Option<[&Volume; 2]>,
+    at: [u64; 2],
+) -> Result<Value, Problem> {
+    let pixel = truth.pixel(at)?;
+    let lit = truth.lit_by(pixel);
+    let point = truth.point(pixel);
+    let two: Vec<Value> = truth
+        .spots
+        .iter()
+        .enumerate()
+        .filter_map(|(i, spot)| {
+            let (spot, point) = (spot.as_ref()?, point?);
+            let position = spot.position.map(f64::from);
+            let path = f64::from(spot.path_m) + distance(position, point) + length(point);
+            Some(json!({
+                "spot": i, "path_m": path, "ns": path / METRES_PER_NS, "lit": lit.contains(&i),
+            }))
+        })
+        .collect();
+    let [row, column] = at.map(|x| x as f32);
+    let own = truth.spots.iter().enumerate().find_map(|(i, spot)| {
+        let spot = spot.as_ref()?;
+        let [x, y] = truth.film(spot)?;
+        let inside = (column..column + 1.0).contains(&x) && (row..row + 1.0).contains(&y);
+        let path = f64::from(spot.path_m) + length(spot.position.map(f64::from));
+        inside.then(|| json!({"spot": i, "path_m": path, "ns": path / METRES_PER_NS}))
+    });
+    Ok(json!({
+        "h": volume.histogram(pixel), "parts": parts.map(|parts| parts.map(|p| p.histogram(pixel))),
+        "one": own, "two": two, "values": truth.values(at)?,
+    }))
+}
+
+fn length(v: [f64; 3]) -> f64 {
+    v.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    length([a[0] - b[0], a[1] - b[1], a[2] - b[2]])
+}

@@ -1,0 +1,298 @@
+//! The data sets in the given stores. Nothing else is read.
+
+use std::{
+    path::PathBuf,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use object_store::{ObjectStore, path::Path};
+use picofarm_dataset::Dataset;
+use picofarm_store::{StorageError, open_store};
+use tokio::sync::Mutex;
+
+use super::{
+    SceneId, Truth,
+    cache::Cache,
+    volume::{Light, Volume, has_parts},
+};
+use crate::{App, answer::Problem};
+
+/// Levels of folders below a store that are searched for data sets.
+const DEPTH: usize = 2;
+/// Most data sets and folders that are looked at in a store.
+const MOST: usize = 400;
+/// Time for which a list of data sets is used again.
+const FRESH: Duration = Duration::from_secs(4);
+/// Bytes of images in memory.
+const IMAGES: usize = 192 << 20;
+/// Bytes of volumes in memory.
+const VOLUMES: usize = 320 << 20;
+
+/// A store, a data set or a render that the user named.
+struct Place {
+    /// As the user named it.
+    name: String,
+    store: Arc<dyn ObjectStore>,
+    prefix: Path,
+    /// The folder, of a place on this machine.
+    folder: Option<PathBuf>,
+}
+
+/// A data set that was found.
+#[derive(Debug, Clone)]
+pub struct DataSet {
+    /// Its name in URLs: the position of its place, and the path below that.
+    pub id: String,
+    /// Its location for people.
+    pub place: String,
+    /// The data set.
+    pub dataset: Dataset,
+    /// Its finished scenes, ascending.
+    pub scenes: Vec<u64>,
+}
+
+/// The stores of a server, and what it has decoded of them.
+pub struct Stores {
+    places: Vec<Place>,
+    listed: Mutex<Option<(Instant, Arc<[DataSet]>)>>,
+    truths: Cache<SceneId, Truth>,
+    volumes: Cache<(SceneId, Light), Volume>,
+}
+
+impl Stores {
+    /// Opens the stores, without reading them.
+    ///
+    /// # Errors
+    /// Fails if a URL is not usable.
+    pub fn open(names: &[String]) -> Result<Self, StorageError> {
+        let open = |name: &String| {
+            let (store, prefix) = open_store(name)?;
+            let folder = (!name.contains("://")).then(|| PathBuf::from(name));
+            Ok(Place {
+                name: name.trim_end_matches('/').to_owned(),
+                store,
+                prefix,
+                folder,
+            })
+        };
+        Ok(Self {
+            places: names
+                .iter()
+                .map(open)
+                .collect::<Result<_, StorageError>>()?,
+            listed: Mutex::default(),
+            truths: Cache::new(IMAGES),
+            volumes: Cache::new(VOLUMES),
+        })
+    }
+
+    /// Returns the names of the stores.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.places.iter().map(|place| &*place.name)
+    }
+
+    /// Returns the data sets. Those that cannot be read are logged and left out.
+    pub async fn list(&self) -> Arc<[DataSet]> {
+        let mut listed = self.listed.lock().await;
+        if let Some((at, sets)) = &*listed
+            && at.elapsed() < FRESH
+        {
+            return Arc::clone(sets);
+        }
+        let mut sets = Vec::new();
+        for (position, place) in self.places.iter().enumerate() {
+            if let Err(error) = place.search(position, &mut sets).await {
+                tracing::warn!(%error, store = place.name, "a store cannot be listed");
+            }
+        }
+        let sets: Arc<[DataSet]> = sets.into();
+        *listed = Some((Instant::now(), Arc::clone(&sets)));
+        sets
+    }
+
+    /// Opens the data set of a URL.
+    ///
+    /// # Errors
+    /// Fails if its name leads out of the stores, or if there is none.
+    pub async fn dataset(&self, id: &str) -> Result<Dataset, Problem> {
+        let (place, rest) = self.find(id)?;
+        let prefix = rest.split('/').filter(|part| !part.is_empty());
+        let prefix = prefix.fold(place.prefix.clone(), |prefix, part| prefix.join(part));
+        Ok(Dataset::open(Arc::clone(&place.store), prefix).await?)
+    }
+
+    /// Returns the folder of a data set on this machine.
+    ///
+    /// # Errors
+    /// Fails if the name leads out of the stores.
+    pub fn folder(&self, id: &str) -> Result<Option<PathBuf>, Problem> {
+        let (place, rest) = self.find(id)?;
+        Ok(place.folder.as_ref().map(|folder| match rest {
+            "" => folder.clone(),
+            rest => folder.join(rest),
+        }))
+    }
+
+    fn find<'a>(&self, id: &'a str) -> Result<(&Place, &'a str), Problem> {
+        let missing = || Problem::missing(format!("set: there is no data set {id:?}"));
+        let (position, rest) = id.split_once('/').unwrap_or((id, ""));
+        let position: usize = position.parse().map_err(|_| missing())?;
+        let place = self.places.get(position).ok_or_else(missing)?;
+        let climbs = |part: &str| matches!(part, "" | "." | "..") || part.contains(['\\', '\0']);
+        match !rest.is_empty() && rest.split('/').any(climbs) {
+            true => Err(missing()),
+            false => Ok((place, rest)),
+        }
+    }
+
+    /// Returns the images of a scene.
+    ///
+    /// # Errors
+    /// Fails if the scene cannot be read.
+    pub async fn truth(&self, app: &App, id: &SceneId) -> Result<Arc<Truth>, Problem> {
+        if let Some(truth) = self.truths.get(id) {
+            return Ok(truth);
+        }
+        let _place = app.limits.images.acquire().await;
+        if let Some(truth) = self.truths.get(id) {
+            return Ok(truth);
+        }
+        let dataset = self.dataset(&id.set).await?;
+        let truth = Arc::new(Truth::read(&dataset, id.scene).await?);
+        self.truths
+            .insert(id.clone(), Arc::clone(&truth), truth.bytes());
+        Ok(truth)
+    }
+
+    /// Returns the volume of a scene.
+    ///
+    /// # Errors
+    /// Fails if the scene has no such light or cannot be read.
+    pub async fn volume(
+        &self,
+        app: &App,
+        id: &SceneId,
+        light: Light,
+    ) -> Result<Arc<Volume>, Problem> {
+        let key = (id.clone(), light);
+        if let Some(volume) = self.volumes.get(&key) {
+            return Ok(volume);
+        }
+        let _place = app.limits.volumes.acquire().await;
+        // Another request may have read it meanwhile.
+        if let Some(volume) = self.volumes.get(&key) {
+            return Ok(volume);
+        }
+        let dataset = self.dataset(&id.set).await?;
+        let folder = self.folder(&id.set)?;
+        let volume = Arc::new(Volume::read(dataset, folder, id.scene, light).await?);
+        self.volumes
+            .insert(key, Arc::clone(&volume), volume.bytes());
+        Ok(volume)
+    }
+}
+
+impl Stores {
+    /// Returns the light of two bounces, and that of three and more, of a render that has them
+    /// apart; `None` otherwise.
+    ///
+    /// # Errors
+    /// Fails if the scene cannot be read.
+    pub async fn parts(
+        &self,
+        app: &App,
+        id: &SceneId,
+    ) -> Result<Option<[Arc<Volume>; 2]>, Problem> {
+        let folder = self.folder(&id.set)?;
+        if folder.as_deref().is_none_or(|folder| !has_parts(folder)) {
+            return Ok(None);
+        }
+        let two = self.volume(app, id, Light::Two).await?;
+        Ok(Some([two, self.volume(app, id, Light::More).await?]))
+    }
+}
+
+impl Place {
+    /// Adds the data sets of this place: itself, or those in its folders.
+    async fn search(&self, position: usize, found: &mut Vec<DataSet>) -> Result<(), StorageError> {
+        let mut folders = vec![(self.prefix.clone(), String::new(), 0)];
+        let mut looked = 0;
+        while let Some((prefix, below, depth)) = folders.pop() {
+            looked += 1;
+            if looked > MOST {
+                tracing::warn!(
+                    store = self.name,
+                    "only the first {MOST} folders are searched"
+                );
+                break;
+            }
+            match Dataset::open(Arc::clone(&self.store), prefix.clone()).await {
+                Ok(dataset) => {
+                    let id = format!("{position}{below}");
+                    let place = format!("{}{below}", self.name);
+                    let scenes = dataset.scenes_present().await?;
+                    found.push(DataSet {
+                        id,
+                        place,
+                        dataset,
+                        scenes,
+                    });
+                    continue;
+                }
+                // Other groups: predictions, reconstructions, what others wrote.
+                Err(StorageError::Invalid { .. } | StorageError::Damaged { .. }) => continue,
+                Err(StorageError::NoDataset { .. }) if depth < DEPTH => {}
+                Err(StorageError::NoDataset { .. }) => continue,
+                Err(error) => return Err(error),
+            }
+            let listed = self.store.list_with_delimiter(Some(&prefix)).await;
+            let listed = listed.map_err(|e| StorageError::store("list", prefix.to_string(), e))?;
+            let mut inner: Vec<_> = listed
+                .common_prefixes
+                .into_iter()
+                .filter_map(|path| {
+                    let name = path.filename()?.to_owned();
+                    let hidden = name.starts_with('.');
+                    (!hidden).then(|| (path, format!("{below}/{name}"), depth + 1))
+                })
+                .collect();
+            // The last is looked at first.
+            inner.sort_by(|a, b| b.1.cmp(&a.1));
+            folders.extend(inner);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_lead_out_of_the_stores_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = folder.path().display().to_string();
+        let stores = Stores::open(&[store.clone()]).unwrap();
+        assert_eq!(
+            stores.folder("0/a/b").unwrap(),
+            Some(PathBuf::from(&store).join("a/b"))
+        );
+        for id in [
+            "1",
+            "",
+            "x",
+            "-1",
+            "0/..",
+            "0/../x",
+            "0/a/../../x",
+            "0//etc",
+            "0/./a",
+            "0/a\\..\\b",
+            "/etc",
+            "0/a/",
+        ] {
+            assert!(stores.folder(id).is_err(), "{id}");
+        }
+    }
+}

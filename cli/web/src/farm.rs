@@ -1,0 +1,96 @@
+//! What the pages ask of a coordinator. The program implements it with its client, and tests with a
+//! farm in memory.
+
+use async_trait::async_trait;
+use picofarm_proto::{
+    ids::JobId,
+    messages::{
+        AuditEntry, ConnectedWorker, Event, JobState, JobStatus, JobSummary, Reason,
+        TaskExplanation,
+    },
+    spec::JobSpec,
+};
+
+/// Why the coordinator gave no answer.
+#[derive(Debug, Clone)]
+pub struct Refusal {
+    /// What happened.
+    pub message: String,
+    /// What the user can do.
+    pub hint: Option<String>,
+    /// Whether the caller's rights do not suffice.
+    pub denied: bool,
+}
+
+/// Selects jobs of the list.
+#[derive(Debug, Clone, Default)]
+pub struct JobFilter {
+    /// Only jobs in this state.
+    pub state: Option<JobState>,
+    /// Only jobs of this user; empty = all.
+    pub user: String,
+    /// Only jobs with this name, or with an id that begins with it; empty = all.
+    pub find: String,
+    /// Start of the page, as returned with the previous page; empty = the newest job.
+    pub page: String,
+    /// Maximum number of jobs.
+    pub limit: u32,
+}
+
+/// Selects events.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Events {
+    /// Only those of this job.
+    pub job: Option<JobId>,
+    /// Only those after this sequence number.
+    pub after: u64,
+    /// Maximum number, at most 1000.
+    pub limit: u32,
+    /// Selects the last ones instead of the first.
+    pub newest: bool,
+    /// Includes the logs of tasks.
+    pub logs: bool,
+}
+
+/// The workers of a coordinator.
+#[derive(Debug, Clone, Default)]
+pub struct Workers {
+    /// Name of the process that answered.
+    pub coordinator: String,
+    /// Its workers.
+    pub workers: Vec<ConnectedWorker>,
+    /// Number of workers of other coordinators of the same catalog.
+    pub elsewhere: u32,
+}
+
+/// A coordinator, asked with the rights of the user who started the server. All methods fail if it
+/// cannot be reached, refuses, or knows no such job.
+#[async_trait]
+pub trait Farm: Send + Sync {
+    /// Returns the coordinator's URL.
+    fn url(&self) -> String;
+    /// Returns a page of the list of jobs, newest first, and the start of the next page.
+    async fn jobs(&self, filter: &JobFilter) -> Result<(Vec<JobSummary>, Option<String>), Refusal>;
+    /// Returns a job's status.
+    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal>;
+    /// Returns a job as it was submitted.
+    async fn spec(&self, job: JobId) -> Result<JobSpec, Refusal>;
+    /// Returns events, oldest first.
+    async fn events(&self, ask: Events) -> Result<Vec<Event>, Refusal>;
+    /// Explains the state of a job, or of a task, given by the position of its stage and its index.
+    async fn explain(
+        &self,
+        job: JobId,
+        task: Option<(u32, u64)>,
+    ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal>;
+    /// Returns the connected workers.
+    async fn workers(&self) -> Result<Workers, Refusal>;
+    /// Returns the newest entries of the audit log.
+    async fn audit(&self, before: Option<u64>, limit: u32) -> Result<Vec<AuditEntry>, Refusal>;
+    /// Cancels a job.
+    async fn cancel(&self, job: JobId) -> Result<(), Refusal>;
+    /// Pauses or resumes a job.
+    async fn pause(&self, job: JobId, paused: bool) -> Result<(), Refusal>;
+    /// Makes a job's dead tasks pending again.
+    async fn retry(&self, job: JobId) -> Result<(), Refusal>;
+}

@@ -1,0 +1,129 @@
+//! The farm in a browser: jobs, workers and events of a coordinator, pictures of data sets, and
+//! light in flight. A server of HTML pages, server-sent events and binary volumes over HTTP/1.1.
+//!
+//! The server is a client of the coordinator ([`Farm`]) and of the stores: it has no rights and no
+//! state of its own. All pages come from this binary, without files from elsewhere.
+//!
+//! Layers, each of which imports only from those above it: [`guard`](mod@guard) (who may ask),
+//! `data` (scenes and volumes of stores), `pages` (HTML), `routes`, `server`.
+
+mod answer;
+mod assets;
+mod data;
+mod farm;
+mod guard;
+mod live;
+mod pages;
+mod query;
+mod routes;
+mod server;
+
+use std::{net::SocketAddr, sync::Arc};
+
+use picofarm_store::StorageError;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+
+pub use farm::{Events, Farm, JobFilter, Refusal, Workers};
+pub use guard::is_host;
+
+use self::{data::Stores, guard::Guard};
+
+/// What a server shows and to whom.
+pub struct Settings {
+    /// Address to listen on; port 0 = any free port.
+    pub listen: SocketAddr,
+    /// Names, without ports, under which browsers may reach the server, besides those of this
+    /// machine's loopback interface.
+    pub hosts: Vec<String>,
+    /// Folders and URLs of the stores, data sets and renders to show. No others are read.
+    pub stores: Vec<String>,
+}
+
+/// A server that listens and does not yet answer.
+pub struct Server {
+    listener: TcpListener,
+    address: SocketAddr,
+    app: Arc<App>,
+}
+
+/// What all requests share.
+struct App {
+    guard: Guard,
+    farm: Arc<dyn Farm>,
+    stores: Stores,
+    limits: server::Limits,
+    stop: CancellationToken,
+}
+
+/// Why a server cannot start.
+#[derive(Debug)]
+pub enum StartError {
+    /// The address cannot be used.
+    Listen(SocketAddr, std::io::Error),
+    /// The address is reachable from elsewhere, and no name for it was given.
+    Open(SocketAddr),
+    /// A store cannot be opened.
+    Store(StorageError),
+}
+
+impl Server {
+    /// Listens on the address.
+    ///
+    /// # Errors
+    /// Fails if the address cannot be used, if it is not of the loopback interface and
+    /// `settings.hosts` is empty, or if a store's URL is not usable.
+    pub async fn bind(settings: Settings, farm: Arc<dyn Farm>) -> Result<Self, StartError> {
+        let listen = settings.listen;
+        if !listen.ip().is_loopback() && settings.hosts.is_empty() {
+            return Err(StartError::Open(listen));
+        }
+        let stores = Stores::open(&settings.stores).map_err(StartError::Store)?;
+        let failed = |e| StartError::Listen(listen, e);
+        let listener = TcpListener::bind(listen).await.map_err(failed)?;
+        let address = listener.local_addr().map_err(failed)?;
+        let app = App {
+            guard: Guard::new(settings.hosts),
+            farm,
+            stores,
+            limits: server::Limits::default(),
+            stop: CancellationToken::new(),
+        };
+        Ok(Self {
+            listener,
+            address,
+            app: Arc::new(app),
+        })
+    }
+
+    /// Returns the address that it listens on.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Returns the link to `path` for the user who started the server. It contains the key, without
+    /// which nothing is answered.
+    pub fn link(&self, path: &str) -> String {
+        let host = match self.app.guard.first_host() {
+            Some(host) if !self.address.ip().is_loopback() => {
+                format!("{host}:{}", self.address.port())
+            }
+            _ => self.address.to_string(),
+        };
+        let join = if path.contains('?') { '&' } else { '?' };
+        format!("http://{host}{path}{join}key={}", self.app.guard.key())
+    }
+
+    /// Returns the path of the page that shows light in flight of the first finished scene; `None`
+    /// if the stores have none.
+    pub async fn first_flight(&self) -> Option<String> {
+        let sets = self.app.stores.list().await;
+        let set = sets.iter().find(|set| !set.scenes.is_empty())?;
+        Some(data::flight_path(&set.id, *set.scenes.first()?))
+    }
+
+    /// Answers requests until `stop`.
+    pub async fn serve(self, stop: CancellationToken) {
+        server::run(self.listener, self.app, stop).await;
+    }
+}

@@ -1,0 +1,258 @@
+//! One job: stages, tasks, failures, explanation, log and job file.
+
+use std::collections::BTreeMap;
+
+use maud::{Markup, html};
+use picofarm_proto::{
+    ids::JobId,
+    messages::{Event, EventKind, JobState, JobStatus},
+    spec::JobSpec,
+};
+
+use super::{
+    Page, events, grid,
+    parts::{badge, bar, count, job_state, now_ms, remaining, safe, seconds, stage_state, time},
+};
+use crate::{
+    App, Events,
+    answer::Problem,
+    query::{Query, encode},
+};
+
+/// Number of running tasks in the list.
+const RUNNING: usize = 24;
+/// Number of events of the log.
+const LOG: u32 = 200;
+/// Number of groups of failures.
+const GROUPS: usize = 20;
+
+/// Returns the page of a job.
+pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> {
+    let view = query.text("view");
+    let newest = Events {
+        job: Some(id),
+        limit: LOG,
+        newest: true,
+        logs: view == "log",
+        ..Events::default()
+    };
+    let (job, history, newest, why) = tokio::join!(
+        app.farm.job(id),
+        grid::history(app, id),
+        app.farm.events(newest),
+        app.farm.explain(id, None)
+    );
+    let (job, history, newest, (reasons, _)) = (job?, history?, newest?, why?);
+    let part = match view {
+        "" => overview(&job, &history),
+        "log" => {
+            let mut shown = newest;
+            shown.reverse();
+            html! { section #log { h2 { "Log" } (events::table(&shown, false)) } }
+        }
+        "file" => file(&app.farm.spec(id).await?)?,
+        other => {
+            return Err(Problem::input(format!(
+                "view: expected log or file, found {other:?}"
+            )));
+        }
+    };
+    let content = html! {
+        section #head {
+            h1 { (safe(&job.name)) " " (badge(job_state(job.state, job.paused, &job.tasks))) }
+            (summary(&job))
+            @if job.state == JobState::Active && !reasons.is_empty() {
+                ul.reasons aria-label="Why it stands so" {
+                    @for reason in &reasons { li { (safe(&reason.words)) } }
+                }
+            }
+        }
+        section #actions.actions aria-label="Actions" { (actions(app, &job)) }
+        nav.filters aria-label="Views" {
+            @for (name, value) in [("tasks", ""), ("log", "log"), ("job file", "file")] {
+                a href={ "/jobs/" (id) "?" (encode(&[("view", value)])) }
+                    aria-current=[(value == view).then_some("true")] { (name) }
+            }
+        }
+        (part)
+    };
+    Ok(Page {
+        title: job.name.clone(),
+        tab: "/jobs",
+        live: view != "file",
+        script: None,
+        content,
+    })
+}
+
+fn summary(job: &JobStatus) -> Markup {
+    let end = job.ended_at_ms.unwrap_or_else(now_ms);
+    let left = remaining(&job.tasks, job.mean_task_seconds, job.running.len());
+    html! {
+        (bar(&job.tasks))
+        dl.line {
+            div { dt { "tasks" } dd { (count(&job.tasks)) } }
+            div { dt { "reused" } dd { (job.tasks.reused) } }
+            div { dt { "dead" } dd { (job.tasks.dead) } }
+            div { dt { "took" } dd { (seconds((end - job.submitted_at_ms) as f64 / 1000.0)) } }
+            @if let Some(left) = left { div { dt { "left" } dd { "about " (seconds(left)) } } }
+            @if let Some(mean) = job.mean_task_seconds { div { dt { "per task" } dd { (seconds(mean)) } } }
+            @if job.workers > 0 { div { dt { "workers" } dd { (job.workers) } } }
+            @if !job.user.is_empty() { div { dt { "user" } dd { (safe(&job.user)) } } }
+            div { dt { "submitted" } dd { (time(job.submitted_at_ms)) } }
+            div { dt { "id" } dd { code { (job.id) } } }
+        }
+        @if job.unverified > 0 {
+            p.hint { (job.unverified) " results were reported and not found in their store yet." }
+        }
+    }
+}
+
+/// The forms that change a job. The coordinator checks the rights of whoever started the server.
+fn actions(app: &App, job: &JobStatus) -> Markup {
+    let form = |act: &str, text: &str| {
+        html! {
+            form method="post" action={ "/jobs/" (job.id) "/" (act) } {
+                input type="hidden" name="form" value=(app.guard.form());
+                button id={ "act-" (act) } { (text) }
+            }
+        }
+    };
+    html! {
+        @if job.state == JobState::Active {
+            @if job.paused { (form("resume", "Resume")) } @else { (form("pause", "Pause")) }
+            details.confirm {
+                summary { "Cancel…" }
+                p { "Running tasks are stopped. What is done stays, and is reused when the job is submitted again." }
+                (form("cancel", "Cancel this job"))
+            }
+        }
+        @if job.tasks.dead > 0 { (form("retry", "Retry dead tasks")) }
+    }
+}
+
+fn overview(job: &JobStatus, history: &[Event]) -> Markup {
+    html! {
+        section #stages {
+            h2 { "Stages" }
+            div.scroll tabindex="0" role="region" aria-label="Table of stages" { table {
+                thead { tr {
+                    th { "stage" } th { "kind" } th { "state" } th.wide { "progress" } th.number { "tasks" }
+                    th.number { "reused" } th.number { "dead" } th { "needs" }
+                } }
+                tbody { @for stage in &job.stages { tr {
+                    td { (safe(&stage.name)) }
+                    td { (safe(&stage.kind)) }
+                    td { (badge(stage_state(stage.state, &stage.tasks))) }
+                    td.wide { (bar(&stage.tasks)) }
+                    td.number { (count(&stage.tasks)) }
+                    td.number { (stage.tasks.reused) }
+                    td.number { (stage.tasks.dead) }
+                    td { (safe(stage.needs.join(", "))) }
+                } } }
+            } }
+        }
+        section #grid {
+            h2 { "Tasks" }
+            (grid::legend())
+            @for (position, stage) in job.stages.iter().enumerate() {
+                (grid::draw(job, position as u32, stage, history))
+            }
+        }
+        @if !job.running.is_empty() {
+            section #running {
+                h2 { "Running" }
+                div.scroll tabindex="0" role="region" aria-label="Table of running tasks" { table {
+                    thead { tr {
+                        th { "stage" } th.number { "task" } th { "worker" } th.number { "done" }
+                        th.number { "since" } th { "at" }
+                    } }
+                    tbody { @for task in job.running.iter().take(RUNNING) {
+                        @let name = job.stages.get(task.stage as usize).map_or("", |s| &*s.name);
+                        tr {
+                            td { (safe(name)) }
+                            td.number { a href={ "/jobs/" (job.id) "/tasks/" (task.stage) "/" (task.index) } { (task.index) } }
+                            td { (safe(&task.worker)) }
+                            td.number { (format!("{:.0} %", 100.0 * task.fraction)) }
+                            td.number { (seconds(task.seconds)) }
+                            td { (safe(&task.text)) }
+                        }
+                    } }
+                } }
+                @if job.running.len() > RUNNING { p { (job.running.len() - RUNNING) " more run." } }
+            }
+        }
+        (failures(job, history))
+    }
+}
+
+/// Failures with equal messages are one group: numbers in messages often differ.
+fn failures(job: &JobStatus, history: &[Event]) -> Markup {
+    let mut groups: BTreeMap<String, Vec<&Event>> = BTreeMap::new();
+    let failed = history
+        .iter()
+        .filter(|e| matches!(e.kind, EventKind::Failed | EventKind::Dead));
+    for event in failed {
+        groups.entry(shape(&event.message)).or_default().push(event);
+    }
+    let mut groups: Vec<_> = groups.into_values().collect();
+    groups.sort_by_key(|group| std::cmp::Reverse(group.len()));
+    html! {
+        @if !groups.is_empty() {
+            section #failures {
+                h2 { "Failures by message" }
+                ul.failures { @for group in groups.iter().take(GROUPS) {
+                    @let last = group[group.len() - 1];
+                    li {
+                        b { (group.len()) "×" } " "
+                        span.message { (safe(&last.message)) }
+                        " " @if let Some(task) = last.task {
+                            a href={ "/jobs/" (job.id) "/tasks/" (last.stage.unwrap_or(0)) "/" (task) } { "task " (task) }
+                        }
+                        @if !last.worker.is_empty() { " on " (safe(&last.worker)) }
+                        ", " (time(last.at_ms))
+                    }
+                } }
+                @if groups.len() > GROUPS { p { (groups.len() - GROUPS) " more messages." } }
+            }
+        }
+    }
+}
+
+/// A message with its numbers replaced.
+fn shape(message: &str) -> String {
+    let mut text = String::with_capacity(message.len());
+    for c in message.chars() {
+        match c {
+            '0'..='9' if text.ends_with('#') => {}
+            '0'..='9' => text.push('#'),
+            c => text.push(c),
+        }
+    }
+    text
+}
+
+fn file(spec: &JobSpec) -> Result<Markup, Problem> {
+    let text = toml::to_string_pretty(spec).map_err(|e| {
+        let status = http::StatusCode::INTERNAL_SERVER_ERROR;
+        Problem::new(status, format!("the job cannot be written as TOML: {e}"))
+    })?;
+    Ok(html! {
+        section #file {
+            h2 { "Job file" }
+            p { "As submitted, with all defaults, versions and locations filled in." }
+            pre.file tabindex="0" { (safe(text)) }
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::shape;
+
+    #[test]
+    fn messages_that_differ_in_numbers_have_one_shape() {
+        assert_eq!(shape("scene 12 of 340: full"), shape("scene 7 of 9: full"));
+        assert_ne!(shape("scene 12: full"), shape("scene 12: empty"));
+    }
+}

@@ -1,0 +1,126 @@
+//! Connections and their limits. hyper speaks HTTP/1.1; requests are bounded here.
+
+use std::{convert::Infallible, pin::Pin, sync::Arc, time::Duration};
+
+use http::{Request, StatusCode};
+use http_body::Body as _;
+use hyper::{body::Incoming, server::conn::http1, service::service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::{net::TcpListener, sync::Semaphore};
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    App,
+    answer::{Answer, Problem},
+    routes,
+};
+
+/// Most concurrent connections. Each open page has one for its events.
+const CONNECTIONS: usize = 128;
+/// Most pages that get events.
+const LIVE: usize = 48;
+/// Most scenes whose images are read at a time; further requests wait.
+const IMAGES: usize = 2;
+/// The longest request head, bytes.
+const HEAD: usize = 16 << 10;
+/// The longest body of a form, bytes.
+const FORM: usize = 4 << 10;
+/// Time limit of a request head, and of a form.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// The limits that requests share.
+pub struct Limits {
+    /// Pages that get events.
+    pub live: Arc<Semaphore>,
+    /// Scenes whose images are read.
+    pub images: Semaphore,
+    /// Volumes that are read: one at a time, because each may need a gigabyte, and so that requests
+    /// for parts of the same one wait for it.
+    pub volumes: Semaphore,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            live: Arc::new(Semaphore::new(LIVE)),
+            images: Semaphore::new(IMAGES),
+            volumes: Semaphore::new(1),
+        }
+    }
+}
+
+/// Answers requests until `stop`.
+pub async fn run(listener: TcpListener, app: Arc<App>, stop: CancellationToken) {
+    let places = Arc::new(Semaphore::new(CONNECTIONS));
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = stop.cancelled() => break,
+        };
+        let stream = match accepted {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                tracing::warn!(%error, "the web server cannot accept a connection");
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                continue;
+            }
+        };
+        // A further connection is closed at once, because waiting ones would use files too.
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+            continue;
+        };
+        let app = Arc::clone(&app);
+        tokio::spawn(async move {
+            let _place = place;
+            let ended = app.stop.clone();
+            let service = service_fn(|request| {
+                let app = Arc::clone(&app);
+                async move { Ok::<_, Infallible>(respond(app, request).await) }
+            });
+            let connection = http1::Builder::new()
+                .timer(TokioTimer::new())
+                .header_read_timeout(PATIENCE)
+                .max_buf_size(HEAD)
+                .serve_connection(TokioIo::new(stream), service);
+            tokio::select! {
+                // A browser that leaves early is no error.
+                _ = connection => {}
+                () = ended.cancelled() => {}
+            }
+        });
+    }
+    app.stop.cancel();
+}
+
+async fn respond(app: Arc<App>, request: Request<Incoming>) -> Answer {
+    let (head, body) = request.into_parts();
+    let form = match head.method {
+        http::Method::POST => match tokio::time::timeout(PATIENCE, form(body)).await {
+            Ok(Ok(form)) => form,
+            Ok(Err(problem)) => return routes::problem(&app, &problem),
+            Err(_) => {
+                let status = StatusCode::REQUEST_TIMEOUT;
+                return routes::problem(&app, &Problem::new(status, "the form did not arrive"));
+            }
+        },
+        _ => String::new(),
+    };
+    routes::answer(&app, &head, &form).await
+}
+
+/// Reads the body of a form.
+async fn form(mut body: Incoming) -> Result<String, Problem> {
+    let mut bytes = Vec::new();
+    let frame =
+        |body: &mut Incoming, cx: &mut std::task::Context<'_>| Pin::new(body).poll_frame(cx);
+    while let Some(part) = std::future::poll_fn(|cx| frame(&mut body, cx)).await {
+        let part = part.map_err(|e| Problem::input(format!("the form broke off: {e}")))?;
+        let Ok(data) = part.into_data() else { continue };
+        if bytes.len() + data.len() > FORM {
+            let what = format!("expected a form of at most {FORM} bytes");
+            return Err(Problem::new(StatusCode::PAYLOAD_TOO_LARGE, what));
+        }
+        bytes.extend_from_slice(&data);
+    }
+    String::from_utf8(bytes).map_err(|_| Problem::input("expected a form in UTF-8"))
+}

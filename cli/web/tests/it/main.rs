@@ -1,0 +1,9 @@
+//! The server as browsers and attackers see it: requests over TCP, a farm in memory, and a small
+//! data set on disk.
+
+mod access;
+mod actions;
+mod client;
+mod farm;
+mod room;
+mod scenes;

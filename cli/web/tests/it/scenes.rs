@@ -1,0 +1,185 @@
+//! Pictures, values and volumes of scenes.
+
+use serde_json::json;
+
+use crate::{
+    client::Web,
+    room::{self, BINS, SIDE, h},
+};
+
+fn shown() -> (tempfile::TempDir, Web) {
+    let folder = tempfile::tempdir().unwrap();
+    room::write(&folder.path().join("store"));
+    std::fs::write(folder.path().join("secret"), "secret").unwrap();
+    let store = folder.path().join("store").display().to_string();
+    let web = Web::start(vec![store]);
+    (folder, web)
+}
+
+#[test]
+fn the_data_sets_of_a_store_and_their_finished_scenes_are_found() {
+    let (_folder, web) = shown();
+    let list = web.get("/data").text();
+    assert!(
+        list.contains("/data?set=0%2Frooms") && list.contains("2 of 3 scenes"),
+        "{list}"
+    );
+    let gallery = web.get("/data?set=0%2Frooms").text();
+    let cards = |html: &str| html.matches("/bytes/card?").count();
+    assert_eq!(cards(&gallery), 2);
+    assert_eq!(cards(&web.get("/data?set=0%2Frooms&from=1").text()), 1);
+    assert_eq!(cards(&web.get("/data?set=0%2Frooms&to=1&from=1").text()), 0);
+    let card = web.get("/bytes/card?set=0%2Frooms&scene=2");
+    assert!(card.body.starts_with(b"\x89PNG"));
+}
+
+#[test]
+fn places_outside_of_the_given_stores_are_not_read() {
+    let (folder, web) = shown();
+    let outside = folder.path().join("store/rooms").display().to_string();
+    let outside = outside.trim_start_matches('/');
+    for set in [
+        "0/../store/rooms",
+        "1/rooms",
+        "0/rooms/../rooms",
+        outside,
+        "0//rooms",
+        "0/rooms/",
+    ] {
+        let set: String = url::form_urlencoded::byte_serialize(set.as_bytes()).collect();
+        for page in [
+            "data/scene",
+            "flight",
+            "bytes/picture",
+            "bytes/flight",
+            "bytes/slab",
+        ] {
+            let path = format!("/{page}?set={set}&scene=0&what=rgb&from=0&to=1");
+            assert_eq!(web.get(&path).status, 404, "{path}");
+        }
+        assert_eq!(web.get(&format!("/data?set={set}")).status, 404, "{set}");
+    }
+    assert_eq!(web.get("/flight?set=0%2Frooms&scene=0").status, 200);
+}
+
+#[test]
+fn a_scene_is_shown_with_all_images_also_next_to_another() {
+    let (_folder, web) = shown();
+    let one = web.get("/data/scene?set=0%2Frooms&scene=0").text();
+    for what in [
+        "rgb",
+        "intensity",
+        "depth",
+        "normal",
+        "label",
+        "instance",
+        "mirror",
+        "lit&amp;spot=0",
+    ] {
+        let link = format!("&amp;what={what}\"");
+        let at = one.find(&link).unwrap_or_else(|| panic!("{what}"));
+        let start = one[..at].rfind("src=\"").unwrap() + 5;
+        let path = one[start..at + link.len() - 1].replace("&amp;", "&");
+        let picture = web.get(&path);
+        assert!(picture.body.starts_with(b"\x89PNG"), "{path}");
+    }
+    assert!(
+        one.contains("<dt>task key</dt><dd><code>task</code>"),
+        "{one}"
+    );
+    let two = web.get("/data/scene?set=0%2Frooms&scene=0&scene2=2").text();
+    assert_eq!(two.matches("class=\"column\"").count(), 2, "{two}");
+    assert_eq!(web.get("/data/scene?set=0%2Frooms&scene=1").status, 404);
+    assert_eq!(
+        web.get("/data/scene?set=0%2Frooms&scene=0&spot=9").status,
+        400
+    );
+}
+
+#[test]
+fn values_are_those_of_the_pixel() {
+    let (_folder, web) = shown();
+    let at = |row: usize, column: usize| {
+        let path = format!("/bytes/value?set=0%2Frooms&scene=0&row={row}&column={column}");
+        web.get(&path)
+    };
+    let upper = at(0, 3).json();
+    assert_eq!(upper["depth_m"], 2.0);
+    assert_eq!(upper["label_name"], "<b>wall</b>");
+    assert_eq!(upper["lit_by"], json!([0, 1]));
+    assert_eq!(at(SIDE - 1, 3).json()["lit_by"], json!([0]));
+    let outside = at(SIDE, 0);
+    assert_eq!(outside.status, 400);
+    assert!(outside.text().contains("row: expected a number below 20"));
+}
+
+#[test]
+fn a_volume_arrives_in_slabs_and_its_codes_are_the_stored_values() {
+    let (_folder, web) = shown();
+    let query = "set=0%2Frooms&scene=2";
+    let facts = web.get(&format!("/bytes/flight?{query}")).json();
+    let volume = &facts["volume"];
+    assert_eq!(
+        (&volume["bins"], &volume["width"]),
+        (&json!(BINS), &json!(SIDE))
+    );
+    let factor = volume["factor"].as_f64().unwrap();
+    for (light, spots) in [("all", &[0, 1][..]), ("spot-1", &[1])] {
+        let mut codes = Vec::new();
+        for from in (0..BINS).step_by(32) {
+            let to = BINS.min(from + 32);
+            let path = format!("/bytes/slab?{query}&light={light}&from={from}&to={to}");
+            codes.extend(web.get(&path).body);
+        }
+        assert_eq!(codes.len(), 2 * SIDE * SIDE * BINS);
+        for (i, code) in codes.chunks_exact(2).enumerate() {
+            let (bin, pixel) = (i / (SIDE * SIDE), i % (SIDE * SIDE));
+            let found = (f64::from(u16::from_le_bytes([code[0], code[1]])) / factor).powi(2);
+            let exact: f32 = spots.iter().map(|s| h(*s, pixel, bin)).sum();
+            assert!(
+                (found - f64::from(exact)).abs() < 0.02,
+                "{pixel} {bin} {found} {exact}"
+            );
+        }
+    }
+    let small = web.get(&format!("/bytes/coarse?{query}"));
+    assert_eq!(small.body.len(), 2 * SIDE * SIDE * BINS);
+    for light in ["spot-2", "two", "25"] {
+        let reply = web.get(&format!("/bytes/flight?{query}&light={light}"));
+        assert!(
+            matches!(reply.status, 400 | 404),
+            "{light}: {}",
+            reply.status
+        );
+    }
+}
+
+#[test]
+fn a_histogram_has_the_times_of_one_and_two_bounces() {
+    let (_folder, web) = shown();
+    // Spot 0 is half a metre left of the middle, at column 10 - 0.5·10/2 = 7.5, row 10.
+    let path =
+        |row, column| format!("/bytes/pixel?set=0%2Frooms&scene=0&row={row}&column={column}");
+    let own = web.get(&path(10, 7)).json();
+    let distance = 0.5f64.hypot(2.0);
+    assert!(
+        (own["one"]["path_m"].as_f64().unwrap() - 2.0 * distance).abs() < 1e-6,
+        "{own}"
+    );
+    let other = web.get(&path(15, 10)).json();
+    assert_eq!(other["one"], json!(null));
+    // The pixel's middle sees x = 0.1, y = 1.1 on the wall.
+    let (x, y, z) = (0.1f64, 1.1f64, 2.0f64);
+    let two = distance + ((x + 0.5).powi(2) + y * y).sqrt() + (x * x + y * y + z * z).sqrt();
+    assert!(
+        (other["two"][0]["path_m"].as_f64().unwrap() - two).abs() < 1e-6,
+        "{other}"
+    );
+    assert_eq!(other["two"][0]["lit"], true);
+    assert_eq!(other["two"][1]["lit"], false);
+    let pixel = 15 * SIDE + 10;
+    for (bin, found) in other["h"].as_array().unwrap().iter().enumerate() {
+        let exact = h(0, pixel, bin) + h(1, pixel, bin);
+        assert!((found.as_f64().unwrap() - f64::from(exact)).abs() < 0.02);
+    }
+}
