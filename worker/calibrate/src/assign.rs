@@ -80,7 +80,9 @@ mod tests {
             };
             let best = sum(&assign(&costs));
             let mut order = [0, 1, 2, 3, 4];
-            visit(&mut order, 0, &mut |order| assert!(best <= sum(order) + 1e-12));
+            visit(&mut order, 0, &mut |order| {
+                assert!(best <= sum(order) + 1e-12)
+            });
         }
     }
 

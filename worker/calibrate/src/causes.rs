@@ -4,7 +4,7 @@ use picofarm_settings::PS_PER_M;
 
 use crate::{
     Measurement,
-    check::{LEAST_LASER, Refined, Relocated, SIGNIFICANT, upright},
+    check::{Refined, Relocated, SIGNIFICANT, upright},
     fit::{Fitted, Observed},
     hypotheses::{Chosen, SCALES, order_name},
     masks::MaskOrder,
@@ -17,6 +17,9 @@ use crate::{
 
 /// Share of times within one bin below which a calibration explains nothing.
 const UNEXPLAINED: f64 = 0.22;
+/// Distance of peaks from predicted times, over that from shifted times, above which a calibration
+/// explains nothing of a capture of all spots at once.
+const UNCLEAR: f64 = 0.5;
 /// Share of dead pixels, t0 in bins, laser in metres, focal length and bin width relative, from
 /// which on results are wrong.
 const WRONG_DEAD: f64 = 0.2;
@@ -44,7 +47,8 @@ pub(crate) struct Findings<'a> {
     pub before: &'a Fitted,
     pub refined: &'a Refined,
     pub relocated: &'a [Relocated],
-    pub masks: Option<&'a MaskOrder>,
+    /// The order of masks, and whether they are stored already turned.
+    pub masks: Option<&'a (MaskOrder, bool)>,
 }
 
 /// Writes down one cause.
@@ -84,18 +88,26 @@ pub(crate) fn report(f: &Findings) -> Report {
     continuous(f, &mut causes);
     counting(f, &mut causes);
     let fitted = &f.refined.fitted;
-    if fitted.agreeing < UNEXPLAINED {
+    let unexplained = match f.seen.unclear {
+        None => (fitted.agreeing < UNEXPLAINED).then(|| {
+            let percent = 100.0 * fitted.agreeing;
+            let what = format!("only {percent:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more");
+            (fitted.agreeing, "share of times", what)
+        }),
+        Some(share) => (share > UNCLEAR).then(|| {
+            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.3 and less");
+            (share, "of the distance by chance", what)
+        }),
+    };
+    if let Some((value, unit, finding)) = unexplained {
         causes.push(
             Found {
                 fault: Fault::Unexplained,
                 wrong: true,
-                value: fitted.agreeing,
+                value,
                 error: 0.0,
-                unit: "",
-                finding: format!(
-                    "only {:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more",
-                    100.0 * fitted.agreeing
-                ),
+                unit,
+                finding,
                 advice: "check the stated spots, the camera and the unit of time together: more than one of them is wrong, or the room moved",
                 corrected: false,
             }
@@ -108,7 +120,11 @@ pub(crate) fn report(f: &Findings) -> Report {
         rms_m: fitted.rms_m,
     };
     Report {
-        verdict: causes.iter().map(|c| c.severity).max().unwrap_or(Verdict::Good),
+        verdict: causes
+            .iter()
+            .map(|c| c.severity)
+            .max()
+            .unwrap_or(Verdict::Good),
         causes,
         notes: notes(f),
         stated: Some(agreement(f.before)),
@@ -142,8 +158,7 @@ fn spot(f: &Findings, k: usize) -> SpotResidual {
         times: near.len(),
         rms_m: (squares / near.len().max(1) as f64).sqrt(),
         median_m: quantile(&mut near, 0.5),
-        return_m: f.observed.returns[k]
-            .map(|r| path + length(point) - fitted.model.path(r.bin)),
+        return_m: f.observed.returns[k].map(|r| path + length(point) - fitted.model.path(r.bin)),
     }
 }
 
@@ -187,7 +202,10 @@ fn discrete(f: &Findings, causes: &mut Vec<Cause>) {
     if h.reordered() {
         add(
             Fault::SpotOrder,
-            format!("histograms and spots are {}: so {shares}{returns}", order_name(&h.order)),
+            format!(
+                "histograms and spots are {}: so {shares}{returns}",
+                order_name(&h.order)
+            ),
             "reorder the stated spots so that spot k belongs to histogram k",
         );
     }
@@ -195,11 +213,14 @@ fn discrete(f: &Findings, causes: &mut Vec<Cause>) {
         let (factor, reason) = SCALES[h.scale];
         add(
             Fault::TimeScale,
-            format!("times are {factor:.4} of what they should be ({reason}): multiplied by it, {shares}", factor = 1.0 / factor),
+            format!(
+                "times are {factor:.4} of what they should be ({reason}): multiplied by it, {shares}",
+                factor = 1.0 / factor
+            ),
             "state bin width and begin of the gate as metres of path: picoseconds times 0.000299792",
         );
     }
-    if let Some(masks) = f.masks
+    if let Some((masks, _)) = f.masks
         && masks.order.iter().enumerate().any(|(k, j)| k != *j)
     {
         causes.push(
@@ -464,15 +485,23 @@ fn notes(f: &Findings) -> Vec<String> {
     }
     let placed = f.base.beams.iter().all(|b| b.point.is_some());
     if !placed {
-        notes.push("no spot has a stated place: a common scale of all lengths cannot be seen".into());
+        notes.push(
+            "no spot has a stated place: a common scale of all lengths cannot be seen".into(),
+        );
     }
     if f.pixels.dark_bins == 0 {
         notes.push("the gate begins with light: background and hot pixels cannot be seen".into());
     }
+    if f.seen.pulse.is_none() {
+        notes.push(format!(
+            "no return shows the pulse: that of {:.2} bins is assumed",
+            crate::observe::ASSUMED.fwhm_bins()
+        ));
+    }
     notes.push(format!(
         "shifts below {:.2} bins of t0, {:.0} mm of the laser and {SIGNIFICANT} standard errors are not corrected",
-        crate::check::LEAST_T0,
-        1e3 * LEAST_LASER
+        f.refined.least.t0,
+        1e3 * f.refined.least.laser
     ));
     notes
 }

@@ -14,11 +14,30 @@ use crate::{
     spots::locate,
 };
 
-/// Least shifts that are corrected: t0 in bins, the laser in metres and each of its coordinates,
-/// relative focal length and bin width, a spot in metres.
-pub(crate) const LEAST_T0: f64 = 0.25;
-pub(crate) const LEAST_LASER: f64 = 0.006;
-const LEAST_COORDINATE: f64 = 0.004;
+/// Least shifts of t0 in bins, of the laser and of each of its coordinates in metres, that are
+/// corrected.
+#[derive(Clone, Copy)]
+pub(crate) struct Least {
+    pub t0: f64,
+    pub laser: f64,
+    pub coordinate: f64,
+}
+
+impl Least {
+    pub const SHARP: Self = Self {
+        t0: 0.25,
+        laser: 0.006,
+        coordinate: 0.004,
+    };
+    /// Where the pulse is unknown, so that its peak is.
+    pub const VAGUE: Self = Self {
+        t0: 0.8,
+        laser: 0.03,
+        coordinate: 0.02,
+    };
+}
+
+/// The same of relative focal length and bin width, and of a spot in metres.
 pub(crate) const LEAST_FOCAL: f64 = 0.004;
 pub(crate) const LEAST_WIDTH: f64 = 0.003;
 pub(crate) const LEAST_SPOT: f64 = 0.03;
@@ -80,19 +99,43 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
     let h = &chosen.hypothesis;
     let observed = h.observed(&seen.observed, width, height);
     let base = h.model(&stated);
-    let mut refined = refine(&base, &observed);
-    let relocated = relocate(&mut refined, &observed);
+    let least = match seen.pulse {
+        Some(_) => Least::SHARP,
+        None => Least::VAGUE,
+    };
+    let mut refined = refine(&base, &observed, least);
+    let (relocated, moved) = relocate(&refined, &base, &observed);
+    if !relocated.is_empty() {
+        refined = refine(&moved, &observed, least);
+    }
     let masks = m.masks.map(|masks| {
         let (model, ranges) = (&refined.fitted.model, &refined.fitted.ranges);
-        masks::order(model, &observed, ranges, masks, m.pixels(), &seen.observed.pixels)
+        let order = |pixels| masks::order(model, &observed, ranges, masks, m.pixels(), pixels);
+        // Masks are stored as the histograms are, or already turned.
+        let (own, turned) = (order(&seen.observed.pixels), order(&observed.pixels));
+        if turned.contrast > own.contrast {
+            (turned, true)
+        } else {
+            (own, false)
+        }
     });
     let mut placed = stated.clone();
-    let bins: Vec<_> = seen.observed.returns.iter().map(|r| r.map(|r| r.bin)).collect();
+    let bins: Vec<_> = seen
+        .observed
+        .returns
+        .iter()
+        .map(|r| r.map(|r| r.bin))
+        .collect();
     placed.place_beams(&bins);
     let before = seen.observed.judged(placed, [0.0; 6], 0.0);
     let pictures = Pictures {
         stated_m: image(&before, &seen.observed, &seen.observed.pixels, m.pixels()),
-        corrected_m: image(&refined.fitted, &observed, &seen.observed.pixels, m.pixels()),
+        corrected_m: image(
+            &refined.fitted,
+            &observed,
+            &seen.observed.pixels,
+            m.pixels(),
+        ),
         pulse_samples: seen.samples.clone(),
         pulse: seen.pulse,
     };
@@ -129,6 +172,8 @@ pub(crate) struct Refined {
     pub tied: f64,
     /// Whether the laser can be told from t0.
     pub separable: bool,
+    /// What counts as a shift.
+    pub least: Least,
 }
 
 fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
@@ -137,52 +182,65 @@ fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
 
 /// Fits t0 and laser, then bin width and focal length if the times demand them. What moves by no
 /// more than chance stays as stated.
-fn refine(base: &Model, seen: &Observed) -> Refined {
+fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
     let mut free = Free::LASER;
     let mut best = seen.fit(base, free);
     let all = best.clone();
-    let vague = LASER.iter().any(|k| !(best.errors[*k] > 0.0 && best.errors[*k] < VAGUE_M));
+    let vague = LASER
+        .iter()
+        .any(|k| !(best.errors[*k] > 0.0 && best.errors[*k] < VAGUE_M));
     let separable = !vague;
     if vague {
         free = Free::T0;
         best = seen.fit(base, free);
     }
     let placed = base.beams.iter().all(|b| b.point.is_some());
-    for more in [
-        Free { focal: true, ..free },
-        Free { width: true, ..free },
-    ] {
-        if more.width && !placed {
+    let worth = |tried: &Fitted, more: Free, than: &Fitted| {
+        let focal = (tried.model.lens[0] / base.lens[0] - 1.0).abs();
+        let width = (tried.model.width / base.width - 1.0).abs();
+        let real = |on: bool, value: f64, least: f64, name: usize| {
+            !on || value > least.max(SIGNIFICANT * tried.errors[name])
+        };
+        let better =
+            tried.rms_m < (1.0 - SAVES) * than.rms_m || tried.agreeing > than.agreeing + 0.01;
+        better
+            && tried.agreeing > than.agreeing - 0.005
+            && real(more.focal, focal, LEAST_FOCAL, FOCAL)
+            && real(more.width, width, LEAST_WIDTH, WIDTH)
+    };
+    let plain = free;
+    // One more parameter before two.
+    for (focal, width) in [(true, false), (false, true), (true, true)] {
+        if width && !placed {
             continue;
         }
         let more = Free {
-            focal: more.focal || free.focal,
-            ..more
+            focal,
+            width,
+            ..plain
         };
         let tried = seen.fit(base, more);
-        let (name, least, value) = match more.width {
-            true => (WIDTH, LEAST_WIDTH, tried.model.width / base.width - 1.0),
-            false => (FOCAL, LEAST_FOCAL, tried.model.lens[0] / base.lens[0] - 1.0),
-        };
-        let real = value.abs() > least.max(SIGNIFICANT * tried.errors[name]);
-        let better = tried.rms_m < (1.0 - SAVES) * best.rms_m || tried.agreeing > best.agreeing + 0.01;
-        if real && better && tried.agreeing > best.agreeing - 0.005 {
+        if worth(&tried, more, &best) {
             (free, best) = (more, tried);
         }
     }
     let moved = shift(&best, base);
-    let far = length(moved) > LEAST_LASER;
+    let far = length(moved) > least.laser;
     let mut held = free;
     for a in 0..3 {
-        let sure = moved[a].abs() > LEAST_COORDINATE.max(SIGNIFICANT * best.errors[LASER[a]]);
+        let sure = moved[a].abs() > least.coordinate.max(SIGNIFICANT * best.errors[LASER[a]]);
         held.laser[a] = free.laser[a] && far && sure;
     }
     if held != free {
         free = held;
         best = seen.fit(base, free);
     }
+    if free.laser != [false; 3] && length(shift(&best, base)) < least.laser {
+        free.laser = [false; 3];
+        best = seen.fit(base, free);
+    }
     let late = (best.model.start - base.start) / base.width;
-    let t0 = late.abs() > LEAST_T0.max(SIGNIFICANT * best.errors[0] / base.width);
+    let t0 = late.abs() > least.t0.max(SIGNIFICANT * best.errors[0] / base.width);
     let simple = free == Free::T0 && !t0;
     if simple {
         let mut model = base.clone();
@@ -197,6 +255,7 @@ fn refine(base: &Model, seen: &Observed) -> Refined {
         errors: [all.errors[0], all.errors[1], all.errors[2], all.errors[3]],
         tied: all.tied,
         separable,
+        least,
     }
 }
 
@@ -208,9 +267,21 @@ pub(crate) struct Relocated {
     pub agreeing: [usize; 2],
 }
 
-fn relocate(refined: &mut Refined, seen: &Observed) -> Vec<Relocated> {
+/// Finds spots that are elsewhere, and returns the calibration with them moved. Only spots with a
+/// return take part.
+fn relocate(refined: &Refined, base: &Model, seen: &Observed) -> (Vec<Relocated>, Model) {
     let mut all = Vec::new();
     let fitted = &refined.fitted;
+    let near = |k: usize| {
+        let off = seen.residuals(&fitted.model, &fitted.ranges, k);
+        let close = off
+            .iter()
+            .flatten()
+            .filter(|e| e.abs() < fitted.model.width);
+        close.count() as f64
+    };
+    let mut counts: Vec<f64> = (0..fitted.model.beams.len()).map(near).collect();
+    let usual = crate::numeric::median(&mut counts).unwrap_or(0.0);
     for k in 0..fitted.model.beams.len() {
         let (Some(stated), Some(found)) = (
             fitted.model.beams[k].point,
@@ -220,21 +291,20 @@ fn relocate(refined: &mut Refined, seen: &Observed) -> Vec<Relocated> {
         };
         let distance = length(sub(found.point, stated));
         let least = LEAST_SPOT.max(SIGNIFICANT * found.error);
-        let more = found.agreeing[1] as f64 > 1.1 * found.agreeing[0] as f64;
-        if distance > least && more {
+        let more = found.agreeing[1] as f64 > 1.25 * found.agreeing[0] as f64;
+        // Light by way of a bright wall makes a few pixels agree on a spot that is not there.
+        let enough = found.agreeing[1] as f64 > 0.4 * usual;
+        if distance > least && more && enough {
             all.push((k, found, distance));
         }
     }
     // If most spots moved, it is not the spots that are wrong.
     if 3 * all.len() > fitted.model.beams.len() {
-        return Vec::new();
+        return (Vec::new(), base.clone());
     }
-    let mut model = fitted.model.clone();
+    let mut model = base.clone();
     for (k, found, _) in &all {
         model.beams[*k].point = Some(found.point);
-    }
-    if !all.is_empty() {
-        refined.fitted = seen.judged(model, fitted.errors, fitted.tied);
     }
     let made = all.into_iter().map(|(spot, found, distance)| Relocated {
         spot,
@@ -242,7 +312,7 @@ fn relocate(refined: &mut Refined, seen: &Observed) -> Vec<Relocated> {
         error: found.error,
         agreeing: found.agreeing,
     });
-    made.collect()
+    (made.collect(), model)
 }
 
 /// Median residual of each stored pixel.

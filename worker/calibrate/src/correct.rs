@@ -26,7 +26,9 @@ pub struct Corrected {
     /// How the stored image is turned.
     pub turn: Turn,
     /// The stated mask of each histogram's spot; `None` if masks were not stated.
-    pub masks: Option<Vec<usize>>,
+    pub mask_order: Option<Vec<usize>>,
+    /// Whether stated masks are stored as the histograms are, so that they are turned with them.
+    pub turn_masks: bool,
     /// Stored pixels that are set to 0, `[row][column]`.
     pub hot: Vec<bool>,
     /// Pulses of a histogram, if pile-up is to be corrected.
@@ -74,7 +76,8 @@ impl Corrected {
             laser,
             spots,
             turn: h.turn,
-            masks: f.masks.map(|m| m.order.clone()),
+            mask_order: f.masks.map(|(m, _)| m.order.clone()),
+            turn_masks: f.masks.is_none_or(|(_, turned)| !turned),
             hot: f.pixels.hot.clone(),
             pulses: f.pixels.pulses.filter(|_| has(Fault::PileUp)),
             dark_bins: has(Fault::Background).then_some(f.pixels.dark_bins),
@@ -91,7 +94,11 @@ impl Corrected {
         all.par_chunks_mut(pixels * bins)
             .zip(stored.par_chunks(pixels * bins))
             .for_each(|(out, stored)| {
-                for (p, h) in stored.chunks(bins).enumerate().filter(|(p, _)| !self.hot[*p]) {
+                for (p, h) in stored
+                    .chunks(bins)
+                    .enumerate()
+                    .filter(|(p, _)| !self.hot[*p])
+                {
                     let q = self.turn.pixel(p, width, height);
                     let out = &mut out[q * bins..][..bins];
                     out.copy_from_slice(h);
@@ -121,11 +128,14 @@ impl Corrected {
         all
     }
 
-    /// Returns stated masks, `[spot][row][column]`, in the order of the histograms.
-    pub fn reordered(&self, masks: &[u8]) -> Vec<u8> {
+    /// Returns stated masks, `[spot][row][column]`, in the order and orientation of the corrected
+    /// histograms.
+    pub fn masks(&self, stored: &[u8]) -> Vec<u8> {
         let (width, height) = self.size();
         let pixels = width * height;
-        match &self.masks {
+        let turned = self.turn_masks.then(|| self.image(stored));
+        let masks = turned.as_deref().unwrap_or(stored);
+        match &self.mask_order {
             Some(order) => order
                 .iter()
                 .flat_map(|j| masks[j * pixels..][..pixels].iter().copied())

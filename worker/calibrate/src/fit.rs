@@ -158,7 +158,11 @@ impl Observed {
             };
             let mut step = vec![0.0; count];
             for (i, k) in list.iter().enumerate() {
-                let sum: f64 = inverse[i].iter().zip(&normal.right).map(|(a, b)| a * b).sum();
+                let sum: f64 = inverse[i]
+                    .iter()
+                    .zip(&normal.right)
+                    .map(|(a, b)| a * b)
+                    .sum();
                 // A wrong start must not throw the fit out of its valley.
                 step[*k] = sum.clamp(-0.3, 0.3);
             }
@@ -188,7 +192,11 @@ impl Observed {
         for k in 0..self.times.len() {
             off.extend(self.residuals(&model, &ranges, k).iter().flatten());
         }
-        let near: Vec<f64> = off.iter().copied().filter(|e| e.abs() < model.width).collect();
+        let near: Vec<f64> = off
+            .iter()
+            .copied()
+            .filter(|e| e.abs() < model.width)
+            .collect();
         let squares: f64 = near.iter().map(|e| e * e).sum();
         let all = self.times.iter().flatten().flatten().count().max(1);
         let agreeing = near.len() as f64 / all as f64;
@@ -233,7 +241,9 @@ impl Observed {
                 let x = along([0.0; 3], ray, *range);
                 let (mut up, mut down) = (0.0, 0.0);
                 for k in 0..self.times.len() {
-                    let Some(time) = self.time(k, n) else { continue };
+                    let Some(time) = self.time(k, n) else {
+                        continue;
+                    };
                     let (e, w) = rows.weigh(k, x, &time, scale);
                     let slope = 1.0 + dot(ray, unit(sub(x, rows.spots[k].0)));
                     up += w * e * slope;
@@ -246,7 +256,9 @@ impl Observed {
             let x = along([0.0; 3], ray, *range);
             let mut block = Block::new(list.len());
             for k in 0..self.times.len() {
-                let Some(time) = self.time(k, n) else { continue };
+                let Some(time) = self.time(k, n) else {
+                    continue;
+                };
                 let (e, w) = rows.weigh(k, x, &time, scale);
                 if w > 0.0 {
                     let away = unit(sub(x, rows.spots[k].0));
@@ -268,12 +280,17 @@ impl Observed {
         let scatter = 1.48 * median(&mut sizes).unwrap_or(0.0) / model.width;
         let error = scatter.clamp(RETURN_BINS[0], RETURN_BINS[1]) * model.width;
         for (k, r) in self.returns.iter().enumerate() {
-            let (Some(r), Some(e)) = (r, late[k]) else { continue };
+            let (Some(r), Some(e)) = (r, late[k]) else {
+                continue;
+            };
             let (point, _) = rows.spots[k];
             let w = tukey(e / (scale + 3.0 * error)) / (error * error);
             let row = rows.one_bounce(k, unit(point), r.bin, list);
             normal.add(&row, e, w);
-            if let Some(film) = model.film(point).filter(|_| limit > FILM_LIMIT || list.contains(&FOCAL)) {
+            if let Some(film) = model
+                .film(point)
+                .filter(|_| limit > FILM_LIMIT || list.contains(&FOCAL))
+            {
                 let seen = [r.pixel % model.columns, r.pixel / model.columns];
                 let off = [0, 1].map(|a| film[a] - (seen[a] as f64 + 0.5));
                 let far = (off[0] * off[0] + off[1] * off[1]).sqrt() / (3.0 + limit);

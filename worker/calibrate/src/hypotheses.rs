@@ -13,6 +13,8 @@ use crate::{
 const PIXELS: usize = 400;
 /// A hypothesis must explain this factor of times more than the stated calibration, and this share.
 const BETTER: (f64, f64) = (1.2, 0.03);
+/// Or so much more if it brings returns to this share of their distance, by at least so many pixels.
+const NEARER: (f64, f64, f64) = (0.015, 0.5, 1.0);
 /// Share of times that a further fault must explain.
 const SIMPLER: f64 = 0.015;
 /// Factors of time, and their usual reasons.
@@ -20,8 +22,14 @@ pub(crate) const SCALES: [(f64, &str); 5] = [
     (1.0, ""),
     (2.0, "one way instead of there and back"),
     (0.5, "there and back instead of one way"),
-    (0.299_792_458, "a tenth of nanoseconds times 3 taken for metres"),
-    (3.335_640_952, "nanoseconds taken for metres, or the reverse"),
+    (
+        0.299_792_458,
+        "a tenth of nanoseconds times 3 taken for metres",
+    ),
+    (
+        3.335_640_952,
+        "nanoseconds taken for metres, or the reverse",
+    ),
 ];
 
 /// How the stored image is turned.
@@ -176,7 +184,10 @@ pub(crate) fn choose(stated: &Model, seen: &Observed, width: usize, height: usiz
                 tries.push(plain.clone());
             }
             let order = by_returns(&plain.model(stated), &own);
-            for order in order.into_iter().chain(usual_orders(spots, own.returns.is_empty())) {
+            for order in order.into_iter().chain(usual_orders(
+                spots,
+                own.returns.iter().flatten().next().is_none(),
+            )) {
                 let h = Hypothesis {
                     order,
                     ..plain.clone()
@@ -194,7 +205,11 @@ pub(crate) fn choose(stated: &Model, seen: &Observed, width: usize, height: usiz
             }
         }
     }
-    if best.0 < BETTER.0 * base.agreeing + BETTER.1 {
+    let better = best.0 > BETTER.0 * base.agreeing + BETTER.1;
+    let nearer = best.0 > base.agreeing + NEARER.0
+        && best.1 < NEARER.1 * base_distance
+        && best.1 < base_distance - NEARER.2;
+    if !better && !nearer {
         best = (base.agreeing, base_distance, Hypothesis::stated(spots));
     }
     Chosen {
@@ -206,15 +221,12 @@ pub(crate) fn choose(stated: &Model, seen: &Observed, width: usize, height: usiz
     }
 }
 
-/// Median distance of returns from the projections of their spots, pixels.
+/// Mean distance of returns from the projections of their spots, pixels; NaN without returns.
 pub(crate) fn distance(model: &Model, seen: &Observed) -> f64 {
-    let mut all: Vec<f64> = (0..model.beams.len())
-        .filter_map(|k| {
-            let r = seen.returns.get(k).copied().flatten()?;
-            apart(model, k, r.pixel)
-        })
+    let all: Vec<f64> = (0..model.beams.len())
+        .filter_map(|k| apart(model, k, seen.returns[k]?.pixel))
         .collect();
-    crate::numeric::median(&mut all).unwrap_or(f64::NAN)
+    all.iter().sum::<f64>() / all.len() as f64
 }
 
 /// Distance of a pixel from the projection of a spot, pixels.
@@ -242,7 +254,11 @@ fn by_returns(model: &Model, seen: &Observed) -> Option<Vec<usize>> {
             let mut placed = model.clone();
             placed.place_beams(&vec![Some(r.bin); spots]);
             (0..spots)
-                .map(|j| apart(&placed, j, r.pixel).map_or(most, |d| d.min(most)).powi(2))
+                .map(|j| {
+                    apart(&placed, j, r.pixel)
+                        .map_or(most, |d| d.min(most))
+                        .powi(2)
+                })
                 .collect()
         })
         .collect();
@@ -272,7 +288,11 @@ pub(crate) fn order_name(order: &[usize]) -> String {
     let moved: Vec<usize> = (0..n).filter(|k| order[*k] != *k).collect();
     let shifted = (1..n).find(|s| (0..n).all(|k| order[k] == (k + s) % n));
     if let Some(s) = shifted {
-        let by = if s * 2 <= n { s as i64 } else { s as i64 - n as i64 };
+        let by = if s * 2 <= n {
+            s as i64
+        } else {
+            s as i64 - n as i64
+        };
         return format!("shifted by {by}");
     }
     if (0..n).all(|k| order[k] == n - 1 - k) {

@@ -3,8 +3,8 @@
 
 use crate::{assign::assign, fit::Observed, model::Model};
 
-/// Gain in contrast per spot from which on another order counts.
-const BETTER: f64 = 0.08;
+/// Gain in the sum of contrasts from which on another order counts.
+const BETTER: f64 = 0.35;
 
 /// The order of masks.
 pub(crate) struct MaskOrder {
@@ -35,7 +35,11 @@ pub(crate) fn order(
         .collect();
     let contrast = |k: usize, j: usize| {
         let (mut lit, mut all) = ([0.0; 2], [0.0; 2]);
-        for (n, p) in stored.iter().enumerate().filter(|(n, _)| ranges[*n].is_finite()) {
+        for (n, p) in stored
+            .iter()
+            .enumerate()
+            .filter(|(n, _)| ranges[*n].is_finite())
+        {
             let inside = usize::from(masks[j * cells + p] != 0);
             all[inside] += 1.0;
             lit[inside] += f64::from(u8::from(light[k][n]));

@@ -180,8 +180,8 @@ impl Model {
     /// A point of the camera's frame in world axes.
     pub fn world(camera: &Camera, p: V3) -> Vec3 {
         let axis = |k: usize| {
-            let [o, r, d, f] = [camera.origin, camera.right, camera.down, camera.forward]
-                .map(|a| a.to_f64()[k]);
+            let [o, r, d, f] =
+                [camera.origin, camera.right, camera.down, camera.forward].map(|a| a.to_f64()[k]);
             (o + r * p[0] + d * p[1] + f * p[2]) as f32
         };
         Vec3::new(axis(0), axis(1), axis(2))

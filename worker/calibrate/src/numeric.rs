@@ -96,7 +96,10 @@ mod tests {
         for i in 0..3 {
             for j in 0..3 {
                 let sum: f64 = (0..3).map(|k| m[i][k] * inverse[k][j]).sum();
-                assert!((sum - f64::from(u8::from(i == j))).abs() < 1e-6, "{i} {j}: {sum}");
+                assert!(
+                    (sum - f64::from(u8::from(i == j))).abs() < 1e-6,
+                    "{i} {j}: {sum}"
+                );
             }
         }
         assert!(super::inverse(&[vec![1.0, 1.0], vec![1.0, 1.0]]).is_none());

@@ -20,9 +20,9 @@ const CONTRAST: f64 = 4.0;
 /// Share of the pulses from which on pile-up spoils the shape of a return.
 const SPOILT: f64 = 0.3;
 /// Pulse that is assumed where no return shows one, bins.
-const ASSUMED: Pulse = Pulse {
-    sigma_bins: 0.4,
-    tail_bins: 0.3,
+pub(crate) const ASSUMED: Pulse = Pulse {
+    sigma_bins: 0.35,
+    tail_bins: 0.5,
 };
 /// Probability of light from which on a spot's peak is looked for in a histogram of all spots.
 const LIT: f32 = 0.7;
@@ -37,6 +37,9 @@ pub(crate) struct Seen {
     pub pulse: Option<Pulse>,
     /// Bins and shares of the returns' light: (bins after the pulse's peak, share of the return).
     pub samples: Vec<[f64; 2]>,
+    /// Of a capture of all spots at once: distance of peaks from the times that the stated
+    /// calibration predicts, over that from shifted times.
+    pub unclear: Option<f64>,
 }
 
 /// Good pixels that take part, evenly over the image.
@@ -53,7 +56,9 @@ pub(crate) fn each(m: &Measurement, per_spot: &[f32], pixels: &Pixels) -> Seen {
     let good = pixels.good();
     let mut corrected = per_spot.to_vec();
     if let Some(pulses) = pixels.pulses {
-        corrected.par_chunks_mut(bins).for_each(|h| unpile(h, pulses));
+        corrected
+            .par_chunks_mut(bins)
+            .for_each(|h| unpile(h, pulses));
     }
     let captures: Vec<&[f32]> = corrected.chunks(cells).collect();
     let mut returns: Vec<Option<Return>> = captures
@@ -77,7 +82,10 @@ pub(crate) fn each(m: &Measurement, per_spot: &[f32], pixels: &Pixels) -> Seen {
     let pulse = known.then(|| estimate(&mut returns, &whole, of_pixel));
     if pulse.is_none() {
         // The rise of a spoilt return still tells its pixel, and its time to a bin.
-        returns.iter_mut().flatten().for_each(|r| r.bin = r.bin.floor() + 0.5);
+        returns
+            .iter_mut()
+            .flatten()
+            .for_each(|r| r.bin = r.bin.floor() + 0.5);
     }
     let samples = samples(&returns, &whole, of_pixel);
     let finder = Finder::new(&pulse.unwrap_or(ASSUMED), pixels.gain);
@@ -97,6 +105,7 @@ pub(crate) fn each(m: &Measurement, per_spot: &[f32], pixels: &Pixels) -> Seen {
         },
         pulse,
         samples,
+        unclear: None,
     }
 }
 

@@ -13,6 +13,8 @@ const HOT: [f64; 2] = [0.5, 5.0];
 const RISE: f64 = 0.02;
 /// Bins before that which count as light: a pulse begins before its peak.
 const BEFORE: usize = 3;
+/// Bins before a pixel's own first bright bin.
+const MARGIN: usize = 8;
 /// Rank of the bin that counts as a pixel's brightest, so that a return of one bounce does not.
 const RANK: usize = 8;
 /// Least count that may be a ceiling, and cells that must be at it.
@@ -44,7 +46,11 @@ pub(crate) struct Pixels {
 
 impl Pixels {
     pub fn good(&self) -> Vec<bool> {
-        self.dead.iter().zip(&self.hot).map(|(d, h)| !d && !h).collect()
+        self.dead
+            .iter()
+            .zip(&self.hot)
+            .map(|(d, h)| !d && !h)
+            .collect()
     }
 
     pub fn new(m: &Measurement) -> Self {
@@ -56,13 +62,27 @@ impl Pixels {
         let mut middle: Vec<f64> = tops.iter().copied().filter(|t| *t > 0.0).collect();
         let typical = quantile(&mut middle, 0.5).unwrap_or(1.0);
         // Light in other units is taken for a bright measurement of 1000 photons in a bin.
-        let gain = if counts { 1.0 } else { (1000.0 / typical) as f32 };
+        let gain = if counts {
+            1.0
+        } else {
+            (1000.0 / typical) as f32
+        };
         let totals: Vec<f64> = h.par_chunks(bins).map(sum).collect();
         let dark: Vec<f32> = h
             .par_chunks(bins)
             .map(|h| match dark_bins {
                 0 => 0.0,
-                n => (sum(&h[..n]) / n as f64) as f32,
+                // The pulse of a bright spot's pixel may begin earlier.
+                n => {
+                    let top = h.iter().copied().fold(0.0f32, f32::max);
+                    let own = h.iter().position(|x| *x > 0.3 * top).unwrap_or(n);
+                    let n = if own < MARGIN + 4 {
+                        n
+                    } else {
+                        n.min(own - MARGIN)
+                    };
+                    (sum(&h[..n]) / n as f64) as f32
+                }
             })
             .collect();
         let shared = |part: &[f32]| {
@@ -181,7 +201,10 @@ fn pile_up(m: &Measurement, counts: bool, dead: &[bool], hot: &[bool]) -> (Optio
         }
     };
     brightest.sort_by(f64::total_cmp);
-    let (half, most) = (brightest[brightest.len() / 2], brightest[brightest.len() - 1]);
+    let (half, most) = (
+        brightest[brightest.len() / 2],
+        brightest[brightest.len() - 1],
+    );
     let level = brightest.len() >= 4 && half >= 100.0 && most - half <= LEVEL * half;
     let pulses = match m.pulses {
         Some(n) => n as f64,

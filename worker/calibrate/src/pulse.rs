@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::numeric::{V3, median};
+use crate::numeric::V3;
 
 /// Steps of a template per bin.
 pub(crate) const STEPS: i64 = 16;
@@ -11,6 +11,9 @@ const REACH: i64 = 14;
 /// Bins of a return before and after its brightest bin that take part.
 const BEFORE: usize = 4;
 const AFTER: usize = 7;
+
+/// Share of squared light beyond which a return has another shape than the pulse.
+const ODD: f64 = 0.03;
 
 /// A pulse as a Gaussian convolved with an exponential tail. Its zero, to which every time refers,
 /// is its peak.
@@ -202,11 +205,9 @@ pub(crate) fn estimate<'a>(
             tail_bins: tail,
         };
         let template = pulse.template(0.0);
-        let mut left: Vec<f64> = peaks
-            .iter()
-            .map(|(h, bin)| place(h, *bin, &template).1)
-            .collect();
-        median(&mut left).unwrap_or(f64::INFINITY)
+        let left = peaks.iter().map(|(h, bin)| place(h, *bin, &template).1);
+        // A return that is none must not decide.
+        left.map(|l| l.min(ODD)).sum::<f64>()
     };
     let mut best: V3 = [0.3, 0.0, f64::INFINITY];
     let mut span = [2.0f64, 1.3, 1.12];
@@ -215,7 +216,10 @@ pub(crate) fn estimate<'a>(
         for i in -4i32..=4 {
             for j in -4i32..=4 {
                 let (sigma, tail) = match round {
-                    0 => (0.4 * span.powi(i), [0.0, 0.8 * span.powi(j)][usize::from(j > -4)]),
+                    0 => (
+                        0.4 * span.powi(i),
+                        [0.0, 0.8 * span.powi(j)][usize::from(j > -4)],
+                    ),
                     _ => (around[0] * span.powi(i), around[1] * span.powi(j)),
                 };
                 let left = cost(sigma.clamp(0.05, 4.0), tail.min(6.0));

@@ -11,6 +11,8 @@ use crate::{
 const LIMITS: [f64; 9] = [24.0, 12.0, 8.0, 4.0, 4.0, 2.0, 2.0, 1.0, 1.0];
 /// Fewest times.
 const FEWEST: usize = 20;
+/// Distance of a return from its spot, bins and pixels, up to which it belongs to the spot.
+const NEAR: (f64, f64) = (2.0, 2.5);
 
 /// A spot that was found anew.
 #[derive(Debug, Clone, Copy)]
@@ -24,7 +26,10 @@ pub(crate) struct Found {
 
 /// Finds the place of spot `k`, whose path from the laser is straight.
 pub(crate) fn locate(model: &Model, seen: &Observed, ranges: &[f64], k: usize) -> Option<Found> {
-    let stated = model.beams[k].point.filter(|_| model.beams[k].fold == 0.0)?;
+    let stated = model.beams[k]
+        .point
+        .filter(|_| model.beams[k].fold == 0.0)?;
+    let r = seen.returns[k]?;
     let times: Vec<(V3, f64, f64)> = (0..seen.pixels.len())
         .filter_map(|n| {
             let time = seen.times[k][n].filter(|_| ranges[n].is_finite())?;
@@ -72,19 +77,24 @@ pub(crate) fn locate(model: &Model, seen: &Observed, ranges: &[f64], k: usize) -
         }
         Some((point, spread))
     };
+    // A return says where its spot is: no other place is right, and none that it denies.
+    let denied = |point: V3| {
+        let late = length(sub(point, model.laser)) + length(point) - model.path(r.bin);
+        let film = model.film(point).unwrap_or([f64::INFINITY; 2]);
+        let u = film[0] - (r.pixel % model.columns) as f64 - 0.5;
+        let v = film[1] - (r.pixel / model.columns) as f64 - 0.5;
+        late.abs() > NEAR.0 * model.width || (u * u + v * v).sqrt() > NEAR.1
+    };
     // From the stated place, and from where its return is seen.
     let mut starts = vec![stated];
-    if let Some(r) = seen.returns[k] {
-        let ray = model.ray(r.pixel);
-        let path = model.path(r.bin);
-        if let Some(range) = model.range(ray, (model.laser, 0.0), path) {
-            starts.push(along([0.0; 3], ray, range));
-        }
+    let ray = model.ray(r.pixel);
+    if let Some(range) = model.range(ray, (model.laser, 0.0), model.path(r.bin)) {
+        starts.push(along([0.0; 3], ray, range));
     }
     let mut best: Option<Found> = None;
     for (point, error) in starts.into_iter().filter_map(solve) {
         let after = near(point);
-        if after >= FEWEST && best.is_none_or(|b| after > b.agreeing[1]) {
+        if after >= FEWEST && !denied(point) && best.is_none_or(|b| after > b.agreeing[1]) {
             best = Some(Found {
                 point,
                 error,

@@ -192,21 +192,25 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
         all.push((name, made, masks.clone(), None));
     };
     let laser = |c: &mut Capturing, by: f32| {
+        let stated = c.laser;
         c.laser = c.laser + c.camera.right * by;
-        let laser = c.laser;
         for place in c.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
-            place.path_m = (place.point - laser).length();
+            place.path_m += (place.point - c.laser).length() - (place.point - stated).length();
         }
     };
     add("t0 1 bin late", &|c| c.gate.start_m += GATE.bin_width_m);
-    add("t0 5 bins early", &|c| c.gate.start_m -= 5.0 * GATE.bin_width_m);
+    add("t0 5 bins early", &|c| {
+        c.gate.start_m -= 5.0 * GATE.bin_width_m
+    });
     add("laser 1 cm right", &|c| laser(c, 0.01));
     add("laser 10 cm right", &|c| laser(c, 0.10));
     add("laser 1 cm right, t0 1 bin late", &|c| {
         laser(c, 0.01);
         c.gate.start_m += GATE.bin_width_m;
     });
-    add("only directions", &|c| c.spots.iter_mut().for_each(|s| s.place = None));
+    add("only directions", &|c| {
+        c.spots.iter_mut().for_each(|s| s.place = None)
+    });
     add("only directions, t0 1 bin late", &|c| {
         c.spots.iter_mut().for_each(|s| s.place = None);
         c.gate.start_m += GATE.bin_width_m;
@@ -258,11 +262,15 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
         for (n, h) in c.per_spot.chunks_mut(bins).enumerate() {
             let p = n % pixels;
             if p % (pixels / 20) == 5 {
-                h.iter_mut().enumerate().for_each(|(b, x)| *x += 40.0 + ((n + b) * 31 % 11) as f32);
+                h.iter_mut()
+                    .enumerate()
+                    .for_each(|(b, x)| *x += 40.0 + ((n + b) * 31 % 11) as f32);
             }
         }
     });
-    add("counts clipped at 127", &|c| c.per_spot.iter_mut().for_each(|x| *x = x.min(127.0)));
+    add("counts clipped at 127", &|c| {
+        c.per_spot.iter_mut().for_each(|x| *x = x.min(127.0))
+    });
     let mut rolled = masks.clone();
     rolled.rotate_left(pixels);
     all.push(("masks shifted by one", plain.clone(), rolled, None));
