@@ -281,9 +281,6 @@ fn summary(args: &Reconstruct, made: &Made) -> String {
     let [measuring, fitting, _] = made.seconds.map(duration);
     text += &format!("  measurements {measuring}, reconstruction {fitting}\n");
     text += &format!("  verdict: {}\n", Verdict::of_reconstruction(m).text);
-    for left in &made.reconstructed.measured.left_out {
-        text += &format!("  note: spot {} was left out: {}\n", left.beam, left.why);
-    }
     for note in &made.reconstructed.notes {
         text += &format!("  note: {note}\n");
     }

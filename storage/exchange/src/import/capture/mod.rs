@@ -127,12 +127,13 @@ pub fn import(
         return known::read(&described, &description, opener);
     }
     let mut parts = Vec::new();
+    let several = named.len() > 1;
     for file in &named {
         opener.check(file)?;
         parts.push(kinds::read(file, &description, &described, &reader)?);
     }
     let part = join(parts)?;
-    let mut capture = finish(part, &description, &described, &reader)?;
+    let mut capture = finish(part, several, &description, &described, &reader)?;
     capture.origin.files = reader.into_list();
     Ok(capture)
 }
@@ -183,9 +184,20 @@ fn join(mut parts: Vec<Part>) -> Result<Part, ImportError> {
     Ok(first)
 }
 
+/// The name of a capture without a name: the file's, or that of the folder of several files.
+fn named_after(file: &Path, several: bool) -> String {
+    let folder = file.parent().and_then(Path::file_name);
+    let name = match several {
+        true => folder.or(file.file_stem()),
+        false => file.file_stem(),
+    };
+    name.unwrap_or_default().to_string_lossy().into_owned()
+}
+
 /// Combines histograms with the description of what they do not say.
 fn finish(
     mut part: Part,
+    several: bool,
     description: &Description,
     described: &Described,
     reader: &Files,
@@ -221,8 +233,7 @@ fn finish(
         false => (part.values, None),
     };
     let name = description.name.clone().unwrap_or_else(|| {
-        let stem = file.file_stem().unwrap_or_default();
-        stem.to_string_lossy().into_owned()
+        named_after(&file, several)
     });
     Ok(Capture {
         name,
