@@ -232,9 +232,10 @@ fn finish(
         true => (arrays::sum(&part.values, spots), Some(part.values)),
         false => (part.values, None),
     };
-    let name = description.name.clone().unwrap_or_else(|| {
-        named_after(&file, several)
-    });
+    let name = description
+        .name
+        .clone()
+        .unwrap_or_else(|| named_after(&file, several));
     Ok(Capture {
         name,
         height: height as u32,
