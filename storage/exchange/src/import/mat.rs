@@ -244,7 +244,7 @@ const COMPRESSED: u32 = 15;
 /// Maximum size in bytes of a decompressed element.
 const MAX: u64 = 1 << 32;
 /// Maximum number of values of an array.
-const MAX_VALUES: usize = 1 << 28;
+pub(super) const MAX_VALUES: usize = 1 << 28;
 
 /// Returns the numeric arrays of a version 5 file; others (text, structures, cells) are skipped.
 fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {

@@ -6,7 +6,7 @@ use picofarm_dataset::Gate;
 
 use super::super::ImportError;
 use super::arrays::{Part, Stated};
-use super::describe::{Description, Described};
+use super::describe::{Described, Description};
 
 /// Most bins of all pixels and spots.
 const MOST: usize = 1 << 32;
@@ -143,7 +143,9 @@ impl Binner {
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Event {
     /// A photon after `ps` picoseconds.
-    Photon { ps: f64 },
+    Photon {
+        ps: f64,
+    },
     LineStart,
     LineStop,
     /// A new frame begins: the next line is the first.
@@ -162,7 +164,14 @@ pub(super) struct Lines {
 
 impl Lines {
     /// Takes the next event, at this clock.
-    pub fn take(&mut self, event: Event, clock: u64, spot: usize, binner: &mut Binner, description: &Description) {
+    pub fn take(
+        &mut self,
+        event: Event,
+        clock: u64,
+        spot: usize,
+        binner: &mut Binner,
+        description: &Description,
+    ) {
         match (event, &mut self.open) {
             (Event::Photon { ps }, Some((_, photons))) => photons.push((clock, ps)),
             (Event::Photon { ps }, None) => binner.add(None, description.path_m(ps)),
@@ -177,7 +186,8 @@ impl Lines {
                 let [rows, columns] = binner.image();
                 let span = clock.saturating_sub(start).max(1);
                 for (at, ps) in photons {
-                    let column = (u128::from(at - start) * columns as u128 / u128::from(span)) as usize;
+                    let column =
+                        (u128::from(at - start) * columns as u128 / u128::from(span)) as usize;
                     let place = Some((spot, self.line % rows, column.min(columns - 1)));
                     binner.add(place, description.path_m(ps));
                 }

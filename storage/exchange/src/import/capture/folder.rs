@@ -12,7 +12,7 @@ use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
 use super::super::IMPORT_VERSION;
-use super::super::scene::{IDENTITY, direction};
+use super::super::scene::direction;
 use super::super::vector::norm;
 use super::{Beam, Capture, Origin};
 
@@ -20,8 +20,22 @@ use super::{Beam, Capture, Origin};
 const CAPTURE: &str = "capture";
 /// Attribute with the directions of beams whose spots are not known.
 const DIRECTIONS: &str = "directions";
+/// Camera-to-world matrix: the world has x to the right, y upwards and z against the view, as glTF
+/// has it, so that meshes stand upright in viewers.
+const POSE: [[f32; 4]; 4] = [
+    [1.0, 0.0, 0.0, 0.0],
+    [0.0, -1.0, 0.0, 0.0],
+    [0.0, 0.0, -1.0, 0.0],
+    [0.0, 0.0, 0.0, 1.0],
+];
 /// Photons in the median pixel's brightest bin, if the values are no counts.
 const PEAK_PHOTONS: f32 = 400.0;
+
+/// From the camera's axes to the world's, and back.
+fn turned([x, y, z]: [f32; 3]) -> [f32; 3] {
+    // Adding 0 turns -0 into 0.
+    [x, 0.0 - y, 0.0 - z]
+}
 
 /// Returns whether a folder of a single render has these attributes because it is a capture.
 pub fn is_capture(attributes: &Map<String, Value>) -> bool {
@@ -86,14 +100,14 @@ impl Capture {
                 let way: [f32; 3] = std::array::from_fn(|k| position[k] - self.laser[k]);
                 let length = norm(way.map(f64::from)).max(f64::MIN_POSITIVE) as f32;
                 json!({
-                    "point": position, "normal": [0.0, 0.0, 0.0], "arriving": way.map(|x| x / length),
+                    "point": turned(*position), "normal": [0.0, 0.0, 0.0], "arriving": turned(way.map(|x| x / length)),
                     "path_m": path_m, "object": 0, "material": 0,
                 })
             }
             Beam::Direction(_) | Beam::Nothing => Value::Null,
         };
         let towards = |beam: &Beam| match beam {
-            Beam::Direction(way) => json!(way),
+            Beam::Direction(way) => json!(turned(*way)),
             Beam::Spot { .. } | Beam::Nothing => Value::Null,
         };
         let attributes = json!({
@@ -104,9 +118,9 @@ impl Capture {
                 "intrinsics": {
                     "fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy, "width": self.width, "height": self.height,
                 },
-                "origin": [0, 0, 0], "right": [1, 0, 0], "down": [0, 1, 0], "forward": [0, 0, 1],
+                "origin": [0, 0, 0], "right": [1, 0, 0], "down": [0, -1, 0], "forward": [0, 0, -1],
             },
-            "laser_origin": self.laser,
+            "laser_origin": turned(self.laser),
             "spots": self.beams.iter().map(spot).collect::<Vec<_>>(),
             DIRECTIONS: self.beams.iter().map(towards).collect::<Vec<_>>(),
             CAPTURE: {
@@ -170,7 +184,7 @@ impl Capture {
             rgb: &vec![0.0; pixels * 3],
             spots: &placed,
             intrinsics: self.intrinsics,
-            camera: IDENTITY,
+            camera: POSE,
             laser: self.laser,
             scale,
         };
@@ -219,7 +233,7 @@ impl Capture {
                 path_m: s.path_m,
             },
             None => match directions.get(k).copied().flatten() {
-                Some(way) => Beam::Direction(way),
+                Some(way) => Beam::Direction(turned(way)),
                 None => Beam::Nothing,
             },
         });

@@ -8,7 +8,7 @@ use super::super::mat::{Mat, is_hdf5};
 use super::super::{ImportError, npy};
 use super::arrays::{Part, Stated, Strided};
 use super::describe::{Described, Description};
-use super::{EXAMPLE, tables};
+use super::{EXAMPLE, h5, ptu, tables};
 
 /// Most numbers of an array.
 const MOST_VALUES: usize = 1 << 32;
@@ -33,6 +33,8 @@ pub(super) fn read(
         }
         h if h.starts_with(b"PK\x03\x04") => ("numpy", npz(file, description, reader)?),
         h if is_matlab(h, file) => ("matlab", matlab(file, description, reader)?),
+        h if h.starts_with(ptu::MAGIC) => return ptu::read(file, description, described, reader),
+        h if is_hdf5(h) => return h5::read(file, description, described, reader),
         h if is_text(h) => return tables::read(file, description, described, reader),
         h => {
             return Err(unknown(
@@ -41,6 +43,16 @@ pub(super) fn read(
             ));
         }
     };
+    ordered(file, format, array, description)
+}
+
+/// Puts the axes of an array in order.
+pub(super) fn ordered(
+    file: &Path,
+    format: &str,
+    array: Strided,
+    description: &Description,
+) -> Result<Part, ImportError> {
     let mut notes = Vec::new();
     let axes = description.axes.as_deref();
     let (dims, apart, values) = array.ordered(file, axes, description.pixels, &mut notes)?;
@@ -94,14 +106,32 @@ fn npz(file: &Path, description: &Description, reader: &Files) -> Result<Strided
 fn matlab(file: &Path, description: &Description, reader: &Files) -> Result<Strided, ImportError> {
     let mat = Mat::open(file, reader)?;
     let names = mat.names();
+    if let (None, Some(array)) = (&description.array, confocal(&names)) {
+        let what = format!(
+            "looks like a confocal scan of a relay wall (Stanford's layout, with the array {array}): each pixel is lit by a laser point of its own. A capture of picofarm has spots that light all pixels, and shadows compare pixels of one spot, so this scan has neither"
+        );
+        let hint = "record with a fixed laser point, or a few, and the detector's whole grid for each; for confocal scans use a solver for hidden scenes, such as the light-cone transform or f-k migration";
+        return Err(ImportError::unreadable(file, what, hint));
+    }
     let name = chosen(file, &names, description)?;
     let matrix = mat.matrix(name)?;
     let values = matrix.values.iter().map(|x| *x as f32).collect();
     Ok(Strided::columns(matrix.dims, values))
 }
 
+/// The array of a confocal scan: `rect_data` with `width` (O'Toole et al. 2018), or `meas` with
+/// `tofgrid` (Lindell et al. 2019).
+fn confocal(names: &[String]) -> Option<&'static str> {
+    let has = |name: &str| names.iter().any(|n| n == name);
+    match () {
+        () if has("rect_data") && has("width") => Some("rect_data"),
+        () if has("meas") && has("tofgrid") => Some("meas"),
+        () => None,
+    }
+}
+
 /// The array of the description, or the only one.
-fn chosen<'a>(
+pub(super) fn chosen<'a>(
     file: &Path,
     names: &'a [String],
     description: &Description,

@@ -7,10 +7,14 @@
 
 mod arrays;
 mod describe;
+mod events;
 mod folder;
+mod h5;
 mod kinds;
 mod known;
+mod ptu;
 mod tables;
+mod walls;
 
 use std::path::{Path, PathBuf};
 

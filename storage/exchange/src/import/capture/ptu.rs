@@ -10,12 +10,13 @@ use std::path::Path;
 use super::super::ImportError;
 use super::super::files::Files;
 use super::arrays::Part;
-use super::describe::{Description, Described};
+use super::describe::{Described, Description};
 use super::events::{Binner, Event, Lines};
 
 /// The first bytes of a file.
 pub(super) const MAGIC: &[u8] = b"PQTTTR\0\0";
-const HINT: &str = "record in T3 mode and save with PicoQuant's software, or export the events as a table (.csv)";
+const HINT: &str =
+    "record in T3 mode and save with PicoQuant's software, or export the events as a table (.csv)";
 
 /// The value of a tag.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -38,8 +39,15 @@ enum Layout {
 enum Record {
     /// The clock goes on by this many sync periods.
     Overflow(u64),
-    Photon { sync: u64, channel: u32, time: u32 },
-    Marker { sync: u64, bits: u32 },
+    Photon {
+        sync: u64,
+        channel: u32,
+        time: u32,
+    },
+    Marker {
+        sync: u64,
+        bits: u32,
+    },
 }
 
 impl Layout {
@@ -57,8 +65,15 @@ impl Layout {
             let (sync, time, channel) = (u64::from(raw & 0xffff), raw >> 16 & 0xfff, raw >> 28);
             return match (channel, time) {
                 (15, 0) => Record::Overflow(1 << 16),
-                (15, bits) => Record::Marker { sync, bits: bits & 15 },
-                (channel, time) => Record::Photon { sync, channel, time },
+                (15, bits) => Record::Marker {
+                    sync,
+                    bits: bits & 15,
+                },
+                (channel, time) => Record::Photon {
+                    sync,
+                    channel,
+                    time,
+                },
             };
         }
         let (sync, time) = (u64::from(raw & 0x3ff), raw >> 10 & 0x7fff);
@@ -67,7 +82,11 @@ impl Layout {
             (true, 63, Self::HydraHarp2) => Record::Overflow(1024 * sync.max(1)),
             (true, 63, _) => Record::Overflow(1024),
             (true, bits, _) => Record::Marker { sync, bits },
-            (false, channel, _) => Record::Photon { sync, channel, time },
+            (false, channel, _) => Record::Photon {
+                sync,
+                channel,
+                time,
+            },
         }
     }
 }
@@ -90,26 +109,40 @@ pub(super) fn read(
         _ => None,
     };
     let absent = |tag: &str| ImportError::unreadable(file, format!("has no tag {tag}"), HINT);
-    let code = whole("TTResultFormat_TTTRRecType").ok_or_else(|| absent("TTResultFormat_TTTRRecType"))?;
+    let code =
+        whole("TTResultFormat_TTTRRecType").ok_or_else(|| absent("TTResultFormat_TTTRRecType"))?;
     let Some(layout) = Layout::of_type(code) else {
-        let what = format!("has records of type {code:#010x}, which is no T3 type this program knows");
+        let what =
+            format!("has records of type {code:#010x}, which is no T3 type this program knows");
         return Err(ImportError::unreadable(file, what, HINT));
     };
     let resolution = real("MeasDesc_Resolution").ok_or_else(|| absent("MeasDesc_Resolution"))?;
     let unit_ps = resolution * 1e12;
     let period = real("MeasDesc_GlobalResolution");
-    let most = period.map(|p| libm::ceil(p / resolution - 1e-6) as u64).filter(|n| *n > 1);
+    let most = period
+        .map(|p| libm::ceil(p / resolution - 1e-6) as u64)
+        .filter(|n| *n > 1);
     let gate = description.event_gate(described, unit_ps, most)?;
-    let bit = |name: &str| whole(name).filter(|n| (1..=4).contains(n)).map(|n| 1u32 << (n - 1));
+    let bit = |name: &str| {
+        whole(name)
+            .filter(|n| (1..=4).contains(n))
+            .map(|n| 1u32 << (n - 1))
+    };
     let [start, stop, frame] = ["ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame"].map(bit);
     let scanned = start.zip(stop);
     if whole("ImgHdr_BiDirect").is_some_and(|b| b != 0) {
         let what = "was scanned in both directions, so every other line would have to be turned and shifted";
         return Err(ImportError::unreadable(file, what, "scan in one direction"));
     }
-    let side = |name: &str| whole(name).and_then(|n| u32::try_from(n).ok()).filter(|n| *n > 0);
+    let side = |name: &str| {
+        whole(name)
+            .and_then(|n| u32::try_from(n).ok())
+            .filter(|n| *n > 0)
+    };
     let stated = side("ImgHdr_PixY").zip(side("ImgHdr_PixX"));
-    let pixels = description.pixels.or(stated.filter(|_| scanned.is_some()).map(|(r, c)| [r, c]));
+    let pixels = description
+        .pixels
+        .or(stated.filter(|_| scanned.is_some()).map(|(r, c)| [r, c]));
     let mut binner = Binner::new(file, pixels, 1, gate, described)?;
     let (mut lines, mut clock) = (Lines::default(), 0u64);
     let width = binner.image()[1];
@@ -130,13 +163,26 @@ pub(super) fn read(
                     }
                 }
             }
-            Record::Photon { sync, channel, time } => {
+            Record::Photon {
+                sync,
+                channel,
+                time,
+            } => {
                 let ps = f64::from(time) * unit_ps;
                 match scanned {
-                    Some(_) => lines.take(Event::Photon { ps }, clock + sync, 0, &mut binner, description),
+                    Some(_) => lines.take(
+                        Event::Photon { ps },
+                        clock + sync,
+                        0,
+                        &mut binner,
+                        description,
+                    ),
                     None => {
                         let pixel = channel as usize;
-                        binner.add(Some((0, pixel / width, pixel % width)), description.path_m(ps));
+                        binner.add(
+                            Some((0, pixel / width, pixel % width)),
+                            description.path_m(ps),
+                        );
                     }
                 }
             }
@@ -166,12 +212,17 @@ fn header(bytes: &[u8]) -> Result<(BTreeMap<String, Tag>, usize), String> {
             return Ok((tags, at));
         }
         let value = match kind {
-            0x0000_0008 | 0x1000_0008 | 0x1100_0008 | 0x1200_0008 => Tag::Whole(i64::from_le_bytes(raw)),
+            0x0000_0008 | 0x1000_0008 | 0x1100_0008 | 0x1200_0008 => {
+                Tag::Whole(i64::from_le_bytes(raw))
+            }
             0x2000_0008 => Tag::Real(f64::from_le_bytes(raw)),
             // Texts, arrays and blobs: the value is their size.
             0x2001_ffff | 0x4001_ffff | 0x4002_ffff | 0xffff_ffff => {
                 let size = usize::try_from(u64::from_le_bytes(raw)).map_err(|_| CUT)?;
-                at = at.checked_add(size).filter(|at| *at <= bytes.len()).ok_or(CUT)?;
+                at = at
+                    .checked_add(size)
+                    .filter(|at| *at <= bytes.len())
+                    .ok_or(CUT)?;
                 Tag::Other
             }
             _ => Tag::Other,
