@@ -124,7 +124,7 @@ fn named(h5: &H5<'_>, names: &[String], description: &Description) -> Result<Par
 }
 
 /// Photon-HDF5 (photon-hdf5.readthedocs.io, version 0.5): each detector is a pixel, and nanotimes
-/// count from the laser pulse.
+/// count from the laser pulse. A photon is counted at the middle of its channel.
 fn photons(
     h5: &H5<'_>,
     description: &Description,
@@ -163,7 +163,7 @@ fn photons(
         let pixel = *detector as usize;
         binner.add(
             Some((0, pixel / width, pixel % width)),
-            description.path_m(time * unit_ps),
+            description.path_m((time + 0.5) * unit_ps),
         );
     }
     let note = format!("each detector is a pixel; bins of the file have {unit_ps} ps");

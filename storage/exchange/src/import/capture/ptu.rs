@@ -168,7 +168,8 @@ pub(super) fn read(
                 channel,
                 time,
             } => {
-                let ps = f64::from(time) * unit_ps;
+                // A photon is counted at the middle of its channel.
+                let ps = (f64::from(time) + 0.5) * unit_ps;
                 match scanned {
                     Some(_) => lines.take(
                         Event::Photon { ps },

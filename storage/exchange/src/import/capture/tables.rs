@@ -108,7 +108,12 @@ pub(super) fn read(
         };
         let whole = |column: usize| number(column).map(index);
         let spot = columns.spot.map_or(Ok(Some(0)), whole)?;
-        let ps = || number(columns.time).map(|t| t * unit);
+        // A whole number is a channel of the timer, whose middle counts.
+        let channel = record
+            .get(columns.time)
+            .is_some_and(|t| t.parse::<u64>().is_ok());
+        let middle = if channel { 0.5 } else { 0.0 };
+        let ps = || number(columns.time).map(|t| (t + middle) * unit);
         if let (Some(marker), Some(clock)) = (columns.marker, columns.clock) {
             let code = number(marker)? as i64;
             let is = |of: Option<i64>| of == Some(code);
