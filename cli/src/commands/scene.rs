@@ -4,7 +4,7 @@ mod gate;
 mod group;
 mod order;
 mod plan;
-mod preview;
+pub(super) mod preview;
 mod render;
 mod sense;
 pub mod sensor;

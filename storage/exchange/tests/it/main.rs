@@ -1,5 +1,6 @@
 //! Tests of import and export, in one executable because each one links the whole crate.
 
+mod captures;
 #[path = "../../../dataset/tests/it/common/mod.rs"]
 mod common;
 mod export;
