@@ -9,6 +9,21 @@ pub enum Capture {
     /// Read what a laboratory measured into a data set of one scene; docs/captures.md has the steps
     #[command(after_help = DESCRIPTION)]
     Import(CaptureImport),
+    /// Judge a capture and its calibration: what is wrong, with figures; fails if results would be
+    /// wrong
+    Check {
+        /// A folder of `picofarm capture import` or of `picofarm scene render`
+        capture: PathBuf,
+    },
+    /// Correct a capture's calibration: t0, laser, spots, camera, pixels
+    Calibrate {
+        /// A folder of `picofarm capture import` or of `picofarm scene render`; it is not changed
+        capture: PathBuf,
+        /// Folder for the data set, preview.png, calibration.json and calibration.png (must not
+        /// exist, or be empty)
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+    },
     /// Show the gate, the spots, the photons of each spot, and the background of a capture
     Show {
         /// A folder of `picofarm capture import` or of `picofarm scene render`

@@ -181,7 +181,7 @@ pub enum Command {
     /// Inspect, check, copy and convert data sets
     #[command(subcommand)]
     Dataset(Dataset),
-    /// Import what a laboratory measured, and inspect it
+    /// Import what a laboratory measured, check and calibrate it
     #[command(subcommand)]
     Capture(Capture),
     /// Inspect, check, export and import trained models

@@ -1,5 +1,7 @@
 //! `picofarm capture …`: what a laboratory measured.
 
+mod calibrate;
+mod calibration_picture;
 mod import;
 mod show;
 
@@ -21,6 +23,8 @@ use crate::{
 pub async fn run(command: Command, output: Output) -> Result<()> {
     let done = tokio::task::spawn_blocking(move || match command {
         Command::Import(args) => import::run(&args, output),
+        Command::Check { capture } => calibrate::check(&capture, output),
+        Command::Calibrate { capture, out } => calibrate::calibrate(&capture, &out, output),
         Command::Show { capture } => show::run(&capture, output),
     });
     done.await

@@ -129,6 +129,7 @@ pub(crate) fn report(f: &Findings) -> Report {
         notes: notes(f),
         stated: Some(agreement(f.before)),
         corrected: Some(agreement(fitted)),
+        unclear: f.seen.unclear,
         errors: Some(f.refined.errors),
         pulse: f.seen.pulse.map(|shape| PulseFound {
             shape,

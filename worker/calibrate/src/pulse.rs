@@ -112,6 +112,13 @@ impl Pulse {
         Template { values }
     }
 
+    /// Returns the share of the pulse that falls into a bin whose middle is so many bins after the
+    /// pulse's peak, at steps of a sixteenth of a bin.
+    pub fn share(&self, bins: f64) -> f64 {
+        let steps = (bins * STEPS as f64).round() as i64;
+        self.template(0.0).share(steps)
+    }
+
     /// Full width at half maximum, bins.
     pub fn fwhm_bins(&self) -> f64 {
         let fine = self.fine();

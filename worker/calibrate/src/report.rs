@@ -132,6 +132,9 @@ pub struct Report {
     pub stated: Option<Agreement>,
     /// Agreement with the corrected calibration.
     pub corrected: Option<Agreement>,
+    /// Of a capture of all spots at once: distance of peaks from the times that the stated
+    /// calibration predicts, over that from shifted times.
+    pub unclear: Option<f64>,
     /// Standard errors of t0 (metres of path) and of the laser's x, y, z (camera's frame, metres).
     pub errors: Option<[f64; 4]>,
     /// The pulse, if returns show it.
