@@ -1,6 +1,7 @@
 //! `picofarm capture …`: what a laboratory measured.
 
 mod import;
+mod resample;
 mod show;
 
 use std::path::Path;
@@ -21,6 +22,7 @@ use crate::{
 pub async fn run(command: Command, output: Output) -> Result<()> {
     let done = tokio::task::spawn_blocking(move || match command {
         Command::Import(args) => import::run(&args, output),
+        Command::Resample(args) => resample::run(&args, output),
         Command::Show { capture } => show::run(&capture, output),
     });
     done.await
