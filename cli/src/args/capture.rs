@@ -24,6 +24,8 @@ pub enum Capture {
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
     },
+    /// Put a capture on another gate, scale or image; photons outside are counted
+    Resample(CaptureResample),
     /// Show the gate, the spots, the photons of each spot, and the background of a capture
     Show {
         /// A folder of `picofarm capture import` or of `picofarm scene render`
@@ -43,6 +45,43 @@ pub struct CaptureImport {
     /// Folder for the data set and preview.png (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+}
+
+#[derive(Args)]
+pub struct CaptureResample {
+    /// A folder of `picofarm capture import` or of `picofarm scene render`; it is not changed
+    pub capture: PathBuf,
+    /// Folder for the data set and preview.png (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Start of the gate, metres of path, after --scale [default: the capture's]
+    #[arg(long, value_name = "M")]
+    pub start_m: Option<f64>,
+    /// Width of a bin, metres of path, after --scale [default: the capture's]
+    #[arg(long, value_name = "M")]
+    pub bin_width_m: Option<f64>,
+    /// Number of bins [default: up to the end of the capture's gate]
+    #[arg(long, value_name = "N")]
+    pub bins: Option<u32>,
+    /// Factor of all lengths: paths, laser, spots and depth
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR")]
+    pub scale: f64,
+    /// Part of the image to keep: first column, first row, columns, rows
+    #[arg(long, value_name = "X,Y,W,H", value_parser = four)]
+    pub crop: Option<[u32; 4]>,
+    /// Dark columns and rows to add: left, top, right, bottom
+    #[arg(long, value_name = "L,T,R,B", value_parser = four)]
+    pub pad: Option<[u32; 4]>,
+    /// Add dark columns and rows until the camera's axis is in the middle, to half a pixel
+    #[arg(long)]
+    pub centre: bool,
+}
+
+/// Four whole numbers.
+fn four(text: &str) -> Result<[u32; 4], String> {
+    let all: Result<Vec<u32>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    let four = all.ok().and_then(|all| <[u32; 4]>::try_from(all).ok());
+    four.ok_or_else(|| "expected four whole numbers with commas between, such as 8,0,64,64".into())
 }
 
 /// What a description has, below the help of `capture import`.

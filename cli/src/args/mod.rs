@@ -26,7 +26,7 @@ use std::{ffi::OsString, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
-pub use capture::{Capture, CaptureImport};
+pub use capture::{Capture, CaptureImport, CaptureResample};
 pub use data::{
     DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, SensorArgs,
 };

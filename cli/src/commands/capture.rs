@@ -3,6 +3,7 @@
 mod calibrate;
 mod calibration_picture;
 mod import;
+mod resample;
 mod show;
 
 use std::path::Path;
@@ -25,6 +26,7 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
         Command::Import(args) => import::run(&args, output),
         Command::Check { capture } => calibrate::check(&capture, output),
         Command::Calibrate { capture, out } => calibrate::calibrate(&capture, &out, output),
+        Command::Resample(args) => resample::run(&args, output),
         Command::Show { capture } => show::run(&capture, output),
     });
     done.await

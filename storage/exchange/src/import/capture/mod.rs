@@ -13,6 +13,7 @@ mod h5;
 mod kinds;
 mod known;
 mod ptu;
+mod resample;
 mod tables;
 mod walls;
 
@@ -23,6 +24,7 @@ use picofarm_files::Opener;
 
 pub use describe::EXAMPLE;
 pub use folder::is_capture;
+pub use resample::Resampling;
 
 use super::files::Files;
 use super::scene::clean;

@@ -231,3 +231,117 @@ fn header(bytes: &[u8]) -> Result<(BTreeMap<String, Tag>, usize), String> {
         tags.insert(name, value);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use picofarm_files::Opener;
+
+    use super::*;
+
+    fn tag(name: &str, kind: u32, value: [u8; 8]) -> Vec<u8> {
+        let mut tag = name.as_bytes().to_vec();
+        tag.resize(32, 0);
+        tag.extend((-1i32).to_le_bytes());
+        tag.extend(kind.to_le_bytes());
+        tag.extend(value);
+        tag
+    }
+
+    /// A file of this type with these records; markers 1, 2 and 3 are line start, line stop and
+    /// frame.
+    fn file(code: i64, records: &[u32]) -> Vec<u8> {
+        let whole = |name: &str, n: i64| tag(name, 0x1000_0008, n.to_le_bytes());
+        let mut bytes = [MAGIC, b"1.0.00\0\0"].concat();
+        let mut text = tag("File_Comment", 0x4001_ffff, 8u64.to_le_bytes());
+        text.extend(b"a room\0\0");
+        for part in [
+            text,
+            whole("TTResultFormat_TTTRRecType", code),
+            tag("MeasDesc_Resolution", 0x2000_0008, 1e-10f64.to_le_bytes()),
+            tag(
+                "MeasDesc_GlobalResolution",
+                0x2000_0008,
+                1e-9f64.to_le_bytes(),
+            ),
+            whole("ImgHdr_LineStart", 1),
+            whole("ImgHdr_LineStop", 2),
+            whole("ImgHdr_Frame", 3),
+            whole("ImgHdr_PixX", 2),
+            whole("ImgHdr_PixY", 2),
+            tag("Header_End", 0xffff_0008, [0; 8]),
+        ] {
+            bytes.extend(part);
+        }
+        bytes.extend(records.iter().flat_map(|r| r.to_le_bytes()));
+        bytes
+    }
+
+    fn counts(code: i64, records: &[u32]) -> Vec<f32> {
+        let folder = tempfile::tempdir().unwrap();
+        let text = r#"{"gate": {"t0_ps": 0}}"#;
+        let (ptu, json) = (
+            folder.path().join("a.ptu"),
+            folder.path().join("capture.json"),
+        );
+        std::fs::write(&ptu, file(code, records)).unwrap();
+        std::fs::write(json, text).unwrap();
+        let opener = Opener::anywhere();
+        let (described, _) = Described::find(&[ptu.clone()], None, &opener).unwrap();
+        let reader = Files::new(folder.path(), &opener);
+        let description = described.read(&reader).unwrap();
+        let part = read(&ptu, &description, &described, &reader).unwrap();
+        assert_eq!(part.dims, [1, 2, 2, 10]);
+        part.values
+    }
+
+    #[test]
+    fn photons_of_all_layouts_come_to_their_pixels_across_overflows() {
+        // Line 0 from clock 100 to 100 + 2000: a photon in channel 3 early, one in channel 7 late.
+        // A frame; line 0 again with a photon in channel 3 early.
+        let pico = |channel: u32, time: u32, sync: u32| channel << 28 | time << 16 | sync;
+        let hydra = |special: u32, channel: u32, time: u32, sync: u32| {
+            special << 31 | channel << 25 | time << 10 | sync
+        };
+        let mut expected = vec![0.0; 40];
+        (expected[3], expected[10 + 7]) = (2.0, 1.0);
+        let of_pico = [
+            pico(15, 1, 65_000),
+            pico(1, 3, 65_100),
+            pico(15, 0, 0),
+            pico(1, 7, 1_400),
+            pico(15, 2, 1_464),
+            pico(15, 4, 1_500),
+            pico(15, 1, 2_000),
+            pico(1, 3, 2_100),
+            pico(15, 2, 4_000),
+        ];
+        assert_eq!(counts(0x0001_0303, &of_pico), expected, "PicoHarp");
+        let hydra_events = |overflows: &[u32]| {
+            let mut all = vec![hydra(1, 1, 0, 100), hydra(0, 0, 3, 200)];
+            all.extend(overflows);
+            all.extend([hydra(0, 0, 7, 20), hydra(1, 2, 0, 52), hydra(1, 4, 0, 60)]);
+            all.extend([
+                hydra(1, 1, 0, 100),
+                hydra(0, 0, 3, 200),
+                hydra(1, 2, 0, 1000),
+            ]);
+            all
+        };
+        // One record for two overflows, or two records.
+        let one = hydra_events(&[hydra(1, 63, 0, 2)]);
+        for code in [0x0101_0304, 0x0001_0305, 0x0001_0306, 0x0001_0307] {
+            assert_eq!(counts(code, &one), expected, "{code:#x}");
+        }
+        let two = hydra_events(&[hydra(1, 63, 0, 0), hydra(1, 63, 0, 0)]);
+        assert_eq!(counts(0x0001_0304, &two), expected, "HydraHarp 1");
+    }
+
+    #[test]
+    fn a_header_that_is_cut_off_is_refused_at_any_length() {
+        let whole = file(0x0001_0303, &[]);
+        for length in MAGIC.len()..whole.len() {
+            assert!(header(&whole[..length]).is_err(), "{length}");
+        }
+        assert_eq!(header(&whole).unwrap().1, whole.len());
+    }
+}
