@@ -31,7 +31,7 @@ pub struct SceneInput {
 }
 
 /// The camera.
-#[derive(Args, Default)]
+#[derive(Args, Default, PartialEq)]
 pub struct ViewArgs {
     /// Camera of the file, by name or number from 0 [default: the first]
     #[arg(long, value_name = "NAME")]

@@ -1,5 +1,6 @@
 //! The command line. A single definition drives the parser, the help and the completions.
 
+mod capture;
 mod data;
 mod dataset;
 mod demultiplex;
@@ -26,6 +27,7 @@ use std::{ffi::OsString, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
+pub use capture::{Capture, CaptureImport, CaptureResample};
 pub use data::{
     DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, SensorArgs,
 };
@@ -185,6 +187,9 @@ pub enum Command {
     /// Inspect, check, copy and convert data sets
     #[command(subcommand)]
     Dataset(Dataset),
+    /// Import what a laboratory measured, check and calibrate it
+    #[command(subcommand)]
+    Capture(Capture),
     /// Inspect, check, export and import trained models
     #[command(subcommand)]
     Model(Model),

@@ -8,7 +8,8 @@ use super::{SceneInput, render::GateArgs};
 
 #[derive(Args)]
 pub struct Reconstruct {
-    /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file
+    /// A .glb, .gltf, .xml (Mitsuba), .json, .ply, .obj or .stl file; or a folder of `picofarm
+    /// capture import` or `picofarm scene render`
     pub file: PathBuf,
     #[command(flatten)]
     pub input: SceneInput,
@@ -17,9 +18,10 @@ pub struct Reconstruct {
     pub out: PathBuf,
     /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and
     /// visibility of the scene itself; or one rendered histogram of all spots at once, separated by
-    /// networks (predictions) or by physics (flash)
-    #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
-    pub spots_from: SpotsFrom,
+    /// networks (predictions) or by physics (flash). A folder has captures, if its spots were
+    /// measured one by one, and flash [default: captures for a file, flash for a folder]
+    #[arg(long, value_enum)]
+    pub spots_from: Option<SpotsFrom>,
     #[command(flatten)]
     pub networks: NetworksArgs,
     /// Form of the density: a grid, in seconds, or PlatoNeRF's networks, in hours
@@ -28,7 +30,7 @@ pub struct Reconstruct {
     #[command(flatten)]
     pub mlp: MlpArgs,
     /// Image width and height in pixels of the measurements
-    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    #[arg(long, default_value_t = Self::RESOLUTION, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: u32,
     /// Nodes of the density grid along its longest side
     #[arg(long, default_value_t = 192, value_name = "N", conflicts_with = "fine", value_parser = clap::value_parser!(u32).range(16..=512))]
@@ -47,7 +49,7 @@ pub struct Reconstruct {
     #[arg(long, value_enum, default_value_t = ViewsArg::Around)]
     pub views: ViewsArg,
     /// Camera paths per pixel of the captures, for three bounces and more
-    #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_048_576))]
+    #[arg(long, default_value_t = Self::SAMPLES, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_048_576))]
     pub samples: u32,
     #[command(flatten)]
     pub detector: DetectorArgs,
@@ -125,6 +127,33 @@ pub enum SpotsFrom {
     Truth,
     Predictions,
     Flash,
+}
+
+impl Reconstruct {
+    /// Width and height of the measurements of a scene file.
+    pub const RESOLUTION: u32 = 256;
+    /// Camera paths of a pixel of a scene file.
+    pub const SAMPLES: u32 = 16;
+
+    /// Returns where times and shadows come from.
+    pub fn source(&self) -> SpotsFrom {
+        self.spots_from.unwrap_or(match self.file.is_dir() {
+            true => SpotsFrom::Flash,
+            false => SpotsFrom::Captures,
+        })
+    }
+}
+
+impl SpotsFrom {
+    /// Returns its name on the command line and in metrics.json.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Captures => "captures",
+            Self::Truth => "truth",
+            Self::Predictions => "predictions",
+            Self::Flash => "flash",
+        }
+    }
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]

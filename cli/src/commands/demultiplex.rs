@@ -12,7 +12,7 @@ use picofarm_demultiplex::{
 };
 use serde_json::{Map, json};
 
-use self::read::Flash;
+pub(super) use self::read::Flash;
 use crate::{
     args::{Demultiplex, ShadowsArg},
     error::{CliError, Code, Result},

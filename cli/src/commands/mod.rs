@@ -2,6 +2,7 @@
 
 mod assets;
 mod audit;
+mod capture;
 mod completions;
 mod config;
 pub mod coordinator;
@@ -51,6 +52,7 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
             verbose,
         } => events::run(follow, last, verbose, settings, output).await,
         Command::Dataset(command) => dataset::run(command, settings, output).await,
+        Command::Capture(command) => capture::run(command, output).await,
         Command::Model(command) => model::run(command, output).await,
         #[cfg(feature = "networks")]
         Command::Sweep(command) => sweep::run(command, settings, output).await,

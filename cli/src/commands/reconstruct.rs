@@ -1,6 +1,7 @@
 //! `picofarm reconstruct`: reconstructs one scene file without a farm.
 
 mod flash;
+mod folder;
 mod mlp;
 pub(crate) mod orbit;
 #[cfg(feature = "networks")]
@@ -61,8 +62,11 @@ struct Made {
 /// Fails on an unusable scene or argument, too little memory, a folder in use, or an interruption.
 pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     mlp::check(&args)?;
-    check_networks(&args)?;
     free_folder(&args.out)?;
+    if args.file.is_dir() {
+        return folder::run(args, output).await;
+    }
+    check_networks(&args)?;
     let mut scene = args.input.read(&args.file)?;
     let i = &mut scene.camera.intrinsics;
     *i = i.resized(args.resolution, args.resolution);
@@ -72,7 +76,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
             "picofarm scene export --spots 16 gives it beams; see docs/scene-files.md for laser_directions",
         ));
     }
-    let networks = match args.spots_from {
+    let networks = match args.source() {
         SpotsFrom::Predictions => Some(predicted::read(&args, scene.laser.beams.len()).await?),
         SpotsFrom::Captures | SpotsFrom::Truth | SpotsFrom::Flash => None,
     };
@@ -137,28 +141,12 @@ fn make(
     threads: usize,
     watch: &Watch,
 ) -> Result<Made> {
-    let nodes = if args.fine {
-        Settings::FINE_NODES
-    } else {
-        args.nodes
-    };
-    check_memory(args, scene, nodes)?;
+    check_memory(args, scene, grid_settings(args).nodes)?;
     let start = Instant::now();
     let (measured, separated) = measure(args, scene, networks, threads, watch)?;
     let lap = |since: Instant| since.elapsed().as_secs_f64();
     let measuring = lap(start);
-    let settings = Settings {
-        nodes,
-        planes: !args.no_planes && args.field == FieldArg::Grid,
-        // Networks use the grid's box and evidence, but learn from shadows themselves.
-        shadows: match args.field {
-            FieldArg::Grid => Settings::default().shadows,
-            FieldArg::Mlp => Shadows::Carve,
-        },
-        seed: args.seed,
-        accept_inconsistent: args.accept_inconsistent,
-        ..Settings::default()
-    };
+    let settings = grid_settings(args);
     let start = Instant::now();
     let (reconstructed, networks) = match args.field {
         FieldArg::Grid => (fit(measured, settings, watch)?, None),
@@ -208,6 +196,26 @@ fn make(
     })
 }
 
+/// The settings of the grid.
+fn grid_settings(args: &Reconstruct) -> Settings {
+    Settings {
+        nodes: if args.fine {
+            Settings::FINE_NODES
+        } else {
+            args.nodes
+        },
+        planes: !args.no_planes && args.field == FieldArg::Grid,
+        // Networks use the grid's box and evidence, but learn from shadows themselves.
+        shadows: match args.field {
+            FieldArg::Grid => Settings::default().shadows,
+            FieldArg::Mlp => Shadows::Carve,
+        },
+        seed: args.seed,
+        accept_inconsistent: args.accept_inconsistent,
+        ..Settings::default()
+    }
+}
+
 /// Fits the grid.
 fn fit(measured: Measured, settings: Settings, watch: &Watch) -> Result<Reconstructed> {
     let mut reconstruction = Reconstruction::begin(measured, settings, watch).map_err(refused)?;
@@ -230,11 +238,11 @@ fn measure(
         let (measured, facts) = predicted::measure(args, scene, networks, threads, watch)?;
         return Ok((measured, Some(("predictions", facts))));
     }
-    if args.spots_from == SpotsFrom::Flash {
+    if args.source() == SpotsFrom::Flash {
         let (measured, facts) = flash::measure(args, scene, threads, watch)?;
         return Ok((measured, Some(("flash", facts))));
     }
-    if args.spots_from == SpotsFrom::Truth {
+    if args.source() == SpotsFrom::Truth {
         watch.step("ground truth", 0.0);
         let rendered = source::truth_of(scene, watch).map_err(refused)?;
         let measured = source::from_truth(scene, &rendered, &Disturbed::default());
@@ -277,11 +285,11 @@ fn fits_memory(settings: &CaptureSettings, scene: &Scene, threads: usize) -> Res
 /// Rejects options for predictions if times have another source.
 fn check_networks(args: &Reconstruct) -> Result<()> {
     let given = &args.networks;
-    if args.spots_from != SpotsFrom::Captures && args.detector.photons.is_some() {
+    if args.source() != SpotsFrom::Captures && args.detector.photons.is_some() {
         let what = "--photons belongs to --spots-from captures";
         return Err(CliError::input(what).hint("add --spots-from captures, or leave it out"));
     }
-    if args.spots_from == SpotsFrom::Predictions {
+    if args.source() == SpotsFrom::Predictions {
         return Ok(());
     }
     for (option, value) in [
@@ -325,12 +333,7 @@ fn metrics(
     let asked = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
-        "spots_from": match args.spots_from {
-            SpotsFrom::Captures => "captures",
-            SpotsFrom::Truth => "truth",
-            SpotsFrom::Predictions => "predictions",
-            SpotsFrom::Flash => "flash",
-        },
+        "spots_from": args.source().name(),
         "resolution": args.resolution,
         "settings": settings,
         "views": match args.views { ViewsArg::Around => "around", ViewsArg::Plato => "plato" },

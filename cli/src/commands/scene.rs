@@ -5,7 +5,7 @@ mod generate;
 mod group;
 mod order;
 mod plan;
-mod preview;
+pub(super) mod preview;
 mod render;
 mod sense;
 pub mod sensor;

@@ -3,6 +3,8 @@
 mod export;
 pub mod import;
 
+pub use import::capture;
+
 /// The message of a program built without the feature `formats`, and how to build one with it.
 #[cfg(not(feature = "formats"))]
 const WITHOUT_FORMATS: &str = "this picofarm was built without OpenEXR and HDF5";

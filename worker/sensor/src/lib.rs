@@ -19,6 +19,7 @@ mod chain;
 mod convolve;
 mod draw;
 mod kernel;
+mod resample;
 mod scale;
 mod sense;
 mod spots;
@@ -27,6 +28,7 @@ pub use bins::{Rebinned, crop, intensity, rebin, rebin_counts, rebin_errors};
 pub use draw::{Draws, binomial, poisson};
 pub use kernel::Kernel;
 pub use picofarm_settings::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
+pub use resample::{Resampled, Resampler, resample};
 pub use sense::{Dropped, Histograms, Sensed, Sensing, Values, narrow, sense};
 pub use spots::{Multiplex, SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
 

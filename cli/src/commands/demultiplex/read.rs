@@ -2,8 +2,10 @@
 
 use std::path::Path;
 
-use picofarm_dataset::{Quantity, RenderGroup};
+use futures::executor::block_on;
+use picofarm_dataset::{Quantity, RenderGroup, SingleRender};
 use picofarm_demultiplex::{Capture, Place, Spot, Truth};
+use picofarm_exchange::capture::is_capture;
 use picofarm_scene::{self as scene, Camera, Vec3};
 use picofarm_transient::Gate;
 use serde_json::{Map, Value};
@@ -41,12 +43,23 @@ impl Flash {
         let laser: Vec3 = source.attribute(folder, "laser_origin")?;
         let gate: Gate = source.attribute(folder, "gate")?;
         let all: Vec<Option<scene::Spot>> = source.attribute(folder, "spots")?;
+        let measured = is_capture(&attributes);
+        let towards: Vec<Option<Vec3>> = match measured {
+            true => source.attribute(folder, "directions")?,
+            false => Vec::new(),
+        };
+        let towards = |beam: usize| towards.get(beam).copied().flatten();
         let i = &camera.intrinsics;
         let image = [u64::from(i.height), u64::from(i.width)];
         let (histogram, truth) = match &source {
             Folder::Sensed(group) => {
                 let cube = [image[0], image[1], u64::from(gate.bins)];
                 (sensed(folder, group, &cube)?, None)
+            }
+            Folder::Render(render) if measured => {
+                let depth = measured_depth(folder, render)?;
+                let truth = depth.map(|depth| (depth, vec![], vec![]));
+                (rendered::transient(folder, render)?, truth)
             }
             Folder::Render(render) => {
                 let truth = (
@@ -62,7 +75,9 @@ impl Flash {
             None => (None, vec![], vec![]),
         };
         let pixels = (image[0] * image[1]) as usize;
-        let beams: Vec<usize> = (0..all.len()).filter(|k| all[*k].is_some()).collect();
+        let beams: Vec<usize> = (0..all.len())
+            .filter(|k| all[*k].is_some() || towards(*k).is_some())
+            .collect();
         let visibility = match visibility.is_empty() {
             true => visibility,
             false => beams
@@ -70,24 +85,28 @@ impl Flash {
                 .flat_map(|k| visibility[k * pixels..][..pixels].iter().copied())
                 .collect(),
         };
-        let spots = all
-            .iter()
-            .flatten()
-            .map(|s| {
-                let way = s.point - laser;
-                // A mirror folds the beam: where it left the laser is not in the group, so its
-                // place stays as given.
-                let folded = s.path_m - way.length() > 1e-3 * s.path_m;
-                let known = places == PlacesArg::Given || folded;
-                Spot {
-                    direction: way,
-                    place: known.then_some(Place {
-                        point: s.point,
-                        path_m: s.path_m,
-                    }),
-                }
+        let spot = |beam: &usize| {
+            let Some(s) = &all[*beam] else {
+                let direction = towards(*beam)?;
+                return Some(Spot {
+                    direction,
+                    place: None,
+                });
+            };
+            let way = s.point - laser;
+            // A mirror folds the beam: where it left the laser is not in the group, so its place
+            // stays as given.
+            let folded = s.path_m - way.length() > 1e-3 * s.path_m;
+            let known = places == PlacesArg::Given || folded;
+            Some(Spot {
+                direction: way,
+                place: known.then_some(Place {
+                    point: s.point,
+                    path_m: s.path_m,
+                }),
             })
-            .collect();
+        };
+        let spots = beams.iter().filter_map(spot).collect();
         Ok(Self {
             attributes,
             histogram,
@@ -120,6 +139,16 @@ impl Flash {
             specular: &self.specular,
             visibility: &self.visibility,
         })
+    }
+}
+
+/// The true depth of a capture whose files have it.
+fn measured_depth(folder: &Path, render: &SingleRender) -> Result<Option<Vec<f32>>> {
+    let manifest = block_on(render.dataset.manifest(0));
+    let manifest = manifest.map_err(|e| rendered::unreadable(folder, e))?;
+    match manifest.missing().iter().any(|m| m == "depth") {
+        true => Ok(None),
+        false => rendered::image::<f32>(folder, render, Quantity::Depth).map(Some),
     }
 }
 

@@ -123,7 +123,7 @@ pub async fn write(out: &Path, order: &Order, spec: &DatasetSpec, r: &Rendered) 
         gate_start_m: r.gate.start_m,
         bin_width_m: r.gate.bin_width_m,
         transient: &r.transient,
-        depth: &r.truth.depth,
+        depth: Some(&r.truth.depth),
     });
     let parts = SingleRenderParts {
         arrays: &arrays,

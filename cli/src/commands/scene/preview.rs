@@ -12,8 +12,9 @@ pub struct Preview<'a> {
     pub bin_width_m: f64,
     /// `[row][column][bin]`.
     pub transient: &'a [f32],
-    /// z-depth in metres, `[row][column]`; 0 = nothing.
-    pub depth: &'a [f32],
+    /// z-depth in metres, `[row][column]`, 0 = nothing. Without it, the path of the brightest bin is
+    /// drawn.
+    pub depth: Option<&'a [f32]>,
 }
 
 /// The longer side of an image, pixels.
@@ -52,12 +53,16 @@ pub fn draw(p: &Preview<'_>) -> Canvas {
     let all = sum(0, p.bins);
     let white = quantile(&all, 0.99).max(f32::MIN_POSITIVE);
     image(0, "all light", &|i| inferno((all[i] / white).powf(0.5)));
-    let seen: Vec<f32> = p.depth.iter().copied().filter(|d| *d > 0.0).collect();
+    let (title, far_away) = match p.depth {
+        Some(depth) => ("depth", depth.to_vec()),
+        None => ("brightest path", brightest(p)),
+    };
+    let seen: Vec<f32> = far_away.iter().copied().filter(|d| *d > 0.0).collect();
     let (near, far) = (quantile(&seen, 0.001), quantile(&seen, 1.0));
     image(
         1,
-        &format!("depth, {near:.2} to {far:.2} m"),
-        &|i| match p.depth[i] {
+        &format!("{title}, {near:.2} to {far:.2} m"),
+        &|i| match far_away[i] {
             d if d > 0.0 => viridis(1.0 - (d - near) / (far - near).max(1e-6)),
             _ => BACKGROUND,
         },
@@ -89,6 +94,18 @@ pub fn draw(p: &Preview<'_>) -> Canvas {
     canvas
 }
 
+/// Returns the path of the brightest bin of each pixel in metres; 0 without light.
+fn brightest(p: &Preview<'_>) -> Vec<f32> {
+    let path = |h: &[f32]| {
+        let first = (0..p.bins).fold(0, |best, bin| if h[bin] > h[best] { bin } else { best });
+        match h[first] > 0.0 {
+            true => (p.gate_start_m + (first as f64 + 0.5) * p.bin_width_m) as f32,
+            false => 0.0,
+        }
+    };
+    p.transient.chunks_exact(p.bins).map(path).collect()
+}
+
 /// Draws the energy over time in the third cell.
 fn curve(canvas: &mut Canvas, energy: &[f64], height: usize, [start, end]: [f64; 2]) {
     let (x, y) = (GAP + 2 * (CELL + GAP), HEAD);
@@ -114,7 +131,7 @@ mod tests {
     #[test]
     fn pictures_of_any_shape_and_of_darkness_are_drawn() {
         for (width, height, bins) in [(1, 1, 1), (7, 3, 5), (3, 40, 300)] {
-            for light in [0.0, 1.0] {
+            for (light, known) in [(0.0, true), (1.0, true), (0.0, false), (1.0, false)] {
                 let transient = vec![light; width * height * bins];
                 let depth = vec![light; width * height];
                 let canvas = draw(&Preview {
@@ -124,7 +141,7 @@ mod tests {
                     gate_start_m: 1.0,
                     bin_width_m: 0.1,
                     transient: &transient,
-                    depth: &depth,
+                    depth: known.then_some(&depth[..]),
                 });
                 assert!(Canvas::from_png(&canvas.png()).is_ok());
             }

@@ -57,6 +57,14 @@ impl Mat {
         })
     }
 
+    /// Returns the names of the numeric arrays.
+    pub fn names(&self) -> Vec<String> {
+        match &self.content {
+            Content::V5(arrays) => arrays.keys().cloned().collect(),
+            Content::V73(file) => file.names(),
+        }
+    }
+
     /// Returns the dimensions of an array in MATLAB's order.
     pub fn dims(&self, name: &str) -> Result<Vec<usize>, ImportError> {
         match &self.content {
@@ -149,10 +157,7 @@ impl Mat {
     }
 
     fn absent(&self, name: &str) -> ImportError {
-        let found = match &self.content {
-            Content::V5(arrays) => format!("{:?}", arrays.keys().collect::<Vec<_>>()),
-            Content::V73(file) => format!("{:?}", file.names()),
-        };
+        let found = format!("{:?}", self.names());
         ImportError::refused(
             &self.path,
             "arrays",
@@ -172,7 +177,7 @@ impl Mat {
 const HDF5_AT: std::ops::Range<u64> = 0..4096;
 
 /// Returns whether the file's first bytes contain the HDF5 signature.
-fn is_hdf5(head: &[u8]) -> bool {
+pub(super) fn is_hdf5(head: &[u8]) -> bool {
     let begins = |at: u64| head[(at as usize).min(head.len())..].starts_with(b"\x89HDF\r\n\x1a\n");
     begins(HDF5_AT.start) || [512, 1024, 2048, HDF5_AT.end].into_iter().any(begins)
 }
@@ -239,7 +244,7 @@ const COMPRESSED: u32 = 15;
 /// Maximum size in bytes of a decompressed element.
 const MAX: u64 = 1 << 32;
 /// Maximum number of values of an array.
-const MAX_VALUES: usize = 1 << 28;
+pub(super) const MAX_VALUES: usize = 1 << 28;
 
 /// Returns the numeric arrays of a version 5 file; others (text, structures, cells) are skipped.
 fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {

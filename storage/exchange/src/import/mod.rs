@@ -7,6 +7,7 @@
 //! quantities.
 
 mod bf_lidar;
+pub mod capture;
 mod check;
 mod error;
 #[cfg(feature = "formats")]

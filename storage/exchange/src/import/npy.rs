@@ -24,6 +24,8 @@ pub(crate) struct Array {
 const FIXED: usize = 10;
 const HINT: &str = "save it again with numpy.save, as an array of numbers";
 
+const HINT_NPZ: &str = "save it again with numpy.savez_compressed";
+
 /// A parsed header.
 struct Header {
     shape: Vec<usize>,
@@ -104,6 +106,27 @@ fn header(file: &Path, bytes: &[u8]) -> Result<Header, ImportError> {
     })
 }
 
+/// Returns the names of the arrays in a `.npz` file, sorted.
+pub(super) fn names_npz(file: &Path, bytes: &[u8]) -> Result<Vec<String>, ImportError> {
+    let archive = archive(file, bytes)?;
+    let mut names: Vec<String> = archive
+        .file_names()
+        .filter_map(|n| n.strip_suffix(".npy").map(str::to_owned))
+        .collect();
+    names.sort();
+    Ok(names)
+}
+
+fn archive<'a>(
+    file: &Path,
+    bytes: &'a [u8],
+) -> Result<zip::ZipArchive<Cursor<&'a [u8]>>, ImportError> {
+    zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| {
+        let what = format!("not a .npz file ({e})");
+        ImportError::unreadable(file, what, HINT_NPZ)
+    })
+}
+
 /// Reads the array `name` of a `.npz` file.
 ///
 /// It is decompressed only if it announces at most `values` numbers.
@@ -113,11 +136,8 @@ pub(super) fn parse_npz(
     name: &str,
     values: usize,
 ) -> Result<Array, ImportError> {
-    let damaged = |what: String| {
-        ImportError::unreadable(file, what, "save it again with numpy.savez_compressed")
-    };
-    let mut archive = zip::ZipArchive::new(Cursor::new(bytes))
-        .map_err(|e| damaged(format!("not a .npz file ({e})")))?;
+    let damaged = |what: String| ImportError::unreadable(file, what, HINT_NPZ);
+    let mut archive = archive(file, bytes)?;
     let entry = format!("{name}.npy");
     if archive.index_for_name(&entry).is_none() {
         let there: Vec<&str> = archive

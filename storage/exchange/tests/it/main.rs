@@ -1,5 +1,7 @@
 //! Tests of import and export, in one executable because each one links the whole crate.
 
+mod captures;
+mod captures_of_tools;
 #[path = "../../../dataset/tests/it/common/mod.rs"]
 mod common;
 mod export;
@@ -9,3 +11,4 @@ mod import_npy;
 mod import_outside;
 mod import_sb3d;
 mod import_two_bounce;
+mod resampled;

@@ -5,6 +5,7 @@ mod common;
 mod detector;
 mod draws;
 mod kernel;
+mod resample;
 mod scale;
 mod settings;
 mod spots;

@@ -1,0 +1,216 @@
+//! `picofarm capture check` and `capture calibrate`: what is wrong with a capture, and the same
+//! capture with a corrected calibration.
+
+use std::path::Path;
+
+use picofarm_calibrate::{Checked, Measurement, Report, VERSION, Verdict, check as judge};
+use picofarm_demultiplex as flash;
+use picofarm_exchange::capture::{Beam, Capture};
+use picofarm_scene::{Camera, Intrinsics, Vec3};
+use serde_json::{Value, json};
+
+use super::{calibration_picture, read, write};
+use crate::{
+    error::{CliError, Code, Result},
+    output::{
+        Output,
+        files::{free_folder, save, write_atomically},
+    },
+};
+
+/// Checks a capture.
+///
+/// # Errors
+/// A folder that is no capture, or damaged; a capture whose results would be wrong.
+pub fn check(folder: &Path, output: Output) -> Result<()> {
+    let capture = read(folder)?;
+    let checked = checked(&capture, folder)?;
+    let facts = facts(&checked.report);
+    output.result(&facts, || {
+        format!("{}: {}", folder.display(), describe(&checked.report))
+    });
+    match checked.report.verdict {
+        Verdict::Good | Verdict::Usable => Ok(()),
+        Verdict::Wrong => {
+            let what = format!("{}: the capture would give wrong results", folder.display());
+            let hint = match checked.report.causes.iter().all(|c| c.corrected) {
+                true => format!(
+                    "picofarm capture calibrate {} --out DIR corrects it",
+                    picofarm_proto::show::path(folder)
+                ),
+                false => "correct what is named above, and import the capture again".into(),
+            };
+            Err(CliError::new(Code::Failed, what).hint(hint))
+        }
+    }
+}
+
+/// Corrects a capture.
+///
+/// # Errors
+/// A folder that is no capture, or damaged; a folder that is taken.
+pub fn calibrate(folder: &Path, out: &Path, output: Output) -> Result<()> {
+    free_folder(out)?;
+    let mut capture = read(folder)?;
+    let checked = checked(&capture, folder)?;
+    let picture = calibration_picture::draw(&checked, &capture);
+    correct(&mut capture, &checked);
+    write(&capture, out)?;
+    let mut facts = facts(&checked.report);
+    let text = serde_json::to_vec_pretty(&facts).expect("a report is plain data");
+    write_atomically(&out.join("calibration.json"), &text)?;
+    save(&picture, &out.join("calibration.png"))?;
+    facts["out"] = json!(out);
+    output.result(&facts, || {
+        format!(
+            "{}: {}  corrected: {}\n",
+            folder.display(),
+            describe(&checked.report),
+            out.display()
+        )
+    });
+    Ok(())
+}
+
+/// The capture's camera: its axes are the capture's.
+fn camera(capture: &Capture) -> Camera {
+    let i = capture.intrinsics;
+    Camera {
+        intrinsics: Intrinsics {
+            fx: i.fx,
+            fy: i.fy,
+            cx: i.cx,
+            cy: i.cy,
+            width: capture.width,
+            height: capture.height,
+        },
+        origin: Vec3::ZERO,
+        right: Vec3::new(1.0, 0.0, 0.0),
+        down: Vec3::new(0.0, 1.0, 0.0),
+        forward: Vec3::new(0.0, 0.0, 1.0),
+    }
+}
+
+fn checked(capture: &Capture, folder: &Path) -> Result<Checked> {
+    let laser = Vec3::from(capture.laser);
+    let spot = |(k, beam): (usize, &Beam)| match beam {
+        Beam::Spot { position, path_m } => {
+            let point = Vec3::from(*position);
+            Ok(flash::Spot {
+                direction: point - laser,
+                place: Some(flash::Place {
+                    point,
+                    path_m: *path_m,
+                }),
+            })
+        }
+        Beam::Direction(way) => Ok(flash::Spot {
+            direction: Vec3::from(*way),
+            place: None,
+        }),
+        Beam::Nothing => {
+            let what = format!(
+                "{}: spot {k} has neither a place nor a direction, so that its times cannot be judged",
+                folder.display()
+            );
+            Err(CliError::input(what).hint("import the capture without its histogram"))
+        }
+    };
+    let spots: Vec<flash::Spot> = capture
+        .beams
+        .iter()
+        .enumerate()
+        .map(spot)
+        .collect::<Result<_>>()?;
+    let camera = camera(capture);
+    let measurement = Measurement {
+        capture: flash::Capture {
+            histogram: &capture.sum,
+            gate: capture.gate,
+            camera: &camera,
+            laser,
+            spots: &spots,
+        },
+        per_spot: capture.per_spot.as_deref(),
+        masks: None,
+        pulses: None,
+    };
+    judge(&measurement).map_err(|e| CliError::input(format!("{}: {e}", folder.display())))
+}
+
+/// Puts the corrected calibration and histograms into the capture.
+fn correct(capture: &mut Capture, checked: &Checked) {
+    let found = &checked.corrected;
+    capture.gate = found.gate;
+    let i = found.camera.intrinsics;
+    capture.intrinsics.fx = i.fx;
+    capture.intrinsics.fy = i.fy;
+    capture.intrinsics.cx = i.cx;
+    capture.intrinsics.cy = i.cy;
+    let array = |v: Vec3| [v.x, v.y, v.z];
+    capture.laser = array(found.laser);
+    let beams = found.spots.iter().map(|spot| match spot.place {
+        Some(place) => Beam::Spot {
+            position: array(place.point),
+            path_m: place.path_m,
+        },
+        None => Beam::Direction(array(spot.direction.normalized())),
+    });
+    capture.beams = beams.collect();
+    match &mut capture.per_spot {
+        Some(each) => {
+            *each = found.histograms(each);
+            let mut sum = vec![0.0f64; capture.sum.len()];
+            for h in each.chunks(sum.len()) {
+                sum.iter_mut().zip(h).for_each(|(s, x)| *s += f64::from(*x));
+            }
+            capture.sum = sum.into_iter().map(|s| s as f32).collect();
+        }
+        None => capture.sum = found.histograms(&capture.sum),
+    }
+    if let Some(depth) = &mut capture.depth {
+        *depth = found.image(depth);
+    }
+    let causes = checked.report.causes.iter().filter(|c| c.corrected);
+    let notes = causes.map(|c| format!("calibrated: {}", c.finding));
+    capture.origin.conversions.extend(notes);
+}
+
+fn facts(report: &Report) -> Value {
+    let mut facts = serde_json::to_value(report).expect("a report is plain data");
+    facts["version"] = json!(VERSION);
+    facts
+}
+
+/// Describes a report in a few lines.
+fn describe(report: &Report) -> String {
+    let mut text = format!("{}\n", report.verdict.name());
+    for cause in &report.causes {
+        text += &format!(
+            "  {}: {}\n    {}{}\n",
+            cause.severity.name(),
+            cause.finding,
+            cause.advice,
+            if cause.corrected { "" } else { " (calibrate cannot correct it)" }
+        );
+    }
+    if let (Some(stated), Some(corrected)) = (report.stated, report.corrected) {
+        text += &format!(
+            "  two-bounce times within a bin: {:.0} %, rms {:.1} mm as stated; {:.0} %, rms {:.1} mm corrected\n",
+            100.0 * stated.share,
+            1e3 * stated.rms_m,
+            100.0 * corrected.share,
+            1e3 * corrected.rms_m
+        );
+    }
+    if let Some(pulse) = report.pulse {
+        text += &format!("  pulse: {:.0} ps wide at half its height\n", pulse.fwhm_ps);
+    }
+    if let Some(background) = report.background {
+        text += &format!("  background: {background:.3} a bin in the sum of all spots\n");
+    }
+    for note in &report.notes {
+        text += &format!("  note: {note}\n");
+    }
+    text
+}

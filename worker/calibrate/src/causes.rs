@@ -1,0 +1,508 @@
+//! Findings put into words, with figures and severities.
+
+use picofarm_settings::PS_PER_M;
+
+use crate::{
+    Measurement,
+    check::{Refined, Relocated, SIGNIFICANT, upright},
+    fit::{Fitted, Observed},
+    hypotheses::{Chosen, SCALES, order_name},
+    masks::MaskOrder,
+    model::{FOCAL, LASER, Model, T0, WIDTH},
+    numeric::{length, median, quantile, sub},
+    observe::Seen,
+    pixels::Pixels,
+    report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict},
+};
+
+/// Share of times within one bin below which a calibration explains nothing.
+const UNEXPLAINED: f64 = 0.22;
+/// Distance of peaks from predicted times, over that from shifted times, above which a calibration
+/// explains nothing of a capture of all spots at once.
+const UNCLEAR: f64 = 0.5;
+/// Share of dead pixels, t0 in bins, laser in metres, focal length and bin width relative, from
+/// which on results are wrong.
+const WRONG_DEAD: f64 = 0.2;
+const WRONG_T0: f64 = 2.0;
+const WRONG_LASER: f64 = 0.05;
+const WRONG_FOCAL: f64 = 0.03;
+const WRONG_WIDTH: f64 = 0.02;
+/// Shares of photons lost to pile-up that are named, and that make results wrong.
+const PILE_UP: [f64; 2] = [0.02, 0.3];
+/// Background over light, in the gate of the median pixel, likewise.
+const BACKGROUND: [f64; 2] = [0.5, 10.0];
+/// Share of histograms with a bin at the ceiling that makes results wrong.
+const WRONG_CLIPPED: f64 = 0.05;
+
+/// Everything that was found.
+pub(crate) struct Findings<'a> {
+    pub m: &'a Measurement<'a>,
+    pub pixels: &'a Pixels,
+    pub seen: &'a Seen,
+    /// What was seen, under the chosen hypothesis.
+    pub observed: &'a Observed,
+    pub chosen: &'a Chosen,
+    /// The calibration under the chosen hypothesis, and refined.
+    pub base: &'a Model,
+    pub before: &'a Fitted,
+    pub refined: &'a Refined,
+    pub relocated: &'a [Relocated],
+    /// The order of masks, and whether they are stored already turned.
+    pub masks: Option<&'a (MaskOrder, bool)>,
+}
+
+/// Writes down one cause.
+struct Found<'a> {
+    fault: Fault,
+    wrong: bool,
+    value: f64,
+    error: f64,
+    unit: &'a str,
+    finding: String,
+    advice: &'a str,
+    corrected: bool,
+}
+
+impl Found<'_> {
+    fn cause(self) -> Cause {
+        Cause {
+            fault: self.fault,
+            severity: if self.wrong {
+                Verdict::Wrong
+            } else {
+                Verdict::Usable
+            },
+            finding: self.finding,
+            value: self.value,
+            error: self.error,
+            unit: self.unit.into(),
+            advice: self.advice.into(),
+            corrected: self.corrected,
+        }
+    }
+}
+
+pub(crate) fn report(f: &Findings) -> Report {
+    let mut causes = Vec::new();
+    discrete(f, &mut causes);
+    continuous(f, &mut causes);
+    counting(f, &mut causes);
+    let fitted = &f.refined.fitted;
+    let unexplained = match f.seen.unclear {
+        None => (fitted.agreeing < UNEXPLAINED).then(|| {
+            let percent = 100.0 * fitted.agreeing;
+            let what = format!("only {percent:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more");
+            (fitted.agreeing, "share of times", what)
+        }),
+        Some(share) => (share > UNCLEAR).then(|| {
+            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.3 and less");
+            (share, "of the distance by chance", what)
+        }),
+    };
+    if let Some((value, unit, finding)) = unexplained {
+        causes.push(
+            Found {
+                fault: Fault::Unexplained,
+                wrong: true,
+                value,
+                error: 0.0,
+                unit,
+                finding,
+                advice: "check the stated spots, the camera and the unit of time together: more than one of them is wrong, or the room moved",
+                corrected: false,
+            }
+            .cause(),
+        );
+    }
+    causes.sort_by_key(|c| std::cmp::Reverse(c.severity));
+    let agreement = |fitted: &Fitted| Agreement {
+        share: fitted.agreeing,
+        rms_m: fitted.rms_m,
+    };
+    Report {
+        verdict: causes
+            .iter()
+            .map(|c| c.severity)
+            .max()
+            .unwrap_or(Verdict::Good),
+        causes,
+        notes: notes(f),
+        stated: Some(agreement(f.before)),
+        corrected: Some(agreement(fitted)),
+        unclear: f.seen.unclear,
+        errors: Some(f.refined.errors),
+        pulse: f.seen.pulse.map(|shape| PulseFound {
+            shape,
+            fwhm_ps: shape.fwhm_bins() * fitted.model.width * PS_PER_M,
+        }),
+        background: (f.pixels.dark_bins > 0).then(|| background(f.pixels)),
+        spots: (0..fitted.model.beams.len()).map(|k| spot(f, k)).collect(),
+    }
+}
+
+fn background(pixels: &Pixels) -> f64 {
+    let mut dark: Vec<f64> = pixels.dark.iter().map(|x| f64::from(*x)).collect();
+    median(&mut dark).unwrap_or(0.0)
+}
+
+fn spot(f: &Findings, k: usize) -> SpotResidual {
+    let fitted = &f.refined.fitted;
+    let off = f.observed.residuals(&fitted.model, &fitted.ranges, k);
+    let mut near: Vec<f64> = off
+        .into_iter()
+        .flatten()
+        .filter(|e| e.abs() < fitted.model.width)
+        .collect();
+    let squares: f64 = near.iter().map(|e| e * e).sum();
+    let (point, path) = fitted.model.spot(k);
+    SpotResidual {
+        times: near.len(),
+        rms_m: (squares / near.len().max(1) as f64).sqrt(),
+        median_m: quantile(&mut near, 0.5),
+        return_m: f.observed.returns[k].map(|r| path + length(point) - fitted.model.path(r.bin)),
+    }
+}
+
+fn discrete(f: &Findings, causes: &mut Vec<Cause>) {
+    let (h, chosen) = (&f.chosen.hypothesis, f.chosen);
+    let shares = format!(
+        "{:.0} % of the two-bounce times agree, against {:.0} % as stated",
+        100.0 * chosen.share,
+        100.0 * chosen.stated_share
+    );
+    let returns = match chosen.pixels.is_finite() && chosen.stated_pixels.is_finite() {
+        true => format!(
+            ", and returns are {:.1} pixels from their spots, against {:.1}",
+            chosen.pixels, chosen.stated_pixels
+        ),
+        false => String::new(),
+    };
+    let gain = chosen.share - chosen.stated_share;
+    let mut add = |fault, finding, advice| {
+        causes.push(
+            Found {
+                fault,
+                wrong: true,
+                value: gain,
+                error: 0.0,
+                unit: "share of times",
+                finding,
+                advice,
+                corrected: true,
+            }
+            .cause(),
+        );
+    };
+    if !upright(h.turn) {
+        add(
+            Fault::Image,
+            format!("the image is {}: so {shares}{returns}", h.turn.name()),
+            "turn the histograms, or the stated camera axes",
+        );
+    }
+    if h.reordered() {
+        add(
+            Fault::SpotOrder,
+            format!(
+                "histograms and spots are {}: so {shares}{returns}",
+                order_name(&h.order)
+            ),
+            "reorder the stated spots so that spot k belongs to histogram k",
+        );
+    }
+    if h.scale > 0 {
+        let (factor, reason) = SCALES[h.scale];
+        add(
+            Fault::TimeScale,
+            format!(
+                "times are {factor:.4} of what they should be ({reason}): multiplied by it, {shares}",
+                factor = 1.0 / factor
+            ),
+            "state bin width and begin of the gate as metres of path: picoseconds times 0.000299792",
+        );
+    }
+    if let Some((masks, _)) = f.masks
+        && masks.order.iter().enumerate().any(|(k, j)| k != *j)
+    {
+        causes.push(
+            Found {
+                fault: Fault::MaskOrder,
+                wrong: true,
+                value: masks.contrast,
+                error: 0.0,
+                unit: "contrast",
+                finding: format!(
+                    "masks and spots are {}: light at a spot's own time differs by {:.2} between lit and dark pixels, against {:.2} as stated",
+                    order_name(&masks.order),
+                    masks.contrast,
+                    masks.stated
+                ),
+                advice: "reorder the masks so that mask k belongs to spot k",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+}
+
+fn continuous(f: &Findings, causes: &mut Vec<Cause>) {
+    let (r, base) = (f.refined, f.base);
+    let model = &r.fitted.model;
+    let errors = &r.fitted.errors;
+    if r.t0 {
+        let late = (model.start - base.start) / base.width;
+        let ps = (model.start - base.start) * PS_PER_M;
+        causes.push(
+            Found {
+                fault: Fault::TimeZero,
+                wrong: late.abs() >= WRONG_T0,
+                value: late,
+                error: errors[T0] / base.width,
+                unit: "bins",
+                finding: format!(
+                    "t0 is off: the gate begins {:.2} bins ({:.1} ps) {} than stated, ± {:.2}",
+                    late.abs(),
+                    ps.abs(),
+                    if late > 0.0 { "later" } else { "earlier" },
+                    errors[T0] / base.width
+                ),
+                advice: "add the shift to the begin of the gate; t0 refers to the pulse's peak",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+    let moved = sub(model.laser, base.laser);
+    if r.free.laser.iter().any(|l| *l) {
+        let error = LASER.iter().map(|k| errors[*k].powi(2)).sum::<f64>().sqrt();
+        let [x, y, z] = moved.map(|m| 100.0 * m);
+        causes.push(
+            Found {
+                fault: Fault::Laser,
+                wrong: length(moved) >= WRONG_LASER,
+                value: length(moved),
+                error,
+                unit: "m",
+                finding: format!(
+                    "the laser is {:.1} cm from its stated place: {x:+.1} cm right, {y:+.1} cm down, {z:+.1} cm ahead, ± {:.2}",
+                    100.0 * length(moved),
+                    100.0 * error
+                ),
+                advice: "use the corrected place of the laser",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+    let focal = model.lens[0] / base.lens[0] - 1.0;
+    if r.free.focal {
+        let columns = model.columns as f64;
+        let degrees = |f: f64| 2.0 * libm::atan2(0.5 * columns, f).to_degrees();
+        causes.push(
+            Found {
+                fault: Fault::FieldOfView,
+                wrong: focal.abs() >= WRONG_FOCAL,
+                value: focal,
+                error: errors[FOCAL],
+                unit: "relative focal length",
+                finding: format!(
+                    "the view is {:.1} degrees wide, not {:.1}: the focal length is {:+.1} %, ± {:.1}",
+                    degrees(model.lens[0]),
+                    degrees(base.lens[0]),
+                    100.0 * focal,
+                    100.0 * errors[FOCAL]
+                ),
+                advice: "use the corrected focal length, or calibrate the camera with a pattern",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+    let width = model.width / base.width - 1.0;
+    if r.free.width {
+        causes.push(
+            Found {
+                fault: Fault::BinWidth,
+                wrong: width.abs() >= WRONG_WIDTH,
+                value: width,
+                error: errors[WIDTH],
+                unit: "relative",
+                finding: format!(
+                    "bins are {:.3} ps wide, not {:.3}: {:+.2} %, ± {:.2}",
+                    model.width * PS_PER_M,
+                    base.width * PS_PER_M,
+                    100.0 * width,
+                    100.0 * errors[WIDTH]
+                ),
+                advice: "calibrate the time-to-digital converter, or use the corrected width",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+    for moved in f.relocated {
+        causes.push(
+            Found {
+                fault: Fault::Spot,
+                wrong: moved.distance >= 0.2,
+                value: moved.distance,
+                error: moved.error,
+                unit: "m",
+                finding: format!(
+                    "spot {} is {:.1} cm from its stated place, ± {:.1}: {} times agree, against {}",
+                    moved.spot,
+                    100.0 * moved.distance,
+                    100.0 * moved.error,
+                    moved.agreeing[1],
+                    moved.agreeing[0]
+                ),
+                advice: "use the corrected place of the spot",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+}
+
+fn counting(f: &Findings, causes: &mut Vec<Cause>) {
+    let p = f.pixels;
+    let all = p.dead.len();
+    let mut pixels = |fault, which: &[bool], what: &str, advice, worst: f64| {
+        let count = which.iter().filter(|w| **w).count();
+        if count > 0 {
+            let share = count as f64 / all as f64;
+            let first = which.iter().position(|w| *w).unwrap_or(0);
+            let (row, column) = (first / f.m.width(), first % f.m.width());
+            causes.push(
+                Found {
+                    fault,
+                    wrong: share >= worst,
+                    value: count as f64,
+                    error: 0.0,
+                    unit: "pixels",
+                    finding: format!(
+                        "{count} of {all} pixels ({:.1} %) {what}; the first is row {row}, column {column}",
+                        100.0 * share
+                    ),
+                    advice,
+                    corrected: true,
+                }
+                .cause(),
+            );
+        }
+    };
+    pixels(
+        Fault::DeadPixels,
+        &p.dead,
+        "are dead: they have no counts above the background",
+        "list them as dead; their neighbours fill in",
+        WRONG_DEAD,
+    );
+    pixels(
+        Fault::HotPixels,
+        &p.hot,
+        "are hot: most of their counts come before light can",
+        "set them to 0; their neighbours fill in",
+        WRONG_DEAD,
+    );
+    if let Some((most, held)) = p.ceiling {
+        let histograms = all * f.m.per_spot.map_or(1, |_| f.m.capture.spots.len());
+        causes.push(
+            Found {
+                fault: Fault::Clipped,
+                wrong: held as f64 > WRONG_CLIPPED * histograms as f64,
+                value: held as f64,
+                error: 0.0,
+                unit: "bins",
+                finding: format!("{held} bins hold exactly {most}, the greatest count: they are clipped"),
+                advice: "measure with less light or wider counters; the lost counts cannot be restored",
+                corrected: false,
+            }
+            .cause(),
+        );
+    }
+    if let Some(pulses) = p.pulses
+        && p.lost > PILE_UP[0]
+    {
+        let known = f.m.pulses.is_some();
+        causes.push(
+            Found {
+                fault: Fault::PileUp,
+                wrong: p.lost > PILE_UP[1],
+                value: p.lost,
+                error: 0.0,
+                unit: "share of photons",
+                finding: format!(
+                    "pile-up hides {:.0} % of the median pixel's photons: {} {pulses} pulses{}",
+                    100.0 * p.lost,
+                    if known { "of" } else { "the brightest pixels stop at" },
+                    if known { "" } else { ", one photon each" }
+                ),
+                advice: "measure with less light, below 5 % of the pulses; what is left is corrected after Coates (1968)",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+    let dark = background(p) * f.m.bins() as f64;
+    let share = dark / p.light.max(1e-300);
+    if p.dark_bins > 0 && share > BACKGROUND[0] {
+        causes.push(
+            Found {
+                fault: Fault::Background,
+                wrong: share > BACKGROUND[1],
+                value: background(p),
+                error: 0.0,
+                unit: "counts per bin",
+                finding: format!(
+                    "the background is {:.3} counts per bin, {share:.1} times the light of the median pixel over the gate",
+                    background(p)
+                ),
+                advice: "darken the room, narrow the optical filter, or gate earlier; the mean is subtracted, its noise stays",
+                corrected: true,
+            }
+            .cause(),
+        );
+    }
+}
+
+fn notes(f: &Findings) -> Vec<String> {
+    let mut notes = Vec::new();
+    let returns = f.seen.observed.returns.iter().flatten().count();
+    let spots = f.m.capture.spots.len();
+    if f.m.per_spot.is_none() {
+        notes.push("all spots were measured at once: mirrored images and spots in another order are not tried".into());
+    } else if returns < spots {
+        notes.push(format!(
+            "{} of {spots} spots show no return of one bounce: it is outside of the gate, hidden, or cut off",
+            spots - returns
+        ));
+    }
+    if !f.refined.separable {
+        notes.push(format!(
+            "t0 and the laser's place cannot be told apart (correlation {:.2}): the laser is kept as stated",
+            f.refined.tied
+        ));
+    }
+    let placed = f.base.beams.iter().all(|b| b.point.is_some());
+    if !placed {
+        notes.push(
+            "no spot has a stated place: a common scale of all lengths cannot be seen".into(),
+        );
+    }
+    if f.pixels.dark_bins == 0 {
+        notes.push("the gate begins with light: background and hot pixels cannot be seen".into());
+    }
+    if f.seen.pulse.is_none() {
+        notes.push(format!(
+            "no return shows the pulse: that of {:.2} bins is assumed",
+            crate::observe::ASSUMED.fwhm_bins()
+        ));
+    }
+    notes.push(format!(
+        "shifts below {:.2} bins of t0, {:.0} mm of the laser and {SIGNIFICANT} standard errors are not corrected",
+        f.refined.least.t0,
+        1e3 * f.refined.least.laser
+    ));
+    notes
+}

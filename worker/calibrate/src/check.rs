@@ -1,0 +1,336 @@
+//! The check from end to end: pixels, observations, hypotheses, least squares, causes.
+
+use crate::{
+    CalibrateError, Measurement, Pulse, Report,
+    causes::{Findings, report},
+    correct::Corrected,
+    fit::{Fitted, Free, Observed},
+    hypotheses::{Chosen, Hypothesis, Turn, choose},
+    masks,
+    model::{FOCAL, LASER, Model, WIDTH},
+    numeric::{length, sub},
+    observe,
+    pixels::Pixels,
+    spots::locate,
+};
+
+/// Least shifts of t0 in bins, of the laser and of each of its coordinates in metres, that are
+/// corrected.
+#[derive(Clone, Copy)]
+pub(crate) struct Least {
+    pub t0: f64,
+    pub laser: f64,
+    pub coordinate: f64,
+}
+
+impl Least {
+    pub const SHARP: Self = Self {
+        t0: 0.25,
+        laser: 0.006,
+        coordinate: 0.004,
+    };
+    /// Where the pulse is unknown, so that its peak is.
+    pub const VAGUE: Self = Self {
+        t0: 0.8,
+        laser: 0.03,
+        coordinate: 0.02,
+    };
+}
+
+/// The same of relative focal length and bin width, and of a spot in metres.
+pub(crate) const LEAST_FOCAL: f64 = 0.004;
+pub(crate) const LEAST_WIDTH: f64 = 0.003;
+pub(crate) const LEAST_SPOT: f64 = 0.03;
+/// A shift counts from this many standard errors on.
+pub(crate) const SIGNIFICANT: f64 = 5.0;
+/// Standard error of a laser coordinate beyond which the laser is not estimated, metres.
+const VAGUE_M: f64 = 0.02;
+/// Share of the rms that a further parameter must save.
+const SAVES: f64 = 0.03;
+
+/// Arrays for pictures of a check.
+#[derive(Debug, Clone)]
+pub struct Pictures {
+    /// Median of prediction minus observation at each stored pixel with the stated calibration,
+    /// metres of path, `[row][column]`; NaN where no time is known.
+    pub stated_m: Vec<f32>,
+    /// The same with the corrected calibration.
+    pub corrected_m: Vec<f32>,
+    /// Share of a return's light in a bin, over the bin's middle minus the pulse's peak, bins.
+    pub pulse_samples: Vec<[f64; 2]>,
+    /// The estimated pulse.
+    pub pulse: Option<Pulse>,
+}
+
+/// The result of a check.
+#[derive(Debug, Clone)]
+pub struct Checked {
+    /// Causes and verdict.
+    pub report: Report,
+    /// The corrected calibration.
+    pub corrected: Corrected,
+    /// Arrays for pictures.
+    pub pictures: Pictures,
+}
+
+/// Checks a capture, and corrects its calibration. Returns the same bytes on any number of threads.
+///
+/// # Errors
+/// Returns [`CalibrateError`] for an argument that cannot be used.
+pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
+    m.check()?;
+    let pixels = Pixels::new(m);
+    let stated = Model::new(&m.capture);
+    let seen = match m.per_spot {
+        Some(h) => observe::each(m, h, &pixels),
+        None => crate::flash::observe(m, &stated, &pixels)?,
+    };
+    let (width, height) = (m.width(), m.pixels() / m.width());
+    let chosen = match m.per_spot {
+        Some(_) => choose(&stated, &seen.observed, width, height),
+        None => Chosen {
+            hypothesis: Hypothesis::stated(stated.beams.len()),
+            share: 1.0,
+            stated_share: 1.0,
+            pixels: f64::NAN,
+            stated_pixels: f64::NAN,
+        },
+    };
+    let h = &chosen.hypothesis;
+    let observed = h.observed(&seen.observed, width, height);
+    let base = h.model(&stated);
+    let least = match seen.pulse {
+        Some(_) => Least::SHARP,
+        None => Least::VAGUE,
+    };
+    let mut refined = refine(&base, &observed, least);
+    let (relocated, moved) = relocate(&refined, &base, &observed);
+    if !relocated.is_empty() {
+        refined = refine(&moved, &observed, least);
+    }
+    let masks = m.masks.map(|masks| {
+        let (model, ranges) = (&refined.fitted.model, &refined.fitted.ranges);
+        let order = |pixels| masks::order(model, &observed, ranges, masks, m.pixels(), pixels);
+        // Masks are stored as the histograms are, or already turned.
+        let (own, turned) = (order(&seen.observed.pixels), order(&observed.pixels));
+        if turned.contrast > own.contrast {
+            (turned, true)
+        } else {
+            (own, false)
+        }
+    });
+    let mut placed = stated.clone();
+    let bins: Vec<_> = seen
+        .observed
+        .returns
+        .iter()
+        .map(|r| r.map(|r| r.bin))
+        .collect();
+    placed.place_beams(&bins);
+    let before = seen.observed.judged(placed, [0.0; 6], 0.0);
+    let pictures = Pictures {
+        stated_m: image(&before, &seen.observed, &seen.observed.pixels, m.pixels()),
+        corrected_m: image(
+            &refined.fitted,
+            &observed,
+            &seen.observed.pixels,
+            m.pixels(),
+        ),
+        pulse_samples: seen.samples.clone(),
+        pulse: seen.pulse,
+    };
+    let findings = Findings {
+        m,
+        pixels: &pixels,
+        seen: &seen,
+        observed: &observed,
+        chosen: &chosen,
+        base: &base,
+        before: &before,
+        refined: &refined,
+        relocated: &relocated,
+        masks: masks.as_ref(),
+    };
+    let report = report(&findings);
+    let corrected = Corrected::new(&findings, &report.causes);
+    Ok(Checked {
+        report,
+        corrected,
+        pictures,
+    })
+}
+
+/// A calibration refined by least squares.
+pub(crate) struct Refined {
+    pub fitted: Fitted,
+    pub free: Free,
+    /// Whether t0 moved by more than chance.
+    pub t0: bool,
+    /// Standard errors with all of t0 and laser free.
+    pub errors: [f64; 4],
+    /// Correlation of t0 and laser.
+    pub tied: f64,
+    /// Whether the laser can be told from t0.
+    pub separable: bool,
+    /// What counts as a shift.
+    pub least: Least,
+}
+
+fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
+    sub(fitted.model.laser, base.laser)
+}
+
+/// Fits t0 and laser, then bin width and focal length if the times demand them. What moves by no
+/// more than chance stays as stated.
+fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
+    let mut free = Free::LASER;
+    let mut best = seen.fit(base, free);
+    let all = best.clone();
+    let vague = LASER
+        .iter()
+        .any(|k| !(best.errors[*k] > 0.0 && best.errors[*k] < VAGUE_M));
+    let separable = !vague;
+    if vague {
+        free = Free::T0;
+        best = seen.fit(base, free);
+    }
+    let placed = base.beams.iter().all(|b| b.point.is_some());
+    let worth = |tried: &Fitted, more: Free, than: &Fitted| {
+        let focal = (tried.model.lens[0] / base.lens[0] - 1.0).abs();
+        let width = (tried.model.width / base.width - 1.0).abs();
+        let real = |on: bool, value: f64, least: f64, name: usize| {
+            !on || value > least.max(SIGNIFICANT * tried.errors[name])
+        };
+        let better =
+            tried.rms_m < (1.0 - SAVES) * than.rms_m || tried.agreeing > than.agreeing + 0.01;
+        better
+            && tried.agreeing > than.agreeing - 0.005
+            && real(more.focal, focal, LEAST_FOCAL, FOCAL)
+            && real(more.width, width, LEAST_WIDTH, WIDTH)
+    };
+    let plain = free;
+    // One more parameter before two.
+    for (focal, width) in [(true, false), (false, true), (true, true)] {
+        if width && !placed {
+            continue;
+        }
+        let more = Free {
+            focal,
+            width,
+            ..plain
+        };
+        let tried = seen.fit(base, more);
+        if worth(&tried, more, &best) {
+            (free, best) = (more, tried);
+        }
+    }
+    let moved = shift(&best, base);
+    let far = length(moved) > least.laser;
+    let mut held = free;
+    for a in 0..3 {
+        let sure = moved[a].abs() > least.coordinate.max(SIGNIFICANT * best.errors[LASER[a]]);
+        held.laser[a] = free.laser[a] && far && sure;
+    }
+    if held != free {
+        free = held;
+        best = seen.fit(base, free);
+    }
+    if free.laser != [false; 3] && length(shift(&best, base)) < least.laser {
+        free.laser = [false; 3];
+        best = seen.fit(base, free);
+    }
+    let late = (best.model.start - base.start) / base.width;
+    let t0 = late.abs() > least.t0.max(SIGNIFICANT * best.errors[0] / base.width);
+    let simple = free == Free::T0 && !t0;
+    if simple {
+        let mut model = base.clone();
+        // Beams without a stated spot keep the ranges of the fit.
+        model.beams.clone_from(&best.model.beams);
+        best = seen.judged(model, best.errors, best.tied);
+    }
+    Refined {
+        fitted: best,
+        free,
+        t0,
+        errors: [all.errors[0], all.errors[1], all.errors[2], all.errors[3]],
+        tied: all.tied,
+        separable,
+        least,
+    }
+}
+
+/// A spot that is not where it is stated.
+pub(crate) struct Relocated {
+    pub spot: usize,
+    pub distance: f64,
+    pub error: f64,
+    pub agreeing: [usize; 2],
+}
+
+/// Finds spots that are elsewhere, and returns the calibration with them moved. Only spots with a
+/// return take part.
+fn relocate(refined: &Refined, base: &Model, seen: &Observed) -> (Vec<Relocated>, Model) {
+    let mut all = Vec::new();
+    let fitted = &refined.fitted;
+    let near = |k: usize| {
+        let off = seen.residuals(&fitted.model, &fitted.ranges, k);
+        let close = off
+            .iter()
+            .flatten()
+            .filter(|e| e.abs() < fitted.model.width);
+        close.count() as f64
+    };
+    let mut counts: Vec<f64> = (0..fitted.model.beams.len()).map(near).collect();
+    let usual = crate::numeric::median(&mut counts).unwrap_or(0.0);
+    for k in 0..fitted.model.beams.len() {
+        let (Some(stated), Some(found)) = (
+            fitted.model.beams[k].point,
+            locate(&fitted.model, seen, &fitted.ranges, k),
+        ) else {
+            continue;
+        };
+        let distance = length(sub(found.point, stated));
+        let least = LEAST_SPOT.max(SIGNIFICANT * found.error);
+        let more = found.agreeing[1] as f64 > 1.25 * found.agreeing[0] as f64;
+        // Light by way of a bright wall makes a few pixels agree on a spot that is not there.
+        let enough = found.agreeing[1] as f64 > 0.4 * usual;
+        if distance > least && more && enough {
+            all.push((k, found, distance));
+        }
+    }
+    // If most spots moved, it is not the spots that are wrong.
+    if 3 * all.len() > fitted.model.beams.len() {
+        return (Vec::new(), base.clone());
+    }
+    let mut model = base.clone();
+    for (k, found, _) in &all {
+        model.beams[*k].point = Some(found.point);
+    }
+    let made = all.into_iter().map(|(spot, found, distance)| Relocated {
+        spot,
+        distance,
+        error: found.error,
+        agreeing: found.agreeing,
+    });
+    (made.collect(), model)
+}
+
+/// Median residual of each stored pixel.
+fn image(fitted: &Fitted, seen: &Observed, stored: &[usize], pixels: usize) -> Vec<f32> {
+    let spots: Vec<_> = (0..seen.times.len())
+        .map(|k| seen.residuals(&fitted.model, &fitted.ranges, k))
+        .collect();
+    let mut image = vec![f32::NAN; pixels];
+    for (n, p) in stored.iter().enumerate() {
+        let mut own: Vec<f64> = spots.iter().filter_map(|s| s[n]).map(f64::abs).collect();
+        if let Some(middle) = crate::numeric::median(&mut own) {
+            image[*p] = middle as f32;
+        }
+    }
+    image
+}
+
+/// Whether nothing turned the image.
+pub(crate) fn upright(turn: Turn) -> bool {
+    turn == Turn::default()
+}

@@ -1,0 +1,256 @@
+//! Pixels: dead, hot, clipped; background; pile-up.
+
+use rayon::prelude::*;
+
+use crate::{Measurement, numeric::quantile};
+
+/// Share of a bright pixel's counts below which a pixel counts as dead.
+const DEAD: f64 = 0.002;
+/// Share of a pixel's counts that come before any light can, and factor over the median's
+/// background, from which on a pixel counts as hot.
+const HOT: [f64; 2] = [0.5, 5.0];
+/// Share of the brightest bin of the mean pixel by which light has come.
+const RISE: f64 = 0.02;
+/// Bins before that which count as light: a pulse begins before its peak.
+const BEFORE: usize = 3;
+/// Bins before a pixel's own first bright bin.
+const MARGIN: usize = 8;
+/// Rank of the bin that counts as a pixel's brightest, so that a return of one bounce does not.
+const RANK: usize = 8;
+/// Least count that may be a ceiling, and cells that must be at it.
+const CEILING: (f32, usize) = (100.0, 8);
+/// Spread of the greatest totals, over their median, below which a pixel's totals are limited by
+/// the number of pulses.
+const LEVEL: f64 = 0.03;
+
+/// What the pixels of a capture are like.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Pixels {
+    pub dead: Vec<bool>,
+    pub hot: Vec<bool>,
+    /// Background of each pixel in the histogram of all spots, per bin.
+    pub dark: Vec<f32>,
+    /// Bins before any light; 0 if the gate begins too late to tell.
+    pub dark_bins: usize,
+    /// Light of the median pixel over the gate, without background.
+    pub light: f64,
+    /// Greatest count, and the number of bins that hold it, if it is a ceiling.
+    pub ceiling: Option<(f32, usize)>,
+    /// Photons for each unit of the histograms.
+    pub gain: f32,
+    /// Pulses of each histogram, stated or from totals that reach them, if pile-up shows.
+    pub pulses: Option<u64>,
+    /// Share of the photons of the median pixel that pile-up hides.
+    pub lost: f64,
+}
+
+impl Pixels {
+    pub fn good(&self) -> Vec<bool> {
+        self.dead
+            .iter()
+            .zip(&self.hot)
+            .map(|(d, h)| !d && !h)
+            .collect()
+    }
+
+    pub fn new(m: &Measurement) -> Self {
+        let bins = m.bins();
+        let h = m.capture.histogram;
+        let cells = m.per_spot.unwrap_or(h);
+        let counts = cells.par_iter().all(|x| *x >= 0.0 && x.fract() == 0.0);
+        let (dark_bins, tops) = first_light(h, bins);
+        let mut middle: Vec<f64> = tops.iter().copied().filter(|t| *t > 0.0).collect();
+        let typical = quantile(&mut middle, 0.5).unwrap_or(1.0);
+        // Light in other units is taken for a bright measurement of 1000 photons in a bin.
+        let gain = if counts {
+            1.0
+        } else {
+            (1000.0 / typical) as f32
+        };
+        let totals: Vec<f64> = h.par_chunks(bins).map(sum).collect();
+        let dark: Vec<f32> = h
+            .par_chunks(bins)
+            .map(|h| match dark_bins {
+                0 => 0.0,
+                // The pulse of a bright spot's pixel may begin earlier.
+                n => {
+                    let top = h.iter().copied().fold(0.0f32, f32::max);
+                    let own = h.iter().position(|x| *x > 0.3 * top).unwrap_or(n);
+                    let n = if own < MARGIN + 4 {
+                        n
+                    } else {
+                        n.min(own - MARGIN)
+                    };
+                    (sum(&h[..n]) / n as f64) as f32
+                }
+            })
+            .collect();
+        let shared = |part: &[f32]| {
+            let mut all: Vec<f64> = part.iter().map(|x| f64::from(*x)).collect();
+            quantile(&mut all, 0.5).unwrap_or(0.0)
+        };
+        let usual = shared(&dark);
+        let light: Vec<f64> = (0..totals.len())
+            .map(|p| totals[p] - f64::from(dark[p]) * bins as f64)
+            .collect();
+        let bright = quantile(&mut light.clone(), 0.9).unwrap_or(0.0).max(0.0);
+        let dead: Vec<bool> = (0..totals.len())
+            .map(|p| {
+                let noise = (3.0 * (totals[p] * f64::from(gain)).max(0.0).sqrt()) / f64::from(gain);
+                totals[p] == 0.0 || totals[p] < DEAD * bright || light[p] < DEAD * bright - noise
+            })
+            .collect();
+        let hot: Vec<bool> = (0..totals.len())
+            .map(|p| {
+                let own = f64::from(dark[p]);
+                let scatter = 5.0 * (usual / (dark_bins.max(1) as f64 * f64::from(gain))).sqrt();
+                let share = own * bins as f64 / totals[p].max(1e-300);
+                !dead[p] && share > HOT[0] && own > HOT[1] * usual + scatter
+            })
+            .collect();
+        let good = |p: &usize| !dead[*p] && !hot[*p];
+        let mut lit: Vec<f64> = (0..totals.len()).filter(good).map(|p| light[p]).collect();
+        let (pulses, lost) = pile_up(m, counts, &dead, &hot);
+        Self {
+            ceiling: counts.then(|| ceiling(cells)).flatten(),
+            light: quantile(&mut lit, 0.5).unwrap_or(0.0),
+            dead,
+            hot,
+            dark,
+            dark_bins,
+            gain,
+            pulses,
+            lost,
+        }
+    }
+
+    /// The background of a pixel in the histogram of one spot, per bin.
+    pub fn dark_of_spot(&self, h: &[f32], bins: usize) -> Vec<f32> {
+        let n = self.dark_bins;
+        h.chunks(bins)
+            .map(|h| match n {
+                0 => 0.0,
+                n => (sum(&h[..n]) / n as f64) as f32,
+            })
+            .collect()
+    }
+}
+
+fn sum(h: &[f32]) -> f64 {
+    h.iter().map(|x| f64::from(*x)).sum()
+}
+
+/// The number of bins before any light, and a bright bin of each pixel.
+fn first_light(h: &[f32], bins: usize) -> (usize, Vec<f64>) {
+    let tops: Vec<f64> = h
+        .par_chunks(bins)
+        .map(|h| {
+            let mut all = h.to_vec();
+            let rank = RANK.min(bins) - 1;
+            f64::from(*all.select_nth_unstable_by(rank, |a, b| b.total_cmp(a)).1)
+        })
+        .collect();
+    let mut profile = vec![0.0; bins];
+    for (h, top) in h.chunks(bins).zip(&tops) {
+        for (sum, x) in profile.iter_mut().zip(h) {
+            *sum += f64::from(*x).min(*top);
+        }
+    }
+    let windows = profile.windows(4).map(|w| w.iter().sum::<f64>() / 4.0);
+    let base = windows.fold(f64::INFINITY, f64::min);
+    let top = profile.iter().copied().fold(0.0, f64::max);
+    let noise = 6.0 * base.max(0.0).sqrt();
+    let least = base + (RISE * (top - base)).max(noise);
+    let first = profile.iter().position(|x| *x > least).unwrap_or(0);
+    let dark = first.saturating_sub(BEFORE);
+    (if dark < 4 { 0 } else { dark }, tops)
+}
+
+/// The greatest count, if many bins hold exactly it.
+fn ceiling(cells: &[f32]) -> Option<(f32, usize)> {
+    let most = cells.iter().copied().fold(0.0f32, f32::max);
+    let held = cells.iter().filter(|x| **x == most).count();
+    (most >= CEILING.0 && held >= CEILING.1).then_some((most, held))
+}
+
+/// Pulses of a histogram and the share of photons that the median pixel loses. A pixel that records
+/// one photon a pulse counts at most so many, so that the brightest pixels, those of the returns,
+/// all have the same total.
+fn pile_up(m: &Measurement, counts: bool, dead: &[bool], hot: &[bool]) -> (Option<u64>, f64) {
+    let (bins, pixels) = (m.bins(), m.pixels());
+    let histograms = m.per_spot.unwrap_or(m.capture.histogram);
+    if !counts {
+        return (None, 0.0);
+    }
+    let mut totals: Vec<f64> = histograms.par_chunks(bins).map(sum).collect();
+    for (k, total) in totals.iter_mut().enumerate() {
+        if dead[k % pixels] || hot[k % pixels] {
+            *total = 0.0;
+        }
+    }
+    let mut brightest: Vec<f64> = match m.per_spot {
+        Some(_) => totals
+            .chunks(pixels)
+            .map(|t| t.iter().copied().fold(0.0, f64::max))
+            .collect(),
+        None => {
+            let mut all = totals.clone();
+            all.sort_by(|a, b| b.total_cmp(a));
+            all.truncate(m.capture.spots.len());
+            all
+        }
+    };
+    brightest.sort_by(f64::total_cmp);
+    let (half, most) = (
+        brightest[brightest.len() / 2],
+        brightest[brightest.len() - 1],
+    );
+    let level = brightest.len() >= 4 && half >= 100.0 && most - half <= LEVEL * half;
+    let pulses = match m.pulses {
+        Some(n) => n as f64,
+        None if level => most,
+        None => return (None, 0.0),
+    };
+    let mut seen: Vec<f64> = totals.into_iter().filter(|t| *t > 0.0).collect();
+    let usual = quantile(&mut seen, 0.5).unwrap_or(0.0) / pulses;
+    let arrived = -libm::log((1.0 - usual).max(1e-6));
+    (Some(pulses as u64), 1.0 - usual / arrived.max(1e-12))
+}
+
+/// Corrects the pile-up of one pixel: Coates, J. Phys. E 1, 878 (1968). Bins after every pulse has
+/// been used hold nothing.
+pub(crate) fn unpile(h: &mut [f32], pulses: u64) {
+    let pulses = pulses as f64;
+    let mut left = pulses;
+    for x in h {
+        let seen = f64::from(*x);
+        let share = if left > 0.0 { seen / left } else { 0.0 };
+        // The last pulses say nothing of what would have come.
+        *x = (pulses * -libm::log1p(-share.min(0.99))) as f32;
+        left -= seen;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::unpile;
+
+    #[test]
+    fn coates_correction_returns_the_arriving_photons() {
+        let arriving = [0.3f64, 0.0, 0.9, 0.2];
+        let pulses = 1e6;
+        let mut left = pulses;
+        let mut seen: Vec<f32> = arriving
+            .iter()
+            .map(|a| {
+                let detected = left * (1.0 - (-a).exp());
+                left -= detected;
+                detected as f32
+            })
+            .collect();
+        unpile(&mut seen, pulses as u64);
+        for (x, a) in seen.iter().zip(arriving) {
+            assert!((f64::from(*x) / pulses - a).abs() < 1e-4, "{x} {a}");
+        }
+    }
+}

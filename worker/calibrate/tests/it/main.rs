@@ -1,0 +1,4 @@
+//! Tests of the calibration, in one executable because each one links the renderer.
+
+mod common;
+mod laws;
