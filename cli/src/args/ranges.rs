@@ -3,7 +3,7 @@
 
 use std::{fmt::Display, ops::RangeInclusive, str::FromStr};
 
-use picofarm_settings::Spots;
+use picofarm_settings::{Resolution, Spots};
 
 fn within<T: FromStr + PartialOrd + Display>(
     text: &str,
@@ -51,6 +51,18 @@ pub fn simulated(text: &str) -> Result<usize, String> {
 /// Parses the memory of a worker.
 pub fn gib(text: &str) -> Result<f64, String> {
     within(text, 0.05..=1e6, "GiB (of 1.07 GB)")
+}
+
+/// Parses the size of an image: 256 is a square, or 320x240.
+pub fn image(text: &str) -> Result<Resolution, String> {
+    let size: Resolution = text.parse()?;
+    match [size.width, size.height]
+        .iter()
+        .all(|n| (1..=4096).contains(n))
+    {
+        true => Ok(size),
+        false => Err("expected 1 to 4096 pixels on each side".into()),
+    }
 }
 
 /// Parses the width of a view.

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use picofarm_settings::Resolution;
 
 use super::{SceneInput, render::GateArgs};
 
@@ -29,9 +30,9 @@ pub struct Reconstruct {
     pub field: FieldArg,
     #[command(flatten)]
     pub mlp: MlpArgs,
-    /// Image width and height in pixels of the measurements
-    #[arg(long, default_value_t = Self::RESOLUTION, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
-    pub resolution: u32,
+    /// Image width and height in pixels of the measurements: 256 is a square, or 320x240
+    #[arg(long, default_value_t = Self::RESOLUTION, value_name = "PX|WxH", value_parser = super::ranges::image)]
+    pub resolution: Resolution,
     /// Nodes of the density grid along its longest side
     #[arg(long, default_value_t = 192, value_name = "N", conflicts_with = "fine", value_parser = clap::value_parser!(u32).range(16..=512))]
     pub nodes: u32,
@@ -131,7 +132,10 @@ pub enum SpotsFrom {
 
 impl Reconstruct {
     /// Width and height of the measurements of a scene file.
-    pub const RESOLUTION: u32 = 256;
+    pub const RESOLUTION: Resolution = Resolution {
+        width: 256,
+        height: 256,
+    };
     /// Camera paths of a pixel of a scene file.
     pub const SAMPLES: u32 = 16;
 

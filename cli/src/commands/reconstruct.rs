@@ -67,9 +67,13 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
         return folder::run(args, output).await;
     }
     check_networks(&args)?;
-    let mut scene = args.input.read(&args.file)?;
-    let i = &mut scene.camera.intrinsics;
-    *i = i.resized(args.resolution, args.resolution);
+    let size = Some(args.resolution).filter(|size| !size.is_square());
+    let mut scene = args.input.read_sized(&args.file, size)?;
+    // A square shows the whole view of the camera.
+    if size.is_none() {
+        let i = &mut scene.camera.intrinsics;
+        *i = i.resized(args.resolution.width, args.resolution.height);
+    }
     if scene.laser.beams.is_empty() {
         let what = format!("{}: the scene has no laser beam", args.file.display());
         return Err(CliError::input(what).hint(

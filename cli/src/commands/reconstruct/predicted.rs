@@ -75,7 +75,8 @@ pub async fn read(args: &Reconstruct, beams: usize) -> Result<Networks> {
             )));
         }
         let (knows, multiple) = picofarm_tasks::takes(&manifest).map_err(&wrong)?;
-        if !args.resolution.is_multiple_of(multiple) {
+        let sides = [args.resolution.width, args.resolution.height];
+        if !sides.iter().all(|side| side.is_multiple_of(multiple)) {
             return Err(wrong(format!(
                 "takes images whose sides are multiples of {multiple}, --resolution is {}",
                 args.resolution
