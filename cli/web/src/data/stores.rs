@@ -134,6 +134,18 @@ impl Stores {
         }))
     }
 
+    /// Returns the location of a data set for people, as the user named its store.
+    ///
+    /// # Errors
+    /// Fails if the name leads out of the stores.
+    pub fn place(&self, id: &str) -> Result<String, Problem> {
+        let (place, rest) = self.find(id)?;
+        Ok(match rest {
+            "" => place.name.clone(),
+            rest => format!("{}/{rest}", place.name),
+        })
+    }
+
     fn find<'a>(&self, id: &'a str) -> Result<(&Place, &'a str), Problem> {
         let missing = || Problem::missing(format!("set: there is no data set {id:?}"));
         let (position, rest) = id.split_once('/').unwrap_or((id, ""));
