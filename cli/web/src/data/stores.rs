@@ -285,7 +285,7 @@ mod tests {
     fn names_that_lead_out_of_the_stores_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let store = folder.path().display().to_string();
-        let stores = Stores::open(&[store.clone()]).unwrap();
+        let stores = Stores::open(std::slice::from_ref(&store)).unwrap();
         assert_eq!(
             stores.folder("0/a/b").unwrap(),
             Some(PathBuf::from(&store).join("a/b"))
