@@ -134,7 +134,7 @@ pub fn answer(status: StatusCode, media: &'static str, body: impl Into<Bytes>) -
     answer
 }
 
-/// The level of gzip for a body, from 1 to 9.
+/// The level of compression of a body, from 1 to 9.
 #[derive(Clone, Copy)]
 struct Level(u32);
 
@@ -145,22 +145,35 @@ pub fn compressed(media: &'static str, body: impl Into<Bytes>, level: u32) -> An
     answer
 }
 
-/// Compresses the body where that is worth it and the client accepts it.
+/// Compresses the body where that is worth it and the client accepts it: by zstd, which takes a
+/// tenth of gzip's time, or by gzip, which every browser accepts.
 pub fn encode(headers: &HeaderMap, mut answer: Answer) -> Answer {
     let Some(Level(level)) = answer.extensions_mut().remove() else {
         return answer;
     };
-    let accepts = headers.get(header::ACCEPT_ENCODING);
-    let accepts = accepts.and_then(|accepts| accepts.to_str().ok());
-    let mut codings = accepts.unwrap_or_default().split(',');
-    let gzip = codings.any(|coding| coding.trim() == "gzip");
-    if let (true, Body::Whole(Some(body))) = (gzip, answer.body_mut()) {
+    let accepted = headers.get(header::ACCEPT_ENCODING);
+    let accepted = accepted.and_then(|accepted| accepted.to_str().ok());
+    let accepts = |coding: &str| {
+        let mut codings = accepted.unwrap_or_default().split(',');
+        codings.any(|accepted| accepted.trim() == coding)
+    };
+    let Body::Whole(Some(body)) = answer.body_mut() else {
+        return answer;
+    };
+    let (coding, written) = if accepts("zstd") {
+        ("zstd", zstd::encode_all(&**body, level as i32))
+    } else if accepts("gzip") {
         let mut encoder = GzEncoder::new(Vec::new(), Compression::new(level));
         let written = encoder.write_all(body).and_then(|()| encoder.finish());
-        *body = written.expect("memory takes all bytes").into();
-        let gzip = HeaderValue::from_static("gzip");
-        answer.headers_mut().insert(header::CONTENT_ENCODING, gzip);
-    }
+        ("gzip", written)
+    } else {
+        return answer;
+    };
+    *body = written.expect("memory takes all bytes").into();
+    let coding = HeaderValue::from_static(coding);
+    answer
+        .headers_mut()
+        .insert(header::CONTENT_ENCODING, coding);
     answer
 }
 
@@ -195,5 +208,42 @@ fn protect(answer: &mut Answer, media: &'static str) {
     for (name, value) in lines {
         let value = HeaderValue::from_static(value);
         answer.headers_mut().insert(name, value);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use super::*;
+
+    #[test]
+    fn bodies_are_compressed_as_the_client_accepts_it() {
+        let text = "light ".repeat(1000);
+        let sent = |accepted: &'static str| {
+            let mut headers = HeaderMap::new();
+            let accepted = HeaderValue::from_static(accepted);
+            headers.insert(header::ACCEPT_ENCODING, accepted);
+            let answer = encode(&headers, compressed("text/plain", text.clone(), 3));
+            let coding = answer.headers().get(header::CONTENT_ENCODING);
+            let coding = coding
+                .map_or("", |coding| coding.to_str().unwrap())
+                .to_owned();
+            let Body::Whole(Some(body)) = answer.into_body() else {
+                panic!("a body");
+            };
+            (coding, body)
+        };
+        let (coding, body) = sent("gzip, deflate, br, zstd");
+        assert_eq!((&*coding, body.len() < 100), ("zstd", true));
+        assert_eq!(zstd::decode_all(&*body).unwrap(), text.as_bytes());
+        let (coding, body) = sent("br, gzip");
+        let mut expanded = String::new();
+        let mut reader = flate2::read::GzDecoder::new(&*body);
+        reader.read_to_string(&mut expanded).unwrap();
+        assert_eq!((&*coding, expanded), ("gzip", text.clone()));
+        for accepted in ["", "br", "gzipped"] {
+            assert_eq!(sent(accepted), (String::new(), text.clone().into()));
+        }
     }
 }

@@ -110,8 +110,10 @@ impl Guard {
         }
         if let Some(origin) = headers.get(ORIGIN) {
             let host = headers.get(HOST).and_then(|host| host.to_str().ok());
-            let own = host.map(|host| format!("http://{host}"));
-            if origin.to_str().ok() != own.as_deref() {
+            let origin = origin.to_str().unwrap_or_default();
+            // A proxy in front may speak TLS.
+            let origin = ["http://", "https://"].map(|scheme| origin.strip_prefix(scheme));
+            if host.is_none() || !origin.contains(&host) {
                 return Err("the request was sent by a page of another origin".into());
             }
         }
@@ -201,10 +203,13 @@ mod tests {
             ("sec-fetch-site", "same-origin"),
         ];
         assert_eq!(guard.check_form(&headers(own), form), Ok(()));
+        let behind_tls = &[("host", "localhost:1"), ("origin", "https://localhost:1")];
+        assert_eq!(guard.check_form(&headers(behind_tls), form), Ok(()));
         assert!(guard.check_form(&headers(own), "").is_err());
         for (name, value) in [
             ("origin", "http://localhost:2"),
             ("origin", "null"),
+            ("origin", "ftp://localhost:1"),
             ("sec-fetch-site", "cross-site"),
             ("sec-fetch-site", "same-site"),
         ] {

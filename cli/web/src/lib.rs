@@ -67,6 +67,15 @@ pub enum StartError {
     Store(StorageError),
 }
 
+impl std::fmt::Debug for Server {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        // Without the key.
+        f.debug_struct("Server")
+            .field("address", &self.address)
+            .finish_non_exhaustive()
+    }
+}
+
 impl Server {
     /// Listens on the address.
     ///

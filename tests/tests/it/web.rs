@@ -167,6 +167,16 @@ fn a_browser_cancels_a_job_by_its_form_and_not_by_a_link() {
 }
 
 #[test]
+fn an_address_that_others_reach_is_refused_without_a_name() {
+    let scratch = Scratch::new("web-open");
+    let cli = Cli::new(scratch.path());
+    cli.run(&["web", "--listen", "0.0.0.0:0"])
+        .fails(3, &["0.0.0.0:0", "--host NAME"]);
+    cli.run(&["web", "--host", "farm:80"])
+        .fails(3, &["--host farm:80", "without a port"]);
+}
+
+#[test]
 fn up_serves_the_pages_unless_told_otherwise() {
     let scratch = Scratch::new("web-up");
     let cli = Cli::new(scratch.path());

@@ -134,6 +134,33 @@ impl Stores {
         }))
     }
 
+    /// Returns the location of a data set for people, as the user named its store.
+    ///
+    /// # Errors
+    /// Fails if the name leads out of the stores.
+    pub fn place(&self, id: &str) -> Result<String, Problem> {
+        let (place, rest) = self.find(id)?;
+        Ok(match rest {
+            "" => place.name.clone(),
+            rest => format!("{}/{rest}", place.name),
+        })
+    }
+
+    /// Returns the name in URLs of the data set at a location that a job names; `None` outside of
+    /// the stores. The data set need not exist.
+    pub fn locate(&self, store: &str, dataset: &str) -> Option<String> {
+        let location = format!("{}/{dataset}", store.trim_end_matches('/'));
+        let mut places = self.places.iter().enumerate();
+        places.find_map(|(position, place)| {
+            let base = match &place.folder {
+                Some(folder) => std::path::absolute(folder).ok()?.display().to_string(),
+                None => place.name.clone(),
+            };
+            let rest = location.strip_prefix(base.trim_end_matches('/'))?;
+            (rest.is_empty() || rest.starts_with('/')).then(|| format!("{position}{rest}"))
+        })
+    }
+
     fn find<'a>(&self, id: &'a str) -> Result<(&Place, &'a str), Problem> {
         let missing = || Problem::missing(format!("set: there is no data set {id:?}"));
         let (position, rest) = id.split_once('/').unwrap_or((id, ""));
@@ -273,11 +300,16 @@ mod tests {
     fn names_that_lead_out_of_the_stores_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let store = folder.path().display().to_string();
-        let stores = Stores::open(&[store.clone()]).unwrap();
+        let stores = Stores::open(std::slice::from_ref(&store)).unwrap();
         assert_eq!(
             stores.folder("0/a/b").unwrap(),
             Some(PathBuf::from(&store).join("a/b"))
         );
+        assert_eq!(stores.locate(&store, "rooms"), Some("0/rooms".into()));
+        let below = format!("{store}/a/");
+        assert_eq!(stores.locate(&below, "b"), Some("0/a/b".into()));
+        assert_eq!(stores.locate("/elsewhere", "rooms"), None);
+        assert_eq!(stores.locate(&format!("{store}s"), "rooms"), None);
         for id in [
             "1",
             "",

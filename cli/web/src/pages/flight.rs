@@ -21,7 +21,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     let spec = dataset.spec();
     let content = html! {
         h1 { "Light in flight, scene " (id.scene) }
-        p.where-from { a href={ "/data?" (encode(&[("set", &id.set)])) } { "data set" } " " (safe(dataset.place()))
+        p.where-from { a href={ "/data?" (encode(&[("set", &id.set)])) } { "data set" } " " (safe(app.stores.place(&id.set)?))
             " · " a href={ "/data/scene?" (id.encode(&[])) } { "images" } " · " (super::gallery::describe(spec)) }
         noscript { p.problem { "The player needs JavaScript." } }
         div #flight.flight data-scene=(id.encode(&[])) data-light=(light.name()) {

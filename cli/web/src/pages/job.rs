@@ -6,7 +6,7 @@ use maud::{Markup, html};
 use picofarm_proto::{
     ids::JobId,
     messages::{Event, EventKind, JobState, JobStatus},
-    spec::JobSpec,
+    spec::{JobSpec, kinds::Manifest},
 };
 
 use super::{
@@ -23,6 +23,8 @@ use crate::{
 const RUNNING: usize = 24;
 /// Number of events of the log.
 const LOG: u32 = 200;
+/// Kinds of stages that make data sets.
+const KINDS: [&str; 3] = ["render", "reprocess", "import"];
 /// Number of groups of failures.
 const GROUPS: usize = 20;
 
@@ -44,7 +46,7 @@ pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> 
     );
     let (job, history, newest, (reasons, _)) = (job?, history?, newest?, why?);
     let part = match view {
-        "" => overview(&job, &history),
+        "" => overview(app, &job, &history),
         "log" => {
             let mut shown = newest;
             shown.reverse();
@@ -131,16 +133,16 @@ fn actions(app: &App, job: &JobStatus) -> Markup {
     }
 }
 
-fn overview(job: &JobStatus, history: &[Event]) -> Markup {
+fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
     html! {
         section #stages {
             h2 { "Stages" }
             div.scroll tabindex="0" role="region" aria-label="Table of stages" { table {
                 thead { tr {
                     th { "stage" } th { "kind" } th { "state" } th.wide { "progress" } th.number { "tasks" }
-                    th.number { "reused" } th.number { "dead" } th { "needs" }
+                    th.number { "reused" } th.number { "dead" } th { "needs" } th { "result" }
                 } }
-                tbody { @for stage in &job.stages { tr {
+                tbody { @for (position, stage) in job.stages.iter().enumerate() { tr {
                     td { (safe(&stage.name)) }
                     td { (safe(&stage.kind)) }
                     td { (badge(stage_state(stage.state, &stage.tasks))) }
@@ -149,6 +151,7 @@ fn overview(job: &JobStatus, history: &[Event]) -> Markup {
                     td.number { (stage.tasks.reused) }
                     td.number { (stage.tasks.dead) }
                     td { (safe(stage.needs.join(", "))) }
+                    td { (result(app, job, position)) }
                 } } }
             } }
         }
@@ -184,6 +187,24 @@ fn overview(job: &JobStatus, history: &[Event]) -> Markup {
         }
         (failures(job, history))
     }
+}
+
+/// A link to the scenes that a stage makes, if they are in a store that is shown.
+fn result(app: &App, job: &JobStatus, position: usize) -> Markup {
+    let stage = job.spec.stages.get(position);
+    let results = stage.map(|stage| stage.task.results());
+    // Predictions and reconstructions have manifests of the same form, and are no data sets.
+    let kind = job.stages.get(position).map_or("", |stage| &*stage.kind);
+    let dataset = results.and_then(|results| match results.manifest {
+        Manifest::Scene { dataset } if KINDS.contains(&kind) => Some((results.store, dataset)),
+        _ => None,
+    });
+    html! { @if let Some((store, dataset)) = dataset {
+        @match app.stores.locate(store, dataset) {
+            Some(set) => { a href={ "/data?" (encode(&[("set", &set)])) } { (safe(dataset)) } }
+            None => { (safe(dataset)) }
+        }
+    } }
 }
 
 /// Failures with equal messages are one group: numbers in messages often differ.

@@ -121,24 +121,26 @@ pub fn bar(counts: &TaskCounts) -> Markup {
         counts.dead,
     ]
     .map(share);
-    let mut at = 0.0;
     let label = format!(
         "{} of {} tasks done, {} running, {} dead",
         counts.done, counts.total, counts.leased, counts.dead
     );
+    let mut at = 0.0;
     let parts = [
         ("reused", reused),
         ("done", done),
         ("bad", dead),
         ("run", leased),
     ];
+    let parts = parts.map(|(class, width)| {
+        let start = at;
+        at += width;
+        (class, start, width)
+    });
     html! {
         svg.bar viewBox="0 0 100 4" preserveAspectRatio="none" role="img" aria-label=(label) {
-            @for (class, width) in parts {
-                @if width > 0.0 {
-                    rect.(class) x=(format!("{at:.2}")) y="0" width=(format!("{width:.2}")) height="4" {}
-                }
-                @let _ = at += width;
+            @for (class, start, width) in parts.iter().filter(|part| part.2 > 0.0) {
+                rect.(class) x=(format!("{start:.2}")) y="0" width=(format!("{width:.2}")) height="4" {}
             }
         }
     }

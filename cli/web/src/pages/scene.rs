@@ -48,7 +48,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
         }
         p.readout #readout role="status" aria-live="polite" { "Point at an image for the values of a pixel. Arrow keys move the point." }
         div.columns.two[columns.len() > 1] {
-            @for (truth, id) in &columns { (column(truth, id, spot)?) }
+            @for (truth, id) in &columns { (column(truth, id, &app.stores.place(&id.set)?, spot)?) }
         }
     };
     Ok(Page {
@@ -60,7 +60,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     })
 }
 
-fn column(truth: &Truth, id: &SceneId, spot: u64) -> Result<Markup, Problem> {
+fn column(truth: &Truth, id: &SceneId, place: &str, spot: u64) -> Result<Markup, Problem> {
     let named = spot.to_string();
     let lit = Picture::Lit(spot as usize);
     let mut pictures: Vec<(Picture, String)> = Vec::new();
@@ -72,7 +72,7 @@ fn column(truth: &Truth, id: &SceneId, spot: u64) -> Result<Markup, Problem> {
     Ok(html! {
         section.column data-scene=(id.encode(&[])) data-width=(truth.spec.width) data-height=(truth.spec.height)
             aria-label={ "Scene " (id.scene) } {
-            p { a href={ "/data?" (crate::query::encode(&[("set", &id.set)])) } { "data set" } " " (safe(&id.set))
+            p { a href={ "/data?" (crate::query::encode(&[("set", &id.set)])) } { "data set" } " " (safe(place))
                 " · " (describe(&truth.spec)) " · " a href=(flight_path(&id.set, id.scene)) { "light in flight" } }
             div.images {
                 @for (picture, title) in &pictures {

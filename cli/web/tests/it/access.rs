@@ -74,7 +74,7 @@ fn an_address_that_others_reach_needs_a_name() {
         runtime.block_on(Server::bind(settings, Arc::new(Memory::default())))
     };
     assert!(matches!(bind(Vec::new()), Err(StartError::Open(_))));
-    let named = bind(vec!["farm.example".into()]).ok().unwrap();
+    let named = bind(vec!["farm.example".into()]).unwrap();
     assert!(named.link("/data?x=1").starts_with("http://farm.example:"));
     assert!(named.link("/data?x=1").contains("/data?x=1&key="));
 }

@@ -65,7 +65,7 @@ impl Web {
             stores,
         };
         let bound = runtime.block_on(Server::bind(settings, farm.clone()));
-        let server = bound.ok().expect("a loopback port is free");
+        let server = bound.expect("a loopback port is free");
         let (address, link) = (server.address(), server.link("/"));
         let stop = CancellationToken::new();
         runtime.spawn(server.serve(stop.clone()));
