@@ -39,6 +39,11 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
         }
     }
     let farm = Coordinator::new(&settings.coordinator, settings.access()?);
+    // Without a farm, the data sets are the first page.
+    let (first, name) = match !args.store.is_empty() && farm.workers().await.is_err() {
+        true => ("/data", "data sets"),
+        false => ("/", "farm"),
+    };
     let shown = Shown {
         listen: args.listen,
         hosts: args.host,
@@ -46,14 +51,12 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
     };
     let server = start(shown, farm).await?;
     let stop = signals::stop_on_signal()?;
-    let link = server.link("/");
+    let link = server.link(first);
     let flight = server.first_flight().await.map(|path| server.link(&path));
     output.result(&json!({"web": link, "flight": flight}), || {
         let flight = flight.as_deref();
         let flight = flight.map_or(String::new(), |link| format!("\nlight in flight  {link}"));
-        format!(
-            "farm             {link}{flight}\nCtrl-C stops the server; a new start has a new link"
-        )
+        format!("{name:15}  {link}{flight}\nCtrl-C stops the server; a new start has a new link")
     });
     server.serve(stop).await;
     Ok(())
