@@ -5,6 +5,9 @@ use serde_json::Value;
 
 /// Loss of a held-out ray for a guess: a reconstruction that absorbs half of the light everywhere.
 pub const GUESS: f64 = std::f64::consts::LN_2;
+/// Distance of peaks from their predicted times, as a share of that from wrong times, above which
+/// nothing speaks for the depth of a flash.
+const MISSED: f64 = 0.7;
 
 /// One line about a result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -80,6 +83,16 @@ impl Verdict {
         let agreement = &metrics["agreement"];
         let reasons = agreement["reasons"].as_array().into_iter().flatten();
         let mut against: Vec<&str> = reasons.filter_map(Value::as_str).collect();
+        let flash = &metrics["flash"]["residual"];
+        let peaks = flash["median_m"].as_f64().zip(flash["control_m"].as_f64());
+        let apart = peaks.filter(|(own, control)| own > &(MISSED * control));
+        let apart = apart.map(|(own, control)| {
+            format!(
+                "peaks are {own:.4} m off the times that the depth predicts, and wrong times {control:.4} m: the calibration or \
+                 the depth is wrong"
+            )
+        });
+        against.extend(apart.as_deref());
         let loss = metrics["held_out_loss"].as_f64();
         let worse = loss.filter(|loss| *loss > GUESS).map(|loss| {
             format!("held-out loss {loss:.3}, worse than a guess ({GUESS:.3}): its shadows are not explained")
@@ -89,8 +102,6 @@ impl Verdict {
             return Self::doubtful(format!("do not trust it: {}", against.join("; ")));
         }
         let residual = agreement["time_residual_m"].as_f64();
-        let flash = &metrics["flash"]["residual"];
-        let peaks = flash["median_m"].as_f64().zip(flash["control_m"].as_f64());
         let peaks = peaks.map(|(own, control)| {
             format!("peaks agree to {own:.4} m (wrong times have {control:.4})")
         });
@@ -231,6 +242,17 @@ mod tests {
                 && blobs
                     .text
                     .contains("times are late; held-out loss 1.680, worse than a guess")
+        );
+        let flash = |off: f64| {
+            let metrics = json!({"held_out_loss": 0.2, "agreement": {}, "flash": {"residual": {"median_m": off, "control_m": 0.09}}});
+            Verdict::of_reconstruction(&metrics)
+        };
+        assert!(!flash(0.01).doubtful);
+        let lost = flash(0.08);
+        assert!(
+            lost.doubtful && lost.text.contains("0.0800 m off"),
+            "{}",
+            lost.text
         );
         assert!(Verdict::of_reconstruction(&json!({})).doubtful);
     }

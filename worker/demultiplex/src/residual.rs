@@ -11,8 +11,11 @@ const LIT: f32 = 0.7;
 const MAY_BE_LIT: f32 = 0.3;
 /// Confidence of the depth from which a pixel takes part.
 const SURE: f32 = 0.6;
-/// Half width of the window in which a peak is looked for, metres of path; at least 3 bins.
-const WINDOW_M: f64 = 0.12;
+/// Half widths of the window in which a peak is looked for, metres of path, at least 3 bins. On a
+/// desk, the light of all spots comes within decimetres, so only a narrow window has one peak.
+const WINDOWS_M: [f64; 3] = [0.12, 0.06, 0.03];
+/// The number of pairs from which no narrower window is tried.
+const ENOUGH: usize = 400;
 /// Spots closer than this number of windows are not told apart.
 const APART: f64 = 1.5;
 /// Windows by which the control's times are shifted.
@@ -36,10 +39,24 @@ pub struct Residual {
 /// and a peak for each spot that lights it, so that wrong depths do not pass. Only pairs take part
 /// whose spot is lit and has no other's light near. Returns `None` if no pair is left.
 pub fn residual(capture: &Capture, found: &Demultiplexed) -> Option<Residual> {
+    let mut best: Option<Residual> = None;
+    for window_m in WINDOWS_M {
+        let found = residual_within(capture, found, window_m);
+        if found.map_or(0, |r| r.peaks) > best.map_or(0, |r| r.peaks) {
+            best = found;
+        }
+        if best.is_some_and(|r| r.peaks >= ENOUGH) {
+            break;
+        }
+    }
+    best
+}
+
+fn residual_within(capture: &Capture, found: &Demultiplexed, window_m: f64) -> Option<Residual> {
     let pixels = capture.pixels();
     let bins = capture.gate.bins as usize;
     let per_bin = 1.0 / capture.gate.bin_width_m;
-    let window = ((WINDOW_M * per_bin).ceil() as usize).max(3);
+    let window = ((window_m * per_bin).ceil() as usize).max(3);
     let camera = capture.camera;
     let width = camera.intrinsics.width as usize;
     let stride = pixels.div_ceil(PIXELS).max(1);
