@@ -330,3 +330,11 @@ def test_a_capture_needs_no_scene() -> None:
     }.items():
         with pytest.raises(ValueError, match=name):
             picofarm.Capture(render.transient, **{**measured, **bad})
+
+
+def test_a_varied_floor_plan_is_another_room_and_an_unknown_one_is_refused() -> None:
+    box = picofarm.furnished(3, resolution=32)
+    varied = picofarm.furnished(3, resolution=32, floor_plan="varied")
+    assert repr(box) != repr(varied)
+    with pytest.raises(ValueError, match="floor_plan"):
+        picofarm.furnished(3, resolution=32, floor_plan="round")
