@@ -1,5 +1,5 @@
-//! Shapes of furnished rooms, and primitive rooms: a cube, a cylinder and a mirror in a bare room (Shoot-Bounce-3D, appendices B
-//! and F.1).
+//! Shapes of furnished rooms, and primitive rooms: a cube, a cylinder and a mirror in a bare room
+//! (Shoot-Bounce-3D, appendices B and F.1).
 
 use serde::{Deserialize, Serialize};
 

@@ -44,8 +44,8 @@ struct Opening {
     glazed: bool,
 }
 
-/// Builds the room of a varied floor plan into `plan`. Returns whether it has a door, and whether it
-/// has a window.
+/// Builds the room of a varied floor plan into `plan`. Returns whether it has a door, and whether
+/// it has a window.
 pub(super) fn varied(
     rng: &mut Rng,
     plan: &mut Plan<'_>,
