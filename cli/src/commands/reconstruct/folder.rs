@@ -192,7 +192,7 @@ fn captures(args: &Reconstruct, flash: &Flash, watch: &Watch) -> Result<Measured
         return Err(CliError::input(what)
             .hint("use --spots-from flash, or import the histograms of each spot"));
     }
-    // Beams that meet nothing have no histogram that says anything.
+    // Beams that meet nothing have no light in their histograms.
     let mut beams = vec![
         Beam {
             direction: flash.camera.forward,
