@@ -238,7 +238,7 @@ fn picture(
     };
     let mut shown = vec![("3D, from the camera", camera)];
     shown.extend(by(0.0).map(|v| ("from the side", v)));
-    // Straight back, the view would be of what is behind the camera.
+    // Straight back, the view would show only the space behind the camera.
     shown.extend(by(-0.6).map(|v| ("from behind", v)));
     let (step, top) = (CELL + GAP, GAP + TEXT + GAP);
     let mut canvas = Canvas::new(GAP + (1 + shown.len()) * step, top + CELL + GAP, BACKGROUND);

@@ -115,8 +115,8 @@ impl Capture {
 /// [`super::Source`].
 ///
 /// # Errors
-/// [`ImportError`] names the file and the field; for an unknown file it describes what the file looks
-/// like and how to describe it.
+/// [`ImportError`] names the file and the field. For an unknown file it describes what the file
+/// looks like and how to describe it.
 pub fn import(
     files: &[PathBuf],
     describe: Option<&Path>,
