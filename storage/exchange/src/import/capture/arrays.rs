@@ -33,7 +33,7 @@ pub(super) struct Part {
     pub binned: bool,
 }
 
-/// What a file itself says, in the camera's axes.
+/// The calibration that a file itself has, in the camera's axes.
 #[derive(Default)]
 pub(super) struct Stated {
     /// Start and width of the bins, metres of path.
@@ -41,6 +41,8 @@ pub(super) struct Stated {
     pub intrinsics: Option<Intrinsics>,
     pub laser: Option<[f64; 3]>,
     pub beams: Option<Vec<Beam>>,
+    /// True z-depth, `[row][column]`.
+    pub depth: Option<Vec<f32>>,
 }
 
 /// An array as a file has it: the size and the stride of each axis.
