@@ -4,7 +4,7 @@ use picofarm_settings::PS_PER_M;
 
 use crate::{
     Measurement,
-    check::{Refined, Relocated, SIGNIFICANT, upright},
+    check::{Refined, Relocated, SIGNIFICANT, UNCLEAR, upright},
     fit::{Fitted, Observed},
     hypotheses::{Chosen, SCALES, order_name},
     masks::MaskOrder,
@@ -17,9 +17,6 @@ use crate::{
 
 /// Share of times within one bin below which a calibration explains nothing.
 const UNEXPLAINED: f64 = 0.22;
-/// Distance of peaks from predicted times, over that from shifted times, above which a calibration
-/// explains nothing of a capture of all spots at once.
-const UNCLEAR: f64 = 0.5;
 /// Share of dead pixels, t0 in bins, laser in metres, focal length and bin width relative, from
 /// which on results are wrong.
 const WRONG_DEAD: f64 = 0.2;
@@ -49,6 +46,9 @@ pub(crate) struct Findings<'a> {
     pub relocated: &'a [Relocated],
     /// The order of masks, and whether they are stored already turned.
     pub masks: Option<&'a (MaskOrder, bool)>,
+    /// Of a capture of all spots at once: distance of peaks from predicted times, over that from
+    /// shifted times.
+    pub unclear: Option<f64>,
 }
 
 /// Writes down one cause.
@@ -88,14 +88,15 @@ pub(crate) fn report(f: &Findings) -> Report {
     continuous(f, &mut causes);
     counting(f, &mut causes);
     let fitted = &f.refined.fitted;
-    let unexplained = match f.seen.unclear {
+    let unexplained = match f.unclear {
         None => (fitted.agreeing < UNEXPLAINED).then(|| {
             let percent = 100.0 * fitted.agreeing;
             let what = format!("only {percent:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more");
             (fitted.agreeing, "share of times", what)
         }),
-        Some(share) => (share > UNCLEAR).then(|| {
-            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.3 and less");
+        // Noise hides peaks as well.
+        Some(share) => (share > UNCLEAR && !noisy(&causes)).then(|| {
+            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.15 and less");
             (share, "of the distance by chance", what)
         }),
     };
@@ -129,7 +130,7 @@ pub(crate) fn report(f: &Findings) -> Report {
         notes: notes(f),
         stated: Some(agreement(f.before)),
         corrected: Some(agreement(fitted)),
-        unclear: f.seen.unclear,
+        unclear: f.unclear,
         errors: Some(f.refined.errors),
         pulse: f.seen.pulse.map(|shape| PulseFound {
             shape,
@@ -138,6 +139,15 @@ pub(crate) fn report(f: &Findings) -> Report {
         background: (f.pixels.dark_bins > 0).then(|| background(f.pixels)),
         spots: (0..fitted.model.beams.len()).map(|k| spot(f, k)).collect(),
     }
+}
+
+/// Whether too few photons are left to judge times.
+fn noisy(causes: &[Cause]) -> bool {
+    causes.iter().any(|c| match c.fault {
+        Fault::Background | Fault::Clipped => true,
+        Fault::DeadPixels => c.severity == Verdict::Wrong,
+        _ => false,
+    })
 }
 
 fn background(pixels: &Pixels) -> f64 {
@@ -471,12 +481,15 @@ fn notes(f: &Findings) -> Vec<String> {
     let returns = f.seen.observed.returns.iter().flatten().count();
     let spots = f.m.capture.spots.len();
     if f.m.per_spot.is_none() {
-        notes.push("all spots were measured at once: mirrored images and spots in another order are not tried".into());
+        notes.push("all spots were measured at once: mirrored images, other units, fields of view and the order of spots are not tried".into());
     } else if returns < spots {
         notes.push(format!(
             "{} of {spots} spots show no return of one bounce: it is outside of the gate, hidden, or cut off",
             spots - returns
         ));
+    }
+    if f.unclear.is_some_and(|share| share > UNCLEAR) {
+        notes.push("the times were not used for a correction, because they agree with none".into());
     }
     if !f.refined.separable {
         notes.push(format!(

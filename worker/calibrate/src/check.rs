@@ -41,6 +41,9 @@ impl Least {
 pub(crate) const LEAST_FOCAL: f64 = 0.004;
 pub(crate) const LEAST_WIDTH: f64 = 0.003;
 pub(crate) const LEAST_SPOT: f64 = 0.03;
+/// Distance of peaks from predicted times, over that from shifted times, above which a calibration
+/// explains nothing of a capture of all spots at once.
+pub(crate) const UNCLEAR: f64 = 0.17;
 /// A shift counts from this many standard errors on.
 pub(crate) const SIGNIFICANT: f64 = 5.0;
 /// Standard error of a laser coordinate beyond which the laser is not estimated, metres.
@@ -103,11 +106,25 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
         Some(_) => Least::SHARP,
         None => Least::VAGUE,
     };
-    let mut refined = refine(&base, &observed, least);
-    let (relocated, moved) = relocate(&refined, &base, &observed);
-    if !relocated.is_empty() {
-        refined = refine(&moved, &observed, least);
+    let (mut refined, mut relocated, mut unclear) = (None, Vec::new(), None);
+    if m.per_spot.is_some() {
+        let first = refine(&base, &observed, least, true);
+        let (elsewhere, moved) = relocate(&first, &base, &observed);
+        refined = Some(match elsewhere.is_empty() {
+            true => first,
+            false => refine(&moved, &observed, least, true),
+        });
+        relocated = elsewhere;
+    } else if crate::flash::placed(&base) {
+        let first = refine(&base, &observed, least, false);
+        let share = crate::flash::unclear(m, &first.fitted.model)?;
+        unclear = Some(share);
+        // What explains nothing corrects nothing.
+        refined = Some(first).filter(|_| share < UNCLEAR);
+    } else {
+        unclear = Some(crate::flash::unclear(m, &base)?);
     }
+    let refined = refined.unwrap_or_else(|| keep(&base, &observed, least));
     let masks = m.masks.map(|masks| {
         let (model, ranges) = (&refined.fitted.model, &refined.fitted.ranges);
         let order = |pixels| masks::order(model, &observed, ranges, masks, m.pixels(), pixels);
@@ -150,6 +167,7 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
         refined: &refined,
         relocated: &relocated,
         masks: masks.as_ref(),
+        unclear,
     };
     let report = report(&findings);
     let corrected = Corrected::new(&findings, &report.causes);
@@ -182,7 +200,9 @@ fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
 
 /// Fits t0 and laser, then bin width and focal length if the times demand them. What moves by no
 /// more than chance stays as stated.
-fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
+///
+/// Bin width and focal length are left alone without `lens`.
+fn refine(base: &Model, seen: &Observed, least: Least, lens: bool) -> Refined {
     let mut free = Free::LASER;
     let mut best = seen.fit(base, free);
     let all = best.clone();
@@ -211,7 +231,7 @@ fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
     let plain = free;
     // One more parameter before two.
     for (focal, width) in [(true, false), (false, true), (true, true)] {
-        if width && !placed {
+        if !lens || width && !placed {
             continue;
         }
         let more = Free {
@@ -255,6 +275,19 @@ fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
         errors: [all.errors[0], all.errors[1], all.errors[2], all.errors[3]],
         tied: all.tied,
         separable,
+        least,
+    }
+}
+
+/// The calibration as stated.
+fn keep(base: &Model, seen: &Observed, least: Least) -> Refined {
+    Refined {
+        fitted: seen.judged(base.clone(), [0.0; 6], 0.0),
+        free: Free::T0,
+        t0: false,
+        errors: [0.0; 4],
+        tied: 0.0,
+        separable: true,
         least,
     }
 }

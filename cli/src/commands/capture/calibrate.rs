@@ -191,7 +191,11 @@ fn describe(report: &Report) -> String {
             cause.severity.name(),
             cause.finding,
             cause.advice,
-            if cause.corrected { "" } else { " (calibrate cannot correct it)" }
+            if cause.corrected {
+                ""
+            } else {
+                " (calibrate cannot correct it)"
+            }
         );
     }
     if let (Some(stated), Some(corrected)) = (report.stated, report.corrected) {

@@ -96,7 +96,9 @@ fn pulse(canvas: &mut Canvas, place: (usize, usize), checked: &Checked) {
     let (x, y) = frame(canvas, place, &title);
     let column = |bins: f64| {
         let share = (bins + SPAN.0) / (SPAN.0 + SPAN.1);
-        (0.0..1.0).contains(&share).then(|| x + (share * SIDE as f64) as usize)
+        (0.0..1.0)
+            .contains(&share)
+            .then(|| x + (share * SIDE as f64) as usize)
     };
     let row = |share: f64| y + ((1.0 - 1.2 * share.clamp(0.0, 0.8)) * (SIDE - 4) as f64) as usize;
     for k in 0..(SPAN.0 + SPAN.1) as usize {
