@@ -27,7 +27,7 @@ const WRONG_WIDTH: f64 = 0.02;
 /// Shares of photons lost to pile-up that are named, and that make results wrong.
 const PILE_UP: [f64; 2] = [0.02, 0.3];
 /// Background over light, in the gate of the median pixel, likewise.
-const BACKGROUND: [f64; 2] = [0.5, 10.0];
+const BACKGROUND: [f64; 2] = [0.1, 0.7];
 /// Share of histograms with a bin at the ceiling that makes results wrong.
 const WRONG_CLIPPED: f64 = 0.05;
 
@@ -405,14 +405,14 @@ fn counting(f: &Findings, causes: &mut Vec<Cause>) {
         Fault::DeadPixels,
         &p.dead,
         "are dead: they have no counts above the background",
-        "list them as dead; their neighbours fill in",
+        "replace the sensor, or take what the nearest good pixels show instead",
         WRONG_DEAD,
     );
     pixels(
         Fault::HotPixels,
         &p.hot,
         "are hot: most of their counts come before light can",
-        "set them to 0; their neighbours fill in",
+        "mask them; the nearest good pixels fill in",
         WRONG_DEAD,
     );
     if let Some((most, held)) = p.ceiling {

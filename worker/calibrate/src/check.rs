@@ -43,7 +43,7 @@ pub(crate) const LEAST_WIDTH: f64 = 0.003;
 pub(crate) const LEAST_SPOT: f64 = 0.03;
 /// Distance of peaks from predicted times, over that from shifted times, above which a calibration
 /// explains nothing of a capture of all spots at once.
-pub(crate) const UNCLEAR: f64 = 0.17;
+pub(crate) const UNCLEAR: f64 = 0.15;
 /// A shift counts from this many standard errors on.
 pub(crate) const SIGNIFICANT: f64 = 5.0;
 /// Standard error of a laser coordinate beyond which the laser is not estimated, metres.

@@ -175,8 +175,8 @@ impl Capturing {
     }
 }
 
-/// A disturbed capture: its name, itself, stated masks, stated pulses.
-pub type Disturbed = (&'static str, Capturing, Vec<u8>, Option<u64>);
+/// A disturbed capture: its name, itself, stated masks.
+pub type Disturbed = (&'static str, Capturing, Vec<u8>);
 
 /// Everything wrong that is tried.
 pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
@@ -184,12 +184,12 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
     let pixels = side * side;
     let bins = GATE.bins as usize;
     let masks = room.visibility.clone();
-    let mut all: Vec<Disturbed> = vec![("nothing", plain.clone(), masks.clone(), None)];
+    let mut all: Vec<Disturbed> = vec![("nothing", plain.clone(), masks.clone())];
     let mut add = |name, change: &dyn Fn(&mut Capturing)| {
         let mut made = plain.clone();
         change(&mut made);
         made.add_up();
-        all.push((name, made, masks.clone(), None));
+        all.push((name, made, masks.clone()));
     };
     let laser = |c: &mut Capturing, by: f32| {
         let stated = c.laser;
@@ -273,14 +273,14 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
     });
     let mut rolled = masks.clone();
     rolled.rotate_left(pixels);
-    all.push(("masks shifted by one", plain.clone(), rolled, None));
+    all.push(("masks shifted by one", plain.clone(), rolled));
     let dark = room.measure(100.0, 1, |s| s.dark_per_bin = 1.0);
-    all.push(("background of 4 counts a bin", dark, masks.clone(), None));
+    all.push(("background of 4 counts a bin", dark, masks.clone()));
     let pile = |pulses| {
         room.measure(100.0, 1, |s| {
             s.dead_time = Some(picofarm_sensor::DeadTime::FirstPhoton { pulses });
         })
     };
-    all.push(("pile-up", pile(2000), masks.clone(), None));
+    all.push(("pile-up", pile(2000), masks.clone()));
     all
 }
