@@ -54,8 +54,9 @@ const SAVES: f64 = 0.03;
 /// Arrays for pictures of a check.
 #[derive(Debug, Clone)]
 pub struct Pictures {
-    /// Median of prediction minus observation at each stored pixel with the stated calibration,
-    /// metres of path, `[row][column]`; NaN where no time is known.
+    /// Distance of prediction and observation at each stored pixel with the stated calibration,
+    /// metres of path, `[row][column]`: within which a third of the spots agree; NaN where no time
+    /// is known.
     pub stated_m: Vec<f32>,
     /// The same with the corrected calibration.
     pub corrected_m: Vec<f32>,
@@ -348,7 +349,10 @@ fn relocate(refined: &Refined, base: &Model, seen: &Observed) -> (Vec<Relocated>
     (made.collect(), model)
 }
 
-/// Median residual of each stored pixel.
+/// Share of spots that light a pixel, at least: shadows have no residual.
+const LIT: f64 = 0.33;
+
+/// Residual of each stored pixel, of the spots that light it.
 fn image(fitted: &Fitted, seen: &Observed, stored: &[usize], pixels: usize) -> Vec<f32> {
     let spots: Vec<_> = (0..seen.times.len())
         .map(|k| seen.residuals(&fitted.model, &fitted.ranges, k))
@@ -356,7 +360,7 @@ fn image(fitted: &Fitted, seen: &Observed, stored: &[usize], pixels: usize) -> V
     let mut image = vec![f32::NAN; pixels];
     for (n, p) in stored.iter().enumerate() {
         let mut own: Vec<f64> = spots.iter().filter_map(|s| s[n]).map(f64::abs).collect();
-        if let Some(middle) = crate::numeric::median(&mut own) {
+        if let Some(middle) = crate::numeric::quantile(&mut own, LIT) {
             image[*p] = middle as f32;
         }
     }

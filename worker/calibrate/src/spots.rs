@@ -77,7 +77,7 @@ pub(crate) fn locate(model: &Model, seen: &Observed, ranges: &[f64], k: usize) -
         }
         Some((point, spread))
     };
-    // A return says where its spot is: no other place is right, and none that it denies.
+    // A spot is where its return is seen, so a place away from it is wrong.
     let denied = |point: V3| {
         let late = length(sub(point, model.laser)) + length(point) - model.path(r.bin);
         let film = model.film(point).unwrap_or([f64::INFINITY; 2]);

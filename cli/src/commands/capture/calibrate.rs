@@ -1,5 +1,5 @@
-//! `picofarm capture check` and `capture calibrate`: what is wrong with a capture, and the same
-//! capture with a corrected calibration.
+//! `picofarm capture check` and `capture calibrate`: the faults of a capture, and the same capture
+//! with a corrected calibration.
 
 use std::path::Path;
 
