@@ -9,8 +9,8 @@ pub enum Capture {
     /// Read what a laboratory measured into a data set of one scene; docs/captures.md has the steps
     #[command(after_help = DESCRIPTION)]
     Import(CaptureImport),
-    /// Judge a capture and its calibration: causes with figures and a verdict; fails if results would
-    /// be wrong
+    /// Judge a capture and its calibration: causes with figures, and a verdict; fails if results
+    /// would be wrong
     Check {
         /// A folder of `picofarm capture import` or of `picofarm scene render`
         capture: PathBuf,

@@ -62,7 +62,7 @@ pub(crate) fn unclear(m: &Measurement, model: &Model) -> Result<f64, CalibrateEr
     Ok(taken_apart(m, model)?.1)
 }
 
-/// Takes the flash apart by rules, without what is learnt.
+/// Takes the flash apart by rules, without learnt shadows.
 fn taken_apart(m: &Measurement, model: &Model) -> Result<(Demultiplexed, f64), CalibrateError> {
     let all = vec![true; model.beams.len()];
     let spots = model.spots(m.capture.camera, m.capture.spots, &all);
