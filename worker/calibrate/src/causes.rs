@@ -10,7 +10,7 @@ use crate::{
     hypotheses::{Chosen, SCALES, order_name},
     masks::MaskOrder,
     model::{FOCAL, LASER, Model, T0, WIDTH},
-    numeric::{length, median, quantile, sub},
+    numeric::{length, quantile, sub},
     observe::Seen,
     pixels::Pixels,
     report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict},

@@ -66,8 +66,6 @@ pub(crate) struct Fitted {
     pub tied: f64,
     /// Share of the times within one bin of the prediction.
     pub agreeing: f64,
-    /// Median distance of the times from the prediction, metres of path, of all times.
-    pub median_m: f64,
     /// Root mean square of the agreeing times' distances, metres of path.
     pub rms_m: f64,
 }
@@ -202,14 +200,11 @@ impl Observed {
         let all = self.times.iter().flatten().flatten().count().max(1);
         let agreeing = near.len() as f64 / all as f64;
         let rms_m = (squares / near.len().max(1) as f64).sqrt();
-        let mut sizes: Vec<f64> = off.iter().map(|e| e.abs()).collect();
-        sizes.resize(all, f64::INFINITY);
         Fitted {
             ranges,
             errors,
             tied,
             agreeing,
-            median_m: median(&mut sizes).unwrap_or(f64::INFINITY),
             rms_m,
             model,
         }
@@ -296,9 +291,9 @@ impl Observed {
                 let off = [0, 1].map(|a| film[a] - (seen[a] as f64 + 0.5));
                 let far = (off[0] * off[0] + off[1] * off[1]).sqrt() / (3.0 + limit);
                 let w = tukey(far) / (RETURN_PIXELS * RETURN_PIXELS);
-                for axis in 0..2 {
+                for (axis, off) in off.iter().enumerate() {
                     let row = rows.film(k, point, axis, list);
-                    normal.add(&row, off[axis], w);
+                    normal.add(&row, *off, w);
                 }
             }
         }
