@@ -168,3 +168,76 @@ fn sensed(folder: &Path, group: &RenderGroup, shape: &[u64]) -> Result<Vec<f32>>
     let counts = array::<u32>(folder, group, "counts", shape)?;
     Ok(counts.into_iter().map(|c| c as f32).collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use picofarm_dataset::{Gate, Intrinsics};
+    use picofarm_exchange::capture::{Beam, Capture, Origin};
+
+    use super::*;
+
+    /// A capture of three beams: a spot, a direction, and a beam that meets nothing.
+    fn capture(depth: Option<Vec<f32>>) -> Capture {
+        let each: Vec<f32> = (0..3 * 2 * 3 * 4).map(|n| n as f32).collect();
+        Capture {
+            name: "lab".into(),
+            height: 2,
+            width: 3,
+            gate: Gate {
+                start_m: 1.0,
+                bin_width_m: 0.1,
+                bins: 4,
+            },
+            sum: (0..24)
+                .map(|at| (0..3).map(|s| each[s * 24 + at]).sum())
+                .collect(),
+            per_spot: Some(each),
+            intrinsics: Intrinsics {
+                fx: 2.0,
+                fy: 2.0,
+                cx: 1.5,
+                cy: 1.0,
+            },
+            laser: [0.1, 0.2, 0.0],
+            beams: vec![
+                Beam::Spot {
+                    position: [0.1, 0.2, 2.0],
+                    path_m: 2.0,
+                },
+                Beam::Nothing,
+                Beam::Direction([0.0, 0.6, 0.8]),
+            ],
+            depth,
+            origin: Origin::default(),
+        }
+    }
+
+    #[test]
+    fn a_capture_is_read_with_its_calibration_and_its_depth_where_it_is_known() {
+        let folder = tempfile::tempdir().unwrap();
+        for depth in [None, Some(vec![2.0; 6])] {
+            let (made, out) = (capture(depth), folder.path().join("out"));
+            block_on(made.write(&out, b"picture")).unwrap();
+            let flash = Flash::read(&out, PlacesArg::Given).unwrap();
+            assert_eq!(flash.histogram, made.sum);
+            assert_eq!(flash.beams, [0, 2]);
+            // The world's axes are turned; the camera's are those of the capture.
+            let seen = |x: Vec3| <[f32; 3]>::from(flash.camera.to_camera(x));
+            assert_eq!(seen(flash.laser), made.laser);
+            let place = flash.spots[0].place.unwrap();
+            assert_eq!((seen(place.point), place.path_m), ([0.1, 0.2, 2.0], 2.0));
+            assert!(flash.spots[1].place.is_none());
+            assert_eq!(seen(flash.spots[1].direction), [0.0, 0.6, 0.8]);
+            let truth = flash.truth();
+            assert_eq!(truth.is_some(), made.depth.is_some());
+            if let Some(truth) = truth {
+                assert_eq!(Some(truth.depth_m.to_vec()), made.depth);
+                // Neither shadows nor mirrors are known.
+                assert!(truth.visibility.is_empty() && truth.specular.is_empty());
+            }
+            let returns = Flash::read(&out, PlacesArg::Returns).unwrap();
+            assert!(returns.spots.iter().all(|s| s.place.is_none()));
+            std::fs::remove_dir_all(out).unwrap();
+        }
+    }
+}

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use hdf5_pure::{Error, File};
+use hdf5_pure::{AttrValue, Error, File};
 
 /// An open file. Arrays stay on disk until they are read.
 pub(super) struct Hdf5(Box<File>);
@@ -43,6 +43,19 @@ impl Hdf5 {
             .map_err(message_of)?
             .read_f64()
             .map_err(message_of)
+    }
+
+    /// Reads an attribute of the root group that is a number; `None` if there is none.
+    ///
+    /// # Errors
+    /// The library's message.
+    pub fn attribute(&self, name: &str) -> Result<Option<f64>, String> {
+        let attributes = self.0.root().attrs().map_err(message_of)?;
+        Ok(match attributes.get(name) {
+            Some(AttrValue::F64(x)) => Some(*x),
+            Some(AttrValue::U64(n)) => Some(*n as f64),
+            _ => None,
+        })
     }
 
     /// Reads `n` rows of the slowest axis, beginning at `first`.

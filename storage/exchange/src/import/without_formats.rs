@@ -56,6 +56,11 @@ impl Hdf5 {
     }
 
     /// Cannot be called.
+    pub fn attribute(&self, _: &str) -> Result<Option<f64>, String> {
+        match *self {}
+    }
+
+    /// Cannot be called.
     pub fn rows(&self, _: &str, _: u64, _: u64) -> Result<Vec<f64>, String> {
         match *self {}
     }

@@ -2,8 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use picofarm_dataset::SingleRender;
 use picofarm_exchange::capture::{Beam, Capture, import};
+use picofarm_exchange::{ExportFormat, Exporter};
 use picofarm_files::Opener;
+use picofarm_store::open_store;
 use tempfile::TempDir;
 
 use crate::common::Lcg;
@@ -362,5 +365,48 @@ async fn a_folder_gives_back_what_was_written() {
             assert_eq!(Capture::read(&out).await.unwrap(), capture);
             std::fs::remove_dir_all(out).unwrap();
         }
+    }
+}
+
+#[tokio::test]
+async fn exports_of_a_capture_come_back_in() {
+    let folder = TempDir::new().unwrap();
+    let depth = npy("<f4", &[ROWS, COLUMNS], &[2.0f32; ROWS * COLUMNS]);
+    write(folder.path(), "d.npy", depth);
+    let all = &counts()[..ROWS * COLUMNS * BINS];
+    let file = write(
+        folder.path(),
+        "a.npy",
+        npy("<f4", &[ROWS, COLUMNS, BINS], all),
+    );
+    let text = description(r#", "depth_m": "d.npy""#);
+    let described = write(folder.path(), "capture.json", text);
+    let capture = read(&[file]).unwrap();
+    let out = folder.path().join("out");
+    capture.write(&out, b"picture").await.unwrap();
+    let dataset = SingleRender::open(&out).await.unwrap().dataset;
+    std::fs::remove_file(described).unwrap();
+    for (format, end) in [
+        (ExportFormat::Hdf5, "h5"),
+        (ExportFormat::WebDataset, "tar"),
+    ] {
+        let to = folder.path().join(end);
+        let (store, prefix) = open_store(to.to_str().unwrap()).unwrap();
+        let mut export = Exporter::new(format, &dataset, &[0], &*store, prefix).unwrap();
+        export.step(0).await.unwrap();
+        export.finish().await.unwrap();
+        let mut files: Vec<PathBuf> = ["", "scenes", "shards", "data"]
+            .iter()
+            .filter_map(|folder| std::fs::read_dir(to.join(folder)).ok())
+            .flatten()
+            .map(|e| e.unwrap().path())
+            .collect();
+        files.retain(|p| p.extension().is_some_and(|e| e == end));
+        let back = read(&files).unwrap();
+        assert_eq!(back.sum, capture.sum);
+        assert_eq!(back.depth, capture.depth);
+        assert_eq!((back.gate, back.laser), (capture.gate, capture.laser));
+        assert_eq!(back.intrinsics, capture.intrinsics);
+        assert_eq!(back.beams, capture.beams);
     }
 }

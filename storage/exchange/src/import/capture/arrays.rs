@@ -41,6 +41,8 @@ pub(super) struct Stated {
     pub intrinsics: Option<Intrinsics>,
     pub laser: Option<[f64; 3]>,
     pub beams: Option<Vec<Beam>>,
+    /// True z-depth, `[row][column]`.
+    pub depth: Option<Vec<f32>>,
 }
 
 /// An array as a file has it: the size and the stride of each axis.

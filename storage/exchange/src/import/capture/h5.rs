@@ -13,7 +13,7 @@ use super::arrays::{Part, Strided};
 use super::describe::{Described, Description};
 use super::events::Binner;
 use super::kinds::{chosen, ordered, unknown};
-use super::walls;
+use super::{own, walls};
 
 const HINT: &str = "see whether the file is whole (h5ls FILE), or save the array with numpy.save";
 
@@ -42,6 +42,13 @@ impl H5<'_> {
         }
         let values = self.content.all(name).map_err(|e| self.broken(name, e))?;
         Ok((shape, values))
+    }
+
+    /// Reads an attribute of the file that is a number.
+    pub fn attribute(&self, name: &str) -> Result<Option<f64>, ImportError> {
+        self.content
+            .attribute(name)
+            .map_err(|e| self.broken(name, e))
     }
 
     /// Reads one number.
@@ -90,6 +97,9 @@ pub(super) fn read(
     let has = |all: &[&str]| all.iter().all(|n| names.iter().any(|m| m == n));
     if h5.shape("photon_data/timestamps")?.is_some() {
         return photons(&h5, description, described);
+    }
+    if has(&["transient", "intrinsics", "manifest"]) {
+        return own::hdf5(&h5);
     }
     if has(&["H", "sensor_grid_xyz", "laser_grid_xyz"]) {
         return walls::tal(&h5);

@@ -8,7 +8,7 @@ use super::super::mat::{Mat, is_hdf5};
 use super::super::{ImportError, npy};
 use super::arrays::{Part, Stated, Strided};
 use super::describe::{Described, Description};
-use super::{EXAMPLE, h5, ptu, tables};
+use super::{EXAMPLE, h5, own, ptu, tables};
 
 /// Most numbers of an array.
 const MOST_VALUES: usize = 1 << 32;
@@ -35,6 +35,7 @@ pub(super) fn read(
         h if is_matlab(h, file) => ("matlab", matlab(file, description, reader)?),
         h if h.starts_with(ptu::MAGIC) => return ptu::read(file, description, described, reader),
         h if is_hdf5(h) => return h5::read(file, description, described, reader),
+        h if h.get(257..262) == Some(&b"ustar"[..]) => return own::webdataset(file, reader),
         h if is_text(h) => return tables::read(file, description, described, reader),
         h => {
             return Err(unknown(

@@ -12,6 +12,7 @@ mod folder;
 mod h5;
 mod kinds;
 mod known;
+mod own;
 mod ptu;
 mod resample;
 mod tables;

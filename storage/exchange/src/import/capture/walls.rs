@@ -113,11 +113,11 @@ pub(super) fn zaragoza(h5: &H5<'_>) -> Result<Part, ImportError> {
     let row_major = Strided::rows(shape.clone(), Vec::new()).strides;
     // Either colours, bins, bounces, sensor x and y, laser x and y, or the reverse, as MATLAB and
     // C order write it.
-    let order: Option<[usize; 7]> = match &shape[..] {
-        &[_, _, _, a, b, lx, ly] if [a, b] == sides && lx * ly == spots.len() => {
+    let order: Option<[usize; 7]> = match shape[..] {
+        [_, _, _, a, b, lx, ly] if [a, b] == sides && lx * ly == spots.len() => {
             Some([0, 1, 2, 3, 4, 5, 6])
         }
-        &[ly, lx, b, a, _, _, _] if [a, b] == sides && lx * ly == spots.len() => {
+        [ly, lx, b, a, _, _, _] if [a, b] == sides && lx * ly == spots.len() => {
             Some([6, 5, 4, 3, 2, 1, 0])
         }
         _ => None,
@@ -296,6 +296,7 @@ fn place(h5: &H5<'_>, format: &str, wall: Wall) -> Result<Part, ImportError> {
             intrinsics: Some(intrinsics),
             laser: Some(laser),
             beams: Some(beams),
+            depth: None,
         },
         notes,
         outside,
@@ -304,10 +305,6 @@ fn place(h5: &H5<'_>, format: &str, wall: Wall) -> Result<Part, ImportError> {
 }
 
 /// Histograms `[spot][row][column][bin]` over whole paths.
-#[expect(
-    clippy::type_complexity,
-    reason = "sizes, values, gate, photons outside"
-)]
 fn arranged(
     h5: &H5<'_>,
     wall: &Wall,
