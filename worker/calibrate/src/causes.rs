@@ -23,7 +23,7 @@ const UNEXPLAINED: f64 = 0.22;
 const WRONG_T0: f64 = 2.0;
 const WRONG_LASER: f64 = 0.05;
 const WRONG_FOCAL: f64 = 0.03;
-const WRONG_WIDTH: f64 = 0.02;
+const WRONG_WIDTH: f64 = 0.015;
 
 /// Everything that was found.
 pub(crate) struct Findings<'a> {
