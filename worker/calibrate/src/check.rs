@@ -189,7 +189,7 @@ pub(crate) struct Refined {
     pub errors: [f64; 4],
     /// Correlation of t0 and laser.
     pub tied: f64,
-    /// Whether the laser can be told from t0.
+    /// Whether laser and t0 can be separated.
     pub separable: bool,
     /// What counts as a shift.
     pub least: Least,

@@ -12,7 +12,7 @@ use crate::{
     times::Finder,
 };
 
-/// Times that the flash is taken apart anew with what was corrected.
+/// Rounds of taking the flash apart, each with the corrected calibration.
 const ROUNDS: usize = 2;
 
 /// Observes a capture of all spots. Only beams with stated spots can be compared, because the

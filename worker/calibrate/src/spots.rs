@@ -14,7 +14,7 @@ const FEWEST: usize = 20;
 /// Distance of a return from its spot, bins and pixels, up to which it belongs to the spot.
 const NEAR: (f64, f64) = (2.0, 2.5);
 
-/// A spot that was found anew.
+/// A spot that was located by its times.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Found {
     pub point: V3,

@@ -155,7 +155,7 @@ impl Capturing {
         made
     }
 
-    /// Makes the sum of the spots anew.
+    /// Adds the histograms of all spots up.
     pub fn add_up(&mut self) {
         let cells = self.per_spot.len() / self.spots.len();
         self.sum = vec![0.0; cells];
@@ -196,7 +196,7 @@ pub fn faults(room: &Room, plain: &Capturing, wanted: impl Fn(&str) -> bool) -> 
     };
     let laser = |c: &mut Capturing, by: f32| {
         let stated = c.laser;
-        c.laser = c.laser + c.camera.right * by;
+        c.laser += c.camera.right * by;
         for place in c.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
             place.path_m += (place.point - c.laser).length() - (place.point - stated).length();
         }
@@ -229,7 +229,7 @@ pub fn faults(room: &Room, plain: &Capturing, wanted: impl Fn(&str) -> bool) -> 
         let laser = c.laser;
         let down = c.camera.down;
         if let Some(place) = c.spots[5].place.as_mut() {
-            place.point = place.point + down * 0.1;
+            place.point += down * 0.1;
             place.path_m = (place.point - laser).length();
         }
     });
@@ -257,7 +257,7 @@ pub fn faults(room: &Room, plain: &Capturing, wanted: impl Fn(&str) -> bool) -> 
     });
     add("half of the pixels dead", &|c| {
         for (n, h) in c.per_spot.chunks_mut(bins).enumerate() {
-            if (n % pixels * 7919) % 2 == 0 {
+            if (n % pixels).is_multiple_of(2) {
                 h.fill(0.0);
             }
         }
