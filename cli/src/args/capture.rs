@@ -19,8 +19,8 @@ pub enum Capture {
     Calibrate {
         /// A folder of `picofarm capture import` or of `picofarm scene render`; it is not changed
         capture: PathBuf,
-        /// Folder for the data set, preview.png, calibration.json and calibration.png (must not
-        /// exist, or be empty)
+        /// Folder for the data set, preview.png, and calibration.json and .png in its folder render
+        /// (must not exist, or be empty)
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
     },

@@ -18,6 +18,10 @@ use crate::{
     },
 };
 
+/// The report and its picture in a capture's folder: `dataset verify` expects them there.
+const REPORT: &str = "render/calibration.json";
+const PICTURE: &str = "render/calibration.png";
+
 /// Checks a capture.
 ///
 /// # Errors
@@ -58,15 +62,16 @@ pub fn calibrate(folder: &Path, out: &Path, output: Output) -> Result<()> {
     write(&capture, out)?;
     let mut facts = facts(&checked.report);
     let text = serde_json::to_vec_pretty(&facts).expect("a report is plain data");
-    write_atomically(&out.join("calibration.json"), &text)?;
-    save(&picture, &out.join("calibration.png"))?;
+    write_atomically(&out.join(REPORT), &text)?;
+    save(&picture, &out.join(PICTURE))?;
     facts["out"] = json!(out);
     output.result(&facts, || {
         format!(
-            "{}: {}  corrected: {}\n",
+            "{}: {}  corrected: {}\n  picture: {}\n",
             folder.display(),
             describe(&checked.report),
-            out.display()
+            out.display(),
+            out.join(PICTURE).display()
         )
     });
     Ok(())
@@ -308,11 +313,11 @@ mod tests {
         check(&right, output).expect("a corrected capture");
         let found = read(&right).expect("a capture");
         assert!((found.laser[0]).abs() < 0.005, "{:?}", found.laser);
-        let text = std::fs::read_to_string(right.join("calibration.json")).expect("a report");
+        let text = std::fs::read_to_string(right.join(REPORT)).expect("a report");
         let report: Value = serde_json::from_str(&text).expect("JSON");
         assert_eq!(report["verdict"], "wrong");
         assert_eq!(report["causes"][0]["fault"], "laser");
-        assert!(right.join("calibration.png").exists());
+        assert!(right.join(PICTURE).exists());
         assert_eq!(
             calibrate(&lab, &right, output).expect_err("taken").code,
             Code::Input
