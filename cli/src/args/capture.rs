@@ -9,8 +9,8 @@ pub enum Capture {
     /// Read what a laboratory measured into a data set of one scene; docs/captures.md has the steps
     #[command(after_help = DESCRIPTION)]
     Import(CaptureImport),
-    /// Judge a capture and its calibration: what is wrong, with figures; fails if results would be
-    /// wrong
+    /// Judge a capture and its calibration: causes with figures, and a verdict; fails if results
+    /// would be wrong
     Check {
         /// A folder of `picofarm capture import` or of `picofarm scene render`
         capture: PathBuf,
@@ -19,8 +19,8 @@ pub enum Capture {
     Calibrate {
         /// A folder of `picofarm capture import` or of `picofarm scene render`; it is not changed
         capture: PathBuf,
-        /// Folder for the data set, preview.png, calibration.json and calibration.png (must not
-        /// exist, or be empty)
+        /// Folder for the data set, preview.png, and calibration.json and .png in its folder render
+        /// (must not exist, or be empty)
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
     },

@@ -102,7 +102,7 @@ fn main() {
         .collect();
     let captures: Vec<_> = rooms
         .iter()
-        .map(|room| faults(room, &room.measure(photons, 1, |_| {})))
+        .map(|room| faults(room, &room.measure(photons, 1, |_| {}), |_| true))
         .collect();
     if env::var_os("FLASH").is_some() {
         return flashes(&captures);
@@ -115,7 +115,7 @@ fn main() {
         let (mut before, mut after) = ([0.0; 3], [0.0; 3]);
         let mut names: Vec<String> = Vec::new();
         for (room, captures) in rooms.iter().zip(&captures) {
-            let (name, capture, masks, _) = &captures[n];
+            let (name, capture, masks) = &captures[n];
             let (text, stated, corrected) = row(room, capture, masks, name.contains("masks"));
             for k in 0..3 {
                 before[k] += stated[k] / count as f64;
@@ -143,7 +143,7 @@ fn flashes(captures: &[Vec<common::Disturbed>]) {
     println!("| room | fault | verdict and causes | peaks, of the distance by chance |");
     println!("| --- | --- | --- | --- |");
     for (room, captures) in captures.iter().enumerate() {
-        for (name, capture, ..) in captures {
+        for (name, capture, _) in captures {
             let checked = check(&Measurement {
                 capture: capture.capture(),
                 per_spot: None,

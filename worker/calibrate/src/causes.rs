@@ -4,12 +4,13 @@ use picofarm_settings::PS_PER_M;
 
 use crate::{
     Measurement,
-    check::{Refined, Relocated, SIGNIFICANT, upright},
+    check::{Refined, Relocated, SIGNIFICANT, UNCLEAR, upright},
+    counting::{background, counting, noisy},
     fit::{Fitted, Observed},
     hypotheses::{Chosen, SCALES, order_name},
     masks::MaskOrder,
     model::{FOCAL, LASER, Model, T0, WIDTH},
-    numeric::{length, median, quantile, sub},
+    numeric::{length, quantile, sub},
     observe::Seen,
     pixels::Pixels,
     report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict},
@@ -17,22 +18,12 @@ use crate::{
 
 /// Share of times within one bin below which a calibration explains nothing.
 const UNEXPLAINED: f64 = 0.22;
-/// Distance of peaks from predicted times, over that from shifted times, above which a calibration
-/// explains nothing of a capture of all spots at once.
-const UNCLEAR: f64 = 0.5;
-/// Share of dead pixels, t0 in bins, laser in metres, focal length and bin width relative, from
+/// t0 in bins, laser in metres, focal length and bin width relative, from
 /// which on results are wrong.
-const WRONG_DEAD: f64 = 0.2;
 const WRONG_T0: f64 = 2.0;
 const WRONG_LASER: f64 = 0.05;
 const WRONG_FOCAL: f64 = 0.03;
-const WRONG_WIDTH: f64 = 0.02;
-/// Shares of photons lost to pile-up that are named, and that make results wrong.
-const PILE_UP: [f64; 2] = [0.02, 0.3];
-/// Background over light, in the gate of the median pixel, likewise.
-const BACKGROUND: [f64; 2] = [0.5, 10.0];
-/// Share of histograms with a bin at the ceiling that makes results wrong.
-const WRONG_CLIPPED: f64 = 0.05;
+const WRONG_WIDTH: f64 = 0.015;
 
 /// Everything that was found.
 pub(crate) struct Findings<'a> {
@@ -49,22 +40,25 @@ pub(crate) struct Findings<'a> {
     pub relocated: &'a [Relocated],
     /// The order of masks, and whether they are stored already turned.
     pub masks: Option<&'a (MaskOrder, bool)>,
+    /// Of a capture of all spots at once: distance of peaks from predicted times, over that from
+    /// shifted times.
+    pub unclear: Option<f64>,
 }
 
 /// Writes down one cause.
-struct Found<'a> {
-    fault: Fault,
-    wrong: bool,
-    value: f64,
-    error: f64,
-    unit: &'a str,
-    finding: String,
-    advice: &'a str,
-    corrected: bool,
+pub(crate) struct Found<'a> {
+    pub fault: Fault,
+    pub wrong: bool,
+    pub value: f64,
+    pub error: f64,
+    pub unit: &'a str,
+    pub finding: String,
+    pub advice: &'a str,
+    pub corrected: bool,
 }
 
 impl Found<'_> {
-    fn cause(self) -> Cause {
+    pub fn cause(self) -> Cause {
         Cause {
             fault: self.fault,
             severity: if self.wrong {
@@ -88,14 +82,15 @@ pub(crate) fn report(f: &Findings) -> Report {
     continuous(f, &mut causes);
     counting(f, &mut causes);
     let fitted = &f.refined.fitted;
-    let unexplained = match f.seen.unclear {
+    let unexplained = match f.unclear {
         None => (fitted.agreeing < UNEXPLAINED).then(|| {
             let percent = 100.0 * fitted.agreeing;
             let what = format!("only {percent:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more");
             (fitted.agreeing, "share of times", what)
         }),
-        Some(share) => (share > UNCLEAR).then(|| {
-            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.3 and less");
+        // Noise hides peaks as well.
+        Some(share) => (share > UNCLEAR && !noisy(&causes)).then(|| {
+            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.15 and less");
             (share, "of the distance by chance", what)
         }),
     };
@@ -129,7 +124,7 @@ pub(crate) fn report(f: &Findings) -> Report {
         notes: notes(f),
         stated: Some(agreement(f.before)),
         corrected: Some(agreement(fitted)),
-        unclear: f.seen.unclear,
+        unclear: f.unclear,
         errors: Some(f.refined.errors),
         pulse: f.seen.pulse.map(|shape| PulseFound {
             shape,
@@ -138,11 +133,6 @@ pub(crate) fn report(f: &Findings) -> Report {
         background: (f.pixels.dark_bins > 0).then(|| background(f.pixels)),
         spots: (0..fitted.model.beams.len()).map(|k| spot(f, k)).collect(),
     }
-}
-
-fn background(pixels: &Pixels) -> f64 {
-    let mut dark: Vec<f64> = pixels.dark.iter().map(|x| f64::from(*x)).collect();
-    median(&mut dark).unwrap_or(0.0)
 }
 
 fn spot(f: &Findings, k: usize) -> SpotResidual {
@@ -364,119 +354,20 @@ fn continuous(f: &Findings, causes: &mut Vec<Cause>) {
     }
 }
 
-fn counting(f: &Findings, causes: &mut Vec<Cause>) {
-    let p = f.pixels;
-    let all = p.dead.len();
-    let mut pixels = |fault, which: &[bool], what: &str, advice, worst: f64| {
-        let count = which.iter().filter(|w| **w).count();
-        if count > 0 {
-            let share = count as f64 / all as f64;
-            let first = which.iter().position(|w| *w).unwrap_or(0);
-            let (row, column) = (first / f.m.width(), first % f.m.width());
-            causes.push(
-                Found {
-                    fault,
-                    wrong: share >= worst,
-                    value: count as f64,
-                    error: 0.0,
-                    unit: "pixels",
-                    finding: format!(
-                        "{count} of {all} pixels ({:.1} %) {what}; the first is row {row}, column {column}",
-                        100.0 * share
-                    ),
-                    advice,
-                    corrected: true,
-                }
-                .cause(),
-            );
-        }
-    };
-    pixels(
-        Fault::DeadPixels,
-        &p.dead,
-        "are dead: they have no counts above the background",
-        "list them as dead; their neighbours fill in",
-        WRONG_DEAD,
-    );
-    pixels(
-        Fault::HotPixels,
-        &p.hot,
-        "are hot: most of their counts come before light can",
-        "set them to 0; their neighbours fill in",
-        WRONG_DEAD,
-    );
-    if let Some((most, held)) = p.ceiling {
-        let histograms = all * f.m.per_spot.map_or(1, |_| f.m.capture.spots.len());
-        causes.push(
-            Found {
-                fault: Fault::Clipped,
-                wrong: held as f64 > WRONG_CLIPPED * histograms as f64,
-                value: held as f64,
-                error: 0.0,
-                unit: "bins",
-                finding: format!("{held} bins hold exactly {most}, the greatest count: they are clipped"),
-                advice: "measure with less light or wider counters; the lost counts cannot be restored",
-                corrected: false,
-            }
-            .cause(),
-        );
-    }
-    if let Some(pulses) = p.pulses
-        && p.lost > PILE_UP[0]
-    {
-        let known = f.m.pulses.is_some();
-        causes.push(
-            Found {
-                fault: Fault::PileUp,
-                wrong: p.lost > PILE_UP[1],
-                value: p.lost,
-                error: 0.0,
-                unit: "share of photons",
-                finding: format!(
-                    "pile-up hides {:.0} % of the median pixel's photons: {} {pulses} pulses{}",
-                    100.0 * p.lost,
-                    if known { "of" } else { "the brightest pixels stop at" },
-                    if known { "" } else { ", one photon each" }
-                ),
-                advice: "measure with less light, below 5 % of the pulses; what is left is corrected after Coates (1968)",
-                corrected: true,
-            }
-            .cause(),
-        );
-    }
-    let dark = background(p) * f.m.bins() as f64;
-    let share = dark / p.light.max(1e-300);
-    if p.dark_bins > 0 && share > BACKGROUND[0] {
-        causes.push(
-            Found {
-                fault: Fault::Background,
-                wrong: share > BACKGROUND[1],
-                value: background(p),
-                error: 0.0,
-                unit: "counts per bin",
-                finding: format!(
-                    "the background is {:.3} counts per bin, {share:.1} times the light of the median pixel over the gate",
-                    background(p)
-                ),
-                advice: "darken the room, narrow the optical filter, or gate earlier; the mean is subtracted, its noise stays",
-                corrected: true,
-            }
-            .cause(),
-        );
-    }
-}
-
 fn notes(f: &Findings) -> Vec<String> {
     let mut notes = Vec::new();
     let returns = f.seen.observed.returns.iter().flatten().count();
     let spots = f.m.capture.spots.len();
     if f.m.per_spot.is_none() {
-        notes.push("all spots were measured at once: mirrored images and spots in another order are not tried".into());
+        notes.push("all spots were measured at once: mirrored images, other units, fields of view and the order of spots are not tried".into());
     } else if returns < spots {
         notes.push(format!(
             "{} of {spots} spots show no return of one bounce: it is outside of the gate, hidden, or cut off",
             spots - returns
         ));
+    }
+    if f.unclear.is_some_and(|share| share > UNCLEAR) {
+        notes.push("the times were not used for a correction, because they agree with none".into());
     }
     if !f.refined.separable {
         notes.push(format!(

@@ -41,6 +41,9 @@ impl Least {
 pub(crate) const LEAST_FOCAL: f64 = 0.004;
 pub(crate) const LEAST_WIDTH: f64 = 0.003;
 pub(crate) const LEAST_SPOT: f64 = 0.03;
+/// Distance of peaks from predicted times, over that from shifted times, above which a calibration
+/// explains nothing of a capture of all spots at once.
+pub(crate) const UNCLEAR: f64 = 0.15;
 /// A shift counts from this many standard errors on.
 pub(crate) const SIGNIFICANT: f64 = 5.0;
 /// Standard error of a laser coordinate beyond which the laser is not estimated, metres.
@@ -51,8 +54,9 @@ const SAVES: f64 = 0.03;
 /// Arrays for pictures of a check.
 #[derive(Debug, Clone)]
 pub struct Pictures {
-    /// Median of prediction minus observation at each stored pixel with the stated calibration,
-    /// metres of path, `[row][column]`; NaN where no time is known.
+    /// Distance of prediction and observation at each stored pixel with the stated calibration,
+    /// metres of path, `[row][column]`: within which a third of the spots agree; NaN where no time
+    /// is known.
     pub stated_m: Vec<f32>,
     /// The same with the corrected calibration.
     pub corrected_m: Vec<f32>,
@@ -103,11 +107,25 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
         Some(_) => Least::SHARP,
         None => Least::VAGUE,
     };
-    let mut refined = refine(&base, &observed, least);
-    let (relocated, moved) = relocate(&refined, &base, &observed);
-    if !relocated.is_empty() {
-        refined = refine(&moved, &observed, least);
+    let (mut refined, mut relocated, mut unclear) = (None, Vec::new(), None);
+    if m.per_spot.is_some() {
+        let first = refine(&base, &observed, least, true);
+        let (elsewhere, moved) = relocate(&first, &base, &observed);
+        refined = Some(match elsewhere.is_empty() {
+            true => first,
+            false => refine(&moved, &observed, least, true),
+        });
+        relocated = elsewhere;
+    } else if crate::flash::placed(&base) {
+        let first = refine(&base, &observed, least, false);
+        let share = crate::flash::unclear(m, &first.fitted.model)?;
+        unclear = Some(share);
+        // What explains nothing corrects nothing.
+        refined = Some(first).filter(|_| share < UNCLEAR);
+    } else {
+        unclear = Some(crate::flash::unclear(m, &base)?);
     }
+    let refined = refined.unwrap_or_else(|| keep(&base, &observed, least));
     let masks = m.masks.map(|masks| {
         let (model, ranges) = (&refined.fitted.model, &refined.fitted.ranges);
         let order = |pixels| masks::order(model, &observed, ranges, masks, m.pixels(), pixels);
@@ -150,6 +168,7 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
         refined: &refined,
         relocated: &relocated,
         masks: masks.as_ref(),
+        unclear,
     };
     let report = report(&findings);
     let corrected = Corrected::new(&findings, &report.causes);
@@ -170,7 +189,7 @@ pub(crate) struct Refined {
     pub errors: [f64; 4],
     /// Correlation of t0 and laser.
     pub tied: f64,
-    /// Whether the laser can be told from t0.
+    /// Whether laser and t0 can be separated.
     pub separable: bool,
     /// What counts as a shift.
     pub least: Least,
@@ -182,7 +201,9 @@ fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
 
 /// Fits t0 and laser, then bin width and focal length if the times demand them. What moves by no
 /// more than chance stays as stated.
-fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
+///
+/// Bin width and focal length are left alone without `lens`.
+fn refine(base: &Model, seen: &Observed, least: Least, lens: bool) -> Refined {
     let mut free = Free::LASER;
     let mut best = seen.fit(base, free);
     let all = best.clone();
@@ -211,7 +232,7 @@ fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
     let plain = free;
     // One more parameter before two.
     for (focal, width) in [(true, false), (false, true), (true, true)] {
-        if width && !placed {
+        if !lens || width && !placed {
             continue;
         }
         let more = Free {
@@ -255,6 +276,19 @@ fn refine(base: &Model, seen: &Observed, least: Least) -> Refined {
         errors: [all.errors[0], all.errors[1], all.errors[2], all.errors[3]],
         tied: all.tied,
         separable,
+        least,
+    }
+}
+
+/// The calibration as stated.
+fn keep(base: &Model, seen: &Observed, least: Least) -> Refined {
+    Refined {
+        fitted: seen.judged(base.clone(), [0.0; 6], 0.0),
+        free: Free::T0,
+        t0: false,
+        errors: [0.0; 4],
+        tied: 0.0,
+        separable: true,
         least,
     }
 }
@@ -315,7 +349,10 @@ fn relocate(refined: &Refined, base: &Model, seen: &Observed) -> (Vec<Relocated>
     (made.collect(), model)
 }
 
-/// Median residual of each stored pixel.
+/// Share of spots that light a pixel, at least: shadows have no residual.
+const LIT: f64 = 0.33;
+
+/// Residual of each stored pixel, of the spots that light it.
 fn image(fitted: &Fitted, seen: &Observed, stored: &[usize], pixels: usize) -> Vec<f32> {
     let spots: Vec<_> = (0..seen.times.len())
         .map(|k| seen.residuals(&fitted.model, &fitted.ranges, k))
@@ -323,7 +360,7 @@ fn image(fitted: &Fitted, seen: &Observed, stored: &[usize], pixels: usize) -> V
     let mut image = vec![f32::NAN; pixels];
     for (n, p) in stored.iter().enumerate() {
         let mut own: Vec<f64> = spots.iter().filter_map(|s| s[n]).map(f64::abs).collect();
-        if let Some(middle) = crate::numeric::median(&mut own) {
+        if let Some(middle) = crate::numeric::quantile(&mut own, LIT) {
             image[*p] = middle as f32;
         }
     }

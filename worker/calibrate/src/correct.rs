@@ -12,6 +12,29 @@ use crate::{
     report::{Cause, Fault},
 };
 
+/// Pixels up to which a neighbour fills in.
+const REACH: usize = 6;
+
+/// The nearest good pixel of each pixel; of equally near ones the first.
+fn sources(good: &[bool], width: usize) -> Vec<Option<usize>> {
+    let height = good.len() / width;
+    (0..good.len())
+        .map(|p| {
+            if good[p] {
+                return Some(p);
+            }
+            let (u, v) = (p % width, p / width);
+            let rows = v.saturating_sub(REACH)..(v + REACH + 1).min(height);
+            let near = rows.flat_map(|y| {
+                let columns = u.saturating_sub(REACH)..(u + REACH + 1).min(width);
+                columns.map(move |x| y * width + x)
+            });
+            near.filter(|q| good[*q])
+                .min_by_key(|q| (q % width).abs_diff(u).pow(2) + (q / width).abs_diff(v).pow(2))
+        })
+        .collect()
+}
+
 /// A corrected calibration, and what must be done to the histograms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Corrected {
@@ -29,8 +52,9 @@ pub struct Corrected {
     pub mask_order: Option<Vec<usize>>,
     /// Whether stated masks are stored as the histograms are, so that they are turned with them.
     pub turn_masks: bool,
-    /// Stored pixels that are set to 0, `[row][column]`.
-    pub hot: Vec<bool>,
+    /// The stored pixel whose histogram each stored pixel takes, `[row][column]`: its own, or that
+    /// of the nearest good pixel if it is dead or hot; `None` if none is near.
+    pub source: Vec<Option<usize>>,
     /// Pulses of a histogram, if pile-up is to be corrected.
     pub pulses: Option<u64>,
     /// Bins before any light, if their mean is to be subtracted.
@@ -78,14 +102,14 @@ impl Corrected {
             turn: h.turn,
             mask_order: f.masks.map(|(m, _)| m.order.clone()),
             turn_masks: f.masks.is_none_or(|(_, turned)| !turned),
-            hot: f.pixels.hot.clone(),
+            source: sources(&f.pixels.good(), f.m.width()),
             pulses: f.pixels.pulses.filter(|_| has(Fault::PileUp)),
             dark_bins: has(Fault::Background).then_some(f.pixels.dark_bins),
         }
     }
 
     /// Returns corrected histograms of the stored image, `[…][row][column][bin]`: pile-up undone,
-    /// background subtracted, hot pixels 0, the image turned.
+    /// background subtracted, dead and hot pixels filled from their neighbours, the image turned.
     pub fn histograms(&self, stored: &[f32]) -> Vec<f32> {
         let bins = self.gate.bins as usize;
         let (width, height) = self.size();
@@ -94,11 +118,9 @@ impl Corrected {
         all.par_chunks_mut(pixels * bins)
             .zip(stored.par_chunks(pixels * bins))
             .for_each(|(out, stored)| {
-                for (p, h) in stored
-                    .chunks(bins)
-                    .enumerate()
-                    .filter(|(p, _)| !self.hot[*p])
-                {
+                for (p, source) in self.source.iter().enumerate() {
+                    let Some(source) = source else { continue };
+                    let h = &stored[source * bins..][..bins];
                     let q = self.turn.pixel(p, width, height);
                     let out = &mut out[q * bins..][..bins];
                     out.copy_from_slice(h);

@@ -3,6 +3,7 @@
 
 use crate::{
     model::{FOCAL, LASER, Model, SHARED, T0, WIDTH},
+    normal::{Block, Normal, Rows},
     numeric::{V3, along, dot, inverse, length, median, sub, unit},
     pulse::Return,
     times::Time,
@@ -65,16 +66,19 @@ pub(crate) struct Fitted {
     pub tied: f64,
     /// Share of the times within one bin of the prediction.
     pub agreeing: f64,
-    /// Median distance of the times from the prediction, metres of path, of all times.
-    pub median_m: f64,
     /// Root mean square of the agreeing times' distances, metres of path.
     pub rms_m: f64,
 }
 
 /// The weight of an error of `x` limits: Tukey's.
-fn tukey(x: f64) -> f64 {
+pub(crate) fn tukey(x: f64) -> f64 {
     let rest = 1.0 - x * x;
     if rest > 0.0 { rest * rest } else { 0.0 }
+}
+
+/// Error of a time, metres: prediction minus observation.
+pub(crate) fn error(model: &Model, spot: (V3, f64), x: V3, time: &Time) -> f64 {
+    spot.1 + length(sub(spot.0, x)) + length(x) - model.path(time.bin)
 }
 
 impl Observed {
@@ -96,11 +100,6 @@ impl Observed {
         self.times[spot][n]
     }
 
-    /// Error of a time, metres: prediction minus observation.
-    fn error(model: &Model, spot: (V3, f64), x: V3, time: &Time) -> f64 {
-        spot.1 + length(sub(spot.0, x)) + length(x) - model.path(time.bin)
-    }
-
     /// The range of each pixel that most times agree on.
     pub fn ranges(&self, model: &Model, limit: f64) -> Vec<f64> {
         let spots: Vec<(V3, f64)> = (0..self.times.len()).map(|k| model.spot(k)).collect();
@@ -120,7 +119,7 @@ impl Observed {
                     let score: f64 = own
                         .iter()
                         .map(|(j, t)| {
-                            let off = Self::error(model, spots[*j], x, t) / model.width;
+                            let off = error(model, spots[*j], x, t) / model.width;
                             tukey(off / limit)
                         })
                         .sum();
@@ -201,14 +200,11 @@ impl Observed {
         let all = self.times.iter().flatten().flatten().count().max(1);
         let agreeing = near.len() as f64 / all as f64;
         let rms_m = (squares / near.len().max(1) as f64).sqrt();
-        let mut sizes: Vec<f64> = off.iter().map(|e| e.abs()).collect();
-        sizes.resize(all, f64::INFINITY);
         Fitted {
             ranges,
             errors,
             tied,
             agreeing,
-            median_m: median(&mut sizes).unwrap_or(f64::INFINITY),
             rms_m,
             model,
         }
@@ -221,7 +217,7 @@ impl Observed {
             .map(|n| {
                 let time = self.time(spot, n).filter(|_| ranges[n].is_finite())?;
                 let x = along([0.0; 3], model.ray(self.pixels[n]), ranges[n]);
-                Some(Self::error(model, place, x, &time))
+                Some(error(model, place, x, &time))
             })
             .collect()
     }
@@ -295,192 +291,12 @@ impl Observed {
                 let off = [0, 1].map(|a| film[a] - (seen[a] as f64 + 0.5));
                 let far = (off[0] * off[0] + off[1] * off[1]).sqrt() / (3.0 + limit);
                 let w = tukey(far) / (RETURN_PIXELS * RETURN_PIXELS);
-                for axis in 0..2 {
+                for (axis, off) in off.iter().enumerate() {
                     let row = rows.film(k, point, axis, list);
-                    normal.add(&row, off[axis], w);
+                    normal.add(&row, *off, w);
                 }
             }
         }
         normal
-    }
-}
-
-/// Derivatives of predictions with respect to the open parameters.
-struct Rows<'a> {
-    model: &'a Model,
-    spots: Vec<(V3, f64)>,
-}
-
-impl<'a> Rows<'a> {
-    fn new(model: &'a Model) -> Self {
-        let spots = (0..model.beams.len()).map(|k| model.spot(k)).collect();
-        Self { model, spots }
-    }
-
-    fn weigh(&self, k: usize, x: V3, time: &Time, scale: f64) -> (f64, f64) {
-        let e = Observed::error(self.model, self.spots[k], x, time);
-        let sigma = time.error * self.model.width;
-        (e, tukey(e / scale) / (sigma * sigma))
-    }
-
-    /// Derivative of a pixel's unit ray with respect to the logarithm of the focal length.
-    fn turn(&self, pixel: usize) -> V3 {
-        let ray = self.model.ray(pixel);
-        // d = (a/f, b/f, 1): its derivative is (−a/f, −b/f, 0), without the part along the ray.
-        let along_film = [-ray[0], -ray[1], 0.0];
-        let own = dot(along_film, ray);
-        along(along_film, ray, -own)
-    }
-
-    /// Derivatives of a spot's place and path with respect to parameter `j`.
-    fn spot(&self, k: usize, j: usize) -> (V3, f64) {
-        let beam = &self.model.beams[k];
-        let mut axis = [0.0; 3];
-        match j {
-            1..=3 => {
-                axis[j - 1] = 1.0;
-                match beam.point {
-                    // The spot stays; the path grows as the laser leaves.
-                    Some(point) => {
-                        let away = unit(sub(self.model.laser, point));
-                        ([0.0; 3], away[j - 1])
-                    }
-                    None => (axis, 0.0),
-                }
-            }
-            _ if j == SHARED + k && beam.point.is_none() => (beam.direction, 1.0),
-            _ => (axis, 0.0),
-        }
-    }
-
-    fn two_bounce(
-        &self,
-        k: usize,
-        away: V3,
-        bin: f64,
-        turn: V3,
-        range: f64,
-        list: &[usize],
-    ) -> Vec<f64> {
-        let derive = |j: &usize| match *j {
-            T0 => -1.0,
-            WIDTH => -self.model.width * bin,
-            FOCAL => range * dot(turn, away),
-            _ => {
-                let (place, path) = self.spot(k, *j);
-                path - dot(place, away)
-            }
-        };
-        list.iter().map(derive).collect()
-    }
-
-    fn one_bounce(&self, k: usize, seen: V3, bin: f64, list: &[usize]) -> Vec<f64> {
-        let derive = |j: &usize| match *j {
-            T0 => -1.0,
-            WIDTH => -self.model.width * bin,
-            FOCAL => 0.0,
-            _ => {
-                let (place, path) = self.spot(k, *j);
-                path + dot(place, seen)
-            }
-        };
-        list.iter().map(derive).collect()
-    }
-
-    fn film(&self, k: usize, point: V3, axis: usize, list: &[usize]) -> Vec<f64> {
-        let focal = self.model.lens[axis];
-        let slope = point[axis] / point[2];
-        let derive = |j: &usize| match *j {
-            T0 | WIDTH => 0.0,
-            FOCAL => focal * slope,
-            _ => {
-                let (place, _) = self.spot(k, *j);
-                focal * (place[axis] - slope * place[2]) / point[2]
-            }
-        };
-        list.iter().map(derive).collect()
-    }
-}
-
-/// Sums of one pixel.
-struct Block {
-    matrix: Vec<Vec<f64>>,
-    right: Vec<f64>,
-    cross: Vec<f64>,
-    own: f64,
-    own_right: f64,
-}
-
-impl Block {
-    fn new(n: usize) -> Self {
-        Self {
-            matrix: vec![vec![0.0; n]; n],
-            right: vec![0.0; n],
-            cross: vec![0.0; n],
-            own: 0.0,
-            own_right: 0.0,
-        }
-    }
-
-    fn add(&mut self, row: &[f64], slope: f64, e: f64, w: f64) {
-        for (i, a) in row.iter().enumerate() {
-            for (m, b) in self.matrix[i].iter_mut().zip(row) {
-                *m += w * a * b;
-            }
-            self.right[i] -= w * a * e;
-            self.cross[i] += w * a * slope;
-        }
-        self.own += w * slope * slope;
-        self.own_right -= w * slope * e;
-    }
-}
-
-/// Normal equations.
-struct Normal {
-    matrix: Vec<Vec<f64>>,
-    right: Vec<f64>,
-    squares: f64,
-    weights: f64,
-    /// Variance of an error over its expectation.
-    unit: f64,
-}
-
-impl Normal {
-    fn new(n: usize) -> Self {
-        Self {
-            matrix: vec![vec![0.0; n]; n],
-            right: vec![0.0; n],
-            squares: 0.0,
-            weights: 0.0,
-            unit: 1.0,
-        }
-    }
-
-    fn add(&mut self, row: &[f64], e: f64, w: f64) {
-        for (i, a) in row.iter().enumerate() {
-            for (m, b) in self.matrix[i].iter_mut().zip(row) {
-                *m += w * a * b;
-            }
-            self.right[i] -= w * a * e;
-        }
-    }
-
-    fn count(&mut self, e: f64, w: f64, sigma: f64) {
-        self.squares += w * e * e;
-        self.weights += w * sigma * sigma;
-        self.unit = (self.squares / self.weights.max(1e-300)).max(1.0);
-    }
-
-    fn eliminate(&mut self, block: &Block) {
-        if block.own <= 0.0 {
-            return;
-        }
-        for i in 0..self.right.len() {
-            for j in 0..self.right.len() {
-                self.matrix[i][j] +=
-                    block.matrix[i][j] - block.cross[i] * block.cross[j] / block.own;
-            }
-            self.right[i] += block.right[i] - block.cross[i] * block.own_right / block.own;
-        }
     }
 }

@@ -1,21 +1,22 @@
 //! A capture of all spots at once: it is taken apart with the stated calibration, and the peaks of
 //! what was found are compared with its times.
 
-use picofarm_demultiplex::residual;
+use picofarm_demultiplex::{Capture, Demultiplexed, Settings, Shading, demultiplex, residual};
 
 use crate::{
     CalibrateError, Measurement,
     fit::{Free, Observed},
     model::Model,
-    observe::{ASSUMED, Seen, apart, together},
+    observe::{ASSUMED, Seen, together},
     pixels::Pixels,
     times::Finder,
 };
 
-/// Times that the flash is taken apart anew with what was corrected.
+/// Rounds of taking the flash apart, each with the corrected calibration.
 const ROUNDS: usize = 2;
 
-/// Observes a capture of all spots.
+/// Observes a capture of all spots. Only beams with stated spots can be compared, because the
+/// places of others follow from the same histogram.
 ///
 /// # Errors
 /// Returns the errors of the method that takes the flash apart.
@@ -26,35 +27,16 @@ pub(crate) fn observe(
 ) -> Result<Seen, CalibrateError> {
     let finder = Finder::new(&ASSUMED, pixels.gain);
     let mut model = stated.clone();
-    let mut observed: Option<Observed> = None;
-    let mut unclear = None;
+    let mut observed = None;
     for _ in 0..ROUNDS {
-        let spots = model.spots(
-            m.capture.camera,
-            m.capture.spots,
-            &vec![true; model.beams.len()],
-        );
-        let known = model.beams.iter().all(|b| b.point.is_some());
-        let mut capture = m.capture;
-        capture.gate = model.gate(capture.gate.bins);
-        capture.laser = model.laser(capture.camera);
-        if known {
-            capture.spots = &spots;
-        }
-        let own = Measurement { capture, ..*m };
-        let found = apart(&own)?;
-        if unclear.is_none() {
-            // Without a pair to compare, nothing is explained.
-            let off = residual(&capture, &found);
-            unclear = Some(off.map_or(1.0, |r| r.median_m / r.control_m));
-        }
+        let (found, _) = taken_apart(m, &model)?;
         for (beam, place) in model.beams.iter_mut().zip(&found.places) {
             if let (None, Some(place)) = (beam.point, place) {
                 beam.range = f64::from(place.path_m);
             }
         }
-        let seen = together(&own, &found, &model, pixels, &finder);
-        if known {
+        let seen: Observed = together(m, &found, &model, pixels, &finder);
+        if placed(&model) {
             model = seen.fit(stated, Free::T0).model;
         }
         observed = Some(seen);
@@ -63,6 +45,42 @@ pub(crate) fn observe(
         observed: observed.expect("at least one round"),
         pulse: None,
         samples: Vec::new(),
-        unclear,
     })
+}
+
+/// Whether all spots have stated places.
+pub(crate) fn placed(model: &Model) -> bool {
+    model.beams.iter().all(|b| b.point.is_some())
+}
+
+/// Distance of peaks from the times that a calibration predicts, over that from shifted times; 1
+/// without a pair to compare.
+///
+/// # Errors
+/// Returns the errors of the method that takes the flash apart.
+pub(crate) fn unclear(m: &Measurement, model: &Model) -> Result<f64, CalibrateError> {
+    Ok(taken_apart(m, model)?.1)
+}
+
+/// Takes the flash apart by rules, without learnt shadows.
+fn taken_apart(m: &Measurement, model: &Model) -> Result<(Demultiplexed, f64), CalibrateError> {
+    let all = vec![true; model.beams.len()];
+    let spots = model.spots(m.capture.camera, m.capture.spots, &all);
+    let capture = Capture {
+        gate: model.gate(m.capture.gate.bins),
+        laser: model.laser(m.capture.camera),
+        spots: if placed(model) {
+            &spots
+        } else {
+            m.capture.spots
+        },
+        ..m.capture
+    };
+    let settings = Settings {
+        shadows: Shading::Physics,
+        ..Settings::default()
+    };
+    let found = demultiplex(&capture, &settings)?;
+    let off = residual(&capture, &found);
+    Ok((found, off.map_or(1.0, |r| r.median_m / r.control_m)))
 }

@@ -13,7 +13,7 @@ use crate::{
 const PIXELS: usize = 400;
 /// A hypothesis must explain this factor of times more than the stated calibration, and this share.
 const BETTER: (f64, f64) = (1.2, 0.03);
-/// Or so much more if it brings returns to this share of their distance, by at least so many pixels.
+/// Or this share more if it brings returns to a share of their distance, by at least some pixels.
 const NEARER: (f64, f64, f64) = (0.015, 0.5, 1.0);
 /// Share of times that a further fault must explain.
 const SIMPLER: f64 = 0.015;

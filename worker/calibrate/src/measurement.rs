@@ -1,4 +1,4 @@
-//! The input: a capture, its per-spot histograms and what else is known of it.
+//! The input: a capture, its per-spot histograms, masks and pulses.
 
 use picofarm_demultiplex::{Capture, DemultiplexError};
 

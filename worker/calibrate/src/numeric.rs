@@ -93,13 +93,12 @@ mod tests {
             vec![0.5, 2.0, 1e-3],
         ];
         let inverse = inverse(&m).expect("a regular matrix");
-        for i in 0..3 {
-            for j in 0..3 {
-                let sum: f64 = (0..3).map(|k| m[i][k] * inverse[k][j]).sum();
-                assert!(
-                    (sum - f64::from(u8::from(i == j))).abs() < 1e-6,
-                    "{i} {j}: {sum}"
-                );
+        let column = |j: usize| inverse.iter().map(move |row| row[j]);
+        for (i, row) in m.iter().enumerate() {
+            for j in 0..row.len() {
+                let sum: f64 = row.iter().zip(column(j)).map(|(a, b)| a * b).sum();
+                let off = (sum - f64::from(u8::from(i == j))).abs();
+                assert!(off < 1e-6, "{i} {j}: {sum}");
             }
         }
         assert!(super::inverse(&[vec![1.0, 1.0], vec![1.0, 1.0]]).is_none());

@@ -1,6 +1,6 @@
 //! What a capture shows: returns of one bounce, the pulse, and the times of two-bounce light.
 
-use picofarm_demultiplex::{Demultiplexed, Settings, Shading, demultiplex};
+use picofarm_demultiplex::Demultiplexed;
 use rayon::prelude::*;
 
 use crate::{
@@ -37,9 +37,6 @@ pub(crate) struct Seen {
     pub pulse: Option<Pulse>,
     /// Bins and shares of the returns' light: (bins after the pulse's peak, share of the return).
     pub samples: Vec<[f64; 2]>,
-    /// Of a capture of all spots at once: distance of peaks from the times that the stated
-    /// calibration predicts, over that from shifted times.
-    pub unclear: Option<f64>,
 }
 
 /// Good pixels that take part, evenly over the image.
@@ -105,7 +102,6 @@ pub(crate) fn each(m: &Measurement, per_spot: &[f32], pixels: &Pixels) -> Seen {
         },
         pulse,
         samples,
-        unclear: None,
     }
 }
 
@@ -177,13 +173,4 @@ pub(crate) fn together(
         times,
         returns: vec![None; spots.len()],
     }
-}
-
-/// Takes the flash apart by rules, without what is learnt.
-pub(crate) fn apart(m: &Measurement) -> Result<Demultiplexed, crate::CalibrateError> {
-    let settings = Settings {
-        shadows: Shading::Physics,
-        ..Settings::default()
-    };
-    Ok(demultiplex(&m.capture, &settings)?)
 }

@@ -1,4 +1,4 @@
-//! What a check says: causes with figures, a verdict, residuals.
+//! The result of a check: causes with figures, a verdict, residuals.
 
 use serde::{Deserialize, Serialize};
 
@@ -68,7 +68,7 @@ pub enum Fault {
 /// A fault that was found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cause {
-    /// What is wrong.
+    /// The kind of fault.
     pub fault: Fault,
     /// What the fault alone makes of the capture.
     pub severity: Verdict,
@@ -124,7 +124,7 @@ pub struct PulseFound {
 pub struct Report {
     /// The worst of the causes' severities.
     pub verdict: Verdict,
-    /// What is wrong, the worst first.
+    /// The faults that were found, the worst first.
     pub causes: Vec<Cause>,
     /// What cannot be seen in this capture.
     pub notes: Vec<String>,

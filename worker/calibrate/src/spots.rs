@@ -14,7 +14,7 @@ const FEWEST: usize = 20;
 /// Distance of a return from its spot, bins and pixels, up to which it belongs to the spot.
 const NEAR: (f64, f64) = (2.0, 2.5);
 
-/// A spot that was found anew.
+/// A spot that was located by its times.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Found {
     pub point: V3,
@@ -77,7 +77,7 @@ pub(crate) fn locate(model: &Model, seen: &Observed, ranges: &[f64], k: usize) -
         }
         Some((point, spread))
     };
-    // A return says where its spot is: no other place is right, and none that it denies.
+    // A spot is where its return is seen, so a place away from it is wrong.
     let denied = |point: V3| {
         let late = length(sub(point, model.laser)) + length(point) - model.path(r.bin);
         let film = model.film(point).unwrap_or([f64::INFINITY; 2]);

@@ -1,5 +1,5 @@
-//! `picofarm capture check` and `capture calibrate`: what is wrong with a capture, and the same
-//! capture with a corrected calibration.
+//! `picofarm capture check` and `capture calibrate`: the faults of a capture, and the same capture
+//! with a corrected calibration.
 
 use std::path::Path;
 
@@ -17,6 +17,10 @@ use crate::{
         files::{free_folder, save, write_atomically},
     },
 };
+
+/// The report and its picture in a capture's folder: `dataset verify` expects them there.
+const REPORT: &str = "render/calibration.json";
+const PICTURE: &str = "render/calibration.png";
 
 /// Checks a capture.
 ///
@@ -58,15 +62,16 @@ pub fn calibrate(folder: &Path, out: &Path, output: Output) -> Result<()> {
     write(&capture, out)?;
     let mut facts = facts(&checked.report);
     let text = serde_json::to_vec_pretty(&facts).expect("a report is plain data");
-    write_atomically(&out.join("calibration.json"), &text)?;
-    save(&picture, &out.join("calibration.png"))?;
+    write_atomically(&out.join(REPORT), &text)?;
+    save(&picture, &out.join(PICTURE))?;
     facts["out"] = json!(out);
     output.result(&facts, || {
         format!(
-            "{}: {}  corrected: {}\n",
+            "{}: {}  corrected: {}\n  picture: {}\n",
             folder.display(),
             describe(&checked.report),
-            out.display()
+            out.display(),
+            out.join(PICTURE).display()
         )
     });
     Ok(())
@@ -217,4 +222,105 @@ fn describe(report: &Report) -> String {
         text += &format!("  note: {note}\n");
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use picofarm_dataset::{Gate, Intrinsics};
+    use picofarm_exchange::capture::Origin;
+    use picofarm_scene::plato::{PlatoObject, PlatoSettings, generate};
+    use picofarm_transient::{Budget, Progress, Settings, render};
+
+    use super::*;
+
+    struct Unstopped;
+
+    impl Progress for Unstopped {
+        fn at(&self, _: f32) -> bool {
+            true
+        }
+    }
+
+    /// A rendered capture whose laser is stated 10 cm to the right of its place.
+    fn with_a_wrong_laser() -> Capture {
+        let scene = generate(&PlatoSettings {
+            object: PlatoObject::Armchair,
+            spots: 16,
+            resolution: 32,
+        })
+        .expect("a room");
+        let gate = Gate {
+            start_m: 1.0,
+            bin_width_m: 0.0384,
+            bins: 400,
+        };
+        let settings = Settings {
+            one_bounce: true,
+            groups: (0..16).map(|k| vec![k]).collect(),
+            ..Settings::new(gate, Budget::Samples(8))
+        };
+        let made = render(&scene, &settings, &Unstopped).expect("a render");
+        let camera = scene.camera;
+        let local = |p: Vec3| {
+            let q = camera.to_camera(p);
+            [q.x, q.y, q.z]
+        };
+        let [x, y, z] = local(scene.laser.origin);
+        let laser = [x + 0.1, y, z];
+        let beams = made.spots.iter().map(|spot| {
+            let position = local(spot.as_ref().expect("a wall").point);
+            Beam::Spot {
+                position,
+                path_m: (Vec3::from(position) - Vec3::from(laser)).length(),
+            }
+        });
+        let i = camera.intrinsics;
+        Capture {
+            name: "lab".into(),
+            height: 32,
+            width: 32,
+            gate,
+            sum: made.transient,
+            per_spot: Some(made.groups.concat()),
+            intrinsics: Intrinsics {
+                fx: i.fx,
+                fy: i.fy,
+                cx: i.cx,
+                cy: i.cy,
+            },
+            laser,
+            beams: beams.collect(),
+            depth: None,
+            origin: Origin::default(),
+        }
+    }
+
+    #[test]
+    fn a_wrong_laser_fails_the_check_and_passes_it_after_the_calibration() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (lab, right) = (folder.path().join("lab"), folder.path().join("right"));
+        write(&with_a_wrong_laser(), &lab).expect("a free folder");
+        let output = Output { json: true };
+        let refused = check(&lab, output).expect_err("a wrong laser");
+        assert_eq!(refused.code, Code::Failed);
+        assert!(
+            refused
+                .hint
+                .expect("a way out")
+                .contains("capture calibrate")
+        );
+        calibrate(&lab, &right, output).expect("a capture");
+        check(&right, output).expect("a corrected capture");
+        let found = read(&right).expect("a capture");
+        assert!((found.laser[0]).abs() < 0.005, "{:?}", found.laser);
+        let text = std::fs::read_to_string(right.join(REPORT)).expect("a report");
+        let report: Value = serde_json::from_str(&text).expect("JSON");
+        assert_eq!(report["verdict"], "wrong");
+        assert_eq!(report["causes"][0]["fault"], "laser");
+        assert!(right.join(PICTURE).exists());
+        assert_eq!(
+            calibrate(&lab, &right, output).expect_err("taken").code,
+            Code::Input
+        );
+    }
 }

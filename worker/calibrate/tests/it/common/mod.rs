@@ -155,7 +155,7 @@ impl Capturing {
         made
     }
 
-    /// Makes the sum of the spots anew.
+    /// Adds the histograms of all spots up.
     pub fn add_up(&mut self) {
         let cells = self.per_spot.len() / self.spots.len();
         self.sum = vec![0.0; cells];
@@ -175,29 +175,33 @@ impl Capturing {
     }
 }
 
-/// A disturbed capture: its name, itself, stated masks, stated pulses.
-pub type Disturbed = (&'static str, Capturing, Vec<u8>, Option<u64>);
+/// A disturbed capture: its name, itself, stated masks.
+pub type Disturbed = (&'static str, Capturing, Vec<u8>);
 
-/// Everything wrong that is tried.
-pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
+/// Everything wrong that is tried, as far as it is wanted by name.
+pub fn faults(room: &Room, plain: &Capturing, wanted: impl Fn(&str) -> bool) -> Vec<Disturbed> {
     let side = room.camera.intrinsics.width as usize;
     let pixels = side * side;
     let bins = GATE.bins as usize;
     let masks = room.visibility.clone();
-    let mut all: Vec<Disturbed> = vec![("nothing", plain.clone(), masks.clone(), None)];
+    let mut all: Vec<Disturbed> = Vec::new();
     let mut add = |name, change: &dyn Fn(&mut Capturing)| {
+        if !wanted(name) {
+            return;
+        }
         let mut made = plain.clone();
         change(&mut made);
         made.add_up();
-        all.push((name, made, masks.clone(), None));
+        all.push((name, made, masks.clone()));
     };
     let laser = |c: &mut Capturing, by: f32| {
         let stated = c.laser;
-        c.laser = c.laser + c.camera.right * by;
+        c.laser += c.camera.right * by;
         for place in c.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
             place.path_m += (place.point - c.laser).length() - (place.point - stated).length();
         }
     };
+    add("nothing", &|_| {});
     add("t0 1 bin late", &|c| c.gate.start_m += GATE.bin_width_m);
     add("t0 5 bins early", &|c| {
         c.gate.start_m -= 5.0 * GATE.bin_width_m
@@ -225,7 +229,7 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
         let laser = c.laser;
         let down = c.camera.down;
         if let Some(place) = c.spots[5].place.as_mut() {
-            place.point = place.point + down * 0.1;
+            place.point += down * 0.1;
             place.path_m = (place.point - laser).length();
         }
     });
@@ -253,7 +257,7 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
     });
     add("half of the pixels dead", &|c| {
         for (n, h) in c.per_spot.chunks_mut(bins).enumerate() {
-            if (n % pixels * 7919) % 2 == 0 {
+            if (n % pixels).is_multiple_of(2) {
                 h.fill(0.0);
             }
         }
@@ -271,16 +275,19 @@ pub fn faults(room: &Room, plain: &Capturing) -> Vec<Disturbed> {
     add("counts clipped at 127", &|c| {
         c.per_spot.iter_mut().for_each(|x| *x = x.min(127.0))
     });
-    let mut rolled = masks.clone();
-    rolled.rotate_left(pixels);
-    all.push(("masks shifted by one", plain.clone(), rolled, None));
-    let dark = room.measure(100.0, 1, |s| s.dark_per_bin = 1.0);
-    all.push(("background of 4 counts a bin", dark, masks.clone(), None));
-    let pile = |pulses| {
-        room.measure(100.0, 1, |s| {
-            s.dead_time = Some(picofarm_sensor::DeadTime::FirstPhoton { pulses });
-        })
-    };
-    all.push(("pile-up", pile(2000), masks.clone(), None));
+    if wanted("masks shifted by one") {
+        let mut rolled = masks.clone();
+        rolled.rotate_left(pixels);
+        all.push(("masks shifted by one", plain.clone(), rolled));
+    }
+    if wanted("background of 4 counts a bin") {
+        let dark = room.measure(100.0, 1, |s| s.dark_per_bin = 1.0);
+        all.push(("background of 4 counts a bin", dark, masks.clone()));
+    }
+    if wanted("pile-up") {
+        let dead_time = Some(picofarm_sensor::DeadTime::FirstPhoton { pulses: 2000 });
+        let piled = room.measure(100.0, 1, |s| s.dead_time = dead_time);
+        all.push(("pile-up", piled, masks));
+    }
     all
 }
