@@ -2,6 +2,7 @@
 
 mod cache;
 mod histogram;
+mod light;
 mod picture;
 mod stores;
 mod truth;
@@ -13,10 +14,10 @@ use http::StatusCode;
 use serde_json::json;
 
 pub use self::{
+    light::{Light, lights},
     picture::{Picture, Span},
     stores::{DataSet, Stores},
     truth::Truth,
-    volume::{Light, lights},
 };
 use crate::{
     App,

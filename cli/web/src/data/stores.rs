@@ -14,7 +14,8 @@ use tokio::sync::Mutex;
 use super::{
     SceneId, Truth,
     cache::Cache,
-    volume::{Light, Volume, has_parts},
+    light::{Light, has_parts},
+    volume::Volume,
 };
 use crate::{App, answer::Problem};
 

@@ -7,103 +7,18 @@
 use std::path::PathBuf;
 
 use http::StatusCode;
-use picofarm_dataset::{Dataset, DatasetSpec, Profile, Quantity as Q, RenderGroup, SingleRender};
+use picofarm_dataset::{Dataset, DatasetSpec, Profile, Quantity as Q};
 use picofarm_figures::scene::quantile;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use crate::{answer::Problem, query::Query};
+use super::light::{Light, parts};
+use crate::answer::Problem;
 
 /// Longest side of the small level.
 const SMALL: usize = 64;
 /// Most values of a volume: a GiB while it is read.
 const MOST: u64 = 1 << 28;
-
-/// Which light of a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Light {
-    /// Of all spots.
-    All,
-    /// Of 4 of 100 spots.
-    Four,
-    /// Of 25 of 100 spots.
-    TwentyFive,
-    /// Of one spot.
-    Spot(u32),
-    /// Of two bounces, of a render with its parts.
-    Two,
-    /// Of three bounces and more, likewise.
-    More,
-}
-
-impl Light {
-    /// Reads the parameter `light`.
-    ///
-    /// # Errors
-    /// Names the unknown light.
-    pub fn of(query: &Query) -> Result<Self, Problem> {
-        match query.text("light") {
-            "" | "all" => Ok(Self::All),
-            "4" => Ok(Self::Four),
-            "25" => Ok(Self::TwentyFive),
-            "two" => Ok(Self::Two),
-            "more" => Ok(Self::More),
-            text => {
-                let spot = text.strip_prefix("spot-").and_then(|n| n.parse().ok());
-                spot.map(Self::Spot).ok_or_else(|| {
-                    Problem::input(format!(
-                        "light: expected all, 4, 25, two, more or spot-N, found {text:?}"
-                    ))
-                })
-            }
-        }
-    }
-
-    /// Returns the name in URLs.
-    pub fn name(self) -> String {
-        match self {
-            Self::All => "all".into(),
-            Self::Four => "4".into(),
-            Self::TwentyFive => "25".into(),
-            Self::Spot(spot) => format!("spot-{spot}"),
-            Self::Two => "two".into(),
-            Self::More => "more".into(),
-        }
-    }
-}
-
-/// Returns the kinds of light that a data set has, with titles. `folder` is its folder on this
-/// machine.
-pub fn lights(spec: &DatasetSpec, folder: Option<&std::path::Path>) -> Vec<(Light, String)> {
-    let mut all = vec![(Light::All, format!("all {} spots", spec.spots))];
-    let has = |quantity| spec.quantities().contains(&quantity);
-    if has(Q::Transient25) {
-        all.push((Light::TwentyFive, "25 of 100 spots".into()));
-    }
-    if has(Q::Transient4) {
-        all.push((Light::Four, "4 of 100 spots".into()));
-    }
-    if folder.is_some_and(has_parts) {
-        all.push((Light::Two, "two bounces".into()));
-        all.push((Light::More, "three bounces and more".into()));
-    }
-    if has(Q::TransientSpots) {
-        let spots = (0..spec.spots).map(|s| (Light::Spot(s), format!("spot {s}")));
-        all.extend(spots);
-    }
-    all
-}
-
-/// Returns whether a folder has a render with the light of two bounces and of more apart.
-pub fn has_parts(folder: &std::path::Path) -> bool {
-    parts(folder).is_some_and(|group| group.has("two") && group.has("multi"))
-}
-
-/// The group with the parts of a single render.
-fn parts(folder: &std::path::Path) -> Option<RenderGroup> {
-    let is = SingleRender::is_in(folder);
-    is.then(|| RenderGroup::open(&folder.join("render")).ok())?
-}
 
 /// A volume in memory.
 pub struct Volume {
@@ -454,22 +369,5 @@ mod tests {
         let volume = Volume::of(spec(4, 4, 8, Profile::LOSSLESS), 1.0, &[0.0; 128]);
         assert_eq!(volume.small.lively, [0, 8]);
         assert!(volume.histogram(3).iter().all(|h| *h == 0.0));
-    }
-
-    #[test]
-    fn names_of_light_are_parsed_again() {
-        let all = [
-            Light::All,
-            Light::Four,
-            Light::TwentyFive,
-            Light::Two,
-            Light::More,
-            Light::Spot(7),
-        ];
-        for light in all {
-            let query = Query::parse(&format!("light={}", light.name()));
-            assert_eq!(Light::of(&query).unwrap(), light);
-        }
-        assert!(Light::of(&Query::parse("light=spot-x")).is_err());
     }
 }
