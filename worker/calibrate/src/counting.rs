@@ -106,7 +106,7 @@ pub(crate) fn counting(f: &Findings, causes: &mut Vec<Cause>) {
                     if known { "of" } else { "the brightest pixels stop at" },
                     if known { "" } else { ", one photon each" }
                 ),
-                advice: "measure with less light, below 5 % of the pulses; what is left is corrected after Coates (1968)",
+                advice: "measure with less light, below 5 % of the pulses; the rest is corrected after Coates (1968)",
                 corrected: true,
             }
             .cause(),

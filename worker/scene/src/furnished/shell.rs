@@ -28,7 +28,7 @@ struct Notch {
     size: [f32; 2],
 }
 
-/// A rectangular hole in a wall, with what is behind it.
+/// A rectangular hole in a wall, and the space behind it.
 #[derive(Debug, Clone, Copy)]
 struct Opening {
     /// The wall: −z, +z, −x, +x.

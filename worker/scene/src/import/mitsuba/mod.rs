@@ -469,7 +469,7 @@ impl<'a> Reader<'a> {
         Ok(all)
     }
 
-    /// Returns whether light passes a shape, and adds a note of what is left out.
+    /// Returns whether light passes a shape, and notes the omission.
     fn lets_light_pass(&mut self, shape: &Node) -> Result<bool, String> {
         let bsdfs = self.children(shape, "bsdf")?;
         match bsdfs.as_slice() {
