@@ -83,8 +83,7 @@ class Scene:
         spots: _Spots,
         fov: float,
         mirrors: int,
-        assets: str,
-        floor_plan: str,
+        room: tuple[str, str],
     ) -> Scene: ...
     @staticmethod
     def from_meshes(meshes: Sequence[_Mesh], view: _View, spots: _Spots) -> Scene: ...

@@ -237,5 +237,5 @@ def furnished(
     side = whole("resolution", resolution)
     least = whole("mirrors", mirrors)
     seed = whole("seed", seed)
-    made = _native.Scene.furnished(seed, side, spots, float(fov), least, assets, floor_plan)
-    return Scene._of(made)
+    room = (assets, floor_plan)
+    return Scene._of(_native.Scene.furnished(seed, side, spots, float(fov), least, room))

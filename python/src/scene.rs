@@ -73,7 +73,7 @@ impl Scene {
         Self::new(read.map_err(errors::scene)?)
     }
 
-    /// Generates the furnished room of a seed.
+    /// Generates the furnished room of a seed, with a library of furniture and a floor plan.
     #[staticmethod]
     fn furnished(
         py: Python<'_>,
@@ -82,10 +82,9 @@ impl Scene {
         spots: &Bound<'_, PyAny>,
         fov: f32,
         mirrors: u32,
-        assets: &str,
-        floor_plan: &str,
+        (assets, floor_plan): (String, String),
     ) -> PyResult<Self> {
-        let floor_plan = match floor_plan {
+        let floor_plan = match &*floor_plan {
             "box" => FloorPlan::Box,
             "varied" => FloorPlan::Varied,
             other => {
@@ -99,12 +98,12 @@ impl Scene {
             height: resolution,
             fov_deg: fov,
             specular_at_least: mirrors,
-            assets: assets.to_owned(),
+            assets: assets.clone(),
             floor_plan,
             ..FurnishedSettings::default()
         };
         let scene = py.detach(|| {
-            let library = AssetLibrary::find(assets, &[])?;
+            let library = AssetLibrary::find(&assets, &[])?;
             furnished::generate(seed, &settings, &library)
         });
         Self::new(scene.map_err(errors::scene)?)
