@@ -192,7 +192,7 @@ fn captures(args: &Reconstruct, flash: &Flash, watch: &Watch) -> Result<Measured
         return Err(CliError::input(what)
             .hint("use --spots-from flash, or import the histograms of each spot"));
     }
-    // Beams that meet nothing have no histogram that says anything.
+    // Beams that meet nothing have no light in their histograms.
     let mut beams = vec![
         Beam {
             direction: flash.camera.forward,
@@ -238,7 +238,7 @@ fn picture(
     };
     let mut shown = vec![("3D, from the camera", camera)];
     shown.extend(by(0.0).map(|v| ("from the side", v)));
-    // Straight back, the view would be of what is behind the camera.
+    // Straight back, the view would show only the space behind the camera.
     shown.extend(by(-0.6).map(|v| ("from behind", v)));
     let (step, top) = (CELL + GAP, GAP + TEXT + GAP);
     let mut canvas = Canvas::new(GAP + (1 + shown.len()) * step, top + CELL + GAP, BACKGROUND);

@@ -12,8 +12,8 @@ pub struct Preview<'a> {
     pub bin_width_m: f64,
     /// `[row][column][bin]`.
     pub transient: &'a [f32],
-    /// z-depth in metres, `[row][column]`, 0 = nothing. Without it, the path of the brightest bin is
-    /// drawn.
+    /// z-depth in metres, `[row][column]`, 0 = nothing. Without it, the path of the brightest bin
+    /// is drawn.
     pub depth: Option<&'a [f32]>,
 }
 

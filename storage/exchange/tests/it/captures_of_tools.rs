@@ -175,7 +175,7 @@ fn a_bounce_flash_collection_keeps_its_spots_apart() {
         "{}",
         String::from_utf8_lossy(&made.stderr)
     );
-    let said = import(&[collection.clone()], None, &Opener::anywhere())
+    let said = import(std::slice::from_ref(&collection), None, &Opener::anywhere())
         .unwrap_err()
         .to_string();
     assert!(said.contains("t0"), "{said}");

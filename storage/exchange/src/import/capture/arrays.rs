@@ -33,7 +33,7 @@ pub(super) struct Part {
     pub binned: bool,
 }
 
-/// What a file itself says, in the camera's axes.
+/// The calibration that a file itself has, in the camera's axes.
 #[derive(Default)]
 pub(super) struct Stated {
     /// Start and width of the bins, metres of path.

@@ -1,4 +1,4 @@
-//! The kinds of files, told apart by their first bytes, and what to say of unknown ones.
+//! The kinds of files, recognised by their first bytes, and the error for unknown ones.
 
 use std::io::Read;
 use std::path::Path;

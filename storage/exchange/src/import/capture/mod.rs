@@ -36,7 +36,7 @@ use describe::{Described, Description};
 /// Name of a description that is found next to the files.
 pub const DESCRIPTION: &str = "capture.json";
 
-/// What is known of a beam of the laser, in the camera's axes, metres.
+/// A beam of the laser, in the camera's axes, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Beam {
     /// The spot's place, and the length of the path from the laser to it.
@@ -115,8 +115,8 @@ impl Capture {
 /// [`super::Source`].
 ///
 /// # Errors
-/// [`ImportError`] names the file and the field; for an unknown file it says what the file looks
-/// like and how to describe it.
+/// [`ImportError`] names the file and the field. For an unknown file it describes what the file
+/// looks like and how to describe it.
 pub fn import(
     files: &[PathBuf],
     describe: Option<&Path>,

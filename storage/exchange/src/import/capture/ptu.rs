@@ -286,7 +286,7 @@ mod tests {
         std::fs::write(&ptu, file(code, records)).unwrap();
         std::fs::write(json, text).unwrap();
         let opener = Opener::anywhere();
-        let (described, _) = Described::find(&[ptu.clone()], None, &opener).unwrap();
+        let (described, _) = Described::find(std::slice::from_ref(&ptu), None, &opener).unwrap();
         let reader = Files::new(folder.path(), &opener);
         let description = described.read(&reader).unwrap();
         let part = read(&ptu, &description, &described, &reader).unwrap();
