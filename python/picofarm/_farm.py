@@ -244,7 +244,7 @@ class LocalFarm(Client):
     """
 
     def __init__(self, folder: str | os.PathLike[str], workers: int, gpus: int) -> None:
-        command = ["up", "--dir", os.fspath(folder), "--listen", "127.0.0.1:0"]
+        command = ["up", "--no-web", "--dir", os.fspath(folder), "--listen", "127.0.0.1:0"]
         command += ["--workers", str(workers), "--gpus", str(gpus)]
         # Standard input stays open as long as this process lives.
         self._process = subprocess.Popen(

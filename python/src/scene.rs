@@ -82,8 +82,9 @@ impl Scene {
         spots: &Bound<'_, PyAny>,
         fov: f32,
         mirrors: u32,
-        (assets, floor_plan): (String, String),
+        room: (String, String),
     ) -> PyResult<Self> {
+        let (assets, floor_plan) = room;
         let floor_plan = match &*floor_plan {
             "box" => FloorPlan::Box,
             "varied" => FloorPlan::Varied,
