@@ -37,4 +37,4 @@ pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-4";
+pub const VERSION: &str = "demultiplex-5";

@@ -2,6 +2,11 @@
 
 use crate::Settings;
 
+/// Fewest bins from which ambient light is estimated.
+const FEWEST: usize = 8;
+/// Standard deviations of ambient light that do not count as light of the laser.
+const SIGMAS: f32 = 4.0;
+
 /// The histogram of one pixel, separated into a slow background and peaks.
 #[derive(Debug, Clone, Default)]
 pub struct Peaks {
@@ -30,13 +35,16 @@ impl Peaks {
             }));
     }
 
-    /// The first bin by which a share of all light has come.
-    pub fn earliest(&mut self, h: &[f32], share: f32) {
-        let total: f32 = h.iter().map(|x| x.min(self.top)).sum();
+    /// The first bin by which a share of all light has come, beyond the noise of ambient light.
+    /// No light of the laser can be in the first `quiet` bins, which show the ambient light.
+    pub fn earliest(&mut self, h: &[f32], share: f32, quiet: usize) {
+        let (ambient, variance) = ambient(&h[..quiet.min(h.len())]);
+        let light = |x: &f32| x.min(self.top) - ambient;
+        let total: f32 = h.iter().map(light).sum();
         let mut sum = 0.0;
-        let first = h.iter().position(|x| {
-            sum += x.min(self.top);
-            sum > share * total
+        let first = h.iter().enumerate().position(|(k, x)| {
+            sum += light(x);
+            sum > share * total + SIGMAS * (variance * (k + 1) as f32).sqrt()
         });
         self.first = first.unwrap_or(h.len());
     }
@@ -55,6 +63,17 @@ impl Peaks {
         let by_size = |a: &f32, b: &f32| b.total_cmp(a);
         self.top = *self.sorted.select_nth_unstable_by(rank, by_size).1;
     }
+}
+
+/// Mean and variance of the bins before any light of the laser; zero if there are too few.
+fn ambient(quiet: &[f32]) -> (f32, f32) {
+    if quiet.len() < FEWEST {
+        return (0.0, 0.0);
+    }
+    let n = quiet.len() as f32;
+    let mean = quiet.iter().sum::<f32>() / n;
+    let squares = quiet.iter().map(|x| (x - mean) * (x - mean)).sum::<f32>();
+    (mean, squares / n)
 }
 
 /// The least or greatest of each bin's neighbours.

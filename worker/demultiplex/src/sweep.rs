@@ -90,6 +90,8 @@ pub struct Known<'a> {
     pub lit: &'a [f32],
 }
 
+/// The most by which a pulse's width brings light earlier, metres of path.
+const PULSE_M: f32 = 0.15;
 /// Cosine from which on a surface counts as facing a spot in full.
 const FULL: f32 = 0.1;
 
@@ -106,6 +108,7 @@ pub fn sweep(
     let bins = gate.bins as usize;
     let reach = reach(gate, settings);
     let full = settings.full_score * (sources.len() as f32 / 16.0).min(1.0);
+    let quiet = quiet(gate, sources);
     let mut score = vec![0.0f32; rays.len() * ranges.count];
     let mut bound = vec![0.0f32; rays.len()];
     score
@@ -120,7 +123,7 @@ pub fn sweep(
                 worker.peaks.find(h, reach, sources.len(), settings);
                 worker.pixel(p, gate, rays, sources, known, ranges);
                 level(&worker.sum, full, out);
-                worker.peaks.earliest(h, settings.early_share);
+                worker.peaks.earliest(h, settings.early_share, quiet);
                 *bound = worker.bound(ranges, settings.early_bins);
             }
         });
@@ -129,6 +132,14 @@ pub fn sweep(
         score,
         bound,
     }
+}
+
+/// Number of the first bins in which no light of the laser can be: every path leads by way of a
+/// spot, and none from there to the camera is shorter than the straight line.
+fn quiet(gate: &Gate, sources: &[Source]) -> usize {
+    let straight = sources.iter().map(|s| s.path_m + s.square.sqrt());
+    let first_m = straight.fold(f32::INFINITY, f32::min) - PULSE_M;
+    ((f64::from(first_m) - gate.start_m) / gate.bin_width_m).max(0.0) as usize
 }
 
 /// Half width of the background's opening in bins.

@@ -262,6 +262,44 @@ fn no_depth_is_farther_than_the_first_light_allows() {
     assert!(late * 200 < room.depth.len() as u32, "{late} pixels");
 }
 
+#[test]
+fn ambient_light_does_not_bring_surfaces_nearer() {
+    let room = Room::new(SIDE, &grid(4), None);
+    let bins = room.gate.bins as usize;
+    let mut peaks: Vec<f32> = room
+        .histogram
+        .chunks(bins)
+        .map(|h| h.iter().copied().fold(0.0, f32::max))
+        .collect();
+    peaks.sort_by(f32::total_cmp);
+    let scale = 400.0 / f64::from(peaks[peaks.len() / 2]);
+    let beams = room.beams(true);
+    let errors = |ambient: f64| {
+        let counted: Vec<f32> = room
+            .histogram
+            .iter()
+            .enumerate()
+            .map(|(k, rate)| {
+                let mut draws = Draws::new(7, 0, (k / bins) as u64, (k % bins) as u64);
+                poisson(f64::from(*rate) * scale + ambient, &mut draws) as f32
+            })
+            .collect();
+        let capture = Capture {
+            histogram: &counted,
+            ..room.capture(&beams)
+        };
+        let found = demultiplex(&capture, &Settings::default()).expect("a room");
+        errors(&room, &found)
+    };
+    let [_, dark] = errors(0.0);
+    let [median, most] = errors(2.0);
+    assert!(median < 0.01, "median {median} m");
+    assert!(
+        most < 0.02 + 2.0 * dark,
+        "95th percentile {most} m, in the dark {dark} m"
+    );
+}
+
 /// 16 spots and 375 bins of 32 ps, as a laboratory's single-photon camera has them, with counted
 /// photons.
 #[test]
