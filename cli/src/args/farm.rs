@@ -38,6 +38,10 @@ pub struct Demo {
     /// Also reconstruct each room in 3D, from the depth and shadows of its ground truth
     #[arg(long)]
     pub reconstruct: bool,
+    /// End without serving pages. In a terminal, the demo otherwise serves its rooms to a browser
+    /// until Ctrl-C
+    #[arg(long)]
+    pub no_web: bool,
     #[command(flatten)]
     pub traces: Traces,
 }

@@ -4,7 +4,7 @@ mod room;
 mod rooms;
 mod sheet;
 
-use std::{net::SocketAddr, path::Path};
+use std::{io::IsTerminal as _, net::SocketAddr, path::Path};
 
 use picofarm_proto::{
     ids::JobId,
@@ -15,6 +15,7 @@ use picofarm_proto::{
 use picofarm_settings::{FloorPlan, Resolution};
 use picofarm_tasks::Access;
 use serde_json::json;
+use tokio_util::sync::CancellationToken;
 
 use room::Room;
 use rooms::Rooms;
@@ -198,11 +199,43 @@ pub async fn run(args: Demo, settings: &Settings, output: Output) -> Result<()> 
     let (place, job, status) = status?;
     verdict(&status)?;
     tokio::select! {
-        told = tell(&args, &dir, &place, job, &status, output) => told,
-        () = stop.cancelled() => Err(signals::interrupted(
+        told = tell(&args, &dir, &place, job, &status, output) => told?,
+        () = stop.cancelled() => return Err(signals::interrupted(
             "run the same command again: it continues where it stopped",
         )),
     }
+    // Scripts have no use for pages, and wait for the end.
+    let person = std::io::stdin().is_terminal() && std::io::stdout().is_terminal();
+    match person && !output.json && !args.no_web {
+        true => serve(&dir, settings, output, stop).await,
+        false => Ok(()),
+    }
+}
+
+/// Serves the rooms to a browser until a signal.
+#[cfg(feature = "web")]
+async fn serve(
+    dir: &Path,
+    settings: &Settings,
+    output: Output,
+    stop: CancellationToken,
+) -> Result<()> {
+    // The demo's farm has ended: there are only its data sets.
+    let farm = super::web::Coordinator::new(&settings.coordinator, settings.access()?);
+    let server = super::web::start_for_up(dir.display().to_string(), farm).await?;
+    if let Some(path) = server.first_flight().await {
+        output.say(format!("light in flight  {}", server.link(&path)));
+    }
+    output.say(format!("in a browser     {}", server.link("/data")));
+    output.say("Ctrl-C ends the pages; all results stay");
+    server.serve(stop).await;
+    Ok(())
+}
+
+#[cfg(not(feature = "web"))]
+#[expect(clippy::unused_async, reason = "like the other")]
+async fn serve(_: &Path, _: &Settings, _: Output, _: CancellationToken) -> Result<()> {
+    Ok(())
 }
 
 /// Renders the rooms. Returns the location, the job and its final status.
