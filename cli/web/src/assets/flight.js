@@ -157,6 +157,7 @@ async function pick(column, row) {
     const found = await (await get('pixel', `&row=${picked[1]}&column=${picked[0]}`)).json();
     if (mine !== picking) return;
     histogram.set(found);
+    $('kinds').hidden = !found.whole;
     const v = found.values;
     $('picked').textContent = `Column ${picked[0]}, row ${picked[1]}: ${v.label_name ?? 'nothing'}, ${v.range_m.toFixed(2)} m · ${histogram.words()}`;
     $('histogram').setAttribute('aria-label', $('picked').textContent);

@@ -66,7 +66,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                 figure.histogram {
                     figcaption #picked aria-live="polite" { "Pick a pixel to see its histogram." }
                     canvas #histogram height="220" tabindex="0" role="img" aria-label="Histogram of the picked pixel" {}
-                    p.legend.times {
+                    p #kinds.legend.times {
                         span.key.one {} "one bounce" span.key.two {} "two bounces, lit by the spot" span.key.more {} "three and more"
                     }
                     div.toggle {

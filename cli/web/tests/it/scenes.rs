@@ -1,5 +1,6 @@
 //! Pictures, values and volumes of scenes.
 
+use picofarm_dataset::{RenderArray, write_render_group};
 use serde_json::json;
 
 use crate::{
@@ -181,5 +182,42 @@ fn a_histogram_has_the_times_of_one_and_two_bounces() {
     for (bin, found) in other["h"].as_array().unwrap().iter().enumerate() {
         let exact = h(0, pixel, bin) + h(1, pixel, bin);
         assert!((found.as_f64().unwrap() - f64::from(exact)).abs() < 0.02);
+    }
+}
+
+#[test]
+fn a_histogram_of_selected_light_has_no_parts_and_only_the_times_of_its_spot() {
+    let (folder, web) = shown();
+    let values = vec![0.25f32; SIDE * SIDE * BINS];
+    let shape = [SIDE, SIDE, BINS].map(|n| n as u64);
+    let arrays = ["two", "multi"].map(|name| RenderArray {
+        name,
+        shape: &shape,
+        dimension_names: &["row", "column", "bin"],
+        data: &values,
+    });
+    let render = folder.path().join("store/rooms/render");
+    write_render_group(&render, &arrays, &serde_json::Map::new()).unwrap();
+    let pixel = |light: &str| {
+        let query = format!("set=0%2Frooms&scene=0&row=10&column=7&light={light}");
+        web.get(&format!("/bytes/pixel?{query}")).json()
+    };
+    let all = pixel("all");
+    assert_eq!(all["whole"], true);
+    assert_eq!(all["parts"].as_array().unwrap().len(), 2);
+    assert_eq!(all["two"].as_array().unwrap().len(), 2);
+    assert_eq!(all["one"]["spot"], 0);
+    for light in ["two", "more", "spot-0", "spot-1"] {
+        let found = pixel(light);
+        assert_eq!(
+            (&found["whole"], &found["parts"]),
+            (&json!(false), &json!(null))
+        );
+        if let Some(spot) = light.strip_prefix("spot-") {
+            let spot: u64 = spot.parse().unwrap();
+            assert_eq!(found["two"].as_array().unwrap().len(), 1, "{light}");
+            assert_eq!(found["two"][0]["spot"], spot);
+            assert_eq!(found["one"].is_null(), spot != 0, "{light}");
+        }
     }
 }
