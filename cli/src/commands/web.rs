@@ -11,7 +11,7 @@ use picofarm_proto::{
 };
 use picofarm_tasks::Access;
 use picofarm_web::{
-    Events, Farm, JobFilter, Refusal, Server, Settings as Shown, StartError, Workers,
+    Events, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError, Workers,
 };
 use serde_json::json;
 use tokio::sync::Mutex;
@@ -113,17 +113,27 @@ impl Coordinator {
             ask(&mut client).await
         };
         let answered = asked.await;
-        if let Err(e) = &answered
-            && e.code == Code::Coordinator
-            && !e.denied
-        {
+        if answered.as_ref().is_err_and(|e| kind(e) == Refused::Away) {
             *self.client.lock().await = None;
         }
         answered.map_err(|e| Refusal {
+            kind: kind(&e),
             message: e.message,
             hint: e.hint,
-            denied: e.denied,
         })
+    }
+}
+
+/// Returns why the coordinator gave no answer.
+fn kind(error: &CliError) -> Refused {
+    use tonic::Code as Grpc;
+    match error.status {
+        _ if error.denied => Refused::Denied,
+        Some(Grpc::NotFound) => Refused::Missing,
+        Some(Grpc::FailedPrecondition) => Refused::NotNow,
+        Some(Grpc::InvalidArgument | Grpc::OutOfRange) => Refused::Input,
+        _ if error.code == Code::Coordinator => Refused::Away,
+        _ => Refused::Failed,
     }
 }
 

@@ -24,7 +24,7 @@ use picofarm_store::StorageError;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-pub use farm::{Events, Farm, JobFilter, Refusal, Workers};
+pub use farm::{Events, Farm, JobFilter, Refusal, Refused, Workers};
 pub use guard::is_host;
 
 use self::{data::Stores, guard::Guard};

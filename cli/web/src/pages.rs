@@ -68,13 +68,13 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
     }
 }
 
-/// Returns an error as a page.
+/// Returns an error as a page. That of a coordinator that is away waits until it answers.
 pub fn problem(problem: &Problem) -> Page {
-    let title = problem.status.canonical_reason().unwrap_or("Error");
+    let title = problem.heading();
     Page {
         title: title.into(),
         tab: "",
-        live: false,
+        live: problem.is_away(),
         script: None,
         content: html! {
             section #problem.problem role="alert" {
@@ -134,7 +134,7 @@ pub fn layout(app: &App, page: &Page) -> Markup {
                     span.where title="coordinator" { (safe(app.farm.url())) }
                     span #state.state role="status" {}
                 }
-                main #main data-live[page.live] { (page.content) }
+                main #main { (page.content) }
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::{client::Web, farm::JOB};
 
-fn form(web: &Web) -> String {
+pub fn form(web: &Web) -> String {
     let html = web.get(&format!("/jobs/{JOB}")).text();
     let (_, rest) = html.split_once("name=\"form\" value=\"").expect("a form");
     format!("form={}", rest.split('"').next().unwrap())
