@@ -50,6 +50,9 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
         stores: args.store,
     };
     let server = start(shown, farm).await?;
+    for line in server.unread().await {
+        output.warn(format!("--store {line}"));
+    }
     let stop = signals::stop_on_signal()?;
     let link = server.link(first);
     let flight = server.first_flight().await.map(|path| server.link(&path));

@@ -59,6 +59,10 @@ impl http_body::Body for Body {
 /// An answer.
 pub type Answer = Response<Body>;
 
+/// How to find and to correct damage.
+pub const DAMAGED: &str = "`picofarm dataset verify` lists all damage of the data set, and \
+    `picofarm dataset repair` makes its broken scenes again";
+
 /// Why a request has no other answer.
 #[derive(Debug)]
 pub struct Problem {
@@ -146,7 +150,11 @@ impl From<picofarm_store::StorageError> for Problem {
             E::Store { .. } => StatusCode::SERVICE_UNAVAILABLE,
             _ => StatusCode::INTERNAL_SERVER_ERROR,
         };
-        Self::new(status, error.to_string())
+        let damaged = matches!(error, E::Damaged { .. });
+        Self {
+            hint: damaged.then(|| DAMAGED.to_owned()),
+            ..Self::new(status, error.to_string())
+        }
     }
 }
 

@@ -16,7 +16,7 @@ use serde_json::json;
 pub use self::{
     light::{Light, lights},
     picture::{Picture, Span},
-    stores::{DataSet, Stores},
+    stores::{DataSet, Listing, Stores},
     truth::Truth,
 };
 use crate::{

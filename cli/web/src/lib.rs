@@ -126,9 +126,19 @@ impl Server {
     /// Returns the path of the page that shows light in flight of the first finished scene; `None`
     /// if the stores have none.
     pub async fn first_flight(&self) -> Option<String> {
-        let sets = self.app.stores.list().await;
-        let set = sets.iter().find(|set| !set.scenes.is_empty())?;
+        let listed = self.app.stores.list().await;
+        let set = listed.sets.iter().find(|set| !set.scenes.is_empty())?;
         Some(data::flight_path(&set.id, *set.scenes.first()?))
+    }
+
+    /// Returns a line for each store or folder in one that cannot be read: its location and the
+    /// reason. The page of the data sets lists them too.
+    pub async fn unread(&self) -> Vec<String> {
+        let listed = self.app.stores.list().await;
+        let lines = listed.unread.iter();
+        lines
+            .map(|unread| format!("{}: {}", unread.place, unread.why))
+            .collect()
     }
 
     /// Answers requests until `stop`.
