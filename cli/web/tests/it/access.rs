@@ -252,6 +252,7 @@ fn the_first_view_of_each_page_is_below_300_kilobytes() {
         "style.css",
         "icon.svg",
         "live.js",
+        "grid.js",
         "scene.js",
         "flight.js",
         "volume.js",

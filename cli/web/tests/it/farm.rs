@@ -35,6 +35,8 @@ pub struct Memory {
     pub viewer: Mutex<bool>,
     /// Whether the job was cancelled before.
     pub ended: Mutex<bool>,
+    /// Whether no task runs.
+    pub idle: Mutex<bool>,
     /// Whether the coordinator does not answer.
     pub away: Mutex<bool>,
 }
@@ -136,6 +138,10 @@ impl Farm for Memory {
             true => JobState::Cancelled,
             false => JobState::Active,
         };
+        let mut tasks = COUNTS;
+        if *self.idle.lock().unwrap() {
+            (tasks.leased, tasks.pending) = (0, tasks.pending + tasks.leased);
+        }
         Ok(JobStatus {
             id: id(),
             name: EVIL.into(),
@@ -150,7 +156,7 @@ impl Farm for Memory {
                 kind: "render".into(),
                 state: StageState::Open,
                 needs: vec![EVIL.into()],
-                tasks: COUNTS,
+                tasks,
             }],
             spec: self.spec(id()).await?,
             mean_task_seconds: Some(2.0),
