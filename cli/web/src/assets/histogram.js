@@ -69,7 +69,7 @@ export class Histogram {
     if (this.parts) return `${height} · rendered apart: ${share(of[2])} one bounce, ` +
       `${share(of[1])} two bounces${from}, ${share(of[0])} three and more`;
     return height + (one ? ` · ${share(of[2])} at the time of one bounce (spot ${one.spot})` : '') +
-      (lit ? ` · ${share(of[1])} at times of two bounces,${from}` : ' · no spot lights this pixel');
+      (lit ? ` · ${share(of[1])} at times of two bounces,${from}` : ' · no times of two bounces: no spot lights this pixel');
   }
 
   range(zoom) { return zoom && this.pixel ? this.lit : [0, this.facts.bins]; }
