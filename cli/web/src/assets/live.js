@@ -97,6 +97,7 @@ async function refused() {
   delay = Math.min(LONGEST, Math.max(2000, 2 * delay));
   retry = setTimeout(follow, delay);
   poll = setInterval(ask, POLL);
+  ask();
   const mine = retry;
   const next = `next try in ${delay / 1000} s`;
   try {
