@@ -40,7 +40,8 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
     }
     let farm = Coordinator::new(&settings.coordinator, settings.access()?);
     // Without a farm, the data sets are the first page.
-    let (first, name) = match !args.store.is_empty() && farm.workers().await.is_err() {
+    let alone = !args.store.is_empty() && farm.workers().await.is_err();
+    let (first, name) = match alone {
         true => ("/data", "data sets"),
         false => ("/", "farm"),
     };
@@ -48,6 +49,7 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
         listen: args.listen,
         hosts: args.host,
         stores: args.store,
+        farm: !alone,
     };
     let server = start(shown, farm).await?;
     for line in server.unread().await {
@@ -247,6 +249,7 @@ pub async fn start_for_up(store: String, farm: Coordinator) -> Result<Server> {
         listen: free,
         hosts: Vec::new(),
         stores: vec![store],
+        farm: true,
     };
     start(shown, farm).await
 }

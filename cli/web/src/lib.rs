@@ -38,6 +38,9 @@ pub struct Settings {
     pub hosts: Vec<String>,
     /// Folders and URLs of the stores, data sets and renders to show. No others are read.
     pub stores: Vec<String>,
+    /// Whether a coordinator answers at the start. Without one, the pages of data sets have no
+    /// links to those of a farm.
+    pub farm: bool,
 }
 
 /// A server that listens and does not yet answer.
@@ -51,6 +54,8 @@ pub struct Server {
 struct App {
     guard: Guard,
     farm: Arc<dyn Farm>,
+    /// Whether the pages of data sets lead to those of the farm.
+    linked: bool,
     stores: Stores,
     limits: server::Limits,
     stop: CancellationToken,
@@ -94,6 +99,7 @@ impl Server {
         let app = App {
             guard: Guard::new(settings.hosts),
             farm,
+            linked: settings.farm,
             stores,
             limits: server::Limits::default(),
             stop: CancellationToken::new(),

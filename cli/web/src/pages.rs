@@ -105,6 +105,9 @@ pub fn locked() -> Page {
 
 /// Returns the whole document.
 pub fn layout(app: &App, page: &Page) -> Markup {
+    const DATA: &str = "/data";
+    let farm = app.linked || page.tab != DATA;
+    let tabs = TABS.into_iter().filter(|(path, _)| farm || *path == DATA);
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -123,15 +126,15 @@ pub fn layout(app: &App, page: &Page) -> Markup {
             body {
                 a.skip href="#main" { "Skip to content" }
                 header.top {
-                    a.brand href="/" { "picofarm" }
+                    a.brand href=(if farm { "/" } else { DATA }) { "picofarm" }
                     nav aria-label="Site" {
-                        @for (path, name) in TABS {
+                        @for (path, name) in tabs {
                             a href=(path) aria-current=[(path == page.tab).then_some("page")] {
                                 (name)
                             }
                         }
                     }
-                    span.where title="coordinator" { (safe(app.farm.url())) }
+                    @if farm { span.where title="coordinator" { (safe(app.farm.url())) } }
                     span #state.state role="status" {}
                 }
                 main #main { (page.content) }

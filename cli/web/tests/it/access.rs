@@ -71,6 +71,7 @@ fn an_address_that_others_reach_needs_a_name() {
             listen: "0.0.0.0:0".parse().unwrap(),
             hosts,
             stores: Vec::new(),
+            farm: true,
         };
         runtime.block_on(Server::bind(settings, Arc::new(Memory::default())))
     };
@@ -179,6 +180,19 @@ fn pages_wait_for_a_coordinator_that_is_away_and_actions_do_not() {
     let posted = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form);
     assert_eq!(posted.status, 502);
     assert!(!posted.text().contains("/assets/live.js"));
+}
+
+#[test]
+fn pages_of_data_sets_lead_to_a_farm_only_if_one_answered_at_the_start() {
+    for answers in [true, false] {
+        let web = Web::start_with(Vec::new(), answers);
+        let html = web.get("/data").text();
+        for path in ["/", "/jobs", "/workers", "/events", "/audit"] {
+            let link = format!("href=\"{path}\"");
+            assert_eq!(html.contains(&link), answers, "{path}: {html}");
+        }
+        assert!(html.contains("href=\"/data\" aria-current"), "{html}");
+    }
 }
 
 #[test]
