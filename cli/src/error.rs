@@ -27,6 +27,8 @@ pub struct CliError {
     pub hint: Option<String>,
     /// Whether the caller was denied access, so that a retry would not help.
     pub denied: bool,
+    /// The status with which the coordinator refused the call.
+    pub status: Option<tonic::Code>,
     /// The field of a job at which the coordinator refuses it.
     pub field: Option<String>,
 }
@@ -40,6 +42,7 @@ impl CliError {
             message: message.to_string(),
             hint: None,
             denied: false,
+            status: None,
             field: None,
         }
     }

@@ -56,6 +56,7 @@ fn refused(status: &Status) -> CliError {
             status.code(),
             Grpc::Unauthenticated | Grpc::PermissionDenied
         ),
+        status: Some(status.code()),
         field: field.and_then(|field| Some(field.to_str().ok()?.to_owned())),
         ..CliError::new(code, status.message())
     }

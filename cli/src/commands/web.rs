@@ -11,7 +11,7 @@ use picofarm_proto::{
 };
 use picofarm_tasks::Access;
 use picofarm_web::{
-    Events, Farm, JobFilter, Refusal, Server, Settings as Shown, StartError, Workers,
+    Events, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError, Workers,
 };
 use serde_json::json;
 use tokio::sync::Mutex;
@@ -40,7 +40,8 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
     }
     let farm = Coordinator::new(&settings.coordinator, settings.access()?);
     // Without a farm, the data sets are the first page.
-    let (first, name) = match !args.store.is_empty() && farm.workers().await.is_err() {
+    let alone = !args.store.is_empty() && farm.workers().await.is_err();
+    let (first, name) = match alone {
         true => ("/data", "data sets"),
         false => ("/", "farm"),
     };
@@ -48,8 +49,12 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
         listen: args.listen,
         hosts: args.host,
         stores: args.store,
+        farm: !alone,
     };
     let server = start(shown, farm).await?;
+    for line in server.unread().await {
+        output.warn(format!("--store {line}"));
+    }
     let stop = signals::stop_on_signal()?;
     let link = server.link(first);
     let flight = server.first_flight().await.map(|path| server.link(&path));
@@ -113,17 +118,27 @@ impl Coordinator {
             ask(&mut client).await
         };
         let answered = asked.await;
-        if let Err(e) = &answered
-            && e.code == Code::Coordinator
-            && !e.denied
-        {
+        if answered.as_ref().is_err_and(|e| kind(e) == Refused::Away) {
             *self.client.lock().await = None;
         }
         answered.map_err(|e| Refusal {
+            kind: kind(&e),
             message: e.message,
             hint: e.hint,
-            denied: e.denied,
         })
+    }
+}
+
+/// Returns why the coordinator gave no answer.
+fn kind(error: &CliError) -> Refused {
+    use tonic::Code as Grpc;
+    match error.status {
+        _ if error.denied => Refused::Denied,
+        Some(Grpc::NotFound) => Refused::Missing,
+        Some(Grpc::FailedPrecondition) => Refused::NotNow,
+        Some(Grpc::InvalidArgument | Grpc::OutOfRange) => Refused::Input,
+        _ if error.code == Code::Coordinator => Refused::Away,
+        _ => Refused::Failed,
     }
 }
 
@@ -234,6 +249,7 @@ pub async fn start_for_up(store: String, farm: Coordinator) -> Result<Server> {
         listen: free,
         hosts: Vec::new(),
         stores: vec![store],
+        farm: true,
     };
     start(shown, farm).await
 }

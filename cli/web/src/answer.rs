@@ -59,6 +59,10 @@ impl http_body::Body for Body {
 /// An answer.
 pub type Answer = Response<Body>;
 
+/// How to find and to correct damage.
+pub const DAMAGED: &str = "`picofarm dataset verify` lists all damage of the data set, and \
+    `picofarm dataset repair` makes its broken scenes again";
+
 /// Why a request has no other answer.
 #[derive(Debug)]
 pub struct Problem {
@@ -85,6 +89,25 @@ impl Problem {
         Self::new(StatusCode::BAD_REQUEST, message)
     }
 
+    /// Returns whether the coordinator cannot be reached, so that a later try may succeed.
+    pub fn is_away(&self) -> bool {
+        self.status == StatusCode::BAD_GATEWAY
+    }
+
+    /// Returns the reason in a few words.
+    pub fn heading(&self) -> &'static str {
+        match self.status {
+            StatusCode::BAD_REQUEST => "This address has a mistake",
+            StatusCode::FORBIDDEN => "Not allowed",
+            StatusCode::NOT_FOUND => "Not found",
+            StatusCode::CONFLICT => "Not possible in this state",
+            StatusCode::BAD_GATEWAY => "The coordinator does not answer",
+            StatusCode::SERVICE_UNAVAILABLE => "Not available now",
+            StatusCode::INTERNAL_SERVER_ERROR => "This cannot be read",
+            status => status.canonical_reason().unwrap_or("Error"),
+        }
+    }
+
     /// There is no such page or thing.
     pub fn missing(message: impl Into<String>) -> Self {
         Self::new(StatusCode::NOT_FOUND, message)
@@ -99,9 +122,14 @@ impl From<String> for Problem {
 
 impl From<crate::Refusal> for Problem {
     fn from(refusal: crate::Refusal) -> Self {
-        let status = match refusal.denied {
-            true => StatusCode::FORBIDDEN,
-            false => StatusCode::BAD_GATEWAY,
+        use crate::Refused as R;
+        let status = match refusal.kind {
+            R::Away => StatusCode::BAD_GATEWAY,
+            R::Denied => StatusCode::FORBIDDEN,
+            R::Missing => StatusCode::NOT_FOUND,
+            R::NotNow => StatusCode::CONFLICT,
+            R::Input => StatusCode::BAD_REQUEST,
+            R::Failed => StatusCode::INTERNAL_SERVER_ERROR,
         };
         Self {
             status,
@@ -119,9 +147,14 @@ impl From<picofarm_store::StorageError> for Problem {
                 StatusCode::NOT_FOUND
             }
             E::Invalid { .. } => StatusCode::BAD_REQUEST,
-            _ => StatusCode::BAD_GATEWAY,
+            E::Store { .. } => StatusCode::SERVICE_UNAVAILABLE,
+            _ => StatusCode::INTERNAL_SERVER_ERROR,
         };
-        Self::new(status, error.to_string())
+        let damaged = matches!(error, E::Damaged { .. });
+        Self {
+            hint: damaged.then(|| DAMAGED.to_owned()),
+            ..Self::new(status, error.to_string())
+        }
     }
 }
 

@@ -13,6 +13,7 @@ pub fn find(name: &str) -> Option<(&'static str, &'static str)> {
         ),
         "icon.svg" => ("image/svg+xml", include_str!("assets/icon.svg")),
         "live.js" => (SCRIPT, include_str!("assets/live.js")),
+        "grid.js" => (SCRIPT, include_str!("assets/grid.js")),
         "scene.js" => (SCRIPT, include_str!("assets/scene.js")),
         "flight.js" => (SCRIPT, include_str!("assets/flight.js")),
         "volume.js" => (SCRIPT, include_str!("assets/volume.js")),

@@ -16,7 +16,7 @@ use serde_json::json;
 pub use self::{
     light::{Light, lights},
     picture::{Picture, Span},
-    stores::{DataSet, Stores},
+    stores::{DataSet, Listing, Stores},
     truth::Truth,
 };
 use crate::{
@@ -110,12 +110,17 @@ pub async fn bytes(app: &Arc<App>, what: &str, query: &Query) -> Result<Answer, 
         "pixel" => {
             let pixel = pixel()?;
             let truth = app.stores.truth(app, &id).await?;
-            let volume = app.stores.volume(app, &id, Light::of(query)?).await?;
-            let parts = app.stores.parts(app, &id).await?;
+            let light = Light::of(query)?;
+            let volume = app.stores.volume(app, &id, light).await?;
+            // The parts are those of all light.
+            let parts = match light {
+                Light::All => app.stores.parts(app, &id).await?,
+                _ => None,
+            };
             let parts = parts
                 .as_ref()
                 .map(|parts| parts.each_ref().map(|part| &**part));
-            let found = histogram::of_pixel(&truth, &volume, parts, pixel)?;
+            let found = histogram::of_pixel(&truth, (light, &volume), parts, pixel)?;
             compressed(JSON, found.to_string(), 1)
         }
         _ => return Err(Problem::missing(format!("there is no /bytes/{what}"))),

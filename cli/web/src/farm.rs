@@ -14,12 +14,29 @@ use picofarm_proto::{
 /// Why the coordinator gave no answer.
 #[derive(Debug, Clone)]
 pub struct Refusal {
+    /// The kind of reason.
+    pub kind: Refused,
     /// What happened.
     pub message: String,
     /// What the user can do.
     pub hint: Option<String>,
-    /// Whether the caller's rights do not suffice.
-    pub denied: bool,
+}
+
+/// The kinds of reasons for which a coordinator gives no answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refused {
+    /// It cannot be reached, or its catalog cannot.
+    Away,
+    /// The caller's rights do not suffice.
+    Denied,
+    /// It has no such job, stage or task.
+    Missing,
+    /// The state of the job does not allow the action.
+    NotNow,
+    /// The request is wrong.
+    Input,
+    /// Something else failed.
+    Failed,
 }
 
 /// Selects jobs of the list.

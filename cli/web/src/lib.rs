@@ -24,7 +24,7 @@ use picofarm_store::StorageError;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-pub use farm::{Events, Farm, JobFilter, Refusal, Workers};
+pub use farm::{Events, Farm, JobFilter, Refusal, Refused, Workers};
 pub use guard::is_host;
 
 use self::{data::Stores, guard::Guard};
@@ -38,6 +38,9 @@ pub struct Settings {
     pub hosts: Vec<String>,
     /// Folders and URLs of the stores, data sets and renders to show. No others are read.
     pub stores: Vec<String>,
+    /// Whether a coordinator answers at the start. Without one, the pages of data sets have no
+    /// links to those of a farm.
+    pub farm: bool,
 }
 
 /// A server that listens and does not yet answer.
@@ -51,6 +54,8 @@ pub struct Server {
 struct App {
     guard: Guard,
     farm: Arc<dyn Farm>,
+    /// Whether the pages of data sets lead to those of the farm.
+    linked: bool,
     stores: Stores,
     limits: server::Limits,
     stop: CancellationToken,
@@ -94,6 +99,7 @@ impl Server {
         let app = App {
             guard: Guard::new(settings.hosts),
             farm,
+            linked: settings.farm,
             stores,
             limits: server::Limits::default(),
             stop: CancellationToken::new(),
@@ -126,9 +132,19 @@ impl Server {
     /// Returns the path of the page that shows light in flight of the first finished scene; `None`
     /// if the stores have none.
     pub async fn first_flight(&self) -> Option<String> {
-        let sets = self.app.stores.list().await;
-        let set = sets.iter().find(|set| !set.scenes.is_empty())?;
+        let listed = self.app.stores.list().await;
+        let set = listed.sets.iter().find(|set| !set.scenes.is_empty())?;
         Some(data::flight_path(&set.id, *set.scenes.first()?))
+    }
+
+    /// Returns a line for each store or folder in one that cannot be read: its location and the
+    /// reason. The page of the data sets lists them too.
+    pub async fn unread(&self) -> Vec<String> {
+        let listed = self.app.stores.list().await;
+        let lines = listed.unread.iter();
+        lines
+            .map(|unread| format!("{}: {}", unread.place, unread.why))
+            .collect()
     }
 
     /// Answers requests until `stop`.

@@ -1,4 +1,5 @@
-//! Server-sent events: a page's content, sent again whenever it changes.
+//! Server-sent events: a page's content, sent again whenever it changes. The event `away` has the
+//! reason why the coordinator gave none.
 
 use std::{sync::Arc, time::Duration};
 
@@ -13,6 +14,8 @@ use crate::{
     query::Query,
 };
 
+/// Most pages that are followed at a time.
+pub const MOST: usize = 48;
 /// Interval at which the coordinator is asked.
 const PERIOD: Duration = Duration::from_secs(1);
 /// A comment is sent after so many unchanged periods, so that a vanished browser is noticed.
@@ -24,8 +27,11 @@ const QUIET: u32 = 15;
 /// Fails if too many pages are followed.
 pub fn follow(app: &Arc<App>, path: String, query: Query) -> Result<Answer, Problem> {
     let Ok(place) = Arc::clone(&app.limits.live).try_acquire_owned() else {
-        let what = "too many open pages; close some";
-        return Err(Problem::new(StatusCode::SERVICE_UNAVAILABLE, what));
+        let what = format!("{MOST} pages are followed already, which is the limit");
+        return Err(Problem {
+            hint: Some("close pages that are not needed".into()),
+            ..Problem::new(StatusCode::SERVICE_UNAVAILABLE, what)
+        });
     };
     let (sender, parts) = mpsc::channel(2);
     let app = Arc::clone(app);
@@ -33,15 +39,17 @@ pub fn follow(app: &Arc<App>, path: String, query: Query) -> Result<Answer, Prob
         let _place = place;
         let (mut last, mut quiet) = (String::new(), 0);
         while !app.stop.is_cancelled() {
-            let content = match pages::content(&app, &path, &query).await {
-                Ok(page) => page.content.into_string(),
-                Err(problem) => pages::problem(&problem).content.into_string(),
+            let event = match pages::content(&app, &path, &query).await {
+                Ok(page) => event("message", &page.content.into_string()),
+                // The page keeps its content.
+                Err(problem) if problem.is_away() => event("away", &problem.message),
+                Err(problem) => event("message", &pages::problem(&problem).content.into_string()),
             };
             quiet += 1;
-            let part = match content == last {
+            let part = match event == last {
                 true if quiet < QUIET => None,
                 true => Some(": still here\n\n".to_owned()),
-                false => Some(event(&content)),
+                false => Some(event.clone()),
             };
             if let Some(part) = part {
                 quiet = 0;
@@ -49,7 +57,7 @@ pub fn follow(app: &Arc<App>, path: String, query: Query) -> Result<Answer, Prob
                     return;
                 }
             }
-            last = content;
+            last = event;
             tokio::select! {
                 () = tokio::time::sleep(PERIOD) => {}
                 () = sender.closed() => return,
@@ -60,10 +68,10 @@ pub fn follow(app: &Arc<App>, path: String, query: Query) -> Result<Answer, Prob
     Ok(stream("text/event-stream", parts))
 }
 
-/// A text as one event; each of its lines needs a prefix.
-fn event(text: &str) -> String {
+/// A text as one event of a type; each of its lines needs a prefix.
+fn event(kind: &str, text: &str) -> String {
     let lines = text.split(['\n', '\r']).map(|l| format!("data: {l}\n"));
-    lines.collect::<String>() + "\n"
+    format!("event: {kind}\n{}\n", lines.collect::<String>())
 }
 
 #[cfg(test)]
@@ -72,8 +80,9 @@ mod tests {
 
     #[test]
     fn no_line_of_a_text_begins_a_field_of_its_own() {
-        let text = event("<pre>a\nevent: x\r\ndata: y</pre>");
-        for line in text.lines().filter(|line| !line.is_empty()) {
+        let text = event("message", "<pre>a\nevent: x\r\ndata: y</pre>");
+        let rest = text.strip_prefix("event: message\n").unwrap();
+        for line in rest.lines().filter(|line| !line.is_empty()) {
             assert!(line.starts_with("data: "), "{line}");
         }
         assert!(text.ends_with("\n\n") && !text.trim_end().contains("\n\n"));

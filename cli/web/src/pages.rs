@@ -68,13 +68,13 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
     }
 }
 
-/// Returns an error as a page.
+/// Returns an error as a page. That of a coordinator that is away waits until it answers.
 pub fn problem(problem: &Problem) -> Page {
-    let title = problem.status.canonical_reason().unwrap_or("Error");
+    let title = problem.heading();
     Page {
         title: title.into(),
         tab: "",
-        live: false,
+        live: problem.is_away(),
         script: None,
         content: html! {
             section #problem.problem role="alert" {
@@ -105,6 +105,9 @@ pub fn locked() -> Page {
 
 /// Returns the whole document.
 pub fn layout(app: &App, page: &Page) -> Markup {
+    const DATA: &str = "/data";
+    let farm = app.linked || page.tab != DATA;
+    let tabs = TABS.into_iter().filter(|(path, _)| farm || *path == DATA);
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -123,18 +126,18 @@ pub fn layout(app: &App, page: &Page) -> Markup {
             body {
                 a.skip href="#main" { "Skip to content" }
                 header.top {
-                    a.brand href="/" { "picofarm" }
+                    a.brand href=(if farm { "/" } else { DATA }) { "picofarm" }
                     nav aria-label="Site" {
-                        @for (path, name) in TABS {
+                        @for (path, name) in tabs {
                             a href=(path) aria-current=[(path == page.tab).then_some("page")] {
                                 (name)
                             }
                         }
                     }
-                    span.where title="coordinator" { (safe(app.farm.url())) }
+                    @if farm { span.where title="coordinator" { (safe(app.farm.url())) } }
                     span #state.state role="status" {}
                 }
-                main #main data-live[page.live] { (page.content) }
+                main #main { (page.content) }
             }
         }
     }

@@ -46,12 +46,24 @@ async fn find(app: &Arc<App>, head: &Parts, form: &str) -> Answer {
         Method::POST => act(app, head, path, &Query::parse(form)).await,
         _ => Err(not_allowed("GET, HEAD")),
     };
-    answered.unwrap_or_else(|problem| self::problem(app, &problem))
+    answered.unwrap_or_else(|problem| match is_read(&head.method) {
+        true => self::problem(app, &problem),
+        // The address of an action shows nothing that could be followed.
+        false => {
+            let mut shown = pages::problem(&problem);
+            shown.live = false;
+            refuse(app, &problem, &shown)
+        }
+    })
 }
 
 /// Returns an error as a page.
 pub fn problem(app: &App, problem: &Problem) -> Answer {
-    let mut answer = page(app, problem.status, &pages::problem(problem));
+    refuse(app, problem, &pages::problem(problem))
+}
+
+fn refuse(app: &App, problem: &Problem, shown: &pages::Page) -> Answer {
+    let mut answer = page(app, problem.status, shown);
     if problem.status == StatusCode::METHOD_NOT_ALLOWED
         && let Some(allowed) = &problem.hint
         && let Ok(allowed) = HeaderValue::from_str(allowed)

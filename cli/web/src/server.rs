@@ -12,13 +12,11 @@ use tokio_util::sync::CancellationToken;
 use crate::{
     App,
     answer::{Answer, Problem},
-    routes,
+    live, routes,
 };
 
 /// Most concurrent connections. Each open page has one for its events.
 const CONNECTIONS: usize = 128;
-/// Most pages that get events.
-const LIVE: usize = 48;
 /// Most scenes whose images are read at a time; further requests wait.
 const IMAGES: usize = 2;
 /// The longest request head, bytes.
@@ -42,7 +40,7 @@ pub struct Limits {
 impl Default for Limits {
     fn default() -> Self {
         Self {
-            live: Arc::new(Semaphore::new(LIVE)),
+            live: Arc::new(Semaphore::new(live::MOST)),
             images: Semaphore::new(IMAGES),
             volumes: Semaphore::new(1),
         }

@@ -120,6 +120,8 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     );
     browser.until("document.documentElement.dataset.flight === 'full'");
     assert_ne!(seek("40"), all);
+    // Shares are those of all light.
+    browser.until("!document.getElementById('picked').textContent.includes('%')");
     // The address has the state: a new page shows the same.
     let there = browser.run("return location.href");
     let shown = browser.run("return document.getElementById('clock').textContent");

@@ -14,6 +14,7 @@ let playing = false, time = 0, picked = null, dirty = true, turn = 0;
 function fail(text) {
   $('message').textContent = text;
   $('message').hidden = false;
+  $('loaded').textContent = '';
   document.documentElement.dataset.flight = 'failed';
 }
 
@@ -157,8 +158,9 @@ async function pick(column, row) {
     const found = await (await get('pixel', `&row=${picked[1]}&column=${picked[0]}`)).json();
     if (mine !== picking) return;
     histogram.set(found);
+    $('kinds').hidden = !found.whole;
     const v = found.values;
-    $('picked').textContent = `Column ${picked[0]}, row ${picked[1]}: ${v.label_name ?? 'nothing'}, ${v.range_m.toFixed(2)} m · ${histogram.words()}`;
+    $('picked').textContent = `Column ${picked[0]}, row ${picked[1]}: ${v.label_name ?? 'nothing'}, ${v.range_m?.toFixed(2) ?? '?'} m · ${histogram.words()}`;
     $('histogram').setAttribute('aria-label', $('picked').textContent);
     document.documentElement.dataset.picked = picked.join(',');
     keep();
@@ -229,8 +231,9 @@ async function slabs(mine, began) {
     $('loaded').textContent = `${Math.round(100 * done / facts.bins)} % of all pixels`;
     touch();
   }
-  const mb = (2 * facts.width * facts.height * facts.bins / 1e6).toFixed(0);
-  $('loaded').textContent = `first picture after ${document.documentElement.dataset.first} ms, all ${mb} MB after ${Math.round(performance.now() - began)} ms`;
+  const bytes = 2 * facts.width * facts.height * facts.bins;
+  const size = bytes < 1e6 ? `${(bytes / 1e3).toFixed(0)} kB` : `${(bytes / 1e6).toFixed(bytes < 1e7 ? 1 : 0)} MB`;
+  $('loaded').textContent = `first picture after ${document.documentElement.dataset.first} ms, all ${size} after ${Math.round(performance.now() - began)} ms`;
   document.documentElement.dataset.flight = 'full';
 }
 

@@ -37,8 +37,11 @@ export class Histogram {
       const bin = Math.floor(this.bin(path));
       for (let b = bin - 1; b <= bin + 1; b++) if (b >= 0 && b < h.length && kinds[b] < kind) kinds[b] = kind;
     };
-    for (const spot of pixel.two) if (spot.lit) mark(spot.path_m, 1);
-    if (pixel.one) mark(pixel.one.path_m, 2);
+    // Selected light has no shares, so its bars are of one colour.
+    if (pixel.whole) {
+      for (const spot of pixel.two) if (spot.lit) mark(spot.path_m, 1);
+      if (pixel.one) mark(pixel.one.path_m, 2);
+    }
     this.kinds = kinds;
     // What the render tells apart needs no prediction. The remainder of rounding is no light.
     const most = h.reduce((a, b) => Math.max(a, b), 0);
@@ -50,21 +53,23 @@ export class Histogram {
 
   /** A summary for the page and for screen readers. */
   words() {
-    const { h, one, two } = this.pixel;
+    const { h, one, two, whole } = this.pixel;
     const sum = h.reduce((a, b) => a + b, 0);
     if (sum === 0) return 'no light';
     let peak = 0;
     for (let b = 1; b < h.length; b++) if (h[b] > h[peak]) peak = b;
+    const height = `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns`;
+    if (!whole) return height;
     const of = [0, 0, 0];
     if (this.parts) this.parts.forEach((part, kind) => { of[kind] = part.reduce((a, b) => a + b, 0); });
     else h.forEach((v, b) => { of[this.kinds[b]] += v; });
     const share = (x) => `${(100 * x / sum).toFixed(0)} %`;
     const lit = two.filter((spot) => spot.lit).length;
-    if (this.parts) return `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns · rendered apart: ${share(of[2])} one bounce, ` +
-      `${share(of[1])} two bounces from ${lit} of ${two.length} spots, ${share(of[0])} three and more`;
-    return `peak ${h[peak].toPrecision(3)} at ${this.ns(peak + 0.5).toFixed(2)} ns` +
-      (one ? ` · ${share(of[2])} at the time of one bounce (spot ${one.spot})` : '') +
-      ` · ${share(of[1])} at times of two bounces, from ${lit} of ${two.length} spots`;
+    const from = lit ? ` from ${lit} of ${two.length} spots` : '';
+    if (this.parts) return `${height} · rendered apart: ${share(of[2])} one bounce, ` +
+      `${share(of[1])} two bounces${from}, ${share(of[0])} three and more`;
+    return height + (one ? ` · ${share(of[2])} at the time of one bounce (spot ${one.spot})` : '') +
+      (lit ? ` · ${share(of[1])} at times of two bounces,${from}` : ' · no times of two bounces: no spot lights this pixel');
   }
 
   range(zoom) { return zoom && this.pixel ? this.lit : [0, this.facts.bins]; }

@@ -5,13 +5,14 @@ let point = null;
 let asked = 0;
 
 function number(value) {
+  if (value === null) return 'damaged';
   return value === 0 ? '0' : Math.abs(value) < 0.001 || Math.abs(value) >= 1e5 ? value.toExponential(2) : value.toPrecision(4);
 }
 
 function words(v) {
-  const lit = v.lit_by.length === 0 ? 'no spot' : v.lit_by.length > 8 ? `${v.lit_by.length} spots` : `spots ${v.lit_by.join(', ')}`;
-  const what = v.label === 0 ? 'nothing' : `${v.label_name ?? `label ${v.label}`} (object ${v.instance})`;
-  return `depth ${number(v.depth_m)} m · range ${number(v.range_m)} m · normal ${v.normal.map((x) => x.toFixed(2)).join(' ')} · ` +
+  const lit = v.lit_by === null ? 'damaged' : v.lit_by.length === 0 ? 'no spot' : v.lit_by.length > 8 ? `${v.lit_by.length} spots` : `spots ${v.lit_by.join(', ')}`;
+  const what = v.label === null ? 'label damaged' : v.label === 0 ? 'nothing' : `${v.label_name ?? `label ${v.label}`} (object ${v.instance ?? 'damaged'})`;
+  return `depth ${number(v.depth_m)} m · range ${number(v.range_m)} m · normal ${v.normal?.map((x) => x.toFixed(2)).join(' ') ?? 'damaged'} · ` +
     `${what}${v.mirror ? ', mirror' : ''} · light ${number(v.intensity)} · lit by ${lit}`;
 }
 

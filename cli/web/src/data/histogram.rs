@@ -2,29 +2,36 @@
 
 use serde_json::{Value, json};
 
-use super::{Truth, truth::METRES_PER_NS, volume::Volume};
+use super::{Light, Truth, truth::METRES_PER_NS, volume::Volume};
 use crate::answer::Problem;
 
 /// Returns h of each bin, h of two bounces and of three and more where the render has these
 /// `parts`, the time of the pixel's own spot, and for each spot the time of its
 /// two-bounce light: laser to spot, spot to the pixel's surface point, and from there to the camera
-/// (the two-bounce time of flight of PlatoNeRF, Klinghoffer et al., CVPR 2024).
+/// (the two-bounce time of flight of PlatoNeRF, Klinghoffer et al., CVPR 2024). With the light of
+/// one spot, the times are those of this spot. `whole` is true for all light: shares of
+/// bounces have no meaning for a part of it.
 ///
 /// # Errors
-/// Fails outside of the image.
+/// Fails outside of the image, and if an array that the times follow from is damaged.
 pub fn of_pixel(
     truth: &Truth,
-    volume: &Volume,
+    (light, volume): (Light, &Volume),
     parts: Option<[&Volume; 2]>,
     at: [u64; 2],
 ) -> Result<Value, Problem> {
     let pixel = truth.pixel(at)?;
-    let lit = truth.lit_by(pixel);
-    let point = truth.point(pixel);
-    let two: Vec<Value> = truth
-        .spots
+    let lit = truth.lit_by(pixel)?;
+    let point = truth.point(pixel)?;
+    let spots = truth.spots.as_ref()?;
+    let chosen = |spot: usize| match light {
+        Light::Spot(chosen) => chosen as usize == spot,
+        _ => true,
+    };
+    let two: Vec<Value> = spots
         .iter()
         .enumerate()
+        .filter(|(i, _)| chosen(*i))
         .filter_map(|(i, spot)| {
             let (spot, point) = (spot.as_ref()?, point?);
             let position = spot.position.map(f64::from);
@@ -35,16 +42,17 @@ pub fn of_pixel(
         })
         .collect();
     let [row, column] = at.map(|x| x as f32);
-    let own = truth.spots.iter().enumerate().find_map(|(i, spot)| {
+    let own = spots.iter().enumerate().find_map(|(i, spot)| {
         let spot = spot.as_ref()?;
-        let [x, y] = truth.film(spot)?;
+        let [x, y] = truth.film(spot).ok()??;
         let inside = (column..column + 1.0).contains(&x) && (row..row + 1.0).contains(&y);
         let path = f64::from(spot.path_m) + length(spot.position.map(f64::from));
-        inside.then(|| json!({"spot": i, "path_m": path, "ns": path / METRES_PER_NS}))
+        (inside && chosen(i))
+            .then(|| json!({"spot": i, "path_m": path, "ns": path / METRES_PER_NS}))
     });
     Ok(json!({
         "h": volume.histogram(pixel), "parts": parts.map(|parts| parts.map(|p| p.histogram(pixel))),
-        "one": own, "two": two, "values": truth.values(at)?,
+        "whole": light == Light::All, "one": own, "two": two, "values": truth.values(at)?,
     }))
 }
 

@@ -2,7 +2,7 @@
 
 use picofarm_figures::{Canvas, inferno, rgb_png, scene::quantile, viridis};
 
-use super::Truth;
+use super::{Truth, truth::Damage};
 use crate::{answer::Problem, query::Query};
 
 /// Where nothing is.
@@ -91,7 +91,7 @@ impl Picture {
     /// Draws the picture as PNG, one pixel for each, with the meaning of its colours.
     ///
     /// # Errors
-    /// Fails if the scene has no such spot.
+    /// Fails if the scene has no such spot, and if an array that the picture shows is damaged.
     pub fn draw(self, truth: &Truth) -> Result<(Vec<u8>, Option<Span>), Problem> {
         let (colour, span) = self.colours(truth)?;
         let pixels: Vec<[u8; 3]> = (0..truth.spec.pixels()).map(colour).collect();
@@ -100,18 +100,25 @@ impl Picture {
     }
 
     /// Returns the meaning of the colours, where they have values.
-    pub fn span(self, truth: &Truth) -> Option<Span> {
-        self.colours(truth).ok().and_then(|(_, span)| span)
+    ///
+    /// # Errors
+    /// Fails as [`draw`](Self::draw) does.
+    pub fn span(self, truth: &Truth) -> Result<Option<Span>, Problem> {
+        Ok(self.colours(truth)?.1)
     }
 
     fn colours(self, truth: &Truth) -> Result<(Colours<'_>, Option<Span>), Problem> {
-        let rgb = |p: usize| [truth.rgb[3 * p], truth.rgb[3 * p + 1], truth.rgb[3 * p + 2]];
+        let rgb = || -> Result<_, &Damage> {
+            let rgb = truth.rgb.as_ref()?;
+            Ok(|p: usize| [rgb[3 * p], rgb[3 * p + 1], rgb[3 * p + 2]])
+        };
         Ok(match self {
-            Self::Rgb => (Box::new(rgb), None),
+            Self::Rgb => (Box::new(rgb()?), None),
             Self::Depth => {
-                let seen: Vec<f32> = truth.depth.iter().copied().filter(|d| *d > 0.0).collect();
+                let depth = truth.depth.as_ref()?;
+                let seen: Vec<f32> = depth.iter().copied().filter(|d| *d > 0.0).collect();
                 let (near, far) = (quantile(&seen, 0.001), quantile(&seen, 1.0));
-                let colour = move |p: usize| match truth.depth[p] {
+                let colour = move |p: usize| match depth[p] {
                     d if d > 0.0 => viridis(1.0 - (d - near) / (far - near).max(1e-6)),
                     _ => NOTHING,
                 };
@@ -123,8 +130,9 @@ impl Picture {
                 (Box::new(colour), Some(span))
             }
             Self::Normal => {
+                let normal = truth.normal.as_ref()?;
                 let colour = |p: usize| {
-                    let n = &truth.normal[3 * p..][..3];
+                    let n = &normal[3 * p..][..3];
                     match n.iter().all(|x| *x == 0.0) {
                         true => NOTHING,
                         // y and z point down and away; their colours grow the other way.
@@ -134,8 +142,9 @@ impl Picture {
                 (Box::new(colour), None)
             }
             Self::Intensity => {
-                let white = quantile(&truth.intensity, 0.995).max(f32::MIN_POSITIVE);
-                let colour = move |p: usize| inferno((truth.intensity[p] / white).sqrt());
+                let light = truth.intensity.as_ref()?;
+                let white = quantile(light, 0.995).max(f32::MIN_POSITIVE);
+                let colour = move |p: usize| inferno((light[p] / white).sqrt());
                 let span = Span {
                     ends: [0.0, white],
                     unit: "1/(m² sr), square root",
@@ -143,22 +152,30 @@ impl Picture {
                 };
                 (Box::new(colour), Some(span))
             }
-            Self::Instance => (Box::new(|p| distinct(truth.instance[p])), None),
-            Self::Label => (Box::new(|p| distinct(u32::from(truth.label[p]))), None),
+            Self::Instance => {
+                let instance = truth.instance.as_ref()?;
+                (Box::new(|p| distinct(instance[p])), None)
+            }
+            Self::Label => {
+                let label = truth.label.as_ref()?;
+                (Box::new(|p| distinct(u32::from(label[p]))), None)
+            }
             Self::Mirror => {
-                let colour = move |p: usize| match truth.specular[p] {
+                let (mirrors, rgb) = (truth.specular.as_ref()?, rgb()?);
+                let colour = move |p: usize| match mirrors[p] {
                     1 => [255; 3],
                     _ => rgb(p).map(|c| c / 3),
                 };
                 (Box::new(colour), None)
             }
             Self::Lit(spot) => {
-                let count = truth.spots.len();
+                let count = truth.spec.spots as usize;
                 if spot >= count {
                     let what = format!("spot: expected a number below {count}, found {spot}");
                     return Err(Problem::input(what));
                 }
-                let mask = &truth.visibility[spot * truth.spec.pixels()..];
+                let rgb = rgb()?;
+                let mask = &truth.visibility.as_ref()?[spot * truth.spec.pixels()..];
                 let colour = move |p: usize| match mask[p] {
                     1 => rgb(p).map(|c| 96 + c / 8 * 5),
                     _ => rgb(p).map(|c| c / 4),

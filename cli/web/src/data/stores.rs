@@ -53,10 +53,32 @@ pub struct DataSet {
     pub scenes: Vec<u64>,
 }
 
+/// A store or a folder in it that cannot be read.
+#[derive(Debug, Clone)]
+pub struct Unread {
+    /// Its name in URLs, as of a data set.
+    pub id: String,
+    /// Its location for people.
+    pub place: String,
+    /// Why.
+    pub why: String,
+    /// What the user can do.
+    pub hint: Option<String>,
+}
+
+/// What there is in the stores.
+#[derive(Debug, Default)]
+pub struct Listing {
+    /// The data sets.
+    pub sets: Vec<DataSet>,
+    /// What cannot be read.
+    pub unread: Vec<Unread>,
+}
+
 /// The stores of a server, and what it has decoded of them.
 pub struct Stores {
     places: Vec<Place>,
-    listed: Mutex<Option<(Instant, Arc<[DataSet]>)>>,
+    listed: Mutex<Option<(Instant, Arc<Listing>)>>,
     truths: Cache<SceneId, Truth>,
     volumes: Cache<(SceneId, Light), Volume>,
 }
@@ -93,23 +115,21 @@ impl Stores {
         self.places.iter().map(|place| &*place.name)
     }
 
-    /// Returns the data sets. Those that cannot be read are logged and left out.
-    pub async fn list(&self) -> Arc<[DataSet]> {
+    /// Returns the data sets, and what cannot be read.
+    pub async fn list(&self) -> Arc<Listing> {
         let mut listed = self.listed.lock().await;
         if let Some((at, sets)) = &*listed
             && at.elapsed() < FRESH
         {
             return Arc::clone(sets);
         }
-        let mut sets = Vec::new();
+        let mut found = Listing::default();
         for (position, place) in self.places.iter().enumerate() {
-            if let Err(error) = place.search(position, &mut sets).await {
-                tracing::warn!(%error, store = place.name, "a store cannot be listed");
-            }
+            place.search(position, &mut found).await;
         }
-        let sets: Arc<[DataSet]> = sets.into();
-        *listed = Some((Instant::now(), Arc::clone(&sets)));
-        sets
+        let found = Arc::new(found);
+        *listed = Some((Instant::now(), Arc::clone(&found)));
+        found
     }
 
     /// Opens the data set of a URL.
@@ -188,8 +208,11 @@ impl Stores {
         }
         let dataset = self.dataset(&id.set).await?;
         let truth = Arc::new(Truth::read(&dataset, id.scene).await?);
-        self.truths
-            .insert(id.clone(), Arc::clone(&truth), truth.bytes());
+        // Damage may be repaired at any time.
+        if truth.is_whole() {
+            self.truths
+                .insert(id.clone(), Arc::clone(&truth), truth.bytes());
+        }
         Ok(truth)
     }
 
@@ -242,55 +265,81 @@ impl Stores {
 }
 
 impl Place {
-    /// Adds the data sets of this place: itself, or those in its folders.
-    async fn search(&self, position: usize, found: &mut Vec<DataSet>) -> Result<(), StorageError> {
+    /// Adds the data sets of this place, itself or those in its folders, and what cannot be read.
+    async fn search(&self, position: usize, found: &mut Listing) {
+        let unread = |below: &str, problem: Problem| Unread {
+            id: format!("{position}{below}"),
+            place: format!("{}{below}", self.name),
+            why: problem.message,
+            hint: problem.hint,
+        };
+        if let Some(folder) = &self.folder
+            && !folder.is_dir()
+        {
+            let missing = Problem::missing("there is no such folder");
+            found.unread.push(unread("", missing));
+            return;
+        }
         let mut folders = vec![(self.prefix.clone(), String::new(), 0)];
         let mut looked = 0;
         while let Some((prefix, below, depth)) = folders.pop() {
             looked += 1;
             if looked > MOST {
-                tracing::warn!(
-                    store = self.name,
-                    "only the first {MOST} folders are searched"
-                );
-                break;
+                let what = format!("only the first {MOST} folders are searched");
+                found.unread.push(unread("", Problem::input(what)));
+                return;
             }
-            match Dataset::open(Arc::clone(&self.store), prefix.clone()).await {
-                Ok(dataset) => {
-                    let id = format!("{position}{below}");
-                    let place = format!("{}{below}", self.name);
-                    let scenes = dataset.scenes_present().await?;
-                    found.push(DataSet {
-                        id,
-                        place,
-                        dataset,
-                        scenes,
-                    });
-                    continue;
-                }
-                // Other groups: predictions, reconstructions, what others wrote.
-                Err(StorageError::Invalid { .. } | StorageError::Damaged { .. }) => continue,
-                Err(StorageError::NoDataset { .. }) if depth < DEPTH => {}
-                Err(StorageError::NoDataset { .. }) => continue,
-                Err(error) => return Err(error),
+            match self.look(&prefix, &below, depth).await {
+                Ok(Found::Set(dataset, scenes)) => found.sets.push(DataSet {
+                    id: format!("{position}{below}"),
+                    place: format!("{}{below}", self.name),
+                    dataset,
+                    scenes,
+                }),
+                // The last is looked at first.
+                Ok(Found::Folders(inner)) => folders.extend(inner.into_iter().rev()),
+                Err(error) => found.unread.push(unread(&below, error.into())),
             }
-            let listed = self.store.list_with_delimiter(Some(&prefix)).await;
-            let listed = listed.map_err(|e| StorageError::store("list", prefix.to_string(), e))?;
-            let mut inner: Vec<_> = listed
-                .common_prefixes
-                .into_iter()
-                .filter_map(|path| {
-                    let name = path.filename()?.to_owned();
-                    let hidden = name.starts_with('.');
-                    (!hidden).then(|| (path, format!("{below}/{name}"), depth + 1))
-                })
-                .collect();
-            // The last is looked at first.
-            inner.sort_by(|a, b| b.1.cmp(&a.1));
-            folders.extend(inner);
         }
-        Ok(())
     }
+
+    /// Looks at a folder: a data set, or the folders in it, ascending.
+    async fn look(&self, prefix: &Path, below: &str, depth: usize) -> Result<Found, StorageError> {
+        match Dataset::open(Arc::clone(&self.store), prefix.clone()).await {
+            Ok(dataset) => {
+                let scenes = dataset.scenes_present().await?;
+                return Ok(Found::Set(dataset, scenes));
+            }
+            Err(StorageError::NoDataset { .. }) if depth < DEPTH => {}
+            Err(StorageError::NoDataset { .. }) => return Ok(Found::Folders(Vec::new())),
+            // Predictions and reconstructions. A data set's own fields begin with `spec.`.
+            Err(StorageError::Invalid { field, .. }) if !field.starts_with("spec.") => {
+                return Ok(Found::Folders(Vec::new()));
+            }
+            Err(error) => return Err(error),
+        }
+        let listed = self.store.list_with_delimiter(Some(prefix)).await;
+        let listed = listed.map_err(|e| StorageError::store("list", prefix.to_string(), e))?;
+        let mut inner: Vec<_> = listed
+            .common_prefixes
+            .into_iter()
+            .filter_map(|path| {
+                let name = path.filename()?.to_owned();
+                let hidden = name.starts_with('.');
+                (!hidden).then(|| (path, format!("{below}/{name}"), depth + 1))
+            })
+            .collect();
+        inner.sort_by(|a, b| a.1.cmp(&b.1));
+        Ok(Found::Folders(inner))
+    }
+}
+
+/// What a folder is.
+enum Found {
+    /// A data set, with its finished scenes.
+    Set(Dataset, Vec<u64>),
+    /// Folders to look at: each with its path below the store and its depth.
+    Folders(Vec<(Path, String, usize)>),
 }
 
 #[cfg(test)]

@@ -1,40 +1,68 @@
 //! The images of a scene.
 
+use http::StatusCode;
 use picofarm_dataset::{Dataset, DatasetSpec, Intrinsics, Manifest, Quantity as Q, Spot};
 use picofarm_store::StorageError;
 use serde_json::{Value, json};
 
-use crate::answer::Problem;
+use crate::answer::{DAMAGED, Problem};
 
 /// Metres that light travels in a nanosecond.
 pub const METRES_PER_NS: f64 = 0.299_792_458;
+
+/// An array of a scene, or what is wrong with it: one damaged array hides no other.
+pub type Array<T> = Result<Vec<T>, Damage>;
+
+/// A description of a damaged array.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Damage(pub String);
+
+impl From<&Damage> for Problem {
+    fn from(damage: &Damage) -> Self {
+        Self {
+            hint: Some(DAMAGED.into()),
+            ..Self::new(StatusCode::INTERNAL_SERVER_ERROR, &damage.0)
+        }
+    }
+}
+
+impl Damage {
+    /// Takes damage as a finding; other errors stay errors.
+    fn found<T>(read: Result<T, StorageError>) -> Result<Result<T, Self>, StorageError> {
+        match read {
+            Ok(values) => Ok(Ok(values)),
+            Err(error @ StorageError::Damaged { .. }) => Ok(Err(Self(error.to_string()))),
+            Err(error) => Err(error),
+        }
+    }
+}
 
 /// The ground truth of a scene. Images are `[row][column]`.
 pub struct Truth {
     /// Properties of the data set.
     pub spec: DatasetSpec,
     /// sRGB, `[row][column][3]`.
-    pub rgb: Vec<u8>,
+    pub rgb: Array<u8>,
     /// z-depth in metres; 0 = nothing.
-    pub depth: Vec<f32>,
+    pub depth: Array<f32>,
     /// Distance along the ray in metres; 0 = nothing.
-    pub range: Vec<f32>,
+    pub range: Array<f32>,
     /// Unit normals in the camera frame, `[row][column][3]`.
-    pub normal: Vec<f32>,
+    pub normal: Array<f32>,
     /// Object + 1; 0 = nothing.
-    pub instance: Vec<u32>,
+    pub instance: Array<u32>,
     /// Label + 1; 0 = nothing.
-    pub label: Vec<u16>,
+    pub label: Array<u16>,
     /// 1 = mirror.
-    pub specular: Vec<u8>,
+    pub specular: Array<u8>,
     /// 1 = lit, `[spot][row][column]`.
-    pub visibility: Vec<u8>,
+    pub visibility: Array<u8>,
     /// Sum over bins of h.
-    pub intensity: Vec<f32>,
+    pub intensity: Array<f32>,
     /// The spots, in the camera frame.
-    pub spots: Vec<Option<Spot>>,
+    pub spots: Array<Option<Spot>>,
     /// Of the camera.
-    pub intrinsics: Intrinsics,
+    pub intrinsics: Result<Intrinsics, Damage>,
     /// Names of the labels; empty if they are not known.
     pub names: Vec<String>,
     /// Who made it from what, and its objects.
@@ -45,7 +73,7 @@ impl Truth {
     /// Reads the images of a scene.
     ///
     /// # Errors
-    /// Fails if the scene is not there or is damaged.
+    /// Fails if the scene is not there, if its manifest is damaged, or if the store fails.
     pub async fn read(dataset: &Dataset, scene: u64) -> Result<Self, StorageError> {
         let manifest = dataset.manifest(scene).await?;
         let names = manifest.provenance.plan["labels"].as_array();
@@ -54,17 +82,17 @@ impl Truth {
         let names = names.collect();
         Ok(Self {
             spec: *dataset.spec(),
-            rgb: dataset.read(scene, Q::Rgb).await?,
-            depth: dataset.read(scene, Q::Depth).await?,
-            range: dataset.read(scene, Q::Range).await?,
-            normal: dataset.read_normal(scene).await?,
-            instance: dataset.read(scene, Q::Instance).await?,
-            label: dataset.read(scene, Q::Label).await?,
-            specular: dataset.read(scene, Q::Specular).await?,
-            visibility: dataset.read_visibility(scene).await?,
-            intensity: dataset.read(scene, Q::Intensity).await?,
-            spots: dataset.read_spots(scene).await?,
-            intrinsics: dataset.read_intrinsics(scene).await?,
+            rgb: Damage::found(dataset.read(scene, Q::Rgb).await)?,
+            depth: Damage::found(dataset.read(scene, Q::Depth).await)?,
+            range: Damage::found(dataset.read(scene, Q::Range).await)?,
+            normal: Damage::found(dataset.read_normal(scene).await)?,
+            instance: Damage::found(dataset.read(scene, Q::Instance).await)?,
+            label: Damage::found(dataset.read(scene, Q::Label).await)?,
+            specular: Damage::found(dataset.read(scene, Q::Specular).await)?,
+            visibility: Damage::found(dataset.read_visibility(scene).await)?,
+            intensity: Damage::found(dataset.read(scene, Q::Intensity).await)?,
+            spots: Damage::found(dataset.read_spots(scene).await)?,
+            intrinsics: Damage::found(dataset.read_intrinsics(scene).await)?,
             names,
             manifest,
         })
@@ -73,7 +101,19 @@ impl Truth {
     /// Returns the size in memory.
     pub fn bytes(&self) -> usize {
         // The images of each pixel, of 3 + 4 + 4 + 12 + 4 + 2 + 1 + 4 bytes, and the masks.
-        34 * self.spec.pixels() + self.visibility.len()
+        34 * self.spec.pixels() + self.visibility.as_ref().map_or(0, Vec::len)
+    }
+
+    /// Returns whether no array is damaged.
+    pub fn is_whole(&self) -> bool {
+        let bytes = [&self.rgb, &self.specular, &self.visibility];
+        let numbers = [&self.depth, &self.range, &self.normal, &self.intensity];
+        bytes.into_iter().all(Result::is_ok)
+            && numbers.into_iter().all(Result::is_ok)
+            && self.instance.is_ok()
+            && self.label.is_ok()
+            && self.spots.is_ok()
+            && self.intrinsics.is_ok()
     }
 
     /// Returns the index of a pixel.
@@ -95,50 +135,65 @@ impl Truth {
     }
 
     /// Returns the surface point of a pixel's middle in the camera frame; `None` for nothing.
-    pub fn point(&self, pixel: usize) -> Option<[f64; 3]> {
+    ///
+    /// # Errors
+    /// Fails if the depth or the intrinsics are damaged.
+    pub fn point(&self, pixel: usize) -> Result<Option<[f64; 3]>, &Damage> {
         let width = self.spec.width as usize;
         let (row, column) = (pixel / width, pixel % width);
-        let z = f64::from(self.depth[pixel]);
-        let i = &self.intrinsics;
+        let z = f64::from(self.depth.as_ref()?[pixel]);
+        let i = self.intrinsics.as_ref()?;
         let direction = |pixel: usize, centre: f32, focal: f32| {
             (pixel as f64 + 0.5 - f64::from(centre)) / f64::from(focal)
         };
-        (z > 0.0).then(|| {
+        Ok((z > 0.0).then(|| {
             let (x, y) = (direction(column, i.cx, i.fx), direction(row, i.cy, i.fy));
             [z * x, z * y, z]
-        })
+        }))
     }
 
     /// Returns where a spot is in the image, in pixels; `None` behind the camera.
-    pub fn film(&self, spot: &Spot) -> Option<[f32; 2]> {
-        film(&self.intrinsics, spot)
+    ///
+    /// # Errors
+    /// Fails if the intrinsics are damaged.
+    pub fn film(&self, spot: &Spot) -> Result<Option<[f32; 2]>, &Damage> {
+        Ok(film(self.intrinsics.as_ref()?, spot))
     }
 
     /// Returns the spots that light a pixel.
-    pub fn lit_by(&self, pixel: usize) -> Vec<usize> {
-        let pixels = self.spec.pixels();
-        let spots = 0..self.spots.len();
-        spots
-            .filter(|spot| self.visibility[spot * pixels + pixel] == 1)
-            .collect()
+    ///
+    /// # Errors
+    /// Fails if the masks are damaged.
+    pub fn lit_by(&self, pixel: usize) -> Result<Vec<usize>, &Damage> {
+        let masks = self.visibility.as_ref()?.chunks(self.spec.pixels().max(1));
+        let lit = masks.enumerate().filter(|(_, mask)| mask[pixel] == 1);
+        Ok(lit.map(|(spot, _)| spot).collect())
     }
 
-    /// Returns the values of a pixel.
+    /// Returns the values of a pixel; those of damaged arrays are null.
     ///
     /// # Errors
     /// Fails outside of the image.
     pub fn values(&self, at: [u64; 2]) -> Result<Value, Problem> {
         let pixel = self.pixel(at)?;
-        let label = self.label[pixel];
-        let name = (label > 0).then(|| self.names.get(usize::from(label) - 1));
-        let normal = &self.normal[3 * pixel..][..3];
+        let label = value(&self.label, pixel);
+        let named = label.filter(|label| *label > 0);
+        let name = named.and_then(|label| self.names.get(usize::from(label) - 1));
+        let mirror = value(&self.specular, pixel).map(|specular| specular == 1);
         Ok(json!({
-            "depth_m": self.depth[pixel], "range_m": self.range[pixel], "normal": normal,
-            "instance": self.instance[pixel], "label": label, "label_name": name.flatten(),
-            "mirror": self.specular[pixel] == 1, "intensity": self.intensity[pixel],
-            "rgb": &self.rgb[3 * pixel..][..3], "lit_by": self.lit_by(pixel),
+            "depth_m": value(&self.depth, pixel), "range_m": value(&self.range, pixel),
+            "normal": self.normal.as_ref().ok().map(|normal| &normal[3 * pixel..][..3]),
+            "instance": value(&self.instance, pixel), "label": label, "label_name": name,
+            "mirror": mirror, "intensity": value(&self.intensity, pixel),
+            "rgb": self.rgb.as_ref().ok().map(|rgb| &rgb[3 * pixel..][..3]),
+            "lit_by": self.lit_by(pixel).ok(),
         }))
     }
+}
+
+/// The value of a pixel; `None` if the array is damaged.
+fn value<T: Copy>(array: &Array<T>, pixel: usize) -> Option<T> {
+    array.as_ref().ok().map(|values| values[pixel])
 }
 
 fn film(i: &Intrinsics, spot: &Spot) -> Option<[f32; 2]> {

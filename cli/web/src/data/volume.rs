@@ -12,7 +12,7 @@ use picofarm_figures::scene::quantile;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::light::{Light, parts};
+use super::light::{Light, lights, parts};
 use crate::answer::Problem;
 
 /// Longest side of the small level.
@@ -166,6 +166,22 @@ async fn planes(
     scene: u64,
     light: Light,
 ) -> Result<Vec<f32>, Problem> {
+    let folder = folder.as_deref();
+    if lights(dataset.spec(), folder)
+        .iter()
+        .all(|(kind, _)| *kind != light)
+    {
+        return Err(Problem::missing(match light {
+            Light::Two | Light::More => {
+                "light: only `picofarm scene render --split` stores two bounces and more apart"
+                    .into()
+            }
+            light => format!(
+                "light: this data set stores no light {:?} of its own",
+                light.name()
+            ),
+        }));
+    }
     let quantity = match light {
         Light::All => Q::Transient,
         Light::Four => Q::Transient4,
@@ -176,11 +192,9 @@ async fn planes(
         }
         Light::Two | Light::More => {
             let name = if light == Light::Two { "two" } else { "multi" };
-            let Some(group) = folder.as_deref().and_then(parts).filter(|g| g.has(name)) else {
-                return Err(Problem::missing(
-                    "light: only `picofarm scene render --split` stores two bounces and more apart",
-                ));
-            };
+            let group = folder.and_then(parts).filter(|group| group.has(name));
+            let missing = || Problem::missing(format!("light: {name} was removed meanwhile"));
+            let group = group.ok_or_else(missing)?;
             let (shape, values) = group.read::<f32>(name)?;
             let spec = dataset.spec();
             let expected = [spec.height, spec.width, spec.gate.bins].map(u64::from);

@@ -18,11 +18,18 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     dataset.manifest(id.scene).await?;
     let folder = app.stores.folder(&id.set)?;
     let lights = lights(dataset.spec(), folder.as_deref());
+    // Links are shared, and may name light that another data set has.
+    let absent = lights.iter().all(|(kind, _)| *kind != light);
+    let asked = light.name();
+    let light = if absent { Light::All } else { light };
     let spec = dataset.spec();
     let content = html! {
         h1 { "Light in flight, scene " (id.scene) }
         p.where-from { a href={ "/data?" (encode(&[("set", &id.set)])) } { "data set" } " " (safe(app.stores.place(&id.set)?))
             " · " a href={ "/data/scene?" (id.encode(&[])) } { "images" } " · " (super::gallery::describe(spec)) }
+        @if absent {
+            p.hint role="status" { "This data set stores no light " code { (safe(asked)) } " of its own: all light is shown." }
+        }
         noscript { p.problem { "The player needs JavaScript." } }
         div #flight.flight data-scene=(id.encode(&[])) data-light=(light.name()) {
             div.stage {
@@ -66,7 +73,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                 figure.histogram {
                     figcaption #picked aria-live="polite" { "Pick a pixel to see its histogram." }
                     canvas #histogram height="220" tabindex="0" role="img" aria-label="Histogram of the picked pixel" {}
-                    p.legend.times {
+                    p #kinds.legend.times {
                         span.key.one {} "one bounce" span.key.two {} "two bounces, lit by the spot" span.key.more {} "three and more"
                     }
                     div.toggle {

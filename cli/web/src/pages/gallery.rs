@@ -1,5 +1,6 @@
 //! The data sets, and a gallery of the scenes of one.
 
+use http::StatusCode;
 use maud::{Markup, html};
 use picofarm_dataset::DatasetSpec;
 use picofarm_figures::number::thousands;
@@ -8,7 +9,7 @@ use super::{Page, parts::safe};
 use crate::{
     App,
     answer::Problem,
-    data::{DataSet, SceneId, flight_path},
+    data::{DataSet, Listing, SceneId, flight_path},
     query::{Query, encode},
 };
 
@@ -17,13 +18,19 @@ const SHOWN: usize = 24;
 
 /// Returns the list of data sets, or the gallery of one.
 pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
-    let sets = app.stores.list().await;
+    let listed = app.stores.list().await;
     let content = match query.text("set") {
-        "" => list(app, &sets),
+        "" => list(app, &listed),
         id => {
-            let set = sets.iter().find(|set| set.id == id);
-            let missing = || Problem::missing(format!("set: there is no data set {id:?}"));
-            gallery(set.ok_or_else(missing)?, query)?
+            let set = listed.sets.iter().find(|set| set.id == id);
+            let problem = || match listed.unread.iter().find(|unread| unread.id == id) {
+                Some(unread) => Problem {
+                    hint: unread.hint.clone(),
+                    ..Problem::new(StatusCode::INTERNAL_SERVER_ERROR, &unread.why)
+                },
+                None => Problem::missing(format!("set: there is no data set {id:?}")),
+            };
+            gallery(set.ok_or_else(problem)?, query)?
         }
     };
     Ok(Page {
@@ -48,10 +55,18 @@ pub fn describe(spec: &DatasetSpec) -> String {
     )
 }
 
-fn list(app: &App, sets: &[DataSet]) -> Markup {
+fn list(app: &App, listed: &Listing) -> Markup {
     html! {
         h1 { "Data sets" }
-        @if sets.is_empty() {
+        @if !listed.unread.is_empty() {
+            section #unread.problem role="alert" {
+                h2 { "Not readable" }
+                ul { @for unread in &listed.unread {
+                    li { b { (safe(&unread.place)) } ": " (safe(&unread.why))
+                        @if let Some(hint) = &unread.hint { p.hint { (safe(hint)) } } }
+                } }
+            }
+        } @else if listed.sets.is_empty() {
             @let names: Vec<&str> = app.stores.names().collect();
             p.none {
                 @if names.is_empty() {
@@ -59,7 +74,7 @@ fn list(app: &App, sets: &[DataSet]) -> Markup {
                 } @else { "No data set yet in " (safe(names.join(", "))) "." }
             }
         }
-        ul.sets { @for set in sets {
+        ul.sets { @for set in &listed.sets {
             @let link = format!("/data?{}", encode(&[("set", &set.id)]));
             li {
                 h2 { a href=(link) { (safe(&set.place)) } }

@@ -6,6 +6,7 @@ use picofarm_proto::{
     messages::{Event, EventKind, JobStatus, StageStatus},
 };
 
+use super::parts::{rest_state, safe};
 use crate::{App, Events, answer::Problem};
 
 /// Most cells of a picture.
@@ -20,6 +21,7 @@ const EVENTS: usize = 20_000;
 enum Cell {
     Reused,
     Done,
+    /// Neither done nor dead, and not running.
     Pending,
     Unknown,
     Running,
@@ -35,6 +37,17 @@ impl Cell {
             Self::Unknown => "unknown",
             Self::Running => "run",
             Self::Dead => "bad",
+        }
+    }
+
+    fn word(self, job: &JobStatus) -> &'static str {
+        match self {
+            Self::Reused => "reused",
+            Self::Done => "done",
+            Self::Pending => rest_state(job),
+            Self::Unknown => "unknown",
+            Self::Running => "running",
+            Self::Dead => "dead",
         }
     }
 }
@@ -59,17 +72,17 @@ pub async fn history(app: &App, job: JobId) -> Result<Vec<Event>, Problem> {
 }
 
 /// Returns the meaning of the colours.
-pub fn legend() -> Markup {
-    let names = [
-        ("done", "done"),
-        ("reused", "reused"),
-        ("run", "running"),
-        ("pending", "pending"),
-        ("bad", "dead"),
+pub fn legend(job: &JobStatus) -> Markup {
+    let cells = [
+        Cell::Done,
+        Cell::Reused,
+        Cell::Running,
+        Cell::Pending,
+        Cell::Dead,
     ];
     html! {
-        p.legend { @for (class, name) in names {
-            span { svg viewBox="0 0 10 10" aria-hidden="true" { rect.(class) width="10" height="10" {} } (name) }
+        p.legend { @for cell in cells {
+            span { svg viewBox="0 0 10 10" aria-hidden="true" { rect.(cell.class()) width="10" height="10" {} } (cell.word(job)) }
         } }
     }
 }
@@ -91,23 +104,27 @@ pub fn draw(job: &JobStatus, position: u32, stage: &StageStatus, history: &[Even
         (cells.len() as u64).div_ceil(ROW),
     );
     let label = format!(
-        "{}: {} of {total} tasks done, {} running, {} pending, {} dead",
-        stage.name, stage.tasks.done, stage.tasks.leased, stage.tasks.pending, stage.tasks.dead
+        "{}: {} of {total} tasks done, {} running, {} {}, {} dead; arrow keys move between tasks",
+        stage.name,
+        stage.tasks.done,
+        stage.tasks.leased,
+        stage.tasks.pending,
+        rest_state(job),
+        stage.tasks.dead
     );
     let size = columns * 12;
     html! {
         figure.grid {
             figcaption {
-                (super::parts::safe(&stage.name))
+                (safe(&stage.name))
                 @if each > 1 { " · a cell is " (each) " tasks and shows the most notable" }
             }
-            svg viewBox={ "0 0 " (size) " " (rows * 12) } width=(size) height=(rows * 12) role="group" aria-label=(label) {
+            svg viewBox={ "0 0 " (size) " " (rows * 12) } width=(size) height=(rows * 12) role="group" aria-label=(label) data-row=(ROW) {
                 @for (i, cell) in cells.iter().enumerate() {
                     @let i = i as u64;
-                    a href={ "/jobs/" (job.id) "/tasks/" (position) "/" (i * each) } tabindex="-1" {
-                        rect.(cell.class()) x=(i % ROW * 12) y=(i / ROW * 12) width="10" height="10" rx="1.5" {
-                            title { "task " (i * each) ": " (cell.class()) }
-                        }
+                    a href={ "/jobs/" (job.id) "/tasks/" (position) "/" (i * each) } tabindex=(if i == 0 { "0" } else { "-1" }) {
+                        title { "task " (i * each) ": " (cell.word(job)) }
+                        rect.(cell.class()) x=(i % ROW * 12) y=(i / ROW * 12) width="10" height="10" rx="1.5" {}
                     }
                 }
             }

@@ -82,7 +82,7 @@ pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> 
         title: job.name.clone(),
         tab: "/jobs",
         live: view != "file",
-        script: None,
+        script: view.is_empty().then_some("grid.js"),
         content,
     })
 }
@@ -145,7 +145,7 @@ fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
                 tbody { @for (position, stage) in job.stages.iter().enumerate() { tr {
                     td { (safe(&stage.name)) }
                     td { (safe(&stage.kind)) }
-                    td { (badge(stage_state(stage.state, &stage.tasks))) }
+                    td { (badge(stage_state(job, stage))) }
                     td.wide { (bar(&stage.tasks)) }
                     td.number { (count(&stage.tasks)) }
                     td.number { (stage.tasks.reused) }
@@ -157,7 +157,7 @@ fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
         }
         section #grid {
             h2 { "Tasks" }
-            (grid::legend())
+            (grid::legend(job))
             @for (position, stage) in job.stages.iter().enumerate() {
                 (grid::draw(job, position as u32, stage, history))
             }

@@ -6,7 +6,7 @@ use maud::{Markup, PreEscaped, html};
 use picofarm_figures::{number, text::Safe};
 use picofarm_proto::{
     ids::JobId,
-    messages::{JobState, StageState, TaskCounts},
+    messages::{JobState, JobStatus, StageState, StageStatus, TaskCounts},
 };
 
 /// Escapes a text, also the characters that change the order of others.
@@ -94,14 +94,25 @@ pub fn job_state(
     }
 }
 
-/// The state of a stage in a word, with its class.
-pub fn stage_state(state: StageState, counts: &TaskCounts) -> (&'static str, &'static str) {
-    match state {
-        StageState::Blocked => ("blocked", "wait"),
-        StageState::Open if counts.leased > 0 => ("running", "run"),
-        StageState::Open => ("waiting", "wait"),
+/// The state of a job's stage in a word, with its class.
+pub fn stage_state(job: &JobStatus, stage: &StageStatus) -> (&'static str, &'static str) {
+    match stage.state {
         StageState::Done => ("done", "done"),
         StageState::Failed => ("failed", "bad"),
+        _ if job.state == JobState::Cancelled => ("cancelled", "off"),
+        StageState::Open if stage.tasks.leased > 0 => ("running", "run"),
+        _ if job.paused => ("paused", "wait"),
+        StageState::Blocked => ("blocked", "wait"),
+        StageState::Open => ("waiting", "wait"),
+    }
+}
+
+/// The state of a job's tasks that are neither done nor dead and do not run, in a word.
+pub fn rest_state(job: &JobStatus) -> &'static str {
+    match job.state {
+        JobState::Cancelled => "cancelled",
+        JobState::Active if job.paused => "paused",
+        _ => "pending",
     }
 }
 

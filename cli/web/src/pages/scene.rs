@@ -1,5 +1,6 @@
 //! The images of a scene, or of two side by side, with the values of a pixel.
 
+use http::StatusCode;
 use maud::{Markup, html};
 use picofarm_figures::number::digits;
 use picofarm_store::published::Manifest as _;
@@ -11,7 +12,7 @@ use super::{
 };
 use crate::{
     App,
-    answer::Problem,
+    answer::{DAMAGED, Problem},
     data::{Picture, SceneId, Span, Truth, flight_path},
     query::Query,
 };
@@ -34,7 +35,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     if let Some(other) = &other {
         columns.push((app.stores.truth(app, other).await?, other.clone()));
     }
-    let spots = columns[0].0.spots.len();
+    let spots = columns[0].0.spec.spots;
     let content = html! {
         h1 { "Scene " (first.scene) @if let Some(other) = &other { " and scene " (other.scene) } }
         form.search action="/data/scene" {
@@ -65,8 +66,13 @@ fn column(truth: &Truth, id: &SceneId, place: &str, spot: u64) -> Result<Markup,
     let lit = Picture::Lit(spot as usize);
     let mut pictures: Vec<(Picture, String)> = Vec::new();
     pictures.extend(Picture::ALL.map(|(picture, title)| (picture, title.to_owned())));
-    if !truth.spots.is_empty() {
-        lit.draw(truth)?;
+    if truth.spec.spots > 0 {
+        let shown = lit.span(truth);
+        if let Err(problem) = shown
+            && problem.status == StatusCode::BAD_REQUEST
+        {
+            return Err(problem);
+        }
         pictures.push((lit, format!("Lit by spot {spot}")));
     }
     Ok(html! {
@@ -74,19 +80,28 @@ fn column(truth: &Truth, id: &SceneId, place: &str, spot: u64) -> Result<Markup,
             aria-label={ "Scene " (id.scene) } {
             p { a href={ "/data?" (crate::query::encode(&[("set", &id.set)])) } { "data set" } " " (safe(place))
                 " · " (describe(&truth.spec)) " · " a href=(flight_path(&id.set, id.scene)) { "light in flight" } }
+            @if !truth.is_whole() {
+                p.problem { "Some arrays of this scene are damaged. " (safe(DAMAGED)) "." }
+            }
             div.images {
                 @for (picture, title) in &pictures {
                     @let more: &[(&str, &str)] = match picture {
                         Picture::Lit(_) => &[("what", "lit"), ("spot", &named)],
                         other => &[("what", other.name())],
                     };
-                    figure.image {
+                    @match picture.span(truth) {
+                    Err(problem) => { figure.image {
+                        div.damaged role="alert" { (safe(&problem.message)) }
+                        figcaption { (title) }
+                    } }
+                    Ok(span) => { figure.image {
                         div.frame tabindex="0" role="application" aria-label={ (title) ", arrow keys move the point" } {
                             img src={ "/bytes/picture?" (id.encode(more)) } alt=(title)
                                 width=(truth.spec.width) height=(truth.spec.height);
                             span.cross.h {} span.cross.v {}
                         }
-                        figcaption { (title) @if let Some(span) = picture.span(truth) { (scale(&span)) } }
+                        figcaption { (title) @if let Some(span) = span { (scale(&span)) } }
+                    } }
                     }
                 }
             }

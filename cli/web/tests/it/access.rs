@@ -8,6 +8,7 @@ use std::{
 use picofarm_web::{Server, Settings, StartError};
 
 use crate::{
+    actions::form,
     client::Web,
     farm::{EVIL, JOB, Memory},
 };
@@ -70,6 +71,7 @@ fn an_address_that_others_reach_needs_a_name() {
             listen: "0.0.0.0:0".parse().unwrap(),
             hosts,
             stores: Vec::new(),
+            farm: true,
         };
         runtime.block_on(Server::bind(settings, Arc::new(Memory::default())))
     };
@@ -135,6 +137,65 @@ fn a_refusal_of_the_coordinator_is_a_page_with_its_reason() {
 }
 
 #[test]
+fn unknown_jobs_and_tasks_are_not_found_and_actions_on_ended_jobs_conflict() {
+    let web = Web::start(Vec::new());
+    let other = JOB.replace("0001", "0002");
+    for path in [
+        format!("/jobs/{other}"),
+        format!("/jobs/{other}/tasks/0/0"),
+        format!("/jobs/{JOB}/tasks/0/99"),
+        format!("/jobs/{JOB}/tasks/7/0"),
+        format!("/jobs/{JOB}/tasks/0/x"),
+    ] {
+        let reply = web.get(&path);
+        assert_eq!(reply.status, 404, "{path}");
+        assert!(reply.text().contains("<h1>Not found</h1>"), "{path}");
+    }
+    let form = form(&web);
+    *web.farm.ended.lock().unwrap() = true;
+    let reply = web.post(&format!("/jobs/{JOB}/pause"), &[], &form);
+    assert_eq!(reply.status, 409);
+    assert!(reply.text().contains("the job has ended"));
+    assert!(!reply.text().contains("Bad Gateway"));
+}
+
+#[test]
+fn pages_wait_for_a_coordinator_that_is_away_and_actions_do_not() {
+    let web = Web::start(Vec::new());
+    let form = form(&web);
+    *web.farm.away.lock().unwrap() = true;
+    for path in ["/jobs", "/workers", &format!("/jobs/{JOB}")] {
+        let reply = web.get(path);
+        assert_eq!(reply.status, 502, "{path}");
+        let html = reply.text();
+        assert!(
+            html.contains("<h1>The coordinator does not answer</h1>"),
+            "{html}"
+        );
+        assert!(html.contains("no coordinator answers"), "{html}");
+        assert!(html.contains("/assets/live.js"), "{path}: {html}");
+    }
+    let missing = web.get("/none").text();
+    assert!(!missing.contains("/assets/live.js"), "{missing}");
+    let posted = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form);
+    assert_eq!(posted.status, 502);
+    assert!(!posted.text().contains("/assets/live.js"));
+}
+
+#[test]
+fn pages_of_data_sets_lead_to_a_farm_only_if_one_answered_at_the_start() {
+    for answers in [true, false] {
+        let web = Web::start_with(Vec::new(), answers);
+        let html = web.get("/data").text();
+        for path in ["/", "/jobs", "/workers", "/events", "/audit"] {
+            let link = format!("href=\"{path}\"");
+            assert_eq!(html.contains(&link), answers, "{path}: {html}");
+        }
+        assert!(html.contains("href=\"/data\" aria-current"), "{html}");
+    }
+}
+
+#[test]
 fn long_heads_and_long_forms_are_refused() {
     let web = Web::start(Vec::new());
     let long = "x".repeat(64 << 10);
@@ -152,18 +213,26 @@ fn an_open_page_gets_its_content_again_when_it_changes() {
     let mut stream = web.connect();
     let request = web.request("GET", &path, &[("Cookie", web.cookie())], "");
     stream.write_all(request.as_bytes()).unwrap();
-    let mut seen = String::new();
+    let (mut seen, mut from) = (String::new(), 0);
     let mut until = |words: &str| {
         let mut part = [0; 4096];
-        while !seen.contains(words) {
+        while !seen[from..].contains(words) {
             let n = stream.read(&mut part).unwrap();
             assert!(n > 0, "the events ended: {seen}");
             seen += &String::from_utf8_lossy(&part[..n]);
         }
+        from += seen[from..].find(words).unwrap() + words.len();
     };
     until("act-pause");
     web.farm.acts.lock().unwrap().push("pause".into());
     until("act-resume");
+    // While the coordinator is away, no content is sent, which would replace the last.
+    *web.farm.away.lock().unwrap() = true;
+    until("event: away\ndata: no coordinator answers\n\n");
+    *web.farm.away.lock().unwrap() = false;
+    web.farm.acts.lock().unwrap().clear();
+    until("act-pause");
+    assert!(!seen.contains("id=\"problem\""), "{seen}");
     assert!(
         seen.to_lowercase()
             .contains("content-type: text/event-stream")
@@ -183,6 +252,9 @@ fn only_so_many_pages_are_followed_at_a_time() {
         followed.push(stream);
         &head == b"HTTP/1.1 503"
     });
+    let reason = web.get("/live?to=%2F");
+    assert_eq!(reason.status, 503);
+    assert!(reason.text().contains("48 pages are followed already"));
     assert!(refused && followed.len() > 16, "{}", followed.len());
     assert_eq!(web.get("/").status, 200, "other pages are still served");
 }
@@ -194,6 +266,7 @@ fn the_first_view_of_each_page_is_below_300_kilobytes() {
         "style.css",
         "icon.svg",
         "live.js",
+        "grid.js",
         "scene.js",
         "flight.js",
         "volume.js",

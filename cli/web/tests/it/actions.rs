@@ -2,7 +2,7 @@
 
 use crate::{client::Web, farm::JOB};
 
-fn form(web: &Web) -> String {
+pub fn form(web: &Web) -> String {
     let html = web.get(&format!("/jobs/{JOB}")).text();
     let (_, rest) = html.split_once("name=\"form\" value=\"").expect("a form");
     format!("form={}", rest.split('"').next().unwrap())
@@ -60,6 +60,45 @@ fn the_coordinator_decides_what_the_user_may_do() {
     let reply = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form(&web));
     assert_eq!(reply.status, 403);
     assert!(reply.text().contains("viewers may not change jobs"));
+}
+
+#[test]
+fn stages_and_tasks_of_a_job_that_is_cancelled_or_paused_say_so() {
+    let web = Web::start(Vec::new());
+    // The state of the only stage, and the words of its cells.
+    let states = || {
+        let html = web.get(&format!("/jobs/{JOB}")).text();
+        let (_, stages) = html.split_once("id=\"stages\"").expect(&html);
+        let badge = stages.split("<span class=\"badge").nth(1).unwrap();
+        let word = badge.split(['>', '<']).nth(1).unwrap().to_owned();
+        let titles = html.split("<title>task ").skip(1);
+        let cells = titles.map(|title| title.split([' ', '<']).nth(1).unwrap().to_owned());
+        (word, cells.collect::<Vec<_>>())
+    };
+    let cells = |rest: &str| {
+        ["done", rest, "running", "dead", rest]
+            .map(str::to_owned)
+            .to_vec()
+    };
+    assert_eq!(states(), ("running".to_owned(), cells("pending")));
+    web.farm.acts.lock().unwrap().push("pause".into());
+    assert_eq!(states(), ("running".to_owned(), cells("paused")));
+    *web.farm.idle.lock().unwrap() = true;
+    assert_eq!(states().0, "paused");
+    *web.farm.ended.lock().unwrap() = true;
+    let (stage, titles) = states();
+    assert_eq!((&*stage, &*titles[1]), ("cancelled", "cancelled"));
+}
+
+#[test]
+fn a_picture_of_tasks_is_one_stop_of_the_tab_key() {
+    let web = Web::start(Vec::new());
+    let html = web.get(&format!("/jobs/{JOB}")).text();
+    let (_, picture) = html.split_once("<figure class=\"grid\">").expect(&html);
+    let picture = picture.split("</figure>").next().unwrap();
+    assert_eq!(picture.matches("tabindex=\"0\"").count(), 1, "{picture}");
+    assert_eq!(picture.matches("tabindex=\"-1\"").count(), 4, "{picture}");
+    assert!(html.contains("/assets/grid.js"));
 }
 
 #[test]

@@ -53,16 +53,23 @@ impl Reply {
 
 impl Web {
     pub fn start(stores: Vec<String>) -> Self {
+        Self::start_with(stores, true)
+    }
+
+    /// Starts a server, next to a coordinator that answers or not.
+    pub fn start_with(stores: Vec<String>, answers: bool) -> Self {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .enable_all()
             .build()
             .unwrap();
         let farm = Arc::new(Memory::default());
+        *farm.away.lock().unwrap() = !answers;
         let settings = Settings {
             listen: "127.0.0.1:0".parse().unwrap(),
             hosts: Vec::new(),
             stores,
+            farm: answers,
         };
         let bound = runtime.block_on(Server::bind(settings, farm.clone()));
         let server = bound.expect("a loopback port is free");

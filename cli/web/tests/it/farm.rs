@@ -11,7 +11,7 @@ use picofarm_proto::{
     },
     spec::JobSpec,
 };
-use picofarm_web::{Events, Farm, JobFilter, Refusal, Workers};
+use picofarm_web::{Events, Farm, JobFilter, Refusal, Refused, Workers};
 
 /// A text that would be markup, a script and an attribute.
 pub const EVIL: &str = "<script>alert(1)</script>\"'><img onerror=x>";
@@ -33,6 +33,20 @@ pub struct Memory {
     pub acts: Mutex<Vec<String>>,
     /// Whether the user's rights do not suffice to act.
     pub viewer: Mutex<bool>,
+    /// Whether the job was cancelled before.
+    pub ended: Mutex<bool>,
+    /// Whether no task runs.
+    pub idle: Mutex<bool>,
+    /// Whether the coordinator does not answer.
+    pub away: Mutex<bool>,
+}
+
+fn refusal(kind: Refused, message: &str) -> Refusal {
+    Refusal {
+        kind,
+        message: message.into(),
+        hint: None,
+    }
 }
 
 fn id() -> JobId {
@@ -50,15 +64,25 @@ const COUNTS: TaskCounts = TaskCounts {
 
 impl Memory {
     fn act(&self, what: &str) -> Result<(), Refusal> {
+        self.answers(id())?;
         if *self.viewer.lock().unwrap() {
-            return Err(Refusal {
-                message: "viewers may not change jobs".into(),
-                hint: None,
-                denied: true,
-            });
+            return Err(refusal(Refused::Denied, "viewers may not change jobs"));
+        }
+        if *self.ended.lock().unwrap() {
+            return Err(refusal(Refused::NotNow, "the job has ended"));
         }
         self.acts.lock().unwrap().push(what.to_owned());
         Ok(())
+    }
+
+    fn answers(&self, job: JobId) -> Result<(), Refusal> {
+        if *self.away.lock().unwrap() {
+            return Err(refusal(Refused::Away, "no coordinator answers"));
+        }
+        match job == id() {
+            true => Ok(()),
+            false => Err(refusal(Refused::Missing, "there is no such job")),
+        }
     }
 
     pub fn acts(&self) -> Vec<String> {
@@ -93,6 +117,7 @@ impl Farm for Memory {
     }
 
     async fn jobs(&self, _: &JobFilter) -> Result<(Vec<JobSummary>, Option<String>), Refusal> {
+        self.answers(id())?;
         let job = JobSummary {
             id: id(),
             name: EVIL.into(),
@@ -107,11 +132,20 @@ impl Farm for Memory {
         Ok((vec![job], Some(EVIL.into())))
     }
 
-    async fn job(&self, _: JobId) -> Result<JobStatus, Refusal> {
+    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal> {
+        self.answers(job)?;
+        let state = match *self.ended.lock().unwrap() {
+            true => JobState::Cancelled,
+            false => JobState::Active,
+        };
+        let mut tasks = COUNTS;
+        if *self.idle.lock().unwrap() {
+            (tasks.leased, tasks.pending) = (0, tasks.pending + tasks.leased);
+        }
         Ok(JobStatus {
             id: id(),
             name: EVIL.into(),
-            state: JobState::Active,
+            state,
             tasks: COUNTS,
             submitted_at_ms: 1_700_000_000_000,
             ended_at_ms: None,
@@ -122,7 +156,7 @@ impl Farm for Memory {
                 kind: "render".into(),
                 state: StageState::Open,
                 needs: vec![EVIL.into()],
-                tasks: COUNTS,
+                tasks,
             }],
             spec: self.spec(id()).await?,
             mean_task_seconds: Some(2.0),
@@ -145,6 +179,7 @@ impl Farm for Memory {
     }
 
     async fn events(&self, ask: Events) -> Result<Vec<Event>, Refusal> {
+        self.answers(ask.job.unwrap_or(id()))?;
         let all = [
             event(1, EventKind::Committed, 0, ""),
             event(2, EventKind::Failed, 3, &format!("{EVIL} 17")),
@@ -156,9 +191,13 @@ impl Farm for Memory {
 
     async fn explain(
         &self,
-        _: JobId,
+        job: JobId,
         task: Option<(u32, u64)>,
     ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal> {
+        self.answers(job)?;
+        if task.is_some_and(|(stage, task)| stage > 0 || task >= COUNTS.total) {
+            return Err(refusal(Refused::Missing, "there is no such task"));
+        }
         let reason = Reason {
             code: "busy".into(),
             tasks: 1,
@@ -184,6 +223,7 @@ impl Farm for Memory {
     }
 
     async fn workers(&self) -> Result<Workers, Refusal> {
+        self.answers(id())?;
         Ok(Workers {
             coordinator: EVIL.into(),
             ..Workers::default()
@@ -194,7 +234,7 @@ impl Farm for Memory {
         Err(Refusal {
             message: EVIL.into(),
             hint: Some(EVIL.into()),
-            denied: true,
+            kind: Refused::Denied,
         })
     }
 

@@ -1,5 +1,8 @@
 //! Pictures, values and volumes of scenes.
 
+use std::path::Path;
+
+use picofarm_dataset::{RenderArray, write_render_group};
 use serde_json::json;
 
 use crate::{
@@ -146,12 +149,16 @@ fn a_volume_arrives_in_slabs_and_its_codes_are_the_stored_values() {
     assert_eq!(small.body.len(), 2 * SIDE * SIDE * BINS);
     for light in ["spot-2", "two", "25"] {
         let reply = web.get(&format!("/bytes/flight?{query}&light={light}"));
-        assert!(
-            matches!(reply.status, 400 | 404),
-            "{light}: {}",
-            reply.status
-        );
+        assert_eq!(reply.status, 404, "{light}");
+        assert!(reply.text().contains("<p>light: "), "{}", reply.text());
+        // The player shows all light in its place, and says so.
+        let page = web.get(&format!("/flight?{query}&light={light}")).text();
+        assert!(page.contains("data-light=\"all\""), "{page}");
+        assert!(page.contains("all light is shown"), "{page}");
+        assert!(page.contains("<option value=\"all\" selected>"), "{page}");
     }
+    let page = web.get(&format!("/flight?{query}&light=spot-1")).text();
+    assert!(page.contains("data-light=\"spot-1\"") && !page.contains("all light is shown"));
 }
 
 #[test]
@@ -182,4 +189,120 @@ fn a_histogram_has_the_times_of_one_and_two_bounces() {
         let exact = h(0, pixel, bin) + h(1, pixel, bin);
         assert!((found.as_f64().unwrap() - f64::from(exact)).abs() < 0.02);
     }
+}
+
+#[test]
+fn a_histogram_of_selected_light_has_no_parts_and_only_the_times_of_its_spot() {
+    let (folder, web) = shown();
+    let values = vec![0.25f32; SIDE * SIDE * BINS];
+    let shape = [SIDE, SIDE, BINS].map(|n| n as u64);
+    let arrays = ["two", "multi"].map(|name| RenderArray {
+        name,
+        shape: &shape,
+        dimension_names: &["row", "column", "bin"],
+        data: &values,
+    });
+    let render = folder.path().join("store/rooms/render");
+    write_render_group(&render, &arrays, &serde_json::Map::new()).unwrap();
+    let pixel = |light: &str| {
+        let query = format!("set=0%2Frooms&scene=0&row=10&column=7&light={light}");
+        web.get(&format!("/bytes/pixel?{query}")).json()
+    };
+    let all = pixel("all");
+    assert_eq!(all["whole"], true);
+    assert_eq!(all["parts"].as_array().unwrap().len(), 2);
+    assert_eq!(all["two"].as_array().unwrap().len(), 2);
+    assert_eq!(all["one"]["spot"], 0);
+    for light in ["two", "more", "spot-0", "spot-1"] {
+        let found = pixel(light);
+        assert_eq!(
+            (&found["whole"], &found["parts"]),
+            (&json!(false), &json!(null))
+        );
+        if let Some(spot) = light.strip_prefix("spot-") {
+            let spot: u64 = spot.parse().unwrap();
+            assert_eq!(found["two"].as_array().unwrap().len(), 1, "{light}");
+            assert_eq!(found["two"][0]["spot"], spot);
+            assert_eq!(found["one"].is_null(), spot != 0, "{light}");
+        }
+    }
+}
+
+/// Changes the bytes of all files below a folder.
+fn damage(folder: &Path) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        match path.is_dir() {
+            true => damage(&path),
+            false => std::fs::write(&path, "damaged").unwrap(),
+        }
+    }
+}
+
+#[test]
+fn damaged_arrays_are_named_in_place_and_hide_no_other_image() {
+    let (folder, web) = shown();
+    let query = "set=0%2Frooms&scene=0";
+    damage(&folder.path().join("store/rooms/depth/c"));
+    damage(&folder.path().join("store/rooms/label/c"));
+    let page = web.get(&format!("/data/scene?{query}"));
+    assert_eq!(page.status, 200, "{}", page.text());
+    let html = page.text();
+    assert_eq!(html.matches("class=\"damaged\"").count(), 2, "{html}");
+    assert!(html.contains("rooms/depth/c/"), "{html}");
+    assert!(html.contains("picofarm dataset repair"), "{html}");
+    for (what, status) in [
+        ("rgb", 200),
+        ("normal", 200),
+        ("depth", 500),
+        ("label", 500),
+    ] {
+        let picture = web.get(&format!("/bytes/picture?{query}&what={what}"));
+        assert_eq!(picture.status, status, "{what}");
+    }
+    let value = web
+        .get(&format!("/bytes/value?{query}&row=0&column=3"))
+        .json();
+    assert_eq!(
+        (&value["depth_m"], &value["label"]),
+        (&json!(null), &json!(null))
+    );
+    assert_eq!(
+        (&value["range_m"], &value["lit_by"]),
+        (&json!(2.0), &json!([0, 1]))
+    );
+    let card = web.get(&format!("/bytes/card?{query}"));
+    assert!(card.body.starts_with(b"\x89PNG"));
+}
+
+#[test]
+fn stores_and_data_sets_that_cannot_be_read_are_listed_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = folder.path().join("store");
+    room::write(&store);
+    let broken = store.join("broken");
+    std::fs::create_dir(&broken).unwrap();
+    std::fs::write(broken.join("zarr.json"), "{").unwrap();
+    let invalid = store.join("invalid");
+    std::fs::create_dir(&invalid).unwrap();
+    let root = std::fs::read_to_string(store.join("rooms/zarr.json")).unwrap();
+    let mut root: serde_json::Value = serde_json::from_str(&root).unwrap();
+    root["attributes"]["picofarm"]["spec"]["gate"]["bins"] = json!(0);
+    std::fs::write(invalid.join("zarr.json"), root.to_string()).unwrap();
+    let missing = folder.path().join("nosuch").display().to_string();
+    let web = Web::start(vec![store.display().to_string(), missing.clone()]);
+    let list = web.get("/data").text();
+    for (place, why) in [
+        (broken.display().to_string(), "not JSON"),
+        (invalid.display().to_string(), "gate.bins"),
+        (missing, "there is no such folder"),
+    ] {
+        let (_, rest) = list.split_once(&format!("<b>{place}</b>: ")).expect(&list);
+        let reason = rest.split("</li>").next().unwrap();
+        assert!(reason.contains(why), "{reason}");
+    }
+    assert!(list.contains("/data?set=0%2Frooms"), "{list}");
+    let page = web.get("/data?set=0%2Fbroken");
+    assert_eq!(page.status, 500);
+    assert!(page.text().contains("not JSON"), "{}", page.text());
 }
