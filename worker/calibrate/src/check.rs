@@ -23,6 +23,9 @@ pub(crate) struct Least {
     pub t0: f64,
     pub laser: f64,
     pub coordinate: f64,
+    /// Share of the times that a shift of t0 alone explains more, or share of the rms that it
+    /// saves.
+    pub gain: [f64; 2],
 }
 
 impl Least {
@@ -30,12 +33,14 @@ impl Least {
         t0: 0.25,
         laser: 0.006,
         coordinate: 0.004,
+        gain: [0.0; 2],
     };
     /// Where the pulse is unknown, so that its peak is.
     pub const VAGUE: Self = Self {
         t0: 0.8,
         laser: 0.03,
         coordinate: 0.02,
+        gain: [0.005, 0.03],
     };
 }
 
@@ -52,8 +57,8 @@ pub(crate) const SIGNIFICANT: f64 = 5.0;
 const VAGUE_M: f64 = 0.02;
 /// Share of the rms that a further parameter must save.
 const SAVES: f64 = 0.03;
-/// Share of the times that a shift of t0 must explain, if it saves nothing of the rms.
-const GAIN: f64 = 0.005;
+/// Share of the times that a shift of t0 may lose, if it saves rms.
+const LOSS: f64 = 0.005;
 
 /// Arrays for pictures of a check.
 #[derive(Debug, Clone)]
@@ -314,8 +319,9 @@ fn refine(base: &Model, seen: &Observed, least: Least, lens: bool) -> Refined {
         model.beams.clone_from(&best.model.beams);
         let simple = seen.judged(model, best.errors, best.tied);
         // A shift that improves nothing is none.
-        let gains = best.agreeing > simple.agreeing + GAIN
-            || best.agreeing > simple.agreeing - GAIN && best.rms_m < (1.0 - SAVES) * simple.rms_m;
+        let [share, saved] = least.gain;
+        let gains = best.agreeing > simple.agreeing + share
+            || best.agreeing > simple.agreeing - LOSS && best.rms_m < (1.0 - saved) * simple.rms_m;
         t0 &= gains || !lens;
         if !t0 {
             best = simple;
