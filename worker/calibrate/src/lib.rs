@@ -52,4 +52,4 @@ pub use pulse::Pulse;
 pub use report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict};
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "calibrate-1";
+pub const VERSION: &str = "calibrate-2";

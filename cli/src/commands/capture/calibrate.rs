@@ -377,4 +377,22 @@ mod tests {
             Code::Input
         );
     }
+
+    #[test]
+    fn a_capture_that_no_correction_explains_is_not_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (lab, right) = (folder.path().join("lab"), folder.path().join("right"));
+        let mut capture = with_a_wrong_laser();
+        capture.intrinsics.fx *= 30.0;
+        capture.intrinsics.fy *= 30.0;
+        assert!(geometry(&capture)[0].contains("degrees wide"));
+        write(&capture, &lab).expect("a free folder");
+        let output = Output { json: true };
+        for refused in [check(&lab, output), calibrate(&lab, &right, output)] {
+            let refused = refused.expect_err("a view of three degrees");
+            assert_eq!(refused.code, Code::Failed);
+            assert!(refused.hint.expect("a way out").contains("by hand"));
+        }
+        assert!(!right.exists());
+    }
 }
