@@ -57,6 +57,8 @@ pub(crate) const SIGNIFICANT: f64 = 5.0;
 const VAGUE_M: f64 = 0.02;
 /// Share of the rms that a further parameter must save.
 const SAVES: f64 = 0.03;
+/// Fewest times that move t0 alone.
+const FEWEST: usize = 100;
 /// Share of the times that a shift of t0 may lose, if it saves rms.
 const LOSS: f64 = 0.005;
 
@@ -246,6 +248,13 @@ pub(crate) struct Refined {
     pub least: Least,
 }
 
+impl Refined {
+    /// Whether any parameter differs from the stated one.
+    pub fn moved(&self) -> bool {
+        self.t0 || self.free != Free::T0
+    }
+}
+
 fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
     sub(fitted.model.laser, base.laser)
 }
@@ -322,7 +331,8 @@ fn refine(base: &Model, seen: &Observed, least: Least, lens: bool) -> Refined {
         let [share, saved] = least.gain;
         let gains = best.agreeing > simple.agreeing + share
             || best.agreeing > simple.agreeing - LOSS && best.rms_m < (1.0 - saved) * simple.rms_m;
-        t0 &= gains || !lens;
+        let enough = seen.times.iter().flatten().flatten().count() >= FEWEST;
+        t0 &= gains && enough || !lens;
         if !t0 {
             best = simple;
         }

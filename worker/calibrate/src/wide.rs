@@ -5,12 +5,21 @@ use picofarm_demultiplex::Capture;
 use picofarm_settings::Gate;
 use rayon::prelude::*;
 
-use crate::{Checked, Measurement, observe::CONTRAST, pulse::brightest};
+use crate::{
+    Checked, Measurement,
+    numeric::{median, quantile},
+    observe::CONTRAST,
+    pulse::brightest,
+};
 
 /// Width at half maximum from which on bins are added up, and the width to come to, bins.
 const WIDE: (f64, f64) = (4.0, 2.5);
 /// Fewest returns of one bounce that tell the width.
 const FEWEST: usize = 3;
+/// Without returns: the quantile of the widths of two-bounce peaks that tells the width, and the
+/// brightest bin of a peak over the mean bin (or one count), at least.
+const NARROWEST: f64 = 0.25;
+const PEAK: f64 = 20.0;
 /// Fewest bins that must be left.
 const LEFT: usize = 32;
 
@@ -28,14 +37,30 @@ pub(crate) fn factor(m: &Measurement) -> usize {
         })
         .collect();
     if widths.len() < FEWEST {
-        return 1;
+        // Two-bounce peaks are as wide, or wider where a pixel sees a range of depths.
+        let mut peaks: Vec<f64> = each.par_chunks(bins).filter_map(peak_width).collect();
+        widths = Vec::from_iter(quantile(&mut peaks, NARROWEST));
     }
-    let usual = crate::numeric::median(&mut widths).unwrap_or(1.0);
+    let usual = median(&mut widths).unwrap_or(1.0);
     if usual <= WIDE.0 {
         return 1;
     }
     let added = (usual / WIDE.1).ceil() as usize;
     if bins / added < LEFT { 1 } else { added }
+}
+
+/// Width of the brightest peak of a histogram, if it stands out.
+fn peak_width(h: &[f32]) -> Option<f64> {
+    let (mut peak, mut sum) = (0, 0.0);
+    for (b, x) in h.iter().enumerate() {
+        sum += f64::from(*x);
+        if *x > h[peak] {
+            peak = b;
+        }
+    }
+    let mean = sum / h.len() as f64;
+    // Few counts have no width.
+    (f64::from(h[peak]) > PEAK * mean.max(1.0)).then(|| width(h, peak))
 }
 
 /// Full width at half maximum of a peak about a bin, smoothed over three bins, in whole bins.

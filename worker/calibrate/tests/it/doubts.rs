@@ -33,11 +33,17 @@ fn faults_that_no_correction_covers_are_wrong_and_nothing_is_corrected() {
         c.camera.intrinsics.cx = 0.2 * side;
         c.camera.intrinsics.cy = 0.7 * side;
     });
+    let corner = disturbed(&|c| {
+        c.camera.intrinsics.cx -= 0.7;
+        c.camera.intrinsics.cy -= 0.7;
+        c.gate.start_m += GATE.bin_width_m;
+    });
     let late = disturbed(&|c| c.gate.start_m -= 20_000.0 / picofarm_sensor::PS_PER_M);
     let cases = [
         ("spots behind the camera", behind),
         ("fov in radians", radians),
         ("another principal point", shifted),
+        ("pixels counted from their corners", corner),
         ("t0 20 ns late", late),
     ];
     for (name, capture) in cases {
