@@ -23,9 +23,9 @@ pub(crate) struct Least {
     pub t0: f64,
     pub laser: f64,
     pub coordinate: f64,
-    /// Share of the times that a shift of t0 alone explains more, or share of the rms that it
-    /// saves.
-    pub gain: [f64; 2],
+    /// Share of the times that a shift of t0 alone must explain more, or share of the rms that it
+    /// must save; `None` where returns with a known pulse tell t0.
+    pub gain: Option<[f64; 2]>,
 }
 
 impl Least {
@@ -33,14 +33,14 @@ impl Least {
         t0: 0.25,
         laser: 0.006,
         coordinate: 0.004,
-        gain: [0.0; 2],
+        gain: None,
     };
     /// Where the pulse is unknown, so that its peak is.
     pub const VAGUE: Self = Self {
         t0: 0.8,
         laser: 0.03,
         coordinate: 0.02,
-        gain: [0.005, 0.03],
+        gain: Some([0.005, 0.03]),
     };
 }
 
@@ -328,11 +328,14 @@ fn refine(base: &Model, seen: &Observed, least: Least, lens: bool) -> Refined {
         model.beams.clone_from(&best.model.beams);
         let simple = seen.judged(model, best.errors, best.tied);
         // A shift that improves nothing is none.
-        let [share, saved] = least.gain;
-        let gains = best.agreeing > simple.agreeing + share
-            || best.agreeing > simple.agreeing - LOSS && best.rms_m < (1.0 - saved) * simple.rms_m;
-        let enough = seen.times.iter().flatten().flatten().count() >= FEWEST;
-        t0 &= gains && enough || !lens;
+        let gains = least.gain.is_none_or(|[share, saved]| {
+            let more = best.agreeing > simple.agreeing + share;
+            let sharper =
+                best.agreeing > simple.agreeing - LOSS && best.rms_m < (1.0 - saved) * simple.rms_m;
+            let times = seen.times.iter().flatten().flatten().count();
+            times >= FEWEST && (more || sharper)
+        });
+        t0 &= gains || !lens;
         if !t0 {
             best = simple;
         }
