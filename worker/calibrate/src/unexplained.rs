@@ -26,6 +26,9 @@ const BEHIND: f64 = 2.0;
 /// Least mean offset of returns from their spots that tells a wrong principal point, pixels and
 /// standard errors; the standard deviation of one return within its pixel.
 const DRIFT: ([f64; 2], f64) = ([0.35, 3.5], 0.29);
+/// Half a pixel and a margin, and the share of returns beyond it that tells the same.
+const HALF: f64 = 0.6;
+const MISSED: f64 = 0.4;
 /// Returns further from their spots belong to others, pixels.
 const OTHER: f64 = 2.0;
 const BY_HAND: &str = "check by hand the camera (field of view, cx, cy), the order of rows and columns, the unit and axes of spots and laser, and t0: more than one of them is wrong, or the room moved";
@@ -127,5 +130,9 @@ fn drift(f: &Findings) -> Option<[f64; 2]> {
     let mean = [0, 1].map(|a| all.iter().map(|o| o[a]).sum::<f64>() / n);
     let ([least, errors], deviation) = DRIFT;
     let size = (mean[0] * mean[0] + mean[1] * mean[1]).sqrt();
-    (all.len() > RETURNS && size > least.max(errors * deviation / n.sqrt())).then_some(mean)
+    // A return's pixel holds its spot, wherever in the pixel a regular grid of spots may be.
+    let missed = all.iter().filter(|o| o.iter().any(|x| x.abs() > HALF));
+    let missed = missed.count() as f64 / n;
+    (all.len() > RETURNS && missed > MISSED && size > least.max(errors * deviation / n.sqrt()))
+        .then_some(mean)
 }
