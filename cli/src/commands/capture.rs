@@ -38,7 +38,15 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
 /// # Errors
 /// Fails on another folder, or a damaged one.
 pub fn read(folder: &Path) -> Result<Capture> {
-    block_on(Capture::read(folder)).map_err(|e| unreadable(folder, e))
+    let hint = match folder.exists() {
+        true => {
+            "expected a folder that `picofarm capture import FILES --out FOLDER` or `picofarm scene render FILE --out FOLDER` wrote"
+        }
+        false => {
+            "there is no such folder; make it with `picofarm capture import FILES --out FOLDER`"
+        }
+    };
+    block_on(Capture::read(folder)).map_err(|e| unreadable(folder, e).hint(hint))
 }
 
 /// Writes a capture and its picture to a new folder.

@@ -5,8 +5,9 @@ use picofarm_settings::PS_PER_M;
 use crate::{
     Measurement,
     check::{Refined, Relocated, SIGNIFICANT, UNCLEAR, upright},
-    counting::{background, counting, noisy},
+    counting::{background, counting, judged, noisy},
     fit::{Fitted, Observed},
+    geometry::geometry,
     hypotheses::{Chosen, SCALES, order_name},
     masks::MaskOrder,
     model::{FOCAL, LASER, Model, T0, WIDTH},
@@ -14,10 +15,9 @@ use crate::{
     observe::Seen,
     pixels::Pixels,
     report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict},
+    unexplained::Failed,
 };
 
-/// Share of times within one bin below which a calibration explains nothing.
-const UNEXPLAINED: f64 = 0.22;
 /// t0 in bins, laser in metres, focal length and bin width relative, from
 /// which on results are wrong.
 const WRONG_T0: f64 = 2.0;
@@ -43,6 +43,10 @@ pub(crate) struct Findings<'a> {
     /// Of a capture of all spots at once: distance of peaks from predicted times, over that from
     /// shifted times.
     pub unclear: Option<f64>,
+    /// Why no calibration explains the times.
+    pub failed: Option<&'a Failed>,
+    /// Bins of the capture in a bin here.
+    pub added: usize,
 }
 
 /// Writes down one cause.
@@ -77,38 +81,28 @@ impl Found<'_> {
 }
 
 pub(crate) fn report(f: &Findings) -> Report {
-    let mut causes = Vec::new();
+    let mut causes = geometry(&f.m.capture);
     discrete(f, &mut causes);
     continuous(f, &mut causes);
     counting(f, &mut causes);
-    let fitted = &f.refined.fitted;
-    let unexplained = match f.unclear {
-        None => (fitted.agreeing < UNEXPLAINED).then(|| {
-            let percent = 100.0 * fitted.agreeing;
-            let what = format!("only {percent:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more");
-            (fitted.agreeing, "share of times", what)
-        }),
-        // Noise hides peaks as well.
-        Some(share) => (share > UNCLEAR && !noisy(&causes)).then(|| {
-            let what = format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.15 and less");
-            (share, "of the distance by chance", what)
-        }),
-    };
-    if let Some((value, unit, finding)) = unexplained {
+    causes.extend(f.failed.map(|failed| failed.cause.clone()));
+    // Noise hides peaks as well.
+    if let Some(share) = f.unclear.filter(|s| *s > UNCLEAR && !noisy(&causes)) {
         causes.push(
             Found {
                 fault: Fault::Unexplained,
                 wrong: true,
-                value,
+                value: share,
                 error: 0.0,
-                unit,
-                finding,
+                unit: "of the distance by chance",
+                finding: format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.15 and less"),
                 advice: "check the stated spots, the camera and the unit of time together: more than one of them is wrong, or the room moved",
                 corrected: false,
             }
             .cause(),
         );
     }
+    let fitted = &f.refined.fitted;
     causes.sort_by_key(|c| std::cmp::Reverse(c.severity));
     let agreement = |fitted: &Fitted| Agreement {
         share: fitted.agreeing,
@@ -121,6 +115,7 @@ pub(crate) fn report(f: &Findings) -> Report {
             .max()
             .unwrap_or(Verdict::Good),
         causes,
+        guesses: f.failed.map_or(Vec::new(), |failed| failed.guesses.clone()),
         notes: notes(f),
         stated: Some(agreement(f.before)),
         corrected: Some(agreement(fitted)),
@@ -130,7 +125,7 @@ pub(crate) fn report(f: &Findings) -> Report {
             shape,
             fwhm_ps: shape.fwhm_bins() * fitted.model.width * PS_PER_M,
         }),
-        background: (f.pixels.dark_bins > 0).then(|| background(f.pixels)),
+        background: judged(f).then(|| background(f)),
         spots: (0..fitted.model.beams.len()).map(|k| spot(f, k)).collect(),
     }
 }
@@ -143,7 +138,7 @@ fn spot(f: &Findings, k: usize) -> SpotResidual {
         .flatten()
         .filter(|e| e.abs() < fitted.model.width)
         .collect();
-    let squares: f64 = near.iter().map(|e| e * e).sum();
+    let squares = near.iter().fold(0.0, |sum, e| sum + e * e);
     let (point, path) = fitted.model.spot(k);
     SpotResidual {
         times: near.len(),
@@ -153,7 +148,7 @@ fn spot(f: &Findings, k: usize) -> SpotResidual {
     }
 }
 
-fn discrete(f: &Findings, causes: &mut Vec<Cause>) {
+pub(crate) fn discrete(f: &Findings, causes: &mut Vec<Cause>) {
     let (h, chosen) = (&f.chosen.hypothesis, f.chosen);
     let shares = format!(
         "{:.0} % of the two-bounce times agree, against {:.0} % as stated",
@@ -235,26 +230,27 @@ fn discrete(f: &Findings, causes: &mut Vec<Cause>) {
     }
 }
 
-fn continuous(f: &Findings, causes: &mut Vec<Cause>) {
+pub(crate) fn continuous(f: &Findings, causes: &mut Vec<Cause>) {
     let (r, base) = (f.refined, f.base);
     let model = &r.fitted.model;
     let errors = &r.fitted.errors;
     if r.t0 {
-        let late = (model.start - base.start) / base.width;
+        let bin = base.width / f.added as f64;
+        let late = (model.start - base.start) / bin;
         let ps = (model.start - base.start) * PS_PER_M;
         causes.push(
             Found {
                 fault: Fault::TimeZero,
-                wrong: late.abs() >= WRONG_T0,
+                wrong: late.abs() >= WRONG_T0 * f.added as f64,
                 value: late,
-                error: errors[T0] / base.width,
+                error: errors[T0] / bin,
                 unit: "bins",
                 finding: format!(
                     "t0 is off: the gate begins {:.2} bins ({:.1} ps) {} than stated, ± {:.2}",
                     late.abs(),
                     ps.abs(),
                     if late > 0.0 { "later" } else { "earlier" },
-                    errors[T0] / base.width
+                    errors[T0] / bin
                 ),
                 advice: "add the shift to the begin of the gate; t0 refers to the pulse's peak",
                 corrected: true,
@@ -319,8 +315,8 @@ fn continuous(f: &Findings, causes: &mut Vec<Cause>) {
                 unit: "relative",
                 finding: format!(
                     "bins are {:.3} ps wide, not {:.3}: {:+.2} %, ± {:.2}",
-                    model.width * PS_PER_M,
-                    base.width * PS_PER_M,
+                    model.width * PS_PER_M / f.added as f64,
+                    base.width * PS_PER_M / f.added as f64,
                     100.0 * width,
                     100.0 * errors[WIDTH]
                 ),
@@ -381,8 +377,14 @@ fn notes(f: &Findings) -> Vec<String> {
             "no spot has a stated place: a common scale of all lengths cannot be seen".into(),
         );
     }
-    if f.pixels.dark_bins == 0 {
+    if !judged(f) {
         notes.push("the gate begins with light: background and hot pixels cannot be seen".into());
+    }
+    let padding = f.pixels.padding.iter().filter(|p| **p).count();
+    if padding > 0 {
+        notes.push(format!(
+            "{padding} pixels at the edges have no count in whole rows or columns: they are taken for padding and stay empty"
+        ));
     }
     if f.seen.pulse.is_none() {
         notes.push(format!(
@@ -390,9 +392,15 @@ fn notes(f: &Findings) -> Vec<String> {
             crate::observe::ASSUMED.fwhm_bins()
         ));
     }
+    if f.added > 1 {
+        notes.push(format!(
+            "the pulse is many bins wide: {} bins each were added up for the check, and times agree within such a sum",
+            f.added
+        ));
+    }
     notes.push(format!(
         "shifts below {:.2} bins of t0, {:.0} mm of the laser and {SIGNIFICANT} standard errors are not corrected",
-        f.refined.least.t0,
+        f.refined.least.t0 * f.added as f64,
         1e3 * f.refined.least.laser
     ));
     notes

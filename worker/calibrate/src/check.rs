@@ -12,6 +12,8 @@ use crate::{
     observe,
     pixels::Pixels,
     spots::locate,
+    unexplained::failed,
+    wide::{self, Coarse},
 };
 
 /// Least shifts of t0 in bins, of the laser and of each of its coordinates in metres, that are
@@ -21,6 +23,9 @@ pub(crate) struct Least {
     pub t0: f64,
     pub laser: f64,
     pub coordinate: f64,
+    /// Share of the times that a shift of t0 alone must explain more, or share of the rms that it
+    /// must save; `None` where returns with a known pulse tell t0.
+    pub gain: Option<[f64; 2]>,
 }
 
 impl Least {
@@ -28,12 +33,14 @@ impl Least {
         t0: 0.25,
         laser: 0.006,
         coordinate: 0.004,
+        gain: None,
     };
     /// Where the pulse is unknown, so that its peak is.
     pub const VAGUE: Self = Self {
         t0: 0.8,
         laser: 0.03,
         coordinate: 0.02,
+        gain: Some([0.005, 0.03]),
     };
 }
 
@@ -50,6 +57,10 @@ pub(crate) const SIGNIFICANT: f64 = 5.0;
 const VAGUE_M: f64 = 0.02;
 /// Share of the rms that a further parameter must save.
 const SAVES: f64 = 0.03;
+/// Fewest times that move t0 alone.
+const FEWEST: usize = 100;
+/// Share of the times that a shift of t0 may lose, if it saves rms.
+const LOSS: f64 = 0.005;
 
 /// Arrays for pictures of a check.
 #[derive(Debug, Clone)]
@@ -60,7 +71,8 @@ pub struct Pictures {
     pub stated_m: Vec<f32>,
     /// The same with the corrected calibration.
     pub corrected_m: Vec<f32>,
-    /// Share of a return's light in a bin, over the bin's middle minus the pulse's peak, bins.
+    /// Share of a return's light in a bin, over the bin's middle minus the pulse's peak, bins. Bins
+    /// are added up for a wide pulse, here and in `pulse`.
     pub pulse_samples: Vec<[f64; 2]>,
     /// The estimated pulse.
     pub pulse: Option<Pulse>,
@@ -83,7 +95,24 @@ pub struct Checked {
 /// Returns [`CalibrateError`] for an argument that cannot be used.
 pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
     m.check()?;
-    let pixels = Pixels::new(m);
+    let added = wide::factor(m);
+    if added == 1 {
+        return judge(m, 1, Pixels::new(m));
+    }
+    let coarse = Coarse::new(m, added);
+    let part = coarse.measurement(m);
+    let pixels = Pixels {
+        // Sums of bins hide a ceiling of counts.
+        ceiling: Pixels::new(m).ceiling,
+        ..Pixels::new(&part)
+    };
+    let mut checked = judge(&part, added, pixels)?;
+    coarse.restore(m, &mut checked);
+    Ok(checked)
+}
+
+/// Checks a capture in whose histograms `added` bins were added up.
+fn judge(m: &Measurement, added: usize, pixels: Pixels) -> Result<Checked, CalibrateError> {
     let stated = Model::new(&m.capture);
     let seen = match m.per_spot {
         Some(h) => observe::each(m, h, &pixels),
@@ -145,19 +174,8 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
         .map(|r| r.map(|r| r.bin))
         .collect();
     placed.place_beams(&bins);
-    let before = seen.observed.judged(placed, [0.0; 6], 0.0);
-    let pictures = Pictures {
-        stated_m: image(&before, &seen.observed, &seen.observed.pixels, m.pixels()),
-        corrected_m: image(
-            &refined.fitted,
-            &observed,
-            &seen.observed.pixels,
-            m.pixels(),
-        ),
-        pulse_samples: seen.samples.clone(),
-        pulse: seen.pulse,
-    };
-    let findings = Findings {
+    let before = seen.observed.judged(placed.clone(), [0.0; 6], 0.0);
+    let mut findings = Findings {
         m,
         pixels: &pixels,
         seen: &seen,
@@ -169,6 +187,41 @@ pub fn check(m: &Measurement) -> Result<Checked, CalibrateError> {
         relocated: &relocated,
         masks: masks.as_ref(),
         unclear,
+        failed: None,
+        added,
+    };
+    // What explains nothing corrects nothing.
+    let failed = failed(&findings);
+    let kept = keep(&placed, &seen.observed, least);
+    let unchanged = Chosen {
+        hypothesis: Hypothesis::stated(stated.beams.len()),
+        share: chosen.stated_share,
+        pixels: chosen.stated_pixels,
+        stated_share: chosen.stated_share,
+        stated_pixels: chosen.stated_pixels,
+    };
+    if failed.is_some() {
+        findings = Findings {
+            observed: &seen.observed,
+            chosen: &unchanged,
+            base: &placed,
+            refined: &kept,
+            relocated: &[],
+            masks: None,
+            failed: failed.as_ref(),
+            ..findings
+        };
+    }
+    let pictures = Pictures {
+        stated_m: image(&before, &seen.observed, &seen.observed.pixels, m.pixels()),
+        corrected_m: image(
+            &findings.refined.fitted,
+            findings.observed,
+            &seen.observed.pixels,
+            m.pixels(),
+        ),
+        pulse_samples: seen.samples.clone(),
+        pulse: seen.pulse,
     };
     let report = report(&findings);
     let corrected = Corrected::new(&findings, &report.causes);
@@ -193,6 +246,13 @@ pub(crate) struct Refined {
     pub separable: bool,
     /// What counts as a shift.
     pub least: Least,
+}
+
+impl Refined {
+    /// Whether any parameter differs from the stated one.
+    pub fn moved(&self) -> bool {
+        self.t0 || self.free != Free::T0
+    }
 }
 
 fn shift(fitted: &Fitted, base: &Model) -> [f64; 3] {
@@ -261,13 +321,24 @@ fn refine(base: &Model, seen: &Observed, least: Least, lens: bool) -> Refined {
         best = seen.fit(base, free);
     }
     let late = (best.model.start - base.start) / base.width;
-    let t0 = late.abs() > least.t0.max(SIGNIFICANT * best.errors[0] / base.width);
-    let simple = free == Free::T0 && !t0;
-    if simple {
+    let mut t0 = late.abs() > least.t0.max(SIGNIFICANT * best.errors[0] / base.width);
+    if free == Free::T0 {
         let mut model = base.clone();
         // Beams without a stated spot keep the ranges of the fit.
         model.beams.clone_from(&best.model.beams);
-        best = seen.judged(model, best.errors, best.tied);
+        let simple = seen.judged(model, best.errors, best.tied);
+        // A shift that improves nothing is none.
+        let gains = least.gain.is_none_or(|[share, saved]| {
+            let more = best.agreeing > simple.agreeing + share;
+            let sharper =
+                best.agreeing > simple.agreeing - LOSS && best.rms_m < (1.0 - saved) * simple.rms_m;
+            let times = seen.times.iter().flatten().flatten().count();
+            times >= FEWEST && (more || sharper)
+        });
+        t0 &= gains || !lens;
+        if !t0 {
+            best = simple;
+        }
     }
     Refined {
         fitted: best,

@@ -15,12 +15,12 @@ use crate::{
 /// Pixels up to which a neighbour fills in.
 const REACH: usize = 6;
 
-/// The nearest good pixel of each pixel; of equally near ones the first.
-fn sources(good: &[bool], width: usize) -> Vec<Option<usize>> {
+/// The nearest good pixel of each pixel; of equally near ones the first. Padding stays as it is.
+fn sources(good: &[bool], padding: &[bool], width: usize) -> Vec<Option<usize>> {
     let height = good.len() / width;
     (0..good.len())
         .map(|p| {
-            if good[p] {
+            if good[p] || padding[p] {
                 return Some(p);
             }
             let (u, v) = (p % width, p / width);
@@ -102,7 +102,7 @@ impl Corrected {
             turn: h.turn,
             mask_order: f.masks.map(|(m, _)| m.order.clone()),
             turn_masks: f.masks.is_none_or(|(_, turned)| !turned),
-            source: sources(&f.pixels.good(), f.m.width()),
+            source: sources(&f.pixels.good(), &f.pixels.padding, f.m.width()),
             pulses: f.pixels.pulses.filter(|_| has(Fault::PileUp)),
             dark_bins: has(Fault::Background).then_some(f.pixels.dark_bins),
         }

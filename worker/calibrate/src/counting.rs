@@ -2,8 +2,8 @@
 
 use crate::{
     causes::{Findings, Found},
+    geometry::earliest,
     numeric::median,
-    pixels::Pixels,
     report::{Cause, Fault, Verdict},
 };
 
@@ -13,6 +13,10 @@ const WRONG_DEAD: f64 = 0.2;
 const PILE_UP: [f64; 2] = [0.02, 0.3];
 /// Background over light, in the gate of the median pixel, likewise.
 const BACKGROUND: [f64; 2] = [0.1, 0.7];
+/// Share of times that agree from which on a background does not make results wrong.
+const READ: f64 = 0.6;
+/// Bins before the first light of a spot, at least, that show the background.
+const FREE: f64 = 4.0;
 /// Share of histograms with a bin at the ceiling that makes results wrong.
 const WRONG_CLIPPED: f64 = 0.05;
 
@@ -25,10 +29,18 @@ pub(crate) fn noisy(causes: &[Cause]) -> bool {
     })
 }
 
+/// Whether the gate has bins before the first light, which show the background.
+pub(crate) fn judged(f: &Findings) -> bool {
+    let model = &f.refined.fitted.model;
+    let free = |path: f64| (path - model.start) / model.width >= FREE;
+    // Without stated spots the histograms alone tell.
+    f.pixels.dark_bins > 0 && earliest(model).is_none_or(free)
+}
+
 /// Background of the median pixel, counts per bin.
-pub(crate) fn background(pixels: &Pixels) -> f64 {
-    let mut dark: Vec<f64> = pixels.dark.iter().map(|x| f64::from(*x)).collect();
-    median(&mut dark).unwrap_or(0.0)
+pub(crate) fn background(f: &Findings) -> f64 {
+    let mut dark: Vec<f64> = f.pixels.dark.iter().map(|x| f64::from(*x)).collect();
+    median(&mut dark).unwrap_or(0.0) / f.added as f64
 }
 
 /// Names dead, hot and clipped pixels, pile-up and background.
@@ -62,8 +74,13 @@ pub(crate) fn counting(f: &Findings, causes: &mut Vec<Cause>) {
     pixels(
         Fault::DeadPixels,
         &p.dead,
-        "are dead: they have no counts above the background",
-        "replace the sensor, or take what the nearest good pixels show instead",
+        match p.shade {
+            true => "are dead: they lack even the background that the others have",
+            false => {
+                "have no light: they are dead, or in full shadow, and no background tells which"
+            }
+        },
+        "take what the nearest good pixels show instead; replace the sensor if many stay dark",
         WRONG_DEAD,
     );
     pixels(
@@ -112,19 +129,21 @@ pub(crate) fn counting(f: &Findings, causes: &mut Vec<Cause>) {
             .cause(),
         );
     }
-    let dark = background(p) * f.m.bins() as f64;
+    let dark = background(f) * (f.added * f.m.bins()) as f64;
     let share = dark / p.light.max(1e-300);
-    if p.dark_bins > 0 && share > BACKGROUND[0] {
+    // A gate that ends early holds little light of a capture whose times are good.
+    let read = f.m.per_spot.is_some() && f.refined.fitted.agreeing > READ;
+    if judged(f) && share > BACKGROUND[0] {
         causes.push(
             Found {
                 fault: Fault::Background,
-                wrong: share > BACKGROUND[1],
-                value: background(p),
+                wrong: share > BACKGROUND[1] && !read,
+                value: background(f),
                 error: 0.0,
                 unit: "counts per bin",
                 finding: format!(
                     "the background is {:.3} counts per bin, {share:.1} times the light of the median pixel over the gate",
-                    background(p)
+                    background(f)
                 ),
                 advice: "darken the room, narrow the optical filter, or gate earlier; the mean is subtracted, its noise stays",
                 corrected: true,

@@ -196,7 +196,7 @@ impl Observed {
             .copied()
             .filter(|e| e.abs() < model.width)
             .collect();
-        let squares: f64 = near.iter().map(|e| e * e).sum();
+        let squares = near.iter().fold(0.0, |sum, e| sum + e * e);
         let all = self.times.iter().flatten().flatten().count().max(1);
         let agreeing = near.len() as f64 / all as f64;
         let rms_m = (squares / near.len().max(1) as f64).sqrt();

@@ -230,7 +230,7 @@ pub(crate) fn distance(model: &Model, seen: &Observed) -> f64 {
 }
 
 /// Distance of a pixel from the projection of a spot, pixels.
-fn apart(model: &Model, k: usize, pixel: usize) -> Option<f64> {
+pub(crate) fn apart(model: &Model, k: usize, pixel: usize) -> Option<f64> {
     let [x, y] = model.film(model.spot(k).0)?;
     let u = (pixel % model.columns) as f64 + 0.5 - x;
     let v = (pixel / model.columns) as f64 + 0.5 - y;

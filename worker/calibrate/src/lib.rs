@@ -26,6 +26,7 @@ mod correct;
 mod counting;
 mod fit;
 mod flash;
+mod geometry;
 mod hypotheses;
 mod masks;
 mod measurement;
@@ -38,14 +39,17 @@ mod pulse;
 mod report;
 mod spots;
 mod times;
+mod unexplained;
+mod wide;
 
 pub use assign::assign;
 pub use check::{Checked, Pictures, check};
 pub use correct::Corrected;
+pub use geometry::geometry;
 pub use hypotheses::Turn;
 pub use measurement::{CalibrateError, Measurement};
 pub use pulse::Pulse;
 pub use report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict};
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "calibrate-1";
+pub const VERSION: &str = "calibrate-2";

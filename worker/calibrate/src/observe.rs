@@ -16,7 +16,7 @@ use crate::{
 /// The greatest number of pixels that take part.
 const MOST: usize = 2500;
 /// A return's brightest bin over those of all other pixels, at least.
-const CONTRAST: f64 = 4.0;
+pub(crate) const CONTRAST: f64 = 4.0;
 /// Share of the pulses from which on pile-up spoils the shape of a return.
 const SPOILT: f64 = 0.3;
 /// Pulse that is assumed where no return shows one, bins.
@@ -76,7 +76,10 @@ pub(crate) fn each(m: &Measurement, per_spot: &[f32], pixels: &Pixels) -> Seen {
         .collect();
     let of_pixel = |k: usize, p: usize| &captures[k][p * bins..][..bins];
     let known = whole.iter().filter(|w| **w).count() >= 3;
-    let pulse = known.then(|| estimate(&mut returns, &whole, of_pixel));
+    let pulse = match known {
+        true => estimate(&mut returns, &whole, of_pixel),
+        false => None,
+    };
     if pulse.is_none() {
         // The rise of a spoilt return still tells its pixel, and its time to a bin.
         returns

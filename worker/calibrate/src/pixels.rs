@@ -4,8 +4,11 @@ use rayon::prelude::*;
 
 use crate::{Measurement, numeric::quantile};
 
-/// Share of a bright pixel's counts below which a pixel counts as dead.
+/// Share of a bright pixel's counts below which a pixel counts as unlit.
 const DEAD: f64 = 0.002;
+/// Share of the usual background below which an unlit pixel counts as dead, and photons of that
+/// background from which on it can be seen. A pixel in shadow has the background of the others.
+const LACKS: (f64, f64) = (0.3, 12.0);
 /// Share of a pixel's counts that come before any light can, and factor over the median's
 /// background, from which on a pixel counts as hot.
 const HOT: [f64; 2] = [0.5, 5.0];
@@ -27,6 +30,10 @@ const LEVEL: f64 = 0.03;
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Pixels {
     pub dead: Vec<bool>,
+    /// Rows and columns at the image's edges without any count.
+    pub padding: Vec<bool>,
+    /// Whether pixels that count show background, by which shadow differs from a dead pixel.
+    pub shade: bool,
     pub hot: Vec<bool>,
     /// Background of each pixel in the histogram of all spots, per bin.
     pub dark: Vec<f32>,
@@ -46,10 +53,8 @@ pub(crate) struct Pixels {
 
 impl Pixels {
     pub fn good(&self) -> Vec<bool> {
-        self.dead
-            .iter()
-            .zip(&self.hot)
-            .map(|(d, h)| !d && !h)
+        (0..self.dead.len())
+            .map(|p| !self.dead[p] && !self.hot[p] && !self.padding[p])
             .collect()
     }
 
@@ -85,11 +90,19 @@ impl Pixels {
                 }
             })
             .collect();
-        let shared = |part: &[f32]| {
-            let mut all: Vec<f64> = part.iter().map(|x| f64::from(*x)).collect();
+        let padding = padding(&totals, m.width());
+        let shared = |part: &[f32], counts: bool| {
+            let part = part
+                .iter()
+                .enumerate()
+                .filter(|(p, _)| !counts || totals[*p] > 0.0);
+            let mut all: Vec<f64> = part.map(|(_, x)| f64::from(*x)).collect();
             quantile(&mut all, 0.5).unwrap_or(0.0)
         };
-        let usual = shared(&dark);
+        let usual = shared(&dark, false);
+        // The background over the gate of a pixel that counts.
+        let shade = shared(&dark, true) * bins as f64;
+        let shaded = shade * f64::from(gain) > LACKS.1;
         let light: Vec<f64> = (0..totals.len())
             .map(|p| totals[p] - f64::from(dark[p]) * bins as f64)
             .collect();
@@ -97,7 +110,10 @@ impl Pixels {
         let dead: Vec<bool> = (0..totals.len())
             .map(|p| {
                 let noise = (3.0 * (totals[p] * f64::from(gain)).max(0.0).sqrt()) / f64::from(gain);
-                totals[p] == 0.0 || totals[p] < DEAD * bright || light[p] < DEAD * bright - noise
+                let unlit = totals[p] == 0.0
+                    || totals[p] < DEAD * bright
+                    || light[p] < DEAD * bright - noise;
+                unlit && !padding[p] && (!shaded || totals[p] < LACKS.0 * shade)
             })
             .collect();
         let hot: Vec<bool> = (0..totals.len())
@@ -108,13 +124,15 @@ impl Pixels {
                 !dead[p] && share > HOT[0] && own > HOT[1] * usual + scatter
             })
             .collect();
-        let good = |p: &usize| !dead[*p] && !hot[*p];
+        let good = |p: &usize| !dead[*p] && !hot[*p] && !padding[*p];
         let mut lit: Vec<f64> = (0..totals.len()).filter(good).map(|p| light[p]).collect();
         let (pulses, lost) = pile_up(m, counts, &dead, &hot);
         Self {
             ceiling: counts.then(|| ceiling(cells)).flatten(),
             light: quantile(&mut lit, 0.5).unwrap_or(0.0),
             dead,
+            padding,
+            shade: shaded,
             hot,
             dark,
             dark_bins,
@@ -138,6 +156,23 @@ impl Pixels {
 
 fn sum(h: &[f32]) -> f64 {
     h.iter().map(|x| f64::from(*x)).sum()
+}
+
+/// Whole rows and columns without any count, from the image's edges inwards: padding.
+fn padding(totals: &[f64], width: usize) -> Vec<bool> {
+    let height = totals.len() / width;
+    let empty_row = |v: &usize| totals[v * width..(v + 1) * width].iter().all(|t| *t == 0.0);
+    let empty_column = |u: &usize| (0..height).all(|v| totals[v * width + u] == 0.0);
+    let top = (0..height).take_while(empty_row).count();
+    let left = (0..width).take_while(empty_column).count();
+    if top == height {
+        return vec![false; totals.len()];
+    }
+    let bottom = height - (0..height).rev().take_while(empty_row).count();
+    let right = width - (0..width).rev().take_while(empty_column).count();
+    let inside =
+        |p: usize| (top..bottom).contains(&(p / width)) && (left..right).contains(&(p % width));
+    (0..totals.len()).map(|p| !inside(p)).collect()
 }
 
 /// The number of bins before any light, and a bright bin of each pixel.

@@ -14,6 +14,8 @@ const AFTER: usize = 7;
 
 /// Share of squared light beyond which a return has another shape than the pulse.
 const ODD: f64 = 0.03;
+/// Share of odd returns from which on the pulse is unknown.
+const UNLIKE: f64 = 0.999;
 
 /// A pulse as a Gaussian convolved with an exponential tail. Its zero, to which every time refers,
 /// is its peak.
@@ -193,12 +195,12 @@ fn place(h: &[f32], peak: usize, template: &Template) -> (i64, f64) {
 }
 
 /// Estimates the pulse from returns, and moves their times to the pulse's peak. `histogram`
-/// returns the bins of a return's pixel in its own capture.
+/// returns the bins of a return's pixel in its own capture. `None` if the returns show no pulse.
 pub(crate) fn estimate<'a>(
     returns: &mut [Option<Return>],
     usable: &[bool],
     histogram: impl Fn(usize, usize) -> &'a [f32],
-) -> Pulse {
+) -> Option<Pulse> {
     let peaks: Vec<(&[f32], usize)> = returns
         .iter()
         .enumerate()
@@ -236,6 +238,10 @@ pub(crate) fn estimate<'a>(
             }
         }
     }
+    // No pulse of any width is like the returns.
+    if best[2] > UNLIKE * ODD * peaks.len() as f64 || peaks.is_empty() {
+        return None;
+    }
     let pulse = Pulse {
         sigma_bins: best[0],
         tail_bins: best[1],
@@ -248,5 +254,5 @@ pub(crate) fn estimate<'a>(
             r.bin = bin as f64 + 0.5 + shift as f64 / STEPS as f64;
         }
     }
-    pulse
+    Some(pulse)
 }

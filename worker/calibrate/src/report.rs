@@ -63,6 +63,10 @@ pub enum Fault {
     NoReturns,
     /// Times agree with no calibration that was tried.
     Unexplained,
+    /// The stated view or principal point is unusual.
+    Camera,
+    /// Stated spots cannot be seen, or their light cannot be in the gate.
+    Spots,
 }
 
 /// A fault that was found.
@@ -126,6 +130,8 @@ pub struct Report {
     pub verdict: Verdict,
     /// The faults that were found, the worst first.
     pub causes: Vec<Cause>,
+    /// Corrections that came nearest, if none explains the times. Nothing confirms them.
+    pub guesses: Vec<Cause>,
     /// What cannot be seen in this capture.
     pub notes: Vec<String>,
     /// Agreement with the stated calibration.
@@ -144,4 +150,16 @@ pub struct Report {
     pub background: Option<f64>,
     /// Residuals of each spot with the corrected calibration.
     pub spots: Vec<SpotResidual>,
+}
+
+impl Report {
+    /// Returns whether no correction can be trusted: the stated geometry is impossible, or no
+    /// calibration that was tried explains the times.
+    pub fn unexplained(&self) -> bool {
+        self.causes.iter().any(|c| match c.fault {
+            Fault::Unexplained => true,
+            Fault::Spots | Fault::Camera => c.severity == Verdict::Wrong,
+            _ => false,
+        })
+    }
 }

@@ -3,7 +3,9 @@
 
 use std::path::Path;
 
-use picofarm_calibrate::{Checked, Measurement, Report, VERSION, Verdict, check as judge};
+use picofarm_calibrate::{
+    Cause, Checked, Measurement, Report, VERSION, Verdict, check as judge, geometry as stated,
+};
 use picofarm_demultiplex as flash;
 use picofarm_exchange::capture::{Beam, Capture};
 use picofarm_scene::{Camera, Intrinsics, Vec3};
@@ -17,6 +19,11 @@ use crate::{
         files::{free_folder, save, write_atomically},
     },
 };
+
+/// Width of a pulse at half its height below which only that it is narrow is sure, bins.
+const NARROW: f64 = 0.5;
+/// What to check where no correction explains the times.
+const BY_HAND: &str = "check by hand the camera (fov_deg in degrees, cx, cy), the order of rows and columns (axes), the unit and axes of spots_m and laser_m (metres; frame), and t0; then import the capture again";
 
 /// The report and its picture in a capture's folder: `dataset verify` expects them there.
 const REPORT: &str = "render/calibration.json";
@@ -37,12 +44,15 @@ pub fn check(folder: &Path, output: Output) -> Result<()> {
         Verdict::Good | Verdict::Usable => Ok(()),
         Verdict::Wrong => {
             let what = format!("{}: the capture would give wrong results", folder.display());
-            let hint = match checked.report.causes.iter().all(|c| c.corrected) {
-                true => format!(
+            let wrong = checked.report.causes.iter();
+            let mut wrong = wrong.filter(|c| c.severity == Verdict::Wrong);
+            let hint = match () {
+                () if checked.report.unexplained() => BY_HAND.into(),
+                () if wrong.all(|c| c.corrected) => format!(
                     "picofarm capture calibrate {} --out DIR corrects it",
                     picofarm_proto::show::path(folder)
                 ),
-                false => "correct what is named above, and import the capture again".into(),
+                () => "correct what is named above, and import the capture again".into(),
             };
             Err(CliError::new(Code::Failed, what).hint(hint))
         }
@@ -52,11 +62,22 @@ pub fn check(folder: &Path, output: Output) -> Result<()> {
 /// Corrects a capture.
 ///
 /// # Errors
-/// A folder that is no capture, or damaged; a folder that is taken.
+/// A folder that is no capture, or damaged; a folder that is taken; a capture whose times no
+/// correction explains.
 pub fn calibrate(folder: &Path, out: &Path, output: Output) -> Result<()> {
     free_folder(out)?;
     let mut capture = read(folder)?;
     let checked = checked(&capture, folder)?;
+    if checked.report.unexplained() {
+        output.result(&facts(&checked.report), || {
+            format!("{}: {}", folder.display(), describe(&checked.report))
+        });
+        let what = format!(
+            "{}: no correction explains the times, so that nothing is written",
+            folder.display()
+        );
+        return Err(CliError::new(Code::Failed, what).hint(BY_HAND));
+    }
     let picture = calibration_picture::draw(&checked, &capture);
     correct(&mut capture, &checked);
     write(&capture, out)?;
@@ -67,9 +88,13 @@ pub fn calibrate(folder: &Path, out: &Path, output: Output) -> Result<()> {
     facts["out"] = json!(out);
     output.result(&facts, || {
         format!(
-            "{}: {}  corrected: {}\n  picture: {}\n",
+            "{}: {}  {}: {}\n  picture: {}\n",
             folder.display(),
             describe(&checked.report),
+            match checked.report.causes.iter().any(|c| c.corrected) {
+                true => "corrected",
+                false => "nothing to correct, a copy with this report",
+            },
             out.display(),
             out.join(PICTURE).display()
         )
@@ -96,12 +121,12 @@ fn camera(capture: &Capture) -> Camera {
     }
 }
 
-fn checked(capture: &Capture, folder: &Path) -> Result<Checked> {
-    let laser = Vec3::from(capture.laser);
-    let spot = |(k, beam): (usize, &Beam)| match beam {
+/// A beam as the methods take it; `None` if it meets nothing.
+fn spot(beam: &Beam, laser: Vec3) -> Option<flash::Spot> {
+    match beam {
         Beam::Spot { position, path_m } => {
             let point = Vec3::from(*position);
-            Ok(flash::Spot {
+            Some(flash::Spot {
                 direction: point - laser,
                 place: Some(flash::Place {
                     point,
@@ -109,23 +134,44 @@ fn checked(capture: &Capture, folder: &Path) -> Result<Checked> {
                 }),
             })
         }
-        Beam::Direction(way) => Ok(flash::Spot {
+        Beam::Direction(way) => Some(flash::Spot {
             direction: Vec3::from(*way),
             place: None,
         }),
-        Beam::Nothing => {
-            let what = format!(
-                "{}: spot {k} has neither a place nor a direction, so that its times cannot be judged",
-                folder.display()
-            );
-            Err(CliError::input(what).hint("import the capture without its histogram"))
-        }
-    };
-    let spots: Vec<flash::Spot> = capture
-        .beams
-        .iter()
-        .enumerate()
-        .map(spot)
+        Beam::Nothing => None,
+    }
+}
+
+/// Returns what shows in a calibration without any light, one sentence each.
+pub fn geometry(capture: &Capture) -> Vec<String> {
+    let laser = Vec3::from(capture.laser);
+    let beams = capture.beams.iter();
+    let spots: Vec<flash::Spot> = beams.filter_map(|beam| spot(beam, laser)).collect();
+    let camera = camera(capture);
+    let causes = stated(&flash::Capture {
+        histogram: &capture.sum,
+        gate: capture.gate,
+        camera: &camera,
+        laser,
+        spots: &spots,
+    });
+    let said = |c: Cause| format!("{}: {}", c.finding, c.advice);
+    causes.into_iter().map(said).collect()
+}
+
+fn checked(capture: &Capture, folder: &Path) -> Result<Checked> {
+    let laser = Vec3::from(capture.laser);
+    let beams = capture.beams.iter().enumerate();
+    let spots: Vec<flash::Spot> = beams
+        .map(|(k, beam)| {
+            spot(beam, laser).ok_or_else(|| {
+                let what = format!(
+                    "{}: spot {k} has neither a place nor a direction, so that its times cannot be judged",
+                    folder.display()
+                );
+                CliError::input(what).hint("import the capture without its histogram")
+            })
+        })
         .collect::<Result<_>>()?;
     let camera = camera(capture);
     let measurement = Measurement {
@@ -212,9 +258,17 @@ fn describe(report: &Report) -> String {
             1e3 * corrected.rms_m
         );
     }
-    if let Some(pulse) = report.pulse {
-        text += &format!("  pulse: {:.0} ps wide at half its height\n", pulse.fwhm_ps);
+    for guess in &report.guesses {
+        text += &format!("  a guess that nothing confirms: {}\n", guess.finding);
     }
+    text += &match report.pulse {
+        Some(p) if p.shape.fwhm_bins() < NARROW => format!(
+            "  pulse: narrower than a bin (about {:.0} ps at half its height)\n",
+            p.fwhm_ps
+        ),
+        Some(p) => format!("  pulse: {:.0} ps wide at half its height\n", p.fwhm_ps),
+        None => "  pulse: not measured\n".into(),
+    };
     if let Some(background) = report.background {
         text += &format!("  background: {background:.3} a bin in the sum of all spots\n");
     }
@@ -322,5 +376,23 @@ mod tests {
             calibrate(&lab, &right, output).expect_err("taken").code,
             Code::Input
         );
+    }
+
+    #[test]
+    fn a_capture_that_no_correction_explains_is_not_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (lab, right) = (folder.path().join("lab"), folder.path().join("right"));
+        let mut capture = with_a_wrong_laser();
+        capture.intrinsics.fx *= 30.0;
+        capture.intrinsics.fy *= 30.0;
+        assert!(geometry(&capture)[0].contains("degrees wide"));
+        write(&capture, &lab).expect("a free folder");
+        let output = Output { json: true };
+        for refused in [check(&lab, output), calibrate(&lab, &right, output)] {
+            let refused = refused.expect_err("a view of three degrees");
+            assert_eq!(refused.code, Code::Failed);
+            assert!(refused.hint.expect("a way out").contains("by hand"));
+        }
+        assert!(!right.exists());
     }
 }

@@ -6,7 +6,7 @@ use picofarm_files::Opener;
 use picofarm_proto::show;
 use serde_json::json;
 
-use super::{show as shown, write};
+use super::{calibrate::geometry, show as shown, write};
 use crate::{
     args::CaptureImport,
     error::{CliError, Code, Result},
@@ -22,13 +22,15 @@ pub fn run(args: &CaptureImport, output: Output) -> Result<()> {
     let describe = args.describe.as_deref();
     let made = capture::import(&args.files, describe, &Opener::anywhere()).map_err(refused)?;
     write(&made, &args.out)?;
+    let doubts = geometry(&made);
     let mut facts = shown::facts(&made);
+    facts["doubts"] = json!(doubts);
     facts["out"] = json!(args.out);
     facts["picture"] = json!(args.out.join(SINGLE_PICTURE));
     output.result(&facts, || {
         let out = show::path(&args.out);
         let mut text = format!("{}: {}", args.out.display(), shown::describe(&made));
-        for note in &made.origin.conversions {
+        for note in made.origin.conversions.iter().chain(&doubts) {
             text += &format!("  note: {note}\n");
         }
         text + &format!(

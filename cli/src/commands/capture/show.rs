@@ -21,7 +21,7 @@ pub fn run(folder: &Path, output: Output) -> Result<()> {
     let mut facts = facts(&capture);
     facts["picture"] = json!(folder.join(SINGLE_PICTURE));
     output.result(&facts, || {
-        let mut text = format!("{}: {}", capture.name, describe(&capture));
+        let mut text = format!("{}: {}", folder.display(), describe(&capture));
         text += &spots(&capture, &facts);
         text + &format!("  picture: {}\n", folder.join(SINGLE_PICTURE).display())
     });

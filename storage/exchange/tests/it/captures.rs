@@ -295,6 +295,26 @@ fn what_a_description_lacks_or_contradicts_is_named() {
             "\"fov_deg\": 200",
             ["camera.fov_deg", "200"],
         ),
+        (
+            "\"bin_width_m\": 0.05",
+            "\"bin_width_ps\": 0.032",
+            ["gate.bin_width_ps", "0.0000096 m; are these nanoseconds?"],
+        ),
+        (
+            "\"bin_width_m\": 0.05",
+            "\"bin_width_m\": 32",
+            ["gate.bin_width_m", "are these picoseconds?"],
+        ),
+        (
+            "\"fov_deg\": 60",
+            "\"fx\": -48, \"cy\": 2",
+            ["camera", "found fx -48, cy 2;"],
+        ),
+        (
+            "\"laser_m\"",
+            "\"axes\": [\"row\", \"spot\", \"column\", \"bin\"], \"laser_m\"",
+            ["[4, 3, 5, 40]", "in their order in \"axes\""],
+        ),
         ("\"start_m\": 1.0,", "", ["gate.start_m", "t0_ps"]),
         ("\"start_m\"", "\"starts\"", ["unknown field", "starts"]),
         ("[1, 0, 2], ", "", ["spots_m", "2"]),
@@ -327,6 +347,22 @@ fn what_a_description_lacks_or_contradicts_is_named() {
             assert!(said.contains(word), "{word}: {said}");
         }
     }
+}
+
+#[test]
+fn folders_without_files_of_a_laboratory_are_refused_with_the_way_out() {
+    let folder = TempDir::new().unwrap();
+    let said = || read(&[folder.path().to_owned()]).unwrap_err();
+    assert!(said().contains("the folder is empty"), "{}", said());
+    write(folder.path(), "notes.txt", "none");
+    assert!(said().contains("capture.json in the folder"), "{}", said());
+    assert!(!said().contains("--format"), "{}", said());
+    write(folder.path(), "zarr.json", "{}");
+    assert!(
+        said().contains("already a data set; use it as it is"),
+        "{}",
+        said()
+    );
 }
 
 #[test]

@@ -102,6 +102,7 @@ proptest! {
     #[test]
     fn a_scale_keeps_every_bin_and_scales_every_length(capture in captures(), scale in 0.2..3.0f64) {
         let made = capture.resampled(&Resampling { scale, ..Resampling::default() }).unwrap();
+        prop_assert_eq!(made.origin.conversions.last(), Some(&format!("resampled: scale {scale}")));
         prop_assert_eq!(&made.sum, &capture.sum);
         prop_assert_eq!(made.gate.bins, capture.gate.bins);
         let hundredth = made.gate.bin_width_m / 100.0;

@@ -6,16 +6,16 @@ use picofarm_calibrate::{Checked, Fault, Measurement, Verdict, check};
 
 use crate::common::{self, Capturing, GATE, Room};
 
-const SIDE: u32 = 48;
-const PHOTONS: f64 = 100.0;
+pub const SIDE: u32 = 48;
+pub const PHOTONS: f64 = 100.0;
 
 /// A furnished room, rendered once.
-fn room() -> &'static Room {
+pub fn room() -> &'static Room {
     static ROOM: OnceLock<Room> = OnceLock::new();
     ROOM.get_or_init(|| Room::new(7, SIDE, 0))
 }
 
-fn checked(capture: &Capturing, masks: Option<&[u8]>) -> Checked {
+pub fn checked(capture: &Capturing, masks: Option<&[u8]>) -> Checked {
     check(&Measurement {
         capture: capture.capture(),
         per_spot: Some(&capture.per_spot),
@@ -25,7 +25,7 @@ fn checked(capture: &Capturing, masks: Option<&[u8]>) -> Checked {
     .expect("a capture")
 }
 
-fn named(checked: &Checked) -> Vec<Fault> {
+pub fn named(checked: &Checked) -> Vec<Fault> {
     checked.report.causes.iter().map(|c| c.fault).collect()
 }
 

@@ -80,6 +80,26 @@ struct CameraText {
     cy: Option<f64>,
 }
 
+impl std::fmt::Display for CameraText {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let fields = [
+            ("fov_deg", self.fov_deg),
+            ("fx", self.fx),
+            ("fy", self.fy),
+            ("cx", self.cx),
+            ("cy", self.cy),
+        ];
+        let given: Vec<String> = fields
+            .iter()
+            .filter_map(|(name, value)| value.map(|v| format!("{name} {v}")))
+            .collect();
+        match given.is_empty() {
+            true => f.write_str("nothing"),
+            false => f.write_str(&given.join(", ")),
+        }
+    }
+}
+
 /// Columns of a table of photon events: names of the header, or numbers from 0.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -4,8 +4,9 @@ use super::super::{
     Captures, Format, ImportError, ImportOptions, ImportedScene, Source, import_scene,
 };
 use super::describe::{Described, Description};
-use super::{Beam, Capture, Origin, arrays};
+use super::{Beam, Capture, DESCRIPTION, EXAMPLE, Origin, arrays};
 use picofarm_files::Opener;
+use std::path::Path;
 
 /// Reads the captures of a folder as one scene.
 pub(super) fn read(
@@ -14,6 +15,7 @@ pub(super) fn read(
     opener: &Opener,
 ) -> Result<Capture, ImportError> {
     let root = described.source.as_deref().unwrap_or(&described.folder);
+    refuse_others(root, opener)?;
     // The format decides which options it takes.
     let bare = Source::open_within(root, None, ImportOptions::default(), None, opener);
     let options = match bare {
@@ -23,7 +25,7 @@ pub(super) fn read(
             fitting(options, Format::BfLidar)
         }
     };
-    let source = Source::open_within(root, None, options, None, opener)?;
+    let source = Source::open_within(root, None, options, None, opener).map_err(described_how)?;
     let mut scenes: Vec<ImportedScene> = Vec::new();
     let apart = matches!(source.format(), Format::Platonerf | Format::BfLidar);
     if !apart && source.scenes() != 1 {
@@ -39,6 +41,50 @@ pub(super) fn read(
         scenes.push(import_scene(&source, index)?);
     }
     joined(&source, scenes, apart)
+}
+
+/// Refuses folders that hold no files of a laboratory.
+fn refuse_others(root: &Path, opener: &Opener) -> Result<(), ImportError> {
+    opener.check(root)?;
+    let io = |e| ImportError::io("read", root, e);
+    let expected = "a folder with a laboratory's histogram files";
+    if root.join("zarr.json").is_file() {
+        let hint = "use it as it is: `picofarm capture show FOLDER` and the other commands read it";
+        let found = "already a data set";
+        return Err(ImportError::refused(
+            root, "contents", expected, found, hint,
+        ));
+    }
+    if root.read_dir().map_err(io)?.next().is_none() {
+        let hint = format!("put the histogram files and {DESCRIPTION} there");
+        let found = "the folder is empty";
+        return Err(ImportError::refused(
+            root, "contents", expected, found, hint,
+        ));
+    }
+    Ok(())
+}
+
+/// The error for a folder in no known layout, with the ways that a capture has.
+fn described_how(error: ImportError) -> ImportError {
+    match error {
+        ImportError::Refused {
+            file,
+            field,
+            expected,
+            found,
+            ..
+        } if field == "contents" => ImportError::Refused {
+            file,
+            field,
+            expected,
+            found,
+            hint: format!(
+                "name the histogram files, or describe them in {DESCRIPTION} in the folder, for example\n{EXAMPLE}"
+            ),
+        },
+        other => other,
+    }
 }
 
 /// The options of the description that the format takes.

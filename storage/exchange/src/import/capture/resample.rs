@@ -1,5 +1,7 @@
 //! Captures on another gate, scale and image, without losing photons unseen.
 
+use std::fmt;
+
 use picofarm_dataset::{Gate, Intrinsics};
 use picofarm_sensor::{SensorError, resample};
 use rayon::prelude::*;
@@ -44,6 +46,24 @@ impl Default for Resampling {
     }
 }
 
+impl fmt::Display for Resampling {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut all = Vec::new();
+        let mut add = |name: &str, value: Option<String>| {
+            all.extend(value.map(|value| format!("{name} {value}")));
+        };
+        let list = |list: [u32; 4]| list.map(|n| n.to_string()).join(",");
+        add("start-m", self.start_m.map(|x| x.to_string()));
+        add("bin-width-m", self.bin_width_m.map(|x| x.to_string()));
+        add("bins", self.bins.map(|n| n.to_string()));
+        add("scale", (self.scale != 1.0).then(|| self.scale.to_string()));
+        add("crop", self.crop.map(list));
+        add("pad", (self.pad != [0; 4]).then(|| list(self.pad)));
+        add("centre", self.centre.then(String::new));
+        f.write_str(all.join(", ").trim_end())
+    }
+}
+
 /// A window of an image in pixels: it may reach beyond the image, where it is dark.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Window {
@@ -83,7 +103,7 @@ impl Capture {
         let mut origin = self.origin.clone();
         origin.outside = outside;
         if *to != Resampling::default() {
-            origin.conversions.push(format!("resampled: {to:?}"));
+            origin.conversions.push(format!("resampled: {to}"));
         }
         let scale = to.scale as f32;
         let beam = |beam: &Beam| match beam {

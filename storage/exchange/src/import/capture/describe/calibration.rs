@@ -102,7 +102,7 @@ impl Description {
         let Some(c) = &self.camera else {
             return Ok(None);
         };
-        let found = format!("{c:?}");
+        let found = c.to_string();
         if let Some(fov) = c.fov_deg {
             if c.fx.or(c.fy).or(c.cx).or(c.cy).is_some() {
                 let what = "fov_deg alone, or fx, fy, cx, cy";
@@ -225,8 +225,19 @@ impl Description {
             ));
         };
         if part.apart && beams.len() != spots {
-            let what = format!("{spots}, one for each histogram");
-            return Err(described.refused("spots_m, directions", what, format!("{}", beams.len())));
+            let what = format!(
+                "{spots}, one for each histogram of [spot, row, column, bin] = {:?} in {}",
+                part.dims,
+                reader.name(&part.file)
+            );
+            let hint = "correct the list, or, if the array has other axes, name them in their order in \"axes\", for example [\"row\", \"column\", \"spot\", \"bin\"]";
+            return Err(ImportError::refused(
+                &described.file,
+                "spots_m, directions",
+                what,
+                beams.len().to_string(),
+                hint,
+            ));
         }
         if let Some(given) = self
             .gate
@@ -275,7 +286,14 @@ impl Description {
         let array = npy::parse(&path, &reader.bytes(&path)?)?;
         if array.shape != [height, width] {
             let expected = format!("an image [{height}, {width}]");
-            return Err(described.refused(field, expected, format!("{:?}", array.shape)));
+            let turned = match array.shape == [width, height] {
+                true => {
+                    ": rows and columns of the histograms are exchanged in \"axes\", or those of the image"
+                }
+                false => "",
+            };
+            let found = format!("{:?}{turned}", array.shape);
+            return Err(described.refused(field, expected, found));
         }
         let z = |(pixel, value): (usize, &f32)| {
             let ray = direction(intrinsics, pixel / width, pixel % width);

@@ -1,6 +1,6 @@
 //! When the bins are: gates in metres and picoseconds, and the gate of photon events.
 
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 use std::path::Path;
 
 use picofarm_dataset::Gate;
@@ -8,14 +8,23 @@ use picofarm_dataset::Gate;
 use super::super::super::ImportError;
 use super::{Described, Description, GateText, LIGHT_M_PS};
 
+/// Widths of bins that a capture can have, metres of path, as taking a flash apart has them.
+const WIDTH_M: RangeInclusive<f64> = 1e-5..=10.0;
+
 impl Description {
     /// Returns start and width of the bins in metres of path, if the description has them.
     pub(super) fn gate_m(&self, described: &Described) -> Result<Option<[f64; 2]>, ImportError> {
         let g = &self.gate;
         let width = match (g.bin_width_m, g.bin_width_ps) {
             (None, None) => None,
-            (Some(m), None) => Some(m),
-            (None, Some(ps)) => Some(ps * LIGHT_M_PS),
+            (Some(m), None) => {
+                self.possible("gate.bin_width_m", m, m, described)?;
+                Some(m)
+            }
+            (None, Some(ps)) => {
+                self.possible("gate.bin_width_ps", ps, ps * LIGHT_M_PS, described)?;
+                Some(ps * LIGHT_M_PS)
+            }
             (Some(_), Some(_)) => {
                 let what = "bin_width_m or bin_width_ps";
                 return Err(described.refused("gate", what, "both"));
@@ -57,6 +66,37 @@ impl Description {
         }
     }
 
+    /// Refuses a width of bins that no capture has: a value of another unit.
+    fn possible(
+        &self,
+        field: &str,
+        given: f64,
+        metres: f64,
+        described: &Described,
+    ) -> Result<(), ImportError> {
+        if WIDTH_M.contains(&metres) {
+            return Ok(());
+        }
+        let expected = format!(
+            "a width of {} to {} m of path",
+            WIDTH_M.start(),
+            WIDTH_M.end()
+        );
+        let picoseconds = field.ends_with("_ps");
+        let guess = match () {
+            () if !(metres.is_finite() && metres > 0.0) => "",
+            () if picoseconds && metres < *WIDTH_M.start() => "; are these nanoseconds?",
+            () if picoseconds => "; are these femtoseconds?",
+            () if metres > *WIDTH_M.end() => "; are these picoseconds?",
+            () => "; are these seconds?",
+        };
+        let path = match picoseconds {
+            true => format!("{given}, which is {metres:.7} m"),
+            false => given.to_string(),
+        };
+        Err(described.refused(field, expected, format!("{path}{guess}")))
+    }
+
     /// Returns the gate into which photon events are binned: start and width in metres, bins.
     pub fn event_gate(
         &self,
@@ -87,11 +127,13 @@ impl Description {
             }
             (Some(_), ..) => {
                 let what = "two increasing paths, without gate.bins";
-                return Err(described.refused(
-                    "gate.keep_m",
-                    what,
-                    format!("{:?}", self.gate.keep_m),
-                ));
+                let [from, to] = self.gate.keep_m.unwrap_or_default();
+                let bins = self
+                    .gate
+                    .bins
+                    .map_or(String::new(), |b| format!(" and {b} bins"));
+                let found = format!("{from} to {to}{bins}");
+                return Err(described.refused("gate.keep_m", what, found));
             }
             (None, Some(bins), _) => (start, f64::from(bins)),
             (None, None, Some(units)) => (

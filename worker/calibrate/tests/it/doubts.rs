@@ -1,0 +1,154 @@
+//! Captures that no correction covers, impossible geometry, shadows, padding and wide pulses.
+
+use picofarm_calibrate::{Fault, Verdict};
+use picofarm_scene::Intrinsics;
+use picofarm_settings::Pulse;
+
+use crate::{
+    common::{Capturing, GATE},
+    laws::{PHOTONS, SIDE, checked, named, room},
+};
+
+#[test]
+fn faults_that_no_correction_covers_are_wrong_and_nothing_is_corrected() {
+    let plain = room().measure(PHOTONS, 1, |_| {});
+    let disturbed = |change: &dyn Fn(&mut Capturing)| {
+        let mut made = plain.clone();
+        change(&mut made);
+        made
+    };
+    let camera = plain.camera;
+    let side = SIDE as f32;
+    let behind = disturbed(&|c| {
+        for place in c.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
+            let ahead = (place.point - camera.origin).dot(camera.forward);
+            place.point = place.point - camera.forward * (2.0 * ahead);
+            place.path_m = (place.point - c.laser).length();
+        }
+    });
+    let radians = disturbed(&|c| {
+        c.camera.intrinsics = Intrinsics::from_fov(1.57, SIDE, SIDE);
+    });
+    let shifted = disturbed(&|c| {
+        c.camera.intrinsics.cx = 0.2 * side;
+        c.camera.intrinsics.cy = 0.7 * side;
+    });
+    let corner = disturbed(&|c| {
+        c.camera.intrinsics.cx -= 0.7;
+        c.camera.intrinsics.cy -= 0.7;
+        c.gate.start_m += GATE.bin_width_m;
+    });
+    let late = disturbed(&|c| c.gate.start_m -= 20_000.0 / picofarm_sensor::PS_PER_M);
+    let cases = [
+        ("spots behind the camera", behind),
+        ("fov in radians", radians),
+        ("another principal point", shifted),
+        ("pixels counted from their corners", corner),
+        ("t0 20 ns late", late),
+    ];
+    for (name, capture) in cases {
+        let found = checked(&capture, None);
+        assert_eq!(found.report.verdict, Verdict::Wrong, "{name}");
+        assert!(found.report.unexplained(), "{name}");
+        assert!(found.report.guesses.iter().all(|g| !g.corrected), "{name}");
+        assert_eq!(found.corrected.gate, capture.gate, "{name}");
+        assert_eq!(found.corrected.laser, capture.laser, "{name}");
+        assert_eq!(found.corrected.camera, capture.camera, "{name}");
+        assert_eq!(found.corrected.spots, capture.spots, "{name}");
+    }
+}
+
+#[test]
+fn impossible_geometry_is_named_before_any_light_is_read() {
+    let plain = room().measure(PHOTONS, 1, |_| {});
+    let said = |change: &dyn Fn(&mut Capturing)| {
+        let mut made = plain.clone();
+        change(&mut made);
+        let causes = picofarm_calibrate::geometry(&made.capture());
+        let all: Vec<_> = causes
+            .into_iter()
+            .map(|c| (c.fault, c.severity, c.finding))
+            .collect();
+        all
+    };
+    assert_eq!(said(&|_| {}), []);
+    let millimetres = said(&|c| {
+        for place in c.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
+            place.point = c.laser + (place.point - c.laser) * 1000.0;
+            place.path_m *= 1000.0;
+        }
+    });
+    assert!(
+        millimetres.iter().any(|(fault, severity, what)| {
+            *fault == Fault::Spots && *severity == Verdict::Wrong && what.contains("16 of 16 spots")
+        }),
+        "{millimetres:?}"
+    );
+    let narrow = said(&|c| {
+        c.camera.intrinsics = Intrinsics::from_fov(1.57, SIDE, SIDE);
+    });
+    assert!(narrow[0].2.contains("1.57 degrees wide"), "{narrow:?}");
+    let outside = said(&|c| c.camera.intrinsics.cx = 500.0);
+    assert!(outside[0].2.contains("column 500.0"), "{outside:?}");
+}
+
+#[test]
+fn pixels_in_shadow_and_padding_are_not_dead() {
+    let lit = room().measure(PHOTONS, 1, |s| s.dark_per_bin = 0.2);
+    let bins = GATE.bins as usize;
+    let cells = lit.per_spot.len() / 16;
+    let dark_of = |h: &[f32]| -> Vec<f32> { h[..20].iter().cycle().take(bins).copied().collect() };
+    let mut shadow = lit.clone();
+    for h in shadow.per_spot.chunks_mut(cells) {
+        let own = dark_of(&h[700 * bins..701 * bins]);
+        h[700 * bins..701 * bins].copy_from_slice(&own);
+        h[900 * bins..901 * bins].fill(0.0);
+    }
+    shadow.add_up();
+    let found = checked(&shadow, None);
+    let dead: Vec<f64> = found
+        .report
+        .causes
+        .iter()
+        .filter(|c| c.fault == Fault::DeadPixels)
+        .map(|c| c.value)
+        .collect();
+    assert_eq!(dead, [1.0]);
+    assert_eq!(found.corrected.source[700], Some(700));
+    assert_ne!(found.corrected.source[900], Some(900));
+    let mut padded = lit;
+    for h in padded.per_spot.chunks_mut(cells) {
+        h[..3 * SIDE as usize * bins].fill(0.0);
+    }
+    padded.add_up();
+    let found = checked(&padded, None);
+    assert!(!named(&found).contains(&Fault::DeadPixels));
+    let note = format!("{} pixels at the edges", 3 * SIDE);
+    assert!(
+        found.report.notes.iter().any(|n| n.starts_with(&note)),
+        "{:?}",
+        found.report.notes
+    );
+}
+
+#[test]
+fn a_pulse_of_many_bins_is_measured_and_moves_nothing() {
+    // A pulse of 206 ps in bins of 32 ps.
+    let mut wide = room().measure(PHOTONS, 1, |s| {
+        s.rebin = 1;
+        s.pulse = Pulse::Analytic { fwhm_ps: 200.0 };
+    });
+    wide.gate.bin_width_m /= 4.0;
+    wide.gate.bins *= 4;
+    let found = checked(&wide, None);
+    assert_eq!(named(&found), [], "{:?}", found.report.causes);
+    let fwhm = found.report.pulse.expect("returns").fwhm_ps;
+    assert!((190.0..250.0).contains(&fwhm), "{fwhm} ps");
+    assert_eq!(found.corrected.gate, wide.gate);
+    let mut late = wide;
+    late.gate.start_m += 0.05;
+    let corrected = checked(&late, None).corrected.gate;
+    assert_eq!(corrected.bins, late.gate.bins);
+    let off = corrected.start_m - GATE.start_m;
+    assert!(off.abs() < 0.01, "{off} m");
+}
