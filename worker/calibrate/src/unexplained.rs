@@ -8,9 +8,11 @@ use crate::{
     report::{Cause, Fault, Verdict},
 };
 
-/// Share of times within one bin below which a calibration explains nothing: wrong calibrations of
-/// nine and more spots come to 0.31 by chance.
-const EXPLAINED: f64 = 0.35;
+/// Times of wrong calibrations agree by chance: of each pixel's times about three, whatever the
+/// number of spots. A calibration explains nothing below this number over that of spots, within
+/// these bounds.
+const BY_CHANCE: f64 = 3.2;
+const EXPLAINED: [f64; 2] = [0.22, 0.5];
 /// Share of times, and factor over the stated calibration's share, below which several large
 /// corrections are not believed, and how many these are.
 const DOUBTFUL: [f64; 2] = [0.5, 1.5];
@@ -49,6 +51,8 @@ pub(crate) fn failed(f: &Findings) -> Option<Failed> {
     let percent = 100.0 * share;
     let pixels = distance(f);
     let columns = f.base.columns as f64;
+    let spots = f.m.capture.spots.len() as f64;
+    let explained = (BY_CHANCE / spots).clamp(EXPLAINED[0], EXPLAINED[1]);
     let most = APART[0].max(APART[1] * columns);
     let mut corrections = Vec::new();
     continuous(f, &mut corrections);
@@ -56,9 +60,11 @@ pub(crate) fn failed(f: &Findings) -> Option<Failed> {
     // Several large corrections that explain little more than none are a fit of chance.
     let chance =
         share < DOUBTFUL[0] && share < DOUBTFUL[1] * f.before.agreeing && large.count() >= LARGE;
-    let (value, unit, finding, advice) = if share < EXPLAINED || chance {
+    let (value, unit, finding, advice) = if share < explained || chance {
         let what = format!(
-            "no correction explains the times: only {percent:.0} % of the two-bounce times agree with any calibration that was tried; a right one explains 40 % and more"
+            "no correction explains the times: only {percent:.0} % of the two-bounce times agree with any calibration that was tried, against {:.0} % as stated; wrong ones come to {:.0} % by chance",
+            100.0 * f.before.agreeing,
+            100.0 * explained
         );
         (share, "share of times", what, BY_HAND)
     } else if let Some(pixels) = pixels.filter(|d| *d > most) {

@@ -85,12 +85,13 @@ fn a_bin_of_t0_and_a_centimetre_of_the_laser_are_corrected_to_a_tenth() {
             small && !name.contains("directions")
         };
         for (name, capture, _) in common::faults(&room, &plain, wanted) {
-            let found = checked(&capture, None).corrected;
+            let made = checked(&capture, None);
+            let (found, causes) = (made.corrected, made.report.causes);
             let late = (found.gate.start_m - GATE.start_m) / GATE.bin_width_m;
             let off = (found.laser - room.laser).length();
             assert!(
                 late.abs() < 0.1,
-                "seed {seed}, {name}: t0 is {late} bins off"
+                "seed {seed}, {name}: t0 is {late} bins off: {causes:?}"
             );
             assert!(off < 0.001, "seed {seed}, {name}: the laser is {off} m off");
         }
