@@ -37,7 +37,7 @@ pub struct SceneGenerate {
     /// Seed
     #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
     pub seed: u64,
-    /// File to write; a file with another scene is kept
+    /// File to write
     #[arg(long, default_value = "scene.glb", value_name = "FILE")]
     pub out: PathBuf,
     /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1,

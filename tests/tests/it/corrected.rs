@@ -9,12 +9,8 @@ use std::{
 use picofarm_tests::{Cli, Farm, Job, farm::undisturbed, store};
 use serde_json::Value;
 
-/// A scene file of a small room, in the place of any other.
+/// A scene file of a small room.
 fn room(cli: &Cli, file: &Path, seed: u64) {
-    // `scene generate` keeps a file with another scene.
-    if file.exists() {
-        fs::remove_file(file).unwrap();
-    }
     let (seed, file) = (seed.to_string(), file.display().to_string());
     let args = ["scene", "generate", "--kind", "primitive", "--spots", "4"];
     let more = ["--resolution", "16", "--seed", &seed, "--out", &file];

@@ -20,23 +20,18 @@ use crate::{
 /// `scene generate`.
 ///
 /// # Errors
-/// Settings out of range, missing furniture, or a file with another scene at `--out`.
+/// Settings out of range, missing furniture, or a file that cannot be written.
 pub fn run(args: &SceneGenerate, settings: &Settings, output: Output) -> Result<()> {
     let scene = generate(args, settings)?;
     let out = &args.out;
     let bytes = export::glb_bytes(&scene)?;
-    if std::fs::read(out).is_ok_and(|there| there != bytes) {
-        let what = format!("--out {}: holds another scene", out.display());
-        return Err(
-            CliError::input(what).hint("remove the file, or choose another name with --out")
-        );
-    }
+    let replaced = out.is_file() && std::fs::read(out).is_ok_and(|there| there != bytes);
     export::write_glb(&scene, out)?;
     output.result(
-        &json!({"file": out, "name": scene.name, "objects": scene.objects.len(), "triangles": scene.triangle_count()}),
+        &json!({"file": out, "name": scene.name, "objects": scene.objects.len(), "triangles": scene.triangle_count(), "replaced": replaced}),
         || format!(
-            "wrote {}: {} objects, {} triangles; next: picofarm scene render {} --out render",
-            out.display(), scene.objects.len(), scene.triangle_count(), show::path(out)
+            "wrote {}{}: {} objects, {} triangles; next: picofarm scene render {} --out render",
+            out.display(), if replaced { " over another file" } else { "" }, scene.objects.len(), scene.triangle_count(), show::path(out)
         ),
     );
     Ok(())
