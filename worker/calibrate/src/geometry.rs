@@ -15,7 +15,7 @@ const VIEW_DEG: [f64; 2] = [5.0, 175.0];
 /// Share of the spots from which on a fault of spots is named.
 const MOST: f64 = 0.5;
 
-/// Returns what is impossible or unusual in a stated calibration: spots behind the camera or
+/// Returns the impossible and unusual parts of a stated calibration: spots behind the camera or
 /// outside of the view, light of spots after the gate's end, a principal point outside of the
 /// image, a very narrow or wide view. No histogram is read.
 pub fn geometry(capture: &Capture) -> Vec<Cause> {

@@ -10,7 +10,7 @@ use crate::answer::{DAMAGED, Problem};
 /// Metres that light travels in a nanosecond.
 pub const METRES_PER_NS: f64 = 0.299_792_458;
 
-/// An array of a scene, or what is wrong with it: one damaged array hides no other.
+/// An array of a scene, or its error: one damaged array hides no other.
 pub type Array<T> = Result<Vec<T>, Damage>;
 
 /// A description of a damaged array.
