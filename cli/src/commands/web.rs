@@ -72,7 +72,11 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
 /// # Errors
 /// Fails as [`Server::bind`] does.
 pub async fn start(shown: Shown, farm: Coordinator) -> Result<Server> {
-    Server::bind(shown, Arc::new(farm)).await.map_err(|e| match e {
+    Server::bind(shown, Arc::new(farm)).await.map_err(refused)
+}
+
+fn refused(error: StartError) -> CliError {
+    match error {
         StartError::Listen(address, e) => {
             io(format!("cannot listen on {address}"), &e).hint("choose another --listen, e.g. 127.0.0.1:0 for any free port")
         }
@@ -83,7 +87,7 @@ pub async fn start(shown: Shown, farm: Coordinator) -> Result<Server> {
             "listen on 127.0.0.1 and use a tunnel (`ssh -L 7421:127.0.0.1:7421 HOST`), or allow it with --host NAME",
         ),
         StartError::Store(e) => CliError::input(format!("--store: {e}")),
-    })
+    }
 }
 
 /// The coordinator, connected when it is first needed and again after it was away.
@@ -241,15 +245,20 @@ impl Farm for Coordinator {
 /// Fails if no address can be used.
 pub async fn start_for_up(store: String, farm: Coordinator) -> Result<Server> {
     let usual: SocketAddr = crate::args::WEB.parse().expect("a constant address");
-    let free = match tokio::net::TcpListener::bind(usual).await {
-        Ok(_) => usual,
-        Err(_) => SocketAddr::new(usual.ip(), 0),
+    let farm = Arc::new(farm);
+    let bind = async |listen| {
+        let shown = Shown {
+            listen,
+            hosts: Vec::new(),
+            stores: vec![store.clone()],
+            farm: true,
+        };
+        Server::bind(shown, farm.clone()).await
     };
-    let shown = Shown {
-        listen: free,
-        hosts: Vec::new(),
-        stores: vec![store],
-        farm: true,
+    // Asking first whether the address is free would leave time for another program to take it.
+    let bound = match bind(usual).await {
+        Err(StartError::Listen(..)) => bind(SocketAddr::new(usual.ip(), 0)).await,
+        bound => bound,
     };
-    start(shown, farm).await
+    bound.map_err(refused)
 }
