@@ -18,7 +18,7 @@ def test_arrays_are_those_of_zarr(dataset: str) -> None:
     for scene in data:
         index = scene["scene"]
         assert np.array_equal(scene["depth"], group["depth"][index])
-        stored = group["transient"][index]
+        stored = np.moveaxis(group["transient"][index], 0, -1)
         coding = group["transient"].attrs
         expected = stored
         exact = np.ones(stored.shape, bool)

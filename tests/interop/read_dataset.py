@@ -71,10 +71,10 @@ def main(dataset, scene, folder, render):
 
     ds = xr.open_zarr(dataset)
     assert dict(ds.sizes)["scene"] == spec["scenes"], ds.sizes
-    assert ds["transient"].dims == ("scene", "row", "column", "bin")
+    assert ds["transient"].dims == ("scene", "bin", "row", "column")
     assert ds["visibility"].dims == ("scene", "spot_byte", "row", "column")
     same("xarray depth", ds["depth"][scene].values, expected["depth"])
-    same("xarray crop", ds["transient"][scene, 3:34, 30:].values, expected["transient"][3:34, 30:])
+    same("xarray crop", ds["transient"][scene, :, 3:34, 30:].values, expected["transient"][:, 3:34, 30:])
     normal = ds["normal"][scene].values
     assert normal.dtype.kind == "f" and np.abs(normal - expected["n"]).max() < 1e-6, "xarray's normals"
 
@@ -84,7 +84,7 @@ def main(dataset, scene, folder, render):
     print("missing scene reads as fill")
 
     single = xr.open_zarr(render)
-    same("render group", single["transient"].values, expected["h"])
+    same("render group", single["transient"].values, np.moveaxis(expected["h"], 0, -1))
     assert single["transient"].dims == ("row", "column", "bin")
     assert single.attrs["note"] == "made by a test"
 

@@ -49,7 +49,7 @@ def main(dataset, export):
         h = values["h"].copy()
         for at, exact in manifest["overflow"]:
             h.reshape(-1)[at] = exact
-        np.testing.assert_allclose(arrays["transient"], h, rtol=1e-6)
+        np.testing.assert_allclose(arrays["transient"], np.moveaxis(h, 0, -1), rtol=1e-6)
         assert arrays["transient"].dtype == np.float32 and arrays["transient"].ndim == 3
         np.testing.assert_array_equal(arrays["visibility"], values["lit"])
         for name in ["depth", "range", "instance", "label", "specular", "rgb", "spots", "intrinsics", "camera", "laser"]:

@@ -72,7 +72,8 @@ class Readers:
             spec["context"] = {"data_copy_concurrency": {"limit": threads}}
         self.tensor = tensorstore.open(spec, read=True).result()
         self.scales = self.group["scale"][:]
-        self.shape = self.group["transient"].shape[1:]
+        bins, height, width = self.group["transient"].shape[1:]
+        self.shape = (height, width, bins)
 
     def read(self, reader, scene, part):
         rows, columns, span = PARTS[part](*self.shape)
@@ -80,10 +81,11 @@ class Readers:
             crop = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
             return self.package.read(scene, crop=crop, bins=(span.start, span.stop))["transient"]
         if reader == "zarr-python":
-            stored = self.group["transient"][scene, rows, columns, span]
+            stored = self.group["transient"][scene, span, rows, columns]
         else:
-            stored = self.tensor[scene, rows, columns, span].read().result()
-        return decoded(stored, self.coding, self.scales[scene])
+            stored = self.tensor[scene, span, rows, columns].read().result()
+        # Views in picofarm's order, which copy nothing.
+        return numpy.moveaxis(decoded(stored, self.coding, self.scales[scene]), 0, -1)
 
 
 NAMES = ("picofarm", "zarr-python", "tensorstore")

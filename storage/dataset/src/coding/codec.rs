@@ -31,12 +31,11 @@ pub struct ChunkCodec {
 const BLOSC_HEADER: usize = 16;
 
 impl ChunkCodec {
-    /// Returns the codec of an array's objects, or of the inner chunks of its shards. Values must
-    /// be in stored order; the codec uses only their number.
+    /// Returns the codec of an array's objects, or of the inner chunks of its shards.
     pub fn new(layout: &Layout) -> Self {
         let shape = layout.inner.as_ref().unwrap_or(&layout.object_shape);
         Self::for_element(
-            &layout.stored_codecs(),
+            &layout.chunk_codecs(),
             std::iter::once(1).chain(shape.iter().copied()),
             layout.element,
             layout.quantity.name(),

@@ -1,5 +1,4 @@
-//! The encoding of transients by profile and format: element type, codecs, and instructions for
-//! readers.
+//! The encoding of transients by profile: element type, codecs, and instructions for readers.
 
 use serde_json::{Value, json};
 
@@ -7,26 +6,21 @@ use crate::coding::squareroot::SATURATED;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::spec::{DatasetSpec, Profile, decimal};
 
-/// From this format on, the values of an inner chunk are stored bin by bin. Neighbouring pixels see
-/// similar light, so they compress better next to each other than neighbouring bins do.
-const BINS_FIRST: u32 = 2;
-/// Number of bins of an inner chunk, from the same format on.
+/// Number of bins of an inner chunk.
 const INNER_BINS: u64 = 128;
 
 /// The encoding of a data set's transients.
 pub(crate) struct Coding {
     pub element: Element,
     pub attributes: Value,
-    /// Whether an inner chunk's values are stored bin by bin.
-    pub bins_first: bool,
     /// Number of bins of an inner chunk.
     pub inner_bins: u64,
     shuffle: &'static str,
 }
 
 impl Coding {
-    /// Returns the encoding of the transient `quantity` in a data set of the given format.
-    pub fn new(quantity: Quantity, spec: &DatasetSpec, format: u32) -> Self {
+    /// Returns the encoding of the transient `quantity`.
+    pub fn new(quantity: Quantity, spec: &DatasetSpec) -> Self {
         let of = match quantity {
             Quantity::Transient => "",
             Quantity::TransientSpots => " of each spot alone",
@@ -68,33 +62,25 @@ impl Coding {
                 attributes
             }
         };
-        if format >= BINS_FIRST {
-            attributes["decode_zarr_python"] = json!(five_lines(quantity, spec.profile));
-            attributes["error"] = json!(
-                "manifests/<scene>.json, 'error': largest and rms error in sigma = sqrt(max(h*scale, 1)), saturated bins"
-            );
-        }
+        attributes["decode_zarr_python"] = json!(five_lines(quantity, spec.profile));
+        attributes["error"] = json!(
+            "manifests/<scene>.json, 'error': largest and rms error in sigma = sqrt(max(h*scale, 1)), saturated bins"
+        );
         if !quantity.spots_of_100().is_empty() {
             attributes["spots"] = json!(quantity.spots_of_100());
         }
         let bins = u64::from(spec.gate.bins);
-        let bins_first = format >= BINS_FIRST;
-        let (element, old, new) = match spec.profile {
-            Profile::SqrtU16 { .. } => (Element::U16, "bitshuffle", "shuffle"),
-            Profile::CountsU16 => (Element::U16, "bitshuffle", "bitshuffle"),
-            Profile::PlainF32 { round } if round > 0.0 => (Element::F32, "shuffle", "bitshuffle"),
-            Profile::PlainF32 { .. } => (Element::F32, "shuffle", "shuffle"),
+        let (element, shuffle) = match spec.profile {
+            Profile::SqrtU16 { .. } => (Element::U16, "shuffle"),
+            Profile::CountsU16 => (Element::U16, "bitshuffle"),
+            Profile::PlainF32 { round } if round > 0.0 => (Element::F32, "bitshuffle"),
+            Profile::PlainF32 { .. } => (Element::F32, "shuffle"),
         };
         Self {
             element,
             attributes,
-            bins_first,
-            inner_bins: if bins_first {
-                bins.min(INNER_BINS)
-            } else {
-                bins
-            },
-            shuffle: if bins_first { new } else { old },
+            inner_bins: bins.min(INNER_BINS),
+            shuffle,
         }
     }
 

@@ -1,13 +1,11 @@
 //! Zarr's sharding format: inner chunks one after another, then an index of (offset, size) pairs.
 //!
 //! zarrs' own sharding codec writes inner chunks in the order in which threads finish them, and
-//! requires the whole shard in one buffer of codes. This module writes them in row-major order and
+//! requires the whole shard in one buffer of codes. This module writes them in a fixed order and
 //! encodes each inner chunk directly from the floats, so the bytes depend only on the values. zarrs
 //! and zarr-python can read the result.
 
 use std::ops::Range;
-
-use bytes::Bytes;
 
 use crate::coding::codec::ChunkCodec;
 use picofarm_store::StorageError;
@@ -20,37 +18,22 @@ pub fn index_len(chunks: usize) -> usize {
     chunks * 16 + 4
 }
 
-/// Joins encoded inner chunks, in row-major order, with their index.
+/// Joins encoded inner chunks with the index of `count` entries. Each chunk comes with its place in
+/// the index; its bytes follow those of the chunk before it. Places without a chunk are all fill
+/// value.
 ///
 /// # Errors
 /// [`StorageError::Codec`].
-pub fn assemble(chunks: &[Vec<u8>]) -> Result<Vec<u8>, StorageError> {
-    put_together(chunks.iter().map(|chunk| Some(&chunk[..])))
-}
-
-/// Like [`assemble`], with some chunks that are all fill value.
-///
-/// # Errors
-/// [`StorageError::Codec`].
-pub fn assemble_some(chunks: &[Option<Bytes>]) -> Result<Vec<u8>, StorageError> {
-    put_together(chunks.iter().map(|chunk| chunk.as_deref()))
-}
-
-fn put_together<'a>(
-    chunks: impl ExactSizeIterator<Item = Option<&'a [u8]>> + Clone,
+pub fn assemble<'a>(
+    count: usize,
+    chunks: impl Iterator<Item = (usize, &'a [u8])> + Clone,
 ) -> Result<Vec<u8>, StorageError> {
-    let payload: usize = chunks.clone().flatten().map(<[u8]>::len).sum();
-    let count = chunks.len();
+    let payload: usize = chunks.clone().map(|(_, chunk)| chunk.len()).sum();
     let mut shard = Vec::with_capacity(payload + index_len(count));
-    let mut index: Vec<u64> = Vec::with_capacity(count * 2);
-    for chunk in chunks {
-        match chunk {
-            Some(chunk) => {
-                index.extend([shard.len() as u64, chunk.len() as u64]);
-                shard.extend_from_slice(chunk);
-            }
-            None => index.extend([u64::MAX; 2]),
-        }
+    let mut index = vec![[u64::MAX; 2]; count];
+    for (place, chunk) in chunks {
+        index[place] = [shard.len() as u64, chunk.len() as u64];
+        shard.extend_from_slice(chunk);
     }
     shard.extend(ChunkCodec::index(count).encode(bytemuck::cast_slice(&index))?);
     Ok(shard)

@@ -8,7 +8,10 @@ use crate::layout::spec::DatasetSpec;
 /// Number of columns reordered at a time. Their targets fit into the first-level cache.
 const BLOCK: usize = 32;
 
-/// The inner chunks of a transient: plane by plane, then by rows, columns and bins.
+/// The inner chunks of a transient, numbered by planes, rows, columns and bins. A shard has them in
+/// this order, so that all bins of a pixel are next to each other and a crop takes few requests.
+/// Inside a chunk, values are stored bin by bin: neighbouring pixels see similar light, so they
+/// compress better next to each other than neighbouring bins do.
 pub(crate) struct Tiles {
     /// Number of images, stacked vertically: row r of plane p has the index p·rows + r.
     planes: usize,
@@ -19,7 +22,6 @@ pub(crate) struct Tiles {
     /// Number of tiles down, across, and along the bins.
     grid: [usize; 3],
     bins: usize,
-    bins_first: bool,
 }
 
 /// One row of a tile's pixels inside the image.
@@ -59,8 +61,8 @@ impl Tiles {
         let inner = layout.inner.as_ref().expect("transients are sharded");
         let image = [spec.height as usize, spec.width as usize];
         let bins = spec.gate.bins as usize;
-        let [.., down, across, along] = inner[..] else {
-            unreachable!("transients have rows, columns and bins");
+        let [.., along, down, across] = inner[..] else {
+            unreachable!("transients have bins, rows and columns");
         };
         let side = [down, across, along].map(|n| n as usize);
         Self {
@@ -73,12 +75,32 @@ impl Tiles {
                 bins.div_ceil(side[2]),
             ],
             bins,
-            bins_first: layout.bins_first,
         }
     }
 
     pub fn count(&self) -> usize {
         self.planes * self.grid.iter().product::<usize>()
+    }
+
+    /// Returns the tile's place in the shard's index, which has the order of the array's axes:
+    /// planes, bins, rows and columns.
+    pub fn place(&self, tile: usize) -> usize {
+        let [down, across, along] = self.grid;
+        let (row, column, slab) = (self.row_of(tile), tile / along % across, tile % along);
+        ((row / down * along + slab) * down + row % down) * across + column
+    }
+
+    /// Returns the flat index in the array of a pixel's bin. Pixels are counted through all planes.
+    pub fn flat(&self, pixel: usize, bin: usize) -> u64 {
+        let pixels = self.image[0] * self.image[1];
+        ((pixel / pixels * self.bins + bin) * pixels + pixel % pixels) as u64
+    }
+
+    /// Returns the pixel, counted through all planes, and the bin of a flat index in the array.
+    pub fn pixel_and_bin(&self, flat: u64) -> (usize, usize) {
+        let pixels = self.image[0] * self.image[1];
+        let (image, pixel) = (flat as usize / pixels, flat as usize % pixels);
+        (image / self.bins * pixels + pixel, image % self.bins)
     }
 
     /// Returns the whole transient as a part.
@@ -151,14 +173,11 @@ impl Tiles {
     }
 
     /// Reorders a tile's values from histogram by histogram to stored order.
-    pub fn to_stored<T: bytemuck::Pod>(&self, values: Vec<T>) -> Vec<T> {
-        if !self.bins_first {
-            return values;
-        }
+    pub fn to_stored<T: bytemuck::Pod>(&self, values: &[T]) -> Vec<T> {
         let mut stored = vec![T::zeroed(); values.len()];
         let pixels = values.len() / self.side[2];
         let matrix = Matrix {
-            values: &values,
+            values,
             stride: self.side[2],
         };
         matrix.transpose(0..pixels, 0..self.side[2], &mut stored, pixels);
@@ -166,22 +185,10 @@ impl Tiles {
     }
 
     /// Returns a run's values at one of the tile's bins, pixel by pixel. `bin` is relative to the
-    /// tile's first bin. If the stored values are not contiguous, they are copied to `scratch`.
-    pub fn of_bin<'a, T: bytemuck::Pod>(
-        &self,
-        stored: &'a [T],
-        run: &Run,
-        bin: usize,
-        scratch: &'a mut Vec<T>,
-    ) -> &'a [T] {
-        if self.bins_first {
-            let at = bin * self.side[0] * self.side[1] + run.tile;
-            return &stored[at..at + run.columns];
-        }
-        let of_pixel = |k| stored[(run.tile + k) * self.side[2] + bin];
-        scratch.clear();
-        scratch.extend((0..run.columns).map(of_pixel));
-        scratch
+    /// tile's first bin.
+    pub fn of_bin<'a, T>(&self, stored: &'a [T], run: &Run, bin: usize) -> &'a [T] {
+        let at = bin * self.side[0] * self.side[1] + run.tile;
+        &stored[at..at + run.columns]
     }
 
     /// Copies some bins of some columns of a run, histogram by histogram, from a stored tile.
@@ -199,19 +206,12 @@ impl Tiles {
         let pixels = first..first + columns.len();
         let slab = bins.start % self.side[2];
         let slab = slab..slab + bins.len();
-        if self.bins_first {
-            target.resize(columns.len() * bins.len(), T::zeroed());
-            let matrix = Matrix {
-                values: stored,
-                stride: self.side[0] * self.side[1],
-            };
-            matrix.transpose(slab, pixels, target, bins.len());
-            return;
-        }
-        for pixel in pixels {
-            let h = &stored[pixel * self.side[2]..][..self.side[2]];
-            target.extend_from_slice(&h[slab.clone()]);
-        }
+        target.resize(columns.len() * bins.len(), T::zeroed());
+        let matrix = Matrix {
+            values: stored,
+            stride: self.side[0] * self.side[1],
+        };
+        matrix.transpose(slab, pixels, target, bins.len());
     }
 }
 

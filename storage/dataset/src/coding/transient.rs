@@ -4,7 +4,6 @@ use bytes::Bytes;
 
 use crate::coding::codec::ChunkCodec;
 use crate::coding::squareroot::EncodeError;
-use crate::layout::manifest::FORMAT_VERSION;
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::ArrayCodec;
@@ -26,20 +25,20 @@ pub struct CodedImage {
     pub shard: Bytes,
     /// The error recorded in the manifest.
     pub error: EncodeError,
-    /// Saturated bins: (flat index in `[row][column][bin]`, exact value).
+    /// Saturated bins: (flat index in `[bin][row][column]`, exact value).
     pub overflow: Vec<(u64, f32)>,
     /// Photons per unit of h.
     pub scale: f32,
 }
 
 impl TransientCodec {
-    /// Returns a codec of the newest format.
+    /// Returns a codec for these properties.
     ///
     /// # Errors
     /// [`StorageError::Invalid`] names the property out of range.
     pub fn new(spec: &DatasetSpec) -> Result<Self, StorageError> {
         spec.check()?;
-        let layout = Quantity::Transient.layout(spec, FORMAT_VERSION);
+        let layout = Quantity::Transient.layout(spec);
         let codec = ChunkCodec::new(&layout);
         Ok(Self {
             spec: *spec,

@@ -31,7 +31,7 @@ impl Source<'_> {
 pub(crate) struct CodedValues {
     pub bytes: Vec<u8>,
     pub error: ErrorSums,
-    /// Saturated bins: (flat index, exact value), unordered.
+    /// Saturated bins: (flat index in the array, exact value), unordered.
     pub overflow: Vec<(u64, f32)>,
 }
 
@@ -47,6 +47,7 @@ pub(crate) fn code(
 ) -> Result<CodedValues, StorageError> {
     let mut error = ErrorSums::default();
     let mut overflow = Vec::new();
+    let flat = |at: usize| tiles.flat(at / source.bins, at % source.bins);
     let valid = |h: &[f32], at: usize| match h.iter().all(|h| (0.0..=f32::MAX).contains(h)) {
         true => Ok(()),
         false => Err(invalid_value(source.name, h, at)),
@@ -60,22 +61,22 @@ pub(crate) fn code(
                     return Err(invalid_value(source.name, h, at));
                 }
                 if facts.saturated {
-                    overflow.extend(saturated(h, q, at));
+                    overflow.extend(saturated(h, q).map(|(i, h)| (flat(at + i), h)));
                 }
                 Ok(())
             })?;
-            bytemuck::cast_slice(&tiles.to_stored(q)).to_vec()
+            bytemuck::cast_slice(&tiles.to_stored(&q)).to_vec()
         }
         Profile::CountsU16 => {
             let q = each(tiles, tile, source, |h, q: &mut [u16], at| {
                 match counts::encode_run(source.scale, h, q, &mut error) {
                     Ok(false) => {}
-                    Ok(true) => overflow.extend(saturated(h, q, at)),
+                    Ok(true) => overflow.extend(saturated(h, q).map(|(i, h)| (flat(at + i), h))),
                     Err(bad) => return Err(invalid_count(source, h[bad], at + bad)),
                 }
                 Ok(())
             })?;
-            bytemuck::cast_slice(&tiles.to_stored(q)).to_vec()
+            bytemuck::cast_slice(&tiles.to_stored(&q)).to_vec()
         }
         Profile::PlainF32 { round } => {
             let rounding = (round > 0.0).then(|| Rounding::new(round, source.scale));
@@ -90,7 +91,7 @@ pub(crate) fn code(
                 }
                 Ok(())
             })?;
-            bytemuck::cast_slice(&tiles.to_stored(values)).to_vec()
+            bytemuck::cast_slice(&tiles.to_stored(&values)).to_vec()
         }
     };
     Ok(CodedValues {
@@ -124,14 +125,11 @@ fn each<T: bytemuck::Pod>(
     Ok(values)
 }
 
-fn saturated<'a>(
-    h: &'a [f32],
-    q: &'a [u16],
-    at: usize,
-) -> impl Iterator<Item = (u64, f32)> + use<'a> {
+/// Returns the saturated values of a run, and their places in it.
+fn saturated<'a>(h: &'a [f32], q: &'a [u16]) -> impl Iterator<Item = (usize, f32)> + use<'a> {
     let all = h.iter().zip(q).enumerate();
     all.filter(|(_, (_, q))| **q == SATURATED)
-        .map(move |(i, (h, _))| ((at + i) as u64, *h))
+        .map(|(i, (h, _))| (i, *h))
 }
 
 fn invalid_value(name: &str, h: &[f32], start: usize) -> StorageError {
@@ -215,7 +213,7 @@ impl<'a> Decoder<'a> {
     /// Like [`Self::decode`], but decodes into images of `pixels` pixels, one for each of the
     /// tile's bins, all in `target`.
     pub fn decode_planes(
-        &mut self,
+        &self,
         tile: usize,
         raw: &[u8],
         pixels: usize,
@@ -224,29 +222,19 @@ impl<'a> Decoder<'a> {
         match self.profile {
             Profile::SqrtU16 { delta } => {
                 let code = SquareRoot::new(delta, self.scale);
-                let mut codes = std::mem::take(&mut self.codes);
                 let decode = |q: &[u16], h: &mut [f32]| code.decode_run(q, h);
-                let saturated = self.planes(tile, &values(raw), &mut codes, pixels, target, decode);
-                self.codes = codes;
-                saturated
+                self.planes(tile, &values(raw), pixels, target, decode)
             }
             Profile::CountsU16 => {
-                let scale = self.scale;
-                let mut codes = std::mem::take(&mut self.codes);
-                let decode = |q: &[u16], h: &mut [f32]| counts::decode_run(scale, q, h);
-                let saturated = self.planes(tile, &values(raw), &mut codes, pixels, target, decode);
-                self.codes = codes;
-                saturated
+                let decode = |q: &[u16], h: &mut [f32]| counts::decode_run(self.scale, q, h);
+                self.planes(tile, &values(raw), pixels, target, decode)
             }
             Profile::PlainF32 { .. } => {
-                let mut floats = std::mem::take(&mut self.floats);
                 let copy = |from: &[f32], h: &mut [f32]| {
                     h.copy_from_slice(from);
                     false
                 };
-                self.planes(tile, &values(raw), &mut floats, pixels, target, copy);
-                self.floats = floats;
-                false
+                self.planes(tile, &values(raw), pixels, target, copy)
             }
         }
     }
@@ -255,7 +243,6 @@ impl<'a> Decoder<'a> {
         &self,
         tile: usize,
         stored: &[T],
-        scratch: &mut Vec<T>,
         pixels: usize,
         target: &mut [f32],
         decode: impl Fn(&[T], &mut [f32]) -> bool,
@@ -264,7 +251,7 @@ impl<'a> Decoder<'a> {
         let runs: Vec<Run> = self.tiles.runs(tile).collect();
         for (bin, plane) in target.chunks_exact_mut(pixels).enumerate() {
             for run in &runs {
-                let from = self.tiles.of_bin(stored, run, bin, scratch);
+                let from = self.tiles.of_bin(stored, run, bin);
                 saturated |= decode(from, &mut plane[run.pixel..run.pixel + run.columns]);
             }
         }

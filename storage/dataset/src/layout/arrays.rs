@@ -22,8 +22,6 @@ pub struct Layout {
     pub object_shape: Vec<u64>,
     /// Shape of the shard's inner chunks, without the scene axis.
     pub inner: Option<Vec<u64>>,
-    /// Whether the values of an inner chunk are stored bin by bin.
-    pub bins_first: bool,
     dimensions: &'static [&'static str],
     /// The shuffle filter of blosc.
     shuffle: &'static str,
@@ -32,12 +30,12 @@ pub struct Layout {
 }
 
 impl Quantity {
-    /// Returns the layout of this quantity's array in a data set of the given format.
-    pub(crate) fn layout(self, spec: &DatasetSpec, format: u32) -> Layout {
+    /// Returns the layout of this quantity's array.
+    pub(crate) fn layout(self, spec: &DatasetSpec) -> Layout {
         use Element::{F32, I16, U8, U16, U32};
         let (h, w) = (u64::from(spec.height), u64::from(spec.width));
         let (n, b) = (u64::from(spec.spots), u64::from(spec.gate.bins));
-        let coding = self.is_transient().then(|| Coding::new(self, spec, format));
+        let coding = self.is_transient().then(|| Coding::new(self, spec));
         let coded = || {
             let coding = coding.as_ref().expect("made for every transient");
             (coding.element, coding.attributes.clone())
@@ -46,14 +44,14 @@ impl Quantity {
         let (element, shape, dimensions, attributes): (_, _, &'static [&'static str], _) =
             match self {
                 Self::Transient | Self::Transient4 | Self::Transient25 => {
-                    let dims = &["scene", "row", "column", "bin"];
+                    let dims = &["scene", "bin", "row", "column"];
                     let (element, attributes) = coded();
-                    (element, vec![h, w, b], dims, attributes)
+                    (element, vec![b, h, w], dims, attributes)
                 }
                 Self::TransientSpots => {
-                    let dims = &["scene", "spot", "row", "column", "bin"];
+                    let dims = &["scene", "spot", "bin", "row", "column"];
                     let (element, attributes) = coded();
-                    (element, vec![n, h, w, b], dims, attributes)
+                    (element, vec![n, b, h, w], dims, attributes)
                 }
                 Self::Intensity => {
                     let a = json!({"long_name": "sum of the transient over all bins, before coding", "units": "1/(m2 sr)"});
@@ -127,7 +125,8 @@ impl Quantity {
                 }
             };
         let inner = coding.as_ref().map(|coding| {
-            let inner = [1, h.min(INNER_SIDE), w.min(INNER_SIDE), coding.inner_bins];
+            let side = |n: u64| n.min(INNER_SIDE);
+            let inner = [1, coding.inner_bins, side(h), side(w)];
             inner[4 - shape.len()..].to_vec()
         });
         let object_shape = match &inner {
@@ -148,7 +147,6 @@ impl Quantity {
             shape,
             object_shape,
             inner,
-            bins_first: coding.as_ref().is_some_and(|c| c.bins_first),
             shuffle: match &coding {
                 Some(coding) => coding.shuffle(),
                 None if element.size() == 1 => "noshuffle",
@@ -179,25 +177,8 @@ impl Layout {
         )
     }
 
-    /// Returns the codecs of an object, or of an inner chunk if there is a shard, in the array's
-    /// order of axes.
+    /// Returns the codecs of an object, or of an inner chunk if there is a shard.
     pub fn chunk_codecs(&self) -> Value {
-        let mut codecs = self.stored_codecs();
-        if let (true, Some(inner)) = (self.bins_first, &self.inner) {
-            // The last axis, bins, is moved before the rows.
-            let axes = inner.len() + 1;
-            let order: Vec<usize> = (0..axes - 3)
-                .chain([axes - 1, axes - 3, axes - 2])
-                .collect();
-            let transpose = json!({"name": "transpose", "configuration": {"order": order}});
-            let codecs = codecs.as_array_mut().expect("a list of codecs");
-            codecs.insert(0, transpose);
-        }
-        codecs
-    }
-
-    /// Like [`Self::chunk_codecs`], for values that are already in stored order.
-    pub fn stored_codecs(&self) -> Value {
         let mut codecs = image_codecs(self.element, self.shuffle);
         let few = matches!(
             self.quantity,

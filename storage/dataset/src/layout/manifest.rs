@@ -13,24 +13,19 @@ use picofarm_store::StorageError;
 use picofarm_store::published;
 use picofarm_store::sealed::{ObjectEntry, document, no_strange_member, same_scene, unseal};
 
-/// Format version of the layout on disk. Data sets of older formats retain theirs: they can be
-/// read, and scenes can be added.
-///
-/// 1: histograms are stored pixel by pixel, in inner chunks of all bins. 2: bin by bin, in inner
-/// chunks of 128 bins.
-pub const FORMAT_VERSION: u32 = 2;
+/// Format version of the layout on disk. Other formats cannot be read.
+pub const FORMAT_VERSION: u32 = 3;
 
 /// Version of the encoder's output. It changes whenever the same record could produce different
 /// bytes.
-pub const ENCODER_VERSION: &str = "encoder-2";
+pub const ENCODER_VERSION: &str = "encoder-3";
 
-/// Returns the encoder named in the root of a data set of the given format, which is the first one
-/// that wrote it.
-pub(crate) fn encoder_of(format: u32) -> &'static str {
-    match format {
-        1 => "encoder-1",
-        _ => "encoder-2",
-    }
+/// Returns what is wrong with data in another format.
+pub(crate) fn other_format(found: u64) -> String {
+    format!(
+        "written in format {found}, and this program reads format {FORMAT_VERSION}: use the version of picofarm that wrote \
+         it, or make the data set again"
+    )
 }
 
 /// The encoding of an additional transient.
@@ -38,8 +33,8 @@ pub(crate) fn encoder_of(format: u32) -> &'static str {
 pub struct SubsetCoding {
     /// The encoding error.
     pub error: EncodeError,
-    /// Saturated bins: (flat index in `[row][column][bin]`, for `transient_spots` in
-    /// `[spot][row][column][bin]`; exact value of h), by index.
+    /// Saturated bins: (flat index in `[bin][row][column]`, for `transient_spots` in
+    /// `[spot][bin][row][column]`; exact value of h), by index.
     pub overflow: Vec<(u64, f32)>,
 }
 
@@ -129,11 +124,8 @@ impl published::Manifest for Manifest {
         };
         let manifest: Self =
             serde_json::from_slice(bytes).map_err(|e| damaged(format!("not a manifest: {e}")))?;
-        if manifest.format > FORMAT_VERSION {
-            return Err(damaged(format!(
-                "written in format {}, this program knows formats up to {FORMAT_VERSION}: use a newer one",
-                manifest.format
-            )));
+        if manifest.format != FORMAT_VERSION {
+            return Err(damaged(other_format(manifest.format.into())));
         }
         same_scene(manifest.scene, *scene, object)?;
         match &manifest.checksum {

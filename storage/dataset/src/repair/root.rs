@@ -8,7 +8,6 @@ use object_store::path::Path;
 use serde_json::Value;
 
 use crate::layout::group::{METADATA, pretty};
-use crate::layout::manifest::FORMAT_VERSION;
 use crate::layout::spec::{DatasetSpec, Gate, Profile, Subsets, Wavelength};
 use crate::repair::recipe::Recipe;
 use crate::scenes::dataset::{Dataset, root_metadata};
@@ -45,7 +44,7 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
         },
         profile: Profile::LOSSLESS,
     };
-    let blind = Dataset::assume(store, prefix, anything, FORMAT_VERSION);
+    let blind = Dataset::assume(store, prefix, anything);
     let mut found = Remains::default();
     for scene in blind.scenes_present().await? {
         match blind.manifest(scene).await {
@@ -73,7 +72,7 @@ impl Dataset {
     pub async fn root_agrees(&self) -> Result<bool, StorageError> {
         let bytes = objects::require(&*self.store, &self.path(METADATA)).await?;
         let stored: Option<Value> = serde_json::from_slice(&bytes).ok();
-        Ok(stored == Some(root_metadata(&self.spec, self.format)))
+        Ok(stored == Some(root_metadata(&self.spec)))
     }
 }
 
@@ -90,8 +89,7 @@ pub async fn restore_root(
     spec: &DatasetSpec,
 ) -> Result<Dataset, StorageError> {
     let mut spec = *spec;
-    let format = format_of(&store, &prefix, spec).await?;
-    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
+    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec);
     let mut agreed = None;
     for array in assumed.arrays.iter() {
         let path = assumed.metadata_path(&array.layout);
@@ -120,28 +118,6 @@ pub async fn restore_root(
     };
     spec.scenes = scenes;
     spec.check()?;
-    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec, format))).await?;
+    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec))).await?;
     Dataset::open(store, prefix).await
-}
-
-/// Returns the format of the arrays: that of the first transient with valid metadata, or otherwise
-/// the newest. Formats differ only in transients.
-async fn format_of(
-    store: &Arc<dyn ObjectStore>,
-    prefix: &Path,
-    spec: DatasetSpec,
-) -> Result<u32, StorageError> {
-    for format in (1..=FORMAT_VERSION).rev() {
-        let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
-        let transients = assumed.arrays.iter().map(|array| &array.layout);
-        for layout in transients.filter(|layout| layout.quantity.is_transient()) {
-            let bytes = objects::get(&**store, &assumed.metadata_path(layout)).await?;
-            let stored: Option<Value> = bytes.and_then(|b| serde_json::from_slice(&b).ok());
-            let Some(stored) = stored else { continue };
-            if stored == layout.metadata(stored["shape"][0].as_u64().unwrap_or(0)) {
-                return Ok(format);
-            }
-        }
-    }
-    Ok(FORMAT_VERSION)
 }

@@ -12,7 +12,7 @@ use crate::layout::arrays::Layout;
 use crate::layout::group::{
     METADATA, counts_fewer, create_metadata, is_predictions, is_reconstructions, pretty,
 };
-use crate::layout::manifest::{FORMAT_VERSION, Manifest, encoder_of};
+use crate::layout::manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, other_format};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 use picofarm_store::StorageError;
@@ -25,8 +25,6 @@ pub struct Dataset {
     pub(crate) store: Arc<dyn ObjectStore>,
     pub(crate) prefix: Path,
     pub(crate) spec: DatasetSpec,
-    /// Format version of the layout: [`FORMAT_VERSION`] at the time of creation.
-    pub(crate) format: u32,
     pub(crate) arrays: Arc<[ArrayCodec]>,
 }
 
@@ -90,16 +88,14 @@ impl Dataset {
     ) -> Result<Self, StorageError> {
         spec.check()?;
         let root = objects::path_of(&prefix, METADATA);
-        let (stored, format) = match objects::get(&*store, &root).await? {
+        let stored = match objects::get(&*store, &root).await? {
             Some(bytes) => parse_root(&bytes, &objects::shown(&*store, &root))?,
             None => {
-                let new = Self::assume(store.clone(), prefix.clone(), *spec, FORMAT_VERSION);
+                let new = Self::assume(store.clone(), prefix.clone(), *spec);
                 for array in new.arrays.iter() {
                     new.create_array_metadata(&array.layout).await?;
                 }
-                if objects::create(&*store, &root, pretty(&root_metadata(spec, FORMAT_VERSION)))
-                    .await?
-                {
+                if objects::create(&*store, &root, pretty(&root_metadata(spec))).await? {
                     return Ok(new);
                 }
                 // Another process created it first.
@@ -118,9 +114,9 @@ impl Dataset {
             });
         }
         if spec.scenes <= stored.scenes {
-            return Ok(Self::assume(store, prefix, stored, format));
+            return Ok(Self::assume(store, prefix, stored));
         }
-        let grown = Self::assume(store, prefix, *spec, format);
+        let grown = Self::assume(store, prefix, *spec);
         for array in grown.arrays.iter() {
             let path = grown.metadata_path(&array.layout);
             let bytes = pretty(&array.layout.metadata(spec.scenes));
@@ -129,10 +125,10 @@ impl Dataset {
             })
             .await?;
         }
-        let bytes = pretty(&root_metadata(spec, format));
+        let bytes = pretty(&root_metadata(spec));
         let place = objects::shown(&*grown.store, &root);
         objects::grow(&*grown.store, &root, bytes, |stored| {
-            parse_root(stored, &place).map_or(true, |(stored, _)| stored.scenes < spec.scenes)
+            parse_root(stored, &place).map_or(true, |stored| stored.scenes < spec.scenes)
         })
         .await?;
         Ok(grown)
@@ -161,8 +157,8 @@ impl Dataset {
                 prefix: objects::shown(&*store, &prefix),
             });
         };
-        let (spec, format) = parse_root(&bytes, &objects::shown(&*store, &root))?;
-        Ok(Self::assume(store, prefix, spec, format))
+        let spec = parse_root(&bytes, &objects::shown(&*store, &root))?;
+        Ok(Self::assume(store, prefix, spec))
     }
 
     /// Returns the data set's stored properties.
@@ -173,11 +169,6 @@ impl Dataset {
     /// Returns the store.
     pub fn store(&self) -> &Arc<dyn ObjectStore> {
         &self.store
-    }
-
-    /// Returns the format version of the layout: [`FORMAT_VERSION`] at the time of creation.
-    pub fn format(&self) -> u32 {
-        self.format
     }
 
     /// Returns the arrays, in the order of their objects in a manifest.
@@ -201,14 +192,9 @@ impl Dataset {
         self.shown(&self.prefix)
     }
 
-    pub(crate) fn assume(
-        store: Arc<dyn ObjectStore>,
-        prefix: Path,
-        spec: DatasetSpec,
-        format: u32,
-    ) -> Self {
+    pub(crate) fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: DatasetSpec) -> Self {
         let array = |quantity: Quantity| {
-            let layout = quantity.layout(&spec, format);
+            let layout = quantity.layout(&spec);
             let codec = ChunkCodec::new(&layout);
             ArrayCodec { layout, codec }
         };
@@ -216,7 +202,6 @@ impl Dataset {
             store,
             prefix,
             spec,
-            format,
             arrays: spec.quantities().into_iter().map(array).collect(),
         }
     }
@@ -281,12 +266,12 @@ impl Dataset {
 }
 
 /// Returns the root's `zarr.json`: attributes and the consolidated metadata of all arrays.
-pub fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
+pub fn root_metadata(spec: &DatasetSpec) -> Value {
     let arrays: Map<String, Value> = spec
         .quantities()
         .into_iter()
         .map(|q| {
-            let layout = q.layout(spec, format);
+            let layout = q.layout(spec);
             (q.name().to_string(), layout.metadata(spec.scenes))
         })
         .collect();
@@ -294,7 +279,7 @@ pub fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
         "zarr_format": 3,
         "node_type": "group",
         "attributes": {
-            "picofarm": {"format": format, "encoder": encoder_of(format), "spec": spec},
+            "picofarm": {"format": FORMAT_VERSION, "encoder": ENCODER_VERSION, "spec": spec},
             "gate": spec.gate,
             "bin": "bin b holds optical path lengths [start_m + b*bin_width_m, start_m + (b+1)*bin_width_m)",
             "speed_of_light_m_s": 299_792_458,
@@ -306,8 +291,8 @@ pub fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
     })
 }
 
-/// Parses the data set's properties and format.
-fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), StorageError> {
+/// Parses the data set's properties.
+fn parse_root(bytes: &[u8], object: &str) -> Result<DatasetSpec, StorageError> {
     let damaged = |what: String| StorageError::Damaged {
         object: object.to_string(),
         what,
@@ -331,16 +316,11 @@ fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), StorageE
                 .into(),
         ));
     };
-    let format = match u32::try_from(format) {
-        Ok(format @ 1..=FORMAT_VERSION) => format,
-        _ => {
-            return Err(damaged(format!(
-                "written in format {format}, this program knows formats 1 to {FORMAT_VERSION}: use a newer one"
-            )));
-        }
-    };
+    if format != u64::from(FORMAT_VERSION) {
+        return Err(damaged(other_format(format)));
+    }
     let spec: DatasetSpec = serde_json::from_value(ours["spec"].clone())
         .map_err(|e| damaged(format!("attributes.picofarm.spec: {e}")))?;
     spec.check()?;
-    Ok((spec, format))
+    Ok(spec)
 }

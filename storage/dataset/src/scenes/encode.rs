@@ -10,7 +10,7 @@ use crate::coding::shard;
 use crate::coding::squareroot::ErrorSums;
 use crate::coding::tiles::Tiles;
 use crate::coding::values::{self, Source};
-use crate::layout::manifest::{ENCODER_VERSION, Manifest, SubsetCoding};
+use crate::layout::manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, SubsetCoding};
 use crate::layout::quantity::Quantity;
 use crate::layout::record::{Provenance, SceneRecord, SubsetRecord};
 use crate::layout::spec::DatasetSpec;
@@ -100,7 +100,7 @@ pub(crate) fn assemble(
     }
     let (error, overflow) = coded.expect("every data set has a transient");
     let manifest = Manifest {
-        format: dataset.format,
+        format: FORMAT_VERSION,
         scene,
         profile: spec.profile,
         encoder: ENCODER_VERSION.into(),
@@ -163,7 +163,13 @@ pub(crate) fn encode_transient(
     }
     overflow.sort_unstable_by_key(|(index, _)| *index);
     Ok(CodedTransient {
-        shard: shard::assemble(&chunks)?,
+        shard: shard::assemble(
+            chunks.len(),
+            chunks
+                .iter()
+                .enumerate()
+                .map(|(tile, chunk)| (tiles.place(tile), &chunk[..])),
+        )?,
         error,
         overflow,
     })

@@ -253,8 +253,7 @@ impl Dataset {
     }
 
     /// Like [`Self::read_transient_crop`], restricted to the given bins. Fetches and decodes only
-    /// the inner chunks that overlap the part, which have 32×32 pixels and 128 bins (all bins in
-    /// data sets of format 1).
+    /// the inner chunks that overlap the part, which have 32×32 pixels and 128 bins.
     ///
     /// # Errors
     /// [`StorageError::Invalid`] if a range is empty or exceeds the transient; those of

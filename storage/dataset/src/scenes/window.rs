@@ -91,7 +91,11 @@ impl Dataset {
             .map_err(|e| e.in_object(|| self.shown(&path)))?;
         let ranges: Vec<(usize, Range<u64>)> = wanted
             .iter()
-            .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
+            .filter_map(|tile| {
+                index[tiles.place(*tile)]
+                    .clone()
+                    .map(|range| (*tile, range))
+            })
             .collect();
         let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
         // The store's default would fetch gaps of up to a megabyte.
@@ -216,7 +220,7 @@ impl Decoding<'_> {
         let slabs = target.par_chunks_mut(tiles.slab_len() * pixels).enumerate();
         let saturated = slabs
             .map(|(slab, values)| {
-                let mut decoder = Decoder::new(self.spec.profile, self.scale, &tiles);
+                let decoder = Decoder::new(self.spec.profile, self.scale, &tiles);
                 let mut saturated = false;
                 for tile in tiles.of_slab(slab) {
                     let Some(bytes) = &chunks[tile] else { continue };
@@ -226,11 +230,9 @@ impl Decoding<'_> {
                 Ok(saturated)
             })
             .collect::<Result<Vec<bool>, StorageError>>()?;
-        let bins = self.spec.gate.bins as usize;
         for (index, value) in self.overflow {
-            let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
-            if pixel < pixels {
-                target[bin * pixels + pixel] = *value;
+            if let Some(target) = target.get_mut(*index as usize) {
+                *target = *value;
             }
         }
         let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());
@@ -244,8 +246,9 @@ impl Decoding<'_> {
             return Err(StorageError::codec("cannot read a shard's index", what));
         };
         let index = shard::parse_index(&bytes[start..], tiles.count(), bytes.len() as u64)?;
-        let bytes_of = |r: Range<u64>| bytes.slice(r.start as usize..r.end as usize);
-        Ok(index.into_iter().map(|entry| entry.map(bytes_of)).collect())
+        let bytes_of = |r: &Range<u64>| bytes.slice(r.start as usize..r.end as usize);
+        let of_tile = |tile| index[tiles.place(tile)].as_ref().map(bytes_of);
+        Ok((0..tiles.count()).map(of_tile).collect())
     }
 
     /// Decodes tiles into a part's values and applies the overflow list. Bands of tiles are decoded
@@ -286,10 +289,9 @@ impl Decoding<'_> {
                 Ok(saturated)
             })
             .collect::<Result<Vec<bool>, StorageError>>()?;
-        let bins = self.spec.gate.bins as usize;
         let width = self.spec.width as usize;
         for (index, value) in self.overflow {
-            let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
+            let (pixel, bin) = tiles.pixel_and_bin(*index);
             let (row, column) = (pixel / width, pixel % width);
             if part.rows.contains(&row)
                 && part.columns.contains(&column)

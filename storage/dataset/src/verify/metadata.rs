@@ -35,7 +35,7 @@ impl Dataset {
 
     /// Returns keys and contents of the metadata that the specification requires, the root's first.
     pub(crate) fn metadata(&self) -> Vec<(String, Value)> {
-        let root = crate::scenes::dataset::root_metadata(&self.spec, self.format);
+        let root = crate::scenes::dataset::root_metadata(&self.spec);
         let arrays = self.arrays.iter().map(|array| {
             let key = format!("{}/{METADATA}", array.layout.quantity.name());
             (key, array.layout.metadata(self.spec.scenes))

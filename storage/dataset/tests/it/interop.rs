@@ -28,6 +28,15 @@ impl Expected<'_> {
     }
 }
 
+/// Reorders images of 36×40 pixels and 24 bins from `[row][column][bin]` to `[bin][row][column]`.
+fn by_bin<T: Copy>(values: &[T]) -> Vec<T> {
+    let images = values.chunks_exact(36 * 40 * 24);
+    images
+        .flat_map(|image| (0..24).flat_map(|bin| image.iter().skip(bin).step_by(24)))
+        .copied()
+        .collect()
+}
+
 #[tokio::test]
 async fn zarr_python_and_xarray_read_the_same_values() {
     let Some(python) = std::env::var_os("PICOFARM_PYTHON") else {
@@ -75,26 +84,26 @@ async fn zarr_python_and_xarray_read_the_same_values() {
             shapes: Map::new(),
         };
         let alone = alone.concat();
-        let (one, nine) = (&[36, 40, 24], &[9, 36, 40, 24]);
+        let (one, nine) = (&[24, 36, 40], &[9, 24, 36, 40]);
         match profile {
             Profile::SqrtU16 { delta } => {
                 let code = SquareRoot::new(delta, scene.scale);
                 let q: Vec<u16> = scene.transient.iter().map(|h| code.encode(*h)).collect();
                 let each: Vec<u16> = alone.iter().map(|h| code.encode(*h)).collect();
-                e.add("transient", "<u2", one, &q);
-                e.add("transient_spots", "<u2", nine, &each);
+                e.add("transient", "<u2", one, &by_bin(&q));
+                e.add("transient_spots", "<u2", nine, &by_bin(&each));
             }
             Profile::CountsU16 => {
                 let whole = |h: &f32| (h * scene.scale).round().min(65_535.0) as u16;
                 let q: Vec<u16> = scene.transient.iter().map(whole).collect();
                 let each: Vec<u16> = alone.iter().map(whole).collect();
-                e.add("transient", "<u2", one, &q);
-                e.add("transient_spots", "<u2", nine, &each);
+                e.add("transient", "<u2", one, &by_bin(&q));
+                e.add("transient_spots", "<u2", nine, &by_bin(&each));
             }
             Profile::PlainF32 { .. } => {
                 let spots = dataset.read_histogram(1, Quantity::TransientSpots).await;
-                e.add("transient", "<f4", one, &h);
-                e.add("transient_spots", "<f4", nine, &spots.unwrap());
+                e.add("transient", "<f4", one, &by_bin(&h));
+                e.add("transient_spots", "<f4", nine, &by_bin(&spots.unwrap()));
             }
         }
         let f32s = [
@@ -139,7 +148,7 @@ async fn zarr_python_and_xarray_read_the_same_values() {
             &dataset.read_normal(1).await.unwrap(),
         );
         e.add("lit", "|u1", &[9, 36, 40], &scene.visibility);
-        e.add("h", "<f4", &[36, 40, 24], &h);
+        e.add("h", "<f4", &[24, 36, 40], &by_bin(&h));
         std::fs::write(
             expected.join("shapes.json"),
             Value::from(e.shapes).to_string(),

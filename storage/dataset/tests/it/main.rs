@@ -7,7 +7,6 @@ mod format;
 mod integrity;
 mod interop;
 mod kills;
-mod old_formats;
 mod places;
 mod profiles;
 mod publish;

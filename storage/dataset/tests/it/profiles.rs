@@ -180,12 +180,12 @@ async fn a_part_fetches_and_decodes_the_inner_chunks_it_touches_and_no_other() {
         .unwrap();
     let at = Path::from("sets/a/transient/c/0/0/0/0");
     let shard = memory.get(&at).await.unwrap().bytes().await.unwrap();
-    // 2 by 3 tiles of 3 slabs.
+    // 3 slabs of 2 by 3 tiles.
     let chunks = chunks_of(&shard, 18);
     let whole = dataset.read_transient(0).await.unwrap();
 
     // Rows of the lower tiles, columns of the second and third, bins of the second slab.
-    let needed = [(3 + 1) * 3 + 1, (3 + 2) * 3 + 1];
+    let needed = [6 + 3 + 1, 6 + 3 + 2];
     let mut damaged = vec![0xa5; shard.len()];
     let index = shard.len() - 4 - 18 * 16;
     damaged[index..].copy_from_slice(&shard[index..]);

@@ -249,7 +249,7 @@ fn open(format: ExportFormat) -> &'static str {
     match format {
         ExportFormat::Zarr => {
             "import numpy, xarray\nlocation, i = \".\", 0\n# the lines that decode a histogram stand in the group's attribute `decode`:\n\
-             for line in xarray.open_zarr(location).attrs[\"decode\"]:\n    exec(line)\nprint(h.shape)  # row, column, bin"
+             for line in xarray.open_zarr(location).attrs[\"decode\"]:\n    exec(line)\nprint(h.shape)  # bin, row, column"
         }
         ExportFormat::Sb3d => {
             "import OpenEXR, json\nfolder = \"000000\"\naside = json.load(open(f\"{folder}/picofarm.json\"))\n\

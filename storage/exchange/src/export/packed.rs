@@ -97,7 +97,7 @@ pub(super) async fn finish(
         out.put(&format!("{name}/{METADATA}"), pretty(metadata))
             .await?;
     }
-    let mut root = root_metadata(&spec, source.format());
+    let mut root = root_metadata(&spec);
     let attributes = root["attributes"].as_object_mut().expect("just made");
     attributes.remove("picofarm");
     attributes.insert(
@@ -135,10 +135,10 @@ async fn put_source_scenes(scenes: &[u64], out: &mut Output<'_>) -> Result<Value
 /// Joins the chunks of several scenes' objects in one shard.
 fn packed(layout: &Layout, objects: &[Bytes]) -> Result<Vec<u8>, StorageError> {
     let each = inner_chunks(layout);
-    let mut chunks = Vec::with_capacity(PACK * each);
-    for bytes in objects {
+    let mut chunks: Vec<(usize, &[u8])> = Vec::with_capacity(PACK * each);
+    for (scene, bytes) in objects.iter().enumerate() {
         if layout.inner.is_none() {
-            chunks.push(Some(bytes.clone()));
+            chunks.push((scene, bytes));
             continue;
         }
         let Some(start) = bytes.len().checked_sub(shard::index_len(each)) else {
@@ -146,11 +146,16 @@ fn packed(layout: &Layout, objects: &[Bytes]) -> Result<Vec<u8>, StorageError> {
             return Err(StorageError::codec("cannot read a shard's index", what));
         };
         let index = shard::parse_index(&bytes[start..], each, bytes.len() as u64)?;
-        let slice = |r: std::ops::Range<u64>| bytes.slice(r.start as usize..r.end as usize);
-        chunks.extend(index.into_iter().map(|entry| entry.map(slice)));
+        let mut own: Vec<_> = index.into_iter().enumerate().collect();
+        // As in the data set, so that neighbouring chunks stay neighbours.
+        own.sort_by_key(|(_, range)| range.as_ref().map(|r| r.start));
+        chunks.extend(own.into_iter().filter_map(|(place, range)| {
+            let range = range?;
+            let bytes = &bytes[range.start as usize..range.end as usize];
+            Some((scene * each + place, bytes))
+        }));
     }
-    chunks.resize(PACK * each, None);
-    shard::assemble_some(&chunks)
+    shard::assemble(PACK * each, chunks.into_iter())
 }
 
 /// Returns the number of inner chunks of one scene.
