@@ -115,5 +115,11 @@ class Dataset:
         self,
         scene: int,
         array: str,
-        part: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None,
     ) -> NDArray[Any]: ...
+    def read_bins(
+        self,
+        scene: int,
+        array: str,
+        ranges: tuple[tuple[int, int], tuple[int, int], tuple[int, int]],
+        target: NDArray[np.float32],
+    ) -> None: ...

@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods};
+use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadwriteArray3};
 use picofarm_dataset::{Dataset as Stored, Element as Type, Quantity};
 use picofarm_store::StorageError;
 use pyo3::{exceptions::PyRuntimeError, prelude::*, types::PyBytes};
@@ -157,23 +157,33 @@ impl Dataset {
             .map_err(|e| PyRuntimeError::new_err(format!("a manifest cannot be written: {e}")))
     }
 
-    /// Reads an array of a scene. Ranges of rows, columns and bins are for `transient` only.
-    fn read<'py>(
+    /// Reads a part of a histogram of a scene into `target`, float32 `[bin, row, column]`. The
+    /// ranges are (first, end) of rows, columns and bins.
+    fn read_bins(
         &self,
-        py: Python<'py>,
+        py: Python<'_>,
         scene: u64,
         array: &str,
-        part: Option<[(u32, u32); 3]>,
-    ) -> PyResult<Bound<'py, PyAny>> {
+        ranges: [(u32, u32); 3],
+        mut target: PyReadwriteArray3<'_, f32>,
+    ) -> PyResult<()> {
+        let opened = self.opened()?;
+        let quantity = quantity(&opened.data, array)?;
+        let ranges = ranges.map(|(first, end)| first..end);
+        let target = target
+            .as_slice_mut()
+            .map_err(|_| argument("target", "expected contiguous memory"))?;
+        let read = opened
+            .data
+            .read_planes_part(scene, quantity, ranges, target);
+        py.detach(|| opened.wait(read))
+    }
+
+    /// Reads an array of a scene.
+    fn read<'py>(&self, py: Python<'py>, scene: u64, array: &str) -> PyResult<Bound<'py, PyAny>> {
         let opened = self.opened()?;
         let data = &opened.data;
-        let layout = data.arrays().iter().map(|a| &a.layout);
-        let Some(layout) = layout.clone().find(|l| l.quantity.name() == array) else {
-            let known: Vec<&str> = layout.map(|l| l.quantity.name()).collect();
-            let what = format!("the data set has no {array:?}, but {}", known.join(", "));
-            return Err(argument("arrays", what));
-        };
-        let quantity = layout.quantity;
+        let quantity = quantity(data, array)?;
         let spec = data.spec();
         let (h, w, bins) = (
             spec.height as usize,
@@ -184,15 +194,6 @@ impl Dataset {
             let lit = py.detach(|| opened.wait(data.read_visibility(scene)))?;
             return shaped(py, lit, &[spec.spots as usize, h, w]);
         }
-        if let (Quantity::Transient, Some([rows, columns, bins])) = (quantity, part) {
-            let range = |(first, end): (u32, u32)| first..end;
-            let values = py.detach(|| {
-                let (rows, columns, bins) = (range(rows), range(columns), range(bins));
-                opened.wait(data.read_transient_part(scene, rows, columns, bins))
-            })?;
-            let shape = [rows, columns, bins].map(|(first, end)| (end - first) as usize);
-            return shaped(py, values, &shape);
-        }
         if quantity.is_transient() {
             let values = py.detach(|| opened.wait(data.read_histogram(scene, quantity)))?;
             let planes = values.len() / (h * w * bins);
@@ -201,7 +202,7 @@ impl Dataset {
                 n => shaped(py, values, &[n, h, w, bins]),
             };
         }
-        match layout.element {
+        match data.array(quantity).layout.element {
             Type::F32 => plain::<f32>(py, &opened, scene, quantity),
             Type::U8 => plain::<u8>(py, &opened, scene, quantity),
             Type::U16 => plain::<u16>(py, &opened, scene, quantity),
@@ -209,6 +210,17 @@ impl Dataset {
             Type::U32 => plain::<u32>(py, &opened, scene, quantity),
         }
     }
+}
+
+/// Returns the quantity of an array by its name.
+fn quantity(data: &Stored, array: &str) -> PyResult<Quantity> {
+    let quantities = data.arrays().iter().map(|a| a.layout.quantity);
+    let found = quantities.clone().find(|q| q.name() == array);
+    found.ok_or_else(|| {
+        let known: Vec<&str> = quantities.map(|q| q.name()).collect();
+        let what = format!("the data set has no {array:?}, but {}", known.join(", "));
+        argument("arrays", what)
+    })
 }
 
 /// Reads stored values in the shape that the quantity has.

@@ -97,7 +97,7 @@ impl Tiles {
     }
 
     /// Returns the pixel, counted through all planes, and the bin of a flat index in the array.
-    pub fn pixel_and_bin(&self, flat: u64) -> (usize, usize) {
+    fn pixel_and_bin(&self, flat: u64) -> (usize, usize) {
         let pixels = self.image[0] * self.image[1];
         let (image, pixel) = (flat as usize / pixels, flat as usize % pixels);
         (image / self.bins * pixels + pixel, image % self.bins)
@@ -121,13 +121,31 @@ impl Tiles {
         self.side[2]
     }
 
-    /// Returns the tiles of one range of bins.
-    pub fn of_slab(&self, slab: usize) -> impl Iterator<Item = usize> + use<> {
-        (slab..self.count()).step_by(self.grid[2])
+    /// Returns the number of the tile's range of bins.
+    pub fn slab_of(&self, tile: usize) -> usize {
+        tile % self.grid[2]
     }
 
-    /// Returns whether the tile overlaps the part.
-    pub fn touches(&self, tile: usize, part: &Part) -> bool {
+    /// Returns the tiles that overlap the part, in order.
+    pub fn touching(&self, part: &Part) -> Vec<usize> {
+        let tiles = 0..self.count();
+        tiles.filter(|tile| self.touches(*tile, part)).collect()
+    }
+
+    /// Returns the place in a part of a flat index in the array: row, column and bin.
+    pub fn within(&self, flat: u64, part: &Part) -> Option<[usize; 3]> {
+        let (pixel, bin) = self.pixel_and_bin(flat);
+        let (row, column) = (pixel / self.image[1], pixel % self.image[1]);
+        let inside =
+            |at: usize, range: &Range<usize>| range.contains(&at).then(|| at - range.start);
+        Some([
+            inside(row, &part.rows)?,
+            inside(column, &part.columns)?,
+            inside(bin, &part.bins)?,
+        ])
+    }
+
+    fn touches(&self, tile: usize, part: &Part) -> bool {
         let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
         let left = self.left_of(tile);
         overlap(&self.rows_of(tile), &part.rows)

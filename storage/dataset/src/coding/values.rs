@@ -210,31 +210,25 @@ impl<'a> Decoder<'a> {
         }
     }
 
-    /// Like [`Self::decode`], but decodes into images of `pixels` pixels, one for each of the
-    /// tile's bins, all in `target`.
-    pub fn decode_planes(
-        &self,
-        tile: usize,
-        raw: &[u8],
-        pixels: usize,
-        target: &mut [f32],
-    ) -> bool {
+    /// Like [`Self::decode`], but decodes into one image for each of the part's bins. All of these
+    /// bins are in the tile.
+    pub fn decode_planes(&self, tile: usize, raw: &[u8], part: &Part, target: &mut [f32]) -> bool {
         match self.profile {
             Profile::SqrtU16 { delta } => {
                 let code = SquareRoot::new(delta, self.scale);
                 let decode = |q: &[u16], h: &mut [f32]| code.decode_run(q, h);
-                self.planes(tile, &values(raw), pixels, target, decode)
+                self.planes(tile, &values(raw), part, target, decode)
             }
             Profile::CountsU16 => {
                 let decode = |q: &[u16], h: &mut [f32]| counts::decode_run(self.scale, q, h);
-                self.planes(tile, &values(raw), pixels, target, decode)
+                self.planes(tile, &values(raw), part, target, decode)
             }
             Profile::PlainF32 { .. } => {
                 let copy = |from: &[f32], h: &mut [f32]| {
                     h.copy_from_slice(from);
                     false
                 };
-                self.planes(tile, &values(raw), pixels, target, copy)
+                self.planes(tile, &values(raw), part, target, copy)
             }
         }
     }
@@ -243,16 +237,27 @@ impl<'a> Decoder<'a> {
         &self,
         tile: usize,
         stored: &[T],
-        pixels: usize,
+        part: &Part,
         target: &mut [f32],
         decode: impl Fn(&[T], &mut [f32]) -> bool,
     ) -> bool {
+        let first = self.tiles.bins_of(tile).start;
+        let runs = self.tiles.runs(tile).filter(|r| part.rows.contains(&r.row));
+        let runs: Vec<(Run, Range<usize>)> = runs
+            .map(|run| {
+                let columns = columns(&run, part);
+                (run, columns)
+            })
+            .collect();
         let mut saturated = false;
-        let runs: Vec<Run> = self.tiles.runs(tile).collect();
-        for (bin, plane) in target.chunks_exact_mut(pixels).enumerate() {
-            for run in &runs {
-                let from = self.tiles.of_bin(stored, run, bin);
-                saturated |= decode(from, &mut plane[run.pixel..run.pixel + run.columns]);
+        let images = target.chunks_exact_mut(part.rows.len() * part.columns.len());
+        for (bin, image) in part.bins.clone().zip(images) {
+            for (run, columns) in &runs {
+                let from = self.tiles.of_bin(stored, run, bin - first);
+                let from = &from[columns.start - run.column..columns.end - run.column];
+                let at = (run.row - part.rows.start) * part.columns.len() + columns.start
+                    - part.columns.start;
+                saturated |= decode(from, &mut image[at..at + columns.len()]);
             }
         }
         saturated

@@ -192,6 +192,43 @@ impl Dataset {
             .await
     }
 
+    /// Reads the given bins of a window of h into `target`, as one image per bin:
+    /// `[bin][row][column]`. A crop fetches and decodes only the inner chunks that overlap it.
+    ///
+    /// # Errors
+    /// Those of [`Self::read_planes_into`] and [`Self::read_transient_part`];
+    /// [`StorageError::Invalid`] if `target` has another size.
+    pub async fn read_planes_part(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+        [rows, columns, bins]: [Range<u32>; 3],
+        target: &mut [f32],
+    ) -> Result<(), StorageError> {
+        let array = self.array_of(quantity)?;
+        if !quantity.is_transient() || array.layout.planes() != 1 {
+            let what = format!("{} is no single transient", quantity.name());
+            return Err(StorageError::invalid("quantity", what));
+        }
+        let part = self.check_part(rows, columns, bins)?;
+        if target.len() != part.len() {
+            let what = format!("expected {} values, found {}", part.len(), target.len());
+            return Err(StorageError::invalid("target", what));
+        }
+        let mut rereads = Rereads::new(&*self.store);
+        loop {
+            let read = async {
+                let manifest = self.manifest_once(scene).await?;
+                self.read_part_planes(&manifest, array, &part, target).await
+            };
+            let read = read.await;
+            match rereads.pause(&read) {
+                None => return read,
+                Some(pause) => tokio::time::sleep(pause).await,
+            }
+        }
+    }
+
     /// Returns a stream of h of many scenes, in the given order, with up to `ahead` of them being
     /// fetched and decoded concurrently. It is meant for training loops. If a scene cannot be read,
     /// the stream returns its error and continues with the next scene.
@@ -265,6 +302,19 @@ impl Dataset {
         columns: Range<u32>,
         bins: Range<u32>,
     ) -> Result<Vec<f32>, StorageError> {
+        let part = self.check_part(rows, columns, bins)?;
+        let manifest = self.manifest(scene).await?;
+        self.read_part(&manifest, self.array(Quantity::Transient), part)
+            .await
+    }
+
+    /// Checks the ranges of a part of a single transient.
+    fn check_part(
+        &self,
+        rows: Range<u32>,
+        columns: Range<u32>,
+        bins: Range<u32>,
+    ) -> Result<Part, StorageError> {
         let limits = [
             ("rows", &rows, self.spec.height),
             ("columns", &columns, self.spec.width),
@@ -279,14 +329,11 @@ impl Dataset {
             }
         }
         let of = |range: Range<u32>| range.start as usize..range.end as usize;
-        let part = Part {
+        Ok(Part {
             rows: of(rows),
             columns: of(columns),
             bins: of(bins),
-        };
-        let manifest = self.manifest(scene).await?;
-        self.read_part(&manifest, self.array(Quantity::Transient), part)
-            .await
+        })
     }
 
     /// Returns h of a single spot, from `transient_spots`: `[row][column][bin]`. Does not fetch or

@@ -44,9 +44,7 @@ impl Dataset {
         part: &Part,
     ) -> Result<Vec<f32>, StorageError> {
         let tiles = Tiles::new(&self.spec, &array.layout);
-        let wanted: Vec<usize> = (0..tiles.count())
-            .filter(|tile| tiles.touches(*tile, part))
-            .collect();
+        let wanted = tiles.touching(part);
         let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
         let mut target = vec![0f32; part.len()];
         let decoding = self.decoding(manifest, array);
@@ -55,6 +53,29 @@ impl Dataset {
         let complete = complete.map_err(|e| e.in_object(|| self.shown(&path)))?;
         self.complete(manifest, complete)?;
         Ok(target)
+    }
+
+    /// Reads a part of an array into `target`, one image per bin.
+    pub(crate) async fn read_part_planes(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        part: &Part,
+        target: &mut [f32],
+    ) -> Result<(), StorageError> {
+        let path = self.path(&array.layout.key(manifest.scene));
+        let tiles = Tiles::new(&self.spec, &array.layout);
+        let decoding = self.decoding(manifest, array);
+        let decoded = if *part == tiles.whole() {
+            let bytes = picofarm_store::objects::require(&*self.store, &path).await?;
+            decoding.planes(&bytes, target)
+        } else {
+            let wanted = tiles.touching(part);
+            let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
+            decoding.part_planes(&tiles, &chunks, part, target)
+        };
+        let complete = decoded.map_err(|e| e.in_object(|| self.shown(&path)))?;
+        self.complete(manifest, complete)
     }
 
     /// Fetches the encoded bytes of the wanted tiles; `None` = all fill value.
@@ -208,31 +229,64 @@ impl Decoding<'_> {
         self.part(&tiles, chunks, &tiles.whole(), target)
     }
 
-    /// Like [`Self::shard`], but as one image per bin. Tiles with the same bins write to adjacent
-    /// memory, so one thread decodes them; different ranges of bins are decoded in parallel.
+    /// Like [`Self::shard`], but as one image per bin.
     pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, StorageError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
-        let chunks = Self::chunks(&tiles, bytes)?;
-        if chunks.iter().any(Option::is_none) {
+        let chunks: Vec<_> = Self::chunks(&tiles, bytes)?
+            .into_iter()
+            .enumerate()
+            .collect();
+        self.part_planes(&tiles, &chunks, &tiles.whole(), target)
+    }
+
+    /// Decodes tiles into a part's values, one image per bin, and applies the overflow list. Tiles
+    /// with the same bins write to adjacent memory, so one thread decodes them; different ranges of
+    /// bins are decoded in parallel. A tile without bytes is all fill value.
+    fn part_planes(
+        &self,
+        tiles: &Tiles,
+        chunks: &[(usize, Option<Bytes>)],
+        part: &Part,
+        target: &mut [f32],
+    ) -> Result<Complete, StorageError> {
+        if chunks.iter().any(|(_, bytes)| bytes.is_none()) {
             target.fill(0.0);
         }
-        let pixels = self.spec.pixels();
-        let slabs = target.par_chunks_mut(tiles.slab_len() * pixels).enumerate();
+        let area = part.rows.len() * part.columns.len();
+        let mut slabs = Vec::new();
+        let mut rest = &mut *target;
+        let mut first = part.bins.start;
+        while first < part.bins.end {
+            let slab = first / tiles.slab_len();
+            let end = ((slab + 1) * tiles.slab_len()).min(part.bins.end);
+            let (values, after) = std::mem::take(&mut rest).split_at_mut((end - first) * area);
+            let bins = Part {
+                bins: first..end,
+                ..part.clone()
+            };
+            slabs.push((slab, bins, values));
+            rest = after;
+            first = end;
+        }
         let saturated = slabs
-            .map(|(slab, values)| {
-                let decoder = Decoder::new(self.spec.profile, self.scale, &tiles);
+            .into_par_iter()
+            .map(|(slab, part, values)| {
+                let decoder = Decoder::new(self.spec.profile, self.scale, tiles);
                 let mut saturated = false;
-                for tile in tiles.of_slab(slab) {
-                    let Some(bytes) = &chunks[tile] else { continue };
+                for (tile, bytes) in chunks {
+                    let Some(bytes) = bytes.as_ref().filter(|_| tiles.slab_of(*tile) == slab)
+                    else {
+                        continue;
+                    };
                     let raw = self.array.codec.decode(bytes)?;
-                    saturated |= decoder.decode_planes(tile, &raw, pixels, values);
+                    saturated |= decoder.decode_planes(*tile, &raw, &part, values);
                 }
                 Ok(saturated)
             })
             .collect::<Result<Vec<bool>, StorageError>>()?;
         for (index, value) in self.overflow {
-            if let Some(target) = target.get_mut(*index as usize) {
-                *target = *value;
+            if let Some([row, column, bin]) = tiles.within(*index, part) {
+                target[bin * area + row * part.columns.len() + column] = *value;
             }
         }
         let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());
@@ -289,16 +343,9 @@ impl Decoding<'_> {
                 Ok(saturated)
             })
             .collect::<Result<Vec<bool>, StorageError>>()?;
-        let width = self.spec.width as usize;
         for (index, value) in self.overflow {
-            let (pixel, bin) = tiles.pixel_and_bin(*index);
-            let (row, column) = (pixel / width, pixel % width);
-            if part.rows.contains(&row)
-                && part.columns.contains(&column)
-                && part.bins.contains(&bin)
-            {
-                let at = (row - part.rows.start) * part.columns.len() + column - part.columns.start;
-                target[at * part.bins.len() + bin - part.bins.start] = *value;
+            if let Some([row, column, bin]) = tiles.within(*index, part) {
+                target[row * part.row_len() + column * part.bins.len() + bin] = *value;
             }
         }
         let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());

@@ -119,6 +119,18 @@ async fn any_part_equals_the_same_part_of_the_whole() {
                 .read_transient_part(0, rows.clone(), columns.clone(), bins.clone())
                 .await
                 .unwrap();
+            let mut images = vec![f32::NAN; part.len()];
+            let ranges = [rows.clone(), columns.clone(), bins.clone()];
+            dataset
+                .read_planes_part(0, Quantity::Transient, ranges, &mut images)
+                .await
+                .unwrap();
+            let (area, depth) = (rows.len() * columns.len(), bins.len());
+            let of_part = |i: usize| images[i % depth * area + i / depth];
+            assert!(
+                (0..part.len()).map(of_part).eq(part.iter().copied()),
+                "{profile}"
+            );
             let mut expected = Vec::new();
             for row in rows {
                 for column in columns.clone() {

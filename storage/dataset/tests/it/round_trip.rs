@@ -113,6 +113,14 @@ async fn a_crop_equals_the_same_window_of_the_whole() {
                 .read_transient_crop(0, rows.clone(), columns.clone())
                 .await
                 .unwrap();
+            let mut images = vec![f32::NAN; crop.len()];
+            let ranges = [rows.clone(), columns.clone(), 0..24];
+            dataset
+                .read_planes_part(0, Quantity::Transient, ranges, &mut images)
+                .await
+                .unwrap();
+            let of_crop = |i: usize| images[i % 24 * (crop.len() / 24) + i / 24];
+            assert!((0..crop.len()).map(of_crop).eq(crop.iter().copied()));
             let mut expected = Vec::new();
             for row in rows {
                 let at = |c: u32| (row * 40 + c) as usize * 24;
