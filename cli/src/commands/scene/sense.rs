@@ -4,8 +4,8 @@ use std::{path::Path, time::Instant};
 
 use picofarm_dataset::{RenderArray, RenderGroup, write_render_group};
 use picofarm_sensor::{
-    Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
-    sense as measure,
+    Frame, Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values,
+    narrow, sense_image,
 };
 use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
@@ -65,9 +65,9 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
     ];
     let bins = gate.bins as usize;
     let transient = rendered::transient(dir, &render)?;
-    // Only a scale by peak depends on the two-bounce part.
+    // Only a scale by peak depends on the two-bounce part, and zones see the spots as well.
     let by_peak = !matches!(sensor.scale, Scale::Fixed { .. });
-    let two = match by_peak && group.has("two") {
+    let two = match by_peak && sensor.zones.is_none() && group.has("two") {
         true => Some(rendered::array(dir, group, "two", &shape)?),
         false => None,
     };
@@ -77,7 +77,11 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         bins,
         bin_width_ps: gate.bin_width_m * PS_PER_M,
     };
-    let sensed = measure(sensor, &input, args.seed, args.scene)
+    let frame = Frame {
+        width: spec.width as usize,
+        start_ps: gate.start_m * PS_PER_M,
+    };
+    let sensed = sense_image(sensor, &input, &frame, args.seed, args.scene)
         .map_err(|e: SensorError| CliError::input(format!("{}: {e}", args.render.display())))?;
     let scale_from = match (by_peak, &two) {
         (false, _) => "settings",
@@ -85,10 +89,11 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         (true, None) => "transient",
     };
     let attributes = attributes(group, gate, sensor, &sensed, args, scale_from);
-    let mut shape = shape;
-    if let Some(last) = shape.last_mut() {
-        *last = sensed.bins as u64;
-    }
+    let [rows, columns] = match sensor.zones {
+        Some(zones) => [zones.rows, zones.columns],
+        None => [spec.height, spec.width],
+    };
+    let shape = vec![u64::from(rows), u64::from(columns), sensed.bins as u64];
     let (array, data_type, photons) = write(&args.out, &shape, &sensed.values, &attributes)?;
     let mut facts = Map::new();
     for name in [
@@ -134,7 +139,68 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
     if dropped.pile_up_photons > 0.0 {
         text += &format!(", {:.2e} lost to pile-up", dropped.pile_up_photons);
     }
+    let notes = notes(args, sensor, gate, spec.spots);
+    for note in &notes {
+        text += &format!("\n  note: {note}");
+    }
+    facts.insert("notes".into(), json!(notes));
     Ok(Report { facts, text })
+}
+
+/// Returns what the render cannot give the sensor.
+fn notes(args: &SceneSense, sensor: &Sensor, gate: Gate, spots: u32) -> Vec<String> {
+    let mut notes = Vec::new();
+    if let Some(preset) = args.sensor.preset.map(|p| p.0) {
+        notes.push(format!(
+            "the {} has a field of view of {}; the render's camera must have it too",
+            preset.device(),
+            preset.view()
+        ));
+        if preset.floods() {
+            notes.push(format!(
+                "it lights the whole view with one flash, which the renderer does not do: the render's {spots} spots \
+                 stand for it, and zones between them see no direct light; use 100 spots with wide beams"
+            ));
+        }
+        notes.push(format!("assumed, not published: {}", preset.assumed()));
+    }
+    if let Some(own) = sensor.gate {
+        let (from, to) = (gate.bin_width_m * PS_PER_M, own.bin_width_ps);
+        if from > 0.5 * to {
+            notes.push(format!(
+                "the render's bins of {from:.0} ps are wide for the sensor's of {to:.0} ps: light is spread evenly over \
+                 a bin of the render; render with bins of at most {:.0} ps",
+                0.25 * to
+            ));
+        }
+    }
+    notes
+}
+
+/// Returns the camera with the pixels of the zones.
+fn zoned(camera: &Value, sensor: &Sensor) -> Value {
+    let mut camera = camera.clone();
+    let Some(zones) = sensor.zones else {
+        return camera;
+    };
+    if let Some(pinhole) = camera.get_mut("intrinsics").and_then(Value::as_object_mut) {
+        let axes = [
+            ("width", zones.columns, ["fx", "cx"]),
+            ("height", zones.rows, ["fy", "cy"]),
+        ];
+        for (size, to, fields) in axes {
+            let Some(from) = pinhole.get(size).and_then(Value::as_f64) else {
+                continue;
+            };
+            for field in fields {
+                if let Some(x) = pinhole.get(field).and_then(Value::as_f64) {
+                    pinhole.insert(field.into(), json!(x * f64::from(to) / from));
+                }
+            }
+            pinhole.insert(size.into(), json!(to));
+        }
+    }
+    camera
 }
 
 /// Returns the attributes that are needed to interpret the counts, and to reproduce them.
@@ -150,7 +216,11 @@ fn attributes(
     let mut all = Map::new();
     for name in ["scene", "provenance", "camera", "laser_origin", "spots"] {
         if let Some(value) = render.get(name) {
-            all.insert(name.into(), value.clone());
+            let value = match name {
+                "camera" => zoned(value, sensor),
+                _ => value.clone(),
+            };
+            all.insert(name.into(), value);
         }
     }
     let mut of_render = Map::new();
@@ -159,10 +229,14 @@ fn attributes(
             of_render.insert(name.into(), value.clone());
         }
     }
+    let (start_m, width_m) = match sensor.gate {
+        Some(own) => (own.start_ps / PS_PER_M, own.bin_width_ps / PS_PER_M),
+        None => (gate.start_m, gate.bin_width_m),
+    };
     let sensed_gate = Gate {
-        bin_width_m: gate.bin_width_m * f64::from(sensor.rebin),
+        start_m,
+        bin_width_m: width_m * f64::from(sensor.rebin),
         bins: sensed.bins as u32,
-        ..gate
     };
     let value = match sensed.values {
         Values::Counts(_) => "counts: photons counted in the bin",

@@ -112,7 +112,7 @@ impl TaskKind for ReprocessTask {
             Histogram::TransientSpots => self.reprocess.spots.len() as u32,
         };
         Some(Shape {
-            bins: source.bins / self.reprocess.sensor.rebin.max(1),
+            bins: self.reprocess.sensor.bins(source.bins),
             spots,
             ..source
         })

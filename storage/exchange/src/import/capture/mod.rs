@@ -6,6 +6,7 @@
 //! Values are photons or energy as the files have them; nothing is normalised.
 
 mod arrays;
+mod consumer_nlos;
 mod describe;
 mod events;
 mod folder;
@@ -152,6 +153,15 @@ fn join(mut parts: Vec<Part>) -> Result<Part, ImportError> {
         return Ok(first);
     }
     for part in std::iter::once(&first).chain(&parts) {
+        if part.format == consumer_nlos::FORMAT {
+            return Err(ImportError::refused(
+                &part.file,
+                "files",
+                "one frame of a moving sensor",
+                format!("{} files", parts.len() + 1),
+                "import each frame alone",
+            ));
+        }
         if part.apart {
             return Err(ImportError::refused(
                 &part.file,
