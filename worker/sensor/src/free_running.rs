@@ -10,13 +10,13 @@ use crate::draw::Draws;
 /// Most pulses whose expected counts are computed one by one. Later ones are like the last.
 const MOST_PULSES: u64 = 256;
 /// Pulses whose mean stands for the later ones if the counts have not settled.
-const LAST: u64 = 64;
+const LAST: u64 = 192;
 /// A bin is divided so that a part has at most this many photons per pulse, but in at most
 /// [`MOST_PARTS`].
-const PART: f64 = 0.05;
-const MOST_PARTS: usize = 32;
+const PART: f64 = 0.1;
+const MOST_PARTS: usize = 16;
 /// Counts have settled if no bin changes by more than this from pulse to pulse.
-const SETTLED: f64 = 1e-12;
+const SETTLED: f64 = 1e-10;
 
 /// A pixel's timing.
 #[derive(Debug, Clone, Copy)]

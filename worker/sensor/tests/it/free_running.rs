@@ -49,8 +49,10 @@ fn a_constant_rate_is_counted_as_a_non_paralysable_detector_counts_it() {
             let expected = 40.0 * n * per_bin / (1.0 + per_bin * dead);
             let found = sum(rate(&s));
             // The pixel is live at the first pulse: at most a detection more than in the long run.
+            // Above ten photons in a dead time it ticks like a clock, whose beat with the pulses
+            // the expected counts average over 192 pulses.
             assert!(
-                (found - expected).abs() < 2e-3 * expected + 1.0,
+                (found - expected).abs() < 4e-3 * expected + 1.0,
                 "{per_bin} {dead} {period}: {found} {expected}"
             );
             let lost = 40.0 * n * per_bin - found;
@@ -79,7 +81,7 @@ fn drawn_counts_of_a_free_running_pixel_have_the_expected_mean() {
             ..plain(1.0)
         };
         let expected = sense(&sensor, &pixel, 60, 0);
-        let pixels = 6000;
+        let pixels = 4000;
         let found = means(&sensor, &pixel, pixels, 3);
         for (b, (found, expected)) in found.iter().zip(rate(&expected)).enumerate() {
             let expected = f64::from(*expected);
