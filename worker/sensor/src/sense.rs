@@ -136,8 +136,8 @@ pub fn sense(
 /// zones, the detector's gate, and crosstalk. Values are `[row][column][bin]` of the zones.
 ///
 /// # Errors
-/// Returns the errors of [`sense`], and [`SensorError::Invalid`] if `frame` has no whole rows or the
-/// zones do not divide the image.
+/// Returns the errors of [`sense`], and [`SensorError::Invalid`] if `frame` has no whole rows or
+/// the zones do not divide the image.
 ///
 /// # Examples
 /// ```

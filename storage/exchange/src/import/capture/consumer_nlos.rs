@@ -3,9 +3,9 @@
 //!
 //! Arrays of a frame: `hists` `[zone][bin]`, rows of zones after rows; `pt_cloud` `[zone][3]`, the
 //! point of the wall that each zone sees, metres, with the wall at z = 0; `cam_z`, in some, the
-//! sensor's distance from the wall, above x = y = 0. The returns of the wall itself are removed, and
-//! time 0 is when light leaves the wall for the hidden scene (`data/dataloader.py` there). A bin is
-//! 250 ps (`t_res` in `configs/`). The flash lights the whole view.
+//! sensor's distance from the wall, above x = y = 0. The returns of the wall itself are removed,
+//! and time 0 is when light leaves the wall for the hidden scene. A bin is 250 ps. Both are stated
+//! by the code there (`load_data`, and `t_res` of the settings). The flash lights the whole view.
 
 use std::path::Path;
 
@@ -169,7 +169,7 @@ pub(super) fn pickled(file: &Path, head: &[u8]) -> Option<ImportError> {
         let hint = "save the histograms alone, as an array of numbers, with numpy.save";
         return Some(ImportError::unreadable(file, what, hint));
     }
-    // The first returns of these files fit 88 ps and bin 13 (`configs/reconstruction.yaml` there).
+    // Bins of 88 ps and time 0 in bin 13 are the calibration there; the distances fit them.
     let what = format!("{what} (it looks like an ams scan of consumer-nlos)");
     let hint = "if you trust the file, convert it: python3 -c \"import numpy; \
                 numpy.save('hists.npy', numpy.load('iter_0.npy', allow_pickle=True).item()['histogram'])\"; then import \
