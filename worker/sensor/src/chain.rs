@@ -171,6 +171,8 @@ impl Chain<'_> {
         } else if let Some(after) = &self.after {
             expected.copy_from_slice(rate);
             after.expect(expected);
+            let made = expected.iter().sum::<f64>() - rate.iter().sum::<f64>();
+            fault = fault.or((made > MAX_DRAWN).then_some(Fault::TooMany { detections: made }));
         }
         PixelTotals {
             light: light + outside,
@@ -318,8 +320,8 @@ pub(crate) fn total(totals: &[PixelTotals], left_over_bins: usize) -> Result<Dro
                 return Err(SensorError::new(
                     format!("transient[pixel {pixel}]"),
                     format!(
-                        "{detections:.3e} detections are more than a free-running pixel draws ({MAX_DRAWN:.0e}); \
-                         choose a smaller sensor.scale or fewer pulses"
+                        "{detections:.3e} detections or afterpulses are more than are drawn one by one ({MAX_DRAWN:.0e}); \
+                         choose a smaller sensor.scale, or fewer pulses"
                     ),
                 ));
             }

@@ -11,6 +11,8 @@ use crate::draw::Draws;
 const MOST_PULSES: u64 = 256;
 /// Pulses whose mean stands for the later ones if the counts have not settled.
 const LAST: u64 = 192;
+/// The longest period, bins.
+const MOST_BINS: f64 = 1e5;
 /// A bin is divided so that a part has at most this many photons per pulse, but in at most
 /// [`MOST_PARTS`].
 const PART: f64 = 0.1;
@@ -73,6 +75,15 @@ impl FreeRunning {
                     "{period_ps} ps are less than the gate of {bins} bins of {width_ps:.1} ps; \
                      expected at least {:.0}",
                     bins as f64 * width_ps
+                ),
+            ));
+        }
+        if period > MOST_BINS {
+            return Err(SensorError::new(
+                "sensor.dead_time.period_ps",
+                format!(
+                    "{period_ps} ps are {period:.0} bins of {width_ps:.1} ps, at most {MOST_BINS} are possible; \
+                     use wider bins (sensor.gate)"
                 ),
             ));
         }

@@ -224,6 +224,11 @@ fn timing_that_does_not_fit_the_bins_is_named() {
         error.starts_with("sensor.dead_time.period_ps: 312 ps are less than the gate"),
         "{error}"
     );
+    let error = fails(10.0, 2e5, false);
+    assert!(
+        error.contains("200000 bins of 8.0 ps, at most 100000"),
+        "{error}"
+    );
     let error = fails(0.5, 40.0, false);
     assert!(
         error.starts_with("sensor.dead_time.dead_ps: 4 ps are less than a bin"),
@@ -254,5 +259,8 @@ fn timing_that_does_not_fit_the_bins_is_named() {
     let error = picofarm_sensor::sense(&endless, &histograms, 0, 0)
         .unwrap_err()
         .to_string();
-    assert!(error.contains("detections are more than"), "{error}");
+    assert!(
+        error.contains("detections or afterpulses are more than"),
+        "{error}"
+    );
 }
