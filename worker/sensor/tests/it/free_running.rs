@@ -81,7 +81,7 @@ fn drawn_counts_of_a_free_running_pixel_have_the_expected_mean() {
             ..plain(1.0)
         };
         let expected = sense(&sensor, &pixel, 60, 0);
-        let pixels = 4000;
+        let pixels = 2000;
         let found = means(&sensor, &pixel, pixels, 3);
         for (b, (found, expected)) in found.iter().zip(rate(&expected)).enumerate() {
             let expected = f64::from(*expected);

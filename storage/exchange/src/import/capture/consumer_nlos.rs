@@ -18,8 +18,8 @@ use super::Beam;
 use super::arrays::{Part, Stated};
 use super::describe::{Description, LIGHT_M_PS};
 
-/// Name of the format.
-pub(super) const FORMAT: &str = "consumer-nlos";
+/// Name of the format of these frames, whose paths count from a relay wall.
+pub const FORMAT: &str = "consumer-nlos";
 /// Names of the arrays of a frame.
 const HISTOGRAMS: &str = "hists";
 const POINTS: &str = "pt_cloud";

@@ -24,6 +24,7 @@ use std::path::{Path, PathBuf};
 use picofarm_dataset::{Gate, Intrinsics};
 use picofarm_files::Opener;
 
+pub use consumer_nlos::FORMAT as RELAY_ZONES;
 pub use describe::EXAMPLE;
 pub use folder::is_capture;
 pub use resample::Resampling;
