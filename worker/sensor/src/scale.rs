@@ -52,11 +52,20 @@ pub(crate) fn scale_of(
         }),
         // There is no light, so any scale gives the same image.
         None if h.transient.iter().all(|h| *h == 0.0) => Ok(without_peak(1.0)),
-        None => Err(SensorError::new(
-            "sensor.scale",
-            "the two-bounce part has no light although the transient has; \
-             use a fixed scale (photons_per_unit) for this scene",
-        )),
+        None => {
+            let what = match gate {
+                None => {
+                    "the two-bounce part has no light although the transient has; \
+                     use a fixed scale (photons_per_unit) for this scene"
+                }
+                Some(_) => {
+                    "no light that sets the scale arrives within the detector's gate; use another gate \
+                     (start_ps, bin_width_ps, bins), a scene nearer to the sensor, or a fixed scale \
+                     (photons_per_unit)"
+                }
+            };
+            Err(SensorError::new("sensor.scale", what))
+        }
     }
 }
 

@@ -253,6 +253,16 @@ fn what_does_not_fit_an_image_is_named() {
     };
     assert!(fails(&gate(0.0, 5), 24).starts_with("sensor.gate.bin_width_ps"));
     assert!(fails(&gate(8.0, 0), 24).starts_with("sensor.gate.bins"));
+    // Bins that start after all light.
+    let late = Sensor {
+        gate: Some(TimeGate {
+            start_ps: 1e6,
+            bin_width_ps: 8.0,
+            bins: 5,
+        }),
+        ..Sensor::default()
+    };
+    assert!(fails(&late, 24).contains("within the detector's gate"));
     let loud = Sensor {
         crosstalk: Some(Crosstalk { probability: 0.5 }),
         ..Sensor::default()
