@@ -15,7 +15,7 @@ const VL53L8CH_BIN_M: f64 = 0.037_534_8;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// ST VL53L8CH: 8×8 zones.
+    /// ST VL53L8CH: 4×4 zones.
     Vl53l8ch,
     /// ams OSRAM TMF8828: 8×8 zones.
     Tmf8828,
@@ -66,8 +66,8 @@ impl Preset {
     pub fn source(self) -> &'static str {
         match self {
             Self::Vl53l8ch => {
-                "zones and view: data sheet DS14161; bins of 37.5348 mm, 24 of them at 64 zones, 4 device bins each: \
-                 ST's driver and example for its histograms (vl53lmz_plugin_cnh)"
+                "zones and view: data sheet DS14161; bins of 37.5348 mm, and 24 sums of four of them at 4×4 zones: ST's \
+                 driver for its histograms and the example there (vl53lmz_plugin_cnh)"
             }
             Self::Tmf8828 => {
                 "zones and view: data sheet DS000693; bins, start, width of the pulse, peak and background: \
@@ -93,9 +93,9 @@ impl Preset {
     /// Returns the settings. Pulses include the detector's jitter. Dead time, crosstalk and
     /// afterpulsing are unpublished, and off.
     pub fn sensor(self) -> Sensor {
-        let square = Zones {
-            rows: 8,
-            columns: 8,
+        let square = |side: u32| Zones {
+            rows: side,
+            columns: side,
         };
         let seen = |fwhm_ps: f64, zones: Zones, gate: TimeGate| Sensor {
             pulse: Pulse::Analytic { fwhm_ps },
@@ -112,7 +112,7 @@ impl Preset {
                     bin_width_ps: 4.0 * bin_ps,
                     bins: 24,
                 };
-                seen(5.0 * bin_ps, square, gate)
+                seen(5.0 * bin_ps, square(4), gate)
             }
             Self::Tmf8828 => {
                 // The peak is the median of 27 zones, and so are 3.0 bins and 520 counts.
@@ -124,7 +124,7 @@ impl Preset {
                 Sensor {
                     scale: Scale::Peak { photons: 3e5 },
                     dark_per_bin: 520.0,
-                    ..seen(3.0 * 88.0, square, gate)
+                    ..seen(3.0 * 88.0, square(8), gate)
                 }
             }
             Self::Ads6311 => {
