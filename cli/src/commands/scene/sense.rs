@@ -445,6 +445,48 @@ mod tests {
     }
 
     #[test]
+    fn zones_and_bins_of_the_sensor_are_those_of_the_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        rendered(folder.path());
+        let with = |out: &str, change: fn(&mut SensorArgs)| {
+            let mut args = args(folder.path(), out);
+            args.sensor.rebin = None;
+            args.sensor.zones = Some("1x2".into());
+            change(&mut args.sensor);
+            args
+        };
+        let zones = measure(&with("zones", |s| {
+            s.gate = Some("3335,20,10".into());
+            s.photons_per_unit = Some(1e4);
+        }))
+        .unwrap();
+        assert_eq!(zones.facts["shape"], json!([1, 2, 10]));
+        assert_eq!(zones.facts["notes"], json!([]));
+        assert_eq!(zones.facts["gate"]["bins"], 10);
+        let start = zones.facts["gate"]["start_m"].as_f64().unwrap();
+        assert!((start - 3335.0 / PS_PER_M).abs() < 1e-9);
+        let bought = measure(&with("bought", |s| {
+            s.preset = Some(crate::args::PresetArg(picofarm_sensor::Preset::Tmf8828));
+        }))
+        .unwrap();
+        assert_eq!(bought.facts["shape"], json!([1, 2, 128]));
+        assert_eq!(bought.facts["scale_from"], "transient");
+        for part in ["63°", "one flash", "the render's 1 spots", "assumed"] {
+            assert!(bought.text.contains(part), "{part}: {}", bought.text);
+        }
+        let camera = json!({"intrinsics": {"fx": 8.0, "fy": 6.0, "cx": 4.0, "cy": 3.0, "width": 8, "height": 6}});
+        let sensor = Sensor {
+            zones: Some(picofarm_sensor::Zones {
+                rows: 2,
+                columns: 4,
+            }),
+            ..Sensor::default()
+        };
+        let expected = json!({"intrinsics": {"fx": 4.0, "fy": 2.0, "cx": 2.0, "cy": 1.0, "width": 4, "height": 2}});
+        assert_eq!(zoned(&camera, &sensor), expected);
+    }
+
+    #[test]
     fn nothing_is_overwritten_and_faults_name_the_file() {
         let folder = tempfile::tempdir().unwrap();
         rendered(folder.path());
