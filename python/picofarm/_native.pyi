@@ -49,6 +49,7 @@ def reconstruct(
 def sense(
     histogram: NDArray[np.float32],
     two: NDArray[np.float32] | None,
+    start_m: float,
     bin_width_m: float,
     sensor: str,
     seed: int,

@@ -97,9 +97,10 @@ class Render:
         """Returns what a single-photon sensor counts. The same arguments give the same counts.
 
         Args:
-            sensor: Settings as in a job file: `pulse`, `jitter`, `scale`, `dark_per_bin`,
-                `poisson`, `rebin` and `dead_time`. Without them, a pulse of 128 ps, 50 ps of
-                jitter and a peak of 10 to 400 photons.
+            sensor: Settings as in a job file: `preset` (`vl53l8ch`, `tmf8828`, `ads6311`),
+                `pulse`, `jitter`, `scale`, `dark_per_bin`, `poisson`, `rebin`, `dead_time`,
+                `zones`, `gate`, `crosstalk` and `afterpulsing`. Without them, a pulse of 128 ps,
+                50 ps of jitter and a peak of 10 to 400 photons.
             peak_photons: Photons in the brightest bin of the median pixel, or a range to draw
                 from. Replaces `scale` of `sensor`.
             seed: Seed of the noise.
@@ -118,6 +119,7 @@ class Render:
         made = _native.sense(
             self.transient,
             self.two,
+            self.gate.start_m,
             self.gate.bin_width_m,
             json.dumps(spec),
             whole("seed", seed),
@@ -125,7 +127,7 @@ class Render:
             count("threads", threads),
         )
         facts = json.loads(made["facts"])
-        gate = Gate(self.gate.start_m, facts["bin_width_m"], facts["bins"])
+        gate = Gate(facts["start_m"], facts["bin_width_m"], facts["bins"])
         return Sensed(render=self, gate=gate, counts=made["counts"], facts=facts)
 
     def demultiplex(

@@ -243,6 +243,15 @@ def test_a_sensor_counts_photons(render: picofarm.Render) -> None:
     assert expected.gate.bin_width_m == 2 * render.gate.bin_width_m
     pairs = render.transient.reshape(*render.depth.shape, -1, 2).sum(axis=3)
     assert np.allclose(expected.counts, expected.scale * pairs, rtol=1e-4, atol=1e-4)
+    height, width, _ = render.transient.shape
+    zones = {"rows": 2, "columns": 2}
+    still = {**quiet, "jitter": {"kind": "gaussian", "fwhm_ps": 0}, "rebin": 1}
+    wide = render.sense({**still, "zones": zones})
+    means = render.transient.reshape(2, height // 2, 2, width // 2, -1).mean(axis=(1, 3))
+    assert np.allclose(wide.counts, wide.scale * means, rtol=1e-4, atol=1e-4)
+    bought = render.sense({"preset": "tmf8828", "zones": zones})
+    assert bought.counts.shape == (2, 2, 128)
+    assert abs(bought.gate.bin_width_m - 88e-12 * 299_792_458) < 1e-9
     assert "photons each" in repr(sensed)
     flash = sensed.demultiplex()
     assert flash.depth.shape == render.depth.shape

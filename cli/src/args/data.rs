@@ -3,11 +3,12 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, ValueEnum};
+use clap::{Args, ValueEnum, builder::PossibleValue};
 use picofarm_proto::spec::Histogram;
 
 use picofarm_exchange::ExportFormat;
 use picofarm_exchange::import::{Captures, DepthKind, Format, ImportOptions, Polarity};
+use picofarm_sensor::Preset;
 use picofarm_tasks::export::Scenes;
 
 /// A sensor.
@@ -16,6 +17,9 @@ pub struct SensorArgs {
     /// Sensor settings (TOML); the options below override them
     #[arg(long, value_name = "FILE")]
     pub sensor: Option<PathBuf>,
+    /// Settings of a sensor that one can buy; the options below override them
+    #[arg(long, value_name = "NAME", conflicts_with = "sensor")]
+    pub preset: Option<PresetArg>,
     /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw from
     /// [default: 10..400]
     #[arg(long, value_name = "LOW..HIGH")]
@@ -23,8 +27,9 @@ pub struct SensorArgs {
     /// Photons per unit of the transient, instead of a peak
     #[arg(long, value_name = "N", conflicts_with = "peak_photons")]
     pub photons_per_unit: Option<f64>,
-    /// Pulse: fwhm:PS (Gaussian rise, exponential tail) or none; measured pulses go into --sensor
-    /// [default: fwhm:128]
+    /// Pulse: fwhm:PS (Gaussian rise, exponential tail), none, or file:PATH, a table (CSV) of the
+    /// time in picoseconds and the energy, with equal steps; light arrives at time 0 [default:
+    /// fwhm:128]
     #[arg(long, value_name = "PULSE")]
     pub pulse: Option<String>,
     /// Timing jitter, full width at half maximum in picoseconds [default: 50]
@@ -42,10 +47,51 @@ pub struct SensorArgs {
     /// Write the expected photons instead of drawing counts
     #[arg(long)]
     pub no_poisson: bool,
-    /// Pile-up: N pulses, of which a pixel detects at most one photon each [default: all photons
-    /// are detected]
-    #[arg(long, value_name = "pulses:N")]
+    /// Pile-up: pulses:N, of which a pixel detects at most one photon each, or
+    /// free:N,DEAD,PERIOD, a free-running pixel with a dead time and pulses a period apart, in
+    /// picoseconds [default: all photons are detected]
+    #[arg(long, value_name = "KIND:…")]
     pub dead_time: Option<String>,
+    /// Wide pixels: the mean over the image's part of each zone
+    #[arg(long, value_name = "ROWSxCOLUMNS")]
+    pub zones: Option<String>,
+    /// Bins of the detector: the start after the laser's pulse, the width of a bin, both in
+    /// picoseconds, and the number of bins [default: those of the render]
+    #[arg(long, value_name = "START,WIDTH,BINS", allow_hyphen_values = true)]
+    pub gate: Option<String>,
+    /// Crosstalk: probability that a count triggers the pixel above, below, left or right
+    #[arg(long, value_name = "P")]
+    pub crosstalk: Option<f64>,
+    /// Afterpulsing: probability, and time constant in picoseconds
+    #[arg(long, value_name = "P,DECAY")]
+    pub afterpulsing: Option<String>,
+}
+
+/// A sensor of a data sheet.
+#[derive(Debug, Clone, Copy)]
+pub struct PresetArg(pub Preset);
+
+impl ValueEnum for PresetArg {
+    fn value_variants<'a>() -> &'a [Self] {
+        const ALL: [PresetArg; 3] = [
+            PresetArg(Preset::ALL[0]),
+            PresetArg(Preset::ALL[1]),
+            PresetArg(Preset::ALL[2]),
+        ];
+        &ALL
+    }
+
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        let preset = self.0;
+        let help = format!(
+            "{}, view {}. From {}. Assumed: {}",
+            preset.device(),
+            preset.view(),
+            preset.source(),
+            preset.assumed()
+        );
+        Some(PossibleValue::new(preset.name()).help(help))
+    }
 }
 
 #[derive(Args)]

@@ -29,7 +29,8 @@ use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use capture::{Capture, CaptureImport, CaptureResample};
 pub use data::{
-    DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, SensorArgs,
+    DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, PresetArg,
+    SensorArgs,
 };
 pub use dataset::Dataset;
 pub use demultiplex::{Demultiplex, PlacesArg, ShadowsArg};

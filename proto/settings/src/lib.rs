@@ -26,6 +26,9 @@ pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLo
 pub use render::{BeamWidth, Budget, Choice, Strategy};
 pub use resolution::Resolution;
 pub use rooms::{FloorPlan, MirrorWall, PrimitiveRooms, Sizes};
-pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
+pub use sensor::{
+    Afterpulsing, Crosstalk, DeadTime, Jitter, PS_PER_M, Preset, Pulse, Scale, Sensor, SensorError,
+    TimeGate, Zones,
+};
 pub use spots::Spots;
 pub use wavelengths::{WAVELENGTHS_NM, Wavelength};

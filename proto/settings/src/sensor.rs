@@ -1,15 +1,20 @@
-//! Settings of a sensor, in the order of their effect, and their limits.
+//! Settings of a sensor.
+
+mod check;
+mod preset;
 
 use serde::{Deserialize, Serialize};
+
+pub use preset::Preset;
 
 /// Picoseconds that light takes for a metre of path.
 pub const PS_PER_M: f64 = 1e12 / 299_792_458.0;
 
 /// Settings of a sensor. The defaults are the method's: an analytic pulse of 128 ps, 50 ps of
 /// jitter, a two-bounce peak of 10 to 400 photons, no dark counts, Poisson noise, no rebinning, no
-/// dead time.
+/// dead time. In a file, `preset` names a [`Preset`], and the other fields replace its values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(from = "preset::SensorText")]
 pub struct Sensor {
     /// The laser's pulse together with the detector's response.
     pub pulse: Pulse,
@@ -26,6 +31,18 @@ pub struct Sensor {
     pub rebin: u32,
     /// Pile-up; `None` means that every photon is counted.
     pub dead_time: Option<DeadTime>,
+    /// Wide pixels; `None` keeps the pixels of the histograms.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zones: Option<Zones>,
+    /// The detector's own bins; `None` keeps the bins of the histograms.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gate: Option<TimeGate>,
+    /// Counts caused by those of the neighbours.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub crosstalk: Option<Crosstalk>,
+    /// Counts caused by earlier ones of the same pixel.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub afterpulsing: Option<Afterpulsing>,
 }
 
 impl Default for Sensor {
@@ -38,8 +55,79 @@ impl Default for Sensor {
             poisson: true,
             rebin: 1,
             dead_time: None,
+            zones: None,
+            gate: None,
+            crosstalk: None,
+            afterpulsing: None,
         }
     }
+}
+
+impl Sensor {
+    /// Returns the number of bins after the gate and the sums, of histograms with `source` bins.
+    pub fn bins(&self, source: u32) -> u32 {
+        self.gate.map_or(source, |gate| gate.bins) / self.rebin.max(1)
+    }
+
+    /// Returns the first field that needs an image with a time axis, such as `zones`: such a sensor
+    /// cannot read single histograms.
+    pub fn needs_image(&self) -> Option<&'static str> {
+        match () {
+            () if self.zones.is_some() => Some("zones"),
+            () if self.gate.is_some() => Some("gate"),
+            () if self.crosstalk.is_some() => Some("crosstalk"),
+            () => None,
+        }
+    }
+}
+
+/// Wide pixels: a zone's histogram is the mean over the pixels of its part of the image. The
+/// numbers must divide those of the image. With zones, [`Sensor::scale`] refers to the brightest
+/// bin of all bounces in the median zone, because a zone sees the spots themselves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Zones {
+    /// Rows of zones.
+    pub rows: u32,
+    /// Columns of zones.
+    pub columns: u32,
+}
+
+/// The time in which the detector counts, and its bins. A bin of the histograms is spread evenly
+/// over its width and divided among the detector's bins. Light outside is dropped and counted.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TimeGate {
+    /// Time after the pulse leaves the laser at which bin 0 starts, picoseconds; may be negative.
+    pub start_ps: f64,
+    /// Width of a bin, picoseconds.
+    pub bin_width_ps: f64,
+    /// Number of bins, before `rebin`.
+    pub bins: u32,
+}
+
+/// Crosstalk: an avalanche triggers the pixels above, below, left and right at the same time. The
+/// rate of a pixel becomes r + k·Σ(rates of these neighbours), to first order in k. Source: Rech et
+/// al., "Optical crosstalk in single photon avalanche diode arrays", Opt. Express 16 (2008).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Crosstalk {
+    /// Probability k that an avalanche triggers a given neighbour.
+    pub probability: f64,
+}
+
+/// Afterpulsing: a detection causes another one with this probability, after the dead time (if any)
+/// and an exponential delay. Each may cause a next one, so that the mean counts grow by 1/(1 − p)
+/// as far as the gate contains them, and their variance by (1 + p)/(1 − p)². Source: Ziarkash et
+/// al., "Comparative study of afterpulsing behavior and models in single photon counting avalanche
+/// photo diode detectors", Sci. Rep. 8 (2018), the model with one time constant.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Afterpulsing {
+    /// Probability p.
+    pub probability: f64,
+    /// Time constant of the delay, picoseconds.
+    pub decay_ps: f64,
 }
 
 /// A pulse shape. Always normalised to sum 1.
@@ -144,7 +232,7 @@ impl Default for Scale {
 }
 
 /// Pile-up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum DeadTime {
     /// A pixel records the first photon after each pulse and is blind until the next pulse: the
@@ -156,6 +244,19 @@ pub enum DeadTime {
     FirstPhoton {
         /// Pulses in a histogram, N.
         pulses: u64,
+    },
+    /// Free running and non-paralysable: after each detection, a pixel is blind for a fixed time,
+    /// also across the next pulses, and then detects again. Photons that arrive meanwhile do not
+    /// prolong it. A constant rate λ is counted as λ/(1 + λd). Source: Rapp, Ma, Dawson, Goyal,
+    /// "Dead time compensation for high-flux ranging", IEEE TSP 67 (2019), section II.
+    FreeRunning {
+        /// Pulses in a histogram, N. The pixel is live at the first.
+        pulses: u64,
+        /// Dead time d, picoseconds: at least a bin, at most the period.
+        dead_ps: f64,
+        /// Time from pulse to pulse, picoseconds: at least the gate. Outside the gate only dark
+        /// counts arrive; they are not recorded.
+        period_ps: f64,
     },
 }
 
@@ -179,134 +280,5 @@ impl SensorError {
             field: field.into(),
             what: what.into(),
         }
-    }
-}
-
-/// Most bins summed to one.
-const MAX_REBIN: u32 = 1 << 16;
-/// Most values of a sampled pulse.
-const MAX_SAMPLES: usize = 1 << 16;
-/// Most pulses in a histogram: all numbers up to it are exact in f64.
-const MAX_PULSES: u64 = 1 << 40;
-
-impl Sensor {
-    /// Checks every field.
-    ///
-    /// # Errors
-    /// Returns [`SensorError::Invalid`] for the first invalid field.
-    pub fn check(&self) -> Result<(), SensorError> {
-        match &self.pulse {
-            Pulse::None {} => {}
-            Pulse::Analytic { fwhm_ps } => {
-                within("sensor.pulse.fwhm_ps", *fwhm_ps, 1e-3, 1e6, "picoseconds")?;
-            }
-            Pulse::Sampled {
-                bin_width_ps,
-                values,
-                zero_bin,
-            } => {
-                within(
-                    "sensor.pulse.bin_width_ps",
-                    *bin_width_ps,
-                    1e-3,
-                    1e6,
-                    "picoseconds",
-                )?;
-                check_samples(values, *zero_bin)?;
-            }
-        }
-        match self.jitter {
-            Jitter::Gaussian { fwhm_ps } => {
-                within("sensor.jitter.fwhm_ps", fwhm_ps, 0.0, 1e6, "picoseconds")?;
-            }
-            Jitter::Sb3dCompat { sigma_bins } => {
-                within("sensor.jitter.sigma_bins", sigma_bins, 0.0, 1e3, "bins")?;
-            }
-        }
-        match self.scale {
-            Scale::Fixed { photons_per_unit } => within(
-                "sensor.scale.photons_per_unit",
-                photons_per_unit,
-                1e-30,
-                1e30,
-                "photons for a unit of h",
-            )?,
-            Scale::Peak { photons } => {
-                within("sensor.scale.photons", photons, 1e-6, 1e8, "photons")?;
-            }
-            Scale::PeakRange { low, high } => {
-                within("sensor.scale.low", low, 1e-6, 1e8, "photons")?;
-                within("sensor.scale.high", high, low, 1e8, "photons")?;
-            }
-        }
-        within(
-            "sensor.dark_per_bin",
-            self.dark_per_bin,
-            0.0,
-            1e8,
-            "photons a bin",
-        )?;
-        if !(1..=MAX_REBIN).contains(&self.rebin) {
-            return Err(SensorError::new(
-                "sensor.rebin",
-                format!(
-                    "{} lies outside 1..={MAX_REBIN} bins summed to one; 1 leaves them as they are",
-                    self.rebin
-                ),
-            ));
-        }
-        if let Some(DeadTime::FirstPhoton { pulses }) = self.dead_time
-            && !(1..=MAX_PULSES).contains(&pulses)
-        {
-            return Err(SensorError::new(
-                "sensor.dead_time.pulses",
-                format!("{pulses} lies outside 1..={MAX_PULSES} pulses"),
-            ));
-        }
-        Ok(())
-    }
-}
-
-fn within(field: &str, value: f64, low: f64, high: f64, unit: &str) -> Result<(), SensorError> {
-    if (low..=high).contains(&value) {
-        return Ok(());
-    }
-    Err(SensorError::new(
-        field,
-        format!("{value} lies outside {low}..={high} {unit}"),
-    ))
-}
-
-fn check_samples(values: &[f64], zero_bin: Option<f64>) -> Result<(), SensorError> {
-    let field = "sensor.pulse.values";
-    if !(1..=MAX_SAMPLES).contains(&values.len()) {
-        let what = format!("expected 1 to {MAX_SAMPLES} values, found {}", values.len());
-        return Err(SensorError::new(field, what));
-    }
-    if let Some(i) = values.iter().position(|v| !(0.0..=1e30).contains(v)) {
-        return Err(SensorError::new(
-            format!("{field}[{i}]"),
-            format!(
-                "expected a finite value of at least 0, found {}; subtract the background and clip it first",
-                values[i]
-            ),
-        ));
-    }
-    let sum: f64 = values.iter().sum();
-    if sum < 1e-30 {
-        return Err(SensorError::new(
-            field,
-            format!("expected some energy, found a sum of {sum}"),
-        ));
-    }
-    match zero_bin {
-        Some(zero) => within(
-            "sensor.pulse.zero_bin",
-            zero,
-            0.0,
-            (values.len() - 1) as f64,
-            "(a bin of the pulse)",
-        ),
-        None => Ok(()),
     }
 }

@@ -35,12 +35,29 @@ fn everything_that_shapes_a_result_is_part_of_its_key_and_nothing_else_is() {
         "[sensor]\njitter = { kind = \"sb3d_compat\" }",
         "[sensor]\nscale = { kind = \"peak\", photons = 100.0 }",
         "[sensor]\ndead_time = { kind = \"first_photon\", pulses = 7 }",
+        "[sensor]\ndead_time = { kind = \"free_running\", pulses = 7, dead_ps = 1e4, period_ps = 1e5 }",
+        "[sensor]\nzones = { rows = 8, columns = 8 }",
+        "[sensor]\ngate = { start_ps = 0.0, bin_width_ps = 250.0, bins = 96 }",
+        "[sensor]\ncrosstalk = { probability = 0.01 }",
+        "[sensor]\nafterpulsing = { probability = 0.01, decay_ps = 1e4 }",
+        "[sensor]\npreset = \"tmf8828\"",
+        "[sensor]\npreset = \"tmf8828\"\nrebin = 2",
     ];
     let keys = settings.map(|text| good(text).stage_key("sqrt-u16"));
     for (i, key) in keys.iter().enumerate() {
         assert!(!keys[..i].contains(key), "{:?}", settings[i]);
     }
     assert_ne!(good("").stage_key("plain-f32"), keys[0]);
+    // A preset is the same as its values.
+    let values = picofarm_settings::Preset::Tmf8828.sensor();
+    let values = ReprocessSettings {
+        sensor: values,
+        ..ReprocessSettings::default()
+    };
+    assert_eq!(
+        values.stage_key("sqrt-u16"),
+        good("[sensor]\npreset = \"tmf8828\"").stage_key("sqrt-u16")
+    );
     // Defaults written out, and any order of fields, give the same key.
     let written = good("[sensor]\nrebin = 1\npulse = { kind = \"analytic\", fwhm_ps = 128.0 }");
     assert_eq!(written.stage_key("sqrt-u16"), keys[0]);
@@ -84,6 +101,10 @@ fn what_cannot_be_used_is_named() {
         (
             "[sensor]\ndead_time = { kind = \"first_photon\", pulses = 0 }",
             "reprocess.sensor.dead_time.pulses",
+        ),
+        (
+            "[sensor]\npreset = \"ads6311\"\nzones = { rows = 0, columns = 8 }",
+            "reprocess.sensor.zones",
         ),
     ] {
         assert_eq!(field(text, "sqrt-u16"), expected, "{text}");

@@ -2,7 +2,8 @@
 //! `just lab sensor`.
 
 use picofarm_sensor::{
-    DeadTime, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values, sense,
+    Afterpulsing, Crosstalk, DeadTime, Frame, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor,
+    TimeGate, Values, Zones, sense_image,
 };
 
 /// Returns histograms similar to those of a furnished room: a dark start, a two-bounce peak, and a
@@ -93,6 +94,65 @@ pub fn run() {
                 ..analytic.clone()
             },
         ),
+        (
+            "free running",
+            637,
+            0.0384,
+            Sensor {
+                dead_time: Some(DeadTime::FreeRunning {
+                    pulses: 100_000,
+                    dead_ps: 20_000.0,
+                    period_ps: 100_000.0,
+                }),
+                ..analytic.clone()
+            },
+        ),
+        (
+            "afterpulsing",
+            637,
+            0.0384,
+            Sensor {
+                afterpulsing: Some(Afterpulsing {
+                    probability: 0.01,
+                    decay_ps: 10_000.0,
+                }),
+                ..analytic.clone()
+            },
+        ),
+        (
+            "crosstalk",
+            637,
+            0.0384,
+            Sensor {
+                crosstalk: Some(Crosstalk { probability: 0.01 }),
+                ..analytic.clone()
+            },
+        ),
+        (
+            "250 ps gate",
+            637,
+            0.0384,
+            Sensor {
+                gate: Some(TimeGate {
+                    start_ps: 0.0,
+                    bin_width_ps: 250.0,
+                    bins: 340,
+                }),
+                ..analytic.clone()
+            },
+        ),
+        (
+            "8x8 zones",
+            637,
+            0.0384,
+            Sensor {
+                zones: Some(Zones {
+                    rows: 8,
+                    columns: 8,
+                }),
+                ..analytic.clone()
+            },
+        ),
         ("427 ps", 128, 0.128, analytic.clone()),
         (
             "8 ps to 32 ps",
@@ -112,9 +172,13 @@ pub fn run() {
             bins,
             bin_width_ps: bin_width_m * PS_PER_M,
         };
+        let frame = Frame {
+            width: 256,
+            start_ps: PS_PER_M,
+        };
         let start = cpu_seconds();
         let sensed = pool
-            .install(|| sense(&sensor, &input, 1, 0))
+            .install(|| sense_image(&sensor, &input, &frame, 1, 0))
             .expect("the settings are sound");
         let seconds = cpu_seconds() - start;
         let photons: f64 = match &sensed.values {

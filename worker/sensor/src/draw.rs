@@ -11,6 +11,8 @@ pub(crate) enum Purpose {
     Counts = 1,
     Peak = 2,
     Roll = 3,
+    Afterpulses = 4,
+    FreeRunning = 5,
 }
 
 /// The key of one pixel's numbers.

@@ -117,13 +117,22 @@ impl Resampler {
     }
 
     /// Adds a histogram to `out`, which has the new bins. Returns the photons outside of them.
-    pub fn add(&self, h: &[f32], out: &mut [f64]) -> f64 {
+    pub fn add<T: Copy + Into<f64>>(&self, h: &[T], out: &mut [f64]) -> f64 {
         for share in &self.shares {
-            out[share.to as usize] += f64::from(h[share.from as usize]) * share.part;
+            let photons: f64 = h[share.from as usize].into();
+            out[share.to as usize] += photons * share.part;
         }
         let gone = self.outside.iter();
-        gone.map(|(from, part)| f64::from(h[*from as usize]) * part)
-            .sum()
+        gone.map(|(from, part)| {
+            let photons: f64 = h[*from as usize].into();
+            photons * part
+        })
+        .sum()
+    }
+
+    /// Returns the number of new bins.
+    pub(crate) fn bins(&self) -> usize {
+        self.bins
     }
 }
 

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use crate::{
     convolve::Convolver,
     draw::{PixelKey, Purpose},
+    resample::Resampler,
     sense::Histograms,
 };
 
@@ -23,7 +24,7 @@ pub(crate) struct Scaled {
 pub(crate) fn scale_of(
     sensor: &Sensor,
     h: &Histograms<'_>,
-    (convolver, known): (&Convolver, Option<f64>),
+    (convolver, gate, known): (&Convolver, Option<&Resampler>, Option<f64>),
     seed: u64,
     scene: u64,
 ) -> Result<Scaled, SensorError> {
@@ -43,7 +44,7 @@ pub(crate) fn scale_of(
         }
     };
     let part = h.two_bounce.unwrap_or(h.transient);
-    match known.or_else(|| median_peak(part, h.bins, convolver)) {
+    match known.or_else(|| median_peak(part, h.bins, convolver, gate)) {
         Some(peak) => Ok(Scaled {
             per_unit: photons / peak,
             photons: Some(photons),
@@ -51,24 +52,47 @@ pub(crate) fn scale_of(
         }),
         // There is no light, so any scale gives the same image.
         None if h.transient.iter().all(|h| *h == 0.0) => Ok(without_peak(1.0)),
-        None => Err(SensorError::new(
-            "sensor.scale",
-            "the two-bounce part has no light although the transient has; \
-             use a fixed scale (photons_per_unit) for this scene",
-        )),
+        None => {
+            let what = match gate {
+                None => {
+                    "the two-bounce part has no light although the transient has; \
+                     use a fixed scale (photons_per_unit) for this scene"
+                }
+                Some(_) => {
+                    "no light that sets the scale arrives within the detector's gate; use another gate \
+                     (start_ps, bin_width_ps, bins), a scene nearer to the sensor, or a fixed scale \
+                     (photons_per_unit)"
+                }
+            };
+            Err(SensorError::new("sensor.scale", what))
+        }
     }
 }
 
 /// Returns the median over the pixels with light of the brightest bin, or `None` if no pixel has
 /// any.
-fn median_peak(h: &[f32], bins: usize, convolver: &Convolver) -> Option<f64> {
+fn median_peak(
+    h: &[f32],
+    bins: usize,
+    convolver: &Convolver,
+    gate: Option<&Resampler>,
+) -> Option<f64> {
+    let gated = gate.map_or(0, Resampler::bins);
     let mut peaks: Vec<f64> = h
         .par_chunks(bins)
         .map_init(
-            || (convolver.clone(), vec![0.0; bins]),
-            |(convolver, rate), h| {
+            || (convolver.clone(), vec![0.0; bins], vec![0.0; gated]),
+            |(convolver, rate, gated), h| {
                 convolver.run(h, rate);
-                rate.iter().copied().fold(0.0, f64::max)
+                let seen = match gate {
+                    None => rate,
+                    Some(gate) => {
+                        gated.fill(0.0);
+                        gate.add(rate, gated);
+                        gated
+                    }
+                };
+                seen.iter().copied().fold(0.0, f64::max)
             },
         )
         .filter(|peak| *peak > 0.0)

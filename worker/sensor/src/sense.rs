@@ -4,11 +4,15 @@ use picofarm_settings::{Jitter, Sensor, SensorError};
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    afterpulse::Afterpulses,
     bins::{check_factor, pixels},
     chain::{Chain, total},
     convolve::Convolver,
     draw::{PixelKey, Purpose},
+    free_running::FreeRunning,
+    image::{self, Frame},
     kernel::Kernel,
+    resample::Resampler,
     scale::scale_of,
 };
 
@@ -125,28 +129,99 @@ pub fn sense(
 ) -> Result<Sensed, SensorError> {
     let sensing = Sensing::new(sensor.clone(), h.bins, h.bin_width_ps)?;
     let chain = sensing.chain(h, None, seed, scene)?;
+    finish(sensor, h, &chain, seed, scene)
+}
+
+/// Measures an image like [`sense`], with everything that needs rows, columns and a time axis:
+/// zones, the detector's gate, and crosstalk. Values are `[row][column][bin]` of the zones.
+///
+/// # Errors
+/// Returns the errors of [`sense`], and [`SensorError::Invalid`] if `frame` has no whole rows or
+/// the zones do not divide the image.
+///
+/// # Examples
+/// ```
+/// use picofarm_sensor::{Frame, Histograms, Sensor, Zones, sense_image};
+///
+/// let transient = [1.0f32; 4 * 4 * 8];
+/// let histograms = Histograms {
+///     transient: &transient,
+///     two_bounce: None,
+///     bins: 8,
+///     bin_width_ps: 1000.0,
+/// };
+/// let frame = Frame { width: 4, start_ps: 0.0 };
+/// let sensor = Sensor {
+///     zones: Some(Zones { rows: 2, columns: 2 }),
+///     ..Sensor::default()
+/// };
+/// let sensed = sense_image(&sensor, &histograms, &frame, 7, 0)?;
+/// assert_eq!(sensed.bins, 8);
+/// # Ok::<(), picofarm_sensor::SensorError>(())
+/// ```
+pub fn sense_image(
+    sensor: &Sensor,
+    h: &Histograms<'_>,
+    frame: &Frame,
+    seed: u64,
+    scene: u64,
+) -> Result<Sensed, SensorError> {
+    sensor.check()?;
+    check(h)?;
+    let gate = image::gate(sensor, frame, h.bins, h.bin_width_ps)?;
+    let received = image::received(sensor, h, frame)?;
+    let h = Histograms {
+        transient: &received.transient,
+        two_bounce: received.two_bounce.as_deref(),
+        ..*h
+    };
+    let sensing = Sensing::gated(sensor.clone(), h.bins, h.bin_width_ps, gate)?;
+    let Some(crosstalk) = sensor.crosstalk else {
+        let chain = sensing.chain(&h, None, seed, scene)?;
+        return finish(sensor, &h, &chain, seed, scene);
+    };
+    // The scale is that of the pixels' own light.
+    let mixed = image::with_crosstalk(h.transient, h.bins, received.width, crosstalk);
+    let mixed = Histograms {
+        transient: &mixed,
+        ..h
+    };
+    let mut chain = sensing.chain(&h, None, seed, scene)?;
+    chain.h = &mixed;
+    chain.crosstalk = Some((received.width, crosstalk.probability));
+    finish(sensor, &mixed, &chain, seed, scene)
+}
+
+fn finish(
+    sensor: &Sensor,
+    h: &Histograms<'_>,
+    chain: &Chain<'_>,
+    seed: u64,
+    scene: u64,
+) -> Result<Sensed, SensorError> {
     let len = h.transient.len() / h.bins * chain.out_bins;
     let (values, totals) = if sensor.poisson {
         let mut counts = vec![0u32; len];
-        let totals = chain.run(&mut counts, |chain, pixel, rate, out| {
-            chain.count(pixel, rate, out, |count| count)
+        let totals = chain.run(&mut counts, |chain, pixel, scratch, out| {
+            chain.count(pixel, scratch, out, |count| count)
         });
         (Values::Counts(counts), totals)
     } else {
         let mut rate = vec![0f32; len];
-        let totals = chain.run(&mut rate, |chain, _, rate, out| {
-            chain.expect(rate, out, |rate| rate)
+        let totals = chain.run(&mut rate, |chain, _, scratch, out| {
+            chain.expect(scratch, out, |rate| rate)
         });
         (Values::Rate(rate), totals)
     };
+    let width_ps = sensor.gate.map_or(h.bin_width_ps, |gate| gate.bin_width_ps);
     Ok(Sensed {
         values,
         bins: chain.out_bins,
-        bin_width_ps: h.bin_width_ps * f64::from(sensor.rebin),
+        bin_width_ps: width_ps * f64::from(sensor.rebin),
         scale: chain.scale.per_unit,
         peak_photons: chain.scale.photons,
         shift_bins: shift(sensor, seed, scene),
-        dropped: total(&totals, h.bins % chain.factor)?,
+        dropped: total(&totals, chain.seen_bins % chain.factor)?,
     })
 }
 
@@ -157,6 +232,9 @@ pub struct Sensing {
     kernel: Kernel,
     bins: usize,
     bin_width_ps: f64,
+    gate: Option<Resampler>,
+    free: Option<FreeRunning>,
+    after: Option<Afterpulses>,
 }
 
 impl Sensing {
@@ -164,16 +242,42 @@ impl Sensing {
     ///
     /// # Errors
     /// Returns the errors of [`Kernel::new`], or [`SensorError::Invalid`] if the bins cannot be
-    /// summed by the sensor's factor.
+    /// summed by the sensor's factor, or if the sensor needs an image ([`sense_image`]).
     pub fn new(sensor: Sensor, bins: usize, bin_width_ps: f64) -> Result<Self, SensorError> {
+        if let Some(field) = sensor.needs_image() {
+            return Err(SensorError::new(
+                format!("sensor.{field}"),
+                "needs an image with a time axis, and here histograms keep their pixels and bins; \
+                 leave it out, or apply it with `picofarm scene sense` or a stage of kind \"reprocess\"",
+            ));
+        }
+        Self::gated(sensor, bins, bin_width_ps, None)
+    }
+
+    fn gated(
+        sensor: Sensor,
+        bins: usize,
+        bin_width_ps: f64,
+        gate: Option<Resampler>,
+    ) -> Result<Self, SensorError> {
         let kernel = Kernel::new(&sensor, bin_width_ps)?;
         pixels(0, bins)?;
-        check_factor(bins, sensor.rebin as usize)?;
+        let seen = gate.as_ref().map_or(bins, Resampler::bins);
+        check_factor(seen, sensor.rebin as usize)?;
+        let width_ps = sensor.gate.map_or(bin_width_ps, |gate| gate.bin_width_ps);
+        let free = FreeRunning::new(&sensor, seen, width_ps)?;
+        let after = match free {
+            Some(_) => None,
+            None => Afterpulses::new(&sensor, width_ps),
+        };
         Ok(Self {
             sensor,
             kernel,
             bins,
             bin_width_ps,
+            gate,
+            free,
+            after,
         })
     }
 
@@ -203,12 +307,12 @@ impl Sensing {
         out.resize(transient.len() / self.bins * chain.out_bins, 0.0);
         let scale = chain.scale.per_unit as f32;
         let totals = if self.sensor.poisson {
-            chain.run(out, |chain, pixel, rate, out| {
-                chain.count(pixel, rate, out, |count| count as f32 / scale)
+            chain.run(out, |chain, pixel, scratch, out| {
+                chain.count(pixel, scratch, out, |count| count as f32 / scale)
             })
         } else {
-            chain.run(out, |chain, _, rate, out| {
-                chain.expect(rate, out, |rate| rate / scale)
+            chain.run(out, |chain, _, scratch, out| {
+                chain.expect(scratch, out, |rate| rate / scale)
             })
         };
         total(&totals, self.bins % chain.factor)?;
@@ -227,14 +331,21 @@ impl Sensing {
         let sensor = &self.sensor;
         let kernel = self.kernel.clone().shifted(shift(sensor, seed, scene));
         let convolver = Convolver::new(&kernel, h.bins);
-        let scale = scale_of(sensor, h, (&convolver, peak), seed, scene)?;
+        let gate = self.gate.as_ref();
+        let scale = scale_of(sensor, h, (&convolver, gate, peak), seed, scene)?;
+        let seen_bins = gate.map_or(h.bins, Resampler::bins);
         Ok(Chain {
             sensor,
             h,
             convolver,
             scale,
+            gate: self.gate.clone(),
+            seen_bins,
+            crosstalk: None,
+            free: self.free,
+            after: self.after,
             factor: sensor.rebin as usize,
-            out_bins: h.bins / sensor.rebin as usize,
+            out_bins: seen_bins / sensor.rebin as usize,
             seed,
             scene,
         })

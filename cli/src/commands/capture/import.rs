@@ -33,8 +33,15 @@ pub fn run(args: &CaptureImport, output: Output) -> Result<()> {
         for note in made.origin.conversions.iter().chain(&doubts) {
             text += &format!("  note: {note}\n");
         }
+        let next = match made.origin.format.as_str() {
+            // Its paths count from a relay wall: nothing else here reads them.
+            capture::RELAY_ZONES => format!("picofarm capture show {out}"),
+            _ => format!(
+                "picofarm demultiplex {out} --out flash; picofarm reconstruct {out} --out room-3d"
+            ),
+        };
         text + &format!(
-            "  picture: {}\n  next: picofarm demultiplex {out} --out flash; picofarm reconstruct {out} --out room-3d\n",
+            "  picture: {}\n  next: {next}\n",
             args.out.join(SINGLE_PICTURE).display()
         )
     });

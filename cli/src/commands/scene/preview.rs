@@ -20,6 +20,8 @@ pub struct Preview<'a> {
 /// The longer side of an image, pixels.
 const CELL: usize = 256;
 const GAP: usize = 6;
+/// Most rows and columns whose histograms are drawn one by one: those of sensors with few zones.
+const MOST_ZONES: usize = 16;
 const HEAD: usize = TEXT + 8;
 const BACKGROUND: [u8; 3] = [16, 16, 20];
 const INK: [u8; 3] = [210, 210, 215];
@@ -91,7 +93,47 @@ pub fn draw(p: &Preview<'_>) -> Canvas {
         });
     }
     curve(&mut canvas, &energy, cell_height, [ns(0), ns(p.bins)]);
+    if longer <= MOST_ZONES && p.bins > 1 {
+        // In place of the light at the last time, of which few pixels show little.
+        let (x, y) = (GAP + 2 * (CELL + GAP), row);
+        zones(&mut canvas, p, [x, y], cell_height);
+    }
     canvas
+}
+
+/// Draws the histogram of each pixel in its place, relative to its brightest bin.
+fn zones(canvas: &mut Canvas, p: &Preview<'_>, [x, y]: [usize; 2], height: usize) {
+    let longer = p.width.max(p.height).max(1);
+    let (wide, tall) = ((CELL * p.width).div_ceil(longer), height);
+    for v in 0..HEAD + tall {
+        for u in 0..CELL {
+            canvas.set(x + u, y + v, BACKGROUND);
+        }
+    }
+    canvas.text(x, y + 4, "each pixel over time", INK);
+    for (pixel, h) in p.transient.chunks_exact(p.bins).enumerate() {
+        let most = h.iter().fold(f32::MIN_POSITIVE, |m, x| m.max(*x));
+        let (row, column) = (pixel / p.width, pixel % p.width);
+        let (left, right) = (column * wide / p.width, (column + 1) * wide / p.width);
+        let (top, bottom) = (row * tall / p.height, (row + 1) * tall / p.height);
+        // A dark line remains between pixels.
+        let (w, room) = (right - left - 1, bottom - top - 1);
+        for u in 0..w {
+            let lo = u * p.bins / w;
+            let hi = ((u + 1) * p.bins / w).clamp(lo + 1, p.bins.max(lo + 1));
+            let peak = h[lo.min(p.bins - 1)..hi.min(p.bins)]
+                .iter()
+                .fold(0.0f32, |m, x| m.max(*x));
+            let bar = (peak.max(0.0) / most * room as f32) as usize;
+            for v in 0..room {
+                let colour = match room - v <= bar {
+                    true => inferno(0.75),
+                    false => inferno(0.08),
+                };
+                canvas.set(x + left + u, y + HEAD + top + v, colour);
+            }
+        }
+    }
 }
 
 /// Returns the path of the brightest bin of each pixel in metres; 0 without light.
@@ -127,6 +169,26 @@ fn curve(canvas: &mut Canvas, energy: &[f64], height: usize, [start, end]: [f64;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn few_pixels_are_drawn_with_a_histogram_each() {
+        // Two pixels side by side: light in the first half of the time, and in the second.
+        let transient = [4.0, 4.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0];
+        let canvas = draw(&Preview {
+            width: 2,
+            height: 1,
+            bins: 4,
+            gate_start_m: 0.0,
+            bin_width_m: 0.1,
+            transient: &transient,
+            depth: None,
+        });
+        let (x, y) = (GAP + 2 * (CELL + GAP), HEAD + CELL / 2 + GAP + HEAD);
+        let at = |u: usize| canvas.part((x + u, y + CELL / 4), (1, 1)).unwrap().png();
+        let [lit, dark] = [0.75, 0.08].map(|share| Canvas::new(1, 1, inferno(share)).png());
+        assert_eq!([at(30), at(100)], [lit.clone(), dark.clone()]);
+        assert_eq!([at(CELL / 2 + 30), at(CELL / 2 + 100)], [dark, lit]);
+    }
 
     #[test]
     fn pictures_of_any_shape_and_of_darkness_are_drawn() {

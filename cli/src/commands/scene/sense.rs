@@ -4,8 +4,8 @@ use std::{path::Path, time::Instant};
 
 use picofarm_dataset::{RenderArray, RenderGroup, write_render_group};
 use picofarm_sensor::{
-    Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
-    sense as measure,
+    Frame, Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values,
+    narrow, sense_image,
 };
 use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
@@ -65,9 +65,9 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
     ];
     let bins = gate.bins as usize;
     let transient = rendered::transient(dir, &render)?;
-    // Only a scale by peak depends on the two-bounce part.
+    // Only a scale by peak depends on the two-bounce part, and zones see the spots as well.
     let by_peak = !matches!(sensor.scale, Scale::Fixed { .. });
-    let two = match by_peak && group.has("two") {
+    let two = match by_peak && sensor.zones.is_none() && group.has("two") {
         true => Some(rendered::array(dir, group, "two", &shape)?),
         false => None,
     };
@@ -77,7 +77,11 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         bins,
         bin_width_ps: gate.bin_width_m * PS_PER_M,
     };
-    let sensed = measure(sensor, &input, args.seed, args.scene)
+    let frame = Frame {
+        width: spec.width as usize,
+        start_ps: gate.start_m * PS_PER_M,
+    };
+    let sensed = sense_image(sensor, &input, &frame, args.seed, args.scene)
         .map_err(|e: SensorError| CliError::input(format!("{}: {e}", args.render.display())))?;
     let scale_from = match (by_peak, &two) {
         (false, _) => "settings",
@@ -85,10 +89,11 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         (true, None) => "transient",
     };
     let attributes = attributes(group, gate, sensor, &sensed, args, scale_from);
-    let mut shape = shape;
-    if let Some(last) = shape.last_mut() {
-        *last = sensed.bins as u64;
-    }
+    let [rows, columns] = match sensor.zones {
+        Some(zones) => [zones.rows, zones.columns],
+        None => [spec.height, spec.width],
+    };
+    let shape = vec![u64::from(rows), u64::from(columns), sensed.bins as u64];
     let (array, data_type, photons) = write(&args.out, &shape, &sensed.values, &attributes)?;
     let mut facts = Map::new();
     for name in [
@@ -134,7 +139,68 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
     if dropped.pile_up_photons > 0.0 {
         text += &format!(", {:.2e} lost to pile-up", dropped.pile_up_photons);
     }
+    let notes = notes(args, sensor, gate, spec.spots);
+    for note in &notes {
+        text += &format!("\n  note: {note}");
+    }
+    facts.insert("notes".into(), json!(notes));
     Ok(Report { facts, text })
+}
+
+/// Returns what the render cannot give the sensor.
+fn notes(args: &SceneSense, sensor: &Sensor, gate: Gate, spots: u32) -> Vec<String> {
+    let mut notes = Vec::new();
+    if let Some(preset) = args.sensor.preset.map(|p| p.0) {
+        notes.push(format!(
+            "the {} has a field of view of {}; the render's camera must have it too",
+            preset.device(),
+            preset.view()
+        ));
+        if preset.floods() {
+            notes.push(format!(
+                "it lights the whole view with one flash, which the renderer does not do: the render's {spots} spots \
+                 stand for it, and zones between them see no direct light; use 100 spots with wide beams"
+            ));
+        }
+        notes.push(format!("assumed, not published: {}", preset.assumed()));
+    }
+    if let Some(own) = sensor.gate {
+        let (from, to) = (gate.bin_width_m * PS_PER_M, own.bin_width_ps);
+        if from > 0.5 * to {
+            notes.push(format!(
+                "the render's bins of {from:.0} ps are wide for the sensor's of {to:.0} ps: light is spread evenly over \
+                 a bin of the render; render with bins of at most {:.0} ps",
+                0.25 * to
+            ));
+        }
+    }
+    notes
+}
+
+/// Returns the camera with the pixels of the zones.
+fn zoned(camera: &Value, sensor: &Sensor) -> Value {
+    let mut camera = camera.clone();
+    let Some(zones) = sensor.zones else {
+        return camera;
+    };
+    if let Some(pinhole) = camera.get_mut("intrinsics").and_then(Value::as_object_mut) {
+        let axes = [
+            ("width", zones.columns, ["fx", "cx"]),
+            ("height", zones.rows, ["fy", "cy"]),
+        ];
+        for (size, to, fields) in axes {
+            let Some(from) = pinhole.get(size).and_then(Value::as_f64) else {
+                continue;
+            };
+            for field in fields {
+                if let Some(x) = pinhole.get(field).and_then(Value::as_f64) {
+                    pinhole.insert(field.into(), json!(x * f64::from(to) / from));
+                }
+            }
+            pinhole.insert(size.into(), json!(to));
+        }
+    }
+    camera
 }
 
 /// Returns the attributes that are needed to interpret the counts, and to reproduce them.
@@ -150,7 +216,11 @@ fn attributes(
     let mut all = Map::new();
     for name in ["scene", "provenance", "camera", "laser_origin", "spots"] {
         if let Some(value) = render.get(name) {
-            all.insert(name.into(), value.clone());
+            let value = match name {
+                "camera" => zoned(value, sensor),
+                _ => value.clone(),
+            };
+            all.insert(name.into(), value);
         }
     }
     let mut of_render = Map::new();
@@ -159,10 +229,14 @@ fn attributes(
             of_render.insert(name.into(), value.clone());
         }
     }
+    let (start_m, width_m) = match sensor.gate {
+        Some(own) => (own.start_ps / PS_PER_M, own.bin_width_ps / PS_PER_M),
+        None => (gate.start_m, gate.bin_width_m),
+    };
     let sensed_gate = Gate {
-        bin_width_m: gate.bin_width_m * f64::from(sensor.rebin),
+        start_m,
+        bin_width_m: width_m * f64::from(sensor.rebin),
         bins: sensed.bins as u32,
-        ..gate
     };
     let value = match sensed.values {
         Values::Counts(_) => "counts: photons counted in the bin",
@@ -222,202 +296,4 @@ fn write(
 }
 
 #[cfg(test)]
-mod tests {
-    use futures::executor::block_on;
-    use picofarm_dataset::{
-        Dataset, DatasetSpec, Intrinsics, Profile, Provenance, SceneRecord, SingleRenderParts,
-        Subsets, Wavelength, write_single_render,
-    };
-
-    use super::*;
-    use crate::args::SensorArgs;
-
-    fn args(folder: &Path, out: &str) -> SceneSense {
-        SceneSense {
-            render: folder.join("render"),
-            out: folder.join(out),
-            sensor: SensorArgs {
-                rebin: Some(4),
-                ..SensorArgs::default()
-            },
-            seed: 7,
-            scene: 0,
-            threads: Some(1),
-        }
-    }
-
-    fn measure(args: &SceneSense) -> Result<Report> {
-        sense(args, &sensor::settings(&args.sensor)?)
-    }
-
-    /// A render of 3×2 pixels and 50 bins of 8 ps, as `scene render --split` writes it.
-    fn rendered(folder: &Path) {
-        let shape = [3u64, 2, 50];
-        let two: Vec<f32> = (0..300)
-            .map(|i| if i % 50 == 20 { 0.01 } else { 0.0 })
-            .collect();
-        let mut transient = two.clone();
-        transient[5] = 0.05;
-        let spec = DatasetSpec {
-            scenes: 1,
-            height: 3,
-            width: 2,
-            spots: 1,
-            subsets: Subsets::NONE,
-            per_spot: false,
-            wavelengths_nm: Wavelength::NONE,
-            two_bounce: false,
-            gate: Gate {
-                start_m: 1.0,
-                bin_width_m: 0.002_398_34,
-                bins: 50,
-            },
-            profile: Profile::LOSSLESS,
-        };
-        let record = SceneRecord {
-            transient: &transient,
-            subsets: &[],
-            depth: &[1.0; 6],
-            range: &[1.0; 6],
-            normal: &[0.0; 18],
-            instance: &[1; 6],
-            label: &[1; 6],
-            specular: &[0; 6],
-            visibility: &[1; 6],
-            two_bounce: &[],
-            rgb: &[0.5; 18],
-            spots: &[None],
-            intrinsics: Intrinsics {
-                fx: 2.0,
-                fy: 2.0,
-                cx: 1.0,
-                cy: 1.5,
-            },
-            camera: [[0.0; 4]; 4],
-            laser: [0.0; 3],
-            scale: 1.0,
-        };
-        let provenance = Provenance {
-            task_key: "a test".into(),
-            renderer: "transient-1".into(),
-            seed: 0,
-            plan: Value::Null,
-        };
-        let attributes = json!({
-            "scene": "room", "camera": {"a": 1}, "spots": [], "renderer": "transient-1", "gate": spec.gate,
-        });
-        let two = RenderArray {
-            name: "two",
-            shape: &shape,
-            dimension_names: &["row", "column", "bin"],
-            data: &two,
-        };
-        let parts = SingleRenderParts {
-            arrays: &[two],
-            attributes: attributes.as_object().unwrap(),
-            picture: b"",
-        };
-        let encode = |dataset: &Dataset| dataset.encode(0, &record, &provenance);
-        let dir = folder.join("render");
-        block_on(write_single_render(&dir, &spec, encode, &parts)).unwrap();
-    }
-
-    #[test]
-    fn counts_and_rates_are_written_with_all_that_made_them() {
-        let folder = tempfile::tempdir().unwrap();
-        rendered(folder.path());
-        let with = |out: &str, change: fn(&mut SensorArgs)| {
-            let mut args = args(folder.path(), out);
-            change(&mut args.sensor);
-            args
-        };
-        let counts = measure(&with("counts", |s| {
-            s.peak_photons = Some("100".into());
-        }))
-        .unwrap();
-        assert_eq!(counts.facts["data_type"], "uint16");
-        assert_eq!(counts.facts["scale_from"], "two");
-        assert_eq!(counts.facts["peak_photons"], 100.0);
-        assert!(
-            counts.text.contains("last 2 bin(s) left over"),
-            "{}",
-            counts.text
-        );
-        let group = RenderGroup::open(&folder.path().join("counts")).unwrap();
-        let (shape, values) = group.read::<u16>("counts").unwrap();
-        assert_eq!(shape, [3, 2, 12]);
-        let sum: f64 = values.iter().map(|v| f64::from(*v)).sum();
-        assert_eq!(counts.facts["photons"], sum);
-        let a = group.attributes();
-        assert_eq!(a["gate"]["bins"], 12);
-        assert_eq!(a["gate"]["bin_width_m"], 4.0 * 0.002_398_34);
-        assert_eq!(a["render"]["gate"]["bins"], 50);
-        assert_eq!(a["render"]["renderer"], "transient-1");
-        assert_eq!(a["camera"]["a"], 1);
-        assert_eq!(a["dropped"]["bins"], 2);
-        let sensor: Sensor = serde_json::from_value(a["sensor"].clone()).unwrap();
-        assert_eq!(sensor.scale, Scale::Peak { photons: 100.0 });
-        let mut expected = with("rate", |s| s.no_poisson = true);
-        expected.sensor.photons_per_unit = a["scale"].as_f64();
-        let rate = measure(&expected).unwrap();
-        assert_eq!(rate.facts["data_type"], "float32");
-        let group = RenderGroup::open(&folder.path().join("rate")).unwrap();
-        let (_, rate) = group.read::<f32>("rate").unwrap();
-        let expected: f64 = rate.iter().map(|r| f64::from(*r)).sum();
-        assert!((sum - expected).abs() < 5.0 * expected.sqrt());
-        // Bright counts need 32 bits.
-        let bright = measure(&with("bright", |s| s.photons_per_unit = Some(1e8))).unwrap();
-        assert_eq!(bright.facts["data_type"], "uint32");
-    }
-
-    #[test]
-    fn nothing_is_overwritten_and_faults_name_the_file() {
-        let folder = tempfile::tempdir().unwrap();
-        rendered(folder.path());
-        let list = || {
-            let mut all: Vec<_> = std::fs::read_dir(folder.path())
-                .unwrap()
-                .map(|e| e.unwrap().file_name())
-                .collect();
-            all.sort();
-            all
-        };
-        let before = list();
-        let fails = |args: SceneSense| {
-            let Err(error) = measure(&args) else {
-                panic!("expected an error")
-            };
-            (error.code, error.message)
-        };
-        let (_, message) = fails(args(folder.path(), "render"));
-        assert!(message.contains("not empty"), "{message}");
-        let (code, message) = fails(SceneSense {
-            render: folder.path().join("absent"),
-            ..args(folder.path(), "out")
-        });
-        assert!(
-            code == Code::Input && message.contains("absent"),
-            "{message}"
-        );
-        let with = |change: fn(&mut SensorArgs)| {
-            let mut args = args(folder.path(), "out");
-            change(&mut args.sensor);
-            args
-        };
-        let (_, message) = fails(with(|s| s.rebin = Some(51)));
-        assert!(message.contains("rebin: expected 1 to 50"), "{message}");
-        let (_, message) = fails(with(|s| s.dark = Some(-1.0)));
-        assert!(message.contains("sensor.dark_per_bin"), "{message}");
-        let chunk = folder.path().join("render/transient/c/0/0/0/0");
-        let mut bytes = std::fs::read(&chunk).unwrap();
-        let middle = bytes.len() / 2;
-        bytes[middle] ^= 1;
-        std::fs::write(&chunk, bytes).unwrap();
-        let (code, message) = fails(args(folder.path(), "out"));
-        assert!(
-            code == Code::Damaged && message.contains("transient/c/0/0/0/0"),
-            "{message}"
-        );
-        assert_eq!(list(), before);
-    }
-}
+mod tests;

@@ -282,6 +282,11 @@ impl ReconstructSettings {
                 );
                 return fail("sensor.rebin", what);
             }
+            if let Some(field) = sensor.needs_image() {
+                let what = "changes the pixels or bins of a whole image, which are kept here: leave it out, or \
+                            make a data set with it first by a stage of kind \"reprocess\"";
+                return fail(&format!("sensor.{field}"), what.into());
+            }
             sensor
                 .check()
                 .or_else(|SensorError::Invalid { field, what }| fail(&field, what))?;

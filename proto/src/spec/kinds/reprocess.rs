@@ -100,7 +100,10 @@ impl TaskKind for ReprocessTask {
         let spots = self.reprocess.histogram == Histogram::TransientSpots;
         // Includes the memory of the previous scene that the allocator still keeps.
         let histograms = if spots { 5.6 } else { 4.2 };
-        Some(BASE + source.truth() + histograms * source.histogram())
+        // The sensor may have more bins than the source.
+        let own = self.reprocess.sensor.gate.map_or(0, |gate| gate.bins);
+        let more = (f64::from(own) / f64::from(source.bins.max(1))).max(1.0);
+        Some(BASE + source.truth() + histograms * more * source.histogram())
     }
 
     fn shape(&self, source: Option<Shape>) -> Option<Shape> {
@@ -112,7 +115,7 @@ impl TaskKind for ReprocessTask {
             Histogram::TransientSpots => self.reprocess.spots.len() as u32,
         };
         Some(Shape {
-            bins: source.bins / self.reprocess.sensor.rebin.max(1),
+            bins: self.reprocess.sensor.bins(source.bins),
             spots,
             ..source
         })

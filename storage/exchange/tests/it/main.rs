@@ -4,6 +4,7 @@ mod captures;
 mod captures_of_tools;
 #[path = "../../../dataset/tests/it/common/mod.rs"]
 mod common;
+mod consumer_nlos;
 mod export;
 mod files;
 mod import_captures;

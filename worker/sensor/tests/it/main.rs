@@ -4,6 +4,8 @@ mod chain;
 mod common;
 mod detector;
 mod draws;
+mod free_running;
+mod image;
 mod kernel;
 mod resample;
 mod scale;

@@ -10,7 +10,8 @@ use picofarm_proto::{
     trace,
 };
 use picofarm_sensor::{
-    Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
+    Frame, Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values,
+    sense_image,
 };
 use serde_json::json;
 use tracing::debug_span;
@@ -101,10 +102,14 @@ impl Reprocessing {
             bins: source.spec().gate.bins as usize,
             bin_width_ps: source.spec().gate.bin_width_m * PS_PER_M,
         };
+        let frame = Frame {
+            width: source.spec().width as usize,
+            start_ps: source.spec().gate.start_m * PS_PER_M,
+        };
         // The key determines every random number. It already covers the scene's number.
         let seed = u64::from_le_bytes(self.key.0[..8].try_into().expect("a key has 32 bytes"));
         let sensed = debug_span!(target: trace::TARGET, "measure")
-            .in_scope(|| sense(&self.sensor, &input, seed, 0))
+            .in_scope(|| sense_image(&self.sensor, &input, &frame, seed, 0))
             .map_err(of_sensor)?;
         drop(h);
         proceed(control, MEASURED)?;
@@ -171,14 +176,31 @@ pub fn target_spec(
         );
         return Err(user("spots", what));
     }
-    let (bins, rebin) = (source.gate.bins, settings.sensor.rebin);
+    if let Some(zones) = settings.sensor.zones
+        && (zones.rows, zones.columns) != (source.height, source.width)
+    {
+        let what = format!(
+            "{}x{} zones of {}x{} pixels (rows x columns): depth, masks and labels have no mean over a zone; render \
+             the data set with one pixel for each zone, whose histogram is the mean over its area, or leave zones out",
+            zones.rows, zones.columns, source.height, source.width
+        );
+        return Err(user("sensor.zones", what));
+    }
+    let own = settings.sensor.gate;
+    let gate = own.map_or(source.gate, |own| Gate {
+        start_m: own.start_ps / PS_PER_M,
+        bin_width_m: own.bin_width_ps / PS_PER_M,
+        bins: own.bins,
+    });
+    let (bins, rebin) = (gate.bins, settings.sensor.rebin);
+    let whose = if own.is_some() { "sensor" } else { "source" };
     if rebin > bins {
-        let what = format!("{rebin} is more than the source's {bins} bins");
+        let what = format!("{rebin} is more than the {whose}'s {bins} bins");
         return Err(user("sensor.rebin", what));
     }
     if bins % rebin != 0 && !settings.drop_left_over {
         let what = format!(
-            "{rebin} does not divide the source's {bins} bins; set drop_left_over (--drop-left-over) to drop the last {}, \
+            "{rebin} does not divide the {whose}'s {bins} bins; set drop_left_over (--drop-left-over) to drop the last {}, \
              or choose a divisor",
             bins % rebin
         );
@@ -192,8 +214,8 @@ pub fn target_spec(
         per_spot: false,
         wavelengths_nm: source.wavelengths_nm,
         gate: Gate {
-            start_m: source.gate.start_m,
-            bin_width_m: source.gate.bin_width_m * f64::from(rebin),
+            start_m: gate.start_m,
+            bin_width_m: gate.bin_width_m * f64::from(rebin),
             bins: bins / rebin,
         },
         profile,

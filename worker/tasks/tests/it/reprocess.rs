@@ -8,7 +8,7 @@ use picofarm_proto::{
     key::{TaskKey, derived_key},
     spec::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
-use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
+use picofarm_settings::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, TimeGate, Zones};
 use picofarm_store::*;
 use picofarm_tasks::{
     Control, Output, TaskError,
@@ -270,6 +270,55 @@ async fn left_over_bins_are_dropped_only_on_request() {
     place.settings.drop_left_over = true;
     place.run(0).await.unwrap();
     assert_eq!(place.open("target", None).await.spec().gate.bins, 9);
+}
+
+#[tokio::test]
+async fn the_sensors_own_bins_are_those_of_the_target() {
+    // Twelve bins, each of four of the source's, from the source's eighth on.
+    let (width_ps, start_ps) = (0.002_398_34 * PS_PER_M, 0.9 * PS_PER_M);
+    let place = Place::new(Sensor {
+        gate: Some(TimeGate {
+            start_ps: start_ps + 8.0 * width_ps,
+            bin_width_ps: 4.0 * width_ps,
+            bins: 10,
+        }),
+        ..ideal()
+    });
+    place.publish(0, lively).await;
+    let (photons, gate) = place.photons().await;
+    assert_eq!(gate.bins, 10);
+    assert!((gate.start_m - 0.9 - 8.0 * 0.002_398_34).abs() < 1e-9);
+    assert!((gate.bin_width_m - 4.0 * 0.002_398_34).abs() < 1e-9);
+    for (pixel, h) in photons.chunks_exact(10).enumerate() {
+        for (bin, photons) in h.iter().enumerate() {
+            let sum: f64 = (0..4)
+                .map(|k| f64::from(lively(pixel, 8 + 4 * bin + k)) * 1000.0)
+                .sum();
+            assert!(
+                (photons - sum).abs() <= 1e-5 * sum.max(1.0),
+                "{pixel} {bin}"
+            );
+        }
+    }
+}
+
+#[tokio::test]
+async fn zones_of_a_data_set_are_its_pixels_or_refused() {
+    let zones = |rows, columns| Sensor {
+        zones: Some(Zones { rows, columns }),
+        ..ideal()
+    };
+    let place = Place::new(zones(8, 8));
+    place.publish(0, lively).await;
+    let text = place.complaint(0).await;
+    assert!(
+        text.contains("reprocess.sensor.zones") && text.contains("one pixel for each zone"),
+        "{text}"
+    );
+    let place = Place::new(zones(SIDE, SIDE));
+    place.publish(0, lively).await;
+    let (photons, _) = place.photons().await;
+    assert!((photons[5] - f64::from(lively(0, 5)) * 1000.0).abs() < 1e-3);
 }
 
 #[tokio::test]

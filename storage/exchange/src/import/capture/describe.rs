@@ -15,7 +15,7 @@ use super::DESCRIPTION;
 pub(super) use calibration::placed;
 
 /// Speed of light, metres per picosecond.
-const LIGHT_M_PS: f64 = 299_792_458.0 * 1e-12;
+pub(super) const LIGHT_M_PS: f64 = 299_792_458.0 * 1e-12;
 
 /// A description in ten lines, which errors and `--help` show.
 pub const EXAMPLE: &str = r#"{

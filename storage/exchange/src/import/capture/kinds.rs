@@ -8,7 +8,7 @@ use super::super::mat::{Mat, is_hdf5};
 use super::super::{ImportError, npy};
 use super::arrays::{Part, Stated, Strided};
 use super::describe::{Described, Description};
-use super::{EXAMPLE, h5, own, ptu, tables};
+use super::{EXAMPLE, consumer_nlos, h5, own, ptu, tables};
 
 /// Most numbers of an array.
 const MOST_VALUES: usize = 1 << 32;
@@ -28,10 +28,22 @@ pub(super) fn read(
     opened.take(HEAD).read_to_end(&mut head).map_err(io)?;
     let (format, array) = match &head[..] {
         h if h.starts_with(b"\x93NUMPY") => {
+            if let Some(error) = consumer_nlos::pickled(file, h) {
+                return Err(error);
+            }
             let array = npy::parse(file, &reader.bytes(file)?)?;
             ("numpy", Strided::rows(array.shape, array.values))
         }
-        h if h.starts_with(b"PK\x03\x04") => ("numpy", npz(file, description, reader)?),
+        h if h.starts_with(b"PK\x03\x04") => {
+            let bytes = reader.bytes(file)?;
+            let names = npy::names_npz(file, &bytes)?;
+            if description.array.is_none() && consumer_nlos::is_frame(&names) {
+                return consumer_nlos::read(file, &bytes, &names, description);
+            }
+            let name = chosen(file, &names, description)?;
+            let array = npy::parse_npz(file, &bytes, name, MOST_VALUES)?;
+            ("numpy", Strided::rows(array.shape, array.values))
+        }
         h if is_matlab(h, file) => ("matlab", matlab(file, description, reader)?),
         h if h.starts_with(ptu::MAGIC) => return ptu::read(file, description, described, reader),
         h if is_hdf5(h) => return h5::read(file, description, described, reader),
@@ -94,14 +106,6 @@ fn is_matlab(head: &[u8], file: &Path) -> bool {
     let version_5 = head.len() >= 128 && matches!(&head[126..128], b"IM" | b"MI");
     let named = file.extension().is_some_and(|e| e == "mat");
     version_5 || (is_hdf5(head) && (named || head.starts_with(b"MATLAB")))
-}
-
-fn npz(file: &Path, description: &Description, reader: &Files) -> Result<Strided, ImportError> {
-    let bytes = reader.bytes(file)?;
-    let names = npy::names_npz(file, &bytes)?;
-    let name = chosen(file, &names, description)?;
-    let array = npy::parse_npz(file, &bytes, name, MOST_VALUES)?;
-    Ok(Strided::rows(array.shape, array.values))
 }
 
 fn matlab(file: &Path, description: &Description, reader: &Files) -> Result<Strided, ImportError> {

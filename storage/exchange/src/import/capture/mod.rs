@@ -6,6 +6,7 @@
 //! Values are photons or energy as the files have them; nothing is normalised.
 
 mod arrays;
+mod consumer_nlos;
 mod describe;
 mod events;
 mod folder;
@@ -23,6 +24,7 @@ use std::path::{Path, PathBuf};
 use picofarm_dataset::{Gate, Intrinsics};
 use picofarm_files::Opener;
 
+pub use consumer_nlos::FORMAT as RELAY_ZONES;
 pub use describe::EXAMPLE;
 pub use folder::is_capture;
 pub use resample::Resampling;
@@ -152,6 +154,15 @@ fn join(mut parts: Vec<Part>) -> Result<Part, ImportError> {
         return Ok(first);
     }
     for part in std::iter::once(&first).chain(&parts) {
+        if part.format == consumer_nlos::FORMAT {
+            return Err(ImportError::refused(
+                &part.file,
+                "files",
+                "one frame of a moving sensor",
+                format!("{} files", parts.len() + 1),
+                "import each frame alone",
+            ));
+        }
         if part.apart {
             return Err(ImportError::refused(
                 &part.file,
