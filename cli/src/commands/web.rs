@@ -11,7 +11,8 @@ use picofarm_proto::{
 };
 use picofarm_tasks::Access;
 use picofarm_web::{
-    Events, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError, Workers,
+    Events, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError, TlsFiles,
+    Workers,
 };
 use serde_json::json;
 use tokio::sync::Mutex;
@@ -24,6 +25,9 @@ use crate::{
     settings::Settings,
     signals,
 };
+
+/// How to reach the pages without opening them to others.
+const TUNNEL: &str = "listen on 127.0.0.1 and use a tunnel (`ssh -L 7421:127.0.0.1:7421 HOST`)";
 
 /// Serves the pages until a signal.
 ///
@@ -45,9 +49,12 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
         true => ("/data", "data sets"),
         false => ("/", "farm"),
     };
+    let tls = args.tls_cert.zip(args.tls_key);
     let shown = Shown {
         listen: args.listen,
         hosts: args.host,
+        tls: tls.map(|(certificate, key)| TlsFiles { certificate, key }),
+        allow_insecure: args.allow_insecure,
         stores: args.store,
         farm: !alone,
     };
@@ -81,11 +88,14 @@ fn refused(error: StartError) -> CliError {
             io(format!("cannot listen on {address}"), &e).hint("choose another --listen, e.g. 127.0.0.1:0 for any free port")
         }
         StartError::Open(address) => CliError::input(format!(
+            "--listen {address}: other machines reach this address, and it has no name"
+        ))
+        .hint(format!("{TUNNEL}, or give --host NAME, --tls-cert and --tls-key")),
+        StartError::Clear(address) => CliError::input(format!(
             "--listen {address}: other machines reach this address, and the pages are not encrypted"
         ))
-        .hint(
-            "listen on 127.0.0.1 and use a tunnel (`ssh -L 7421:127.0.0.1:7421 HOST`), or allow it with --host NAME",
-        ),
+        .hint(format!("{TUNNEL}, or give --tls-cert and --tls-key; --allow-insecure allows it where something else encrypts")),
+        StartError::Certificate(e) => CliError::input(format!("--tls-cert, --tls-key: {e}")),
         StartError::Store(e) => CliError::input(format!("--store: {e}")),
     }
 }
@@ -250,6 +260,8 @@ pub async fn start_for_up(store: String, farm: Coordinator) -> Result<Server> {
         let shown = Shown {
             listen,
             hosts: Vec::new(),
+            tls: None,
+            allow_insecure: false,
             stores: vec![store.clone()],
             farm: true,
         };

@@ -3,6 +3,7 @@
 mod cache;
 mod histogram;
 mod light;
+mod models;
 mod picture;
 mod stores;
 mod truth;
@@ -15,6 +16,7 @@ use serde_json::json;
 
 pub use self::{
     light::{Light, lights},
+    models::{Listed, Model, StoreModels, Sweep},
     picture::{Picture, Span},
     stores::{DataSet, Listing, Stores},
     truth::Truth,

@@ -1,11 +1,9 @@
 //! One job: stages, tasks, failures, explanation, log and job file.
 
-use std::collections::BTreeMap;
-
 use maud::{Markup, html};
 use picofarm_proto::{
     ids::JobId,
-    messages::{Event, EventKind, JobState, JobStatus},
+    messages::{JobState, JobStatus},
     spec::{JobSpec, kinds::Manifest},
 };
 
@@ -16,6 +14,7 @@ use super::{
 use crate::{
     App, Events,
     answer::Problem,
+    history::{self, History},
     query::{Query, encode},
 };
 
@@ -31,24 +30,19 @@ const GROUPS: usize = 20;
 /// Returns the page of a job.
 pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> {
     let view = query.text("view");
-    let newest = Events {
-        job: Some(id),
-        limit: LOG,
-        newest: true,
-        logs: view == "log",
-        ..Events::default()
-    };
-    let (job, history, newest, why) = tokio::join!(
-        app.farm.job(id),
-        grid::history(app, id),
-        app.farm.events(newest),
-        app.farm.explain(id, None)
-    );
-    let (job, history, newest, (reasons, _)) = (job?, history?, newest?, why?);
+    let (job, why) = tokio::join!(app.farm.job(id), app.farm.explain(id, None));
+    let (job, (reasons, _)) = (job?, why?);
     let part = match view {
-        "" => overview(app, &job, &history),
+        "" => overview(app, &job, &*history::read(app, id).await?),
         "log" => {
-            let mut shown = newest;
+            let newest = Events {
+                job: Some(id),
+                limit: LOG,
+                newest: true,
+                logs: true,
+                ..Events::default()
+            };
+            let mut shown = app.farm.events(newest).await?;
             shown.reverse();
             html! { section #log { h2 { "Log" } (events::table(&shown, false)) } }
         }
@@ -133,7 +127,7 @@ fn actions(app: &App, job: &JobStatus) -> Markup {
     }
 }
 
-fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
+fn overview(app: &App, job: &JobStatus, history: &History) -> Markup {
     html! {
         section #stages {
             h2 { "Stages" }
@@ -157,7 +151,7 @@ fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
         }
         section #grid {
             h2 { "Tasks" }
-            (grid::legend(job))
+            (grid::legend(job, history))
             @for (position, stage) in job.stages.iter().enumerate() {
                 (grid::draw(job, position as u32, stage, history))
             }
@@ -208,24 +202,16 @@ fn result(app: &App, job: &JobStatus, position: usize) -> Markup {
 }
 
 /// Failures with equal messages are one group: numbers in messages often differ.
-fn failures(job: &JobStatus, history: &[Event]) -> Markup {
-    let mut groups: BTreeMap<String, Vec<&Event>> = BTreeMap::new();
-    let failed = history
-        .iter()
-        .filter(|e| matches!(e.kind, EventKind::Failed | EventKind::Dead));
-    for event in failed {
-        groups.entry(shape(&event.message)).or_default().push(event);
-    }
-    let mut groups: Vec<_> = groups.into_values().collect();
-    groups.sort_by_key(|group| std::cmp::Reverse(group.len()));
+fn failures(job: &JobStatus, history: &History) -> Markup {
+    let groups = history.failures();
     html! {
         @if !groups.is_empty() {
             section #failures {
                 h2 { "Failures by message" }
                 ul.failures { @for group in groups.iter().take(GROUPS) {
-                    @let last = group[group.len() - 1];
+                    @let last = &group.last;
                     li {
-                        b { (group.len()) "×" } " "
+                        b { (group.count) "×" } " "
                         span.message { (safe(&last.message)) }
                         " " @if let Some(task) = last.task {
                             a href={ "/jobs/" (job.id) "/tasks/" (last.stage.unwrap_or(0)) "/" (task) } { "task " (task) }
@@ -240,19 +226,6 @@ fn failures(job: &JobStatus, history: &[Event]) -> Markup {
     }
 }
 
-/// A message with its numbers replaced.
-fn shape(message: &str) -> String {
-    let mut text = String::with_capacity(message.len());
-    for c in message.chars() {
-        match c {
-            '0'..='9' if text.ends_with('#') => {}
-            '0'..='9' => text.push('#'),
-            c => text.push(c),
-        }
-    }
-    text
-}
-
 fn file(spec: &JobSpec) -> Result<Markup, Problem> {
     let text = toml::to_string_pretty(spec).map_err(|e| {
         let status = http::StatusCode::INTERNAL_SERVER_ERROR;
@@ -265,15 +238,4 @@ fn file(spec: &JobSpec) -> Result<Markup, Problem> {
             pre.file tabindex="0" { (safe(text)) }
         }
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::shape;
-
-    #[test]
-    fn messages_that_differ_in_numbers_have_one_shape() {
-        assert_eq!(shape("scene 12 of 340: full"), shape("scene 7 of 9: full"));
-        assert_ne!(shape("scene 12: full"), shape("scene 12: empty"));
-    }
 }

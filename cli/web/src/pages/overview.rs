@@ -19,6 +19,8 @@ use crate::{
 const FEW: u32 = 12;
 /// Number of jobs on a page of the list.
 const MANY: u32 = 50;
+/// Number of workers on the first page.
+const WORKERS: usize = 20;
 /// Number of waiting jobs that are explained.
 const EXPLAINED: usize = 4;
 /// Bars of the chart of the last hour.
@@ -81,7 +83,7 @@ pub async fn farm(app: &App) -> Result<Page, Problem> {
         section #jobs { h2 { "Jobs" } (table(&jobs)) p { a href="/jobs" { "All jobs" } } }
         section #workers {
             h2 { "Workers" }
-            (super::workers::table(all))
+            (super::workers::few(all, WORKERS))
         }
     };
     Ok(Page {

@@ -39,6 +39,8 @@ pub struct Memory {
     pub idle: Mutex<bool>,
     /// Whether the coordinator does not answer.
     pub away: Mutex<bool>,
+    /// The store that the job names, if another.
+    pub store: Mutex<Option<String>>,
 }
 
 fn refusal(kind: Refused, message: &str) -> Refusal {
@@ -175,7 +177,9 @@ impl Farm for Memory {
     }
 
     async fn spec(&self, _: JobId) -> Result<JobSpec, Refusal> {
-        Ok(toml::from_str(FILE).unwrap())
+        let store = self.store.lock().unwrap().clone();
+        let file = FILE.replace("/stores/a", store.as_deref().unwrap_or("/stores/a"));
+        Ok(toml::from_str(&file).unwrap())
     }
 
     async fn events(&self, ask: Events) -> Result<Vec<Event>, Refusal> {
@@ -185,6 +189,12 @@ impl Farm for Memory {
             event(2, EventKind::Failed, 3, &format!("{EVIL} 17")),
             event(3, EventKind::Failed, 3, &format!("{EVIL} 18")),
             event(4, EventKind::Dead, 3, "gave up"),
+            event(
+                5,
+                EventKind::Log,
+                3,
+                &format!("{EVIL}\r\nevent: message\ndata: {EVIL}"),
+            ),
         ];
         Ok(all.into_iter().filter(|e| e.sequence > ask.after).collect())
     }

@@ -5,5 +5,7 @@ mod access;
 mod actions;
 mod client;
 mod farm;
+mod hostile;
 mod room;
 mod scenes;
+mod tls;
