@@ -6,13 +6,13 @@ use std::{net::SocketAddr, sync::Arc};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::JobId,
-    messages::{AuditEntry, Event, JobStatus, JobSummary, Reason, TaskExplanation},
+    messages::{AuditEntry, Event, JobSummary},
     spec::JobSpec,
 };
 use picofarm_tasks::Access;
 use picofarm_web::{
-    Events, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError, TlsFiles,
-    Workers,
+    Events, Explained, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError,
+    TlsFiles, Workers,
 };
 use serde_json::json;
 use tokio::sync::Mutex;
@@ -183,11 +183,6 @@ impl Farm for Coordinator {
         .await
     }
 
-    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal> {
-        self.call(async |client: &mut Client| client.status(job).await)
-            .await
-    }
-
     async fn spec(&self, job: JobId) -> Result<JobSpec, Refusal> {
         self.call(async |client: &mut Client| client.spec(job).await)
             .await
@@ -207,15 +202,16 @@ impl Farm for Coordinator {
         Ok(events.await?.0)
     }
 
-    async fn explain(
-        &self,
-        job: JobId,
-        task: Option<(u32, u64)>,
-    ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal> {
+    async fn explain(&self, job: JobId, task: Option<(u32, u64)>) -> Result<Explained, Refusal> {
         let (stage, index) = task.map_or((0, None), |(stage, task)| (stage, Some(task)));
         let told = self.call(async |client: &mut Client| client.explain(job, stage, index).await);
         let told = told.await?;
-        Ok((told.reasons, told.task))
+        Ok(Explained {
+            job: told.job,
+            reasons: told.reasons,
+            task: told.task,
+            may_change: told.may_change,
+        })
     }
 
     async fn workers(&self) -> Result<Workers, Refusal> {

@@ -1,6 +1,7 @@
 //! Scenes of the stores: what there is, pictures, values of pixels, and volumes of light in flight.
 
 mod cache;
+mod contents;
 mod histogram;
 mod light;
 mod models;
@@ -15,6 +16,7 @@ use http::StatusCode;
 use serde_json::json;
 
 pub use self::{
+    contents::{Content, Contents},
     light::{Light, lights},
     models::{Listed, Model, StoreModels, Sweep},
     picture::{Picture, Span},

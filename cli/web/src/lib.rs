@@ -28,7 +28,7 @@ use picofarm_store::StorageError;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-pub use farm::{Events, Farm, JobFilter, Refusal, Refused, Workers};
+pub use farm::{Events, Explained, Farm, JobFilter, Refusal, Refused, Workers};
 pub use guard::is_host;
 pub use tls::TlsFiles;
 

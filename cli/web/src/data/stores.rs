@@ -14,6 +14,7 @@ use tokio::sync::Mutex;
 use super::{
     SceneId, Truth,
     cache::Cache,
+    contents::Catalogue,
     light::{Light, has_parts},
     models::{Recent, StoreModels, Sweep},
     volume::Volume,
@@ -82,6 +83,7 @@ pub struct Stores {
     listed: Mutex<Option<(Instant, Arc<Listing>)>>,
     truths: Cache<SceneId, Truth>,
     volumes: Cache<(SceneId, Light), Volume>,
+    pub(super) catalogue: Catalogue,
     pub(super) recent_models: Recent<StoreModels>,
     pub(super) recent_sweeps: Recent<Sweep>,
 }
@@ -110,6 +112,7 @@ impl Stores {
             listed: Mutex::default(),
             truths: Cache::new(IMAGES),
             volumes: Cache::new(VOLUMES),
+            catalogue: Catalogue::default(),
             recent_models: Recent::default(),
             recent_sweeps: Recent::default(),
         })

@@ -1,5 +1,7 @@
 //! One job: stages, tasks, failures, explanation, log and job file.
 
+mod curves;
+
 use maud::{Markup, html};
 use picofarm_proto::{
     ids::JobId,
@@ -22,6 +24,8 @@ use crate::{
 const RUNNING: usize = 24;
 /// Number of events of the log.
 const LOG: u32 = 200;
+/// Number of events in which lines of trainings are looked for, the most that a coordinator gives.
+const LINES: u32 = 1000;
 /// Kinds of stages that make data sets.
 const KINDS: [&str; 3] = ["render", "reprocess", "import"];
 /// Number of groups of failures.
@@ -30,8 +34,8 @@ const GROUPS: usize = 20;
 /// Returns the page of a job.
 pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> {
     let view = query.text("view");
-    let (job, why) = tokio::join!(app.farm.job(id), app.farm.explain(id, None));
-    let (job, (reasons, _)) = (job?, why?);
+    let explained = app.farm.explain(id, None).await?;
+    let (job, reasons) = (explained.job, explained.reasons);
     let part = match view {
         "" => overview(app, &job, &*history::read(app, id).await?),
         "log" => {
@@ -46,13 +50,32 @@ pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> 
             shown.reverse();
             html! { section #log { h2 { "Log" } (events::table(&shown, false)) } }
         }
+        "curves" => {
+            let newest = Events {
+                job: Some(id),
+                limit: LINES,
+                newest: true,
+                logs: true,
+                ..Events::default()
+            };
+            curves::draw(&job, &app.farm.events(newest).await?)
+        }
         "file" => file(&app.farm.spec(id).await?)?,
         other => {
             return Err(Problem::input(format!(
-                "view: expected log or file, found {other:?}"
+                "view: expected log, curves or file, found {other:?}"
             )));
         }
     };
+    let views = [
+        ("tasks", ""),
+        ("curves", "curves"),
+        ("log", "log"),
+        ("job file", "file"),
+    ];
+    let views = views
+        .into_iter()
+        .filter(|(name, _)| *name != "curves" || curves::has_some(&job));
     let content = html! {
         section #head {
             h1 { (safe(&job.name)) " " (badge(job_state(job.state, job.paused, &job.tasks))) }
@@ -63,9 +86,13 @@ pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> 
                 }
             }
         }
-        section #actions.actions aria-label="Actions" { (actions(app, &job)) }
+        @if explained.may_change {
+            section #actions.actions aria-label="Actions" { (actions(app, &job)) }
+        } @else if job.state == JobState::Active || job.tasks.dead > 0 {
+            p #actions.hint { "Your token has no right to change this job." }
+        }
         nav.filters aria-label="Views" {
-            @for (name, value) in [("tasks", ""), ("log", "log"), ("job file", "file")] {
+            @for (name, value) in views {
                 a href={ "/jobs/" (id) "?" (encode(&[("view", value)])) }
                     aria-current=[(value == view).then_some("true")] { (name) }
             }
@@ -104,7 +131,7 @@ fn summary(job: &JobStatus) -> Markup {
     }
 }
 
-/// The forms that change a job. The coordinator checks the rights of whoever started the server.
+/// The forms that change a job. The coordinator checks the rights again.
 fn actions(app: &App, job: &JobStatus) -> Markup {
     let form = |act: &str, text: &str| {
         html! {

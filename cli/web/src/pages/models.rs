@@ -225,7 +225,7 @@ fn curve(history: &[Value]) -> Markup {
     ];
     html! {
         (lines("Loss by optimiser step", ["step", "loss"], &series))
-        p.legend { span.key.training { "training" } span.key.validation { "validation" } }
+        p.legend { span.swatch.training { "training" } span.swatch.validation { "validation" } }
     }
 }
 

@@ -51,8 +51,8 @@ pub async fn farm(app: &App) -> Result<Page, Problem> {
         job.state == JobState::Active && job.tasks.leased == 0 && job.tasks.pending > 0
     });
     let reasons = join_all(waiting.take(EXPLAINED).map(async |job| {
-        let (reasons, _) = app.farm.explain(job.id, None).await?;
-        Ok::<_, Problem>((job, reasons))
+        let explained = app.farm.explain(job.id, None).await?;
+        Ok::<_, Problem>((job, explained.reasons))
     }));
     let reasons = reasons.await.into_iter().collect::<Result<Vec<_>, _>>()?;
     let hour = Hour::of(&events, now_ms());

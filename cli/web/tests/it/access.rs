@@ -21,7 +21,7 @@ fn pages() -> Vec<String> {
         format!("/jobs/{JOB}/tasks/0/3"),
     ];
     let others = [
-        "/", "/jobs", "/workers", "/events", "/audit", "/data", "/none",
+        "/", "/jobs", "/workers", "/events", "/audit", "/data", "/models", "/none",
     ];
     job.into_iter().chain(others.map(String::from)).collect()
 }

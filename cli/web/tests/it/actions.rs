@@ -54,10 +54,16 @@ fn forms_of_other_sites_change_nothing() {
 }
 
 #[test]
-fn the_coordinator_decides_what_the_user_may_do() {
+fn the_coordinator_decides_what_the_user_may_do_and_the_page_has_no_other_buttons() {
     let web = Web::start(Vec::new());
+    let form = form(&web);
     *web.farm.viewer.lock().unwrap() = true;
-    let reply = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form(&web));
+    let html = web.get(&format!("/jobs/{JOB}")).text();
+    assert!(
+        !html.contains("<button") && html.contains("no right to change"),
+        "{html}"
+    );
+    let reply = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form);
     assert_eq!(reply.status, 403);
     assert!(reply.text().contains("viewers may not change jobs"));
 }

@@ -6,6 +6,7 @@ mod actions;
 mod client;
 mod farm;
 mod hostile;
+mod models;
 mod room;
 mod scenes;
 mod tls;

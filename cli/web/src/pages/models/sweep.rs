@@ -88,8 +88,8 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
         section #curves {
             h2 { (error) " by epoch" }
             (lines("Error of each trial by epoch", ["epoch", error], &curves(&trials, best.map(|b| b.0))))
-            p.legend { span.key.best { "best" } span.key.finished { "finished" } span.key.stopped { "stopped" }
-                span.key.diverged { "diverged" } span.key.open { "open" } }
+            p.legend { span.swatch.best { "best" } span.swatch.finished { "finished" } span.swatch.stopped { "stopped" }
+                span.swatch.diverged { "diverged" } span.swatch.open { "open" } }
         }
         section #values {
             h2 { "Settings and error" }
