@@ -19,8 +19,8 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
     img-src 'self' blob: data:; connect-src 'self'; form-action 'self'; base-uri 'none'; \
     frame-ancestors 'none'";
 
-/// The policy of a page that a store keeps: its styles and pictures are within it. The sandbox takes
-/// scripts, forms and this server's origin from it.
+/// The policy of a page that a store keeps: its styles and pictures are within it. The sandbox
+/// takes scripts, forms and this server's origin from it.
 const FOREIGN: &str = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; \
     base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 

@@ -1,5 +1,5 @@
-//! What the events of jobs say about their tasks. A job's history is read once, and later only what
-//! is new, so that the page of a job with many tasks costs the coordinator little.
+//! The states of tasks, from the events of their jobs. A job's history is read once, and later only
+//! its new events, so that the page of a job with many tasks costs the coordinator little.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -80,7 +80,7 @@ impl Histories {
     }
 }
 
-/// Returns a job's history, with what is new. A long one may not be whole yet.
+/// Returns a job's history, with its new events. A long one may not be whole yet.
 ///
 /// # Errors
 /// Fails if the coordinator does not answer.

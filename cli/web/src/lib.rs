@@ -25,7 +25,7 @@ use std::{net::SocketAddr, sync::Arc};
 
 use picofarm_credentials::CredentialError;
 use picofarm_store::StorageError;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket};
 use tokio_util::sync::CancellationToken;
 
 pub use farm::{Events, Explained, Farm, JobFilter, Refusal, Refused, Workers};
@@ -33,6 +33,9 @@ pub use guard::is_host;
 pub use tls::TlsFiles;
 
 use self::{data::Stores, guard::Guard, history::Histories, live::Feeds, tls::Tls};
+
+/// Most connections that wait to be accepted.
+const WAITING: u32 = 1024;
 
 /// What a server shows and to whom.
 pub struct Settings {
@@ -97,12 +100,26 @@ impl std::fmt::Debug for Server {
     }
 }
 
+/// Listens on an address. Tokio's own function lets 128 connections wait to be accepted, so that a
+/// flood of more delays others by seconds.
+fn open_listener(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = match address {
+        SocketAddr::V4(_) => TcpSocket::new_v4()?,
+        SocketAddr::V6(_) => TcpSocket::new_v6()?,
+    };
+    // A restarted server may use the address at once.
+    #[cfg(unix)]
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(WAITING)
+}
+
 impl Server {
     /// Listens on the address.
     ///
     /// # Errors
-    /// Fails if the address cannot be used, or if a store's URL or the certificate is not usable. An
-    /// address that is not of the loopback interface needs a name in `settings.hosts` and a
+    /// Fails if the address cannot be used, or if a store's URL or the certificate is not usable.
+    /// An address that is not of the loopback interface needs a name in `settings.hosts` and a
     /// certificate, unless `settings.allow_insecure`.
     pub async fn bind(settings: Settings, farm: Arc<dyn Farm>) -> Result<Self, StartError> {
         let listen = settings.listen;
@@ -116,7 +133,7 @@ impl Server {
         let tls = tls.map_err(StartError::Certificate)?;
         let stores = Stores::open(&settings.stores).map_err(StartError::Store)?;
         let failed = |e| StartError::Listen(listen, e);
-        let listener = TcpListener::bind(listen).await.map_err(failed)?;
+        let listener = open_listener(listen).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
         let app = App {
             guard: Guard::new(settings.hosts, tls.is_some()),

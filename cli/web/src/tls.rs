@@ -26,7 +26,7 @@ pub struct TlsFiles {
     pub key: PathBuf,
 }
 
-/// The files, and what was last read of them.
+/// The files, and their content when it was last read.
 pub struct Tls {
     files: TlsFiles,
     read: Mutex<Read>,
@@ -52,8 +52,8 @@ impl Tls {
         })
     }
 
-    /// Returns what answers the next connection. A renewed certificate counts within ten seconds.
-    /// One that is not usable is logged, and the last stays.
+    /// Returns the acceptor of the next connection. A renewed certificate counts within ten
+    /// seconds. One that is not usable is logged, and the last stays.
     pub fn acceptor(&self) -> TlsAcceptor {
         let mut read = self.read.lock().expect("no holder panics");
         if read.at.elapsed() >= AGAIN {

@@ -1,4 +1,4 @@
-//! What the manifests of a data set's scenes say, for the filters of its gallery. Manifests are
+//! Facts from the manifests of a data set's scenes, for the filters of its gallery. Manifests are
 //! read when a filter first needs them, a part for each request, and kept.
 
 use std::{
@@ -22,7 +22,7 @@ const PATIENCE: Duration = Duration::from_millis(400);
 /// Data sets whose contents are kept.
 const KEPT: usize = 16;
 
-/// What a scene's manifest says.
+/// Facts from a scene's manifest.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Content {
     /// The type of its room; empty if it has none.
@@ -69,7 +69,7 @@ impl Content {
 }
 
 impl Contents {
-    /// Returns what a scene's manifest says, if it was read.
+    /// Returns the facts from a scene's manifest, if it was read.
     pub fn get(&self, scene: u64) -> Option<&Content> {
         self.scenes.get(&scene)
     }
@@ -104,7 +104,7 @@ impl Catalogue {
 }
 
 impl Stores {
-    /// Reads manifests of a data set for a while, and returns what all that were read say.
+    /// Reads manifests of a data set for a while, and returns the facts from all that were read.
     ///
     /// # Errors
     /// Fails if the store fails.

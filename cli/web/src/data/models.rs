@@ -50,7 +50,7 @@ pub struct StoreModels {
     pub more: usize,
 }
 
-/// A model and what a store knows about it.
+/// A model with its records in the store.
 #[derive(Debug)]
 pub struct Model {
     /// Its manifest.
@@ -76,7 +76,7 @@ pub struct Sweep {
     pub rungs: Vec<Rung>,
 }
 
-/// What was read a short time ago.
+/// Values that were read a short time ago.
 pub struct Recent<T>(Mutex<Vec<(String, Instant, Arc<T>)>>);
 
 impl<T> Default for Recent<T> {

@@ -127,7 +127,7 @@ async fn gallery(app: &App, set: &DataSet, query: &Query) -> Result<(Markup, boo
     Ok((content, read.is_some()))
 }
 
-/// What a scene's manifest says, in a line.
+/// The facts from a scene's manifest in a line.
 fn describe_content(content: &Content) -> Markup {
     html! {
         @if !content.room.is_empty() { " · " (safe(&content.room)) }

@@ -176,8 +176,8 @@ pub struct Queue {
 
 #[derive(Args)]
 pub struct Pages {
-    /// The catalog: an empty SQLite file or the URL of an empty Postgres database [default: a new
-    /// SQLite file that is removed after]
+    /// The catalog: a SQLite file or the URL of a Postgres database, empty or filled by an earlier
+    /// run [default: a new SQLite file that is removed after]
     #[arg(
         long,
         value_name = "FILE|URL",

@@ -9,7 +9,7 @@ use std::{
 };
 
 use picofarm_cli::{
-    client::Client,
+    client::{Client, Listing},
     error::{CliError, Code, Result},
     output::{Output, table},
     signals::interrupted,
@@ -87,11 +87,18 @@ pub async fn run(args: Pages, output: Output, stop: &CancellationToken) -> Resul
     };
     let server = Server::start(&place, 60.0).await?;
     let mut client = server.client().await?;
-    let (small, large) = fill(&args, &server, &mut client, output, stop).await?;
+    let (small, large) = match filled(&args, &mut client).await? {
+        Some(found) => found,
+        None => fill(&args, &server, &mut client, output, stop).await?,
+    };
     let fleet = Running::start(&server, args.workers, TASK);
     fleet.connected(args.workers as u64, stop).await?;
-    while client.status(large).await?.running.len() < args.workers.min(1000) {
-        wait(Duration::from_millis(200), stop).await?;
+    // Some tasks may be too few for all workers.
+    let deadline = Instant::now() + 2 * TASK;
+    while client.status(large).await?.tasks.leased < args.workers as u64
+        && Instant::now() < deadline
+    {
+        wait(Duration::from_millis(500), stop).await?;
     }
     let web = Web::start(server.url())?;
     let mut report = Report {
@@ -157,6 +164,35 @@ async fn wait(time: Duration, stop: &CancellationToken) -> Result<()> {
         () = tokio::time::sleep(time) => Ok(()),
         () = stop.cancelled() => Err(interrupted("nothing is kept of a bench")),
     }
+}
+
+/// Returns small jobs and the large one of a catalog that an earlier run filled; `None` if it has
+/// too few jobs.
+async fn filled(args: &Pages, client: &mut Client) -> Result<Option<(Vec<JobId>, JobId)>> {
+    let (mut jobs, mut page) = (Vec::new(), None);
+    loop {
+        let listing = Listing {
+            limit: 1000,
+            page: page.as_deref(),
+            state: None,
+            user: None,
+            find: None,
+        };
+        let (some, next) = client.list(&listing).await?;
+        jobs.extend(some);
+        match next {
+            Some(next) => page = Some(next),
+            None => break,
+        }
+    }
+    if (jobs.len() as u64) < args.jobs {
+        return Ok(None);
+    }
+    let active = jobs.iter().filter(|job| job.state == JobState::Active);
+    let large = active.max_by_key(|job| job.tasks.total).map(|job| job.id);
+    let small = jobs.iter().filter(|job| job.state == JobState::Done);
+    let small = small.map(|job| job.id).collect();
+    Ok(large.map(|large| (small, large)))
 }
 
 /// Makes the jobs: half of the tasks belong to one job, of which half is done, and the rest to many

@@ -9,7 +9,7 @@ use crate::{
     query::{Query, encode},
 };
 
-/// What selects and orders the scenes of a gallery.
+/// The selection and the order of a gallery's scenes.
 #[derive(Debug, Default, PartialEq)]
 pub struct Filter {
     /// The first and the last scene.
