@@ -4,13 +4,16 @@
 
 use std::{
     collections::HashMap,
-    sync::{Arc, Mutex},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
     time::{Duration, Instant},
 };
 
 use bytes::Bytes;
 use http::StatusCode;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Notify, mpsc, watch};
 
 use crate::{
     App,
@@ -35,14 +38,27 @@ const QUIET: Duration = Duration::from_secs(15);
 /// The last event of a page; empty until there is one.
 type Feed = watch::Sender<Bytes>;
 
-/// The followed pages, by path and query.
+/// The followed pages, by path and query, and the number of acts of users.
 #[derive(Default)]
-pub struct Feeds(Mutex<HashMap<String, Arc<Feed>>>);
+pub struct Feeds {
+    pages: Mutex<HashMap<String, Arc<Feed>>>,
+    acts: AtomicU64,
+    acted: Notify,
+}
 
 impl Feeds {
+    /// Forgets all content, because a user has changed a job, and asks for it again at once.
+    pub fn renew(&self) {
+        self.acts.fetch_add(1, Ordering::SeqCst);
+        for feed in self.pages.lock().expect("no holder panics").values() {
+            feed.send_replace(Bytes::new());
+        }
+        self.acted.notify_waiters();
+    }
+
     /// Returns the events of a page, which a task makes as long as somebody follows them.
     fn follow(app: &Arc<App>, to: &str) -> watch::Receiver<Bytes> {
-        let mut feeds = app.feeds.0.lock().expect("no holder panics");
+        let mut feeds = app.feeds.pages.lock().expect("no holder panics");
         if let Some(feed) = feeds.get(to) {
             return feed.subscribe();
         }
@@ -54,12 +70,12 @@ impl Feeds {
     }
 
     fn len(&self) -> usize {
-        self.0.lock().expect("no holder panics").len()
+        self.pages.lock().expect("no holder panics").len()
     }
 
     /// Ends a feed that nobody follows; returns whether it has ended.
     fn end_unfollowed(&self, to: &str, feed: &Feed) -> bool {
-        let mut feeds = self.0.lock().expect("no holder panics");
+        let mut feeds = self.pages.lock().expect("no holder panics");
         let ended = feed.receiver_count() == 0;
         if ended {
             feeds.remove(to);
@@ -74,6 +90,8 @@ async fn ask(app: Arc<App>, to: String, feed: Arc<Feed>) {
     let query = Query::parse(rest);
     while !app.feeds.end_unfollowed(&to, &feed) {
         let start = Instant::now();
+        let acts = app.feeds.acts.load(Ordering::SeqCst);
+        let acted = app.feeds.acted.notified();
         let event = match pages::content(&app, path, &query).await {
             Ok(page) => event("message", &page.content.into_string()),
             // The page keeps its content.
@@ -82,12 +100,17 @@ async fn ask(app: Arc<App>, to: String, feed: Arc<Feed>) {
         };
         let event = Bytes::from(event);
         feed.send_if_modified(|last| {
+            // The content may be from before the act.
+            if app.feeds.acts.load(Ordering::SeqCst) != acts {
+                return false;
+            }
             let changed = *last != event;
             *last = event;
             changed
         });
         tokio::select! {
             () = tokio::time::sleep(interval(app.feeds.len(), start.elapsed())) => {}
+            () = acted => {}
             () = feed.closed() => {}
             () = app.stop.cancelled() => return,
         }

@@ -185,6 +185,7 @@ async fn act(app: &App, head: &Parts, path: &str, form: &Query) -> Result<Answer
         "retry" => app.farm.retry(job).await?,
         act => app.farm.pause(job, act == "pause").await?,
     }
+    app.feeds.renew();
     Ok(see_other(&format!("/jobs/{job}")))
 }
 
