@@ -27,7 +27,7 @@ pub const MOST: usize = 160;
 /// Interval at which the coordinator is asked for a page, where few pages are followed.
 const PERIOD: Duration = Duration::from_secs(1);
 /// Number of different pages that are asked for in a period. With more, each has longer intervals.
-const PAGES: usize = 5;
+const PAGES: usize = 4;
 /// A page whose content takes long is asked for again after so many times that.
 const PAUSE: u32 = 10;
 /// The longest interval.
