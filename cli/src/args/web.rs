@@ -1,6 +1,6 @@
 //! Arguments of `web`.
 
-use std::net::SocketAddr;
+use std::{net::SocketAddr, path::PathBuf};
 
 use clap::Args;
 
@@ -19,4 +19,14 @@ pub struct Web {
     /// --listen is not a loopback address; may be repeated
     #[arg(long, value_name = "NAME")]
     pub host: Vec<String>,
+    /// Certificate chain (PEM) with which browsers are answered; required if --listen is not a
+    /// loopback address
+    #[arg(long, value_name = "FILE", requires = "tls_key")]
+    pub tls_cert: Option<PathBuf>,
+    /// Private key (PEM) of --tls-cert
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    pub tls_key: Option<PathBuf>,
+    /// Answer other machines without encryption: whoever sees the traffic has your rights
+    #[arg(long, conflicts_with = "tls_cert")]
+    pub allow_insecure: bool,
 }

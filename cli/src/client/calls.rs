@@ -243,6 +243,7 @@ impl Client {
                 .map(TryInto::try_into)
                 .transpose()
                 .map_err(unreadable)?,
+            may_change: reply.may_change,
         })
     }
 
@@ -316,6 +317,9 @@ pub struct Explained {
     pub job: JobStatus,
     pub reasons: Vec<Reason>,
     pub task: Option<TaskExplanation>,
+    /// Whether the caller's rights suffice to change the job.
+    #[serde(skip)]
+    pub may_change: bool,
 }
 
 /// The workers of a coordinator.

@@ -6,12 +6,13 @@ use std::{net::SocketAddr, sync::Arc};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::JobId,
-    messages::{AuditEntry, Event, JobStatus, JobSummary, Reason, TaskExplanation},
+    messages::{AuditEntry, Event, JobSummary},
     spec::JobSpec,
 };
 use picofarm_tasks::Access;
 use picofarm_web::{
-    Events, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError, Workers,
+    Events, Explained, Farm, JobFilter, Refusal, Refused, Server, Settings as Shown, StartError,
+    TlsFiles, Workers,
 };
 use serde_json::json;
 use tokio::sync::Mutex;
@@ -24,6 +25,9 @@ use crate::{
     settings::Settings,
     signals,
 };
+
+/// How to reach the pages without opening them to others.
+const TUNNEL: &str = "listen on 127.0.0.1 and use a tunnel (`ssh -L 7421:127.0.0.1:7421 HOST`)";
 
 /// Serves the pages until a signal.
 ///
@@ -45,9 +49,12 @@ pub async fn run(args: Web, settings: &Settings, output: Output) -> Result<()> {
         true => ("/data", "data sets"),
         false => ("/", "farm"),
     };
+    let tls = args.tls_cert.zip(args.tls_key);
     let shown = Shown {
         listen: args.listen,
         hosts: args.host,
+        tls: tls.map(|(certificate, key)| TlsFiles { certificate, key }),
+        allow_insecure: args.allow_insecure,
         stores: args.store,
         farm: !alone,
     };
@@ -81,11 +88,14 @@ fn refused(error: StartError) -> CliError {
             io(format!("cannot listen on {address}"), &e).hint("choose another --listen, e.g. 127.0.0.1:0 for any free port")
         }
         StartError::Open(address) => CliError::input(format!(
+            "--listen {address}: other machines reach this address, and it has no name"
+        ))
+        .hint(format!("{TUNNEL}, or give --host NAME, --tls-cert and --tls-key")),
+        StartError::Clear(address) => CliError::input(format!(
             "--listen {address}: other machines reach this address, and the pages are not encrypted"
         ))
-        .hint(
-            "listen on 127.0.0.1 and use a tunnel (`ssh -L 7421:127.0.0.1:7421 HOST`), or allow it with --host NAME",
-        ),
+        .hint(format!("{TUNNEL}, or give --tls-cert and --tls-key; --allow-insecure allows it where something else encrypts")),
+        StartError::Certificate(e) => CliError::input(format!("--tls-cert, --tls-key: {e}")),
         StartError::Store(e) => CliError::input(format!("--store: {e}")),
     }
 }
@@ -173,11 +183,6 @@ impl Farm for Coordinator {
         .await
     }
 
-    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal> {
-        self.call(async |client: &mut Client| client.status(job).await)
-            .await
-    }
-
     async fn spec(&self, job: JobId) -> Result<JobSpec, Refusal> {
         self.call(async |client: &mut Client| client.spec(job).await)
             .await
@@ -197,15 +202,16 @@ impl Farm for Coordinator {
         Ok(events.await?.0)
     }
 
-    async fn explain(
-        &self,
-        job: JobId,
-        task: Option<(u32, u64)>,
-    ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal> {
+    async fn explain(&self, job: JobId, task: Option<(u32, u64)>) -> Result<Explained, Refusal> {
         let (stage, index) = task.map_or((0, None), |(stage, task)| (stage, Some(task)));
         let told = self.call(async |client: &mut Client| client.explain(job, stage, index).await);
         let told = told.await?;
-        Ok((told.reasons, told.task))
+        Ok(Explained {
+            job: told.job,
+            reasons: told.reasons,
+            task: told.task,
+            may_change: told.may_change,
+        })
     }
 
     async fn workers(&self) -> Result<Workers, Refusal> {
@@ -250,6 +256,8 @@ pub async fn start_for_up(store: String, farm: Coordinator) -> Result<Server> {
         let shown = Shown {
             listen,
             hosts: Vec::new(),
+            tls: None,
+            allow_insecure: false,
             stores: vec![store.clone()],
             farm: true,
         };

@@ -19,6 +19,11 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
     img-src 'self' blob: data:; connect-src 'self'; form-action 'self'; base-uri 'none'; \
     frame-ancestors 'none'";
 
+/// The policy of a page that a store keeps: its styles and pictures are within it. The sandbox
+/// takes scripts, forms and this server's origin from it.
+const FOREIGN: &str = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; \
+    base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
 /// The body of an answer.
 pub enum Body {
     /// Bytes.
@@ -207,6 +212,15 @@ pub fn encode(headers: &HeaderMap, mut answer: Answer) -> Answer {
     answer
         .headers_mut()
         .insert(header::CONTENT_ENCODING, coding);
+    answer
+}
+
+/// Returns a page of a store, which others may have written.
+pub fn foreign(page: Bytes) -> Answer {
+    let mut answer = compressed("text/html; charset=utf-8", page, 5);
+    let policy = HeaderValue::from_static(FOREIGN);
+    let headers = answer.headers_mut();
+    headers.insert(header::CONTENT_SECURITY_POLICY, policy);
     answer
 }
 

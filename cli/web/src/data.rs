@@ -1,8 +1,10 @@
 //! Scenes of the stores: what there is, pictures, values of pixels, and volumes of light in flight.
 
 mod cache;
+mod contents;
 mod histogram;
 mod light;
+mod models;
 mod picture;
 mod stores;
 mod truth;
@@ -14,7 +16,9 @@ use http::StatusCode;
 use serde_json::json;
 
 pub use self::{
+    contents::{Content, Contents},
     light::{Light, lights},
+    models::{Listed, Model, StoreModels, Sweep},
     picture::{Picture, Span},
     stores::{DataSet, Listing, Stores},
     truth::Truth,

@@ -80,6 +80,19 @@ pub struct Workers {
     pub elsewhere: u32,
 }
 
+/// A job and why it stands so.
+#[derive(Debug, Clone)]
+pub struct Explained {
+    /// The job.
+    pub job: JobStatus,
+    /// Why its tasks do not run, or what they do instead.
+    pub reasons: Vec<Reason>,
+    /// The task that was asked for.
+    pub task: Option<TaskExplanation>,
+    /// Whether the user's rights suffice to cancel, pause, resume and retry the job.
+    pub may_change: bool,
+}
+
 /// A coordinator, asked with the rights of the user who started the server. All methods fail if it
 /// cannot be reached, refuses, or knows no such job.
 #[async_trait]
@@ -88,18 +101,13 @@ pub trait Farm: Send + Sync {
     fn url(&self) -> String;
     /// Returns a page of the list of jobs, newest first, and the start of the next page.
     async fn jobs(&self, filter: &JobFilter) -> Result<(Vec<JobSummary>, Option<String>), Refusal>;
-    /// Returns a job's status.
-    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal>;
     /// Returns a job as it was submitted.
     async fn spec(&self, job: JobId) -> Result<JobSpec, Refusal>;
     /// Returns events, oldest first.
     async fn events(&self, ask: Events) -> Result<Vec<Event>, Refusal>;
-    /// Explains the state of a job, or of a task, given by the position of its stage and its index.
-    async fn explain(
-        &self,
-        job: JobId,
-        task: Option<(u32, u64)>,
-    ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal>;
+    /// Returns a job and explains its state, or that of a task, given by the position of its stage
+    /// and its index.
+    async fn explain(&self, job: JobId, task: Option<(u32, u64)>) -> Result<Explained, Refusal>;
     /// Returns the connected workers.
     async fn workers(&self) -> Result<Workers, Refusal>;
     /// Returns the newest entries of the audit log.

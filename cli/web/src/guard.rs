@@ -23,15 +23,30 @@ pub struct Guard {
     /// What forms contain: it follows from the key, and does not reveal it.
     form: String,
     hosts: Vec<String>,
+    /// Whether browsers are answered with TLS.
+    encrypted: bool,
 }
 
 impl Guard {
     /// Makes a new random key.
-    pub fn new(hosts: Vec<String>) -> Self {
+    pub fn new(hosts: Vec<String>, encrypted: bool) -> Self {
         // A version 4 UUID has 122 random bits from the system.
         let key = Uuid::new_v4().simple().to_string();
         let form = sha256_hex(format!("picofarm form {key}").as_bytes());
-        Self { key, form, hosts }
+        Self {
+            key,
+            form,
+            hosts,
+            encrypted,
+        }
+    }
+
+    /// Returns the beginning of links.
+    pub fn scheme(&self) -> &'static str {
+        match self.encrypted {
+            true => "https://",
+            false => "http://",
+        }
     }
 
     /// Returns the key of links.
@@ -50,17 +65,20 @@ impl Guard {
     }
 
     /// Returns the cookie that carries the key. Cookies do not depend on ports, so its name has the
-    /// beginning of the form's value: two servers on one machine do not replace each other's.
+    /// beginning of the form's value: two servers on one machine do not replace each other's. With
+    /// TLS, browsers send it only encrypted, and `__Host-` lets no other host of the domain set it.
     pub fn cookie(&self) -> String {
+        let secure = if self.encrypted { "; Secure" } else { "" };
         format!(
-            "{}={}; Path=/; HttpOnly; SameSite=Lax",
+            "{}={}; Path=/; HttpOnly; SameSite=Lax{secure}",
             self.cookie_name(),
             self.key
         )
     }
 
     fn cookie_name(&self) -> String {
-        format!("picofarm-{}", &self.form[..8])
+        let host = if self.encrypted { "__Host-" } else { "" };
+        format!("{host}picofarm-{}", &self.form[..8])
     }
 
     /// Returns whether a text is the key.
@@ -104,6 +122,18 @@ impl Guard {
     /// # Errors
     /// A message with the reason.
     pub fn check_form(&self, headers: &HeaderMap, token: &str) -> Result<(), String> {
+        self.check_origin(headers)?;
+        match equal(token, &self.form) {
+            true => Ok(()),
+            false => Err("the form is of another start of this server; reload the page".into()),
+        }
+    }
+
+    /// Checks that a request was not sent by a page of another site.
+    ///
+    /// # Errors
+    /// A message with the reason.
+    pub fn check_origin(&self, headers: &HeaderMap) -> Result<(), String> {
         let site = headers.get("sec-fetch-site");
         if site.is_some_and(|site| site != "same-origin") {
             return Err("the request was sent by a page of another site".into());
@@ -111,16 +141,17 @@ impl Guard {
         if let Some(origin) = headers.get(ORIGIN) {
             let host = headers.get(HOST).and_then(|host| host.to_str().ok());
             let origin = origin.to_str().unwrap_or_default();
-            // A proxy in front may speak TLS.
-            let origin = ["http://", "https://"].map(|scheme| origin.strip_prefix(scheme));
-            if host.is_none() || !origin.contains(&host) {
+            // Without TLS here, a tunnel or a proxy in front may speak it.
+            let schemes = match self.encrypted {
+                true => &["https://"][..],
+                false => &["http://", "https://"],
+            };
+            let own = |scheme: &&str| origin.strip_prefix(scheme) == host;
+            if host.is_none() || !schemes.iter().any(own) {
                 return Err("the request was sent by a page of another origin".into());
             }
         }
-        match equal(token, &self.form) {
-            true => Ok(()),
-            false => Err("the form is of another start of this server; reload the page".into()),
-        }
+        Ok(())
     }
 }
 
@@ -163,7 +194,7 @@ mod tests {
 
     #[test]
     fn only_loopback_and_the_given_names_are_hosts_whatever_their_port() {
-        let guard = Guard::new(vec!["farm.example".into()]);
+        let guard = Guard::new(vec!["farm.example".into()], false);
         for host in [
             "127.0.0.1:7421",
             "localhost",
@@ -183,19 +214,32 @@ mod tests {
 
     #[test]
     fn a_key_is_known_by_its_cookie_alone() {
-        let guard = Guard::new(Vec::new());
+        let guard = Guard::new(Vec::new(), false);
         let cookie = guard.cookie();
         let pair = cookie.split(';').next().unwrap();
         assert!(guard.knows(&headers(&[("cookie", &format!("a=b; {pair}"))])));
-        let other = Guard::new(Vec::new());
+        let other = Guard::new(Vec::new(), false);
         assert!(!other.knows(&headers(&[("cookie", pair)])));
         assert!(!guard.knows(&HeaderMap::new()));
         assert!(!cookie.contains(guard.form()) && !guard.form().contains(guard.key()));
     }
 
     #[test]
+    fn with_tls_the_cookie_is_sent_only_encrypted_and_origins_are_encrypted() {
+        let guard = Guard::new(Vec::new(), true);
+        let cookie = guard.cookie();
+        assert!(cookie.starts_with("__Host-picofarm-"), "{cookie}");
+        assert!(cookie.ends_with("; Secure"), "{cookie}");
+        assert!(!cookie.contains("Domain"), "{cookie}");
+        let origin = |origin| headers(&[("host", "localhost:1"), ("origin", origin)]);
+        let check = |text| guard.check_form(&origin(text), guard.form());
+        assert_eq!(check("https://localhost:1"), Ok(()));
+        assert!(check("http://localhost:1").is_err());
+    }
+
+    #[test]
     fn forms_of_other_sites_origins_and_starts_are_refused() {
-        let guard = Guard::new(Vec::new());
+        let guard = Guard::new(Vec::new(), false);
         let form = guard.form();
         let own = &[
             ("host", "localhost:1"),

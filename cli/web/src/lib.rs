@@ -12,22 +12,30 @@ mod assets;
 mod data;
 mod farm;
 mod guard;
+mod history;
 mod live;
 mod pages;
+mod places;
 mod query;
 mod routes;
 mod server;
+mod tls;
 
 use std::{net::SocketAddr, sync::Arc};
 
+use picofarm_credentials::CredentialError;
 use picofarm_store::StorageError;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket};
 use tokio_util::sync::CancellationToken;
 
-pub use farm::{Events, Farm, JobFilter, Refusal, Refused, Workers};
+pub use farm::{Events, Explained, Farm, JobFilter, Refusal, Refused, Workers};
 pub use guard::is_host;
+pub use tls::TlsFiles;
 
-use self::{data::Stores, guard::Guard};
+use self::{data::Stores, guard::Guard, history::Histories, live::Feeds, tls::Tls};
+
+/// Most connections that wait to be accepted.
+const WAITING: u32 = 1024;
 
 /// What a server shows and to whom.
 pub struct Settings {
@@ -36,6 +44,10 @@ pub struct Settings {
     /// Names, without ports, under which browsers may reach the server, besides those of this
     /// machine's loopback interface.
     pub hosts: Vec<String>,
+    /// The certificate with which browsers are answered; without one, answers are not encrypted.
+    pub tls: Option<TlsFiles>,
+    /// Whether other machines may be answered without encryption.
+    pub allow_insecure: bool,
     /// Folders and URLs of the stores, data sets and renders to show. No others are read.
     pub stores: Vec<String>,
     /// Whether a coordinator answers at the start. Without one, the pages of data sets have no
@@ -57,6 +69,9 @@ struct App {
     /// Whether the pages of data sets lead to those of the farm.
     linked: bool,
     stores: Stores,
+    tls: Option<Tls>,
+    feeds: Feeds,
+    histories: Histories,
     limits: server::Limits,
     stop: CancellationToken,
 }
@@ -68,6 +83,10 @@ pub enum StartError {
     Listen(SocketAddr, std::io::Error),
     /// The address is reachable from elsewhere, and no name for it was given.
     Open(SocketAddr),
+    /// The address is reachable from elsewhere, and no certificate was given.
+    Clear(SocketAddr),
+    /// The certificate or its key is not usable.
+    Certificate(CredentialError),
     /// A store cannot be opened.
     Store(StorageError),
 }
@@ -81,26 +100,49 @@ impl std::fmt::Debug for Server {
     }
 }
 
+/// Listens on an address. Tokio's own function lets 128 connections wait to be accepted, so that a
+/// flood of more delays others by seconds.
+fn open_listener(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = match address {
+        SocketAddr::V4(_) => TcpSocket::new_v4()?,
+        SocketAddr::V6(_) => TcpSocket::new_v6()?,
+    };
+    // A restarted server may use the address at once.
+    #[cfg(unix)]
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(WAITING)
+}
+
 impl Server {
     /// Listens on the address.
     ///
     /// # Errors
-    /// Fails if the address cannot be used, if it is not of the loopback interface and
-    /// `settings.hosts` is empty, or if a store's URL is not usable.
+    /// Fails if the address cannot be used, or if a store's URL or the certificate is not usable.
+    /// An address that is not of the loopback interface needs a name in `settings.hosts` and a
+    /// certificate, unless `settings.allow_insecure`.
     pub async fn bind(settings: Settings, farm: Arc<dyn Farm>) -> Result<Self, StartError> {
         let listen = settings.listen;
         if !listen.ip().is_loopback() && settings.hosts.is_empty() {
             return Err(StartError::Open(listen));
         }
+        if !listen.ip().is_loopback() && settings.tls.is_none() && !settings.allow_insecure {
+            return Err(StartError::Clear(listen));
+        }
+        let tls = settings.tls.map(Tls::open).transpose();
+        let tls = tls.map_err(StartError::Certificate)?;
         let stores = Stores::open(&settings.stores).map_err(StartError::Store)?;
         let failed = |e| StartError::Listen(listen, e);
-        let listener = TcpListener::bind(listen).await.map_err(failed)?;
+        let listener = open_listener(listen).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
         let app = App {
-            guard: Guard::new(settings.hosts),
+            guard: Guard::new(settings.hosts, tls.is_some()),
             farm,
             linked: settings.farm,
             stores,
+            tls,
+            feeds: Feeds::default(),
+            histories: Histories::default(),
             limits: server::Limits::default(),
             stop: CancellationToken::new(),
         };
@@ -120,13 +162,14 @@ impl Server {
     /// which nothing is answered.
     pub fn link(&self, path: &str) -> String {
         let host = match self.app.guard.first_host() {
-            Some(host) if !self.address.ip().is_loopback() => {
+            Some(host) if !self.address.ip().is_loopback() || self.app.tls.is_some() => {
                 format!("{host}:{}", self.address.port())
             }
             _ => self.address.to_string(),
         };
         let join = if path.contains('?') { '&' } else { '?' };
-        format!("http://{host}{path}{join}key={}", self.app.guard.key())
+        let scheme = self.app.guard.scheme();
+        format!("{scheme}{host}{path}{join}key={}", self.app.guard.key())
     }
 
     /// Returns the path of the page that shows light in flight of the first finished scene; `None`

@@ -2,11 +2,13 @@
 //! it draws, and shows texts of others escaped.
 
 mod audit;
+mod chart;
 mod events;
 mod flight;
 mod gallery;
 mod grid;
 mod job;
+mod models;
 mod overview;
 mod parts;
 mod scene;
@@ -33,13 +35,14 @@ pub struct Page {
 }
 
 /// The parts of the site.
-const TABS: [(&str, &str); 6] = [
+const TABS: [(&str, &str); 7] = [
     ("/", "Farm"),
     ("/jobs", "Jobs"),
     ("/workers", "Workers"),
     ("/events", "Events"),
     ("/audit", "Audit"),
     ("/data", "Data sets"),
+    ("/models", "Models"),
 ];
 
 /// Returns the page at `path`.
@@ -58,11 +61,14 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
             };
             task::page(app, routes::job(id)?, stage as u32, task).await
         }
-        ["workers"] => workers::page(app).await,
+        ["workers"] => workers::page(app, query).await,
         ["events"] => events::page(app, query).await,
         ["audit"] => audit::page(app, query).await,
         ["data"] => gallery::page(app, query).await,
         ["data", "scene"] => scene::page(app, query).await,
+        ["models"] => models::page(app, query).await,
+        ["models", "model"] => models::model(app, query).await,
+        ["models", "sweep"] => models::sweep(app, query).await,
         ["flight"] => flight::page(app, query).await,
         _ => Err(Problem::missing(format!("there is no page {path}"))),
     }
@@ -86,8 +92,8 @@ pub fn problem(problem: &Problem) -> Page {
     }
 }
 
-/// Returns the page for browsers without the key.
-pub fn locked() -> Page {
+/// Returns the page for browsers without the key, with the reason why the last one was refused.
+pub fn locked(why: &str) -> Page {
     Page {
         title: "Locked".into(),
         tab: "",
@@ -95,9 +101,14 @@ pub fn locked() -> Page {
         script: None,
         content: html! {
             section.problem {
-                h1 { "This page needs its link" }
-                p { "Open the link that " code { "picofarm web" } " printed, which ends with a key. "
+                h1 { "This page needs its key" }
+                @if !why.is_empty() { p role="alert" { (why) } }
+                p { "Open the link that " code { "picofarm web" } " printed, or enter the key at its end. "
                     "The key is new at each start of the program." }
+                form.search method="post" action=(routes::LOGIN) {
+                    label { "key " input name="key" type="password" size="34" autocomplete="off" required; }
+                    button { "Open" }
+                }
             }
         },
     }
@@ -105,9 +116,12 @@ pub fn locked() -> Page {
 
 /// Returns the whole document.
 pub fn layout(app: &App, page: &Page) -> Markup {
-    const DATA: &str = "/data";
-    let farm = app.linked || page.tab != DATA;
-    let tabs = TABS.into_iter().filter(|(path, _)| farm || *path == DATA);
+    /// Parts that need no farm; the first is the start where none answers.
+    const STORES: [&str; 2] = ["/data", "/models"];
+    let farm = app.linked || !STORES.contains(&page.tab);
+    let tabs = TABS
+        .into_iter()
+        .filter(|(path, _)| farm || STORES.contains(path));
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -126,7 +140,7 @@ pub fn layout(app: &App, page: &Page) -> Markup {
             body {
                 a.skip href="#main" { "Skip to content" }
                 header.top {
-                    a.brand href=(if farm { "/" } else { DATA }) { "picofarm" }
+                    a.brand href=(if farm { "/" } else { STORES[0] }) { "picofarm" }
                     nav aria-label="Site" {
                         @for (path, name) in tabs {
                             a href=(path) aria-current=[(path == page.tab).then_some("page")] {

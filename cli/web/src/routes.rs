@@ -15,12 +15,21 @@ use crate::{
 const HTML: &str = "text/html; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
 
+/// The address of the form with the key.
+pub const LOGIN: &str = "/key";
+
 /// What a user may do with a job.
 const ACTS: [&str; 4] = ["cancel", "pause", "resume", "retry"];
 
 /// Answers a request. `form` is the body of a POST.
 pub async fn answer(app: &Arc<App>, head: &Parts, form: &str) -> Answer {
     answer::encode(&head.headers, find(app, head, form).await)
+}
+
+/// Returns whether a request has the key, in its cookie or in its address.
+pub fn has_key(app: &App, head: &Parts) -> bool {
+    let asked = || Query::parse(head.uri.query().unwrap_or_default());
+    app.guard.knows(&head.headers) || app.guard.is_key(asked().text("key"))
 }
 
 async fn find(app: &Arc<App>, head: &Parts, form: &str) -> Answer {
@@ -38,8 +47,11 @@ async fn find(app: &Arc<App>, head: &Parts, form: &str) -> Answer {
     if app.guard.is_key(query.text("key")) && is_read(&head.method) {
         return admit(app, head);
     }
+    if path == LOGIN {
+        return log_in(app, head, &Query::parse(form));
+    }
     if !app.guard.knows(&head.headers) {
-        return page(app, StatusCode::UNAUTHORIZED, &pages::locked());
+        return page(app, StatusCode::UNAUTHORIZED, &pages::locked(""));
     }
     let answered = match head.method {
         Method::GET | Method::HEAD => read(app, path, query).await,
@@ -85,6 +97,30 @@ fn not_allowed(allowed: &str) -> Problem {
     }
 }
 
+/// Answers the form with the key.
+fn log_in(app: &App, head: &Parts, form: &Query) -> Answer {
+    if head.method != Method::POST {
+        return problem(app, &not_allowed("POST"));
+    }
+    if let Err(why) = app.guard.check_origin(&head.headers) {
+        return problem(app, &Problem::new(StatusCode::FORBIDDEN, why));
+    }
+    if !app.guard.is_key(form.text("key").trim()) {
+        let shown = pages::locked("This is not the key of this server.");
+        return page(app, StatusCode::UNAUTHORIZED, &shown);
+    }
+    welcome(app, "/")
+}
+
+/// Sends the browser to a path, with the cookie.
+fn welcome(app: &App, to: &str) -> Answer {
+    let mut answer = see_other(to);
+    if let Ok(cookie) = HeaderValue::from_str(&app.guard.cookie()) {
+        answer.headers_mut().insert(header::SET_COOKIE, cookie);
+    }
+    answer
+}
+
 /// Exchanges the key of a link for a cookie, so that the key stays in no history of pages.
 fn admit(app: &App, head: &Parts) -> Answer {
     let pairs = url::form_urlencoded::parse(head.uri.query().unwrap_or_default().as_bytes());
@@ -97,11 +133,7 @@ fn admit(app: &App, head: &Parts) -> Answer {
     if !rest.is_empty() {
         to = format!("{to}?{rest}");
     }
-    let mut answer = see_other(&to);
-    if let Ok(cookie) = HeaderValue::from_str(&app.guard.cookie()) {
-        answer.headers_mut().insert(header::SET_COOKIE, cookie);
-    }
-    answer
+    welcome(app, &to)
 }
 
 fn page(app: &App, status: StatusCode, page: &pages::Page) -> Answer {
@@ -113,12 +145,14 @@ fn page(app: &App, status: StatusCode, page: &pages::Page) -> Answer {
 
 async fn read(app: &Arc<App>, path: &str, query: Query) -> Result<Answer, Problem> {
     if path == "/live" {
-        let to = query.text("to").to_owned();
-        let (path, rest) = to.split_once('?').unwrap_or((&to, ""));
-        return live::follow(app, path.to_owned(), Query::parse(rest));
+        return live::follow(app, query.text("to"));
     }
     if let Some(what) = path.strip_prefix("/bytes/") {
         return data::bytes(app, what, &query).await;
+    }
+    if path == "/models/report" {
+        let page = app.stores.report(query.text("store"), query.text("name"));
+        return Ok(answer::foreign(page.await?));
     }
     if let ["jobs", _, act] = parts(path)[..]
         && ACTS.contains(&act)
@@ -151,6 +185,7 @@ async fn act(app: &App, head: &Parts, path: &str, form: &Query) -> Result<Answer
         "retry" => app.farm.retry(job).await?,
         act => app.farm.pause(job, act == "pause").await?,
     }
+    app.feeds.renew();
     Ok(see_other(&format!("/jobs/{job}")))
 }
 

@@ -1342,6 +1342,9 @@ pub struct ExplainJobResponse {
     /// Where the request names a task.
     #[prost(message, optional, tag = "3")]
     pub task: ::core::option::Option<TaskExplanation>,
+    /// Whether the caller may cancel, pause, resume and retry the job, as far as its rights go.
+    #[prost(bool, tag = "4")]
+    pub may_change: bool,
 }
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ListWorkersRequest {}

@@ -104,6 +104,29 @@ impl Reports {
         self.0.location(&name.to_owned())
     }
 
+    /// Returns the manifest of a report; `None` if there is none of this name.
+    ///
+    /// # Errors
+    /// [`StorageError::Damaged`], [`StorageError::Store`].
+    pub async fn look(&self, name: &str) -> Result<Option<ReportManifest>, StorageError> {
+        self.0.manifest(&name.to_owned()).await
+    }
+
+    /// Returns an object of a report, after checking its SHA-256.
+    ///
+    /// # Errors
+    /// [`StorageError::Damaged`] if the manifest names no such file, or if the object is missing or
+    /// changed; [`StorageError::Store`].
+    pub async fn read(&self, manifest: &ReportManifest, file: &str) -> Result<Bytes, StorageError> {
+        let Some(entry) = manifest.objects.iter().find(|object| object.key == file) else {
+            return Err(StorageError::Damaged {
+                object: self.place(&manifest.name),
+                what: format!("names no object {file:?}"),
+            });
+        };
+        self.0.read(&manifest.name, entry).await
+    }
+
     /// Returns the manifest of a report that this task has published, after checking the size of
     /// each object. Returns `None` if the report is not published.
     ///

@@ -31,9 +31,13 @@ use args::{Command, Lab};
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    // The benchmarks of the scheduler and of storage start this program again in these roles.
+    // The benchmarks of the scheduler, of pages and of storage start this program again in these
+    // roles.
     let role = std::env::args().nth(1);
-    if matches!(role.as_deref(), Some("coordinator" | "local-worker")) {
+    if matches!(
+        role.as_deref(),
+        Some("coordinator" | "local-worker" | "web")
+    ) {
         return picofarm_cli::run_program("lab");
     }
     let Lab { global, command } = Lab::parse();
@@ -52,6 +56,7 @@ async fn run(command: Command, settings: &Settings, output: Output) -> Result<()
     let stop = || signals::stop_on_signal();
     match command {
         Command::Queue(args) => queue::run(args, output, &stop()?).await,
+        Command::Pages(args) => queue::pages::run(args, output, &stop()?).await,
         Command::Dataset(args) => dataset::run(args, output, &stop()?).await,
         Command::Store(args) => store::run(args, settings, output, &stop()?).await,
         Command::Model(args) => {

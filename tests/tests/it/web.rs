@@ -68,7 +68,9 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
         "/events?logs=yes",
         "/audit",
         "/data",
+        "/models",
         "/data?set=0%2Frooms",
+        "/data?set=0%2Frooms&sort=error&mirrors=no",
         "/data/scene?set=0%2Frooms&scene=0&scene2=1",
     ];
     for path in pages {

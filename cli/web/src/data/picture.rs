@@ -204,16 +204,24 @@ fn distinct(number: u32) -> [u8; 3] {
     [part(5.0), part(3.0), part(1.0)]
 }
 
-/// Draws a card of the gallery: colour, depth and light in a row.
+/// Draws a card of the gallery: colour, depth and light in a row, each in the middle of a square.
 pub fn card(truth: &Truth) -> Vec<u8> {
-    let size = (truth.spec.width as usize, truth.spec.height as usize);
+    let (width, height) = (truth.spec.width as usize, truth.spec.height as usize);
+    let side = width.max(height);
+    let margin = ((side - width) / 2, (side - height) / 2);
     let mut canvas = Canvas::new(3 * CARD, CARD, NOTHING);
     for (i, picture) in [Picture::Rgb, Picture::Depth, Picture::Intensity]
         .into_iter()
         .enumerate()
     {
         if let Ok((colour, _)) = picture.colours(truth) {
-            canvas.image((i * CARD, 0), CARD, size, colour);
+            let padded = |p: usize| {
+                let column = (p % side).checked_sub(margin.0).filter(|c| *c < width);
+                let row = (p / side).checked_sub(margin.1).filter(|r| *r < height);
+                let inside = row.zip(column);
+                inside.map_or(NOTHING, |(row, column)| colour(row * width + column))
+            };
+            canvas.image((i * CARD, 0), CARD, (side, side), padded);
         }
     }
     canvas.png()

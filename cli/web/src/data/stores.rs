@@ -14,7 +14,9 @@ use tokio::sync::Mutex;
 use super::{
     SceneId, Truth,
     cache::Cache,
+    contents::Catalogue,
     light::{Light, has_parts},
+    models::{Recent, StoreModels, Sweep},
     volume::Volume,
 };
 use crate::{App, answer::Problem};
@@ -81,6 +83,9 @@ pub struct Stores {
     listed: Mutex<Option<(Instant, Arc<Listing>)>>,
     truths: Cache<SceneId, Truth>,
     volumes: Cache<(SceneId, Light), Volume>,
+    pub(super) catalogue: Catalogue,
+    pub(super) recent_models: Recent<StoreModels>,
+    pub(super) recent_sweeps: Recent<Sweep>,
 }
 
 impl Stores {
@@ -107,12 +112,38 @@ impl Stores {
             listed: Mutex::default(),
             truths: Cache::new(IMAGES),
             volumes: Cache::new(VOLUMES),
+            catalogue: Catalogue::default(),
+            recent_models: Recent::default(),
+            recent_sweeps: Recent::default(),
         })
     }
 
     /// Returns the names of the stores.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.places.iter().map(|place| &*place.name)
+    }
+
+    /// Returns the name of a store, given by its position.
+    ///
+    /// # Errors
+    /// Fails if there is none.
+    pub fn name(&self, store: &str) -> Result<&str, Problem> {
+        Ok(&self.position(store)?.name)
+    }
+
+    /// Returns the object store of a store, given by its position, and the prefix in it.
+    ///
+    /// # Errors
+    /// Fails if there is none.
+    pub(super) fn opened(&self, store: &str) -> Result<(Arc<dyn ObjectStore>, Path), Problem> {
+        let place = self.position(store)?;
+        Ok((Arc::clone(&place.store), place.prefix.clone()))
+    }
+
+    fn position(&self, store: &str) -> Result<&Place, Problem> {
+        let missing = || Problem::missing(format!("store: there is no store {store:?}"));
+        let position: usize = store.parse().map_err(|_| missing())?;
+        self.places.get(position).ok_or_else(missing)
     }
 
     /// Returns the data sets, and what cannot be read.

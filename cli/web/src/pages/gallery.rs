@@ -1,15 +1,21 @@
 //! The data sets, and a gallery of the scenes of one.
 
+mod filter;
+
 use http::StatusCode;
 use maud::{Markup, html};
 use picofarm_dataset::DatasetSpec;
 use picofarm_figures::number::thousands;
 
-use super::{Page, parts::safe};
+use self::filter::Filter;
+use super::{
+    Page,
+    parts::{bytes, safe},
+};
 use crate::{
     App,
     answer::Problem,
-    data::{DataSet, Listing, SceneId, flight_path},
+    data::{Content, DataSet, Listing, SceneId, flight_path},
     query::{Query, encode},
 };
 
@@ -19,8 +25,8 @@ const SHOWN: usize = 24;
 /// Returns the list of data sets, or the gallery of one.
 pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     let listed = app.stores.list().await;
-    let content = match query.text("set") {
-        "" => list(app, &listed),
+    let (content, live) = match query.text("set") {
+        "" => (list(app, &listed), false),
         id => {
             let set = listed.sets.iter().find(|set| set.id == id);
             let problem = || match listed.unread.iter().find(|unread| unread.id == id) {
@@ -30,13 +36,13 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                 },
                 None => Problem::missing(format!("set: there is no data set {id:?}")),
             };
-            gallery(set.ok_or_else(problem)?, query)?
+            gallery(app, set.ok_or_else(problem)?, query).await?
         }
     };
     Ok(Page {
         title: "Data sets".into(),
         tab: "/data",
-        live: false,
+        live,
         script: None,
         content,
     })
@@ -80,49 +86,59 @@ fn list(app: &App, listed: &Listing) -> Markup {
                 h2 { a href=(link) { (safe(&set.place)) } }
                 p { (thousands(set.scenes.len() as u64)) " of " (thousands(set.dataset.spec().scenes))
                     " scenes · " (describe(set.dataset.spec())) }
-                div.strip { @for scene in set.scenes.iter().take(3) { (card(set, *scene)) } }
+                div.strip { @for scene in set.scenes.iter().take(3) { (card(set, *scene, None)) } }
             }
         } }
     }
 }
 
-fn gallery(set: &DataSet, query: &Query) -> Result<Markup, Problem> {
-    let (from, to) = (query.number("from")?, query.number("to")?);
+/// Returns a gallery, and whether its scenes are still being read for a filter.
+async fn gallery(app: &App, set: &DataSet, query: &Query) -> Result<(Markup, bool), Problem> {
+    let filter = Filter::parse(query)?;
     let start = query.number("start")?.unwrap_or(0) as usize;
-    let within =
-        |scene: &&u64| from.is_none_or(|f| **scene >= f) && to.is_none_or(|t| **scene <= t);
-    let scenes: Vec<u64> = set.scenes.iter().filter(within).copied().collect();
-    let link = |start: usize| {
-        let start = start.to_string();
-        let (from, to) = (query.text("from"), query.text("to"));
-        let rest = encode(&[
-            ("set", &set.id),
-            ("from", from),
-            ("to", to),
-            ("start", &start),
-        ]);
-        format!("/data?{rest}")
+    let contents = match filter.needs_contents() {
+        true => Some(app.stores.contents(set).await?),
+        false => None,
     };
-    Ok(html! {
+    let contents = contents.as_deref();
+    let scenes = filter.select(&set.scenes, contents);
+    let read = contents
+        .map(|contents| contents.len())
+        .filter(|read| *read < set.scenes.len());
+    let link = |start: usize| Filter::path(query, &set.id, start);
+    let shown = scenes.iter().skip(start).take(SHOWN);
+    let content = html! {
         h1 { (safe(&set.place)) }
         p { (thousands(set.scenes.len() as u64)) " of " (thousands(set.dataset.spec().scenes)) " scenes · "
             (describe(set.dataset.spec())) }
-        form.search action="/data" role="search" {
-            input type="hidden" name="set" value=(set.id);
-            label { "scenes from " input name="from" type="number" min="0" value=(query.text("from")); }
-            label { "to " input name="to" type="number" min="0" value=(query.text("to")); }
-            button { "Show" }
+        (Filter::form(query, &set.id, contents))
+        @if let Some(read) = read {
+            p #reading.hint role="status" { "The manifests of " (thousands(read as u64)) " scenes have been read so far. "
+                "The page adds the others as they are read." }
         }
+        @if contents.is_some() { p #found { (thousands(scenes.len() as u64)) " scenes are as selected." } }
         @if scenes.is_empty() { p.none { "No finished scene here." } }
-        div.cards { @for scene in scenes.iter().skip(start).take(SHOWN) { (card(set, *scene)) } }
+        div.cards { @for scene in shown { (card(set, *scene, contents.and_then(|c| c.get(*scene)))) } }
         nav.pages aria-label="Pages" {
             @if start > 0 { a href=(link(start.saturating_sub(SHOWN))) { "Previous" } }
             @if start + SHOWN < scenes.len() { a href=(link(start + SHOWN)) { "Next" } }
         }
-    })
+    };
+    Ok((content, read.is_some()))
 }
 
-fn card(set: &DataSet, scene: u64) -> Markup {
+/// The facts from a scene's manifest in a line.
+fn describe_content(content: &Content) -> Markup {
+    html! {
+        @if !content.room.is_empty() { " · " (safe(&content.room)) }
+        @if let Some(error) = content.error { " · error " (format!("{:.1} %", 100.0 * error)) }
+        @if let Some(rays) = content.rays { " · " (picofarm_figures::number::prefixed(rays as f64)) " rays" }
+        @if content.bytes > 0 { " · " (bytes(content.bytes)) }
+        @if let Some(damage) = &content.damage { " · " span.doubtful { (safe(damage)) } }
+    }
+}
+
+fn card(set: &DataSet, scene: u64, content: Option<&Content>) -> Markup {
     let id = SceneId {
         set: set.id.clone(),
         scene,
@@ -134,7 +150,8 @@ fn card(set: &DataSet, scene: u64) -> Markup {
                     alt={ "Scene " (scene) ": colour, depth and all light" };
             }
             p { "scene " (scene) " · " a href={ "/data/scene?" (id.encode(&[])) } { "images" } " · "
-                a href=(flight_path(&set.id, scene)) { "light in flight" } }
+                a href=(flight_path(&set.id, scene)) { "light in flight" }
+                @if let Some(content) = content { (describe_content(content)) } }
         }
     }
 }

@@ -1,21 +1,16 @@
 //! A picture of a stage's tasks: one cell for each task, or for several where there are many.
 
 use maud::{Markup, html};
-use picofarm_proto::{
-    ids::JobId,
-    messages::{Event, EventKind, JobStatus, StageStatus},
-};
+use picofarm_figures::number::thousands;
+use picofarm_proto::messages::{JobStatus, StageStatus};
 
 use super::parts::{rest_state, safe};
-use crate::{App, Events, answer::Problem};
+use crate::history::{History, Known};
 
 /// Most cells of a picture.
 const CELLS: u64 = 1200;
 /// Cells in a row.
 const ROW: u64 = 60;
-/// Most events that are read of a job: the state of tasks from before is not known.
-const EVENTS: usize = 20_000;
-
 /// The state of a task in the picture, from least to most notable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Cell {
@@ -52,27 +47,8 @@ impl Cell {
     }
 }
 
-/// Reads the history of a job from its beginning.
-pub async fn history(app: &App, job: JobId) -> Result<Vec<Event>, Problem> {
-    let mut all: Vec<Event> = Vec::new();
-    loop {
-        let page = app.farm.events(Events {
-            job: Some(job),
-            after: all.last().map_or(0, |event| event.sequence),
-            limit: 1000,
-            ..Events::default()
-        });
-        let page = page.await?;
-        let more = page.len() == 1000;
-        all.extend(page);
-        if !more || all.len() >= EVENTS {
-            return Ok(all);
-        }
-    }
-}
-
 /// Returns the meaning of the colours.
-pub fn legend(job: &JobStatus) -> Markup {
+pub fn legend(job: &JobStatus, history: &History) -> Markup {
     let cells = [
         Cell::Done,
         Cell::Reused,
@@ -84,11 +60,15 @@ pub fn legend(job: &JobStatus) -> Markup {
         p.legend { @for cell in cells {
             span { svg viewBox="0 0 10 10" aria-hidden="true" { rect.(cell.class()) width="10" height="10" {} } (cell.word(job)) }
         } }
+        @if !history.whole {
+            p.hint { "The history is being read: " (thousands(history.events)) " events so far. "
+                "Tasks without events in them are grey." }
+        }
     }
 }
 
 /// Returns the picture of a stage.
-pub fn draw(job: &JobStatus, position: u32, stage: &StageStatus, history: &[Event]) -> Markup {
+pub fn draw(job: &JobStatus, position: u32, stage: &StageStatus, history: &History) -> Markup {
     let total = stage.tasks.total;
     if total == 0 {
         return html! {};
@@ -133,7 +113,7 @@ pub fn draw(job: &JobStatus, position: u32, stage: &StageStatus, history: &[Even
 }
 
 /// The state of each task.
-fn cells(job: &JobStatus, position: u32, stage: &StageStatus, history: &[Event]) -> Vec<Cell> {
+fn cells(job: &JobStatus, position: u32, stage: &StageStatus, history: &History) -> Vec<Cell> {
     let counts = &stage.tasks;
     // Where all tasks are in one state, no history is needed.
     let all = [
@@ -145,31 +125,19 @@ fn cells(job: &JobStatus, position: u32, stage: &StageStatus, history: &[Event])
     if let Some((_, cell)) = all.into_iter().find(|(n, _)| *n == counts.total) {
         return vec![cell; counts.total as usize];
     }
-    let first = match history.len() >= EVENTS {
-        true => Cell::Unknown,
-        false => Cell::Pending,
+    // What was not read may be about any task.
+    let open = match history.whole {
+        true => Cell::Pending,
+        false => Cell::Unknown,
     };
-    let mut cells = vec![first; counts.total as usize];
-    for event in history.iter().filter(|e| e.stage == Some(position)) {
-        let cell = match event.kind {
-            EventKind::Committed => Cell::Done,
-            EventKind::Reused => Cell::Reused,
-            EventKind::Dead => Cell::Dead,
-            EventKind::Retried => Cell::Pending,
-            _ => continue,
-        };
-        let (lo, hi) = match (event.task, event.lo, event.hi) {
-            (Some(task), _, _) => (task, task + 1),
-            (None, Some(lo), Some(hi)) => (lo, hi),
-            _ => continue,
-        };
-        for task in cells.iter_mut().take(hi as usize).skip(lo as usize) {
-            // Of a range of tasks that are tried again, only the dead ones change.
-            if event.kind != EventKind::Retried || *task == Cell::Dead {
-                *task = cell;
-            }
-        }
-    }
+    let known = history.stage(position).iter().map(|known| match known {
+        Known::Open => open,
+        Known::Done => Cell::Done,
+        Known::Reused => Cell::Reused,
+        Known::Dead => Cell::Dead,
+    });
+    let rest = std::iter::repeat(open);
+    let mut cells: Vec<Cell> = known.chain(rest).take(counts.total as usize).collect();
     for task in job.running.iter().filter(|task| task.stage == position) {
         if let Some(cell) = cells.get_mut(task.index as usize) {
             *cell = Cell::Running;

@@ -1,11 +1,11 @@
 //! One job: stages, tasks, failures, explanation, log and job file.
 
-use std::collections::BTreeMap;
+mod curves;
 
 use maud::{Markup, html};
 use picofarm_proto::{
     ids::JobId,
-    messages::{Event, EventKind, JobState, JobStatus},
+    messages::{JobState, JobStatus},
     spec::{JobSpec, kinds::Manifest},
 };
 
@@ -16,6 +16,7 @@ use super::{
 use crate::{
     App, Events,
     answer::Problem,
+    history::{self, History},
     query::{Query, encode},
 };
 
@@ -23,6 +24,8 @@ use crate::{
 const RUNNING: usize = 24;
 /// Number of events of the log.
 const LOG: u32 = 200;
+/// Number of events in which lines of trainings are looked for, the most that a coordinator gives.
+const LINES: u32 = 1000;
 /// Kinds of stages that make data sets.
 const KINDS: [&str; 3] = ["render", "reprocess", "import"];
 /// Number of groups of failures.
@@ -31,34 +34,48 @@ const GROUPS: usize = 20;
 /// Returns the page of a job.
 pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> {
     let view = query.text("view");
-    let newest = Events {
-        job: Some(id),
-        limit: LOG,
-        newest: true,
-        logs: view == "log",
-        ..Events::default()
-    };
-    let (job, history, newest, why) = tokio::join!(
-        app.farm.job(id),
-        grid::history(app, id),
-        app.farm.events(newest),
-        app.farm.explain(id, None)
-    );
-    let (job, history, newest, (reasons, _)) = (job?, history?, newest?, why?);
+    let explained = app.farm.explain(id, None).await?;
+    let (job, reasons) = (explained.job, explained.reasons);
     let part = match view {
-        "" => overview(app, &job, &history),
+        "" => overview(app, &job, &*history::read(app, id).await?),
         "log" => {
-            let mut shown = newest;
+            let newest = Events {
+                job: Some(id),
+                limit: LOG,
+                newest: true,
+                logs: true,
+                ..Events::default()
+            };
+            let mut shown = app.farm.events(newest).await?;
             shown.reverse();
             html! { section #log { h2 { "Log" } (events::table(&shown, false)) } }
+        }
+        "curves" => {
+            let newest = Events {
+                job: Some(id),
+                limit: LINES,
+                newest: true,
+                logs: true,
+                ..Events::default()
+            };
+            curves::draw(&job, &app.farm.events(newest).await?)
         }
         "file" => file(&app.farm.spec(id).await?)?,
         other => {
             return Err(Problem::input(format!(
-                "view: expected log or file, found {other:?}"
+                "view: expected log, curves or file, found {other:?}"
             )));
         }
     };
+    let views = [
+        ("tasks", ""),
+        ("curves", "curves"),
+        ("log", "log"),
+        ("job file", "file"),
+    ];
+    let views = views
+        .into_iter()
+        .filter(|(name, _)| *name != "curves" || curves::has_some(&job));
     let content = html! {
         section #head {
             h1 { (safe(&job.name)) " " (badge(job_state(job.state, job.paused, &job.tasks))) }
@@ -69,9 +86,13 @@ pub async fn page(app: &App, id: JobId, query: &Query) -> Result<Page, Problem> 
                 }
             }
         }
-        section #actions.actions aria-label="Actions" { (actions(app, &job)) }
+        @if explained.may_change {
+            section #actions.actions aria-label="Actions" { (actions(app, &job)) }
+        } @else if job.state == JobState::Active || job.tasks.dead > 0 {
+            p #actions.hint { "Your token has no right to change this job." }
+        }
         nav.filters aria-label="Views" {
-            @for (name, value) in [("tasks", ""), ("log", "log"), ("job file", "file")] {
+            @for (name, value) in views {
                 a href={ "/jobs/" (id) "?" (encode(&[("view", value)])) }
                     aria-current=[(value == view).then_some("true")] { (name) }
             }
@@ -110,7 +131,7 @@ fn summary(job: &JobStatus) -> Markup {
     }
 }
 
-/// The forms that change a job. The coordinator checks the rights of whoever started the server.
+/// The forms that change a job. The coordinator checks the rights again.
 fn actions(app: &App, job: &JobStatus) -> Markup {
     let form = |act: &str, text: &str| {
         html! {
@@ -133,7 +154,7 @@ fn actions(app: &App, job: &JobStatus) -> Markup {
     }
 }
 
-fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
+fn overview(app: &App, job: &JobStatus, history: &History) -> Markup {
     html! {
         section #stages {
             h2 { "Stages" }
@@ -157,7 +178,7 @@ fn overview(app: &App, job: &JobStatus, history: &[Event]) -> Markup {
         }
         section #grid {
             h2 { "Tasks" }
-            (grid::legend(job))
+            (grid::legend(job, history))
             @for (position, stage) in job.stages.iter().enumerate() {
                 (grid::draw(job, position as u32, stage, history))
             }
@@ -208,24 +229,16 @@ fn result(app: &App, job: &JobStatus, position: usize) -> Markup {
 }
 
 /// Failures with equal messages are one group: numbers in messages often differ.
-fn failures(job: &JobStatus, history: &[Event]) -> Markup {
-    let mut groups: BTreeMap<String, Vec<&Event>> = BTreeMap::new();
-    let failed = history
-        .iter()
-        .filter(|e| matches!(e.kind, EventKind::Failed | EventKind::Dead));
-    for event in failed {
-        groups.entry(shape(&event.message)).or_default().push(event);
-    }
-    let mut groups: Vec<_> = groups.into_values().collect();
-    groups.sort_by_key(|group| std::cmp::Reverse(group.len()));
+fn failures(job: &JobStatus, history: &History) -> Markup {
+    let groups = history.failures();
     html! {
         @if !groups.is_empty() {
             section #failures {
                 h2 { "Failures by message" }
                 ul.failures { @for group in groups.iter().take(GROUPS) {
-                    @let last = group[group.len() - 1];
+                    @let last = &group.last;
                     li {
-                        b { (group.len()) "×" } " "
+                        b { (group.count) "×" } " "
                         span.message { (safe(&last.message)) }
                         " " @if let Some(task) = last.task {
                             a href={ "/jobs/" (job.id) "/tasks/" (last.stage.unwrap_or(0)) "/" (task) } { "task " (task) }
@@ -240,19 +253,6 @@ fn failures(job: &JobStatus, history: &[Event]) -> Markup {
     }
 }
 
-/// A message with its numbers replaced.
-fn shape(message: &str) -> String {
-    let mut text = String::with_capacity(message.len());
-    for c in message.chars() {
-        match c {
-            '0'..='9' if text.ends_with('#') => {}
-            '0'..='9' => text.push('#'),
-            c => text.push(c),
-        }
-    }
-    text
-}
-
 fn file(spec: &JobSpec) -> Result<Markup, Problem> {
     let text = toml::to_string_pretty(spec).map_err(|e| {
         let status = http::StatusCode::INTERNAL_SERVER_ERROR;
@@ -265,15 +265,4 @@ fn file(spec: &JobSpec) -> Result<Markup, Problem> {
             pre.file tabindex="0" { (safe(text)) }
         }
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::shape;
-
-    #[test]
-    fn messages_that_differ_in_numbers_have_one_shape() {
-        assert_eq!(shape("scene 12 of 340: full"), shape("scene 7 of 9: full"));
-        assert_ne!(shape("scene 12: full"), shape("scene 12: empty"));
-    }
 }

@@ -19,6 +19,8 @@ use crate::{
 const FEW: u32 = 12;
 /// Number of jobs on a page of the list.
 const MANY: u32 = 50;
+/// Number of workers on the first page.
+const WORKERS: usize = 20;
 /// Number of waiting jobs that are explained.
 const EXPLAINED: usize = 4;
 /// Bars of the chart of the last hour.
@@ -49,8 +51,8 @@ pub async fn farm(app: &App) -> Result<Page, Problem> {
         job.state == JobState::Active && job.tasks.leased == 0 && job.tasks.pending > 0
     });
     let reasons = join_all(waiting.take(EXPLAINED).map(async |job| {
-        let (reasons, _) = app.farm.explain(job.id, None).await?;
-        Ok::<_, Problem>((job, reasons))
+        let explained = app.farm.explain(job.id, None).await?;
+        Ok::<_, Problem>((job, explained.reasons))
     }));
     let reasons = reasons.await.into_iter().collect::<Result<Vec<_>, _>>()?;
     let hour = Hour::of(&events, now_ms());
@@ -81,7 +83,7 @@ pub async fn farm(app: &App) -> Result<Page, Problem> {
         section #jobs { h2 { "Jobs" } (table(&jobs)) p { a href="/jobs" { "All jobs" } } }
         section #workers {
             h2 { "Workers" }
-            (super::workers::table(all))
+            (super::workers::few(all, WORKERS))
         }
     };
     Ok(Page {

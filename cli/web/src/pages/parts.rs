@@ -157,6 +157,11 @@ pub fn bar(counts: &TaskCounts) -> Markup {
     }
 }
 
+/// A wide table that scrolls within itself.
+pub fn scroll(label: &str, table: Markup) -> Markup {
+    html! { div.scroll tabindex="0" role="region" aria-label=(label) { (table) } }
+}
+
 /// Done and all tasks.
 pub fn count(counts: &TaskCounts) -> String {
     format!(

@@ -11,8 +11,8 @@ use crate::{App, answer::Problem};
 
 /// Returns the page of a task, given by the position of its stage and its index.
 pub async fn page(app: &App, job: JobId, stage: u32, task: u64) -> Result<Page, Problem> {
-    let (_, found) = app.farm.explain(job, Some((stage, task))).await?;
-    let Some(found) = found else {
+    let explained = app.farm.explain(job, Some((stage, task))).await?;
+    let Some(found) = explained.task else {
         return Err(Problem::missing(format!(
             "stage {stage} has no task {task}"
         )));

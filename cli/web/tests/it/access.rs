@@ -21,7 +21,7 @@ fn pages() -> Vec<String> {
         format!("/jobs/{JOB}/tasks/0/3"),
     ];
     let others = [
-        "/", "/jobs", "/workers", "/events", "/audit", "/data", "/none",
+        "/", "/jobs", "/workers", "/events", "/audit", "/data", "/models", "/none",
     ];
     job.into_iter().chain(others.map(String::from)).collect()
 }
@@ -61,22 +61,27 @@ fn a_site_whose_name_resolves_to_this_machine_gets_no_answer() {
 }
 
 #[test]
-fn an_address_that_others_reach_needs_a_name() {
+fn an_address_that_others_reach_needs_a_name_and_a_certificate() {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .unwrap();
-    let bind = |hosts: Vec<String>| {
+    let bind = |hosts: &[&str], insecure| {
+        let hosts = hosts.iter().map(|host| (*host).to_owned()).collect();
         let settings = Settings {
             listen: "0.0.0.0:0".parse().unwrap(),
             hosts,
+            tls: None,
+            allow_insecure: insecure,
             stores: Vec::new(),
             farm: true,
         };
         runtime.block_on(Server::bind(settings, Arc::new(Memory::default())))
     };
-    assert!(matches!(bind(Vec::new()), Err(StartError::Open(_))));
-    let named = bind(vec!["farm.example".into()]).unwrap();
+    assert!(matches!(bind(&[], true), Err(StartError::Open(_))));
+    let clear = bind(&["farm.example"], false);
+    assert!(matches!(clear, Err(StartError::Clear(_))));
+    let named = bind(&["farm.example"], true).unwrap();
     assert!(named.link("/data?x=1").starts_with("http://farm.example:"));
     assert!(named.link("/data?x=1").contains("/data?x=1&key="));
 }
@@ -244,7 +249,7 @@ fn only_so_many_pages_are_followed_at_a_time() {
     let web = Web::start(Vec::new());
     let request = web.request("GET", "/live?to=%2F", &[("Cookie", web.cookie())], "");
     let mut followed = Vec::new();
-    let refused = (0..64).any(|_| {
+    let refused = (0..250).any(|_| {
         let mut stream = web.connect();
         stream.write_all(request.as_bytes()).unwrap();
         let mut head = [0; 12];
@@ -254,8 +259,8 @@ fn only_so_many_pages_are_followed_at_a_time() {
     });
     let reason = web.get("/live?to=%2F");
     assert_eq!(reason.status, 503);
-    assert!(reason.text().contains("48 pages are followed already"));
-    assert!(refused && followed.len() > 16, "{}", followed.len());
+    assert!(reason.text().contains("160 pages are followed already"));
+    assert!(refused && followed.len() > 100, "{}", followed.len());
     assert_eq!(web.get("/").status, 200, "other pages are still served");
 }
 

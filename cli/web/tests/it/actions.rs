@@ -1,5 +1,7 @@
 //! What changes a job, and what does not.
 
+use std::io::{Read, Write};
+
 use crate::{client::Web, farm::JOB};
 
 pub fn form(web: &Web) -> String {
@@ -54,10 +56,16 @@ fn forms_of_other_sites_change_nothing() {
 }
 
 #[test]
-fn the_coordinator_decides_what_the_user_may_do() {
+fn the_coordinator_decides_what_the_user_may_do_and_the_page_has_no_other_buttons() {
     let web = Web::start(Vec::new());
+    let form = form(&web);
     *web.farm.viewer.lock().unwrap() = true;
-    let reply = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form(&web));
+    let html = web.get(&format!("/jobs/{JOB}")).text();
+    assert!(
+        !html.contains("<button") && html.contains("no right to change"),
+        "{html}"
+    );
+    let reply = web.post(&format!("/jobs/{JOB}/cancel"), &[], &form);
     assert_eq!(reply.status, 403);
     assert!(reply.text().contains("viewers may not change jobs"));
 }
@@ -113,4 +121,32 @@ fn unknown_actions_and_other_methods_are_refused() {
     let cookie = [("Cookie", web.cookie())];
     let deleted = web.raw(&web.request("DELETE", &format!("/jobs/{JOB}"), &cookie, ""));
     assert_eq!(deleted.status, 405);
+}
+
+#[test]
+fn after_an_action_no_viewer_gets_content_from_before() {
+    let web = Web::start(Vec::new());
+    let follow = || {
+        let path = format!("/live?to=%2Fjobs%2F{JOB}");
+        let mut stream = web.connect();
+        let request = web.request("GET", &path, &[("Cookie", web.cookie())], "");
+        stream.write_all(request.as_bytes()).unwrap();
+        let (mut seen, mut part) = (String::new(), [0; 4096]);
+        // An event ends with an empty line.
+        while !seen.contains("\n\n") {
+            let n = stream.read(&mut part).unwrap();
+            assert!(n > 0, "the events ended: {seen}");
+            seen += &String::from_utf8_lossy(&part[..n]);
+        }
+        (stream, seen)
+    };
+    let (_stream, first) = follow();
+    assert!(first.contains("act-pause"), "{first}");
+    let reply = web.post(&format!("/jobs/{JOB}/pause"), &[], &form(&web));
+    assert_eq!(reply.status, 303);
+    let (_stream, next) = follow();
+    assert!(
+        next.contains("act-resume") && !next.contains("act-pause"),
+        "{next}"
+    );
 }

@@ -68,6 +68,8 @@ impl Web {
         let settings = Settings {
             listen: "127.0.0.1:0".parse().unwrap(),
             hosts: Vec::new(),
+            tls: None,
+            allow_insecure: false,
             stores,
             farm: answers,
         };

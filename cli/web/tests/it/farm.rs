@@ -11,7 +11,7 @@ use picofarm_proto::{
     },
     spec::JobSpec,
 };
-use picofarm_web::{Events, Farm, JobFilter, Refusal, Refused, Workers};
+use picofarm_web::{Events, Explained, Farm, JobFilter, Refusal, Refused, Workers};
 
 /// A text that would be markup, a script and an attribute.
 pub const EVIL: &str = "<script>alert(1)</script>\"'><img onerror=x>";
@@ -39,6 +39,8 @@ pub struct Memory {
     pub idle: Mutex<bool>,
     /// Whether the coordinator does not answer.
     pub away: Mutex<bool>,
+    /// The store that the job names, if another.
+    pub store: Mutex<Option<String>>,
 }
 
 fn refusal(kind: Refused, message: &str) -> Refusal {
@@ -89,6 +91,47 @@ impl Memory {
         self.acts.lock().unwrap().clone()
     }
 
+    async fn status(&self) -> Result<JobStatus, Refusal> {
+        let state = match *self.ended.lock().unwrap() {
+            true => JobState::Cancelled,
+            false => JobState::Active,
+        };
+        let mut tasks = COUNTS;
+        if *self.idle.lock().unwrap() {
+            (tasks.leased, tasks.pending) = (0, tasks.pending + tasks.leased);
+        }
+        Ok(JobStatus {
+            id: id(),
+            name: EVIL.into(),
+            state,
+            tasks: COUNTS,
+            submitted_at_ms: 1_700_000_000_000,
+            ended_at_ms: None,
+            paused: self.paused(),
+            user: EVIL.into(),
+            stages: vec![StageStatus {
+                name: EVIL.into(),
+                kind: "render".into(),
+                state: StageState::Open,
+                needs: vec![EVIL.into()],
+                tasks,
+            }],
+            spec: self.spec(id()).await?,
+            mean_task_seconds: Some(2.0),
+            running: vec![RunningTask {
+                stage: 0,
+                index: 2,
+                worker: EVIL.into(),
+                fraction: 0.5,
+                seconds: 3.0,
+                text: EVIL.into(),
+                figures: Default::default(),
+            }],
+            workers: 1,
+            unverified: 0,
+        })
+    }
+
     fn paused(&self) -> bool {
         self.acts().last().is_some_and(|act| act == "pause")
     }
@@ -132,50 +175,10 @@ impl Farm for Memory {
         Ok((vec![job], Some(EVIL.into())))
     }
 
-    async fn job(&self, job: JobId) -> Result<JobStatus, Refusal> {
-        self.answers(job)?;
-        let state = match *self.ended.lock().unwrap() {
-            true => JobState::Cancelled,
-            false => JobState::Active,
-        };
-        let mut tasks = COUNTS;
-        if *self.idle.lock().unwrap() {
-            (tasks.leased, tasks.pending) = (0, tasks.pending + tasks.leased);
-        }
-        Ok(JobStatus {
-            id: id(),
-            name: EVIL.into(),
-            state,
-            tasks: COUNTS,
-            submitted_at_ms: 1_700_000_000_000,
-            ended_at_ms: None,
-            paused: self.paused(),
-            user: EVIL.into(),
-            stages: vec![StageStatus {
-                name: EVIL.into(),
-                kind: "render".into(),
-                state: StageState::Open,
-                needs: vec![EVIL.into()],
-                tasks,
-            }],
-            spec: self.spec(id()).await?,
-            mean_task_seconds: Some(2.0),
-            running: vec![RunningTask {
-                stage: 0,
-                index: 2,
-                worker: EVIL.into(),
-                fraction: 0.5,
-                seconds: 3.0,
-                text: EVIL.into(),
-                figures: Default::default(),
-            }],
-            workers: 1,
-            unverified: 0,
-        })
-    }
-
     async fn spec(&self, _: JobId) -> Result<JobSpec, Refusal> {
-        Ok(toml::from_str(FILE).unwrap())
+        let store = self.store.lock().unwrap().clone();
+        let file = FILE.replace("/stores/a", store.as_deref().unwrap_or("/stores/a"));
+        Ok(toml::from_str(&file).unwrap())
     }
 
     async fn events(&self, ask: Events) -> Result<Vec<Event>, Refusal> {
@@ -185,15 +188,17 @@ impl Farm for Memory {
             event(2, EventKind::Failed, 3, &format!("{EVIL} 17")),
             event(3, EventKind::Failed, 3, &format!("{EVIL} 18")),
             event(4, EventKind::Dead, 3, "gave up"),
+            event(
+                5,
+                EventKind::Log,
+                3,
+                &format!("{EVIL}\r\nevent: message\ndata: {EVIL}"),
+            ),
         ];
         Ok(all.into_iter().filter(|e| e.sequence > ask.after).collect())
     }
 
-    async fn explain(
-        &self,
-        job: JobId,
-        task: Option<(u32, u64)>,
-    ) -> Result<(Vec<Reason>, Option<TaskExplanation>), Refusal> {
+    async fn explain(&self, job: JobId, task: Option<(u32, u64)>) -> Result<Explained, Refusal> {
         self.answers(job)?;
         if task.is_some_and(|(stage, task)| stage > 0 || task >= COUNTS.total) {
             return Err(refusal(Refused::Missing, "there is no such task"));
@@ -219,7 +224,12 @@ impl Farm for Memory {
             output: None,
             events: Vec::new(),
         });
-        Ok((vec![reason], explained))
+        Ok(Explained {
+            job: self.status().await?,
+            reasons: vec![reason],
+            task: explained,
+            may_change: !*self.viewer.lock().unwrap(),
+        })
     }
 
     async fn workers(&self) -> Result<Workers, Refusal> {

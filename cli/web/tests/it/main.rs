@@ -5,5 +5,8 @@ mod access;
 mod actions;
 mod client;
 mod farm;
+mod hostile;
+mod models;
 mod room;
 mod scenes;
+mod tls;

@@ -96,7 +96,19 @@ pub fn write(store: &Path) {
         task_key: "task".into(),
         renderer: "transient".into(),
         seed: 1,
-        plan: json!({"labels": ["<b>wall</b>"]}),
+        plan: json!({
+            "labels": ["<b>wall</b>"],
+            "scene": {"notes": {"room_type": "kitchen"}},
+            "error": {"median_relative": 0.02},
+        }),
+    };
+    let mirrored = Provenance {
+        plan: json!({
+            "labels": ["<b>wall</b>"],
+            "strategies": ["mirror images: 1 planar mirrors"],
+            "error": {"median_relative": 0.1},
+        }),
+        ..provenance.clone()
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -106,8 +118,8 @@ pub fn write(store: &Path) {
         let (at, prefix) = picofarm_store::open_store(&store.display().to_string()).unwrap();
         let rooms = prefix.join("rooms");
         let dataset = Dataset::create_or_open(at, rooms, &SPEC).await.unwrap();
-        for scene in [0, 2] {
-            dataset.publish(scene, &record, &provenance).await.unwrap();
+        for (scene, provenance) in [(0, &provenance), (2, &mirrored)] {
+            dataset.publish(scene, &record, provenance).await.unwrap();
         }
     });
 }

@@ -37,6 +37,41 @@ fn the_data_sets_of_a_store_and_their_finished_scenes_are_found() {
 }
 
 #[test]
+fn a_gallery_is_filtered_and_sorted_by_what_manifests_say() {
+    let (folder, web) = shown();
+    let cards = |filter: &str| -> Vec<String> {
+        let html = web.get(&format!("/data?set=0%2Frooms&{filter}")).text();
+        let cards = html.split("/bytes/card?").skip(1);
+        let scene = |card: &str| card.split(['"', '&']).nth(1).unwrap_or_default().to_owned();
+        cards
+            .map(|card| scene(&card.replace("&amp;", "&")))
+            .collect()
+    };
+    assert_eq!(cards("room=kitchen"), ["scene=0"]);
+    assert_eq!(cards("mirrors=yes"), ["scene=2"]);
+    assert_eq!(cards("least=5&most=20"), ["scene=2"]);
+    assert_eq!(cards("sort=error"), ["scene=2", "scene=0"]);
+    assert_eq!(cards("room=kitchen&sort=error&mirrors=yes"), [""; 0]);
+    let manifest = folder.path().join("store/rooms/manifests/0.json");
+    let text = std::fs::read_to_string(&manifest).unwrap();
+    assert_eq!(cards("damaged=yes"), [""; 0]);
+    std::fs::write(&manifest, text.replace("kitchen", "kitchem")).unwrap();
+    // Another start has read nothing yet.
+    let again = Web::start(vec![folder.path().join("store").display().to_string()]);
+    let html = again.get("/data?set=0%2Frooms&damaged=yes").text();
+    assert_eq!(html.matches("/bytes/card?").count(), 1, "{html}");
+    for wrong in ["mirrors=maybe", "least=x", "sort=age"] {
+        let reply = web.get(&format!("/data?set=0%2Frooms&{wrong}"));
+        let name = wrong.split('=').next().unwrap();
+        assert_eq!(reply.status, 400, "{wrong}");
+        assert!(
+            reply.text().contains(&format!("{name}: expected")),
+            "{wrong}"
+        );
+    }
+}
+
+#[test]
 fn places_outside_of_the_given_stores_are_not_read() {
     let (folder, web) = shown();
     let outside = folder.path().join("store/rooms").display().to_string();

@@ -114,6 +114,7 @@ pub(super) async fn explain(
         job: Some(status.into()),
         reasons: reasons.into_iter().map(Into::into).collect(),
         task: explained.map(Into::into),
+        may_change: link.has_right(by, job).await?,
     })
 }
 

@@ -7,7 +7,7 @@ use tonic::Status;
 use super::link::{Link, broken, no_such_job};
 use crate::{
     actor::{Command, Reply},
-    auth::{Caller, not_owner},
+    auth::{Caller, Needs, Role, not_owner},
 };
 
 impl Link {
@@ -48,6 +48,17 @@ impl Link {
             return Err(no_such_job(job));
         }
         Err(Status::permission_denied(not_owner(&job, &owner)))
+    }
+
+    /// Returns whether a caller may change a job that it may see.
+    ///
+    /// # Errors
+    /// Returns NOT_FOUND for a missing job, or UNAVAILABLE if the catalog fails.
+    pub(super) async fn has_right(&self, caller: &Caller, job: JobId) -> Result<bool, Status> {
+        if !caller.roles.allow(Needs::Role(Role::Submit)) {
+            return Ok(false);
+        }
+        Ok(caller.is_admin() || caller.may_change(&self.owner(job).await?))
     }
 
     /// Sends a command about a job to the actor, if the caller may change the job, and records it.

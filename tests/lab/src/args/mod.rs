@@ -30,6 +30,9 @@ pub enum Command {
     /// Measure the scheduler: durable no-op tasks a second against the database's own limit, and
     /// fleets of simulated workers
     Queue(Queue),
+    /// Measure the pages of `picofarm web` at many jobs and workers, and the coordinator's CPU with
+    /// many viewers
+    Pages(Pages),
     /// Measure the cost of very many (simulated, tiny) scenes: list, verify, snapshot, gc
     Dataset(Dataset),
     /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of
@@ -169,6 +172,34 @@ pub struct Queue {
     /// [default: never]
     #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
+}
+
+#[derive(Args)]
+pub struct Pages {
+    /// The catalog: a SQLite file or the URL of a Postgres database, empty or filled by an earlier
+    /// run [default: a new SQLite file that is removed after]
+    #[arg(
+        long,
+        value_name = "FILE|URL",
+        env = "PICOFARM_CATALOG",
+        hide_env_values = true
+    )]
+    pub catalog: Option<CatalogPlace>,
+    /// Jobs
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..))]
+    pub jobs: u64,
+    /// Tasks of all jobs; half of them belong to one
+    #[arg(long, default_value_t = 100_000)]
+    pub tasks: u64,
+    /// Simulated workers
+    #[arg(long, default_value_t = 1000, value_parser = ranges::simulated)]
+    pub workers: usize,
+    /// Viewers that follow pages
+    #[arg(long, default_value_t = 50)]
+    pub viewers: usize,
+    /// Requests of each page
+    #[arg(long, default_value_t = 100)]
+    pub asks: usize,
 }
 
 #[derive(Args)]

@@ -3,6 +3,7 @@
 //! committed. Only rendering is left out.
 
 mod limits;
+pub mod pages;
 mod raw;
 mod server;
 mod stats;

@@ -91,38 +91,7 @@ impl Server {
 
     /// Returns CPU time and peak memory so far.
     pub fn usage(&self) -> Result<Usage> {
-        let id = self.child.id();
-        let read = |file: &str| {
-            std::fs::read_to_string(format!("/proc/{id}/{file}")).map_err(|e| {
-                CliError::new(
-                    Code::Resource,
-                    format!("/proc/{id}/{file}: {e}; this bench needs Linux"),
-                )
-            })
-        };
-        let stat = read("stat")?;
-        // After the name in parentheses: utime and stime are fields 14 and 15 of the whole.
-        let fields: Vec<&str> = stat
-            .rsplit_once(')')
-            .map_or("", |(_, rest)| rest)
-            .split_whitespace()
-            .collect();
-        let ticks = |at: usize| {
-            fields
-                .get(at)
-                .and_then(|t| t.parse::<f64>().ok())
-                .unwrap_or(0.0)
-        };
-        let status = read("status")?;
-        let peak = status
-            .lines()
-            .find_map(|line| line.strip_prefix("VmHWM:"))
-            .and_then(|kib| kib.trim().strip_suffix("kB"))
-            .and_then(|kib| kib.trim().parse::<u64>().ok());
-        Ok(Usage {
-            cpu_s: (ticks(11) + ticks(12)) / rustix::param::clock_ticks_per_second() as f64,
-            peak_bytes: peak.unwrap_or(0) * 1024,
-        })
+        usage(self.child.id())
     }
 
     fn end(&mut self) {
@@ -136,6 +105,44 @@ impl Drop for Server {
     fn drop(&mut self) {
         self.end();
     }
+}
+
+/// Returns CPU time and peak memory of a process so far.
+///
+/// # Errors
+/// Fails if it has ended, and on systems other than Linux.
+pub fn usage(id: u32) -> Result<Usage> {
+    let read = |file: &str| {
+        std::fs::read_to_string(format!("/proc/{id}/{file}")).map_err(|e| {
+            CliError::new(
+                Code::Resource,
+                format!("/proc/{id}/{file}: {e}; this bench needs Linux"),
+            )
+        })
+    };
+    let stat = read("stat")?;
+    // After the name in parentheses: utime and stime are fields 14 and 15 of the whole.
+    let fields: Vec<&str> = stat
+        .rsplit_once(')')
+        .map_or("", |(_, rest)| rest)
+        .split_whitespace()
+        .collect();
+    let ticks = |at: usize| {
+        fields
+            .get(at)
+            .and_then(|t| t.parse::<f64>().ok())
+            .unwrap_or(0.0)
+    };
+    let status = read("status")?;
+    let peak = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmHWM:"))
+        .and_then(|kib| kib.trim().strip_suffix("kB"))
+        .and_then(|kib| kib.trim().parse::<u64>().ok());
+    Ok(Usage {
+        cpu_s: (ticks(11) + ticks(12)) / rustix::param::clock_ticks_per_second() as f64,
+        peak_bytes: peak.unwrap_or(0) * 1024,
+    })
 }
 
 fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, String, String)> {
@@ -161,6 +168,7 @@ fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, Str
         .args(["--check-stores", "none"])
         // A lost session counts until it is noticed.
         .args(["--max-sessions", "100000"])
+        .args(["--max-jobs-per-user", "100000"])
         // Not as an argument, because it may contain a password.
         .env("PICOFARM_CATALOG", url)
         .stdout(Stdio::piped())

@@ -37,7 +37,8 @@ pub struct Latency {
     pub most_ms: f64,
 }
 
-fn latency(mut seconds: Vec<f64>) -> Latency {
+/// Returns the distribution of durations, given in seconds.
+pub fn latency(mut seconds: Vec<f64>) -> Latency {
     seconds.sort_by(f64::total_cmp);
     let at = |share: f64| {
         let last = seconds.len().saturating_sub(1) as f64;
