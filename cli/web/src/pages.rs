@@ -9,6 +9,7 @@ mod grid;
 mod job;
 mod overview;
 mod parts;
+mod room;
 mod scene;
 mod task;
 mod workers;
@@ -63,6 +64,7 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
         ["audit"] => audit::page(app, query).await,
         ["data"] => gallery::page(app, query).await,
         ["data", "scene"] => scene::page(app, query).await,
+        ["data", "room"] => room::page(app, query).await,
         ["flight"] => flight::page(app, query).await,
         _ => Err(Problem::missing(format!("there is no page {path}"))),
     }

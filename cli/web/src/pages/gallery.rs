@@ -83,6 +83,7 @@ fn list(app: &App, listed: &Listing) -> Markup {
                 div.strip { @for scene in set.scenes.iter().take(3) { (card(set, *scene)) } }
             }
         } }
+        (super::room::list(&listed.made))
     }
 }
 
