@@ -134,7 +134,14 @@ function draw() {
   strip();
   recorder?.frame();
   texts();
-  histogram.draw({ log: $('hlog').checked, zoom: $('zoom').checked, time, shutter: Number($('shutter').value) });
+  histogram.draw({ log: $('hlog').checked, zoom: $('zoom').checked, time: time + later(), shutter: Number($('shutter').value) });
+}
+
+// At the surfaces, light of the picked pixel that is seen now arrives this many bins later.
+function later() {
+  if (!inSpace || !space || !picked || !$('surface').checked) return 0;
+  const i = picked[1] * facts.width + picked[0];
+  return space.depth[i] > 0 ? (Math.hypot(...space.point(i)) - space.middle) / facts.bin_m : 0;
 }
 
 // A frame only where something changed.
@@ -258,6 +265,8 @@ let depth = null;
 async function enter() {
   inSpace = true;
   show();
+  // The volume enters when it has arrived.
+  if (!volume) return;
   const mine = turn;
   try {
     depth ??= get('depth').then((r) => r.arrayBuffer());
@@ -265,19 +274,20 @@ async function enter() {
     if (mine !== turn || !inSpace) return;
     if (!space) {
       space = new Space(volume, values, found);
-      orbit ??= looking(space.middle);
+      orbit ??= looking();
     }
     document.documentElement.dataset.view = 'space';
   } catch (error) {
     depth = null;
     inSpace = false;
-    fail(error.message);
+    $('message').textContent = `Only the image is shown: ${error.message}`;
+    $('message').hidden = false;
   }
   show();
 }
 
-function looking(distance) {
-  const made = new Orbit(distance, found.up, touch);
+function looking() {
+  const made = new Orbit(space.middle, found.up, space.extent, touch);
   if (asked.has('orbit')) made.parse(asked.get('orbit'));
   return made;
 }
@@ -291,8 +301,8 @@ function leave() {
 function show() {
   $('image').setAttribute('aria-pressed', String(!inSpace));
   $('space').setAttribute('aria-pressed', String(inSpace));
-  $('surface').disabled = !inSpace;
-  $('how').textContent = inSpace ? 'Drag or arrow keys turn, Shift moves, wheel or + − zoom, Home: camera' : '';
+  $('surface').closest('label').hidden = !inSpace;
+  $('how').textContent = inSpace ? 'Drag or the arrow keys turn the room; Shift or two fingers move it; the wheel, + and − go closer and away; Home is the camera.' : '';
   $('screen').classList.toggle('space', inSpace);
   keep();
   touch();
@@ -402,7 +412,7 @@ function scrub(element, bin) {
   element.addEventListener('pointermove', (event) => { if (element.hasPointerCapture(event.pointerId)) move(event); });
   element.addEventListener('pointerup', keep);
 }
-scrub($('histogram'), (x) => histogram?.pixel ? histogram.binAt(x, $('zoom').checked) : time);
+scrub($('histogram'), (x) => histogram?.pixel ? histogram.binAt(x, $('zoom').checked) - later() : time);
 scrub($('energy'), (x) => (x - THUMB / 2) / Math.max(1, $('energy').clientWidth - THUMB) * (facts.bins - 1));
 addEventListener('keydown', (event) => {
   if (!facts || event.ctrlKey || event.metaKey || event.altKey) return;

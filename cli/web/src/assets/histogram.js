@@ -181,8 +181,9 @@ export class Histogram {
       if (place + half < width - 18) c.fillText(text, place - half, height - 3);
     }
     c.fillText('ns', width - 14, height - 3);
-    c.fillText(most.toPrecision(2), 0, top + 8);
-    c.fillText(log ? floor.toPrecision(2) : '0', 0, bottom);
+    const short = (v) => (v === 0 || (v >= 0.001 && v < 1e4) ? v.toPrecision(2) : v.toExponential(1));
+    c.fillText(short(most), 0, top + 8);
+    c.fillText(log ? short(floor) : '0', 0, bottom);
   }
 }
 

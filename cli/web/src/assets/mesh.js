@@ -27,6 +27,17 @@ uniform int mode;
 uniform bool hasTruth, hidden, back;
 out vec4 colour;
 
+// The true depth at a place of the image: between pixels of one surface the inverse is linear.
+float trueDepth(vec2 at) {
+  ivec2 last = ivec2(trueSize) - 1, from = ivec2(floor(at - 0.5));
+  vec2 part = at - 0.5 - vec2(from);
+  vec4 z;
+  for (int i = 0; i < 4; i++) z[i] = texelFetch(depth, clamp(from + ivec2(i & 1, i >> 1), ivec2(0), last), 0).r;
+  float low = min(min(z.x, z.y), min(z.z, z.w)), high = max(max(z.x, z.y), max(z.z, z.w));
+  if (low <= 0.0 || high > 1.1 * low) return texelFetch(depth, ivec2(at), 0).r;
+  return 1.0 / mix(mix(1.0 / z.x, 1.0 / z.y, part.x), mix(1.0 / z.z, 1.0 / z.w, part.x), part.y);
+}
+
 void main() {
   vec3 towards = normalize(eye - p);
   vec3 normal = dot(n, n) > 0.0 ? normalize(n) : normalize(cross(dFdx(p), dFdy(p)));
@@ -46,7 +57,7 @@ void main() {
     base = kind == 1 ? vec3(0.30, 0.34, 0.42) : vec3(0.22, 0.22, 0.24);
     vec2 at = trueLens.xy * p.xy / max(p.z, 1e-6) + trueLens.zw;
     if (kind == 0 && hasTruth && all(greaterThanEqual(at, vec2(0.0))) && all(lessThan(at, trueSize))) {
-      float z = texelFetch(depth, ivec2(at), 0).r;
+      float z = trueDepth(at);
       if (z > 0.0) base = viridis(clamp(abs(p.z - z) * length(p) / p.z / most, 0.0, 1.0));
     }
   } else if (mode == 2) {

@@ -10,13 +10,16 @@ const NEAR = 0.02, FAR = 500;
 const STEEP = 0.49 * PI;
 
 export class Orbit {
-  /** Looks at the point `depth` metres before the camera; `up` is the room's. */
-  constructor(depth, up, changed) {
+  /**
+   * Takes the distance in metres at which the camera's own view turns, the direction that is upwards
+   * in the room, and middle and size of what is there.
+   */
+  constructor(depth, up, { middle, size }, changed) {
     // A camera upside down is one whose world has another axis upwards.
     this.up = up && up[1] < 0 ? unit(up) : [0, -1, 0];
     this.forward = unit(sum([0, 0, 1], this.up, -this.up[2]));
     this.right = cross(this.forward, this.up);
-    this.depth = depth;
+    Object.assign(this, { depth, middle, size });
     this.changed = changed;
     this.field = 55 / 180 * PI;
     this.start();
@@ -27,7 +30,8 @@ export class Orbit {
     this.camera();
     this.yaw = 0.5;
     this.pitch = min(STEEP, max(0.3, this.pitch + 0.15));
-    this.distance = 1.75 * this.depth;
+    this.target = this.middle;
+    this.distance = 2.6 * this.size;
   }
 
   /** The camera's own view. */
@@ -155,6 +159,14 @@ export function follow(element, orbit, click, done) {
     orbit().zoom(2 ** (event.deltaY / 400));
     done();
   }, { passive: false });
+}
+
+/** Returns the middle of points, each of three numbers, and their mean distance from it. */
+export function extent(points) {
+  const middle = [0, 0, 0];
+  for (const p of points) for (let k = 0; k < 3; k++) middle[k] += p[k] / points.length;
+  const size = points.reduce((all, p) => all + hypot(...sum(p, middle, -1)) / points.length, 0);
+  return { middle, size: max(0.1, size) };
 }
 
 /** Returns where a point is on a picture of a size, in its pixels; null behind the viewer. */

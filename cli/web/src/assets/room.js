@@ -3,7 +3,7 @@ import { context } from './gl.js';
 import { readGlb } from './glb.js';
 import { fit } from './histogram.js';
 import { Mesh } from './mesh.js';
-import { Orbit, drawCamera, follow } from './orbit.js';
+import { Orbit, drawCamera, extent, follow } from './orbit.js';
 import { savePng } from './save.js';
 
 const $ = (id) => document.getElementById(id);
@@ -80,10 +80,10 @@ async function load() {
     const i = read.camera?.intrinsics;
     camera = i ? { lens: [i.fx, i.fy, i.cx, i.cy], size: [i.width, i.height] } : null;
     laser = read.laser;
-    const z = [];
-    for (let k = 2; k < read.positions.length; k += 3) z.push(read.positions[k]);
-    z.sort((a, b) => a - b);
-    orbit = new Orbit(Math.max(0.3, z[z.length >> 1]), read.up, touch);
+    const points = [];
+    for (let k = 0; k < read.positions.length; k += 3) points.push(read.positions.slice(k, k + 3));
+    const about = extent(points);
+    orbit = new Orbit(Math.max(0.3, about.middle[2]), read.up, about, touch);
     if (asked.has('orbit')) orbit.parse(asked.get('orbit'));
     mesh = new Mesh(context($('view')), read, camera, depth);
     $('loaded').textContent = `${read.indices.length / 3} triangles after ${Math.round(performance.now() - began)} ms`;
@@ -110,15 +110,17 @@ function draw() {
   const keys = [
     [],
     [['err0', 'no error'], ['err1', `${most.toFixed(2)} m and more, along the ray`], ['hid', 'hidden from the camera'], ['out', 'outside of its view']],
-    [['vis', 'the camera sees it'], ['occ', 'hidden, known from shadows'], ['off', 'outside of the view']],
+    [['vis', 'the camera sees it'], ['occ', 'hidden from the camera'], ['off', 'outside of the view']],
   ][mode];
   const text = keys.map(([name, words]) => name + words).join();
   if ($('meaning').dataset.text === text) return;
   $('meaning').dataset.text = text;
-  $('meaning').replaceChildren(...keys.flatMap(([name, words]) => {
-    const key = document.createElement('span');
+  $('meaning').replaceChildren(...keys.map(([name, words]) => {
+    const [item, key] = [document.createElement('span'), document.createElement('span')];
+    item.className = 'item';
     key.className = `key ${name}`;
-    return [key, document.createTextNode(words)];
+    item.append(key, words);
+    return item;
   }));
 }
 

@@ -68,7 +68,7 @@ function facts(p) {
     list.push(['energy', p.rendered_apart ? `one bounce ${one}, two ${two}, three and more ${more}, rendered apart`
       : `${one} at times of one bounce, ${two} at times of two, ${more} at others`]);
   }
-  if (p.peak_bins !== null) list.push(['two-bounce peaks', `${p.peak_bins.toFixed(2)} bins (${(1000 * p.peak_m).toFixed(1)} mm) from their predicted times, ` +
+  if (p.peak_bins !== null) list.push(['two-bounce peaks', `${Math.abs(p.peak_bins).toFixed(2)} bins (${Math.abs(1000 * p.peak_m).toFixed(1)} mm) ${p.peak_bins < 0 ? 'before' : 'after'} their predicted times, ` +
     `${p.pairs} pairs of pixel and spot`]);
   if (p.contrast !== null) list.push(['brightness there', `${p.contrast.toFixed(2)} times that of other times`]);
   if (p.early !== null) list.push(['light too early', `in ${percent(p.early, 2)} of the pixels`]);
@@ -92,7 +92,7 @@ async function compare(section) {
     const verdict = document.createElement('b');
     verdict.textContent = p.verdict;
     verdict.className = { agrees: 'good', 'does not agree': 'bad' }[p.verdict] ?? '';
-    line.replaceChildren('Light and geometry: ', verdict, p.reasons.length ? `: ${p.reasons.join('; ')}` : '');
+    line.replaceChildren(verdict, p.reasons.length ? `: ${p.reasons.join('; ')}` : '');
     const list = document.createElement('dl');
     list.className = 'facts-list';
     for (const [name, value] of facts(p)) {

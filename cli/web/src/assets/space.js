@@ -1,7 +1,7 @@
 // The depth map as points in space, coloured by the light that arrives from them, or that is at the
 // surfaces, at the time of the player.
 import { LIGHT, Program, floats } from './gl.js';
-import { drawCamera, project } from './orbit.js';
+import { drawCamera, extent, project } from './orbit.js';
 
 const VERTEX = `${LIGHT}
 uniform highp sampler2D depth;
@@ -34,7 +34,9 @@ export class Space {
     Object.assign(this, { volume, depth, scene, facts, gl });
     this.program = new Program(gl, VERTEX, FRAGMENT);
     floats(gl, 3, facts.width, facts.height, depth);
-    const ranges = [...depth.keys()].filter((i) => depth[i] > 0).map((i) => Math.hypot(...this.point(i))).sort((a, b) => a - b);
+    const points = [...depth.keys()].filter((i) => depth[i] > 0).map((i) => this.point(i));
+    this.extent = extent(points);
+    const ranges = points.map((p) => Math.hypot(...p)).sort((a, b) => a - b);
     const at = (share) => ranges[Math.floor(share * (ranges.length - 1))] ?? 1;
     /** The median distance from the camera, and the nearest and the farthest. */
     this.middle = at(0.5);

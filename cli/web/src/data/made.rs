@@ -159,7 +159,7 @@ impl Stores {
 
     /// Returns the scene of this index that a task made, in any of the data sets.
     async fn with_key(&self, scene: u64, task_key: &str) -> Option<SceneId> {
-        for set in &self.list().await.sets {
+        for set in &self.recent().await.sets {
             if set.scenes.binary_search(&scene).is_ok()
                 && let Ok(manifest) = set.dataset.manifest(scene).await
                 && manifest.provenance.task_key == task_key
@@ -174,7 +174,7 @@ impl Stores {
     /// Returns the reconstructions of a scene, each with its location.
     pub async fn rooms_of(&self, scene: &Manifest) -> Vec<(SceneId, String)> {
         let mut found = Vec::new();
-        for made in &self.list().await.made {
+        for made in &self.recent().await.made {
             if let Kind::Reconstructions(rooms, scenes) = &made.kind
                 && scenes.binary_search(&scene.scene).is_ok()
                 && let Ok(manifest) = rooms.manifest(scene.scene).await
@@ -197,7 +197,7 @@ impl Stores {
     pub async fn seen(&self, truth: &Truth, pixel: usize) -> Result<Vec<Value>, Problem> {
         let scene = truth.manifest.scene;
         let mut found = Vec::new();
-        for made in &self.list().await.made {
+        for made in &self.recent().await.made {
             let Kind::Predictions(predictions) = &made.kind else {
                 continue;
             };

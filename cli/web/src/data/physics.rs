@@ -9,10 +9,9 @@ use crate::answer::Problem;
 
 /// Largest shift of the histograms against the predicted times that is tried, bins.
 const SHIFT: i64 = 8;
-/// Bins before the earliest possible light that an edge inside of a pixel may explain.
-const EDGE: usize = 2;
-/// Share of pixels with earlier light above which a scene is doubtful. Mirrors and edges explain
-/// fewer.
+/// Bins by which light may seem early, because a pixel and its bins have a width.
+const EDGE: i64 = 2;
+/// Share of pixels with earlier light above which a scene is doubtful.
 const EARLY: f64 = 0.02;
 /// Least brightness at predicted times, compared with that of times a few bins away.
 const CONTRAST: f64 = 1.2;
@@ -54,6 +53,8 @@ pub fn verdict(
     truth.depth.as_ref()?;
     truth.intrinsics.as_ref()?;
     let own = own_pixels(truth)?;
+    let least = least_paths(truth, &own)?;
+    let width = (truth.spec.width as usize).max(1);
     let of_pixel = |mut sums: Sums, pixel: usize| -> Result<Sums, Problem> {
         let h = volume.histogram(pixel);
         let Some(first) = h.iter().position(|h| *h > 0.0) else {
@@ -71,7 +72,6 @@ pub fn verdict(
                 }
             }
         };
-        let mut earliest = i64::MAX;
         let within = |bin: i64| {
             usize::try_from(bin)
                 .ok()
@@ -81,7 +81,6 @@ pub fn verdict(
         for (index, spot) in spots.iter().enumerate() {
             let Some(spot) = spot else { continue };
             let bin = bin_of(two_bounce(spot, point));
-            earliest = earliest.min(bin);
             if masks[index * pixels + pixel] != 1 || mirrors[pixel] == 1 {
                 continue;
             }
@@ -95,19 +94,19 @@ pub fn verdict(
             }
         }
         for (_, path) in own.iter().filter(|(own, _)| *own == pixel) {
-            let bin = bin_of(*path);
-            earliest = earliest.min(bin);
-            mark(bin, 0);
+            mark(bin_of(*path), 0);
         }
+        // A pixel at an edge also sees the surface of a neighbour.
+        let earliest = neighbours(pixel, width, pixels).map(|p| least[p]);
+        let earliest = earliest.fold(f64::INFINITY, f64::min);
         sums.lit += 1;
-        sums.early += u64::from(((first + EDGE) as i64) < earliest);
+        sums.early += u64::from(earliest.is_finite() && first as i64 + EDGE < bin_of(earliest));
         for (h, kind) in h.iter().zip(&kinds) {
             sums.energy[usize::from(*kind)] += f64::from(*h);
         }
         Ok(sums)
     };
     // Rows are added in order, so that the figures do not depend on threads.
-    let width = (truth.spec.width as usize).max(1);
     let rows: Vec<Sums> = (0..truth.spec.height as usize)
         .into_par_iter()
         .map(|row| (row * width..(row + 1) * width).try_fold(Sums::default(), &of_pixel))
@@ -142,6 +141,30 @@ fn own_pixels(truth: &Truth) -> Result<Vec<(usize, f64)>, Problem> {
         }
     }
     Ok(found)
+}
+
+/// Returns for each pixel the shortest path by any spot, lit or not: no light comes by a shorter
+/// one. Infinite for pixels that see nothing.
+fn least_paths(truth: &Truth, own: &[(usize, f64)]) -> Result<Vec<f64>, Problem> {
+    let spots: Vec<_> = truth.spots.as_ref()?.iter().flatten().collect();
+    let mut least = (0..truth.spec.pixels())
+        .map(|pixel| {
+            let point = truth.point(pixel)?;
+            let paths = point.map(|point| spots.iter().map(move |spot| two_bounce(spot, point)));
+            Ok(paths.into_iter().flatten().fold(f64::INFINITY, f64::min))
+        })
+        .collect::<Result<Vec<f64>, Problem>>()?;
+    for (pixel, path) in own {
+        least[*pixel] = least[*pixel].min(*path);
+    }
+    Ok(least)
+}
+
+/// Returns a pixel and those around it.
+fn neighbours(pixel: usize, width: usize, pixels: usize) -> impl Iterator<Item = usize> {
+    let (row, column) = (pixel / width, pixel % width);
+    let near = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
+    near(row, pixels / width).flat_map(move |r| near(column, width).map(move |c| r * width + c))
 }
 
 fn join(mut a: Sums, b: Sums) -> Sums {

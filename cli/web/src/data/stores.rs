@@ -27,6 +27,8 @@ const DEPTH: usize = 2;
 const MOST: usize = 400;
 /// Time for which a list of data sets is used again.
 const FRESH: Duration = Duration::from_secs(4);
+/// Time for which a list serves to find results about a scene. Long lists take seconds.
+const RECENT: Duration = Duration::from_secs(60);
 /// Bytes of images in memory.
 const IMAGES: usize = 192 << 20;
 /// Bytes of predictions in memory.
@@ -139,6 +141,16 @@ impl Stores {
         let found = Arc::new(found);
         *listed = Some((Instant::now(), Arc::clone(&found)));
         found
+    }
+
+    /// Returns a list that may be a minute old.
+    pub async fn recent(&self) -> Arc<Listing> {
+        if let Some((at, sets)) = &*self.listed.lock().await
+            && at.elapsed() < RECENT
+        {
+            return Arc::clone(sets);
+        }
+        self.list().await
     }
 
     /// Opens the data set of a URL.

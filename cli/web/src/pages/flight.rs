@@ -36,8 +36,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                 div.views role="group" aria-label="View" {
                     button #image type="button" aria-pressed="true" title="key 2" { "Image" }
                     button #space type="button" aria-pressed="false" title="key 3" { "In space" }
-                    label.check { input #surface type="checkbox" checked; " light at the surfaces" }
-                    span #how.hint {}
+                    label.check hidden { input #surface type="checkbox" checked; " light at the surfaces" }
                 }
                 div.screen #screen tabindex="0" role="application"
                     aria-label="Room with light in flight. Space plays, comma and full stop step, arrow keys move the picked pixel; in space they turn the room." {
@@ -53,6 +52,7 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                     }
                     output #clock { "0.00 ns" }
                 }
+                p #how.hint {}
             }
             div.side {
                 form #controls.controls {
@@ -87,7 +87,8 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                     div #seen.seen {}
                     canvas #histogram height="220" tabindex="0" role="img" aria-label="Histogram of the picked pixel" {}
                     p #kinds.legend.times {
-                        span.key.one {} "one bounce" span.key.two {} "two bounces, lit by the spot" span.key.more {} "three and more"
+                        span.item { span.key.one {} "one bounce" } span.item { span.key.two {} "two bounces, lit by the spot" }
+                        span.item { span.key.more {} "three and more" }
                     }
                     div.toggle {
                         label.check { input #hlog type="checkbox" checked; " logarithmic" }

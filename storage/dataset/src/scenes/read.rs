@@ -189,10 +189,8 @@ impl Dataset {
             .await
     }
 
-    /// Like [`Self::read_planes_into`], but copies the stored 16-bit codes of the square-root
-    /// profile ([`SquareRoot`](crate::SquareRoot), with the scale of the scene's manifest): half
-    /// the memory, and nothing is computed. Saturated bins keep
-    /// [`SATURATED`](crate::SATURATED); their values are in the manifest.
+    /// Like [`Self::read_planes_into`], but copies the stored codes of the square-root profile
+    /// ([`SquareRoot`](crate::SquareRoot)). The manifest has the values of saturated bins.
     ///
     /// # Errors
     /// Those of [`Self::read_planes_into`]; [`StorageError::Invalid`] for another profile.
@@ -204,10 +202,8 @@ impl Dataset {
     ) -> Result<(), StorageError> {
         let array = self.single_transient(quantity)?;
         if !matches!(self.spec.profile, Profile::SqrtU16 { .. }) {
-            let what = format!(
-                "{} stores no codes of the square-root profile; read its values",
-                self.spec.profile.name()
-            );
+            let name = self.spec.profile.name();
+            let what = format!("{name} has no codes of the square-root profile; read its values");
             return Err(StorageError::invalid("profile", what));
         }
         self.decode_into(scene, array, target, Self::copy_codes_into)
