@@ -17,6 +17,8 @@ const DELAY: u16 = 5;
 const SIDE: usize = 256;
 /// Width of a figure, millimetres: two columns of most journals.
 const WIDTH: f64 = 180.0;
+/// Share of a pixel's light before the end of its histogram's panel.
+const ARRIVED: f64 = 0.99;
 /// The longest shutter of the player, bins.
 const SHUTTER: usize = 32;
 /// Steps of the logarithmic scale below white: four decades.
@@ -206,12 +208,18 @@ fn nanoseconds(volume: &Volume, bin: f64) -> f64 {
     (f64::from(gate.start_m) + bin * f64::from(gate.bin_width_m)) / METRES_PER_NS
 }
 
-/// The histogram of a pixel between its first and its last light, with the times of two bounces.
+/// The histogram of a pixel from its first light to nearly all, with the times of two bounces.
 fn curve(truth: &Truth, volume: &Volume, at: [u64; 2]) -> Result<Panel, Problem> {
     let pixel = truth.pixel(at)?;
     let h = volume.histogram(pixel);
     let first = h.iter().position(|h| *h > 0.0).unwrap_or(0);
-    let last = h.iter().rposition(|h| *h > 0.0).unwrap_or(h.len() - 1);
+    let all: f64 = h.iter().map(|h| f64::from(*h)).sum();
+    let mut sum = 0.0;
+    let arrived = h.iter().position(|h| {
+        sum += f64::from(*h);
+        sum > ARRIVED * all
+    });
+    let last = arrived.unwrap_or(h.len().saturating_sub(1));
     let shown = first.saturating_sub(4)..(last + 5).min(h.len());
     let (lit, point) = (truth.lit_by(pixel)?, truth.point(pixel)?);
     let spots = truth.spots.as_ref()?.iter().enumerate();
