@@ -305,7 +305,7 @@ fn a_folder_of_a_reconstruction_is_listed_and_shown_in_3d() {
         "{list}"
     );
     let page = web.get("/data/room?set=0%2Fmy-room&scene=0").text();
-    assert!(page.contains("<dd>0.25 m</dd>"), "{page}");
+    assert!(page.contains("<dd>0.250 m</dd>"), "{page}");
     // No scene of the stores is known to be its source.
     assert!(!page.contains("data-source") && !page.contains("value=\"error\""));
     assert_eq!(web.get("/bytes/mesh?set=0%2Fmy-room&scene=0").body, b"glTF");
