@@ -11,6 +11,7 @@ mod job;
 mod models;
 mod overview;
 mod parts;
+mod room;
 mod scene;
 mod task;
 mod workers;
@@ -69,6 +70,7 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
         ["models"] => models::page(app, query).await,
         ["models", "model"] => models::model(app, query).await,
         ["models", "sweep"] => models::sweep(app, query).await,
+        ["data", "room"] => room::page(app, query).await,
         ["flight"] => flight::page(app, query).await,
         _ => Err(Problem::missing(format!("there is no page {path}"))),
     }

@@ -233,13 +233,23 @@ impl<'a> Decoder<'a> {
         }
     }
 
-    fn planes<T: bytemuck::Pod>(
+    /// Like [`Self::decode_planes`], but copies the codes of [`Profile::SqrtU16`]. Saturated bins
+    /// keep theirs.
+    pub fn copy_planes(&self, tile: usize, raw: &[u8], part: &Part, target: &mut [u16]) {
+        let copy = |from: &[u16], to: &mut [u16]| {
+            to.copy_from_slice(from);
+            false
+        };
+        self.planes(tile, &values(raw), part, target, copy);
+    }
+
+    fn planes<T: bytemuck::Pod, U>(
         &self,
         tile: usize,
         stored: &[T],
         part: &Part,
-        target: &mut [f32],
-        decode: impl Fn(&[T], &mut [f32]) -> bool,
+        target: &mut [U],
+        decode: impl Fn(&[T], &mut [U]) -> bool,
     ) -> bool {
         let first = self.tiles.bins_of(tile).start;
         let runs = self.tiles.runs(tile).filter(|r| part.rows.contains(&r.row));

@@ -173,6 +173,17 @@ impl Dataset {
         self.complete(manifest, whole)
     }
 
+    /// Like [`Self::decode_planes_into`], but copies the codes of the square-root profile.
+    pub(crate) fn copy_codes_into(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        bytes: &Bytes,
+        target: &mut [u16],
+    ) -> Result<(), StorageError> {
+        self.decoding(manifest, array).codes(bytes, target)
+    }
+
     /// Returns whether a shard can be decoded, whatever its values are.
     pub(crate) fn shard_is_whole(
         &self,
@@ -232,16 +243,23 @@ impl Decoding<'_> {
     /// Like [`Self::shard`], but as one image per bin.
     pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, StorageError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
-        let chunks: Vec<_> = Self::chunks(&tiles, bytes)?
-            .into_iter()
-            .enumerate()
-            .collect();
+        let chunks = Self::numbered(&tiles, bytes)?;
         self.part_planes(&tiles, &chunks, &tiles.whole(), target)
     }
 
-    /// Decodes tiles into a part's values, one image per bin, and applies the overflow list. Tiles
-    /// with the same bins write to adjacent memory, so one thread decodes them; different ranges of
-    /// bins are decoded in parallel. A tile without bytes is all fill value.
+    /// Copies the codes of a whole transient of the square-root profile, as one image per bin.
+    pub fn codes(&self, bytes: &Bytes, target: &mut [u16]) -> Result<(), StorageError> {
+        let tiles = Tiles::new(self.spec, &self.array.layout);
+        let chunks = Self::numbered(&tiles, bytes)?;
+        let copy = |decoder: &Decoder<'_>, tile, raw: &[u8], part: &Part, codes: &mut [u16]| {
+            decoder.copy_planes(tile, raw, part, codes);
+            false
+        };
+        self.slabs(&tiles, &chunks, &tiles.whole(), target, copy)?;
+        Ok(())
+    }
+
+    /// Decodes tiles into a part's values, one image per bin, and applies the overflow list.
     fn part_planes(
         &self,
         tiles: &Tiles,
@@ -249,12 +267,38 @@ impl Decoding<'_> {
         part: &Part,
         target: &mut [f32],
     ) -> Result<Complete, StorageError> {
+        let decode = |decoder: &Decoder<'_>, tile, raw: &[u8], part: &Part, h: &mut [f32]| {
+            decoder.decode_planes(tile, raw, part, h)
+        };
+        let saturated = self.slabs(tiles, chunks, part, target, decode)?;
+        let area = part.rows.len() * part.columns.len();
+        for (index, value) in self.overflow {
+            if let Some([row, column, bin]) = tiles.within(*index, part) {
+                target[bin * area + row * part.columns.len() + column] = *value;
+            }
+        }
+        let complete = !saturated || target.iter().all(|h| h.is_finite());
+        Ok(Complete(complete))
+    }
+
+    /// Calls `each` with the raw bytes of each tile, those bins of the part that it has, and their
+    /// images in `target`. Tiles with the same bins write to adjacent memory, so one thread decodes
+    /// them; different ranges of bins are decoded in parallel. A tile without bytes is all zero.
+    /// Returns whether `each` returned true.
+    fn slabs<T: bytemuck::Pod + Send>(
+        &self,
+        tiles: &Tiles,
+        chunks: &[(usize, Option<Bytes>)],
+        part: &Part,
+        target: &mut [T],
+        each: impl Fn(&Decoder<'_>, usize, &[u8], &Part, &mut [T]) -> bool + Sync,
+    ) -> Result<bool, StorageError> {
         if chunks.iter().any(|(_, bytes)| bytes.is_none()) {
-            target.fill(0.0);
+            target.fill(T::zeroed());
         }
         let area = part.rows.len() * part.columns.len();
         let mut slabs = Vec::new();
-        let mut rest = &mut *target;
+        let mut rest = target;
         let mut first = part.bins.start;
         while first < part.bins.end {
             let slab = first / tiles.slab_len();
@@ -268,29 +312,31 @@ impl Decoding<'_> {
             rest = after;
             first = end;
         }
-        let saturated = slabs
+        let found = slabs
             .into_par_iter()
             .map(|(slab, part, values)| {
                 let decoder = Decoder::new(self.spec.profile, self.scale, tiles);
-                let mut saturated = false;
-                for (tile, bytes) in chunks {
-                    let Some(bytes) = bytes.as_ref().filter(|_| tiles.slab_of(*tile) == slab)
-                    else {
-                        continue;
-                    };
+                let mut found = false;
+                let own = chunks
+                    .iter()
+                    .filter(|(tile, _)| tiles.slab_of(*tile) == slab);
+                for (tile, bytes) in own {
+                    let Some(bytes) = bytes else { continue };
                     let raw = self.array.codec.decode(bytes)?;
-                    saturated |= decoder.decode_planes(*tile, &raw, &part, values);
+                    found |= each(&decoder, *tile, &raw, &part, values);
                 }
-                Ok(saturated)
+                Ok(found)
             })
             .collect::<Result<Vec<bool>, StorageError>>()?;
-        for (index, value) in self.overflow {
-            if let Some([row, column, bin]) = tiles.within(*index, part) {
-                target[bin * area + row * part.columns.len() + column] = *value;
-            }
-        }
-        let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());
-        Ok(Complete(complete))
+        Ok(found.contains(&true))
+    }
+
+    /// Returns the encoded bytes of each tile of a shard, with its number.
+    fn numbered(tiles: &Tiles, bytes: &Bytes) -> Result<Vec<(usize, Option<Bytes>)>, StorageError> {
+        Ok(Self::chunks(tiles, bytes)?
+            .into_iter()
+            .enumerate()
+            .collect())
     }
 
     /// Returns the encoded bytes of each tile of a shard; `None` = all fill value.
