@@ -1,0 +1,177 @@
+"""The three scenes of the laboratory as Mitsuba files, in the scan's axes: x left, y up, z forward.
+
+Lengths are metres. The camera is at the origin, and the laser is beside it on the x axis.
+"""
+
+import math
+from dataclasses import dataclass
+
+BASELINE_M = 0.257
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene, the view of the detector, and the way to its spots."""
+
+    name: str
+    # Limits of the view in the plane z = 1, [u, v]; None takes those of the detector's scan.
+    view: tuple | None
+    # The laser scan with the voltages of the spots, and the factor on their slopes.
+    laser_scan: str
+    spread: float
+    # First path and last path of the gate, metres.
+    gate: tuple
+    shapes: tuple
+
+
+def box(low, high, material="white"):
+    """Returns a cuboid between two corners."""
+    middle = [(a + b) / 2 for a, b in zip(low, high)]
+    half = [(b - a) / 2 for a, b in zip(low, high)]
+    return f'<shape type="cube"><transform name="to_world">{scale(half)}{translate(middle)}</transform>{ref(material)}</shape>'
+
+
+def turned(centre, half, degrees, material="white"):
+    """Returns a cuboid that is turned about the vertical axis."""
+    turn = f'<rotate y="1" angle="{degrees}"/>'
+    return (
+        f'<shape type="cube"><transform name="to_world">{scale(half)}{turn}{translate(centre)}</transform>'
+        f"{ref(material)}</shape>"
+    )
+
+
+def ball(centre, half, material="white"):
+    """Returns an ellipsoid."""
+    return (
+        f'<shape type="sphere"><transform name="to_world">{scale(half)}{translate(centre)}</transform>'
+        f"{ref(material)}</shape>"
+    )
+
+
+def rod(foot, top, radius, material="white"):
+    """Returns a cylinder with a lid."""
+    points = "".join(
+        f'<point name="{name}" x="{p[0]}" y="{p[1]}" z="{p[2]}"/>' for name, p in (("p0", foot), ("p1", top))
+    )
+    side = f'<shape type="cylinder">{points}<float name="radius" value="{radius}"/>{ref(material)}</shape>'
+    flat = f'<rotate x="1" angle="-90"/>{scale([radius, radius, radius])}{translate(top)}'
+    lid = f'<shape type="disk"><transform name="to_world">{flat}</transform>{ref(material)}</shape>'
+    return side + lid
+
+
+def scale(by):
+    return f'<scale x="{by[0]}" y="{by[1]}" z="{by[2]}"/>'
+
+
+def translate(by):
+    return f'<translate x="{by[0]}" y="{by[1]}" z="{by[2]}"/>'
+
+
+def ref(material):
+    return f'<ref id="{material}"/>'
+
+
+def room(left, right, low, high, far, near=0.02):
+    """Returns floor, ceiling, two side walls and the far wall; the room is open behind the camera."""
+    thick = 0.02
+    return (
+        box((right, low - thick, near), (left, low, far)),
+        box((right, high, near), (left, high + thick, far)),
+        box((left, low, near), (left + thick, high, far)),
+        box((right - thick, low, near), (right, high, far)),
+        box((right - thick, low - thick, far), (left + thick, high + thick, far + thick)),
+    )
+
+
+HALF_46 = math.tan(math.radians(23.0))
+
+FOAM = Scene(
+    name="foam",
+    view=((-HALF_46, HALF_46), (-HALF_46, HALF_46)),
+    laser_scan="TCI_large_scene_16pts--laser_scan_16pts.mat",
+    # All beams end inside of the narrower view.
+    spread=0.72,
+    gate=(0.9, 4.5),
+    shapes=(
+        *room(0.62, -0.50, -0.36, 0.42, 1.25),
+        turned((0.16, -0.29, 0.90), (0.07, 0.07, 0.07), 28),
+        # The cylinder of the laboratory is one inch wide.
+        rod((-0.14, -0.36, 0.95), (-0.14, -0.16, 0.95), 0.0127),
+        box((-0.38, 0.0, 1.245), (-0.12, 0.24, 1.249), "mirror"),
+    ),
+)
+
+HEAD = Scene(
+    name="head",
+    view=None,
+    laser_scan="TCI_large_scene_16pts--laser_scan_16pts.mat",
+    spread=1.0,
+    gate=(0.9, 6.2),
+    shapes=(
+        *room(1.25, -0.95, -1.10, 0.85, 1.90),
+        ball((0.10, 0.02, 1.30), (0.085, 0.125, 0.105)),
+        ball((0.10, 0.00, 1.195), (0.014, 0.022, 0.024)),
+        ball((0.188, 0.01, 1.30), (0.012, 0.030, 0.020)),
+        ball((0.012, 0.01, 1.30), (0.012, 0.030, 0.020)),
+        rod((0.10, -0.24, 1.32), (0.10, -0.08, 1.32), 0.055),
+        ball((0.10, -0.34, 1.34), (0.23, 0.14, 0.11)),
+        box((-0.10, -1.10, 1.20), (0.30, -0.46, 1.50)),
+    ),
+)
+
+CORNER = Scene(
+    name="corner",
+    view=None,
+    laser_scan="Depth_Chart_Collection--laser_scan_16pts.mat",
+    spread=1.15,
+    gate=(0.9, 6.2),
+    shapes=(
+        *room(1.20, -0.85, -1.00, 0.80, 2.00),
+        # An armchair.
+        turned((0.45, -0.78, 1.55), (0.26, 0.10, 0.24), 20),
+        turned((0.53, -0.50, 1.76), (0.26, 0.30, 0.05), 20),
+        turned((0.71, -0.66, 1.47), (0.04, 0.16, 0.22), 20),
+        turned((0.21, -0.66, 1.64), (0.04, 0.16, 0.22), 20),
+        # A table with a lamp.
+        box((-0.62, -0.52, 1.30), (-0.16, -0.48, 1.72)),
+        *(
+            rod((x, -1.00, z), (x, -0.52, z), 0.018)
+            for x in (-0.59, -0.19)
+            for z in (1.33, 1.69)
+        ),
+        rod((-0.40, -0.48, 1.52), (-0.40, -0.22, 1.52), 0.02),
+        ball((-0.40, -0.15, 1.52), (0.10, 0.09, 0.10)),
+        # A shelf on the far wall.
+        box((-0.10, 0.22, 1.78), (0.62, 0.25, 2.00)),
+        box((0.34, 0.25, 1.82), (0.46, 0.46, 1.98)),
+    ),
+)
+
+SCENES = {scene.name: scene for scene in (FOAM, HEAD, CORNER)}
+
+
+def mitsuba(scene, focal, principal, size, directions):
+    """Returns the scene as text.
+
+    focal is in widths of the image, principal is the principal point's offset in widths and heights,
+    and directions are those of the beams.
+    """
+    fov = 2 * math.degrees(math.atan(0.5 / focal))
+    beams = []
+    for x, y, z in directions:
+        target = f"{BASELINE_M + x}, {y}, {z}"
+        beams.append(
+            '<emitter type="spot"><float name="cutoff_angle" value="0.5"/><transform name="to_world">'
+            f'<lookat origin="{BASELINE_M}, 0, 0" target="{target}" up="0, 1, 0"/></transform></emitter>'
+        )
+    white = '<bsdf type="diffuse" id="white"><rgb name="reflectance" value="0.8, 0.8, 0.8"/></bsdf>'
+    mirror = '<bsdf type="conductor" id="mirror"><string name="material" value="none"/></bsdf>'
+    return (
+        '<scene version="3.0.0"><sensor type="perspective">'
+        f'<float name="fov" value="{fov}"/><string name="fov_axis" value="x"/>'
+        f'<float name="principal_point_offset_x" value="{principal[0]}"/>'
+        f'<float name="principal_point_offset_y" value="{principal[1]}"/>'
+        '<transform name="to_world"><lookat origin="0, 0, 0" target="0, 0, 1" up="0, 1, 0"/></transform>'
+        f'<film type="hdrfilm"><integer name="width" value="{size}"/><integer name="height" value="{size}"/></film>'
+        f"</sensor>{white}{mirror}{''.join(beams)}{''.join(scene.shapes)}</scene>"
+    )
