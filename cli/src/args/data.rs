@@ -247,6 +247,7 @@ pub enum CapturesArg {
     #[default]
     Separate,
     Sum,
+    Both,
 }
 
 impl ImportArgs {
@@ -272,6 +273,7 @@ impl ImportArgs {
             captures: match self.captures {
                 CapturesArg::Separate => Captures::Separate,
                 CapturesArg::Sum => Captures::Sum,
+                CapturesArg::Both => Captures::Both,
             },
             straight_beams: self.straight_beams,
             unchecked: self.unchecked,

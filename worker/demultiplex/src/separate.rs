@@ -15,7 +15,7 @@ use picofarm_settings::Gate;
 use rayon::prelude::*;
 
 use crate::{
-    Capture, Demultiplexed, DemultiplexError, Ground, Place,
+    Capture, DemultiplexError, Demultiplexed, Ground, Place,
     demultiplex::{LEAP, NEAR, relative, spot_normal},
     geometry::{Rays, Source, normals, places},
 };
@@ -98,12 +98,13 @@ pub fn separate<E: From<DemultiplexError>>(
         Separate::MatchedFilter => lit,
         Separate::Likelihood => {
             let mut all = vec![0.0; count * pixels];
-            for source in &found.sources {
+            for (source, normal) in found.sources.iter().zip(&surface.at) {
                 let histogram = read(source.beam)?;
                 let judge = likelihood::Judge {
                     timing: Timing::new(&capture.gate, source),
                     photons,
                     source,
+                    normal: *normal,
                     rays: &found.rays,
                     surface: &surface,
                     albedo: &albedo,
@@ -181,7 +182,9 @@ impl Found {
         let own = self.sources.iter().filter_map(|source| {
             let found = self.returns[source.beam * pixels + pixel];
             let (range, slope) = along(source, ray, found.path_m)?;
-            found.lit.then(|| (range, found.variance_m2 * slope * slope))
+            found
+                .lit
+                .then(|| (range, found.variance_m2 * slope * slope))
         });
         let own: Vec<(f32, f32)> = own.collect();
         let range = match method {

@@ -5,6 +5,7 @@
 //! pixel's albedo times cos·cos/r², with the albedo from the pixel's own returns. All lengths in
 //! bins are those of 8 ps.
 
+use picofarm_scene::Vec3;
 use rayon::prelude::*;
 
 use super::{
@@ -70,7 +71,10 @@ fn statistics(h: &[f32], b: f64, bin: usize, timing: &Timing) -> Option<Peak> {
         return None;
     }
     let mean = part().map(|(k, n)| n * k).sum::<f64>() / photons;
-    let square = part().map(|(k, n)| n * (k - mean) * (k - mean)).sum::<f64>() / photons;
+    let square = part()
+        .map(|(k, n)| n * (k - mean) * (k - mean))
+        .sum::<f64>()
+        / photons;
     Some(Peak {
         bin,
         mean,
@@ -86,7 +90,11 @@ fn greatest(h: &[f32], weights: &[f32]) -> (usize, f32) {
     for bin in 0..h.len() {
         let skip = reach.saturating_sub(bin);
         let from = bin.saturating_sub(reach);
-        let f: f32 = weights[skip..].iter().zip(&h[from..]).map(|(w, x)| w * x).sum();
+        let f: f32 = weights[skip..]
+            .iter()
+            .zip(&h[from..])
+            .map(|(w, x)| w * x)
+            .sum();
         if f > best.1 {
             best = (bin, f);
         }
@@ -142,6 +150,8 @@ pub struct Judge<'a> {
     pub timing: Timing,
     pub photons: f32,
     pub source: &'a Source,
+    /// Normal of the surface that the spot is on, camera axes.
+    pub normal: Vec3,
     pub rays: &'a Rays,
     pub surface: &'a Surface,
     /// Photons for cos·cos/r².
@@ -153,12 +163,12 @@ impl Judge<'_> {
     /// to a half by the prior: the answer is the same.
     pub fn lit(&self, histogram: &[f32], out: &mut [f32]) {
         let bins = self.timing.gate.bins as usize;
-        let normal = self.normal();
         out.par_iter_mut()
             .zip(histogram.par_chunks(bins))
             .enumerate()
             .for_each(|(p, (lit, h))| {
-                let expected = self.albedo[p] * shape(self.rays, self.surface, self.source, normal, p);
+                let expected =
+                    self.albedo[p] * shape(self.rays, self.surface, self.source, self.normal, p);
                 let x = self.rays.unit[p] * (self.surface.depth[p] * self.rays.slant[p]);
                 let path = f64::from(self.source.path(x));
                 let gate = &self.timing.gate;
@@ -170,15 +180,6 @@ impl Judge<'_> {
                 let seen = f64::from(h[range].iter().sum::<f32>() * self.photons);
                 *lit = probability(seen, ambient, f64::from(expected)) as f32;
             });
-    }
-
-    fn normal(&self) -> picofarm_scene::Vec3 {
-        crate::demultiplex::spot_normal(
-            self.rays,
-            &self.surface.depth,
-            &self.surface.normals,
-            self.source,
-        )
     }
 }
 

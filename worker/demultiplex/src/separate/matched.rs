@@ -4,7 +4,7 @@
 //! log10 of the maximum > −2.5 as lit. Three things differ here. Its histograms have the unit of
 //! one renderer, so that the threshold means nothing for others: here each histogram is divided by
 //! its sum, as in the preprocessing of PlatoNeRF's own method, and the maximum is a density for a
-//! bin of 8 ps. The background is subtracted. Its product of spectra lacks the conjugate, which
+//! bin of 8 ps. The background is subtracted from the maximum. Its product of spectra lacks the conjugate, which
 //! mirrors the pulse in time: here it is a correlation.
 
 use rayon::prelude::*;
@@ -70,7 +70,7 @@ pub fn returns(histogram: &[f32], timing: &Timing, out: &mut [Return]) {
         .for_each(|(found, h)| {
             let b = timing.background(h);
             let light: Vec<f32> = h.iter().map(|x| x - b).collect();
-            let sum: f32 = light.iter().sum();
+            let sum: f32 = h.iter().sum();
             let (bin, c) = pulse.greatest(&light);
             let score = density * c / sum;
             let lit = sum > 0.0 && score > 0.0 && libm::log10f(score) > THRESHOLD_LOG10;
