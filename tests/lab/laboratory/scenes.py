@@ -16,9 +16,11 @@ class Scene:
     name: str
     # Limits of the view in the plane z = 1, [u, v]; None takes those of the detector's scan.
     view: tuple | None
-    # The laser scan with the voltages of the spots, and the factor on their slopes.
+    # The laser scan with the voltages of the spots, the factor on their slopes, and the depth at which
+    # a beam without voltage crosses the axis of the camera.
     laser_scan: str
     spread: float
+    aim_m: float
     # First path and last path of the gate, metres.
     gate: tuple
     shapes: tuple
@@ -91,13 +93,14 @@ FOAM = Scene(
     laser_scan="TCI_large_scene_16pts--laser_scan_16pts.mat",
     # All beams end inside of the narrower view.
     spread=0.72,
+    aim_m=1.25,
     gate=(0.9, 4.5),
     shapes=(
         *room(0.62, -0.50, -0.36, 0.42, 1.25),
         turned((0.16, -0.29, 0.90), (0.07, 0.07, 0.07), 28),
         # The cylinder of the laboratory is one inch wide.
         rod((-0.14, -0.36, 0.95), (-0.14, -0.16, 0.95), 0.0127),
-        box((-0.38, 0.0, 1.245), (-0.12, 0.24, 1.249), "mirror"),
+        box((-0.37, 0.07, 1.245), (-0.21, 0.27, 1.249), "mirror"),
     ),
 )
 
@@ -106,6 +109,7 @@ HEAD = Scene(
     view=None,
     laser_scan="TCI_large_scene_16pts--laser_scan_16pts.mat",
     spread=1.0,
+    aim_m=1.9,
     gate=(0.9, 6.2),
     shapes=(
         *room(1.25, -0.95, -1.10, 0.85, 1.90),
@@ -124,6 +128,7 @@ CORNER = Scene(
     view=None,
     laser_scan="Depth_Chart_Collection--laser_scan_16pts.mat",
     spread=1.15,
+    aim_m=2.0,
     gate=(0.9, 6.2),
     shapes=(
         *room(1.20, -0.85, -1.00, 0.80, 2.00),

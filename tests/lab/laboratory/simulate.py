@@ -32,7 +32,7 @@ T0_S = 14.2428e-9
 WIDTH_M = BIN_S * LIGHT_M_S
 ZERO_M = T0_S * LIGHT_M_S
 # Degrees of the beam for a volt at the laser's galvo: a mirror of 0.5 V per degree turns the beam by
-# twice its own angle. The laser's own calibration is not published.
+# twice its own angle. The laser's own calibration and zero are not published.
 DEGREES_PER_VOLT = 4.0
 PULSE = "Replica_Collection_and_Bias_Lookup_Table--replica.mat"
 SCAN = "TCI_large_scene_16pts--detector_scan_200x200.mat"
@@ -84,6 +84,7 @@ def beams(scene, data):
     """Returns the slopes of the beams at the laser, [spot, 3]."""
     volts = scipy.io.loadmat(data / scene.laser_scan)["V_UV"]
     slopes = np.tan(np.radians(DEGREES_PER_VOLT * volts)) * scene.spread
+    slopes[:, 0] -= scenes.BASELINE_M / scene.aim_m
     return np.column_stack([slopes, np.ones(len(slopes))])
 
 
@@ -148,9 +149,11 @@ def simulate(scene, data, args):
 def write(file, counts, first, background, rng):
     """Writes one capture, with the bins before the gate that a timer also records."""
     size, bins = counts.shape[0], counts.shape[-1]
-    cube = np.empty((size * size, first + bins), dtype=np.uint16, order="F")
+    # The one-bounce return may have more than 65535 photons.
+    kind = np.uint16 if counts.max() < 2**16 else np.uint32
+    cube = np.empty((size * size, first + bins), dtype=kind, order="F")
     cube[:, :first] = rng.poisson(background, (size * size, first))
-    cube[:, first:] = np.minimum(counts.reshape(size * size, bins), 65535)
+    cube[:, first:] = counts.reshape(size * size, bins)
     scipy.io.savemat(file, {"dataCube": cube}, do_compression=True)
 
 
