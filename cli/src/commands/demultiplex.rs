@@ -1,5 +1,5 @@
-//! `picofarm demultiplex`: one flash taken apart by physics, or separate captures by the methods that
-//! were published for them.
+//! `picofarm demultiplex`: one flash taken apart by physics, or separate captures by published
+//! methods.
 
 mod picture;
 mod read;

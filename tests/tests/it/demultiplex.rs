@@ -112,7 +112,10 @@ fn separate_captures_give_depth_and_masks_by_the_published_methods() {
         // They find no mirrors, and claim none.
         assert!(!scratch.join(method).join("mirror").exists());
         cli.run(&["demultiplex", "sum", "--method", method, "--out", "none"])
-            .fails(3, &["sum", "no histogram of each spot", "--groups per-spot"]);
+            .fails(
+                3,
+                &["sum", "no histogram of each spot", "--groups per-spot"],
+            );
     }
     let useless = ["--method", "likelihood", "--shadows", "learned"];
     cli.run(&[&["demultiplex", "render", "--out", "none"][..], &useless].concat())

@@ -32,7 +32,7 @@ pub enum Separate {
     MatchedFilter,
     /// Peak statistics: mean, width and photons of a return. Depth is the mean over the spots,
     /// weighted by inverse variance. A pixel is lit where a likelihood ratio of the photons at the
-    /// expected time says so.
+    /// expected time exceeds a limit.
     Likelihood,
 }
 
@@ -129,7 +129,7 @@ pub fn separate<E: From<DemultiplexError>>(
     })
 }
 
-/// What the captures say of each pair of pixel and spot.
+/// The returns of all pairs of pixel and spot.
 struct Found {
     rays: Rays,
     places: Vec<Option<Place>>,
@@ -138,7 +138,7 @@ struct Found {
     returns: Vec<Return>,
 }
 
-/// What all spots together say of each pixel.
+/// The surface that all spots together give.
 struct Surface {
     depth: Vec<f32>,
     confidence: Vec<f32>,

@@ -7,8 +7,8 @@
 //! checked. Bin k (from 1) has the time k · 8 ps − t0. The files contain neither t0 nor the laser's
 //! position.
 //!
-//! If all captures become one scene, it has their sum and, if asked for, each of them. Two-bounce times and detections next to them are
-//! imported, too: [`two_bounce`].
+//! If all captures become one scene, it has their sum and, if asked for, each of them. Two-bounce
+//! times and detections next to them are imported, too: [`two_bounce`].
 
 mod scan;
 mod two_bounce;

@@ -4,8 +4,8 @@
 //! log10 of the maximum > −2.5 as lit. Three things differ here. Its histograms have the unit of
 //! one renderer, so that the threshold means nothing for others: here each histogram is divided by
 //! its sum, as in the preprocessing of PlatoNeRF's own method, and the maximum is a density for a
-//! bin of 8 ps. The background is subtracted from the maximum. Its product of spectra lacks the conjugate, which
-//! mirrors the pulse in time: here it is a correlation.
+//! bin of 8 ps. The background is subtracted from the maximum. Its product of spectra lacks the
+//! conjugate, which mirrors the pulse in time: here it is a correlation.
 
 use rayon::prelude::*;
 

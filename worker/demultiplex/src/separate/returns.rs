@@ -1,4 +1,4 @@
-//! What a capture of one spot says of a pixel, and the times that both methods share.
+//! The return of one spot at a pixel, and the times that both methods share.
 
 use picofarm_settings::Gate;
 

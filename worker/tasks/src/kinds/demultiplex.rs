@@ -1,6 +1,6 @@
 //! Demultiplexing: stores depth, and the pixels that each spot lights, of a scene, computed by
-//! physics from the histogram of all spots, or by another method from that of each spot. The task adopts predictions that exist, or computes and
-//! publishes them in the form of an infer stage.
+//! physics from the histogram of all spots, or by another method from that of each spot. The task
+//! adopts predictions that exist, or computes and publishes them in the form of an infer stage.
 
 mod flash;
 
