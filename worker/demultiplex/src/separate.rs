@@ -125,7 +125,7 @@ pub fn separate<E: From<DemultiplexError>>(
         lit,
         albedo: relative(albedo),
         mirror: None,
-        mirror_probability: Vec::new(),
+        mirror_probability: vec![0.0; pixels],
     })
 }
 

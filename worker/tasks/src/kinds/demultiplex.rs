@@ -136,8 +136,10 @@ impl RunTask for DemultiplexTask {
         };
         if depth.is_none() {
             answers.depth_m = made.depth_m;
-            // Methods for separate captures find no mirrors, and have none of these.
-            answers.specular = made.mirror_probability.iter().map(|m| byte(*m)).collect();
+            // Methods for separate captures find no mirrors.
+            if spec.specular {
+                answers.specular = made.mirror_probability.iter().map(|m| byte(*m)).collect();
+            }
             answers.confidence = made.confidence.iter().map(|c| byte(*c)).collect();
         }
         manifest.agreement =
