@@ -200,7 +200,7 @@ mod tests {
 
     #[test]
     fn a_half_is_nine_tenths_at_equal_priors() {
-        for (seen, ambient, expected) in [(7.0, 3.0, 4.0), (5.0, 3.0, 4.0), (60.0, 9.0, 50.0)] {
+        for (seen, ambient, expected) in [(7.0, 3.0, 4.0), (5.0, 3.0, 4.0), (20.0, 9.0, 12.0)] {
             // P = 1/(1 + exp(Q log λ0 − Q log λ1 − λ0 + λ1)), as published.
             let (none, some) = (f64::ln(ambient), f64::ln(ambient + expected));
             let published = 1.0 / (1.0 + f64::exp(seen * none - seen * some + expected));
