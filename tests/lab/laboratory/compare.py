@@ -66,8 +66,8 @@ def views(depth):
 
 def render_depth(program, file, origin, target, out):
     """Returns z-depth of a scene file from a place; 0 where nothing is seen."""
-    command = [program, "scene", "render", file, "--out", out, "--samples", 1, "--bins", 3, "--bin-width-m", 5]
-    command += ["--resolution", f"{SIDE}x{SIDE}", "--fov", 70, "--spots", 1, "--unit", "m", "--max-bounces", 1]
+    command = [program, "scene", "render", file, "--out", out, "--samples", 2, "--bins", 3, "--bin-width-m", 5]
+    command += ["--resolution", SIDE, "--fov", 70, "--spots", 1, "--unit", "m", "--max-bounces", 2]
     command += ["--look-from", ",".join(map(str, origin)), "--look-at", ",".join(map(str, target))]
     done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
     if done.returncode != 0:
@@ -109,15 +109,49 @@ def mesh_errors(program, true, mesh, temporary):
     return float(np.concatenate(errors).mean()), missing / total
 
 
+def picture(folder, scenes, file):
+    """Draws true and found depth of the noisy captures, and the mask of one spot."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    rows, columns = 2 * len(scenes), 1 + len(METHODS)
+    figure, axes = pyplot.subplots(rows, columns, figsize=(1.9 * columns, 1.9 * rows), squeeze=False)
+    for k, scene in enumerate(scenes):
+        depth, lit, _ = truth_of(folder / scene)
+        low, high = np.quantile(depth, [0.01, 0.99])
+        # The spot whose mask has the most shadow without being dark.
+        spot = int(np.argmin(np.abs(lit.mean(axis=(1, 2)) - 0.8)))
+        found = [zarr.open_group(folder / f"{scene}-{m}-noisy", mode="r") for m in METHODS]
+        depths = [depth, *(np.asarray(g["depth"][0]) for g in found)]
+        masks = [lit[spot] == 1, *(np.asarray(g["lit"][0, spot]) >= 128 for g in found)]
+        for n, (z, mask) in enumerate(zip(depths, masks)):
+            axes[2 * k, n].imshow(z, vmin=low, vmax=high, cmap="viridis")
+            axes[2 * k + 1, n].imshow(mask, vmin=0, vmax=1, cmap="gray")
+            if k == 0:
+                axes[0, n].set_title(["truth", "physics", "matched filter", "likelihood"][n], fontsize=9)
+        axes[2 * k, 0].set_ylabel(f"{scene}, depth", fontsize=9)
+        axes[2 * k + 1, 0].set_ylabel("lit by a spot", fontsize=9)
+    for axis in axes.flat:
+        axis.set_xticks([])
+        axis.set_yticks([])
+    figure.tight_layout(pad=0.3)
+    figure.savefig(file, dpi=90)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--program", default="picofarm")
     parser.add_argument("--no-meshes", action="store_true")
+    parser.add_argument("--picture", type=pathlib.Path, help="file to draw (needs matplotlib)")
     args = parser.parse_args()
     scenes = [path.parent.name for path in sorted(args.folder.glob("*/truth"))]
     if not scenes:
         sys.exit(f"{args.folder}: has no SCENE/truth; run simulate.py with this folder as --out")
+    if args.picture:
+        picture(args.folder, scenes, args.picture)
     tables = {"images": {}, "meshes": {}}
     for scene in scenes:
         truth = truth_of(args.folder / scene)

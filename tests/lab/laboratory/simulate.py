@@ -122,7 +122,7 @@ def simulate(scene, data, args):
     shape, peak = pulse(data)
     blurred = np.empty_like(light)
     for k, each in enumerate(light):
-        whole = scipy.signal.oaconvolve(each, shape[None, None, :].astype(np.float32), axes=2)
+        whole = scipy.signal.fftconvolve(each, shape[None, None, :].astype(np.float32), axes=2)
         blurred[k] = np.maximum(whole[..., peak : peak + bins], 0)
     # Eight spots share a byte.
     lit = np.unpackbits(np.asarray(truth["visibility"][0]), axis=0, bitorder="little")[: len(light)] == 1

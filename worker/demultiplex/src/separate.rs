@@ -38,6 +38,8 @@ pub enum Separate {
 
 /// Deviation of a spot's range from the pixel's up to which it agrees, metres.
 const AGREES_M: f32 = 0.05;
+/// Least cosine that is assumed: a normal from a map of depths may be wrong, and the light decides.
+const LEAST_COSINE: f32 = 0.1;
 /// Least cos·cos/r², 1/m², from which the energy of a pair tells the albedo.
 const LEAST_SHAPE: f32 = 0.02;
 
@@ -234,7 +236,7 @@ fn shape(rays: &Rays, surface: &Surface, source: &Source, normal: Vec3, pixel: u
     let way = way / square.sqrt();
     let facing = |n: Vec3, d: Vec3| match n == Vec3::ZERO {
         true => 1.0,
-        false => n.dot(d).max(0.0),
+        false => n.dot(d).max(LEAST_COSINE),
     };
     facing(normal, way) * facing(surface.normals[pixel], -way) / square
 }
