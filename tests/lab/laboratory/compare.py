@@ -26,6 +26,8 @@ METHODS = {
     "likelihood": "likelihood ratio, 16 captures",
 }
 MESHES = ["truth", "captures-16", "filter", "flash", "captures-4", "captures-1"]
+# Cosine up to which a surface and a spot count as on one plane.
+LEAST_COSINE = 0.05
 # Error of a ray that meets the scene but not the mesh, or differs by more, metres.
 MOST_M = 0.5
 SIDE = 64
@@ -34,22 +36,35 @@ SIDE = 64
 def truth_of(folder):
     group = zarr.open_group(folder / "truth", mode="r")
     depth = np.asarray(group["depth"][0])
-    spots = len(group["spots"][0])
-    lit = np.unpackbits(np.asarray(group["visibility"][0]), axis=0, bitorder="little")[:spots]
-    return depth, lit, np.asarray(group["specular"][0])
+    spots = np.asarray(group["spots"][0])
+    lit = np.unpackbits(np.asarray(group["visibility"][0]), axis=0, bitorder="little")[: len(spots)]
+    # Pairs of pixel and spot that carry two-bounce light unless something is in between.
+    fx, fy, cx, cy = np.asarray(group["intrinsics"][0])
+    rows, columns = np.indices(depth.shape) + 0.5
+    seen = np.stack([(columns - cx) / fx * depth, (rows - cy) / fy * depth, depth], -1)
+    normals = np.asarray(group["normal"][0])
+    ways = seen[None] - spots[:, None, None, :3]
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True).clip(1e-9)
+    cosines = np.minimum((ways * spots[:, None, None, 3:6]).sum(-1), -(ways * normals[None]).sum(-1))
+    return depth, lit, np.asarray(group["specular"][0]), cosines > LEAST_COSINE
 
 
 def depth_and_masks(truth, folder):
-    """Returns the mean error of depth in metres, its median, and the IoU of masks."""
-    depth, lit, specular = truth
+    """Returns the mean error of depth in metres, its median, the IoU of masks over all pairs of pixel
+    and spot, that over pairs that can carry light, and that of "all lit" over these."""
+    depth, lit, specular, carry = truth
     group = zarr.open_group(folder, mode="r")
     seen = (depth > 0) & (specular == 0)
     off = np.abs(np.asarray(group["depth"][0]) - depth)[seen]
     found = np.asarray(group["lit"][0]) >= 128
     known = np.broadcast_to(specular == 0, lit.shape)
     true = lit == 1
-    both, either = (found & true & known).sum(), ((found | true) & known).sum()
-    return float(off.mean()), float(np.median(off)), float(both / either)
+
+    def iou(found, of):
+        return float((found & true & of).sum() / ((found | true) & of).sum())
+
+    masks = [iou(found, known), iou(found, known & carry), iou(np.ones_like(found), known & carry)]
+    return float(off.mean()), float(np.median(off)), *masks
 
 
 def views(depth):
@@ -119,7 +134,7 @@ def picture(folder, scenes, file):
     rows, columns = 2 * len(scenes), 1 + len(METHODS)
     figure, axes = pyplot.subplots(rows, columns, figsize=(1.9 * columns, 1.9 * rows), squeeze=False)
     for k, scene in enumerate(scenes):
-        depth, lit, _ = truth_of(folder / scene)
+        depth, lit, *_ = truth_of(folder / scene)
         low, high = np.quantile(depth, [0.01, 0.99])
         # The spot whose mask has the most shadow without being dark.
         spot = int(np.argmin(np.abs(lit.mean(axis=(1, 2)) - 0.8)))
@@ -174,10 +189,11 @@ def main():
                     for mesh in sorted((args.folder / name).rglob("mesh.ply")):
                         tables["meshes"][f"{scene} {noise} {kind}"] = mesh_errors(args.program, true, mesh, temporary)
     (args.folder / "tables.json").write_text(json.dumps(tables, indent=2) + "\n")
-    print("| capture | method | depth MAE, m | median, m | shadow IoU |\n| --- | --- | --- | --- | --- |")
-    for key, (mean, median, iou) in tables["images"].items():
+    print("| capture | method | depth MAE, m | median, m | shadow IoU | where light can be | all lit |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for key, (mean, median, iou, carrying, all_lit) in tables["images"].items():
         scene, noise, method = key.split()
-        print(f"| {scene}, {noise} | {METHODS[method]} | {mean:.4f} | {median:.4f} | {iou:.3f} |")
+        print(f"| {scene}, {noise} | {METHODS[method]} | {mean:.4f} | {median:.4f} | {iou:.3f} | {carrying:.3f} | {all_lit:.3f} |")
     print("\n| capture | 3D from | error, m | not met |\n| --- | --- | --- | --- |")
     for key, (mean, missing) in tables["meshes"].items():
         scene, noise, kind = key.split()

@@ -118,7 +118,7 @@ def simulate(scene, data, args):
         sys.exit(f"{scene.name}: the renderer's camera is {seen}, expected {expected}")
     if np.isnan(np.asarray(truth["spots"][0])[:, :3]).any():
         sys.exit(f"{scene.name}: a beam meets nothing")
-    light = np.asarray(truth["transient_spots"][0])
+    light = histograms(truth["transient_spots"])
     shape, peak = pulse(data)
     blurred = np.empty_like(light)
     for k, each in enumerate(light):
@@ -144,6 +144,13 @@ def simulate(scene, data, args):
             counts = np.rint(rate) if noise == "clean" else rng.poisson(rate)
             write(folder / f"spot_{k + 1}.mat", counts, first, background, rng)
         print(f"{folder}: {len(light)} captures of {size}x{size} pixels, {bins} bins from {start_m:.4f} m")
+
+
+def histograms(array):
+    """Returns the histograms of scene 0 as [spot, row, column, bin], whatever the order on disk."""
+    names = array.metadata.dimension_names[1:]
+    order = [names.index(name) for name in ("spot", "row", "column", "bin")]
+    return np.ascontiguousarray(np.asarray(array[0]).transpose(order))
 
 
 def write(file, counts, first, background, rng):
