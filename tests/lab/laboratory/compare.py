@@ -25,7 +25,17 @@ METHODS = {
     "matched-filter": "matched filter, 16 captures",
     "likelihood": "likelihood ratio, 16 captures",
 }
-MESHES = ["truth", "captures-16", "filter", "flash", "captures-4", "captures-1"]
+# Names of reconstructions, by what they are made from.
+MESHES = {
+    "3d-truth": "the truth",
+    "3d-captures-clean": "16 captures without noise",
+    "3d-captures-noisy": "16 captures",
+    "3d-likelihood-noisy": "16 captures, likelihood ratio",
+    "3d-captures-four": "4 captures",
+    "3d-captures-one": "1 capture",
+    "3d-flash-clean": "one flash without noise",
+    "3d-flash-noisy": "one flash",
+}
 # Cosine up to which a surface and a spot count as on one plane.
 LEAST_COSINE = 0.05
 # Error of a ray that meets the scene but not the mesh, or differs by more, metres.
@@ -183,21 +193,19 @@ def main():
             for k, (origin, target) in enumerate(views(truth[0])):
                 out = temporary / f"truth-{k}"
                 true.append((origin, target, render_depth(args.program, args.folder / scene / "scene.xml", origin, target, out)))
-            for noise in ("clean", "noisy"):
-                for kind in MESHES:
-                    name = f"{scene}-3d-truth" if kind == "truth" else f"{scene}-3d-{kind}-{noise}"
-                    for mesh in sorted((args.folder / name).rglob("mesh.ply")):
-                        tables["meshes"][f"{scene} {noise} {kind}"] = mesh_errors(args.program, true, mesh, temporary)
+            for kind in MESHES:
+                for mesh in sorted((args.folder / f"{scene}-{kind}").rglob("mesh.ply")):
+                    tables["meshes"][f"{scene} {kind}"] = mesh_errors(args.program, true, mesh, temporary)
     (args.folder / "tables.json").write_text(json.dumps(tables, indent=2) + "\n")
     print("| capture | method | depth MAE, m | median, m | shadow IoU | where light can be | all lit |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for key, (mean, median, iou, carrying, all_lit) in tables["images"].items():
         scene, noise, method = key.split()
         print(f"| {scene}, {noise} | {METHODS[method]} | {mean:.4f} | {median:.4f} | {iou:.3f} | {carrying:.3f} | {all_lit:.3f} |")
-    print("\n| capture | 3D from | error, m | not met |\n| --- | --- | --- | --- |")
+    print("\n| scene | 3D from | error, m | not met |\n| --- | --- | --- | --- |")
     for key, (mean, missing) in tables["meshes"].items():
-        scene, noise, kind = key.split()
-        print(f"| {scene}, {noise} | {kind} | {mean:.4f} | {100 * missing:.1f} % |")
+        scene, kind = key.split()
+        print(f"| {scene} | {MESHES[kind]} | {mean:.4f} | {100 * missing:.1f} % |")
 
 
 if __name__ == "__main__":

@@ -42,6 +42,10 @@ BEFORE, AFTER = 80, 400
 NOISE = {"noisy": (40.0, 0.1), "clean": (20_000.0, 0.0)}
 
 
+# Folders with only some of the noisy captures, by number.
+FEW = {"four": (1, 5, 11, 15), "one": (11,)}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=pathlib.Path, default=os.environ.get("PICOFARM_BF_LIDAR"))
@@ -143,7 +147,18 @@ def simulate(scene, data, args):
             rng = np.random.default_rng([7, k])
             counts = np.rint(rate) if noise == "clean" else rng.poisson(rate)
             write(folder / f"spot_{k + 1}.mat", counts, first, background, rng)
+        if noise == "noisy":
+            for name, spots in FEW.items():
+                fewer(folder, out / name, spots)
         print(f"{folder}: {len(light)} captures of {size}x{size} pixels, {bins} bins from {start_m:.4f} m")
+
+
+def fewer(folder, out, spots):
+    """Writes a folder with only some captures of another one."""
+    out.mkdir(exist_ok=True)
+    for file in [*folder.glob("*.json"), *folder.glob("detector_scan*"), *(folder / f"spot_{k}.mat" for k in spots)]:
+        (out / file.name).unlink(missing_ok=True)
+        os.link(file, out / file.name)
 
 
 def histograms(array):
