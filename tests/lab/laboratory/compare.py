@@ -119,12 +119,16 @@ def turned(file, out):
     out.write_bytes(head + b"end_header\n" + vertices.tobytes() + body[vertices.nbytes :])
 
 
-def mesh_errors(program, true, mesh, temporary):
+def mesh_errors(program, true, mesh, temporary, kind):
+    # The truth's world is that of the scene file; captures are in the camera's axes.
     file = temporary / "mesh.ply"
-    turned(mesh, file)
+    if kind == "3d-truth":
+        file.write_bytes(mesh.read_bytes())
+    else:
+        turned(mesh, file)
     errors, missing, total = [], 0, 0
     for k, (origin, target, expected) in enumerate(true):
-        out = temporary / f"{mesh.parent.parent.name}-{k}"
+        out = temporary / f"{kind}-{k}"
         found = render_depth(program, file, origin, target, out)
         seen = expected > 0
         off = np.where(found > 0, np.abs(found - expected), MOST_M)
@@ -195,7 +199,7 @@ def main():
                 true.append((origin, target, render_depth(args.program, args.folder / scene / "scene.xml", origin, target, out)))
             for kind in MESHES:
                 for mesh in sorted((args.folder / f"{scene}-{kind}").rglob("mesh.ply")):
-                    tables["meshes"][f"{scene} {kind}"] = mesh_errors(args.program, true, mesh, temporary)
+                    tables["meshes"][f"{scene} {kind}"] = mesh_errors(args.program, true, mesh, temporary, kind)
     (args.folder / "tables.json").write_text(json.dumps(tables, indent=2) + "\n")
     print("| capture | method | depth MAE, m | median, m | shadow IoU | where light can be | all lit |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
