@@ -218,8 +218,8 @@ pub struct ImportArgs {
     /// Arrival time at zero distance, seconds (bf-lidar)
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     pub t0_s: Option<f64>,
-    /// Captures of single spots: one scene each, or the sum of a folder as one scene (platonerf,
-    /// bf-lidar)
+    /// Captures of single spots: one scene each, the sum of a folder as one scene (platonerf,
+    /// bf-lidar), or a scene with both the sum and each capture (bf-lidar)
     #[arg(long, value_enum, default_value_t = CapturesArg::Separate)]
     pub captures: CapturesArg,
     /// No mirror folds a beam: each is straight from the laser to its spot (sb3d, npy)
