@@ -39,7 +39,7 @@ SCAN = "TCI_large_scene_16pts--detector_scan_200x200.mat"
 # Bins of the measured pulse before and after its peak.
 BEFORE, AFTER = 80, 400
 # Photons in the brightest two-bounce bin of the median lit pixel, and background photons for each bin.
-NOISE = {"noisy": (40.0, 0.1), "clean": (20_000.0, 0.0)}
+NOISE = {"noisy": (40.0, 0.1), "clean": (4_000.0, 0.0)}
 
 
 # Folders with only some of the noisy captures, by number.
