@@ -264,8 +264,8 @@ pub struct ImportArgs {
     /// Arrival time at zero distance, seconds (bf-lidar)
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     pub t0_s: Option<f64>,
-    /// Captures of single spots: one scene each, or the sum of a folder as one scene (platonerf,
-    /// bf-lidar)
+    /// Captures of single spots: one scene each, the sum of a folder as one scene (platonerf,
+    /// bf-lidar), or a scene with both the sum and each capture (bf-lidar)
     #[arg(long, value_enum, default_value_t = CapturesArg::Separate)]
     pub captures: CapturesArg,
     /// No mirror folds a beam: each is straight from the laser to its spot (sb3d, npy)
@@ -293,6 +293,7 @@ pub enum CapturesArg {
     #[default]
     Separate,
     Sum,
+    Both,
 }
 
 impl ImportArgs {
@@ -318,6 +319,7 @@ impl ImportArgs {
             captures: match self.captures {
                 CapturesArg::Separate => Captures::Separate,
                 CapturesArg::Sum => Captures::Sum,
+                CapturesArg::Both => Captures::Both,
             },
             straight_beams: self.straight_beams,
             unchecked: self.unchecked,

@@ -33,7 +33,7 @@ pub use data::{
     SensorArgs,
 };
 pub use dataset::Dataset;
-pub use demultiplex::{Demultiplex, PlacesArg, ShadowsArg};
+pub use demultiplex::{Demultiplex, MethodArg, PlacesArg, ShadowsArg};
 pub use farm::{Coordinator, Demo, Http, Traces, Up, Worker, Workers};
 pub use figure::{ColoursArg, Figure, PanelArg};
 pub use guard::{Audit, Guard, Token};

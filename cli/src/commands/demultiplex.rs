@@ -1,20 +1,23 @@
-//! `picofarm demultiplex`: one flash taken apart by physics.
+//! `picofarm demultiplex`: one flash taken apart by physics, or separate captures by published
+//! methods.
 
 mod picture;
 mod read;
 
 use std::time::Instant;
 
-use picofarm_dataset::{RenderArray, write_render_group};
+use futures::executor::block_on;
+use picofarm_dataset::{RenderArray, SingleRender, write_render_group};
 use picofarm_demultiplex::{
-    Demultiplexed, DepthScore, MaskScore, Residual, Settings, Shading, VERSION, demultiplex,
-    residual, score,
+    DemultiplexError, Demultiplexed, DepthScore, MaskScore, Residual, SEPARATE_VERSION, Separate,
+    Settings, Shading, VERSION, demultiplex, residual, score, separate,
 };
 use serde_json::{Map, json};
 
 pub(super) use self::read::Flash;
 use crate::{
-    args::{Demultiplex, ShadowsArg},
+    args::{Demultiplex, MethodArg, ShadowsArg},
+    commands::rendered::unreadable,
     error::{CliError, Code, Result},
     output::{
         Output, duration,
@@ -62,16 +65,29 @@ struct Made {
 
 fn make(args: Demultiplex) -> Result<Made> {
     let flash = Flash::read(&args.render, args.places)?;
-    let settings = Settings {
-        shadows: match args.shadows {
-            ShadowsArg::Physics => Shading::Physics,
-            ShadowsArg::Learned => Shading::Learned,
-        },
-        ..Settings::default()
-    };
+    let refused = |e: DemultiplexError| CliError::input(format!("{}: {e}", args.render.display()));
     let start = Instant::now();
-    let found = demultiplex(&flash.capture(), &settings)
-        .map_err(|e| CliError::input(format!("{}: {e}", args.render.display())))?;
+    let (found, settings, version) = match args.method {
+        MethodArg::Physics => {
+            let settings = Settings {
+                shadows: match args.shadows {
+                    Some(ShadowsArg::Physics) => Shading::Physics,
+                    Some(ShadowsArg::Learned) | None => Shading::Learned,
+                },
+                ..Settings::default()
+            };
+            let found = demultiplex(&flash.capture(), &settings).map_err(refused)?;
+            (found, json!(settings), VERSION)
+        }
+        MethodArg::MatchedFilter => {
+            let found = from_captures(&args, &flash, Separate::MatchedFilter)?;
+            (found, json!({"method": "matched-filter"}), SEPARATE_VERSION)
+        }
+        MethodArg::Likelihood => {
+            let found = from_captures(&args, &flash, Separate::Likelihood)?;
+            (found, json!({"method": "likelihood"}), SEPARATE_VERSION)
+        }
+    };
     let seconds = start.elapsed().as_secs_f64();
     let truth = flash.truth();
     let depth = truth.as_ref().map(|t| score::depth(&found.depth_m, t));
@@ -93,7 +109,7 @@ fn make(args: Demultiplex) -> Result<Made> {
         "albedo": "relative to the median pixel's",
         "confidence": "0 to 1: how well the histogram speaks for the depth",
         "settings": settings,
-        "version": VERSION,
+        "version": version,
         "scores": {"depth": depth, "masks": masks, "mirrors_iou": mirrors, "residual": residual},
     });
     let attributes = attributes
@@ -113,6 +129,51 @@ fn make(args: Demultiplex) -> Result<Made> {
         mirrors,
         residual,
         seconds,
+    })
+}
+
+/// The failure of a method that reads captures itself.
+enum Failed {
+    Method(DemultiplexError),
+    Read(CliError),
+}
+
+impl From<DemultiplexError> for Failed {
+    fn from(e: DemultiplexError) -> Self {
+        Self::Method(e)
+    }
+}
+
+/// Finds depth and shadows in the histograms of each spot.
+fn from_captures(args: &Demultiplex, flash: &Flash, method: Separate) -> Result<Demultiplexed> {
+    let folder = &args.render;
+    if args.shadows.is_some() {
+        let what = "--shadows is for --method physics";
+        return Err(CliError::input(what).hint("leave it out"));
+    }
+    let none = || {
+        let what = format!(
+            "{}: has no histogram of each spot, which --method reads",
+            folder.display()
+        );
+        CliError::input(what)
+            .hint("render with --groups per-spot, or import the histograms of each spot")
+    };
+    if !SingleRender::is_in(folder) {
+        return Err(none());
+    }
+    let single = block_on(SingleRender::open(folder)).map_err(|e| unreadable(folder, e))?;
+    if !single.dataset.spec().per_spot {
+        return Err(none());
+    }
+    let manifest = block_on(single.dataset.manifest(0)).map_err(|e| unreadable(folder, e))?;
+    let mut read = |spot: usize| {
+        let read = block_on(single.dataset.read_spot(0, flash.beams[spot] as u32));
+        read.map_err(|e| Failed::Read(unreadable(folder, e)))
+    };
+    separate(&flash.capture(), method, manifest.scale, &mut read).map_err(|e| match e {
+        Failed::Method(e) => CliError::input(format!("{}: {e}", folder.display())),
+        Failed::Read(e) => e,
     })
 }
 
@@ -141,14 +202,16 @@ fn write(
         dimension_names: &["spot", "row", "column"],
         data,
     };
-    let arrays = [
+    let mut arrays = vec![
         image("depth", &found.depth_m),
         image("confidence", &found.confidence),
         image("albedo", &found.albedo),
-        image("mirror", &found.mirror_probability),
         by_spot("lit", &found.lit),
         by_spot("ground", &ground),
     ];
+    if found.mirror.is_some() {
+        arrays.push(image("mirror", &found.mirror_probability));
+    }
     write_render_group(&args.out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
 }
 

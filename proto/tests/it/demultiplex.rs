@@ -55,6 +55,8 @@ fn a_demultiplexing_has_a_task_for_each_scene_and_needs_no_model() {
         "version = \"x\"",
         "depth = \"truth\"",
         "evidence = true",
+        "method = \"matched-filter\"",
+        "method = \"likelihood\"",
     ] {
         assert_ne!(key(other), plain, "{other}");
     }
@@ -68,6 +70,22 @@ fn a_demultiplexing_that_cannot_be_is_refused_with_its_field() {
             "demultiplex.histogram: \"transient_spots\" has each spot alone",
         ),
         (apart("places = \"guessed\"", PLACE), "guessed"),
+        (apart("method = \"guessed\"", PLACE), "guessed"),
+        (
+            apart("method = \"likelihood\", evidence = true", PLACE),
+            "demultiplex.evidence: is for method = \"physics\"",
+        ),
+        (
+            apart(
+                "method = \"matched-filter\", histogram = \"transient_25\"",
+                PLACE,
+            ),
+            "demultiplex.histogram: is for method = \"physics\"",
+        ),
+        (
+            apart("method = \"matched-filter\", depth = \"truth\"", PLACE),
+            "demultiplex.depth: is for method = \"physics\"",
+        ),
         (apart("models = [\"a\"]", PLACE), "models"),
         (
             apart("", "store = \"/s\", dataset = \"rooms\""),

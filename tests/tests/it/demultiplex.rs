@@ -90,6 +90,39 @@ fn spots_are_found_by_their_returns_and_a_sensors_counts_will_do() {
 }
 
 #[test]
+fn separate_captures_give_depth_and_masks_by_the_published_methods() {
+    let scratch = Scratch::new("demultiplex-separate");
+    let cli = Cli::new(scratch.path());
+    let room = ["--kind", "plato", "--object", "hidden-box", "--spots", "4"];
+    cli.run(&[&["scene", "generate", "--out", "room.glb"][..], &room].concat())
+        .ok();
+    let size = ["--resolution", "32", "--samples", "8"];
+    let spots = ["--groups", "per-spot"];
+    let render = ["scene", "render", "room.glb", "--out"];
+    cli.run(&[&render[..], &["render"], &size, &spots].concat())
+        .ok();
+    cli.run(&[&render[..], &["sum"], &size].concat()).ok();
+    for method in ["matched-filter", "likelihood"] {
+        let demultiplex = ["demultiplex", "render", "--method", method, "--out"];
+        let said = cli.json(&[&demultiplex[..], &[method]].concat());
+        let median = said["depth"]["median_m"].as_f64().unwrap();
+        assert!(median < 0.03, "{method}: {said}");
+        let (shape, _) = array(&scratch.join(method), "lit");
+        assert_eq!(shape, [4, 32, 32]);
+        // They find no mirrors, and claim none.
+        assert!(!scratch.join(method).join("mirror").exists());
+        cli.run(&["demultiplex", "sum", "--method", method, "--out", "none"])
+            .fails(
+                3,
+                &["sum", "no histogram of each spot", "--groups per-spot"],
+            );
+    }
+    let useless = ["--method", "likelihood", "--shadows", "learned"];
+    cli.run(&[&["demultiplex", "render", "--out", "none"][..], &useless].concat())
+        .fails(3, &["--shadows is for --method physics"]);
+}
+
+#[test]
 fn what_is_no_flash_is_refused_by_name() {
     let scratch = Scratch::new("demultiplex-refused");
     let cli = Cli::new(scratch.path());

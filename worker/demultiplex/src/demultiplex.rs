@@ -20,9 +20,9 @@ use crate::{
 };
 
 /// Half width of the neighbourhood that a normal follows from, steps ([`Rays::step`]).
-const NEAR: usize = 2;
+pub const NEAR: usize = 2;
 /// Share of depth beyond which a neighbour is another surface.
-const LEAP: f32 = 0.04;
+pub const LEAP: f32 = 0.04;
 
 /// The same around spots, at least.
 const SPOT: usize = 3;
@@ -323,7 +323,7 @@ fn finish(rays: &Rays, slants: &Slants, settings: &Settings) -> (Vec<f32>, Vec<f
 
 /// Normal of the surface that a spot is on: of the planes seen around it the one, moved to the
 /// spot, to which most of the visible points around it belong.
-fn spot_normal(rays: &Rays, depth: &[f32], normals: &[Vec3], source: &Source) -> Vec3 {
+pub fn spot_normal(rays: &Rays, depth: &[f32], normals: &[Vec3], source: &Source) -> Vec3 {
     let Some(p) = rays.pixel_of(source.point) else {
         return Vec3::ZERO;
     };
@@ -359,7 +359,7 @@ fn spot_normal(rays: &Rays, depth: &[f32], normals: &[Vec3], source: &Source) ->
 }
 
 /// Over the median.
-fn relative(albedo: Vec<f32>) -> Vec<f32> {
+pub fn relative(albedo: Vec<f32>) -> Vec<f32> {
     let mut sorted = albedo.clone();
     sorted.sort_by(f32::total_cmp);
     let median = sorted[sorted.len() / 2].max(f32::MIN_POSITIVE);

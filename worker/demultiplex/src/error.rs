@@ -28,4 +28,15 @@ impl DemultiplexError {
             what: what.into(),
         }
     }
+
+    /// Names the spot that an argument is about.
+    pub(crate) fn in_spot(self, spot: usize) -> Self {
+        match self {
+            Self::Invalid { argument, what } => Self::Invalid {
+                argument: format!("capture of spot {spot}: {argument}"),
+                what,
+            },
+            other => other,
+        }
+    }
 }

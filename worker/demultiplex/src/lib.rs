@@ -22,6 +22,7 @@ mod peaks;
 mod planes;
 mod residual;
 pub mod score;
+mod separate;
 mod settings;
 mod shadows;
 mod sweep;
@@ -33,6 +34,7 @@ pub use error::DemultiplexError;
 pub use evidence::Evidence;
 pub use residual::{Residual, residual};
 pub use score::{DepthScore, MaskScore, Truth};
+pub use separate::{SEPARATE_VERSION, Separate, separate};
 pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 

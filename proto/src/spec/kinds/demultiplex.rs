@@ -38,10 +38,13 @@ pub struct DemultiplexTask {
     pub output: OutputSettings,
 }
 
-/// The input of the method.
+/// The method and its input.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemultiplexSettings {
+    /// The method.
+    #[serde(skip_serializing_if = "is_default")]
+    pub method: Method,
     /// The histogram of several spots: `transient`, `transient_4` or `transient_25`.
     pub histogram: Histogram,
     /// Source of the places of the spots.
@@ -57,6 +60,31 @@ pub struct DemultiplexSettings {
     /// Version of the method and of the encoder, part of every task key; filled in at submission if
     /// omitted.
     pub version: String,
+}
+
+/// The way to depth and shadows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// One flash is taken apart by physics.
+    #[default]
+    Physics,
+    /// PlatoNeRF's matched filter, from a histogram of each spot alone.
+    MatchedFilter,
+    /// Bounce-flash lidar's peak statistics and likelihood ratio, from a histogram of each spot
+    /// alone.
+    Likelihood,
+}
+
+impl Method {
+    /// Returns the name in job files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Physics => "physics",
+            Self::MatchedFilter => "matched-filter",
+            Self::Likelihood => "likelihood",
+        }
+    }
 }
 
 /// Source of the places of the spots.
@@ -80,6 +108,31 @@ pub enum DepthSource {
     Own,
     /// The ground truth.
     Truth,
+}
+
+impl DemultiplexSettings {
+    /// Returns an error for fields that the method does not use.
+    fn check_method(&self) -> Result<(), SpecError> {
+        if self.method == Method::Physics {
+            return Ok(());
+        }
+        let useless = [
+            ("histogram", self.histogram != Histogram::default()),
+            ("depth", self.depth != DepthSource::default()),
+            ("evidence", self.evidence),
+        ];
+        match useless.iter().find(|(_, given)| *given) {
+            Some((field, _)) => Err(SpecError::new(
+                format!("demultiplex.{field}"),
+                format!(
+                    "is for method = \"physics\"; method = {:?} reads the histogram of each spot alone \
+                     and finds its own depth; remove it",
+                    self.method.name()
+                ),
+            )),
+            None => Ok(()),
+        }
+    }
 }
 
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
@@ -126,6 +179,7 @@ impl TaskKind for DemultiplexTask {
     fn check(&self) -> Result<(), SpecError> {
         check_source(&self.source)?;
         check_count("count", self.count)?;
+        self.demultiplex.check_method()?;
         if self.demultiplex.histogram == Histogram::TransientSpots {
             let what = "\"transient_spots\" has each spot alone, so nothing is multiplexed; expected \"transient\", \
                         \"transient_4\" or \"transient_25\"";

@@ -7,8 +7,8 @@
 //! checked. Bin k (from 1) has the time k · 8 ps − t0. The files contain neither t0 nor the laser's
 //! position.
 //!
-//! If all captures become one scene, two-bounce times and detections next to them are imported,
-//! too: [`two_bounce`].
+//! If all captures become one scene, it has their sum and, if asked for, each of them. Two-bounce
+//! times and detections next to them are imported, too: [`two_bounce`].
 
 mod scan;
 mod two_bounce;
@@ -63,7 +63,7 @@ pub(super) fn find(
         ) && captures(folder).is_ok_and(|c| !c.is_empty())
     };
     let folders = super::folders_with(root, opener, is_scene)?;
-    if options.captures == Captures::Sum {
+    if options.captures != Captures::Separate {
         return Ok(folders);
     }
     let mut items = Vec::new();
@@ -206,6 +206,7 @@ pub(super) fn read(
     let given = given.map(|both| two_bounce::read(&both, &scan, paths.len(), laser, files));
     let given = given.transpose()?;
     let mut total: Option<(Shape, Vec<f32>)> = None;
+    let mut each = Vec::new();
     let (mut positions, mut checks, mut conversions) = (Vec::new(), Vec::new(), Vec::new());
     for path in &paths {
         let cube = Mat::open(path, files)?;
@@ -239,6 +240,9 @@ pub(super) fn read(
         let (position, check) = scan.spot(path, &shape, &counts, laser)?;
         positions.push(position);
         checks.push(check);
+        if options.captures == Captures::Both {
+            each.extend_from_slice(&counts);
+        }
         match &mut total {
             None => total = Some((shape, counts)),
             Some((first, sum)) => {
@@ -279,6 +283,7 @@ pub(super) fn read(
         }
         Some(_) => "spots are those of illum_pts".to_string(),
     });
+    scene.each = each;
     if paths.len() > 1 {
         conversions.push(format!("{} captures summed", paths.len()));
     }

@@ -198,7 +198,7 @@ impl Source {
             width: self.shape.width,
             spots: self.shape.spots,
             subsets: self.shape.subsets,
-            per_spot: false,
+            per_spot: self.options.captures == Captures::Both,
             wavelengths_nm: Wavelength::NONE,
             two_bounce: self.shape.two_bounce,
             gate: self.shape.gate,

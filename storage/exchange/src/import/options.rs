@@ -83,6 +83,8 @@ pub enum Captures {
     Separate,
     /// All captures of a folder are summed into one scene with all spots.
     Sum,
+    /// Like `Sum`, and the scene also has each capture.
+    Both,
 }
 
 /// Overrides. A `None` value is taken from the files or from the format's conventions, and checked.
@@ -132,7 +134,7 @@ impl ImportOptions {
     /// Returns an error for options that the format does not use, and for invalid values.
     pub(super) fn check(&self, format: Format) -> Result<(), ImportError> {
         use Format::{BfLidar, Npy, Platonerf, Sb3d};
-        let given: [(&'static str, bool, &[Format]); 12] = [
+        let given: [(&'static str, bool, &[Format]); 13] = [
             (
                 "--gate-start-m",
                 self.gate_start_m.is_some(),
@@ -156,6 +158,11 @@ impl ImportOptions {
                 "--captures",
                 self.captures != Captures::Separate,
                 &[Platonerf, BfLidar],
+            ),
+            (
+                "--captures both",
+                self.captures == Captures::Both,
+                &[BfLidar],
             ),
         ];
         for (option, given, formats) in given {

@@ -79,6 +79,8 @@ pub struct ImportedScene {
     pub(super) shape: Shape,
     pub(super) transient: Vec<f32>,
     pub(super) subsets: Vec<(Quantity, Vec<f32>)>,
+    /// Each spot alone, `[spot][row][column][bin]`; empty if the data set has no such array.
+    pub(super) each: Vec<f32>,
     pub(super) depth: Vec<f32>,
     pub(super) range: Vec<f32>,
     pub(super) normal: Vec<f32>,
@@ -114,6 +116,7 @@ impl ImportedScene {
             check: Value::Null,
             transient,
             subsets: Vec::new(),
+            each: Vec::new(),
             depth: vec![0.0; n],
             range: vec![0.0; n],
             normal: vec![0.0; n * 3],
@@ -232,7 +235,7 @@ impl ImportedScene {
 
     /// Calls `use_it` with the record for the encoder.
     pub(super) fn with_record<T>(&self, use_it: impl FnOnce(&SceneRecord<'_>) -> T) -> T {
-        let subsets: Vec<SubsetRecord<'_>> = self
+        let mut subsets: Vec<SubsetRecord<'_>> = self
             .subsets
             .iter()
             .map(|(quantity, h)| SubsetRecord {
@@ -240,6 +243,12 @@ impl ImportedScene {
                 planes: vec![h],
             })
             .collect();
+        if !self.each.is_empty() {
+            subsets.push(SubsetRecord {
+                quantity: Quantity::TransientSpots,
+                planes: self.each.chunks_exact(self.transient.len()).collect(),
+            });
+        }
         let bins = self.shape.gate.bins as usize;
         let scale = self
             .scale

@@ -398,3 +398,37 @@ fn two_bounce_paths_must_fit_spots_and_depth() {
         }
     }
 }
+
+#[tokio::test]
+async fn captures_of_one_scene_are_kept_next_to_their_sum_if_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    collection(folder.path());
+    let source = Source::open(folder.path(), None, options(Captures::Both), None).unwrap();
+    assert_eq!(source.scenes(), 1);
+    assert!(source.spec(Profile::CountsU16).per_spot);
+    let (dataset, _) = published(&source, Profile::CountsU16).await;
+    let sum = dataset.read_transient(0).await.unwrap();
+    let mut expected = vec![0.0; sum.len()];
+    for spot in 0..3 {
+        let one = dataset.read_spot(0, spot).await.unwrap();
+        assert_eq!(one.iter().sum::<f32>(), 200.0);
+        let apart = Source::open(folder.path(), None, options(Captures::Separate), None).unwrap();
+        let (alone, _) = published_scene(&apart, u64::from(spot)).await;
+        assert_eq!(one, alone);
+        expected.iter_mut().zip(one).for_each(|(e, x)| *e += x);
+    }
+    assert_eq!(sum, expected);
+}
+
+/// Returns the histograms of a scene, and the data set.
+async fn published_scene(source: &Source, index: u64) -> (Vec<f32>, Dataset) {
+    let (store, _) = in_memory(&spec(Profile::LOSSLESS)).await;
+    let spec = source.spec(Profile::CountsU16);
+    let dataset = Dataset::create_or_open(store, "sets/b".into(), &spec)
+        .await
+        .unwrap();
+    let scene = import_scene(source, index).unwrap();
+    let encoded = source.encode(&dataset, index, &scene).unwrap();
+    dataset.publish_encoded(encoded).await.unwrap();
+    (dataset.read_transient(index).await.unwrap(), dataset)
+}

@@ -1,21 +1,21 @@
 //! Demultiplexing: stores depth, and the pixels that each spot lights, of a scene, computed by
-//! physics from the histogram of all spots. The task adopts predictions that exist, or computes and
-//! publishes them in the form of an infer stage.
+//! physics from the histogram of all spots, or by another method from that of each spot. The task
+//! adopts predictions that exist, or computes and publishes them in the form of an infer stage.
 
 mod flash;
 
 use picofarm_dataset::{Dataset, ENCODER_VERSION, Manifest, Quantity};
 use picofarm_demultiplex::{
-    DemultiplexError, Demultiplexed, Evidence, Settings, VERSION, demultiplex, shadows_at,
-    with_evidence,
+    DemultiplexError, Demultiplexed, Evidence, SEPARATE_VERSION, Separate, Settings, VERSION,
+    demultiplex, separate, shadows_at, with_evidence,
 };
 use picofarm_proto::{
     key::TaskKey,
     spec::{
-        TaskSpec,
+        Histogram, TaskSpec,
         kinds::{
             DemultiplexTask,
-            demultiplex::{DemultiplexSettings, DepthSource},
+            demultiplex::{DemultiplexSettings, DepthSource, Method},
         },
         memory::EVIDENCE_PLANES,
     },
@@ -39,9 +39,9 @@ use crate::{
 };
 
 pub use flash::Flash;
-use flash::{byte, check_gate, numbers, quantity};
+use flash::{byte, check_gate, numbers, quantity, separate_quantity};
 
-/// Name of the method in manifests, in place of a model's.
+/// Name of the physical method in manifests, in place of a model's.
 const METHOD: &str = "demultiplex";
 /// The memory of tasks is estimated from this number.
 const _: () = assert!(Evidence::PLANES == EVIDENCE_PLANES as usize);
@@ -50,9 +50,12 @@ const READ: f32 = 0.1;
 const APART: f32 = 0.95;
 
 /// Returns the version of all code that determines the bytes of predictions and their manifests:
-/// the method, encoder and agreement figures.
+/// the methods, encoder and agreement figures.
 fn version() -> String {
-    format!("{VERSION}/{ENCODER_VERSION}/{}", agreement::VERSION)
+    format!(
+        "{VERSION}/{SEPARATE_VERSION}/{ENCODER_VERSION}/{}",
+        agreement::VERSION
+    )
 }
 
 impl RunTask for DemultiplexTask {
@@ -64,7 +67,10 @@ impl RunTask for DemultiplexTask {
         let (stores, place, index) = (&context.stores, &self.source, task.index);
         let dataset = stores.open_source(&place.store, &place.dataset, control)?;
         stores.fits(TaskSpec::Demultiplex(self.clone()), Some(dataset.spec()))?;
-        let histogram = quantity(&dataset, self.demultiplex.histogram)?;
+        let histogram = match self.demultiplex.method {
+            Method::Physics => quantity(&dataset, self.demultiplex.histogram)?,
+            other => separate_quantity(&dataset, other)?,
+        };
         check_gate(&dataset)?;
         let found = source_manifest(stores, &dataset, index, control)?;
         if self.demultiplex.depth == DepthSource::Truth {
@@ -97,13 +103,30 @@ impl RunTask for DemultiplexTask {
                 Some(stores.wait(control, read)?)
             }
         };
-        control.say("takes the flash apart".into(), &[]);
-        let (made, evidence) = self.apart(&flash, depth.as_deref()).map_err(|e| {
-            TaskError::User(format!(
-                "source: scene {index} of {place}: {e}",
-                place = dataset.place()
-            ))
-        })?;
+        let user = |e: DemultiplexError| {
+            let place = dataset.place();
+            TaskError::User(format!("source: scene {index} of {place}: {e}"))
+        };
+        let (made, evidence) = match self.separate() {
+            None => {
+                control.say("takes the flash apart".into(), &[]);
+                self.apart(&flash, depth.as_deref()).map_err(user)?
+            }
+            Some(method) => {
+                let mut read = |spot: usize| {
+                    let beam = flash.beams()[spot];
+                    control.say(format!("capture of spot {beam}"), &[]);
+                    proceed(control, READ)?;
+                    Ok(stores.wait(control, dataset.read_spot(index, beam as u32))?)
+                };
+                let made = separate(&flash.capture(), method, found.scale, &mut read);
+                let made = made.map_err(|e| match e {
+                    Failed::Method(e) => user(e),
+                    Failed::Task(e) => e,
+                })?;
+                (made, None)
+            }
+        };
         proceed(control, APART)?;
         let spots = spec.spots.len();
         let mut answers = Predicted {
@@ -113,7 +136,10 @@ impl RunTask for DemultiplexTask {
         };
         if depth.is_none() {
             answers.depth_m = made.depth_m;
-            answers.specular = made.mirror_probability.iter().map(|m| byte(*m)).collect();
+            // Methods for separate captures find no mirrors.
+            if spec.specular {
+                answers.specular = made.mirror_probability.iter().map(|m| byte(*m)).collect();
+            }
             answers.confidence = made.confidence.iter().map(|c| byte(*c)).collect();
         }
         manifest.agreement =
@@ -125,8 +151,29 @@ impl RunTask for DemultiplexTask {
     }
 }
 
+/// The failure of a method that reads captures itself.
+enum Failed {
+    Method(DemultiplexError),
+    Task(TaskError),
+}
+
+impl From<DemultiplexError> for Failed {
+    fn from(e: DemultiplexError) -> Self {
+        Self::Method(e)
+    }
+}
+
+impl From<TaskError> for Failed {
+    fn from(e: TaskError) -> Self {
+        Self::Task(e)
+    }
+}
+
 /// How one task takes a flash apart.
-trait Method {
+trait Work {
+    /// Returns the method, if it is one for separate captures.
+    fn separate(&self) -> Option<Separate>;
+
     /// Returns the layout of the group of predictions.
     fn spec(&self, dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec;
 
@@ -139,7 +186,15 @@ trait Method {
     ) -> Result<(Demultiplexed, Option<Evidence>), DemultiplexError>;
 }
 
-impl Method for DemultiplexTask {
+impl Work for DemultiplexTask {
+    fn separate(&self) -> Option<Separate> {
+        match self.demultiplex.method {
+            Method::Physics => None,
+            Method::MatchedFilter => Some(Separate::MatchedFilter),
+            Method::Likelihood => Some(Separate::Likelihood),
+        }
+    }
+
     fn spec(&self, dataset: &Dataset, spots: Vec<u32>) -> PredictionSpec {
         let source = dataset.spec();
         let own = self.demultiplex.depth == DepthSource::Own;
@@ -149,7 +204,7 @@ impl Method for DemultiplexTask {
             width: source.width,
             depth: own,
             spots,
-            specular: own,
+            specular: own && self.separate().is_none(),
             confidence: own,
             evidence: self.demultiplex.evidence.then(Evidence::form),
         }
@@ -186,14 +241,24 @@ fn manifest(task: &DemultiplexTask, scene: u64, found: &Manifest) -> PredictionM
     };
     let method = json!([version(), input, Settings::default()]).to_string();
     let used = ModelUsed {
-        name: METHOD.to_owned(),
+        name: match task.demultiplex.method {
+            Method::Physics => METHOD,
+            other => other.name(),
+        }
+        .to_owned(),
         manifest_sha256: sha256_hex(method.as_bytes()),
-        histogram: task.demultiplex.histogram.name().to_owned(),
+        histogram: match task.demultiplex.method {
+            Method::Physics => task.demultiplex.histogram,
+            _ => Histogram::TransientSpots,
+        }
+        .name()
+        .to_owned(),
         spots: Vec::new(),
     };
     let named = json!([source.manifest_sha256, method]);
     let key = TaskKey(Sha256::digest(named.to_string()).into());
     let kinds: &[&str] = match task.demultiplex.depth {
+        DepthSource::Own if task.separate().is_some() => &["tof", "shadow"],
         DepthSource::Own => &["tof", "shadow", "specular"],
         DepthSource::Truth => &["shadow"],
     };

@@ -3,7 +3,10 @@
 
 use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_demultiplex::{Capture, Evidence, Place, Spot};
-use picofarm_proto::spec::{Histogram, kinds::demultiplex::Places};
+use picofarm_proto::spec::{
+    Histogram,
+    kinds::demultiplex::{Method, Places},
+};
 use picofarm_scene::{Camera, Intrinsics, Vec3};
 use picofarm_settings::Gate;
 use picofarm_store::StorageError;
@@ -55,10 +58,26 @@ pub(super) fn quantity(dataset: &Dataset, histogram: Histogram) -> Result<Quanti
     )))
 }
 
+/// Returns the array of a histogram for each spot.
+///
+/// # Errors
+/// [`TaskError::User`] if the data set has none.
+pub(super) fn separate_quantity(dataset: &Dataset, method: Method) -> Result<Quantity, TaskError> {
+    match dataset.spec().per_spot {
+        true => Ok(Quantity::TransientSpots),
+        false => Err(TaskError::User(format!(
+            "demultiplex.method: {} has no histogram of each spot alone, which {:?} reads; render it with per_spot = true, \
+             or import it with captures = \"both\"",
+            dataset.place(),
+            method.name()
+        ))),
+    }
+}
+
 /// Returns the spots that contribute to a histogram.
 pub(super) fn numbers(dataset: &Dataset, histogram: Quantity) -> Vec<u32> {
     match histogram {
-        Quantity::Transient => (0..dataset.spec().spots).collect(),
+        Quantity::Transient | Quantity::TransientSpots => (0..dataset.spec().spots).collect(),
         subset => subset.spots_of_100().to_vec(),
     }
 }
@@ -105,7 +124,8 @@ impl Flash {
         stores.wait(control, read)
     }
 
-    /// Reads a scene whose quantities are known to be there.
+    /// Reads a scene whose quantities are known to be there. The histograms of single spots are not
+    /// read.
     ///
     /// # Errors
     /// Those of [`Dataset::read_histogram`] and [`Dataset::read`].
@@ -116,8 +136,14 @@ impl Flash {
         places: Places,
     ) -> Result<Self, StorageError> {
         let spec = dataset.spec();
+        let histogram = async {
+            match quantity {
+                Quantity::TransientSpots => Ok(Vec::new()),
+                _ => dataset.read_histogram(scene, quantity).await,
+            }
+        };
         let (histogram, all, i, pose, laser) = futures::try_join!(
-            dataset.read_histogram(scene, quantity),
+            histogram,
             dataset.read_spots(scene),
             dataset.read_intrinsics(scene),
             dataset.read::<f32>(scene, Quantity::Camera),
