@@ -186,7 +186,7 @@ impl Found {
             let (range, slope) = along(source, ray, found.path_m)?;
             found
                 .lit
-                .then(|| (range, found.variance_m2 * slope * slope))
+                .then_some((range, found.variance_m2 * slope * slope))
         });
         let own: Vec<(f32, f32)> = own.collect();
         let range = match method {
