@@ -47,7 +47,7 @@ pub enum Dataset {
     Report(DatasetReport),
     /// Measure every scene with a sensor, into another data set, without rendering; resumes if run
     /// again
-    Reprocess(DatasetReprocess),
+    Reprocess(Box<DatasetReprocess>),
     /// Export a data set, or a part of it, in another format; resumes if run again
     Export(DatasetExport),
     /// Import Shoot-Bounce-3D's release, PlatoNeRF's or bounce-flash lidar captures, or .npy files;

@@ -54,7 +54,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Repair(args) => repair::run(args, settings, output).await,
         Command::Snapshot(command) => snapshot::run(command, output).await,
         Command::Gc(args) => gc::run(&args, output).await,
-        Command::Reprocess(args) => reprocess::run(args, output).await,
+        Command::Reprocess(args) => reprocess::run(*args, output).await,
         Command::Export(args) => export::run(args, output).await,
         Command::Import(args) => import::run(*args, output).await,
         Command::Split(args) => split::run(args, output).await,
