@@ -122,7 +122,7 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
 
     // The room in space is another picture, which turns by pointer and keyboard.
     let frames = "return new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))";
-    let flat = browser.run(PIXELS);
+    let flat = seek("60");
     browser.run("document.getElementById('screen').focus()");
     browser.press("3");
     browser.until("document.documentElement.dataset.view === 'space'");
