@@ -124,7 +124,7 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
 
     // The room in space is another picture, which turns by pointer and keyboard.
     let frames = "return new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))";
-    let flat = browser.run(PIXELS);
+    let flat = seek("60");
     browser.run("document.getElementById('screen').focus()");
     browser.press("3");
     browser.until("document.documentElement.dataset.view === 'space'");
@@ -246,7 +246,9 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     let view = browser.run(orbit);
     visit(&browser, there.as_str().unwrap());
     browser.until("document.documentElement.dataset.room === 'shown'");
-    browser.press("\t");
+    // Closer and away again: the address is written from the view that it was read into.
+    browser.run("document.getElementById('screen').focus()");
+    browser.press("+-");
     assert_eq!(browser.run(orbit), view, "the address has the view");
     let lines = browser.console();
     assert!(lines.is_empty(), "{lines:?}");

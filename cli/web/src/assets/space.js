@@ -61,10 +61,8 @@ export class Space {
     gl.clearColor(0.03, 0.035, 0.045, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     volume.prepare(program, settings, sharp);
-    program.use({ depth: 3, surface }, {
-      time: settings.time, middle: this.middle, bin: facts.bin_m,
-      dot: 1.4 * Math.min(width, height) / 2 / Math.tan(orbit.field / 2),
-    });
+    this.dot = 1.4 * Math.min(width, height) / 2 / Math.tan(orbit.field / 2);
+    program.use({ depth: 3, surface }, { time: settings.time, middle: this.middle, bin: facts.bin_m, dot: this.dot });
     gl.uniform4fv(program.at('lens'), this.scene.intrinsics);
     gl.uniformMatrix4fv(program.at('see'), false, this.matrix);
     gl.drawArrays(gl.POINTS, 0, facts.width * facts.height);
@@ -98,12 +96,14 @@ export class Space {
   /** Returns column and row of the nearest point under a place of the picture; null for none. */
   pick(x, y, width, height) {
     let best = null, nearest = Infinity;
+    const ratio = this.volume.canvas.width / width;
     for (let i = 0; i < this.depth.length; i++) {
       if (!(this.depth[i] > 0)) continue;
       const at = project(this.matrix, this.point(i), width, height);
       if (!at) continue;
       const away = Math.hypot(at[0] - x, at[1] - y);
-      if (away < 8 && at[2] + away / 20 < nearest) { nearest = at[2] + away / 20; best = i; }
+      const reach = Math.max(8, 0.6 * this.dot / ratio * this.depth[i] / this.scene.intrinsics[0] / at[2]);
+      if (away < reach && at[2] + away / 20 < nearest) { nearest = at[2] + away / 20; best = i; }
     }
     return best === null ? null : [best % this.facts.width, Math.floor(best / this.facts.width)];
   }

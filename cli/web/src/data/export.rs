@@ -205,7 +205,7 @@ pub fn figure(
 
 fn nanoseconds(volume: &Volume, bin: f64) -> f64 {
     let gate = &volume.spec().gate;
-    (f64::from(gate.start_m) + bin * f64::from(gate.bin_width_m)) / METRES_PER_NS
+    (gate.start_m + bin * gate.bin_width_m) / METRES_PER_NS
 }
 
 /// The histogram of a pixel from its first light to nearly all, with the times of two bounces.

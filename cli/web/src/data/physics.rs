@@ -45,7 +45,7 @@ pub fn verdict(
 ) -> Result<Value, Problem> {
     let gate = &truth.spec.gate;
     let bin_of = |path: f64| {
-        let bin = (path - f64::from(gate.start_m)) / f64::from(gate.bin_width_m);
+        let bin = (path - gate.start_m) / gate.bin_width_m;
         bin.floor() as i64
     };
     let (spots, mirrors) = (truth.spots.as_ref()?, truth.specular.as_ref()?);
@@ -180,7 +180,7 @@ fn join(mut a: Sums, b: Sums) -> Sums {
 }
 
 fn assess(truth: &Truth, sums: &Sums, rendered: Option<[f64; 3]>) -> Value {
-    let bin_m = f64::from(truth.spec.gate.bin_width_m);
+    let bin_m = truth.spec.gate.bin_width_m;
     let (peak, contrast) = match sums.pairs {
         0 => (None, None),
         _ => (peak(&sums.shifted), contrast(&sums.shifted)),
