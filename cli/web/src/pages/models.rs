@@ -319,6 +319,12 @@ fn pretty(value: &Value) -> String {
 fn plain(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
+        Value::Object(parts) => {
+            let parts = parts
+                .iter()
+                .map(|(name, value)| format!("{name} {}", plain(value)));
+            parts.collect::<Vec<_>>().join(", ")
+        }
         Value::Number(number) if number.is_f64() => number
             .as_f64()
             .map(picofarm_figures::number::short)
