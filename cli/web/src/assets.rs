@@ -18,6 +18,14 @@ pub fn find(name: &str) -> Option<(&'static str, &'static str)> {
         "flight.js" => (SCRIPT, include_str!("assets/flight.js")),
         "volume.js" => (SCRIPT, include_str!("assets/volume.js")),
         "histogram.js" => (SCRIPT, include_str!("assets/histogram.js")),
+        "gl.js" => (SCRIPT, include_str!("assets/gl.js")),
+        "orbit.js" => (SCRIPT, include_str!("assets/orbit.js")),
+        "space.js" => (SCRIPT, include_str!("assets/space.js")),
+        "save.js" => (SCRIPT, include_str!("assets/save.js")),
+        "room.js" => (SCRIPT, include_str!("assets/room.js")),
+        "glb.js" => (SCRIPT, include_str!("assets/glb.js")),
+        "mesh.js" => (SCRIPT, include_str!("assets/mesh.js")),
+        "marks.js" => (SCRIPT, include_str!("assets/marks.js")),
         _ => return None,
     })
 }

@@ -11,6 +11,7 @@ mod job;
 mod models;
 mod overview;
 mod parts;
+mod room;
 mod scene;
 mod task;
 mod workers;
@@ -66,6 +67,7 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
         ["audit"] => audit::page(app, query).await,
         ["data"] => gallery::page(app, query).await,
         ["data", "scene"] => scene::page(app, query).await,
+        ["data", "room"] => room::page(app, query).await,
         ["models"] => models::page(app, query).await,
         ["models", "model"] => models::model(app, query).await,
         ["models", "sweep"] => models::sweep(app, query).await,

@@ -47,7 +47,12 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     std::fs::write(
         &file,
         format!(
-            "name = \"rooms\"\n{}",
+            "name = \"rooms\"\n{}\
+             [[stage]]\nname = \"apart\"\nkind = \"demultiplex\"\nsource = \"rooms\"\n\
+             output = {{ store = {store:?}, dataset = \"apart\" }}\n\
+             [[stage]]\nname = \"rooms-3d\"\nkind = \"reconstruct\"\nsource = \"rooms\"\n\
+             reconstruct = {{ views = 2, grid = {{ nodes = 48, iterations = 30 }} }}\n\
+             output = {{ store = {store:?}, dataset = \"rooms-3d\" }}\n",
             Rooms::fine(2).per_spot().stage(&store)
         ),
     )
@@ -76,6 +81,16 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     for path in pages {
         visit(&browser, &web.at(path));
     }
+    // The light of a render agrees with its geometry.
+    browser.until("document.querySelectorAll('[data-verdict]').length === 2");
+    let verdicts =
+        "return [...document.querySelectorAll('[data-verdict]')].map(e => e.textContent).join()";
+    let verdicts = browser.run(verdicts);
+    assert_eq!(
+        browser.run("return [...document.querySelectorAll('[data-verdict]')].every(e => e.dataset.verdict === 'agrees')"),
+        true,
+        "{verdicts}"
+    );
     // Images are shown, and the pointer reads values.
     browser.until("[...document.images].every(i => i.complete && i.naturalWidth > 0)");
     browser.run("document.querySelector('.frame').focus()");
@@ -100,13 +115,84 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
     browser.click("screen", [0.3, 0.6]);
     browser.until("document.documentElement.dataset.picked === '9,19'");
     browser.until("document.getElementById('picked').textContent.includes('two bounces')");
+    browser.until("document.getElementById('seen').textContent.startsWith('One flash')");
     let drawn = "const c = document.getElementById('histogram'); \
         return [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data].some(x => x > 0)";
     assert_eq!(browser.run(drawn), true);
     browser.press("\u{e014}");
     browser.until("document.documentElement.dataset.picked === '10,19'");
 
+    // The room in space is another picture, which turns by pointer and keyboard.
+    let frames = "return new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))";
+    let flat = seek("60");
+    browser.run("document.getElementById('screen').focus()");
+    browser.press("3");
+    browser.until("document.documentElement.dataset.view === 'space'");
+    browser.run(frames);
+    let in_space = browser.run(PIXELS);
+    assert_ne!(in_space, flat);
+    browser.press("\u{e014}\u{e013}+");
+    browser.run(frames);
+    let turned = browser.run(PIXELS);
+    assert_ne!(turned, in_space, "arrow keys turn the room");
+    browser.run("document.getElementById('surface').click()");
+    browser.run(frames);
+    assert_ne!(
+        browser.run(PIXELS),
+        turned,
+        "light arrives later than it is at the surfaces"
+    );
+    browser.run("document.getElementById('surface').click()");
+    let orbit = "return new URLSearchParams(location.search).get('orbit')";
+    let view = browser.run(orbit);
+    assert!(
+        view.as_str()
+            .is_some_and(|view| view.split(',').count() == 6)
+    );
+    // A click without a drag picks a point.
+    browser.run("delete document.documentElement.dataset.picked");
+    browser.press("\u{e011}");
+    browser.run(frames);
+    browser.click("screen", [0.5, 0.5]);
+    browser.until("document.documentElement.dataset.picked");
+    browser.run("document.getElementById('screen').focus()");
+    browser.press("2");
+    browser.run(frames);
+    assert_eq!(
+        browser.run("const v = document.getElementById('view'); return [v.width, v.height].join()"),
+        "32,32"
+    );
+
+    // Each export makes a file of its kind.
+    for (button, kind) in [
+        ("export", "png"),
+        ("gif", "gif"),
+        ("figure", "svg"),
+        ("record", "webm"),
+    ] {
+        browser.run("document.documentElement.dataset.saved = ''");
+        browser.run(&format!(
+            "document.getElementById('speed').value = 2; document.getElementById('{button}').click()"
+        ));
+        browser.until(&format!(
+            "/\\.{kind} [1-9]/.test(document.documentElement.dataset.saved)"
+        ));
+    }
+    browser.until("document.getElementById('play').textContent === 'Play'");
+    browser.run("document.getElementById('speed').value = 0");
+
+    // A finger on the strip of light shows the time under it.
+    let scrub = "const e = document.getElementById('energy'), b = e.getBoundingClientRect(); \
+        e.dispatchEvent(new PointerEvent('pointerdown', {pointerId: 1, pointerType: 'touch', \
+        clientX: b.left + b.width / 2, clientY: b.top + 5, bubbles: true}))";
+    browser.run(scrub);
+    browser.run(frames);
+    let middle = "const t = document.getElementById('time'); return t.value / t.max";
+    let at = browser.run(middle).as_f64().unwrap();
+    assert!((at - 0.5).abs() < 0.02, "{at}");
+
     // Space plays, and time moves on.
+    browser.run("document.getElementById('screen').focus()");
     let time = "return document.getElementById('clock').textContent";
     let before = browser.run(time);
     browser.press(" ");
@@ -134,6 +220,34 @@ fn a_browser_plays_light_in_flight_and_shows_the_histogram_of_a_pixel() {
         "spot-2"
     );
     assert_eq!(browser.run(time), shown);
+    let lines = browser.console();
+    assert!(lines.is_empty(), "{lines:?}");
+
+    // The reconstruction in 3D, with the colours of its errors.
+    visit(&browser, &web.at("/data/scene?set=0%2Frooms&scene=1"));
+    browser.run("document.querySelector('a[href*=\"/data/room?\"]').click()");
+    browser.until("document.documentElement.dataset.room === 'shown'");
+    let shown = |colour: &str| {
+        browser.run(&format!(
+            "const c = document.getElementById('colour'); c.value = '{colour}'; \
+             c.dispatchEvent(new Event('input', {{bubbles: true}}))"
+        ));
+        browser.run(frames);
+        browser.run(PIXELS)
+    };
+    let (shape, error, seen) = (shown("shape"), shown("error"), shown("seen"));
+    assert!(shape != error && error != seen && seen != shape);
+    browser.run("document.getElementById('hidden').click()");
+    browser.run(frames);
+    assert_ne!(browser.run(PIXELS), seen, "what the camera does not see");
+    browser.run("document.getElementById('screen').focus()");
+    browser.press("\u{e012}");
+    let there = browser.run("return location.href");
+    let view = browser.run(orbit);
+    visit(&browser, there.as_str().unwrap());
+    browser.until("document.documentElement.dataset.room === 'shown'");
+    browser.press("\t");
+    assert_eq!(browser.run(orbit), view, "the address has the view");
     let lines = browser.console();
     assert!(lines.is_empty(), "{lines:?}");
     drop(web.process);

@@ -1,6 +1,10 @@
 // The player of light in flight: controls, keys, loading, the picked pixel and its histogram.
 import { Volume } from './volume.js';
 import { Histogram, fit } from './histogram.js';
+import { Orbit, follow } from './orbit.js';
+import { imageMarks } from './marks.js';
+import { Space } from './space.js';
+import { Recorder, saveBlob, savePng } from './save.js';
 
 const METRES_PER_NS = 0.299792458;
 const SLAB = 32;
@@ -8,8 +12,9 @@ const $ = (id) => document.getElementById(id);
 const root = $('flight');
 const scene = root.dataset.scene;
 let light = root.dataset.light;
-let facts = null, spots = [], volume = null, histogram = null, energy = [];
+let facts = null, found = null, spots = [], volume = null, histogram = null, energy = [];
 let playing = false, time = 0, picked = null, dirty = true, turn = 0;
+let space = null, orbit = null, inSpace = false, recorder = null;
 
 function fail(text) {
   $('message').textContent = text;
@@ -33,6 +38,8 @@ const asked = new URLSearchParams(location.search);
 for (const [name, id] of Object.entries(KEPT)) if (asked.has(name)) $(id).value = asked.get(name);
 if (asked.get('pixel')?.match(/^\d+,\d+$/)) picked = asked.get('pixel').split(',').map(Number);
 for (const name of ['spots']) if (asked.get(name) === 'yes') $(name).checked = true;
+if (asked.get('surface') === 'no') $('surface').checked = false;
+inSpace = asked.get('view') === 'space';
 
 function address() {
   const now = new URLSearchParams(scene);
@@ -40,6 +47,11 @@ function address() {
   for (const [name, id] of Object.entries(KEPT)) now.set(name, $(id).value);
   if ($('spots').checked) now.set('spots', 'yes');
   if (picked) now.set('pixel', picked.join(','));
+  if (inSpace) {
+    now.set('view', 'space');
+    if (orbit) now.set('orbit', orbit.text());
+    if (!$('surface').checked) now.set('surface', 'no');
+  }
   now.set('bin', time.toFixed(1));
   return `${location.pathname}?${now}`;
 }
@@ -65,7 +77,9 @@ function seek(bin, wrap = false) {
 }
 
 function texts() {
-  const ns = (facts.start_m + time * facts.bin_m) / METRES_PER_NS;
+  // At the surfaces, time is that of the light before its way to the camera.
+  const way = space && inSpace && $('surface').checked ? space.middle : 0;
+  const ns = (facts.start_m + time * facts.bin_m - way) / METRES_PER_NS;
   $('clock').textContent = `${ns.toFixed(2)} ns · ${(ns * METRES_PER_NS).toFixed(2)} m`;
   $('time').value = time;
   $('time').setAttribute('aria-valuetext', `${ns.toFixed(2)} nanoseconds`);
@@ -79,34 +93,14 @@ const rate = () => (facts.lively[1] - facts.lively[0]) / 8 * 2 ** Number($('spee
 
 function marks() {
   const { context: c, width, height } = fit($('marks'));
-  const sx = width / facts.width, sy = height / facts.height;
-  if ($('spots').checked) {
-    c.font = '10px system-ui, sans-serif';
-    spots.forEach((spot, i) => {
-      if (!spot?.film) return;
-      const [x, y] = [spot.film[0] * sx, spot.film[1] * sy];
-      c.strokeStyle = '#000a'; c.lineWidth = 3; ring(c, x, y, 5);
-      c.strokeStyle = light === `spot-${i}` ? '#fff' : '#ffb454'; c.lineWidth = 1.5; ring(c, x, y, 5);
-      c.fillStyle = '#fff';
-      c.fillText(String(i), x + 7, y + 3);
-    });
-  }
-  if (picked) {
-    const [x, y] = [(picked[0] + 0.5) * sx, (picked[1] + 0.5) * sy];
-    for (const [colour, wide] of [['#000b', 4], ['#4cc9f0', 1.5]]) {
-      c.strokeStyle = colour; c.lineWidth = wide;
-      c.beginPath();
-      for (const [dx, dy] of [[-1, 0], [1, 0], [0, -1], [0, 1]]) {
-        c.moveTo(x + 4 * dx, y + 4 * dy); c.lineTo(x + 12 * dx, y + 12 * dy);
-      }
-      c.stroke();
-    }
-  }
+  const shown = { spots: $('spots').checked ? spots : [], picked, light };
+  if (!inSpace) imageMarks(c, width, height, facts, shown);
+  else space?.marks(c, width, height, shown);
 }
 
-function ring(c, x, y, r) { c.beginPath(); c.arc(x, y, r, 0, 2 * Math.PI); c.stroke(); }
-
-// Light over time, with the time that is shown.
+// Light over time, below the slider: the middle of its thumb is at the same place.
+const THUMB = 14;
+const along = (bin, width) => THUMB / 2 + bin / Math.max(1, facts.bins - 1) * (width - THUMB);
 function strip() {
   const { context: c, width, height } = fit($('energy'));
   const style = getComputedStyle(document.documentElement);
@@ -114,25 +108,50 @@ function strip() {
   c.fillStyle = style.getPropertyValue('--more');
   energy.forEach((e, b) => {
     const tall = Math.sqrt(e / most) * (height - 2);
-    c.fillRect(b / facts.bins * width, height - tall, Math.max(0.75, width / facts.bins), tall);
+    c.fillRect(along(b, width), height - tall, Math.max(0.75, along(1, width) - along(0, width)), tall);
   });
   c.fillStyle = style.getPropertyValue('--accent');
-  c.fillRect(time / (facts.bins - 1) * width - 1, 0, 2, height);
+  c.fillRect(along(time, width) - 1, 0, 2, height);
+}
+
+// The picture of the room in space has the pixels of the screen, that of the image its own.
+function resize() {
+  const view = $('view');
+  let [w, h] = [facts.width, facts.height];
+  if (inSpace && space) {
+    const wide = Math.min(1600, Math.round($('screen').clientWidth * Math.min(2, devicePixelRatio || 1)));
+    [w, h] = [wide, Math.round(wide * facts.height / facts.width)];
+  }
+  if (w > 0 && (view.width !== w || view.height !== h)) { view.width = w; view.height = h; }
 }
 
 function draw() {
   if (!volume) return;
-  volume.draw(settings());
+  resize();
+  if (inSpace && space) space.draw(settings(), orbit, $('surface').checked);
+  else volume.draw(settings());
   marks();
   strip();
+  recorder?.frame();
   texts();
-  histogram.draw({ log: $('hlog').checked, zoom: $('zoom').checked, time, shutter: Number($('shutter').value) });
+  histogram.draw({ log: $('hlog').checked, zoom: $('zoom').checked, time: time + later(), shutter: Number($('shutter').value) });
+}
+
+// At the surfaces, light of the picked pixel that is seen now arrives this many bins later.
+function later() {
+  if (!inSpace || !space || !picked || !$('surface').checked) return 0;
+  const i = picked[1] * facts.width + picked[0];
+  return space.depth[i] > 0 ? (Math.hypot(...space.point(i)) - space.middle) / facts.bin_m : 0;
 }
 
 // A frame only where something changed.
 let before = null, counted = 0, since = 0;
 function frame(now) {
-  if (playing && before !== null) seek(time + rate() * Math.min(0.1, (now - before) / 1000), true);
+  if (playing && before !== null) {
+    const next = time + rate() * Math.min(0.1, (now - before) / 1000);
+    if (recorder && next > facts.lively[1]) record();
+    else seek(next, true);
+  }
   before = now;
   if (dirty) { dirty = false; draw(); counted++; }
   if (now - since > 1000) {
@@ -160,6 +179,7 @@ async function pick(column, row) {
     histogram.set(found);
     $('kinds').hidden = !found.whole;
     const v = found.values;
+    $('seen').replaceChildren(...histogram.seen().map((line) => Object.assign(document.createElement('p'), { textContent: line })));
     $('picked').textContent = `Column ${picked[0]}, row ${picked[1]}: ${v.label_name ?? 'nothing'}, ${v.range_m?.toFixed(2) ?? '?'} m · ${histogram.words()}`;
     $('histogram').setAttribute('aria-label', $('picked').textContent);
     document.documentElement.dataset.picked = picked.join(',');
@@ -180,16 +200,18 @@ async function load() {
   image.src = `/bytes/picture?${scene}&what=rgb`;
   try {
     const both = Promise.all([get('flight').then((r) => r.json()), get('coarse').then((r) => r.arrayBuffer())]);
-    const [found, small] = await both;
+    const [answer, small] = await both;
     if (mine !== turn) return;
     const first = !facts;
-    facts = found.volume;
-    spots = found.scene.spots;
+    facts = answer.volume;
+    found = answer.scene;
+    spots = found.spots;
     energy = facts.energy;
     if (volume) volume.gl.getExtension('WEBGL_lose_context') && replaceCanvas();
     volume = new Volume($('view'), facts);
     volume.setSmall(small);
     histogram = new Histogram($('histogram'), facts);
+    space = null;
     const bin = Number(asked.get('bin'));
     if (first) seek(asked.has('bin') && Number.isFinite(bin) ? bin : facts.lively[0] + (facts.lively[1] - facts.lively[0]) / 4);
     draw();
@@ -197,6 +219,7 @@ async function load() {
     document.documentElement.dataset.first = Math.round(performance.now() - began);
     $('loaded').textContent = `first picture after ${Math.round(performance.now() - began)} ms; loading all pixels…`;
     if (picked) pick(...picked);
+    if (inSpace) await enter();
     await image.decode().catch(() => null);
     if (mine !== turn) return;
     if (image.naturalWidth) { volume.setRoom(image); touch(); }
@@ -237,25 +260,93 @@ async function slabs(mine, began) {
   document.documentElement.dataset.flight = 'full';
 }
 
-function save() {
+// The room in space needs the depth, which is asked for once.
+let depth = null;
+async function enter() {
+  inSpace = true;
+  show();
+  // The volume enters when it has arrived.
   if (!volume) return;
-  const times = Math.max(1, Math.round(768 / facts.width));
-  const canvas = document.createElement('canvas');
-  canvas.width = facts.width * times;
-  canvas.height = facts.height * times;
-  const c = canvas.getContext('2d');
-  c.imageSmoothingEnabled = false;
-  volume.draw(settings());
-  c.drawImage($('view'), 0, 0, canvas.width, canvas.height);
-  c.drawImage($('marks'), 0, 0, canvas.width, canvas.height);
-  canvas.toBlob((blob) => {
-    const link = document.createElement('a');
-    link.href = URL.createObjectURL(blob);
-    link.download = `light-in-flight-${(time * facts.bin_m / METRES_PER_NS + facts.start_m / METRES_PER_NS).toFixed(2)}ns.png`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-  });
+  const mine = turn;
+  try {
+    depth ??= get('depth').then((r) => r.arrayBuffer());
+    const values = new Float32Array(await depth);
+    if (mine !== turn || !inSpace) return;
+    if (!space) {
+      space = new Space(volume, values, found);
+      orbit ??= looking();
+    }
+    document.documentElement.dataset.view = 'space';
+  } catch (error) {
+    depth = null;
+    inSpace = false;
+    $('message').textContent = `Only the image is shown: ${error.message}`;
+    $('message').hidden = false;
+  }
+  show();
 }
+
+function looking() {
+  const made = new Orbit(space.middle, found.up, space.extent, touch);
+  if (asked.has('orbit')) made.parse(asked.get('orbit'));
+  return made;
+}
+
+function leave() {
+  inSpace = false;
+  document.documentElement.dataset.view = 'image';
+  show();
+}
+
+function show() {
+  $('image').setAttribute('aria-pressed', String(!inSpace));
+  $('space').setAttribute('aria-pressed', String(inSpace));
+  $('surface').closest('label').hidden = !inSpace;
+  $('how').textContent = inSpace ? 'Drag or the arrow keys turn the room; Shift or two fingers move it; the wheel, + and − go closer and away; Home is the camera.' : '';
+  $('screen').classList.toggle('space', inSpace);
+  keep();
+  touch();
+}
+
+const layers = () => [$('view'), $('marks')];
+const named = (kind) => `light-in-flight-${$('clock').textContent.split(' ')[0]}ns.${kind}`;
+const say = (text) => { $('saved').textContent = text; };
+
+async function attempt(work) {
+  if (!volume) return;
+  try { await work(); } catch (error) { say(`Not saved: ${error.message}.`); }
+}
+
+const png = () => attempt(async () => { draw(); await savePng(layers(), named('png')); say('Saved the picture.'); });
+
+// The server makes these, with the look of the player.
+const fetched = (what, kind) => attempt(async () => {
+  say(`Making the ${kind.toUpperCase()}…`);
+  const look = new URLSearchParams(address().split('?')[1]);
+  const more = ['bin', 'shutter', 'exposure', 'scale', 'map', 'pixel'].filter((name) => look.has(name));
+  const reply = await get(what, more.map((name) => `&${name}=${encodeURIComponent(look.get(name))}`).join(''));
+  saveBlob(await reply.blob(), named(kind));
+  say(`Saved the ${kind.toUpperCase()}.`);
+});
+
+// Plays from the first light to most of it and records that.
+const record = () => attempt(async () => {
+  if (recorder) {
+    const last = recorder;
+    recorder = null;
+    play(false);
+    $('record').textContent = 'Record WebM';
+    await last.stop();
+    say('Saved the video.');
+    return;
+  }
+  seek(facts.lively[0]);
+  draw();
+  recorder = new Recorder(layers, named('webm'));
+  $('record').textContent = 'Stop recording';
+  say('Recording…');
+  play(true);
+});
 
 $('play').addEventListener('click', () => play());
 $('time').addEventListener('input', () => { playing && play(false); seek(Number($('time').value)); });
@@ -266,7 +357,13 @@ $('controls').addEventListener('input', (event) => {
 });
 $('light').addEventListener('change', () => { light = $('light').value; keep(); load(); });
 for (const id of ['hlog', 'zoom']) $(id).addEventListener('input', touch);
-$('export').addEventListener('click', save);
+$('export').addEventListener('click', png);
+$('record').addEventListener('click', record);
+$('gif').addEventListener('click', () => fetched('gif', 'gif'));
+$('figure').addEventListener('click', () => fetched('figure', 'svg'));
+$('image').addEventListener('click', leave);
+$('space').addEventListener('click', enter);
+$('surface').addEventListener('input', () => { keep(); touch(); });
 $('link').addEventListener('click', async () => {
   keep();
   try {
@@ -288,29 +385,45 @@ function pickSpot(u, v) {
 }
 
 $('screen').addEventListener('pointerdown', (event) => {
-  if (!facts || event.button !== 0) return;
+  if (!facts || inSpace || event.button !== 0) return;
   const box = $('view').getBoundingClientRect();
   const [u, v] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
   if ($('spots').checked && pickSpot(u, v)) return;
   pick(Math.floor(u * facts.width), Math.floor(v * facts.height));
 });
-$('histogram').addEventListener('pointerdown', (event) => {
-  if (!histogram?.pixel) return;
-  playing && play(false);
-  seek(histogram.binAt(event.offsetX, $('zoom').checked));
-});
-$('energy').addEventListener('pointerdown', (event) => {
-  if (!facts) return;
-  playing && play(false);
-  seek(event.offsetX / $('energy').clientWidth * facts.bins);
-});
+follow($('screen'), () => (inSpace && space ? orbit : null), (event) => {
+  const box = $('view').getBoundingClientRect();
+  const at = space.pick(event.clientX - box.left, event.clientY - box.top, box.width, box.height);
+  if (at) pick(...at);
+}, keep);
+
+// Scrubs with a pointer, also a finger.
+function scrub(element, bin) {
+  const move = (event) => {
+    if (!facts) return;
+    playing && play(false);
+    seek(bin(event.clientX - element.getBoundingClientRect().left));
+  };
+  element.addEventListener('pointerdown', (event) => {
+    if (event.button !== 0) return;
+    element.setPointerCapture(event.pointerId);
+    move(event);
+  });
+  element.addEventListener('pointermove', (event) => { if (element.hasPointerCapture(event.pointerId)) move(event); });
+  element.addEventListener('pointerup', keep);
+}
+scrub($('histogram'), (x) => histogram?.pixel ? histogram.binAt(x, $('zoom').checked) - later() : time);
+scrub($('energy'), (x) => (x - THUMB / 2) / Math.max(1, $('energy').clientWidth - THUMB) * (facts.bins - 1));
 addEventListener('keydown', (event) => {
   if (!facts || event.ctrlKey || event.metaKey || event.altKey) return;
   const inField = event.target.closest('input, select, button, a');
   const step = { ',': -1, '.': 1, '<': -10, '>': 10 }[event.key];
   if (event.key === ' ' && !event.target.closest('select, button, a, input[type=checkbox]')) { event.preventDefault(); play(); return; }
   if (step && !inField) { playing && play(false); seek(Math.round(time) + step); return; }
+  const act = { 2: leave, 3: enter, s: png, r: record, g: () => fetched('gif', 'gif'), f: () => fetched('figure', 'svg') }[event.key];
+  if (act && (!inField || event.target.matches('button, input[type=range]'))) { act(); return; }
   if (event.target !== $('screen')) return;
+  if (inSpace) { if (orbit?.key(event)) { event.preventDefault(); keep(); } return; }
   const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
   if (!move) return;
   event.preventDefault();

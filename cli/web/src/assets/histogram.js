@@ -72,6 +72,25 @@ export class Histogram {
       (lit ? ` · ${share(of[1])} at times of two bounces,${from}` : ' · no times of two bounces: no spot lights this pixel');
   }
 
+  /** What predictions say of the pixel, a line each. */
+  seen() {
+    const { seen, values, two } = this.pixel;
+    const truth = new Set(two.filter((spot) => spot.lit).map((spot) => spot.spot));
+    return (seen ?? []).map((p) => {
+      const who = `${p.flash ? 'One flash' : 'Predicted'} (${p.place})`;
+      if (p.problem) return `${who}: not readable: ${p.problem}`;
+      const lit = p.lit.filter((s) => s.share >= 0.5).map((s) => s.spot);
+      const missed = [...truth].filter((s) => !lit.includes(s)), wrong = lit.filter((s) => !truth.has(s));
+      const parts = [];
+      if (p.range_m !== null) parts.push(`${p.range_m.toFixed(2)} m` + (values.range_m ? ` (true ${values.range_m.toFixed(2)} m)` : ''));
+      if (p.lit.length) parts.push(`lit by ${lit.length} of ${p.lit.length} spots` + (missed.length ? `, misses ${missed.join(' ')}` : '') +
+        (wrong.length ? `, adds ${wrong.join(' ')}` : missed.length ? '' : ', as in truth'));
+      if (p.confidence !== null) parts.push(`confidence ${(100 * p.confidence).toFixed(0)} %`);
+      if (p.mirror !== null && p.mirror >= 0.5) parts.push('a mirror');
+      return `${who}: ${parts.join(' · ')}`;
+    });
+  }
+
   range(zoom) { return zoom && this.pixel ? this.lit : [0, this.facts.bins]; }
 
   /** The bin under a horizontal place on the canvas. */
@@ -97,9 +116,11 @@ export class Histogram {
       const t = log ? Math.log(Math.max(v, floor) / floor) / Math.log(most / floor) : v / most;
       return bottom - t * (bottom - top);
     };
+    // The shown bins, in the axes.
+    const [from, to] = [time, time + shutter].map((bin) => Math.min(LEFT + wide, Math.max(LEFT, x(bin))));
     c.globalAlpha = 0.2;
     c.fillStyle = css('--text');
-    c.fillRect(x(time), top, Math.max(1.5, x(time + shutter) - x(time)), bottom - top);
+    if (to > from) c.fillRect(from, top, Math.max(1.5, to - from), bottom - top);
     c.globalAlpha = 1;
     const colours = [css('--more'), css('--two'), css('--one')];
     const bar = (b, v, colour) => {
@@ -139,15 +160,37 @@ export class Histogram {
     c.globalAlpha = 1;
     c.strokeStyle = css('--line');
     c.strokeRect(LEFT - 0.5, top + 0.5, wide + 1, bottom - top);
-    c.fillStyle = css('--dim');
-    for (let i = 0; i <= 4; i++) {
-      const text = `${this.ns(lo + (hi - lo) * i / 4).toFixed(1)}${i === 4 ? ' ns' : ''}`;
-      const place = LEFT + wide * i / 4 - (i === 0 ? 0 : i === 4 ? c.measureText(text).width : c.measureText(text).width / 2);
-      c.fillText(text, place, height - 4);
+    // Where predictions look for light: filled for a spot that they judge to light the pixel.
+    const flash = this.pixel.seen?.find((p) => p.lit?.length);
+    for (const spot of flash?.lit ?? []) {
+      const bin = this.bin(spot.path_m);
+      if (bin < lo || bin > hi) continue;
+      c.beginPath();
+      c.moveTo(x(bin), bottom - 6); c.lineTo(x(bin) - 3.5, bottom); c.lineTo(x(bin) + 3.5, bottom); c.closePath();
+      c.lineWidth = 1; c.strokeStyle = c.fillStyle = css('--done');
+      if (spot.share >= 0.5) c.fill(); else c.stroke();
     }
-    c.fillText(most.toPrecision(2), 0, top + 8);
-    c.fillText(log ? floor.toPrecision(2) : '0', 0, bottom);
+    c.fillStyle = css('--dim');
+    const [start, end] = [this.ns(lo), this.ns(hi)];
+    const step = round((end - start) / Math.max(2, Math.min(8, wide / 70)));
+    for (let k = Math.ceil(start / step); k * step <= end; k++) {
+      const place = LEFT + (k * step - start) / (end - start) * wide;
+      c.fillRect(place - 0.5, bottom, 1, 4);
+      const text = (k * step).toFixed(step < 1 ? 1 : 0);
+      const half = c.measureText(text).width / 2;
+      if (place + half < width - 18) c.fillText(text, place - half, height - 3);
+    }
+    c.fillText('ns', width - 14, height - 3);
+    const short = (v) => (v === 0 || (v >= 0.001 && v < 1e4) ? v.toPrecision(2) : v.toExponential(1));
+    c.fillText(short(most), 0, top + 8);
+    c.fillText(log ? short(floor) : '0', 0, bottom);
   }
+}
+
+/** Rounds to 1, 2 or 5 times a power of ten, upwards. */
+function round(x) {
+  const power = 10 ** Math.floor(Math.log10(x));
+  return power * [1, 2, 5, 10].find((n) => n * power >= x);
 }
 
 const LEFT = 48;

@@ -58,3 +58,53 @@ for (const frame of document.querySelectorAll('.frame')) {
     move((Math.floor(from.x * w) + step[0] + 0.5) / w, (Math.floor(from.y * h) + step[1] + 0.5) / h);
   });
 }
+
+// Whether the light agrees with the geometry. Reading the histograms takes a moment.
+function facts(p) {
+  const percent = (x, digits = 1) => `${(100 * x).toFixed(digits)} %`;
+  const list = [];
+  if (p.shares) {
+    const [one, two, more] = p.shares.map((share) => percent(share));
+    list.push(['energy', p.rendered_apart ? `one bounce ${one}, two ${two}, three and more ${more}, rendered apart`
+      : `${one} at times of one bounce, ${two} at times of two, ${more} at others`]);
+  }
+  if (p.peak_bins !== null) list.push(['two-bounce peaks', `${Math.abs(p.peak_bins).toFixed(2)} bins (${Math.abs(1000 * p.peak_m).toFixed(1)} mm) ${p.peak_bins < 0 ? 'before' : 'after'} their predicted times, ` +
+    `${p.pairs} pairs of pixel and spot`]);
+  if (p.contrast !== null) list.push(['brightness there', `${p.contrast.toFixed(2)} times that of other times`]);
+  if (p.early !== null) list.push(['light too early', `in ${percent(p.early, 2)} of the pixels`]);
+  const e = p.error;
+  if (e?.median_relative !== undefined) list.push(['stated error', `median of a pixel ${percent(e.median_relative)}` +
+    (e.p95_relative === undefined ? '' : `, 95 of 100 pixels below ${percent(e.p95_relative)}`)]);
+  if (typeof p.outside === 'number') list.push(['light outside of the gate', percent(p.outside, 2)]);
+  list.push(['coding', `${p.coding_rms_sigma.toFixed(3)} of the photon noise`]);
+  return list;
+}
+
+async function compare(section) {
+  const line = section.querySelector('p');
+  try {
+    const reply = await fetch(`/bytes/physics?${section.dataset.physics}`);
+    if (!reply.ok) {
+      const page = new DOMParser().parseFromString(await reply.text(), 'text/html');
+      throw new Error(page.querySelector('.problem p')?.textContent ?? `the server answers ${reply.status}`);
+    }
+    const p = await reply.json();
+    const verdict = document.createElement('b');
+    verdict.textContent = p.verdict;
+    verdict.className = { agrees: 'good', 'does not agree': 'bad' }[p.verdict] ?? '';
+    line.replaceChildren(verdict, p.reasons.length ? `: ${p.reasons.join('; ')}` : '');
+    const list = document.createElement('dl');
+    list.className = 'facts-list';
+    for (const [name, value] of facts(p)) {
+      const [dt, dd] = [document.createElement('dt'), document.createElement('dd')];
+      [dt.textContent, dd.textContent] = [name, value];
+      list.append(dt, dd);
+    }
+    section.append(list);
+    section.dataset.verdict = p.verdict;
+  } catch (error) {
+    line.textContent = `Not compared: ${error.message}`;
+    section.dataset.verdict = 'failed';
+  }
+}
+for (const section of document.querySelectorAll('[data-physics]')) compare(section);

@@ -1,5 +1,6 @@
 //! A pixel's histogram, with the times at which light of one and two bounces must arrive.
 
+use picofarm_dataset::Spot;
 use serde_json::{Value, json};
 
 use super::{Light, Truth, truth::METRES_PER_NS, volume::Volume};
@@ -34,8 +35,7 @@ pub fn of_pixel(
         .filter(|(i, _)| chosen(*i))
         .filter_map(|(i, spot)| {
             let (spot, point) = (spot.as_ref()?, point?);
-            let position = spot.position.map(f64::from);
-            let path = f64::from(spot.path_m) + distance(position, point) + length(point);
+            let path = two_bounce(spot, point);
             Some(json!({
                 "spot": i, "path_m": path, "ns": path / METRES_PER_NS, "lit": lit.contains(&i),
             }))
@@ -56,7 +56,14 @@ pub fn of_pixel(
     }))
 }
 
-fn length(v: [f64; 3]) -> f64 {
+/// Returns the length in metres of the path from the laser by a spot and a surface point to the
+/// camera.
+pub fn two_bounce(spot: &Spot, point: [f64; 3]) -> f64 {
+    f64::from(spot.path_m) + distance(spot.position.map(f64::from), point) + length(point)
+}
+
+/// Returns the length of a vector.
+pub fn length(v: [f64; 3]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 

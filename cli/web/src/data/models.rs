@@ -110,7 +110,7 @@ impl<T> Recent<T> {
 
 impl Stores {
     fn models_of(&self, store: &str) -> Result<(Models, Reports), Problem> {
-        let (at, prefix) = self.opened(store)?;
+        let (at, prefix) = self.open_at(store)?;
         let models = Models::new(Arc::clone(&at), &prefix);
         Ok((models, Reports::new(at, &prefix)))
     }

@@ -9,6 +9,7 @@ use std::{
 
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::Dataset;
+use picofarm_results::Predicted;
 use picofarm_store::{StorageError, open_store};
 use tokio::sync::Mutex;
 
@@ -17,6 +18,7 @@ use super::{
     cache::Cache,
     contents::Catalogue,
     light::{Light, has_parts},
+    made::{Kind, Made},
     models::{Recent, StoreModels, Sweep},
     volume::Volume,
 };
@@ -28,8 +30,12 @@ const DEPTH: usize = 2;
 const MOST: usize = 400;
 /// Time for which a list of data sets is used again.
 const FRESH: Duration = Duration::from_secs(4);
+/// Time for which a list serves to find results about a scene. Long lists take seconds.
+const RECENT: Duration = Duration::from_secs(60);
 /// Bytes of images in memory.
 const IMAGES: usize = 192 << 20;
+/// Bytes of predictions in memory.
+const PREDICTIONS: usize = 32 << 20;
 /// Bytes of volumes in memory.
 const VOLUMES: usize = 320 << 20;
 
@@ -74,6 +80,8 @@ pub struct Unread {
 pub struct Listing {
     /// The data sets.
     pub sets: Vec<DataSet>,
+    /// Results about their scenes.
+    pub made: Vec<Made>,
     /// What cannot be read.
     pub unread: Vec<Unread>,
 }
@@ -87,6 +95,8 @@ pub struct Stores {
     pub(super) catalogue: Catalogue,
     pub(super) recent_models: Recent<StoreModels>,
     pub(super) recent_sweeps: Recent<Sweep>,
+    /// By the name of the group, and the task key of the scene's predictions.
+    pub(super) predicted: Cache<(String, String), Predicted>,
 }
 
 impl Stores {
@@ -116,23 +126,13 @@ impl Stores {
             catalogue: Catalogue::default(),
             recent_models: Recent::default(),
             recent_sweeps: Recent::default(),
+            predicted: Cache::new(PREDICTIONS),
         })
     }
 
     /// Returns the names of the stores.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.places.iter().map(|place| &*place.name)
-    }
-
-    /// Returns the object store of a folder of the stores, and the prefix in it.
-    ///
-    /// # Errors
-    /// Fails if its name leads out of the stores.
-    pub(super) fn opened(&self, id: &str) -> Result<(Arc<dyn ObjectStore>, Path), Problem> {
-        let (place, rest) = self.find(id)?;
-        let parts = rest.split('/').filter(|part| !part.is_empty());
-        let prefix = parts.fold(place.prefix.clone(), |prefix, part| prefix.join(part));
-        Ok((Arc::clone(&place.store), prefix))
     }
 
     /// Returns the folders that may have models: the named stores, and those with data sets.
@@ -161,13 +161,34 @@ impl Stores {
         found
     }
 
+    /// Returns a list that may be a minute old.
+    pub async fn recent(&self) -> Arc<Listing> {
+        if let Some((at, sets)) = &*self.listed.lock().await
+            && at.elapsed() < RECENT
+        {
+            return Arc::clone(sets);
+        }
+        self.list().await
+    }
+
     /// Opens the data set of a URL.
     ///
     /// # Errors
     /// Fails if its name leads out of the stores, or if there is none.
     pub async fn dataset(&self, id: &str) -> Result<Dataset, Problem> {
-        let (store, prefix) = self.opened(id)?;
+        let (store, prefix) = self.open_at(id)?;
         Ok(Dataset::open(store, prefix).await?)
+    }
+
+    /// Returns the store and the folder in it that a URL names.
+    ///
+    /// # Errors
+    /// Fails if the name leads out of the stores.
+    pub fn open_at(&self, id: &str) -> Result<(Arc<dyn ObjectStore>, Path), Problem> {
+        let (place, rest) = self.find(id)?;
+        let parts = rest.split('/').filter(|part| !part.is_empty());
+        let prefix = parts.fold(place.prefix.clone(), |prefix, part| prefix.join(part));
+        Ok((Arc::clone(&place.store), prefix))
     }
 
     /// Returns the folder of a data set on this machine.
@@ -323,6 +344,11 @@ impl Place {
                     dataset,
                     scenes,
                 }),
+                Ok(Found::Made(kind)) => found.made.push(Made {
+                    id: format!("{position}{below}"),
+                    place: format!("{}{below}", self.name),
+                    kind,
+                }),
                 // The last is looked at first.
                 Ok(Found::Folders(inner)) => folders.extend(inner.into_iter().rev()),
                 Err(error) => found.unread.push(unread(&below, error.into())),
@@ -341,12 +367,18 @@ impl Place {
             Err(StorageError::NoDataset { .. }) => return Ok(Found::Folders(Vec::new())),
             // Predictions and reconstructions. A data set's own fields begin with `spec.`.
             Err(StorageError::Invalid { field, .. }) if !field.starts_with("spec.") => {
-                return Ok(Found::Folders(Vec::new()));
+                return Ok(match Kind::open(&self.store, prefix).await? {
+                    Some(kind) => Found::Made(kind),
+                    None => Found::Folders(Vec::new()),
+                });
             }
             Err(error) => return Err(error),
         }
         let listed = self.store.list_with_delimiter(Some(prefix)).await;
         let listed = listed.map_err(|e| StorageError::store("list", prefix.to_string(), e))?;
+        if Made::is_room(&listed.objects) {
+            return Ok(Found::Made(Kind::Folder));
+        }
         let mut inner: Vec<_> = listed
             .common_prefixes
             .into_iter()
@@ -365,6 +397,8 @@ impl Place {
 enum Found {
     /// A data set, with its finished scenes.
     Set(Dataset, Vec<u64>),
+    /// Results about scenes.
+    Made(Kind),
     /// Folders to look at: each with its path below the store and its depth.
     Folders(Vec<(Path, String, usize)>),
 }

@@ -139,9 +139,17 @@ impl Truth {
     /// # Errors
     /// Fails if the depth or the intrinsics are damaged.
     pub fn point(&self, pixel: usize) -> Result<Option<[f64; 3]>, &Damage> {
+        self.point_at(pixel, self.depth.as_ref()?[pixel])
+    }
+
+    /// Returns the point of a pixel's middle at a z-depth in metres; `None` for 0.
+    ///
+    /// # Errors
+    /// Fails if the intrinsics are damaged.
+    pub fn point_at(&self, pixel: usize, depth: f32) -> Result<Option<[f64; 3]>, &Damage> {
         let width = self.spec.width as usize;
         let (row, column) = (pixel / width, pixel % width);
-        let z = f64::from(self.depth.as_ref()?[pixel]);
+        let z = f64::from(depth);
         let i = self.intrinsics.as_ref()?;
         let direction = |pixel: usize, centre: f32, focal: f32| {
             (pixel as f64 + 0.5 - f64::from(centre)) / f64::from(focal)
@@ -207,10 +215,20 @@ fn film(i: &Intrinsics, spot: &Spot) -> Option<[f32; 2]> {
 /// Fails if the scene is not there or is damaged.
 pub async fn facts(dataset: &Dataset, scene: u64) -> Result<Value, StorageError> {
     let (spots, i) = (dataset.read_spots(scene), dataset.read_intrinsics(scene));
-    let (spots, i) = futures::try_join!(spots, i)?;
+    let laser = dataset.read::<f32>(scene, Q::Laser);
+    let camera = dataset.read::<f32>(scene, Q::Camera);
+    let (spots, i, laser, camera) = futures::try_join!(spots, i, laser, camera)?;
+    let spec = dataset.spec();
     let spots = spots.iter().map(|spot| {
         let spot = spot.as_ref()?;
-        Some(json!({"film": film(&i, spot), "path_m": spot.path_m}))
+        Some(json!({
+            "film": film(&i, spot), "path_m": spot.path_m, "position": spot.position,
+        }))
     });
-    Ok(json!({"spots": spots.collect::<Vec<_>>()}))
+    Ok(json!({
+        "spots": spots.collect::<Vec<_>>(), "laser": laser,
+        "intrinsics": [i.fx, i.fy, i.cx, i.cy], "size": [spec.width, spec.height],
+        // The world's y axis in the camera's frame: the second row of the rotation to the world.
+        "up": camera.get(4..7),
+    }))
 }

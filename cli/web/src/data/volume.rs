@@ -8,39 +8,25 @@ use std::path::PathBuf;
 
 use http::StatusCode;
 use picofarm_dataset::{Dataset, DatasetSpec, Profile, Quantity as Q};
-use picofarm_figures::scene::quantile;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::light::{Light, lights, parts};
+use super::{
+    light::{Light, lights, parts},
+    small::{Blocks, Small},
+};
 use crate::answer::Problem;
 
-/// Longest side of the small level.
-const SMALL: usize = 64;
-/// Most values of a volume: a GiB while it is read.
+/// Most values of a volume: half a GiB, and a GiB more while values are coded.
 const MOST: u64 = 1 << 28;
 
 /// A volume in memory.
 pub struct Volume {
     spec: DatasetSpec,
     factor: f64,
-    /// Little-endian codes, `[bin][row][column]`.
-    codes: Vec<u8>,
+    /// Codes, `[bin][row][column]`. The bytes in memory are little-endian.
+    codes: Vec<u16>,
     small: Small,
-}
-
-/// The small level.
-struct Small {
-    width: usize,
-    height: usize,
-    /// Little-endian codes, `[bin][row][column]`.
-    codes: Vec<u8>,
-    /// The bins between the first light and most of it.
-    lively: [usize; 2],
-    /// h of a bright pixel of one bin.
-    white: f32,
-    /// Sum of h over the image, for each bin, without the brightest pixels.
-    energy: Vec<f64>,
 }
 
 impl Volume {
@@ -66,8 +52,13 @@ impl Volume {
         let handle = tokio::runtime::Handle::current();
         let made = tokio::task::spawn_blocking(move || {
             let scale = handle.block_on(dataset.manifest(scene))?.scale;
-            let planes = handle.block_on(planes(&dataset, folder, scene, light))?;
-            Ok(Self::of(spec, scale, &planes))
+            let light = handle.block_on(stored(&dataset, folder, scene, light))?;
+            Ok(match light {
+                Stored::Codes { delta, codes } => {
+                    Self::of_codes(spec, factor_of(delta, scale), codes)
+                }
+                Stored::Planes(planes) => Self::of_planes(spec, scale, &planes),
+            })
         });
         let broken = |e| {
             let status = StatusCode::INTERNAL_SERVER_ERROR;
@@ -77,30 +68,32 @@ impl Volume {
     }
 
     /// Codes h, `[bin][row][column]`.
-    fn of(spec: DatasetSpec, scale: f32, planes: &[f32]) -> Self {
+    fn of_planes(spec: DatasetSpec, scale: f32, planes: &[f32]) -> Self {
         let factor = match spec.profile {
-            Profile::SqrtU16 { delta } => 2.0 / f64::from(delta) * f64::from(scale).sqrt(),
+            Profile::SqrtU16 { delta } => factor_of(delta, scale),
             _ => {
                 let most = planes.par_iter().copied().reduce(|| 0.0, f32::max);
                 65_535.0 / f64::from(most.max(f32::MIN_POSITIVE)).sqrt()
             }
         };
+        let code = |value: &f32| encode(*value, factor as f32);
+        Self::of_codes(spec, factor, planes.par_iter().map(code).collect())
+    }
+
+    /// Takes codes, `[bin][row][column]`.
+    fn of_codes(spec: DatasetSpec, factor: f64, mut codes: Vec<u16>) -> Self {
         let pixels = spec.pixels().max(1);
-        let (shape, small) = Small::shape(&spec);
-        let mut codes = vec![0; 2 * planes.len()];
-        let mut means = vec![0.0; small * planes.len() / pixels];
-        let bins = codes.par_chunks_mut(2 * pixels);
-        let bins = bins.zip(means.par_chunks_mut(small));
-        // One pass over each image, while it is in the cache.
-        bins.zip(planes.par_chunks(pixels))
-            .for_each(|((codes, means), values)| {
-                for (code, value) in codes.chunks_exact_mut(2).zip(values) {
-                    code.copy_from_slice(&encode(*value, factor as f32));
-                }
-                shape.means(values, means);
+        let blocks = Blocks::of(&spec);
+        let mut means = vec![0.0; blocks.count() * codes.len() / pixels];
+        let images = means.par_chunks_mut(blocks.count());
+        images
+            .zip(codes.par_chunks_mut(pixels))
+            .for_each(|(means, image)| {
+                blocks.means(image, factor, means);
+                image.iter_mut().for_each(|code| *code = code.to_le());
             });
         Self {
-            small: Small::of(&shape, factor as f32, &means),
+            small: Small::of(&blocks, factor, &means),
             spec,
             factor,
             codes,
@@ -109,7 +102,7 @@ impl Volume {
 
     /// Returns the size in memory.
     pub fn bytes(&self) -> usize {
-        self.codes.len() + self.small.codes.len()
+        2 * self.codes.len() + self.small.codes.len()
     }
 
     /// Returns sizes, times and exposure.
@@ -138,34 +131,76 @@ impl Volume {
             let what = format!("from, to: expected bins within 0..{bins}, found {from}..{to}");
             return Err(Problem::input(what));
         }
-        let bin = 2 * self.spec.pixels();
-        Ok(&self.codes[from as usize * bin..to as usize * bin])
+        let bin = self.spec.pixels();
+        let codes = &self.codes[from as usize * bin..to as usize * bin];
+        Ok(bytemuck::cast_slice(codes))
     }
 
     /// Returns h of a pixel, for each bin.
     pub fn histogram(&self, pixel: usize) -> Vec<f32> {
-        let bins = self.codes.chunks_exact(2 * self.spec.pixels().max(1));
-        bins.map(|codes| decode([codes[2 * pixel], codes[2 * pixel + 1]], self.factor))
-            .collect()
+        let images = self.codes.chunks_exact(self.spec.pixels().max(1));
+        images.map(|image| self.decode(image[pixel])).collect()
+    }
+
+    /// Returns the sum of h over some bins, for each pixel.
+    pub fn light_in(&self, bins: std::ops::Range<usize>) -> Vec<f32> {
+        let pixels = self.spec.pixels();
+        let images = &self.codes[bins.start * pixels..bins.end * pixels];
+        let mut light = vec![0.0; pixels];
+        for image in images.chunks_exact(pixels.max(1)) {
+            for (sum, code) in light.iter_mut().zip(image) {
+                *sum += self.decode(*code);
+            }
+        }
+        light
+    }
+
+    /// Returns the bins between the first light and most of it.
+    pub fn lively(&self) -> std::ops::Range<usize> {
+        self.small.lively[0]..self.small.lively[1]
+    }
+
+    /// Returns h of a bright pixel of one bin.
+    pub fn white(&self) -> f32 {
+        self.small.white
+    }
+
+    /// Returns the properties of the data set.
+    pub fn spec(&self) -> &DatasetSpec {
+        &self.spec
+    }
+
+    fn decode(&self, code: u16) -> f32 {
+        (f64::from(u16::from_le(code)) / self.factor).powi(2) as f32
     }
 }
 
-fn encode(value: f32, factor: f32) -> [u8; 2] {
+/// Returns codes per root of h in the square-root profile of step `delta`.
+fn factor_of(delta: f32, scale: f32) -> f64 {
+    2.0 / f64::from(delta) * f64::from(scale).sqrt()
+}
+
+/// Returns the code of h.
+pub fn encode(value: f32, factor: f32) -> u16 {
     // The conversion ends at 65,535.
-    ((factor * value.max(0.0).sqrt() + 0.5) as u16).to_le_bytes()
+    (factor * value.max(0.0).sqrt() + 0.5) as u16
 }
 
-fn decode(code: [u8; 2], factor: f64) -> f32 {
-    (f64::from(u16::from_le_bytes(code)) / factor).powi(2) as f32
+/// A scene's light as it is stored, one image for each bin.
+enum Stored {
+    /// Codes of the square-root profile of step `delta`.
+    Codes { delta: f32, codes: Vec<u16> },
+    /// h.
+    Planes(Vec<f32>),
 }
 
-/// Reads h as one image for each bin. Blocks its thread.
-async fn planes(
+/// Reads light as one image for each bin. Blocks its thread.
+async fn stored(
     dataset: &Dataset,
     folder: Option<PathBuf>,
     scene: u64,
     light: Light,
-) -> Result<Vec<f32>, Problem> {
+) -> Result<Stored, Problem> {
     let folder = folder.as_deref();
     if lights(dataset.spec(), folder)
         .iter()
@@ -188,7 +223,7 @@ async fn planes(
         Light::TwentyFive => Q::Transient25,
         Light::Spot(spot) => {
             let values = dataset.read_spot(scene, spot).await?;
-            return Ok(by_bin(&values, dataset.spec()));
+            return Ok(Stored::Planes(by_bin(&values, dataset.spec())));
         }
         Light::Two | Light::More => {
             let name = if light == Light::Two { "two" } else { "multi" };
@@ -202,14 +237,19 @@ async fn planes(
                 let what = format!("{name}: expected the shape {expected:?}, found {shape:?}");
                 return Err(Problem::input(what));
             }
-            return Ok(by_bin(&values, spec));
+            return Ok(Stored::Planes(by_bin(&values, spec)));
         }
     };
-    let mut target = Vec::new();
+    if let Profile::SqrtU16 { delta } = dataset.spec().profile {
+        let mut codes = Vec::new();
+        dataset.read_codes_into(scene, quantity, &mut codes).await?;
+        return Ok(Stored::Codes { delta, codes });
+    }
+    let mut planes = Vec::new();
     dataset
-        .read_planes_into(scene, quantity, &mut target)
+        .read_planes_into(scene, quantity, &mut planes)
         .await?;
-    Ok(target)
+    Ok(Stored::Planes(planes))
 }
 
 /// Turns `[row][column][bin]` into `[bin][row][column]`.
@@ -223,103 +263,6 @@ fn by_bin(values: &[f32], spec: &DatasetSpec) -> Vec<f32> {
         }
     });
     planes
-}
-
-/// Blocks of pixels.
-struct Blocks {
-    /// Of the full image.
-    size: [usize; 2],
-    step: usize,
-    width: usize,
-    height: usize,
-}
-
-impl Blocks {
-    /// Sets `means` to the mean of each block of an image.
-    fn means(&self, image: &[f32], means: &mut [f32]) {
-        let [w, h] = self.size;
-        for (y, line) in means.chunks_exact_mut(self.width).enumerate() {
-            let rows = y * self.step..h.min((y + 1) * self.step);
-            line.fill(0.0);
-            for row in rows.clone() {
-                let parts = image[row * w..][..w].chunks(self.step);
-                for (mean, part) in line.iter_mut().zip(parts) {
-                    *mean += part.iter().sum::<f32>();
-                }
-            }
-            for (x, mean) in line.iter_mut().enumerate() {
-                let columns = w.min((x + 1) * self.step) - x * self.step;
-                *mean /= (rows.len() * columns) as f32;
-            }
-        }
-    }
-}
-
-impl Small {
-    /// Returns the blocks, and their number.
-    fn shape(spec: &DatasetSpec) -> (Blocks, usize) {
-        let (w, h) = (spec.width as usize, spec.height as usize);
-        let step = w.max(h).div_ceil(SMALL).max(1);
-        let blocks = Blocks {
-            size: [w, h],
-            step,
-            width: w.div_ceil(step),
-            height: h.div_ceil(step),
-        };
-        let count = (blocks.width * blocks.height).max(1);
-        (blocks, count)
-    }
-
-    /// Makes the level from the means of the blocks, `[bin][row][column]`.
-    fn of(blocks: &Blocks, factor: f32, means: &[f32]) -> Self {
-        let (width, height) = (blocks.width, blocks.height);
-        let pixels = (width * height).max(1);
-        let mut total = vec![0.0f32; pixels];
-        for image in means.chunks_exact(pixels) {
-            total.iter_mut().zip(image).for_each(|(t, h)| *t += h);
-        }
-        // Without the brightest pixels, which the spots themselves make.
-        let limit = quantile(&total, 0.97);
-        let energy: Vec<f64> = means
-            .chunks_exact(pixels)
-            .map(|image| {
-                let kept = image.iter().zip(&total).filter(|(_, t)| **t <= limit);
-                kept.map(|(h, _)| f64::from(*h)).sum()
-            })
-            .collect();
-        let lively = lively(&energy);
-        let probes: Vec<f32> = (1..8)
-            .map(|k| lively[0] + (lively[1] - lively[0]) * k / 12)
-            .filter_map(|bin| means.get(bin * pixels..(bin + 1) * pixels))
-            .flatten()
-            .copied()
-            .filter(|h| *h > 0.0)
-            .collect();
-        Self {
-            width,
-            height,
-            codes: means.iter().flat_map(|h| encode(*h, factor)).collect(),
-            lively,
-            white: quantile(&probes, 0.99).max(f32::MIN_POSITIVE),
-            energy,
-        }
-    }
-}
-
-/// The bins between the first light and 95 % of it. Later there is only a faint, even glow.
-fn lively(energy: &[f64]) -> [usize; 2] {
-    let total: f64 = energy.iter().sum();
-    let arrived = |share: f64| {
-        let mut sum = 0.0;
-        energy.iter().position(|e| {
-            sum += e;
-            sum > share * total
-        })
-    };
-    match (arrived(1e-6), arrived(0.95)) {
-        (Some(first), Some(last)) => [first.saturating_sub(2), (last + 1).min(energy.len())],
-        _ => [0, energy.len()],
-    }
 }
 
 #[cfg(test)]
@@ -352,7 +295,7 @@ mod tests {
         for profile in [Profile::default(), Profile::LOSSLESS] {
             let spec = spec(3, 2, 4, profile);
             let planes: Vec<f32> = (0..24).map(|i| (i * i) as f32).collect();
-            let volume = Volume::of(spec, 1.0, &planes);
+            let volume = Volume::of_planes(spec, 1.0, &planes);
             for pixel in 0..6 {
                 for (bin, h) in volume.histogram(pixel).into_iter().enumerate() {
                     let exact = planes[bin * 6 + pixel];
@@ -362,7 +305,11 @@ mod tests {
                     );
                 }
             }
-            assert_eq!(volume.slab(1, 3).unwrap(), &volume.codes[12..36]);
+            let bytes: Vec<u8> = volume.codes[6..18]
+                .iter()
+                .flat_map(|code| code.to_ne_bytes())
+                .collect();
+            assert_eq!(volume.slab(1, 3).unwrap(), bytes);
             assert!(volume.slab(1, 5).is_err() && volume.slab(2, 2).is_err());
         }
     }
@@ -370,17 +317,18 @@ mod tests {
     #[test]
     fn the_small_level_has_the_means_of_blocks_also_at_the_edges() {
         let spec = spec(129, 65, 2, Profile::default());
-        let volume = Volume::of(spec, 1.0, &vec![4.0; 129 * 65 * 2]);
+        let volume = Volume::of_planes(spec, 1.0, &vec![4.0; 129 * 65 * 2]);
         assert_eq!((volume.small.width, volume.small.height), (43, 22));
         let codes = volume.small.codes.chunks_exact(2);
         for code in codes {
-            assert_eq!(decode([code[0], code[1]], volume.factor), 4.0);
+            let code = u16::from_le_bytes([code[0], code[1]]);
+            assert_eq!((f64::from(code) / volume.factor).powi(2) as f32, 4.0);
         }
     }
 
     #[test]
     fn darkness_has_a_volume_too() {
-        let volume = Volume::of(spec(4, 4, 8, Profile::LOSSLESS), 1.0, &[0.0; 128]);
+        let volume = Volume::of_planes(spec(4, 4, 8, Profile::LOSSLESS), 1.0, &[0.0; 128]);
         assert_eq!(volume.small.lively, [0, 8]);
         assert!(volume.histogram(3).iter().all(|h| *h == 0.0));
     }

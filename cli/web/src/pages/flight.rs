@@ -33,18 +33,26 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
         noscript { p.problem { "The player needs JavaScript." } }
         div #flight.flight data-scene=(id.encode(&[])) data-light=(light.name()) {
             div.stage {
+                div.views role="group" aria-label="View" {
+                    button #image type="button" aria-pressed="true" title="key 2" { "Image" }
+                    button #space type="button" aria-pressed="false" title="key 3" { "In space" }
+                    label.check hidden { input #surface type="checkbox" checked; " light at the surfaces" }
+                }
                 div.screen #screen tabindex="0" role="application"
-                    aria-label="Room with light in flight. Space plays, comma and full stop step, arrow keys move the picked pixel." {
+                    aria-label="Room with light in flight. Space plays, comma and full stop step, arrow keys move the picked pixel; in space they turn the room." {
                     canvas #view width=(spec.width) height=(spec.height) {}
                     canvas #marks width=(spec.width) height=(spec.height) aria-hidden="true" {}
                     p #message role="alert" {}
                 }
                 div.transport {
                     button #play type="button" title="Play or pause (space)" { "Play" }
-                    input #time type="range" min="0" max=(spec.gate.bins - 1) step="any" value="0" aria-label="Time";
+                    div.when {
+                        input #time type="range" min="0" max=(spec.gate.bins - 1) step="any" value="0" aria-label="Time";
+                        canvas #energy height="36" aria-hidden="true" {}
+                    }
                     output #clock { "0.00 ns" }
                 }
-                canvas #energy height="36" aria-hidden="true" {}
+                p #how.hint {}
             }
             div.side {
                 form #controls.controls {
@@ -66,15 +74,21 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
                     label { span { "Room" } input #room type="range" min="0" max="1" step="0.05" value="0.25"; }
                     label.check { input #spots type="checkbox"; " show the spots" }
                     div.buttons {
-                        button #export type="button" { "Save PNG" }
+                        button #export type="button" title="key s" { "Save PNG" }
+                        button #record type="button" title="key r" { "Record WebM" }
+                        button #gif type="button" title="key g" { "Save GIF" }
+                        button #figure type="button" title="key f" { "Save figure (SVG)" }
                         button #link type="button" { "Copy link" }
                     }
+                    p #saved.hint role="status" {}
                 }
                 figure.histogram {
                     figcaption #picked aria-live="polite" { "Pick a pixel to see its histogram." }
+                    div #seen.seen {}
                     canvas #histogram height="220" tabindex="0" role="img" aria-label="Histogram of the picked pixel" {}
                     p #kinds.legend.times {
-                        span.key.one {} "one bounce" span.key.two {} "two bounces, lit by the spot" span.key.more {} "three and more"
+                        span.item { span.key.one {} "one bounce" } span.item { span.key.two {} "two bounces, lit by the spot" }
+                        span.item { span.key.more {} "three and more" }
                     }
                     div.toggle {
                         label.check { input #hlog type="checkbox" checked; " logarithmic" }

@@ -89,6 +89,7 @@ fn list(app: &App, listed: &Listing) -> Markup {
                 div.strip { @for scene in set.scenes.iter().take(3) { (card(set, *scene, None)) } }
             }
         } }
+        (super::room::list(&listed.made))
     }
 }
 

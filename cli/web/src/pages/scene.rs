@@ -9,6 +9,7 @@ use super::{
     Page,
     gallery::describe,
     parts::{bytes, safe},
+    room::path as room_path,
 };
 use crate::{
     App,
@@ -36,6 +37,10 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
         columns.push((app.stores.truth(app, other).await?, other.clone()));
     }
     let spots = columns[0].0.spec.spots;
+    let mut rooms = Vec::new();
+    for (truth, _) in &columns {
+        rooms.push(app.stores.rooms_of(&truth.manifest).await);
+    }
     let content = html! {
         h1 { "Scene " (first.scene) @if let Some(other) = &other { " and scene " (other.scene) } }
         form.search action="/data/scene" {
@@ -49,7 +54,9 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
         }
         p.readout #readout role="status" aria-live="polite" { "Point at an image for the values of a pixel. Arrow keys move the point." }
         div.columns.two[columns.len() > 1] {
-            @for (truth, id) in &columns { (column(truth, id, &app.stores.place(&id.set)?, spot)?) }
+            @for ((truth, id), rooms) in columns.iter().zip(&rooms) {
+                (column(truth, id, &app.stores.place(&id.set)?, (spot, rooms))?)
+            }
         }
     };
     Ok(Page {
@@ -61,7 +68,12 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     })
 }
 
-fn column(truth: &Truth, id: &SceneId, place: &str, spot: u64) -> Result<Markup, Problem> {
+fn column(
+    truth: &Truth,
+    id: &SceneId,
+    place: &str,
+    (spot, rooms): (u64, &[(SceneId, String)]),
+) -> Result<Markup, Problem> {
     let named = spot.to_string();
     let lit = Picture::Lit(spot as usize);
     let mut pictures: Vec<(Picture, String)> = Vec::new();
@@ -79,7 +91,8 @@ fn column(truth: &Truth, id: &SceneId, place: &str, spot: u64) -> Result<Markup,
         section.column data-scene=(id.encode(&[])) data-width=(truth.spec.width) data-height=(truth.spec.height)
             aria-label={ "Scene " (id.scene) } {
             p { a href={ "/data?" (crate::query::encode(&[("set", &id.set)])) } { "data set" } " " (safe(place))
-                " · " (describe(&truth.spec)) " · " a href=(flight_path(&id.set, id.scene)) { "light in flight" } }
+                " · " (describe(&truth.spec)) " · " a href=(flight_path(&id.set, id.scene)) { "light in flight" }
+                @for (room, place) in rooms { " · " a href=(room_path(&room.set, room.scene)) { "in 3D, " (safe(place)) } } }
             @if !truth.is_whole() {
                 p.problem { "Some arrays of this scene are damaged. " (safe(DAMAGED)) "." }
             }
@@ -104,6 +117,11 @@ fn column(truth: &Truth, id: &SceneId, place: &str, spot: u64) -> Result<Markup,
                     } }
                     }
                 }
+            }
+            section.physics data-physics=(id.encode(&[])) {
+                h2 { "Light and geometry" }
+                p role="status" { "Comparing the light with the geometry…" }
+                noscript { p { "The comparison needs JavaScript." } }
             }
             (origin(truth))
         }

@@ -91,6 +91,13 @@ fn places_outside_of_the_given_stores_are_not_read() {
             "bytes/picture",
             "bytes/flight",
             "bytes/slab",
+            "bytes/depth",
+            "bytes/view",
+            "bytes/physics",
+            "bytes/gif",
+            "bytes/figure",
+            "bytes/mesh",
+            "data/room",
         ] {
             let path = format!("/{page}?set={set}&scene=0&what=rgb&from=0&to=1");
             assert_eq!(web.get(&path).status, 404, "{path}");
@@ -261,6 +268,97 @@ fn a_histogram_of_selected_light_has_no_parts_and_only_the_times_of_its_spot() {
             assert_eq!(found["one"].is_null(), spot != 0, "{light}");
         }
     }
+}
+
+#[test]
+fn light_at_times_that_geometry_forbids_is_found() {
+    let (_folder, web) = shown();
+    let found = web.get("/bytes/physics?set=0%2Frooms&scene=0").json();
+    assert_eq!(found["verdict"], "does not agree", "{found}");
+    assert!(found["reasons"][0].is_string(), "{found}");
+    let shares: Vec<f64> = serde_json::from_value(found["shares"].clone()).unwrap();
+    assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-9, "{found}");
+    assert_eq!(found["rendered_apart"], false);
+}
+
+#[test]
+fn light_in_flight_is_saved_as_an_animation_and_as_a_figure() {
+    let (_folder, web) = shown();
+    let query = "set=0%2Frooms&scene=0&bin=12&shutter=4&exposure=1&scale=log&map=1";
+    let gif = web.get(&format!("/bytes/gif?{query}"));
+    assert!(gif.body.starts_with(b"GIF89a"), "{}", gif.head);
+    let named = gif.header("content-disposition");
+    assert_eq!(
+        named,
+        Some("attachment; filename=\"light-in-flight-0.gif\"")
+    );
+    let dark = web.get(&format!(
+        "/bytes/gif?{}",
+        query.replace("=1&scale", "=-9&scale")
+    ));
+    assert_ne!(dark.body, gif.body, "exposure counts");
+    let figure = |more: &str| web.get(&format!("/bytes/figure?{query}{more}"));
+    let svg = figure("").text();
+    assert!(svg.starts_with("<svg") && svg.contains("light at"), "{svg}");
+    assert!(!svg.contains("pixel ("));
+    let svg = figure("&pixel=7,10").text();
+    assert!(svg.contains("pixel (7, 10)"));
+    for (more, name) in [
+        ("&pixel=7", "pixel: "),
+        ("&pixel=7,20", "row: "),
+        ("&shutter=99", "shutter: "),
+    ] {
+        let refused = figure(more);
+        assert_eq!(refused.status, 400, "{more}");
+        assert!(refused.text().contains(&format!("<p>{name}")), "{more}");
+    }
+}
+
+#[test]
+fn the_depth_and_the_camera_of_a_scene_are_those_of_the_data_set() {
+    let (_folder, web) = shown();
+    let depth = web.get("/bytes/depth?set=0%2Frooms&scene=0").body;
+    assert_eq!(depth, 2.0f32.to_le_bytes().repeat(SIDE * SIDE));
+    let view = web.get("/bytes/view?set=0%2Frooms&scene=0").json();
+    assert_eq!(view["intrinsics"], json!([10.0, 10.0, 10.0, 10.0]));
+    assert_eq!(view["laser"], json!([0.0, 0.0, 0.0]));
+    assert_eq!(view["up"], json!([0.0, 1.0, 0.0]));
+    assert_eq!(view["spots"][0]["position"], json!([-0.5, 0.0, 2.0]));
+}
+
+#[test]
+fn a_folder_of_a_reconstruction_is_listed_and_shown_in_3d() {
+    let (folder, web) = shown();
+    let room = folder.path().join("store/my-room");
+    std::fs::create_dir(&room).unwrap();
+    std::fs::write(room.join("mesh.glb"), "glTF").unwrap();
+    let metrics = json!({"triangles": 7, "novel_views": {"all": {"l1_m": 0.25}}});
+    std::fs::write(room.join("metrics.json"), metrics.to_string()).unwrap();
+    let list = web.get("/data").text();
+    assert!(
+        list.contains("/data/room?set=0%2Fmy-room&amp;scene=0"),
+        "{list}"
+    );
+    let page = web.get("/data/room?set=0%2Fmy-room&scene=0").text();
+    assert!(page.contains("<dd>0.250 m</dd>"), "{page}");
+    // No scene of the stores is known to be its source.
+    assert!(!page.contains("data-source") && !page.contains("value=\"error\""));
+    assert_eq!(web.get("/bytes/mesh?set=0%2Fmy-room&scene=0").body, b"glTF");
+    for (set, scene) in [
+        ("0%2Fmy-room", 1),
+        ("0%2Frooms", 0),
+        ("0%2Fnosuch", 0),
+        ("0%2F..%2Fmy-room", 0),
+    ] {
+        for what in ["bytes/mesh", "data/room"] {
+            let path = format!("/{what}?set={set}&scene={scene}");
+            assert_eq!(web.get(&path).status, 404, "{path}");
+        }
+    }
+    std::fs::write(room.join("metrics.json"), "{").unwrap();
+    let broken = web.get("/data/room?set=0%2Fmy-room&scene=0");
+    assert_eq!(broken.status, 500);
+    assert!(broken.text().contains("not JSON"), "{}", broken.text());
 }
 
 /// Changes the bytes of all files below a folder.

@@ -251,14 +251,26 @@ impl<'a> Decoder<'a> {
         }
     }
 
-    fn planes<T: bytemuck::Pod>(
+    /// Like [`Self::decode_planes`], but copies the codes of [`Profile::SqrtU16`]. Saturated bins
+    /// keep theirs.
+    pub fn copy_planes(&mut self, tile: usize, raw: &[u8], pixels: usize, target: &mut [u16]) {
+        let mut codes = std::mem::take(&mut self.codes);
+        let copy = |from: &[u16], to: &mut [u16]| {
+            to.copy_from_slice(from);
+            false
+        };
+        self.planes(tile, &values(raw), &mut codes, pixels, target, copy);
+        self.codes = codes;
+    }
+
+    fn planes<T: bytemuck::Pod, U>(
         &self,
         tile: usize,
         stored: &[T],
         scratch: &mut Vec<T>,
         pixels: usize,
-        target: &mut [f32],
-        decode: impl Fn(&[T], &mut [f32]) -> bool,
+        target: &mut [U],
+        decode: impl Fn(&[T], &mut [U]) -> bool,
     ) -> bool {
         let mut saturated = false;
         let runs: Vec<Run> = self.tiles.runs(tile).collect();

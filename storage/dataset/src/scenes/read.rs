@@ -9,6 +9,7 @@ use crate::coding::tiles::Part;
 use crate::layout::manifest::Manifest;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::record::{Intrinsics, Spot};
+use crate::layout::spec::Profile;
 use crate::scenes::dataset::{ArrayCodec, Dataset};
 use picofarm_store::StorageError;
 use picofarm_store::objects::{self, Rereads};
@@ -133,12 +134,12 @@ impl Dataset {
     }
 
     /// Fetches a scene's shard and decodes it into `target`, which is resized.
-    async fn decode_into(
+    async fn decode_into<T: Clone + Default>(
         &self,
         scene: u64,
         array: &ArrayCodec,
-        target: &mut Vec<f32>,
-        decode: impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), StorageError>,
+        target: &mut Vec<T>,
+        decode: impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [T]) -> Result<(), StorageError>,
     ) -> Result<(), StorageError> {
         let mut rereads = Rereads::new(&*self.store);
         loop {
@@ -150,12 +151,12 @@ impl Dataset {
         }
     }
 
-    async fn decode_once(
+    async fn decode_once<T: Clone + Default>(
         &self,
         scene: u64,
         array: &ArrayCodec,
-        target: &mut Vec<f32>,
-        decode: &impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), StorageError>,
+        target: &mut Vec<T>,
+        decode: &impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [T]) -> Result<(), StorageError>,
     ) -> Result<(), StorageError> {
         let manifest = self.manifest_once(scene).await?;
         let path = self.path(&array.layout.key(scene));
@@ -164,7 +165,7 @@ impl Dataset {
         if target.len() != len {
             // A new allocation is zeroed by the operating system; resizing would touch its pages
             // twice.
-            *target = vec![0.0; len];
+            *target = vec![T::default(); len];
         }
         decode(self, &manifest, array, &bytes, target)
             .map_err(|e| e.in_object(|| self.shown(&path)))
@@ -183,13 +184,40 @@ impl Dataset {
         quantity: Quantity,
         target: &mut Vec<f32>,
     ) -> Result<(), StorageError> {
-        let array = self.array_of(quantity)?;
-        if !quantity.is_transient() || array.layout.planes() != 1 {
-            let what = format!("{} is no single transient", quantity.name());
-            return Err(StorageError::invalid("quantity", what));
-        }
+        let array = self.single_transient(quantity)?;
         self.decode_into(scene, array, target, Self::decode_planes_into)
             .await
+    }
+
+    /// Like [`Self::read_planes_into`], but copies the stored codes of the square-root profile
+    /// ([`SquareRoot`](crate::SquareRoot)). The manifest has the values of saturated bins.
+    ///
+    /// # Errors
+    /// Those of [`Self::read_planes_into`]; [`StorageError::Invalid`] for another profile.
+    pub async fn read_codes_into(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+        target: &mut Vec<u16>,
+    ) -> Result<(), StorageError> {
+        let array = self.single_transient(quantity)?;
+        if !matches!(self.spec.profile, Profile::SqrtU16 { .. }) {
+            let name = self.spec.profile.name();
+            let what = format!("{name} has no codes of the square-root profile; read its values");
+            return Err(StorageError::invalid("profile", what));
+        }
+        self.decode_into(scene, array, target, Self::copy_codes_into)
+            .await
+    }
+
+    /// Returns the array of a transient of one image for each bin.
+    fn single_transient(&self, quantity: Quantity) -> Result<&ArrayCodec, StorageError> {
+        let array = self.array_of(quantity)?;
+        if quantity.is_transient() && array.layout.planes() == 1 {
+            return Ok(array);
+        }
+        let what = format!("{} is no single transient", quantity.name());
+        Err(StorageError::invalid("quantity", what))
     }
 
     /// Returns a stream of h of many scenes, in the given order, with up to `ahead` of them being

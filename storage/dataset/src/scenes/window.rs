@@ -148,6 +148,17 @@ impl Dataset {
         self.complete(manifest, whole)
     }
 
+    /// Like [`Self::decode_planes_into`], but copies the codes of the square-root profile.
+    pub(crate) fn copy_codes_into(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        bytes: &Bytes,
+        target: &mut [u16],
+    ) -> Result<(), StorageError> {
+        self.decoding(manifest, array).codes(bytes, target)
+    }
+
     /// Returns whether a shard can be decoded, whatever its values are.
     pub(crate) fn shard_is_whole(
         &self,
@@ -207,25 +218,10 @@ impl Decoding<'_> {
     /// Like [`Self::shard`], but as one image per bin. Tiles with the same bins write to adjacent
     /// memory, so one thread decodes them; different ranges of bins are decoded in parallel.
     pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, StorageError> {
-        let tiles = Tiles::new(self.spec, &self.array.layout);
-        let chunks = Self::chunks(&tiles, bytes)?;
-        if chunks.iter().any(Option::is_none) {
-            target.fill(0.0);
-        }
         let pixels = self.spec.pixels();
-        let slabs = target.par_chunks_mut(tiles.slab_len() * pixels).enumerate();
-        let saturated = slabs
-            .map(|(slab, values)| {
-                let mut decoder = Decoder::new(self.spec.profile, self.scale, &tiles);
-                let mut saturated = false;
-                for tile in tiles.of_slab(slab) {
-                    let Some(bytes) = &chunks[tile] else { continue };
-                    let raw = self.array.codec.decode(bytes)?;
-                    saturated |= decoder.decode_planes(tile, &raw, pixels, values);
-                }
-                Ok(saturated)
-            })
-            .collect::<Result<Vec<bool>, StorageError>>()?;
+        let saturated = self.slabs(bytes, target, 0.0, |decoder, tile, raw, values| {
+            decoder.decode_planes(tile, raw, pixels, values)
+        })?;
         let bins = self.spec.gate.bins as usize;
         for (index, value) in self.overflow {
             let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
@@ -233,8 +229,50 @@ impl Decoding<'_> {
                 target[bin * pixels + pixel] = *value;
             }
         }
-        let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());
+        let complete = !saturated || target.iter().all(|h| h.is_finite());
         Ok(Complete(complete))
+    }
+
+    /// Like [`Self::planes`], but copies the codes of the square-root profile.
+    pub fn codes(&self, bytes: &Bytes, target: &mut [u16]) -> Result<(), StorageError> {
+        let pixels = self.spec.pixels();
+        self.slabs(bytes, target, 0, |decoder, tile, raw, codes| {
+            decoder.copy_planes(tile, raw, pixels, codes);
+            false
+        })?;
+        Ok(())
+    }
+
+    /// Calls `each` with the raw bytes of each tile and the images of its bins in `target`. `fill`
+    /// is the value of tiles without bytes. Returns whether `each` returned true.
+    fn slabs<T: Copy + Send + Sync>(
+        &self,
+        bytes: &Bytes,
+        target: &mut [T],
+        fill: T,
+        each: impl Fn(&mut Decoder<'_>, usize, &[u8], &mut [T]) -> bool + Sync,
+    ) -> Result<bool, StorageError> {
+        let tiles = Tiles::new(self.spec, &self.array.layout);
+        let chunks = Self::chunks(&tiles, bytes)?;
+        if chunks.iter().any(Option::is_none) {
+            target.fill(fill);
+        }
+        let slabs = target
+            .par_chunks_mut(tiles.slab_len() * self.spec.pixels())
+            .enumerate();
+        let found = slabs
+            .map(|(slab, values)| {
+                let mut decoder = Decoder::new(self.spec.profile, self.scale, &tiles);
+                let mut found = false;
+                for tile in tiles.of_slab(slab) {
+                    let Some(bytes) = &chunks[tile] else { continue };
+                    let raw = self.array.codec.decode(bytes)?;
+                    found |= each(&mut decoder, tile, &raw, values);
+                }
+                Ok(found)
+            })
+            .collect::<Result<Vec<bool>, StorageError>>()?;
+        Ok(found.contains(&true))
     }
 
     /// Returns the encoded bytes of each tile of a shard; `None` = all fill value.

@@ -145,6 +145,23 @@ async fn any_part_equals_the_same_part_of_the_whole() {
             (0..whole.len()).map(of_pixel).eq(whole.iter().copied()),
             "{profile}"
         );
+        let mut codes = vec![7; 3];
+        let read = dataset.read_codes_into(0, Quantity::Transient, &mut codes);
+        match (spec.profile, read.await) {
+            (Profile::SqrtU16 { delta }, Ok(())) => {
+                let scale = dataset.manifest(0).await.unwrap().scale;
+                let code = SquareRoot::new(delta, scale);
+                let decoded = codes.iter().zip(&planes).all(|(q, h)| match *q {
+                    SATURATED => *h > code.decode(SATURATED - 1),
+                    q => code.decode(q) == *h,
+                });
+                assert!(decoded && codes.len() == planes.len(), "{profile}");
+            }
+            (_, read) => {
+                let error = read.unwrap_err().to_string();
+                assert!(error.starts_with("profile: "), "{profile}: {error}");
+            }
+        }
         let error = dataset.read_transient_part(0, 0..1, 0..1, 300..301).await;
         assert!(error.unwrap_err().to_string().starts_with("bins: expected"));
     }
