@@ -110,15 +110,15 @@ impl<T> Recent<T> {
 
 impl Stores {
     fn models_of(&self, store: &str) -> Result<(Models, Reports), Problem> {
-        let (at, prefix) = self.opened(store)?;
+        let (at, prefix) = self.open_at(store)?;
         let models = Models::new(Arc::clone(&at), &prefix);
         Ok((models, Reports::new(at, &prefix)))
     }
 
-    /// Returns the models of a store, given by its position.
+    /// Returns the models of a store, given as in URLs.
     ///
     /// # Errors
-    /// Fails if there is no such store, or if it cannot be read.
+    /// Fails if its name leads out of the named stores, or if it cannot be read.
     pub async fn models(&self, store: &str) -> Result<Arc<StoreModels>, Problem> {
         let (models, _) = self.models_of(store)?;
         let read = async {

@@ -1,6 +1,7 @@
 //! The data sets in the given stores. Nothing else is read.
 
 use std::{
+    collections::BTreeSet,
     path::PathBuf,
     sync::Arc,
     time::{Duration, Instant},
@@ -134,27 +135,13 @@ impl Stores {
         self.places.iter().map(|place| &*place.name)
     }
 
-    /// Returns the name of a store, given by its position.
-    ///
-    /// # Errors
-    /// Fails if there is none.
-    pub fn name(&self, store: &str) -> Result<&str, Problem> {
-        Ok(&self.position(store)?.name)
-    }
-
-    /// Returns the object store of a store, given by its position, and the prefix in it.
-    ///
-    /// # Errors
-    /// Fails if there is none.
-    pub(super) fn opened(&self, store: &str) -> Result<(Arc<dyn ObjectStore>, Path), Problem> {
-        let place = self.position(store)?;
-        Ok((Arc::clone(&place.store), place.prefix.clone()))
-    }
-
-    fn position(&self, store: &str) -> Result<&Place, Problem> {
-        let missing = || Problem::missing(format!("store: there is no store {store:?}"));
-        let position: usize = store.parse().map_err(|_| missing())?;
-        self.places.get(position).ok_or_else(missing)
+    /// Returns the folders that may have models: the named stores, and those with data sets.
+    pub async fn folders(&self) -> BTreeSet<String> {
+        let listed = self.list().await;
+        let parents = listed.sets.iter().filter_map(|set| set.id.rsplit_once('/'));
+        let parents = parents.map(|(parent, _)| parent.to_owned());
+        let named = (0..self.places.len()).map(|position| position.to_string());
+        parents.chain(named).collect()
     }
 
     /// Returns the data sets, and what cannot be read.
@@ -244,7 +231,7 @@ impl Stores {
     }
 
     fn find<'a>(&self, id: &'a str) -> Result<(&Place, &'a str), Problem> {
-        let missing = || Problem::missing(format!("set: there is no data set {id:?}"));
+        let missing = || Problem::missing(format!("there is no data set or store {id:?}"));
         let (position, rest) = id.split_once('/').unwrap_or((id, ""));
         let position: usize = position.parse().map_err(|_| missing())?;
         let place = self.places.get(position).ok_or_else(missing)?;

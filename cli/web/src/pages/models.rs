@@ -2,6 +2,8 @@
 
 mod sweep;
 
+use std::sync::Arc;
+
 use futures::future::join_all;
 use maud::{Markup, html};
 use picofarm_figures::number::thousands;
@@ -18,7 +20,7 @@ use super::{
 use crate::{
     App,
     answer::Problem,
-    data::{Listed, Model, SceneId, StoreModels, flight_path},
+    data::{Listed, Listing, Model, SceneId, StoreModels, flight_path},
     query::{Query, encode},
 };
 
@@ -27,23 +29,30 @@ const WORST: usize = 40;
 
 /// Returns the list of models.
 pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
-    let stores: Vec<(String, &str)> = match query.text("store") {
-        "" => {
-            let names = app.stores.names().enumerate();
-            names.map(|(at, name)| (at.to_string(), name)).collect()
-        }
-        store => vec![(store.to_owned(), app.stores.name(store)?)],
+    let stores: Vec<String> = match query.text("store") {
+        "" => app.stores.folders().await.into_iter().collect(),
+        store => vec![store.to_owned()],
     };
-    let read = stores.iter().map(|(store, _)| app.stores.models(store));
-    let read = join_all(read).await;
+    let read = stores.iter().map(async |store| {
+        let models = app.stores.models(store).await;
+        Ok::<_, Problem>((store, app.stores.place(store)?, models))
+    });
+    let read = join_all(read).await.into_iter();
+    let read = read.collect::<Result<Vec<_>, Problem>>()?;
+    let shown = |models: &Result<Arc<StoreModels>, Problem>| match models {
+        Ok(models) => !models.models.is_empty(),
+        Err(_) => true,
+    };
     let content = html! {
         h1 { "Models" }
         @if stores.is_empty() {
             p.none { "No store is shown. Start " code { "picofarm web --store FOLDER_OR_URL" } "." }
+        } @else if !read.iter().any(|(_, _, models)| shown(models)) {
+            p.none { "No models. " code { "picofarm job init --kind train" } " writes a job that trains some." }
         }
-        @for ((store, name), models) in stores.iter().zip(&read) {
+        @for (store, place, models) in read.iter().filter(|(_, _, models)| shown(models)) {
             section id={ "store-" (store) } {
-                h2 { (safe(name)) }
+                h2 { (safe(place)) }
                 @match models {
                     Ok(models) => { (table(store, models)) }
                     Err(problem) => { p.problem role="alert" { (safe(&problem.message)) } }
@@ -61,9 +70,6 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
 }
 
 fn table(store: &str, models: &StoreModels) -> Markup {
-    if models.models.is_empty() {
-        return html! { p.none { "No models. " code { "picofarm job init --kind train" } " writes a job that trains some." } };
-    }
     let rest = [
         (models.trials, "trials are on the pages of their sweeps."),
         (models.more, "more models are not listed."),
@@ -132,9 +138,7 @@ fn verdict(verdict: &Verdict) -> Markup {
 /// Reads the parameters `store` and `name`.
 fn named(query: &Query) -> Result<(&str, &str), Problem> {
     match (query.text("store"), query.text("name")) {
-        ("", _) => Err(Problem::input(
-            "store: expected the position of a store, found nothing",
-        )),
+        ("", _) => Err(Problem::input("store: expected a store, found nothing")),
         (_, "") => Err(Problem::input("name: expected a name, found nothing")),
         both => Ok(both),
     }
@@ -144,6 +148,7 @@ fn named(query: &Query) -> Result<(&str, &str), Problem> {
 pub async fn model(app: &App, query: &Query) -> Result<Page, Problem> {
     let (store, name) = named(query)?;
     let model = app.stores.model(store, name).await?;
+    let listed = app.stores.list().await;
     let content = html! {
         h1 { (safe(name)) }
         (facts(store, &model))
@@ -155,7 +160,7 @@ pub async fn model(app: &App, query: &Query) -> Result<Page, Problem> {
             }
         }
         @for (i, evaluation) in model.evaluations.iter().enumerate() {
-            (evaluated(app, store, &model.manifest, evaluation, i))
+            (evaluated(&listed, store, &model.manifest, evaluation, i))
         }
         section #settings { h2 { "Settings" }
             pre.file tabindex="0" { (safe(pretty(&model.manifest.settings))) } }
@@ -239,15 +244,19 @@ fn validation_loss(line: &Value) -> Option<f64> {
 
 /// An evaluation, with the scenes in the order of their errors, worst first.
 fn evaluated(
-    app: &App,
+    listed: &Listing,
     store: &str,
     model: &ModelManifest,
     evaluation: &Evaluation,
     position: usize,
 ) -> Markup {
     let metrics = &evaluation.metrics;
-    let name = app.stores.name(store).unwrap_or_default();
-    let set = app.stores.locate(name, &evaluation.dataset);
+    let set = format!("{store}/{}", evaluation.dataset);
+    let set = listed
+        .sets
+        .iter()
+        .any(|found| found.id == set)
+        .then_some(set);
     let shown = [
         "examples",
         "by_scene",
@@ -310,6 +319,12 @@ fn pretty(value: &Value) -> String {
 fn plain(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
+        Value::Object(parts) => {
+            let parts = parts
+                .iter()
+                .map(|(name, value)| format!("{name} {}", plain(value)));
+            parts.collect::<Vec<_>>().join(", ")
+        }
         Value::Number(number) if number.is_f64() => number
             .as_f64()
             .map(picofarm_figures::number::short)

@@ -9,7 +9,7 @@ use picofarm_results::{
 use picofarm_store::published::Manifest as _;
 use serde_json::json;
 
-use crate::{client::Web, farm::EVIL};
+use crate::{client::Web, farm::EVIL, room};
 
 const ID: &str = "0123456789abcdef";
 
@@ -106,7 +106,9 @@ fn write(store: &Path) {
 
 fn shown() -> (tempfile::TempDir, Web) {
     let folder = tempfile::tempdir().unwrap();
-    write(folder.path());
+    // A store within the folder that the user named, as `up` has it.
+    write(&folder.path().join("store"));
+    room::write(&folder.path().join("store"));
     let web = Web::start(vec![folder.path().display().to_string()]);
     (folder, web)
 }
@@ -116,32 +118,35 @@ fn models_are_listed_with_what_they_predict_and_their_sweeps() {
     let (_folder, web) = shown();
     let html = web.get("/models").text();
     for text in [
-        "/models/model?store=0&amp;name=depth",
+        "/models/model?store=0%2Fstore&amp;name=depth",
         "<td>tof</td>",
-        &format!("/models/sweep?store=0&amp;name=depth&amp;id={ID}"),
+        &format!("/models/sweep?store=0%2Fstore&amp;name=depth&amp;id={ID}"),
         "depth MAE",
     ] {
         assert!(html.contains(text), "{text}: {html}");
     }
     assert_eq!(web.get("/models?store=7").status, 404);
-    assert_eq!(web.get("/models/model?store=0&name=shadow").status, 404);
+    assert_eq!(
+        web.get("/models/model?store=0%2Fstore&name=shadow").status,
+        404
+    );
     assert_eq!(web.get("/models/model?store=0").status, 400);
 }
 
 #[test]
 fn a_model_has_its_curve_and_its_scenes_by_error() {
     let (_folder, web) = shown();
-    let html = web.get("/models/model?store=0&name=depth").text();
+    let html = web.get("/models/model?store=0%2Fstore&name=depth").text();
     assert_eq!(html.matches("</polyline>").count(), 2, "{html}");
     assert!(!html.contains(EVIL) && html.contains("&lt;script&gt;"));
     // Scene 2 has the larger error.
     let link = |scene: u32| {
-        html.find(&format!("set=0%2Frooms&amp;scene={scene}"))
+        html.find(&format!("set=0%2Fstore%2Frooms&amp;scene={scene}"))
             .expect(&html)
     };
     assert!(link(2) < link(0));
     assert!(
-        html.contains("/models/report?store=0&amp;name=report"),
+        html.contains("/models/report?store=0%2Fstore&amp;name=report"),
         "{html}"
     );
 }
@@ -149,7 +154,7 @@ fn a_model_has_its_curve_and_its_scenes_by_error() {
 #[test]
 fn a_sweep_has_the_reason_of_each_end_and_its_address_the_order() {
     let (_folder, web) = shown();
-    let path = format!("/models/sweep?store=0&name=depth&id={ID}");
+    let path = format!("/models/sweep?store=0%2Fstore&name=depth&id={ID}");
     let html = web.get(&path).text();
     assert!(!html.contains(EVIL), "{html}");
     for text in [
@@ -184,7 +189,7 @@ fn a_sweep_has_the_reason_of_each_end_and_its_address_the_order() {
 #[test]
 fn a_report_is_shown_in_a_sandbox_without_scripts() {
     let (_folder, web) = shown();
-    let reply = web.get("/models/report?store=0&name=report");
+    let reply = web.get("/models/report?store=0%2Fstore&name=report");
     assert!(reply.text().contains("<p>report"));
     let policy = reply.header("content-security-policy").unwrap();
     assert!(policy.starts_with("sandbox;"), "{policy}");
@@ -192,5 +197,8 @@ fn a_report_is_shown_in_a_sandbox_without_scripts() {
         assert!(!policy.contains(word), "{policy}");
     }
     assert!(policy.contains("default-src 'none'"), "{policy}");
-    assert_eq!(web.get("/models/report?store=0&name=other").status, 404);
+    assert_eq!(
+        web.get("/models/report?store=0%2Fstore&name=other").status,
+        404
+    );
 }
