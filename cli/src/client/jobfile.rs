@@ -206,12 +206,17 @@ mod tests {
                 .filter_map(|line| line.strip_prefix("[scale.")?.split(']').next())
                 .collect();
             assert!(sizes.len() >= 2, "{path:?}");
+            // The laboratory's captures are made first, and the number of scenes follows from them.
+            let counted = !path.ends_with("laboratory.toml");
             for scale in sizes {
                 // Furnished rooms need assets. The test uses primitive rooms; nothing else changes.
                 let dir = tempfile::tempdir().unwrap();
                 let path = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
                 let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
-                let spec = checked(spec, &path).unwrap();
+                let spec = match counted {
+                    true => checked(spec, &path).unwrap(),
+                    false => spec,
+                };
                 let kinds: Vec<&str> = spec.stages.iter().map(|s| s.task.kind()).collect();
                 // The errors of a reconstruction are stored with it, and `dataset info` shows their
                 // means.

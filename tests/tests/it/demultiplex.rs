@@ -106,7 +106,7 @@ fn separate_captures_give_depth_and_masks_by_the_published_methods() {
         let demultiplex = ["demultiplex", "render", "--method", method, "--out"];
         let said = cli.json(&[&demultiplex[..], &[method]].concat());
         let median = said["depth"]["median_m"].as_f64().unwrap();
-        assert!(median < 0.03, "{method}: {said}");
+        assert!(median < 0.05, "{method}: {said}");
         let (shape, _) = array(&scratch.join(method), "lit");
         assert_eq!(shape, [4, 32, 32]);
         // They find no mirrors, and claim none.

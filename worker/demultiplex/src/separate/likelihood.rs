@@ -71,10 +71,9 @@ fn statistics(h: &[f32], b: f64, bin: usize, timing: &Timing) -> Option<Peak> {
         return None;
     }
     let mean = part().map(|(k, n)| n * k).sum::<f64>() / photons;
-    let square = part()
-        .map(|(k, n)| n * (k - mean) * (k - mean))
-        .sum::<f64>()
-        / photons;
+    let spread: f64 = part().map(|(k, n)| n * (k - mean) * (k - mean)).sum();
+    // Light is anywhere in its bin, which counts where bins are wide.
+    let square = spread / photons + 1.0 / 12.0;
     Some(Peak {
         bin,
         mean,
