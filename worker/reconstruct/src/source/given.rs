@@ -63,9 +63,13 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
         computed: matches!(given.times, Times::Range(_)),
         mirror: given.mirror.to_vec(),
         confidence: Vec::new(),
+        unlit_range_m: Vec::new(),
         left_out: Vec::new(),
     };
     let pixels = measured.pixels();
+    if let Times::Range(metres) = given.times {
+        measured.unlit_range_m = metres.to_vec();
+    }
     let images = given.beams.len() * pixels;
     let times = match given.times {
         Times::Range(metres) => ("times.range", metres.len(), pixels),
