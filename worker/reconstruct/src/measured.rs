@@ -59,8 +59,8 @@ pub struct Measured {
     /// How surely each pixel's times are its own, 0 to 1, where times were separated from one
     /// flash; empty = all are.
     pub confidence: Vec<f32>,
-    /// The distance along the ray of pixels that no spot lights, metres, as far as other light shows
-    /// it; NaN = unknown; empty = no pixel's is known.
+    /// The distance along the ray of pixels that no spot lights, metres, as far as other light
+    /// shows it; NaN = unknown; empty = no pixel's is known.
     pub unlit_range_m: Vec<f32>,
     /// The spots that are not used.
     pub left_out: Vec<LeftOut>,

@@ -20,7 +20,7 @@ const CLOSE_M: f32 = 0.02;
 /// The least cosine between a point's normal and the plane's.
 const ALIKE: f32 = 0.9;
 /// The least share of the pixels on a plane.
-const LEAST_SHARE: f32 = 1.0 / 100.0;
+const LEAST_SHARE: f32 = 1.0 / 40.0;
 /// The distance from which points are behind a plane, as a multiple of the tolerance.
 const BEHIND: f32 = 3.0;
 
@@ -203,8 +203,8 @@ pub fn settle(measured: &Measured, depth: &mut Depth, walls: &[Wall]) {
     }
 }
 
-/// Moves pixels that are behind a closed part of a wall onto it, because nothing is visible there: a
-/// mirror on a wall shows a room behind the wall, and light of three bounces comes late. Their
+/// Moves pixels that are behind a closed part of a wall onto it, because nothing is visible there:
+/// a mirror on a wall shows a room behind the wall, and light of three bounces comes late. Their
 /// light paths are left unused. Returns the number of pixels.
 pub fn confine(measured: &mut Measured, depth: &mut Depth, walls: &[Wall]) -> usize {
     let pixels = measured.pixels();

@@ -29,7 +29,7 @@ pub enum State {
 /// The half width of the band around a visible surface, voxels.
 const BAND: f32 = 1.5;
 /// The share of the points excluded at each end of an axis when computing the box.
-const OUTLIERS: f32 = 5e-4;
+const OUTLIERS: f32 = 5e-3;
 /// The margin of the box on each side, voxels.
 const MARGIN: f32 = 4.0;
 /// The number of supersampling positions along a side of a voxel where states change.
@@ -166,12 +166,7 @@ impl Seen<'_> {
 }
 
 /// Sets the logits of every node, and returns the nodes' states.
-pub fn start(
-    field: &mut Field,
-    measured: &Measured,
-    depth: &Depth,
-    walls: &[Wall],
-) -> Vec<State> {
+pub fn start(field: &mut Field, measured: &Measured, depth: &Depth, walls: &[Wall]) -> Vec<State> {
     let seen = Seen {
         measured,
         depth,

@@ -38,8 +38,8 @@ impl Wall {
     /// Returns whether the wall is closed at the foot of a position, or around the foot.
     pub fn is_closed(&self, x: Vec3) -> bool {
         let [i, j] = cell(&self.frame, x).map(|c| c.round());
-        let [i, j] = [(i, self.size[0]), (j, self.size[1])]
-            .map(|(c, n)| (c.max(0.0) as usize).min(n - 1));
+        let [i, j] =
+            [(i, self.size[0]), (j, self.size[1])].map(|(c, n)| (c.max(0.0) as usize).min(n - 1));
         self.closed[i * self.size[1] + j]
     }
 
@@ -52,8 +52,8 @@ impl Wall {
         }
     }
 
-    /// Returns the distance from `origin` along `ray` to the wall, or `None` if the ray misses it or
-    /// passes an opening.
+    /// Returns the distance from `origin` along `ray` to the wall, or `None` if the ray misses it
+    /// or passes an opening.
     pub fn hit(&self, origin: Vec3, ray: Vec3) -> Option<f32> {
         let slope = self.plane.normal.dot(ray);
         let range = self.plane.inside(origin) / slope;

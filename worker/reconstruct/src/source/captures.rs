@@ -98,8 +98,8 @@ impl Captures {
         self.measured.mirror = mirror;
     }
 
-    /// Adds the capture of beam `beam`: histograms `[row][column][bin]`. Whole numbers are counts of
-    /// photons: their ambient light is subtracted, and returns within their noise are undecided.
+    /// Adds the capture of beam `beam`: histograms `[row][column][bin]`. Whole numbers are counts
+    /// of photons: their ambient light is subtracted, and returns within their noise are undecided.
     ///
     /// # Errors
     /// [`ReconstructError::Invalid`] for a histogram of another size, a NaN or infinite value, or a
@@ -287,7 +287,11 @@ fn first_light(h: &[f32], dark: usize) -> Option<usize> {
     let (before, after) = h.split_at(dark);
     let count = before.len().max(1) as f32;
     let level = before.iter().sum::<f32>() / count;
-    let variance = before.iter().map(|v| (v - level) * (v - level)).sum::<f32>() / count;
+    let variance = before
+        .iter()
+        .map(|v| (v - level) * (v - level))
+        .sum::<f32>()
+        / count;
     let all: f32 = after.iter().map(|v| v - level).sum();
     let mut sum = 0.0f32;
     let arrived = |(n, v): (usize, &f32)| {

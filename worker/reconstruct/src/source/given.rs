@@ -67,9 +67,6 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
         left_out: Vec::new(),
     };
     let pixels = measured.pixels();
-    if let Times::Range(metres) = given.times {
-        measured.unlit_range_m = metres.to_vec();
-    }
     let images = given.beams.len() * pixels;
     let times = match given.times {
         Times::Range(metres) => ("times.range", metres.len(), pixels),

@@ -27,7 +27,13 @@ fn camera() -> Camera {
 /// Returns the distance along a ray from the origin to a room of 4 × 2.6 m that is L-shaped: right
 /// of x = 0.4 m it is deeper.
 fn l_room(ray: Vec3) -> f32 {
-    let to = |far: f32, slope: f32| if slope > 0.0 { far / slope } else { f32::INFINITY };
+    let to = |far: f32, slope: f32| {
+        if slope > 0.0 {
+            far / slope
+        } else {
+            f32::INFINITY
+        }
+    };
     let sides = to(2.0, ray.x.abs()).min(to(1.3, ray.y.abs()));
     let wall = to(-WALL_Z, -ray.z);
     let x = ray.x * wall;
@@ -122,7 +128,10 @@ fn wrong_depths_behind_a_wall_neither_grow_the_box_nor_remove_the_wall() {
     }
     let wrong = made(&range);
     assert_eq!(wrong.planes.len(), right.planes.len(), "{:?}", wrong.planes);
-    let (a, b) = (right.field.end() - right.field.origin, wrong.field.end() - wrong.field.origin);
+    let (a, b) = (
+        right.field.end() - right.field.origin,
+        wrong.field.end() - wrong.field.origin,
+    );
     assert!((0..3).all(|k| (a[k] - b[k]).abs() < 0.2), "{a:?} {b:?}");
     assert!(
         wrong.notes.iter().any(|n| n.contains("behind a wall")),
@@ -144,9 +153,9 @@ fn a_pixel_that_no_spot_lights_has_the_given_distance() {
         let made = reconstruct(measured.clone(), small(), &Unwatched).unwrap();
         made.depth.range[pixel]
     };
-    assert!((depth(&measured) - range[pixel]).abs() < 0.05);
-    measured.unlit_range_m.clear();
     assert!(depth(&measured).is_nan());
+    measured.unlit_range_m = range.clone();
+    assert!((depth(&measured) - range[pixel]).abs() < 0.05);
     measured.unlit_range_m = vec![1.0; 3];
     let refusal = measured.check().unwrap_err().to_string();
     assert!(refusal.contains("unlit_range_m"), "{refusal}");
@@ -172,7 +181,14 @@ fn captures_without_noise_give_no_worse_room_than_captures_with_noise() {
         dark_per_bin: 1.0,
         ..Sensor::default()
     };
-    let of = || Captures::new(scene.camera, scene.laser.clone(), settings.gate, LIT_THRESHOLD);
+    let of = || {
+        Captures::new(
+            scene.camera,
+            scene.laser.clone(),
+            settings.gate,
+            LIT_THRESHOLD,
+        )
+    };
     let mut all = [of(), of().behind(&sensor, 7).unwrap()];
     let mut alone = scene.clone();
     for (beam, only) in scene.laser.beams.iter().enumerate() {
@@ -187,7 +203,12 @@ fn captures_without_noise_give_no_worse_room_than_captures_with_noise() {
         let made = reconstruct(captures.finish(), small(), &Unwatched).unwrap();
         let views = around(&made.measured, &made.depth.range, &world, 8, 48);
         let renderer = Renderer::new(&made.field);
-        score_views(&renderer, &scene.camera, &world, &views).all.l1_m
+        score_views(&renderer, &scene.camera, &world, &views)
+            .all
+            .l1_m
     });
-    assert!(free <= 1.1 * noisy, "{free} m without noise, {noisy} m with");
+    assert!(
+        free <= 1.1 * noisy,
+        "{free} m without noise, {noisy} m with"
+    );
 }
