@@ -15,6 +15,8 @@ use crate::{
 
 /// The greatest number of spots whose times are not believed without a surface around the pixel.
 const LONELY: usize = 2;
+/// The least number of spots whose first light must be known for a wall to go on.
+const FEWEST_TIMES: usize = 3;
 /// The number of bins by which light may be early before a wall is refused.
 const EARLY_BINS: f32 = 2.0;
 /// The number of dark pixels among a pixel and its eight neighbours that make a dark object.
@@ -38,7 +40,7 @@ pub(crate) fn fill(measured: &mut Measured, first: &[f32]) {
     for p in 0..pixels {
         let pairs = || (0..measured.spots.len()).map(move |k| k * pixels + p);
         let lit = |q: &usize| measured.lit[*q] != 0 && measured.used[*q] != 0;
-        let few = pairs().filter(lit).count() <= LONELY;
+        let few = !measured.computed && pairs().filter(lit).count() <= LONELY;
         if few && depth.normal[p] == Vec3::ZERO && depth.range[p].is_finite() {
             depth.range[p] = f32::NAN;
             for q in pairs().collect::<Vec<_>>() {
@@ -68,8 +70,13 @@ fn on_wall(measured: &Measured, walls: &[Wall], first: &[f32], pixel: usize) -> 
     let (origin, ray) = (measured.camera.origin, measured.ray(pixel));
     let hits = walls.iter().filter_map(|w| w.hit(origin, ray));
     let range = hits.min_by(f32::total_cmp)?;
-    let early = EARLY_BINS * measured.bin_width_m;
+    // At a small angle, the near end of a pixel's surface is much nearer than its middle.
+    let early = EARLY_BINS * measured.bin_width_m + JOINED * range;
     let pixels = measured.pixels();
+    let known = (0..measured.spots.len()).filter(|k| first[k * pixels + pixel].is_finite());
+    if known.count() < FEWEST_TIMES {
+        return None;
+    }
     let possible = measured.spots.iter().enumerate().all(|(k, spot)| {
         let seen = first[k * pixels + pixel] + early - spot.path_m;
         let far = on_ellipsoid(seen, spot.point - origin, ray);

@@ -121,7 +121,9 @@ fn divided(
             return Some((x, true));
         }
         let passed = plane.inside(eye) / (plane.inside(eye) - far);
-        (far < -BEHIND * close).then(|| (eye + (x - eye) * passed, false))
+        // A wrong time has no surface around it.
+        let seen = far < -BEHIND * close && normal != Vec3::ZERO;
+        seen.then(|| (eye + (x - eye) * passed, false))
     };
     let votes: Vec<(Vec3, bool)> = points.iter().filter_map(vote).collect();
     let across = match plane.normal.x.abs() < 0.7 {

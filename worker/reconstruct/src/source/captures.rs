@@ -240,7 +240,11 @@ impl Captures {
             if near || mirror || sum <= 0.0 {
                 // A histogram without any light is not evidence: not even light of three bounces
                 // arrived.
-                return (0.0, 0, 0, Return::default());
+                let none = Return {
+                    first_m: f32::NAN,
+                    ..Return::default()
+                };
+                return (0.0, 0, 0, none);
             }
             let (bin, _) = peak(h);
             let mut response = 0.0f32;
