@@ -91,9 +91,9 @@ pub fn depth_alone(
     let raw = closed_form(&mut measured).0;
     some_depth(&raw)?;
     let mut depth = smooth(&measured, &raw);
-    let walls = match settings.planes {
+    let (walls, _) = match settings.planes {
         true => planes(&measured, &depth, settings.seed),
-        false => Vec::new(),
+        false => (Vec::new(), Vec::new()),
     };
     settle(&measured, &mut depth, &walls);
     let (lo, hi) = bounds(&measured, &depth, settings.nodes as usize);

@@ -27,6 +27,8 @@ pub mod saved;
 pub mod score;
 pub mod source;
 mod start;
+mod unlit;
+mod walls;
 mod world;
 
 pub use agreement::{Agreement, Verdict};
@@ -43,4 +45,4 @@ pub use world::{Hit, World};
 
 /// The version of the reconstruction, which is part of every task key. Change it whenever any bit
 /// of a result may change.
-pub const VERSION: &str = "reconstruct-6";
+pub const VERSION: &str = "reconstruct-7";

@@ -59,6 +59,9 @@ pub struct Measured {
     /// How surely each pixel's times are its own, 0 to 1, where times were separated from one
     /// flash; empty = all are.
     pub confidence: Vec<f32>,
+    /// The distance along the ray of pixels that no spot lights, metres, as far as other light
+    /// shows it; NaN = unknown; empty = no pixel's is known.
+    pub unlit_range_m: Vec<f32>,
     /// The spots that are not used.
     pub left_out: Vec<LeftOut>,
 }
@@ -84,6 +87,16 @@ impl Measured {
     /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.camera.intrinsics.width as usize * self.camera.intrinsics.height as usize
+    }
+
+    /// Returns the pixel that sees a position, or `None` outside the view.
+    pub(crate) fn pixel_of(&self, x: Vec3) -> Option<usize> {
+        let i = &self.camera.intrinsics;
+        let q = self.camera.to_camera(x);
+        let (u, v) = (i.fx * q.x / q.z + i.cx, i.fy * q.y / q.z + i.cy);
+        let inside =
+            q.z > 0.02 && u >= 0.0 && v >= 0.0 && u < i.width as f32 && v < i.height as f32;
+        inside.then(|| v as usize * i.width as usize + u as usize)
     }
 
     /// Returns the unit direction through the middle of a pixel.
@@ -132,6 +145,13 @@ impl Measured {
                 self.confidence.len()
             );
             return Err(ReconstructError::invalid("confidence", what));
+        }
+        if !self.unlit_range_m.is_empty() && self.unlit_range_m.len() != pixels {
+            let what = format!(
+                "has {} values, expected {pixels} pixels or none",
+                self.unlit_range_m.len()
+            );
+            return Err(ReconstructError::invalid("unlit_range_m", what));
         }
         for (i, spot) in self.spots.iter().enumerate() {
             if !(spot.point.is_finite() && spot.path_m.is_finite() && spot.path_m >= 0.0) {

@@ -1,11 +1,12 @@
-//! Planes of the room: large planes with hardly any visible points behind them. They close the room
-//! outside the camera's view, and stabilise the depth of points on them.
+//! Planes of the room: large planes that visible points are on, with their openings. They close the
+//! room outside the camera's view, and stabilise the depth of points on them.
 
 use picofarm_scene::Vec3;
 
 use crate::{
     Depth, Measured,
     rng::{Rng, Stream},
+    walls::{Wall, walls},
 };
 
 /// The greatest number of planes.
@@ -20,8 +21,6 @@ const CLOSE_M: f32 = 0.02;
 const ALIKE: f32 = 0.9;
 /// The least share of the pixels on a plane.
 const LEAST_SHARE: f32 = 1.0 / 40.0;
-/// The largest share of the points behind a plane.
-const MOST_BEHIND: f32 = 0.02;
 /// The distance from which points are behind a plane, as a multiple of the tolerance.
 const BEHIND: f32 = 3.0;
 
@@ -42,13 +41,21 @@ impl Plane {
     }
 }
 
+/// A plane that many pixels see.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Candidate {
+    pub plane: Plane,
+    /// The share of the pixels on it.
+    pub share: f32,
+}
+
 /// A pixel's point and its normal, pointing out of the room.
 type Point = (Vec3, Vec3);
 
 /// Finds planes by random sample consensus (Fischler and Bolles 1981) over the pixels' points and
-/// normals, the largest first, each refined by least squares. A plane with more than 2 % of the
-/// points behind it (a table's top, a wardrobe's front) is not a wall and is rejected.
-pub fn planes(measured: &Measured, depth: &Depth, seed: u64) -> Vec<Plane> {
+/// normals, the largest first, each refined by least squares. Returns those that are walls, and
+/// notes on the others and on openings.
+pub(crate) fn planes(measured: &Measured, depth: &Depth, seed: u64) -> (Vec<Wall>, Vec<String>) {
     let mut errors: Vec<f32> = depth
         .error
         .iter()
@@ -108,18 +115,14 @@ pub fn planes(measured: &Measured, depth: &Depth, seed: u64) -> Vec<Plane> {
         for (f, q) in free.iter_mut().zip(&points) {
             *f &= !(plane.inside(q.0).abs() < 2.0 * close && plane.normal.dot(q.1) > ALIKE);
         }
-        let behind = points
-            .iter()
-            .filter(|q| plane.inside(q.0) < -BEHIND * close)
-            .count();
-        if behind as f32 <= MOST_BEHIND * points.len() as f32 && count > 0 {
-            found.push(plane);
-            if found.len() == MOST {
-                break;
-            }
-        }
+        found.push(Candidate {
+            plane,
+            share: (count * STRIDE) as f32 / depth.range.len() as f32,
+        });
     }
-    found
+    let (mut found, notes) = walls(measured, depth, (&found, close));
+    found.truncate(MOST);
+    (found, notes)
 }
 
 /// Returns the plane through points with the least sum of squared distances, facing as `plane`
@@ -179,7 +182,7 @@ fn smallest_axis(mut cov: [[f64; 3]; 3], near: Vec3) -> Vec3 {
 
 /// Moves pixels that are on a plane, by position and normal, onto it, and sets their normal to the
 /// plane's.
-pub fn settle(measured: &Measured, depth: &mut Depth, planes: &[Plane]) {
+pub fn settle(measured: &Measured, depth: &mut Depth, walls: &[Wall]) {
     for p in 0..depth.range.len() {
         let (range, normal) = (depth.range[p], depth.normal[p]);
         if !range.is_finite() || normal == Vec3::ZERO {
@@ -190,7 +193,7 @@ pub fn settle(measured: &Measured, depth: &mut Depth, planes: &[Plane]) {
         let reach = CLOSE_M.max(3.0 * depth.error[p]).min(4.0 * CLOSE_M);
         let near =
             |plane: &&Plane| plane.inside(x).abs() < reach && -plane.normal.dot(normal) > ALIKE;
-        if let Some(plane) = planes.iter().find(near) {
+        if let Some(plane) = walls.iter().map(|w| &w.plane).find(near) {
             let slope = plane.normal.dot(ray);
             if slope > 0.05 {
                 depth.range[p] = range + plane.inside(x) / slope;
@@ -200,28 +203,32 @@ pub fn settle(measured: &Measured, depth: &mut Depth, planes: &[Plane]) {
     }
 }
 
-/// Moves doubtful pixels that are behind a plane of the room onto it, because nothing is visible
-/// there: a mirror on a wall shows a room behind the wall. Their light paths are left unused.
-pub fn confine(measured: &mut Measured, depth: &mut Depth, planes: &[Plane]) {
+/// Moves pixels that are behind a closed part of a wall onto it, because nothing is visible there:
+/// a mirror on a wall shows a room behind the wall, and light of three bounces comes late. Their
+/// light paths are left unused. Returns the number of pixels.
+pub fn confine(measured: &mut Measured, depth: &mut Depth, walls: &[Wall]) -> usize {
     let pixels = measured.pixels();
+    let mut count = 0;
     for p in 0..pixels {
-        if !depth.range[p].is_finite() || !measured.is_doubtful(p) {
+        if !depth.range[p].is_finite() {
             continue;
         }
         let ray = measured.ray(p);
         let origin = measured.camera.origin;
         let x = origin + ray * depth.range[p];
-        let first = planes
+        let reach = BEHIND * CLOSE_M.max(depth.error[p]);
+        let first = walls
             .iter()
-            .filter(|plane| plane.inside(x) < -BEHIND * CLOSE_M && plane.normal.dot(ray) > 0.05)
-            .map(|plane| (plane.inside(origin) / plane.normal.dot(ray), plane.normal))
-            .filter(|(range, _)| *range > 0.0)
+            .filter(|wall| wall.plane.inside(x) < -reach)
+            .filter_map(|wall| Some((wall.hit(origin, ray)?, wall.plane.normal)))
             .min_by(|a, b| a.0.total_cmp(&b.0));
         if let Some((range, normal)) = first {
             (depth.range[p], depth.normal[p]) = (range, -normal);
+            count += 1;
             for spot in 0..measured.spots.len() {
                 measured.used[spot * pixels + p] = 0;
             }
         }
     }
+    count
 }

@@ -15,6 +15,8 @@ use crate::{
     planes::{Plane, confine, planes, settle},
     progress::{Phase, Progress, begin},
     start::{State, bounds, start},
+    unlit,
+    walls::Wall,
 };
 
 /// The kind of evidence for a node of the result.
@@ -101,24 +103,35 @@ impl Reconstruction {
             .map_err(|(field, what)| ReconstructError::invalid(field, what))?;
         let mut notes = measured.check()?;
         begin(progress, Phase::Depth)?;
-        let (raw, times) = closed_form(&mut measured);
+        let (mut raw, times) = closed_form(&mut measured);
         if !raw.range.iter().any(|r| r.is_finite()) {
             let what = "no time gives a depth: all are shorter than the way by the spot; check the gate and the laser's place";
             return Err(ReconstructError::invalid("tau", what));
         }
-        let mut depth = smooth(&measured, &raw);
+        let lit = smooth(&measured, &raw);
         begin(progress, Phase::Planes)?;
-        let walls = match settings.planes {
-            true => planes(&measured, &depth, settings.seed),
-            false => Vec::new(),
+        let (walls, seen) = match settings.planes {
+            true => planes(&measured, &lit, settings.seed),
+            false => (Vec::new(), Vec::new()),
         };
-        let agreement = agreement::check(&measured, &depth, &times);
+        notes.extend(seen);
+        let agreement = agreement::check(&measured, &lit, &times);
+        let mut depth = match unlit::add(&measured, &mut raw) {
+            0 => lit,
+            _ => smooth(&measured, &raw),
+        };
         if agreement.verdict == Verdict::Contradicts && !settings.accept_inconsistent {
             let reasons = agreement.reasons;
             return Err(ReconstructError::Inconsistent { reasons });
         }
         settle(&measured, &mut depth, &walls);
-        confine(&mut measured, &mut depth, &walls);
+        let behind = confine(&mut measured, &mut depth, &walls);
+        if behind > 0 {
+            notes.push(format!(
+                "{behind} pixels ({:.1} %) were behind a wall that their neighbours see, and are placed on it",
+                100.0 * behind as f32 / measured.pixels() as f32
+            ));
+        }
         if settings.planes && walls.is_empty() {
             notes.push(
                 "no plane of a room was found: what lies outside the view stays empty".into(),
@@ -146,7 +159,7 @@ impl Reconstruction {
             settings,
             measured,
             depth,
-            planes: walls,
+            planes: walls.iter().map(|w| w.plane).collect(),
             field,
             evidence,
             trainable: these,
@@ -298,9 +311,9 @@ fn evidence(
     field: &Field,
     states: &[State],
     empty: Option<&[f32]>,
-    planes: &[Plane],
+    walls: &[Wall],
 ) -> Vec<Evidence> {
-    let near = |x: Vec3| planes.iter().any(|p| p.inside(x) < 1.5 * field.spacing);
+    let near = |x: Vec3| walls.iter().any(|p| p.inside(x) < 1.5 * field.spacing);
     let of = |i: usize| match states[i] {
         State::Free | State::Band => Evidence::Seen,
         State::Wall => Evidence::Plane,

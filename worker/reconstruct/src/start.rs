@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::{
     Depth, Measured,
     field::{EMPTY, Field, GAIN, SOLID, surface_logit},
-    planes::Plane,
+    walls::Wall,
 };
 
 /// The state of a node before light paths are evaluated.
@@ -29,7 +29,7 @@ pub enum State {
 /// The half width of the band around a visible surface, voxels.
 const BAND: f32 = 1.5;
 /// The share of the points excluded at each end of an axis when computing the box.
-const OUTLIERS: f32 = 5e-4;
+const OUTLIERS: f32 = 5e-3;
 /// The margin of the box on each side, voxels.
 const MARGIN: f32 = 4.0;
 /// The number of supersampling positions along a side of a voxel where states change.
@@ -42,8 +42,13 @@ const LEAST_IN_BAND: u32 = 9;
 /// a margin of four voxels.
 pub fn bounds(measured: &Measured, depth: &Depth, nodes: usize) -> (Vec3, Vec3) {
     let mut axes: [Vec<f32>; 3] = Default::default();
+    let known = |p: &usize| depth.range[*p].is_finite();
+    let smooth = |p: &usize| depth.normal[*p] != Vec3::ZERO;
+    let all = (0..depth.range.len()).filter(known).count();
+    let few = 2 * (0..depth.range.len()).filter(known).filter(smooth).count() < all;
     for (p, &range) in depth.range.iter().enumerate() {
-        if range.is_finite() {
+        // A surface has neighbours; a wrong time has none.
+        if range.is_finite() && (few || depth.normal[p] != Vec3::ZERO) {
             let x = measured.camera.origin + measured.ray(p) * range;
             for (k, axis) in axes.iter_mut().enumerate() {
                 axis.push(x[k]);
@@ -77,7 +82,7 @@ pub fn bounds(measured: &Measured, depth: &Depth, nodes: usize) -> (Vec3, Vec3) 
 struct Seen<'a> {
     measured: &'a Measured,
     depth: &'a Depth,
-    planes: &'a [Plane],
+    walls: &'a [Wall],
     spacing: f32,
     surface: f32,
 }
@@ -90,7 +95,7 @@ impl Seen<'_> {
     fn at(&self, x: Vec3) -> (State, f32) {
         let h = self.spacing;
         let wall = self
-            .planes
+            .walls
             .iter()
             .map(|p| p.inside(x))
             .fold(f32::INFINITY, f32::min);
@@ -161,16 +166,11 @@ impl Seen<'_> {
 }
 
 /// Sets the logits of every node, and returns the nodes' states.
-pub fn start(
-    field: &mut Field,
-    measured: &Measured,
-    depth: &Depth,
-    planes: &[Plane],
-) -> Vec<State> {
+pub fn start(field: &mut Field, measured: &Measured, depth: &Depth, walls: &[Wall]) -> Vec<State> {
     let seen = Seen {
         measured,
         depth,
-        planes,
+        walls,
         spacing: field.spacing,
         surface: surface_logit(),
     };

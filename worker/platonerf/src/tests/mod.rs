@@ -38,6 +38,7 @@ fn room() -> Measured {
         mirror: Vec::new(),
         computed: false,
         confidence: Vec::new(),
+        unlit_range_m: Vec::new(),
         left_out: Vec::new(),
     };
     for (beam, at) in [[1.5, 0.3, 1.0], [-1.5, 0.1, 1.2], [0.2, 1.4, 0.8]]

@@ -15,7 +15,7 @@ use super::{
     counted::{Counted, Detector},
     expected::{Return, expected},
 };
-use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
+use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError, unlit};
 
 /// A pixel is lit if the matched filter's response is at least this (PlatoNeRF's threshold in all
 /// four of its scenes).
@@ -25,6 +25,8 @@ pub const LIT_THRESHOLD: f32 = 0.15;
 const ASTRAY: f32 = 0.04;
 /// Bins of the pulse template below this share of its peak are omitted.
 const TEMPLATE_FLOOR: f32 = 1e-3;
+/// The share of a pixel's light whose arrival counts as first light.
+const EARLY: f32 = 0.03;
 /// With photon noise, the number of standard deviations from which a peak counts as a return.
 const CERTAIN: f32 = 3.0;
 
@@ -54,6 +56,7 @@ impl Captures {
             mirror: Vec::new(),
             computed: false,
             confidence: Vec::new(),
+            unlit_range_m: Vec::new(),
             left_out: Vec::new(),
         };
         Self {
@@ -95,7 +98,8 @@ impl Captures {
         self.measured.mirror = mirror;
     }
 
-    /// Adds the capture of beam `beam`: histograms `[row][column][bin]`.
+    /// Adds the capture of beam `beam`: histograms `[row][column][bin]`. Whole numbers are counts
+    /// of photons: their ambient light is subtracted, and returns within their noise are undecided.
     ///
     /// # Errors
     /// [`ReconstructError::Invalid`] for a histogram of another size, a NaN or infinite value, or a
@@ -122,7 +126,11 @@ impl Captures {
             return Err(ReconstructError::invalid(field(), what));
         }
         let counted = match &self.detector {
-            None => None,
+            // Whole numbers are counts of photons, with their noise.
+            None => histogram
+                .par_iter()
+                .all(|v| v.fract() == 0.0)
+                .then(|| Counted::of_counts(histogram.to_vec(), bins)),
             Some(detector) => Some(detector.count(beam, histogram, &self.gate)?),
         };
         let histogram = counted.as_ref().map_or(histogram, |c| &c.light);
@@ -141,7 +149,10 @@ impl Captures {
 
     /// Returns the measurements, with masks from the expected light of a lit pixel.
     pub fn finish(self) -> Measured {
-        expected(self.measured, &self.returns)
+        let mut measured = expected(self.measured, &self.returns);
+        let first: Vec<f32> = self.returns.iter().map(|r| r.first_m).collect();
+        unlit::fill(&mut measured, &first);
+        measured
     }
 
     /// Returns the measurements with PlatoNeRF's masks: lit if the matched filter's response
@@ -217,6 +228,10 @@ impl Captures {
             taps.last().map_or(0, |t| t.0),
         );
         let to_spot = (spot.point - self.measured.camera.origin).normalized();
+        // No light of this spot arrives before that of its shortest path.
+        let soonest = spot.path_m + (spot.point - self.measured.camera.origin).length();
+        let dark = (f64::from(soonest) - self.gate.start_m) / self.gate.bin_width_m - 2.0;
+        let dark = (dark.max(0.0) as usize).min(bins);
         let this = &*self;
         let pixel = |(p, h): (usize, &[f32])| -> (f32, u8, u8, Return) {
             let near = this.measured.ray(p).cross(to_spot).length() < NEAR_SPOT_SINE;
@@ -225,7 +240,11 @@ impl Captures {
             if near || mirror || sum <= 0.0 {
                 // A histogram without any light is not evidence: not even light of three bounces
                 // arrived.
-                return (0.0, 0, 0, Return::default());
+                let none = Return {
+                    first_m: f32::NAN,
+                    ..Return::default()
+                };
+                return (0.0, 0, 0, none);
             }
             let (bin, _) = peak(h);
             let mut response = 0.0f32;
@@ -251,6 +270,7 @@ impl Captures {
                 energy: near,
                 share: near / sum,
                 noise,
+                first_m: first_light(h, dark).map_or(f32::NAN, |bin| this.middle(bin)),
             };
             (if lit { tau } else { 0.0 }, u8::from(lit), 1, strongest)
         };
@@ -263,6 +283,26 @@ impl Captures {
         }
         self.measured.spots.push(spot);
     }
+}
+
+/// Returns the bin by which a small share of a histogram's light has arrived, or `None` without
+/// light. The first `dark` bins have no light but the background.
+fn first_light(h: &[f32], dark: usize) -> Option<usize> {
+    let (before, after) = h.split_at(dark);
+    let count = before.len().max(1) as f32;
+    let level = before.iter().sum::<f32>() / count;
+    let variance = before
+        .iter()
+        .map(|v| (v - level) * (v - level))
+        .sum::<f32>()
+        / count;
+    let all: f32 = after.iter().map(|v| v - level).sum();
+    let mut sum = 0.0f32;
+    let arrived = |(n, v): (usize, &f32)| {
+        sum += v - level;
+        sum > 0.0 && sum >= EARLY * all && sum >= CERTAIN * (variance * (n + 1) as f32).sqrt()
+    };
+    after.iter().enumerate().position(arrived).map(|n| n + dark)
 }
 
 /// Returns the first highest bin and its value.

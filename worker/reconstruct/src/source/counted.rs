@@ -38,19 +38,25 @@ impl Detector {
         };
         let sensed = sense(&self.sensor, &input, self.seed, beam as u64)
             .map_err(|e| ReconstructError::invalid("sensor", e.to_string()))?;
-        let mut light: Vec<f32> = match sensed.values {
+        let light: Vec<f32> = match sensed.values {
             Values::Counts(counts) => counts.into_iter().map(|n| n as f32).collect(),
             Values::Rate(rate) => rate,
         };
-        // Most bins contain only ambient light, so its level is estimated from the lower half of
-        // the bins.
+        Ok(Counted::of_counts(light, bins))
+    }
+}
+
+impl Counted {
+    /// Subtracts the ambient light of each pixel from its counts. Most bins contain only ambient
+    /// light, so its level is estimated from the lower half of the bins.
+    pub fn of_counts(mut light: Vec<f32>, bins: usize) -> Self {
         let ambient = |h: &mut [f32]| -> f32 {
             let level = lower_mean(h);
             h.iter_mut().for_each(|n| *n -= level);
             level
         };
         let ambient = light.par_chunks_mut(bins).map(ambient).collect();
-        Ok(Counted { light, ambient })
+        Self { light, ambient }
     }
 }
 

@@ -38,6 +38,8 @@ pub(super) struct Return {
     pub energy: f32,
     /// The share of all light.
     pub share: f32,
+    /// The path of the first light, metres; NaN without light.
+    pub first_m: f32,
     /// The standard deviation of the light, if photons were counted.
     pub noise: f32,
 }

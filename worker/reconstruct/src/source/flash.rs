@@ -6,7 +6,7 @@ use picofarm_demultiplex::{Capture, Demultiplexed};
 use picofarm_scene::Camera;
 
 use super::{Given, Times, given};
-use crate::{LeftOut, Measured, ReconstructError};
+use crate::{LeftOut, Measured, ReconstructError, unlit};
 
 /// The probabilities of light between which a pair of pixel and spot is no evidence.
 const UNDECIDED: std::ops::Range<f32> = 0.3..0.7;
@@ -96,6 +96,9 @@ pub fn weigh(
         }
     }
     measured.confidence = confidence.to_vec();
+    // The sum of all spots does not show the first light of each.
+    let unknown = vec![f32::NAN; measured.lit.len()];
+    unlit::fill(measured, &unknown);
     Ok(())
 }
 

@@ -63,6 +63,7 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
         computed: matches!(given.times, Times::Range(_)),
         mirror: given.mirror.to_vec(),
         confidence: Vec::new(),
+        unlit_range_m: Vec::new(),
         left_out: Vec::new(),
     };
     let pixels = measured.pixels();

@@ -50,6 +50,7 @@ pub fn from_truth(
         mirror: truth.specular.clone(),
         computed: false,
         confidence: Vec::new(),
+        unlit_range_m: Vec::new(),
         left_out: Vec::new(),
     };
     let pixels = measured.pixels();

@@ -9,3 +9,4 @@ mod masks;
 mod rays;
 mod rooms;
 mod same_bytes;
+mod walls;
