@@ -26,7 +26,7 @@ class Scene:
       (integer, `[m, 3]`), and optionally `rgb` (three numbers from 0 to 1) and `mirror` (the
       roughness of a mirror).
 
-    Camera, laser and unit that the source does not have are chosen; `notes` says how.
+    Camera, laser and unit that the source does not have are chosen; `notes` lists the choices.
 
     Args:
         camera: Name or number of the file's camera.

@@ -20,7 +20,7 @@ pub const FORMAT_VERSION: u32 = 3;
 /// bytes.
 pub const ENCODER_VERSION: &str = "encoder-3";
 
-/// Returns what is wrong with data in another format.
+/// Returns the message for data in another format.
 pub(crate) fn other_format(found: u64) -> String {
     format!(
         "written in format {found}, and this program reads format {FORMAT_VERSION}: use the version of picofarm that wrote \

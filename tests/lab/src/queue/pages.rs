@@ -268,7 +268,7 @@ async fn watch(
             Ok(())
         });
     }
-    // The first second opens the connections and reads what is read once.
+    // The first second opens the connections and reads what later requests share.
     wait(Duration::from_secs(3), stop).await?;
     if let Some(ended) = viewers.try_join_next() {
         let what = format!("a followed page ended: {ended:?}");
