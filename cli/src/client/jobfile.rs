@@ -211,7 +211,14 @@ mod tests {
             for scale in sizes {
                 // Furnished rooms need assets. The test uses primitive rooms; nothing else changes.
                 let dir = tempfile::tempdir().unwrap();
-                let path = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
+                let text = text.replace("\"furnished\"", "\"primitive\"");
+                let path = written(dir.path(), &text.replace("../../picofarm-data", "data"));
+                if !counted {
+                    for noise in ["noisy", "clean", "four", "one"] {
+                        let captures = dir.path().join(format!("data/laboratory/{scale}/{noise}"));
+                        std::fs::create_dir_all(captures).unwrap();
+                    }
+                }
                 let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
                 let spec = match counted {
                     true => checked(spec, &path).unwrap(),
