@@ -157,7 +157,7 @@ fn from_captures(args: &Demultiplex, flash: &Flash, method: Separate) -> Result<
             folder.display()
         );
         CliError::input(what)
-            .hint("render with --groups per-spot, or import the histograms of each spot")
+            .hint("render with --groups per-spot, or import the histograms of each spot; `scene sense` keeps only their sum")
     };
     if !SingleRender::is_in(folder) {
         return Err(none());
@@ -246,9 +246,14 @@ fn summary(made: &Made) -> String {
     }
     if let Some(m) = &made.masks {
         text += &format!(
-            "  masks: IoU {:.3} over all pairs ({:.3} for \"all lit\"), {:.3} over those that can carry light\n",
-            m.iou, m.all_lit_iou, m.iou_carrying
+            "  masks: IoU {:.3} over all pairs ({:.3} for \"all lit\")",
+            m.iou, m.all_lit_iou
         );
+        // The other methods judge every pair by its light.
+        if made.args.method == MethodArg::Physics {
+            text += &format!(", {:.3} over those that can carry light", m.iou_carrying);
+        }
+        text += "\n";
     }
     if let Some(iou) = made.mirrors {
         text += &format!("  mirrors: IoU {iou:.3}\n");

@@ -108,6 +108,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     let mut shown = made.metrics.clone();
     shown["out"] = json!(args.out);
     shown["threads"] = json!(threads);
+    shown["verdict"] = json!(Verdict::of_reconstruction(&made.metrics));
     shown["seconds"] =
         json!({"measurements": measuring, "reconstruction": fitting, "metrics": scoring});
     output.result(&shown, || summary(&args, &made));

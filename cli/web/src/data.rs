@@ -206,8 +206,10 @@ pub async fn bytes(app: &Arc<App>, what: &str, query: &Query) -> Result<Answer, 
                 text => Some(pixel_of(text)?),
             };
             let truth = app.stores.truth(app, &id).await?;
-            let volume = app.stores.volume(app, &id, Light::of(query)?).await?;
-            let svg = apart(move || export::figure(&truth, &volume, &look, at)).await?;
+            let light = Light::of(query)?;
+            let volume = app.stores.volume(app, &id, light).await?;
+            let draw = move || export::figure(&truth, (light, &volume), &look, at);
+            let svg = apart(draw).await?;
             file(SVG, svg, &format!("light-in-flight-{}.svg", id.scene))
         }
         "mesh" => compressed(GLB, app.stores.room(&id).await?.mesh, 1),

@@ -56,11 +56,10 @@ pub async fn content(app: &App, path: &str, query: &Query) -> Result<Page, Probl
         ["jobs"] => overview::jobs(app, query).await,
         ["jobs", id] => job::page(app, routes::job(id)?, query).await,
         ["jobs", id, "tasks", stage, task] => {
-            let number = |text: &str| text.parse::<u64>().ok();
-            let (Some(stage), Some(task)) = (number(stage), number(task)) else {
+            let (Ok(stage), Ok(task)) = (stage.parse(), task.parse()) else {
                 return Err(Problem::missing("expected /jobs/JOB/tasks/STAGE/TASK"));
             };
-            task::page(app, routes::job(id)?, stage as u32, task).await
+            task::page(app, routes::job(id)?, stage, task).await
         }
         ["workers"] => workers::page(app, query).await,
         ["events"] => events::page(app, query).await,

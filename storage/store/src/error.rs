@@ -42,9 +42,7 @@ pub enum StorageError {
         prefix: String,
     },
     /// The scene's index is outside of the data set.
-    #[error(
-        "scene {scene}: the data set has room for {scenes} scenes (0 to {scenes} - 1); grow it first"
-    )]
+    #[error("scene {scene}: the data set has {scenes} scenes, counted from 0; grow it first")]
     SceneOutOfRange {
         /// The index.
         scene: u64,

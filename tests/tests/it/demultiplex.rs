@@ -102,8 +102,12 @@ fn separate_captures_give_depth_and_masks_by_the_published_methods() {
     cli.run(&[&render[..], &["render"], &size, &spots].concat())
         .ok();
     cli.run(&[&render[..], &["sum"], &size].concat()).ok();
-    for method in ["matched-filter", "likelihood"] {
-        let demultiplex = ["demultiplex", "render", "--method", method, "--out"];
+    let narrow = ["--groups", "per-spot", "--bins", "2000"];
+    let width = ["--bin-width-m", "0.0096"];
+    cli.run(&[&render[..], &["narrow"], &size, &narrow, &width].concat())
+        .ok();
+    for (method, source) in [("matched-filter", "render"), ("likelihood", "narrow")] {
+        let demultiplex = ["demultiplex", source, "--method", method, "--out"];
         let said = cli.json(&[&demultiplex[..], &[method]].concat());
         let median = said["depth"]["median_m"].as_f64().unwrap();
         assert!(median < 0.05, "{method}: {said}");
@@ -117,6 +121,15 @@ fn separate_captures_give_depth_and_masks_by_the_published_methods() {
                 &["sum", "no histogram of each spot", "--groups per-spot"],
             );
     }
+    cli.run(&[
+        "demultiplex",
+        "render",
+        "--method",
+        "likelihood",
+        "--out",
+        "none",
+    ])
+    .fails(3, &["bins", "0.0384 m wide", "use matched-filter"]);
     let useless = ["--method", "likelihood", "--shadows", "learned"];
     cli.run(&[&["demultiplex", "render", "--out", "none"][..], &useless].concat())
         .fails(3, &["--shadows is for --method physics"]);

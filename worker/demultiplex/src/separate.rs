@@ -62,6 +62,15 @@ pub fn separate<E: From<DemultiplexError>>(
         let what = format!("is {photons}, expected a positive number of photons for a unit");
         return Err(DemultiplexError::invalid("photons", what).into());
     }
+    let width = capture.gate.bin_width_m;
+    if method == Separate::Likelihood && width > likelihood::WIDEST_M {
+        let what = format!(
+            "are {width} m wide; the likelihood ratio judges the widths of returns, for which bins \
+             of at most {} m are narrow enough: import narrower bins, or use matched-filter",
+            likelihood::WIDEST_M
+        );
+        return Err(DemultiplexError::invalid("gate: bins", what).into());
+    }
     let rays = Rays::new(capture.camera.intrinsics);
     let (pixels, count) = (rays.len(), capture.spots.len());
     let mut found = Found {

@@ -248,7 +248,7 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
         .filter(|_| measured.spots.len() >= FEWEST_SPOTS);
     if let Some(share) = unlit.filter(|s| *s > UNLIT.doubtful(0.0)) {
         let text = format!(
-            "{:.0} % of the pixels are lit by none of {} spots; check the masks' polarity",
+            "{:.0} % of the pixels are lit by none of {} spots; check the masks' polarity, or light the room with more spots",
             100.0 * share,
             measured.spots.len()
         );

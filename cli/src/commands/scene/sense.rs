@@ -152,11 +152,11 @@ fn notes(args: &SceneSense, sensor: &Sensor, gate: Gate, spots: u32) -> Vec<Stri
     let mut notes = Vec::new();
     if let Some(preset) = args.sensor.preset.map(|p| p.0) {
         notes.push(format!(
-            "the {} has a field of view of {}; the render's camera must have it too",
+            "the field of view of the {} is {}; the render's camera must have it too",
             preset.device(),
             preset.view()
         ));
-        if preset.floods() {
+        if preset.floods() && spots < 100 {
             notes.push(format!(
                 "it lights the whole view with one flash, which the renderer does not do: the render's {spots} spots \
                  stand for it, and zones between them see no direct light; use 100 spots with wide beams"

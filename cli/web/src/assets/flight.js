@@ -40,6 +40,8 @@ if (asked.get('pixel')?.match(/^\d+,\d+$/)) picked = asked.get('pixel').split(',
 for (const name of ['spots']) if (asked.get(name) === 'yes') $(name).checked = true;
 if (asked.get('surface') === 'no') $('surface').checked = false;
 inSpace = asked.get('view') === 'space';
+// An address may name a choice that is not on the list.
+for (const id of ['scale', 'map']) if ($(id).selectedIndex < 0) $(id).selectedIndex = 0;
 
 function address() {
   const now = new URLSearchParams(scene);

@@ -6,7 +6,7 @@ use picofarm_figures::{
     viridis,
 };
 
-use super::{Truth, histogram::two_bounce, truth::METRES_PER_NS, volume::Volume};
+use super::{Light, Truth, histogram::two_bounce, truth::METRES_PER_NS, volume::Volume};
 use crate::{answer::Problem, query::Query};
 
 /// Most frames of an animation. Of more bins, each frame is the mean of several.
@@ -139,14 +139,14 @@ pub fn gif(volume: &Volume, look: &Look) -> Vec<u8> {
 /// Fails outside of the image, and if an array that the figure shows is damaged.
 pub fn figure(
     truth: &Truth,
-    volume: &Volume,
+    (light, volume): (Light, &Volume),
     look: &Look,
     pixel: Option<[u64; 2]>,
 ) -> Result<String, Problem> {
     let bins = volume.spec().gate.bins as usize;
     let first = look.bin.min(bins.saturating_sub(1));
     let shown = first..(first + look.shutter).min(bins);
-    let middle = nanoseconds(volume, 0.5 * (shown.start + shown.end) as f64);
+    let [from, to] = [shown.start, shown.end].map(|bin| nanoseconds(volume, bin as f64));
     let count = shown.len() as f32;
     let white = volume.white() / look.gain;
     let mean: Vec<f32> = volume
@@ -154,13 +154,16 @@ pub fn figure(
         .into_iter()
         .map(|h| h / count)
         .collect();
-    let all = truth.intensity.as_ref()?;
-    let most = picofarm_figures::scene::quantile(all, 0.995).max(f32::MIN_POSITIVE);
+    let all = match light {
+        Light::All => truth.intensity.as_ref()?.clone(),
+        _ => volume.light_in(0..bins),
+    };
+    let most = picofarm_figures::scene::quantile(&all, 0.995).max(f32::MIN_POSITIVE);
     let marks: Vec<[f64; 2]> = pixel
         .iter()
         .map(|[row, column]| [*column as f64 + 0.5, *row as f64 + 0.5])
         .collect();
-    let light = |title: String, values: &[f32], high: f32, name| {
+    let image = |title: String, values: &[f32], high: f32, name| {
         let exponent = if look.scale == Scale::Linear {
             1.0
         } else {
@@ -186,16 +189,16 @@ pub fn figure(
         })
     };
     let mut panels = vec![
-        light(
-            format!("light at {middle:.2} ns"),
+        image(
+            format!("{from:.2} to {to:.2} ns"),
             &mean,
             white,
             "light in a bin",
         ),
-        light("all light".into(), all, most, "light"),
+        image(light.title(), &all, most, "light"),
     ];
     if let Some([row, column]) = pixel {
-        panels.push(curve(truth, volume, [row, column])?);
+        panels.push(curve(truth, (light, volume), [row, column])?);
     }
     let columns = panels.len();
     let drawn = paper::draw(&panels, WIDTH, columns);
@@ -209,7 +212,7 @@ fn nanoseconds(volume: &Volume, bin: f64) -> f64 {
 }
 
 /// The histogram of a pixel from its first light to nearly all, with the times of two bounces.
-fn curve(truth: &Truth, volume: &Volume, at: [u64; 2]) -> Result<Panel, Problem> {
+fn curve(truth: &Truth, (light, volume): (Light, &Volume), at: [u64; 2]) -> Result<Panel, Problem> {
     let pixel = truth.pixel(at)?;
     let h = volume.histogram(pixel);
     let first = h.iter().position(|h| *h > 0.0).unwrap_or(0);
@@ -224,6 +227,7 @@ fn curve(truth: &Truth, volume: &Volume, at: [u64; 2]) -> Result<Panel, Problem>
     let (lit, point) = (truth.lit_by(pixel)?, truth.point(pixel)?);
     let spots = truth.spots.as_ref()?.iter().enumerate();
     let mut marks: Vec<Mark> = spots
+        .filter(|(index, _)| light.has(*index))
         .filter_map(|(index, spot)| {
             let at = two_bounce(spot.as_ref()?, point?) / METRES_PER_NS;
             let style = usize::from(lit.contains(&index));

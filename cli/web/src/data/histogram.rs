@@ -25,10 +25,7 @@ pub fn of_pixel(
     let lit = truth.lit_by(pixel)?;
     let point = truth.point(pixel)?;
     let spots = truth.spots.as_ref()?;
-    let chosen = |spot: usize| match light {
-        Light::Spot(chosen) => chosen as usize == spot,
-        _ => true,
-    };
+    let chosen = |spot: usize| light.has(spot);
     let two: Vec<Value> = spots
         .iter()
         .enumerate()

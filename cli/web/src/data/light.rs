@@ -46,6 +46,26 @@ impl Light {
         }
     }
 
+    /// Returns whether light of the spot is in it, as far as it is the light of one spot.
+    pub fn has(self, spot: usize) -> bool {
+        match self {
+            Self::Spot(chosen) => chosen as usize == spot,
+            _ => true,
+        }
+    }
+
+    /// Returns the name in a sentence.
+    pub fn title(self) -> String {
+        match self {
+            Self::All => "all light".into(),
+            Self::Four => "4 of 100 spots".into(),
+            Self::TwentyFive => "25 of 100 spots".into(),
+            Self::Spot(spot) => format!("spot {spot}, all times"),
+            Self::Two => "two bounces, all times".into(),
+            Self::More => "three bounces and more, all times".into(),
+        }
+    }
+
     /// Returns the name in URLs.
     pub fn name(self) -> String {
         match self {

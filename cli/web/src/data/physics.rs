@@ -21,7 +21,8 @@ const OFF: f64 = 1.0;
 /// Sums over pixels.
 #[derive(Default)]
 struct Sums {
-    /// h at the predicted two-bounce times, by shift.
+    /// h at the predicted two-bounce times, by shift, as a share of the pixel's light. Pixels at a
+    /// spot are left out.
     shifted: [f64; 2 * SHIFT as usize + 1],
     /// Pairs of pixel and lit spot.
     pairs: u64,
@@ -55,6 +56,11 @@ pub fn verdict(
     let own = own_pixels(truth)?;
     let least = least_paths(truth, &own)?;
     let width = (truth.spec.width as usize).max(1);
+    // The light of a spot itself would outshine that of two bounces.
+    let mut at_spot = vec![false; pixels];
+    for (pixel, _) in &own {
+        neighbours(*pixel, width, pixels).for_each(|p| at_spot[p] = true);
+    }
     let of_pixel = |mut sums: Sums, pixel: usize| -> Result<Sums, Problem> {
         let h = volume.histogram(pixel);
         let Some(first) = h.iter().position(|h| *h > 0.0) else {
@@ -73,11 +79,11 @@ pub fn verdict(
             }
         };
         let within = |bin: i64| {
-            usize::try_from(bin)
-                .ok()
-                .and_then(|bin| h.get(bin))
-                .copied()
+            let bin = usize::try_from(bin).ok();
+            f64::from(bin.and_then(|bin| h.get(bin)).copied().unwrap_or(0.0))
         };
+        // Bright pixels count no more than dark ones.
+        let unit = total(&h).recip();
         for (index, spot) in spots.iter().enumerate() {
             let Some(spot) = spot else { continue };
             let bin = bin_of(two_bounce(spot, point));
@@ -86,10 +92,10 @@ pub fn verdict(
             }
             mark(bin, 1);
             // Pairs whose shifts are all in the gate count alike for each.
-            if bin >= SHIFT && bin + SHIFT < h.len() as i64 {
+            if bin >= SHIFT && bin + SHIFT < h.len() as i64 && !at_spot[pixel] {
                 sums.pairs += 1;
                 for (sum, shift) in sums.shifted.iter_mut().zip(-SHIFT..=SHIFT) {
-                    *sum += f64::from(within(bin + shift).unwrap_or(0.0));
+                    *sum += unit * within(bin + shift);
                 }
             }
         }

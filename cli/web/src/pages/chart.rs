@@ -93,7 +93,6 @@ pub fn lines(label: &str, [x_name, y_name]: [&str; 2], series: &[Series]) -> Mar
     let up = Axis::over(points().filter(finite).map(|p| p.1), true);
     let x = |value: f64| LEFT + across.place(value) * (WIDTH - LEFT - RIGHT);
     let y = |value: f64| HEIGHT - BOTTOM - up.place(value) * (HEIGHT - TOP - BOTTOM);
-    let whole = |value: &f64| value.fract() == 0.0;
     html! {
         div.scroll tabindex="0" role="region" aria-label=(label) {
             svg.lines viewBox={ "0 0 " (WIDTH) " " (HEIGHT) } role="img" aria-label=(safe(label)) {
@@ -156,7 +155,8 @@ pub fn parallel(label: &str, axes: &[Coordinate], drawn: &[(String, &'static str
                     line.axis x1=(px(x(i))) x2=(px(x(i))) y1=(y(0.0)) y2=(y(1.0)) {}
                     text.across x=(px(x(i))) y="12" { (safe(&axis.name)) }
                     @if axis.words.is_empty() {
-                        @for tick in scale.ticks() {
+                        @let numbers = axis.values.iter().flatten().all(whole);
+                        @for tick in scale.ticks().into_iter().filter(|tick| !numbers || whole(tick)) {
                             text.tick x=(px(x(i) + 4.0)) y=(px(y(scale.place(tick)) + 4.0)) { (short(tick)) }
                         }
                     }
@@ -176,6 +176,10 @@ fn px(value: f64) -> String {
 fn path(points: &[(f64, f64)]) -> String {
     let points = points.iter().map(|(x, y)| format!("{x:.1},{y:.1}"));
     points.collect::<Vec<_>>().join(" ")
+}
+
+fn whole(value: &f64) -> bool {
+    value.fract() == 0.0
 }
 
 #[cfg(test)]

@@ -122,7 +122,7 @@ async fn gallery(app: &App, set: &DataSet, query: &Query) -> Result<(Markup, boo
         div.cards { @for scene in shown { (card(set, *scene, contents.and_then(|c| c.get(*scene)))) } }
         nav.pages aria-label="Pages" {
             @if start > 0 { a href=(link(start.saturating_sub(SHOWN))) { "Previous" } }
-            @if start + SHOWN < scenes.len() { a href=(link(start + SHOWN)) { "Next" } }
+            @if start.saturating_add(SHOWN) < scenes.len() { a href=(link(start + SHOWN)) { "Next" } }
         }
     };
     Ok((content, read.is_some()))

@@ -125,7 +125,7 @@ fn summary(job: &JobStatus) -> Markup {
             div { dt { "submitted" } dd { (time(job.submitted_at_ms)) } }
             div { dt { "id" } dd { code { (job.id) } } }
         }
-        @if job.unverified > 0 {
+        @if job.unverified > 0 && job.state == JobState::Active {
             p.hint { (job.unverified) " results were reported and not found in their store yet." }
         }
     }

@@ -86,7 +86,7 @@ fn errors(metrics: &Value) -> Markup {
         .iter()
         .filter_map(|(name, pointer)| Some((*name, metres(pointer)?)))
         .collect();
-    let verdict = metrics["agreement"]["verdict"].as_str();
+    let verdict = picofarm_results::Verdict::of_reconstruction(metrics);
     html! {
         h2 { "Stored errors" }
         @if rows.is_empty() { p.none { "This reconstruction stores no errors: nothing true was there to compare with." } }
@@ -98,8 +98,9 @@ fn errors(metrics: &Value) -> Markup {
         dl.facts-list {
             @if let Some(triangles) = count("triangles") { dt { "triangles" } dd { (triangles) } }
             @if let Some(spots) = count("spots") { dt { "spots" } dd { (spots) } }
-            @if let Some(verdict) = verdict { dt { "measurements" } dd { (safe(verdict)) } }
         }
+        h2 { "Verdict" }
+        p.doubtful[verdict.doubtful] { (safe(&verdict.text)) }
     }
 }
 

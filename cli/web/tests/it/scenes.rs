@@ -299,7 +299,10 @@ fn light_in_flight_is_saved_as_an_animation_and_as_a_figure() {
     assert_ne!(dark.body, gif.body, "exposure counts");
     let figure = |more: &str| web.get(&format!("/bytes/figure?{query}{more}"));
     let svg = figure("").text();
-    assert!(svg.starts_with("<svg") && svg.contains("light at"), "{svg}");
+    assert!(
+        svg.starts_with("<svg") && svg.contains(" ns</text>"),
+        "{svg}"
+    );
     assert!(!svg.contains("pixel ("));
     let svg = figure("&pixel=7,10").text();
     assert!(svg.contains("pixel (7, 10)"));

@@ -28,6 +28,9 @@ const AFTER: f64 = 4.0;
 const FLARE: f64 = 10.0;
 /// Squared width of a two-bounce return, bins²; three bounces are wider.
 const WIDTHS: std::ops::Range<f64> = 2.0..185.0;
+/// Widest bins in which the width of a return can be told, metres: 40 ps. The published ones have
+/// 8 ps.
+pub const WIDEST_M: f64 = 0.012;
 /// Probability above which a pixel is lit.
 const LIT: f64 = 0.9;
 
