@@ -1,18 +1,10 @@
 //! One flash taken apart by `picofarm demultiplex`: output files, printed text, and refused inputs.
 
-use std::{path::Path, sync::Arc};
-
 use picofarm_tests::{Cli, Scratch};
-use zarrs::{array::Array, filesystem::FilesystemStore};
+
+use crate::arrays::array;
 
 const SIDE: u64 = 48;
-
-fn array(group: &Path, name: &str) -> (Vec<u64>, Vec<f32>) {
-    let store = Arc::new(FilesystemStore::new(group).unwrap());
-    let array = Array::open(store, &format!("/{name}")).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let data = array.retrieve_array_subset(&array.subset_all()).unwrap();
-    (array.shape().to_vec(), data)
-}
 
 fn rendered(cli: &Cli) {
     let room = [

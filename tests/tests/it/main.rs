@@ -1,6 +1,7 @@
 //! Tests of the whole program, with real processes, in one executable because each one links the
 //! whole crate.
 
+mod arrays;
 mod attack;
 mod bad_input;
 mod chaos;

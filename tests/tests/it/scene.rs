@@ -5,12 +5,7 @@ use std::{path::Path, sync::Arc};
 use picofarm_tests::{Cli, Scratch, store};
 use zarrs::{array::Array, filesystem::FilesystemStore};
 
-fn array(group: &Path, name: &str) -> (Vec<u64>, Vec<f32>) {
-    let store = Arc::new(FilesystemStore::new(group).unwrap());
-    let array = Array::open(store, &format!("/{name}")).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let data = array.retrieve_array_subset(&array.subset_all()).unwrap();
-    (array.shape().to_vec(), data)
-}
+use crate::arrays::array;
 
 const GATE: [&str; 4] = ["--bins", "64", "--bin-width-m", "0.384"];
 

@@ -1,20 +1,14 @@
 //! Histograms of subsets of the spots from one pass, in single renders and in data sets; and the
 //! estimated cost of a render.
 
-use std::{fs, path::Path, sync::Arc};
+use std::fs;
 
 use picofarm_tests::{Cli, Farm, Job, Scratch, store};
-use zarrs::{array::Array, filesystem::FilesystemStore};
+
+use crate::arrays::array;
 
 const GATE: [&str; 4] = ["--bins", "64", "--bin-width-m", "0.384"];
 const FOUR: [usize; 4] = [22, 27, 72, 77];
-
-fn array(group: &Path, name: &str) -> (Vec<u64>, Vec<f32>) {
-    let store = Arc::new(FilesystemStore::new(group).unwrap());
-    let array = Array::open(store, &format!("/{name}")).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let data = array.retrieve_array_subset(&array.subset_all()).unwrap();
-    (array.shape().to_vec(), data)
-}
 
 /// Generates a room with `spots` spots, `room.glb`.
 fn room(cli: &Cli, spots: &str) {
