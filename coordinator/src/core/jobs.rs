@@ -98,7 +98,6 @@ impl Core {
                 entry.held.give_pending(self.outcome.changes());
             }
         }
-        self.load.job_removed(job);
     }
 
     /// Makes the given-up tasks of an active job pending again.

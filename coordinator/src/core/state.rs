@@ -97,7 +97,6 @@ impl Core {
         timings: &HashMap<ResultSet, Timing>,
     ) {
         self.stages.add_job(job, stages, timings);
-        self.load.job_added(job);
     }
 
     /// Opens stages that may begin and removes jobs that have ended.
@@ -111,7 +110,6 @@ impl Core {
         for end in &settled.ends {
             tracing::info!(job = %end.job, state = ?end.state, "job ended");
             self.stages.remove_job(end.job);
-            self.load.job_removed(end.job);
         }
     }
 

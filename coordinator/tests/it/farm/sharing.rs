@@ -101,27 +101,6 @@ async fn the_higher_priority_goes_first_and_equals_share() {
 }
 
 #[tokio::test]
-async fn jobs_take_turns_on_a_worker_that_runs_one_task_at_a_time() {
-    let mut farm = Farm::start().await;
-    farm.submit(&named("long", 40)).await;
-    let mut worker = farm.worker().await;
-    let mut turns = Vec::new();
-    for turn in 0..8 {
-        if turn == 2 {
-            farm.submit(&named("short", 3)).await;
-        }
-        let lease = worker.lease().await;
-        turns.extend(jobs_of(&mut farm, std::slice::from_ref(&lease)).await);
-        assert!(worker.done(&lease, lease.lo).await.accepted);
-    }
-    // A new job queues behind those that wait, so that many new ones keep no old one from its turn.
-    let expected = [
-        "long", "long", "long", "short", "long", "short", "long", "short",
-    ];
-    assert_eq!(turns, expected);
-}
-
-#[tokio::test]
 async fn no_more_workers_than_a_job_allows() {
     let mut farm = Farm::start().await;
     let mut limited = named("limited", 40);
