@@ -16,6 +16,7 @@ from ._arguments import Gate
 from ._data import Dataset, Stream, open
 from ._farm import Client, FarmError, Job, JobFailed, LocalFarm, Sweep, local
 from ._flash import Capture, Flash, Reconstruction
+from ._model import Model
 from ._native import __version__
 from ._render import Render, Sensed
 from ._scene import Scene, furnished
@@ -30,6 +31,7 @@ __all__ = [
     "Job",
     "JobFailed",
     "LocalFarm",
+    "Model",
     "Reconstruction",
     "Render",
     "Scene",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -41,6 +42,9 @@ class Dataset:
         split_name: Name of the split.
         split_version: Version of the split; the newest without it.
         threads: Threads that decode; all cores without it. Use 1 in workers of a `DataLoader`.
+        cache: Local folder that keeps what was read of the arrays, for stores in a cloud. Several
+            processes and data sets may share it. A scene that was replaced is read again.
+        cache_bytes: Size of the cache, bytes. What was used longest ago is removed first.
 
     Raises:
         FileNotFoundError: There is no data set.
@@ -60,12 +64,17 @@ class Dataset:
         split_name: str = "default",
         split_version: int | None = None,
         threads: int | None = None,
+        cache: str | os.PathLike[str] | None = None,
+        cache_bytes: int = 100 * 10**9,
     ) -> None:
         if split is not None and scenes is not None:
             raise ValueError("scenes: give scenes or split, not both")
         self.url = os.fspath(url)
         self._threads = threads
-        self._native = _native.Dataset(self.url, threads)
+        if cache_bytes < 1:
+            raise ValueError(f"cache_bytes: expected at least 1, found {cache_bytes}")
+        self._cache = None if cache is None else (os.fspath(cache), int(cache_bytes))
+        self._native = _native.Dataset(self.url, threads, self._cache)
         facts = json.loads(self._native.facts())
         spec = facts["spec"]
         self.gate = Gate(**spec["gate"])
@@ -126,6 +135,8 @@ class Dataset:
         made: dict[str, Any] = {"scene": scene, "scale": manifest["scale"]}
         for name in self.arrays:
             made[name] = self._array(scene, name, window, span)
+        if self._cache is not None and (trouble := self._native.cache_trouble()) is not None:
+            warnings.warn(f"{trouble}; scenes are read from the store", stacklevel=2)
         return made
 
     def to_xarray(self, scene: int) -> xarray.Dataset:
@@ -220,7 +231,7 @@ class Dataset:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._native = _native.Dataset(self.url, self._threads)
+        self._native = _native.Dataset(self.url, self._threads, self._cache)
 
     def __repr__(self) -> str:
         height, width = self.shape

@@ -2,12 +2,13 @@
 
 use std::{
     future::Future,
+    path::PathBuf,
     sync::{Arc, Mutex, PoisonError},
 };
 
 use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadwriteArray3};
 use picofarm_dataset::{Dataset as Stored, Element as Type, Quantity};
-use picofarm_store::StorageError;
+use picofarm_store::{Cache, StorageError};
 use pyo3::{exceptions::PyRuntimeError, prelude::*, types::PyBytes};
 
 use crate::errors::{self, argument};
@@ -17,6 +18,7 @@ use crate::errors::{self, argument};
 pub(crate) struct Dataset {
     url: String,
     threads: usize,
+    cache: Option<(PathBuf, u64)>,
     opened: Mutex<Arc<Opened>>,
 }
 
@@ -24,12 +26,13 @@ pub(crate) struct Dataset {
 struct Opened {
     process: u32,
     data: Stored,
+    cache: Option<Cache>,
     runtime: tokio::runtime::Runtime,
     pool: rayon::ThreadPool,
 }
 
 impl Opened {
-    fn new(url: &str, threads: usize) -> PyResult<Self> {
+    fn new(url: &str, threads: usize, cache: Option<&(PathBuf, u64)>) -> PyResult<Self> {
         let failed = |e: &dyn std::fmt::Display| {
             PyRuntimeError::new_err(format!("cannot start {threads} threads: {e}"))
         };
@@ -44,9 +47,16 @@ impl Opened {
             let (store, prefix) = picofarm_store::open_store(url)?;
             Stored::open(store, prefix).await
         });
+        let mut data = data.map_err(errors::store)?;
+        let cache = cache.map(|(folder, most)| Cache::open(folder, *most));
+        let cache = cache.transpose().map_err(errors::store)?;
+        if let Some(cache) = &cache {
+            data = data.with_cache(cache.clone());
+        }
         Ok(Self {
             process: std::process::id(),
-            data: data.map_err(errors::store)?,
+            data,
+            cache,
             runtime,
             pool,
         })
@@ -69,7 +79,7 @@ impl Dataset {
         if opened.process != std::process::id() {
             let inherited = std::mem::replace(
                 &mut *opened,
-                Arc::new(Opened::new(&self.url, self.threads)?),
+                Arc::new(Opened::new(&self.url, self.threads, self.cache.as_ref())?),
             );
             // Its threads do not exist in this process, so ending it would wait forever.
             std::mem::forget(inherited);
@@ -81,7 +91,12 @@ impl Dataset {
 #[pymethods]
 impl Dataset {
     #[new]
-    fn new(py: Python<'_>, url: String, threads: Option<usize>) -> PyResult<Self> {
+    fn new(
+        py: Python<'_>,
+        url: String,
+        threads: Option<usize>,
+        cache: Option<(PathBuf, u64)>,
+    ) -> PyResult<Self> {
         picofarm_cli::provide_cryptography();
         let threads = threads.unwrap_or_else(picofarm_tasks::cores);
         if !(1..=4096).contains(&threads) {
@@ -90,10 +105,11 @@ impl Dataset {
                 format!("expected 1 to 4096, found {threads}"),
             ));
         }
-        let opened = py.detach(|| Opened::new(&url, threads))?;
+        let opened = py.detach(|| Opened::new(&url, threads, cache.as_ref()))?;
         Ok(Self {
             url,
             threads,
+            cache,
             opened: Mutex::new(Arc::new(opened)),
         })
     }
@@ -109,6 +125,11 @@ impl Dataset {
             .map(|a| a.layout.quantity.name())
             .collect();
         Ok(serde_json::json!({"spec": spec, "arrays": arrays}).to_string())
+    }
+
+    /// The first error of writing to the cache since the last call.
+    fn cache_trouble(&self) -> PyResult<Option<String>> {
+        Ok(self.opened()?.cache.as_ref().and_then(Cache::trouble))
     }
 
     /// Indices of the published scenes, ascending.

@@ -4,6 +4,8 @@
 mod data;
 mod errors;
 mod flash;
+#[cfg(feature = "networks")]
+mod model;
 mod render;
 mod scene;
 mod sensor;
@@ -35,6 +37,8 @@ fn _native(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(sensor::sense, m)?)?;
     m.add_class::<scene::Scene>()?;
     m.add_class::<data::Dataset>()?;
+    #[cfg(feature = "networks")]
+    m.add_class::<model::Model>()?;
     m.add_class::<flash::Viewpoint>()?;
     Ok(())
 }

@@ -86,6 +86,41 @@ def test_flipped_bytes_are_noticed(dataset: str, tmp_path: pathlib.Path) -> None
             pass
 
 
+def test_a_cache_keeps_what_was_read(dataset: str, tmp_path: pathlib.Path) -> None:
+    import shutil
+
+    copy, cache = tmp_path / "rooms", tmp_path / "cache"
+    shutil.copytree(dataset, copy)
+    data = picofarm.open(copy, arrays=["transient", "depth"], cache=cache)
+    crop = {"crop": (0, 0, 8, 8), "bins": (3, 9)}
+    first = [(data[k], data.read(data.scenes[k], **crop)) for k in range(2)]
+    for array in ("transient", "depth"):
+        shutil.rmtree(copy / array / "c")
+    again = pickle.loads(pickle.dumps(data))
+    for k, scenes in enumerate(first):
+        for scene, other in zip(scenes, (again[k], again.read(data.scenes[k], **crop)), strict=True):
+            assert np.array_equal(scene["transient"], other["transient"])
+            assert np.array_equal(scene["depth"], other["depth"])
+    with pytest.raises(OSError, match="missing"):
+        picofarm.open(copy)[0]
+
+
+def test_a_cache_that_cannot_be_written_warns_and_reads(
+    dataset: str, tmp_path: pathlib.Path
+) -> None:
+    cache = tmp_path / "cache"
+    data = picofarm.open(dataset, arrays=["depth"], cache=cache)
+    cache.rmdir()
+    cache.write_text("a file")
+    with pytest.warns(UserWarning, match="cannot write to the cache"):
+        scene = data[0]
+    assert np.array_equal(scene["depth"], picofarm.open(dataset)[0]["depth"])
+    with pytest.raises(OSError, match="cache"):
+        picofarm.open(dataset, cache=cache)
+    with pytest.raises(ValueError, match="cache_bytes"):
+        picofarm.open(dataset, cache=tmp_path / "other", cache_bytes=0)
+
+
 def test_a_stream_reads_each_scene_once_an_epoch_in_an_order_of_its_own(dataset: str) -> None:
     data = picofarm.open(dataset, arrays=["depth"], threads=1)
     stream = data.stream(seed=3, ahead=2)

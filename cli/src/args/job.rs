@@ -62,17 +62,17 @@ pub enum Job {
     },
     /// Show one job
     Status {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
     },
     /// Follow a job with progress until it ends
     Watch {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
     },
     /// Wait silently until a job ends
     Wait {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
         /// Give up after this many seconds (exit code 1)
         #[arg(long, value_name = "S", value_parser = super::ranges::seconds)]
@@ -80,28 +80,28 @@ pub enum Job {
     },
     /// Cancel a job; its finished results remain
     Cancel {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
     },
     /// Pause a job: running tasks continue, and no other task starts
     Pause {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
     },
     /// Continue a paused job
     Resume {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
     },
     /// Run a job's dead tasks again. After a correction of scene files, a new job takes over the
     /// finished scenes
     Retry {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
     },
     /// Show the history of a job, or of one of its tasks with its log on the worker
     Logs {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
         /// Only this stage: its name or position [default: every stage]
         #[arg(long, value_name = "NAME")]
@@ -121,7 +121,7 @@ pub enum Job {
     },
     /// Explain why a job does not run, or why one of its tasks ran, ran again or was reused
     Explain {
-        /// Job id, or the first letters of one
+        /// Number, name or id of the job, the first letters of its id, or `last`
         job: String,
         /// The stage of the task: its name or position [default: the first]
         #[arg(long, value_name = "NAME", requires = "task")]

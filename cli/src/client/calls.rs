@@ -104,7 +104,8 @@ impl Client {
         required(reply.job, "job")?.try_into().map_err(unreadable)
     }
 
-    /// Finds the only job with an id that begins with `text`.
+    /// Finds a job by its id or the beginning of it, by its number, its name, or as `last`: the
+    /// caller's latest.
     pub async fn find(&mut self, text: &str) -> Result<JobId> {
         if let Ok(id) = text.parse() {
             return Ok(id);
@@ -125,7 +126,7 @@ impl Client {
                 "{text:?} fits several jobs, e.g. {} and {}",
                 a.id, b.id
             ))
-            .hint("give more letters of the id")),
+            .hint("give the number of the job, or its id")),
             _ => Err(CliError::input(format!("no job {text:?}")).hint("see `picofarm job list`")),
         }
     }

@@ -202,6 +202,7 @@ impl From<JobSummary> for wire::JobSummary {
             tasks: Some(m.tasks.into()),
             submitted_at_ms: m.submitted_at_ms,
             ended_at_ms: m.ended_at_ms.unwrap_or(0),
+            number: m.number,
         }
     }
 }
@@ -213,6 +214,7 @@ impl TryFrom<wire::JobSummary> for JobSummary {
         Ok(JobSummary {
             state: w.state().try_into()?,
             id: parse(&w.id, "job.id")?,
+            number: w.number,
             name: w.name,
             user: w.user,
             project: w.project,

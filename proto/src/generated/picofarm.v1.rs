@@ -117,6 +117,9 @@ pub struct JobSummary {
     /// 0 while not ended.
     #[prost(int64, tag = "9")]
     pub ended_at_ms: i64,
+    /// Counts the jobs of a farm from 1.
+    #[prost(uint64, tag = "10")]
+    pub number: u64,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct StageStatus {
@@ -1207,7 +1210,7 @@ pub struct ListJobsRequest {
     /// Only this user's; empty = all.
     #[prost(string, tag = "4")]
     pub user: ::prost::alloc::string::String,
-    /// Only those of this name, or whose id begins so; empty = all.
+    /// Only those of this name or number, or whose id begins so; "last" = the caller's latest; empty = all.
     #[prost(string, tag = "5")]
     pub find: ::prost::alloc::string::String,
 }

@@ -147,6 +147,8 @@ impl JobStatus {
 pub struct JobSummary {
     /// Id.
     pub id: JobId,
+    /// Number, which counts the jobs of a farm from 1.
+    pub number: u64,
     /// Name.
     pub name: String,
     /// The submitter.

@@ -17,7 +17,8 @@ pub struct JobQuery {
     pub state: Option<JobState>,
     /// Only jobs of this user.
     pub user: Option<String>,
-    /// Only jobs with this name, or with an id that begins with this text.
+    /// Only jobs with this name or number, or with an id that begins with this text. A text of at
+    /// most nine digits is a number, not the beginning of an id.
     pub find: Option<String>,
 }
 

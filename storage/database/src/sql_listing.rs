@@ -22,12 +22,13 @@ macro_rules! listing_queries {
             pub(crate) async fn page(c: &mut Connection, query: &JobQuery) -> Result<Page> {
                 let [all, user, projects] = crate::seen::columns(&query.sight);
                 let ids = query.find.as_deref().and_then(crate::listing::ids);
+                let number = query.find.as_deref().and_then(crate::listing::number);
                 let most = i64::from(query.limit.max(1));
                 let mut rows = sqlx::query(concat!(
                     "SELECT key, id, name, username, project, state, paused, submitted_ms, ended_ms, tasks, done, reused, \
                      dead FROM job WHERE key < $1 AND (CAST($2 AS BIGINT) IS NULL OR state = $2) \
                      AND (CAST($3 AS TEXT) IS NULL OR username = $3) \
-                     AND (CAST($4 AS TEXT) IS NULL OR name = $4 OR (id >= $5 AND id <= $6)) AND ",
+                     AND (CAST($4 AS TEXT) IS NULL OR name = $4 OR key = $11 OR (id >= $5 AND id <= $6)) AND ",
                     seen!("$7", "$8", "$9"),
                     " ORDER BY key DESC LIMIT $10"
                 ))
@@ -42,6 +43,7 @@ macro_rules! listing_queries {
                 .bind(projects)
                 // One more row shows whether there is another page.
                 .bind(most + 1)
+                .bind(number)
                 .fetch_all(&mut *c)
                 .await?;
                 let more = rows.len() as i64 > most;
@@ -86,6 +88,7 @@ macro_rules! listing_queries {
                 let state = sql::job_state(row.try_get("state")?)?;
                 Ok(JobSummary {
                     id: JobId::from_uuid(row.try_get("id")?),
+                    number: uint(row, "key")?,
                     name: row.try_get("name")?,
                     user: row.try_get("username")?,
                     project: row.try_get("project")?,

@@ -7,6 +7,7 @@
 mod account;
 mod bandwidth;
 mod bucket_url;
+mod cache;
 #[cfg(feature = "clouds")]
 mod clouds;
 pub mod concurrent;
@@ -34,6 +35,7 @@ use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 
 pub use bandwidth::{Bandwidth, limit_bandwidth};
+pub use cache::Cache;
 pub use error::StorageError;
 pub use failure::io_hint;
 pub use folder::check_own_folder;

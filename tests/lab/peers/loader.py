@@ -1,9 +1,10 @@
 """Compares the readers of a data set: loader.py DATASET [--scenes N] [--workers 0,2,4].
 
 DATASET is a folder or an s3:// URL. Prints CPU seconds and wall seconds per read of the Python package, zarr-python and
-tensorstore, for whole scenes, aligned crops of 64x64 pixels and single bins. All read the same scenes, in turns, and the
+tensorstore, for whole scenes, aligned crops of 64x64 pixels, and bins at random places. All read the same scenes, in turns, and the
 values are compared. All compare chunks with their CRC-32C; the package also reads the manifest of each scene. With
---workers, spawned processes of one decoding thread each read whole scenes and crops, and scenes per second are printed.
+--workers, spawned processes of one decoding thread each read them, and scenes per second and CPU
+milliseconds per scene are printed; 0 reads in this process.
 """
 
 import argparse
@@ -18,11 +19,21 @@ import zarr
 
 import picofarm
 
-PARTS = {
-    "whole": lambda h, w, bins: (slice(0, h), slice(0, w), slice(0, bins)),
-    "crop 64x64": lambda h, w, bins: (slice(64, 128), slice(64, 128), slice(0, bins)),
-    "one bin": lambda h, w, bins: (slice(0, h), slice(0, w), slice(200, 201)),
-}
+PARTS = ("whole", "crop 64x64", "one bin", "64 bins")
+
+
+def place(part, shape, draw):
+    """The rows, columns and bins of a part. `draw` in [0, 1) chooses crops and bins."""
+    height, width, bins = shape
+    rows, columns, span = slice(0, height), slice(0, width), slice(0, bins)
+    if part == "crop 64x64":
+        top, left = (int(draw * ((n - 64) // 32 + 1)) * 32 for n in (height, width))
+        rows, columns = slice(top, top + 64), slice(left, left + 64)
+    elif part.endswith(("bin", "bins")):
+        count = 1 if part == "one bin" else 64
+        first = int(draw * (bins - count + 1))
+        span = slice(first, first + count)
+    return rows, columns, span
 
 
 def zarr_store(location):
@@ -75,8 +86,8 @@ class Readers:
         bins, height, width = self.group["transient"].shape[1:]
         self.shape = (height, width, bins)
 
-    def read(self, reader, scene, part):
-        rows, columns, span = PARTS[part](*self.shape)
+    def read(self, reader, scene, part, draw):
+        rows, columns, span = place(part, self.shape, draw)
         if reader == "picofarm":
             crop = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
             return self.package.read(scene, crop=crop, bins=(span.start, span.stop))["transient"]
@@ -97,20 +108,24 @@ def begin(location):
 
 
 def load(task):
-    return readers.read(*task).shape
+    """Reads a part and returns the CPU seconds that it took."""
+    cpu = time.process_time()
+    readers.read(*task)
+    return time.process_time() - cpu
 
 
 def table(location, count, rounds):
     readers = Readers(location)
     scenes = readers.package.scenes[:count]
+    random = numpy.random.default_rng(1)
     for part in PARTS:
         spent = {reader: [] for reader in NAMES}
         for _ in range(rounds):
             for scene in scenes:
-                first = None
+                first, draw = None, random.random()
                 for reader in NAMES:
                     cpu, wall = time.process_time(), time.perf_counter()
-                    h = readers.read(reader, scene, part)
+                    h = readers.read(reader, scene, part, draw)
                     spent[reader].append((time.process_time() - cpu, time.perf_counter() - wall))
                     if first is None:
                         first = h
@@ -126,23 +141,28 @@ def table(location, count, rounds):
 
 def by_workers(location, workers, count, rounds):
     scenes = picofarm.open(location).scenes[:count] * rounds
-    for part in ("whole", "crop 64x64"):
+    draws = numpy.random.default_rng(1).random(len(scenes))
+    for part in PARTS:
         for reader in NAMES:
-            tasks = [(reader, scene, part) for scene in scenes]
+            tasks = [(reader, scene, part, draw) for scene, draw in zip(scenes, draws, strict=True)]
             if workers == 0:
                 begin(location)
                 load(tasks[0])
                 start = time.perf_counter()
-                list(map(load, tasks))
+                cpu = list(map(load, tasks))
                 seconds = time.perf_counter() - start
             else:
                 with multiprocessing.get_context("spawn").Pool(workers, begin, (location,)) as pool:
                     # Starts the processes and opens the arrays.
                     pool.map(load, tasks[:1] * workers, chunksize=1)
                     start = time.perf_counter()
-                    pool.map(load, tasks, chunksize=1)
+                    cpu = pool.map(load, tasks, chunksize=1)
                     seconds = time.perf_counter() - start
-            print(f"{workers} workers {part:12} {reader:12} {len(tasks) / seconds:8.1f} scenes/s")
+                    # Lets the threads of the readers end.
+                    pool.close()
+                    pool.join()
+            rate, cpu = len(tasks) / seconds, 1000 * numpy.mean(cpu)
+            print(f"{workers} workers {part:12} {reader:12} {rate:8.1f} scenes/s {cpu:8.1f} CPU ms")
 
 
 def main():

@@ -163,6 +163,7 @@ impl Farm for Memory {
         self.answers(id())?;
         let job = JobSummary {
             id: id(),
+            number: 12,
             name: EVIL.into(),
             user: EVIL.into(),
             project: EVIL.into(),

@@ -157,8 +157,9 @@ impl Jobs for JobsService {
         request: Request<wire::ListJobsRequest>,
     ) -> Result<Response<wire::ListJobsResponse>, Status> {
         let account = account(&request);
-        let sight = caller(&request).sight(self.link.visibility);
-        let query = listing(request.into_inner(), sight)?;
+        let by = caller(&request);
+        let sight = by.sight(self.link.visibility);
+        let query = listing(request.into_inner(), &by, sight)?;
         let charge = account.charge("the list", LINE * u64::from(query.limit));
         let _charge = charge.await?;
         let page = self

@@ -33,8 +33,20 @@ pub(super) fn filter(text: String, field: &str) -> Result<Option<String>, Status
     Ok(Some(text))
 }
 
+/// The name by which callers find their own latest job.
+const LAST: &str = "last";
+
 /// Reads the query of a list.
-pub(super) fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Status> {
+pub(super) fn listing(
+    mut request: wire::ListJobsRequest,
+    by: &Caller,
+    sight: Sight,
+) -> Result<JobQuery, Status> {
+    if request.find == LAST {
+        request.find.clear();
+        request.user = by.name.to_string();
+        request.page_size = 1;
+    }
     let state = match wire::JobState::try_from(request.state) {
         Ok(wire::JobState::Unspecified) => None,
         Ok(state) => Some(state.try_into().map_err(invalid)?),

@@ -15,9 +15,9 @@ use crate::layout::group::{
 use crate::layout::manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, other_format};
 use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
-use picofarm_store::StorageError;
 use picofarm_store::objects::{self, Rereads};
 use picofarm_store::published::Published;
+use picofarm_store::{Cache, StorageError};
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -26,6 +26,7 @@ pub struct Dataset {
     pub(crate) prefix: Path,
     pub(crate) spec: DatasetSpec,
     pub(crate) arrays: Arc<[ArrayCodec]>,
+    pub(crate) cache: Option<Cache>,
 }
 
 /// An array and its chunk codec.
@@ -203,6 +204,7 @@ impl Dataset {
             prefix,
             spec,
             arrays: spec.quantities().into_iter().map(array).collect(),
+            cache: None,
         }
     }
 

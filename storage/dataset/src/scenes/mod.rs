@@ -1,5 +1,6 @@
 //! Data sets and their scenes: creating, publishing, reading, and listing by splits and snapshots.
 
+mod cached;
 pub(crate) mod dataset;
 pub(crate) mod derive;
 pub(crate) mod encode;

@@ -159,16 +159,15 @@ impl Dataset {
         decode: &impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [T]) -> Result<(), StorageError>,
     ) -> Result<(), StorageError> {
         let manifest = self.manifest_once(scene).await?;
-        let path = self.path(&array.layout.key(scene));
-        let bytes = objects::require(&*self.store, &path).await?;
+        let key = array.layout.key(scene);
+        let bytes = self.object(&manifest, &key).await?;
         let len = array.layout.planes() * self.spec.transient_len();
         if target.len() != len {
             // A new allocation is zeroed by the operating system; resizing would touch its pages
             // twice.
             *target = vec![T::default(); len];
         }
-        decode(self, &manifest, array, &bytes, target)
-            .map_err(|e| e.in_object(|| self.shown(&path)))
+        decode(self, &manifest, array, &bytes, target).map_err(|e| self.damaged(e, &manifest, &key))
     }
 
     /// Reads h of a scene as one image per bin: `[bin][row][column]`, the order that networks
@@ -428,7 +427,15 @@ impl Dataset {
         scene: u64,
         array: &ArrayCodec,
     ) -> Result<Vec<T>, StorageError> {
-        let path = self.path(&array.layout.key(scene));
+        let key = array.layout.key(scene);
+        let path = self.path(&key);
+        if self.cache.is_some() {
+            let manifest = self.manifest_once(scene).await?;
+            let bytes = self.object(&manifest, &key).await?;
+            let values = array.codec.decode(&bytes);
+            let values = values.map_err(|e| self.damaged(e, &manifest, &key))?;
+            return Ok(bytemuck::pod_collect_to_vec(&values));
+        }
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
             // Distinguishes an unpublished scene from one with a missing object.
             self.manifest_once(scene).await?;

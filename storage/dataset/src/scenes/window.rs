@@ -3,7 +3,6 @@
 use std::ops::Range;
 
 use bytes::Bytes;
-use object_store::ObjectStoreExt;
 use rayon::prelude::*;
 
 use crate::coding::shard;
@@ -49,8 +48,8 @@ impl Dataset {
         let mut target = vec![0f32; part.len()];
         let decoding = self.decoding(manifest, array);
         let complete = decoding.part(&tiles, chunks, part, &mut target);
-        let path = self.path(&array.layout.key(manifest.scene));
-        let complete = complete.map_err(|e| e.in_object(|| self.shown(&path)))?;
+        let key = array.layout.key(manifest.scene);
+        let complete = complete.map_err(|e| self.damaged(e, manifest, &key))?;
         self.complete(manifest, complete)?;
         Ok(target)
     }
@@ -63,18 +62,18 @@ impl Dataset {
         part: &Part,
         target: &mut [f32],
     ) -> Result<(), StorageError> {
-        let path = self.path(&array.layout.key(manifest.scene));
+        let key = array.layout.key(manifest.scene);
         let tiles = Tiles::new(&self.spec, &array.layout);
         let decoding = self.decoding(manifest, array);
         let decoded = if *part == tiles.whole() {
-            let bytes = picofarm_store::objects::require(&*self.store, &path).await?;
+            let bytes = self.object(manifest, &key).await?;
             decoding.planes(&bytes, target)
         } else {
             let wanted = tiles.touching(part);
             let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
             decoding.part_planes(&tiles, &chunks, part, target)
         };
-        let complete = decoded.map_err(|e| e.in_object(|| self.shown(&path)))?;
+        let complete = decoded.map_err(|e| self.damaged(e, manifest, &key))?;
         self.complete(manifest, complete)
     }
 
@@ -106,10 +105,10 @@ impl Dataset {
             object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
             e => StorageError::store("read", self.shown(&path), e),
         };
-        let index = self.store.get_range(&path, start..entry.size);
+        let index = self.object_range(entry, &path, start..entry.size);
         let index = index.await.map_err(fetch_error)?;
         let index = shard::parse_index(&index, tiles.count(), entry.size)
-            .map_err(|e| e.in_object(|| self.shown(&path)))?;
+            .map_err(|e| self.damaged(e, manifest, &key))?;
         let ranges: Vec<(usize, Range<u64>)> = wanted
             .iter()
             .filter_map(|tile| {
@@ -120,7 +119,7 @@ impl Dataset {
             .collect();
         let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
         // The store's default would fetch gaps of up to a megabyte.
-        let fetch = |range| self.store.get_range(&path, range);
+        let fetch = |range| self.object_range(entry, &path, range);
         let parts = object_store::coalesce_ranges(&only, fetch, GAP);
         let parts = parts.await.map_err(fetch_error)?;
         let mut found = ranges.iter().map(|(tile, _)| *tile).zip(parts).peekable();

@@ -1,5 +1,6 @@
 //! Tests of data sets, in one executable because each one links the whole crate.
 
+mod cached;
 mod common;
 mod faults;
 mod flips;
