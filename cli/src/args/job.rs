@@ -14,6 +14,14 @@ pub enum Job {
         #[arg(long, value_enum)]
         kind: Option<JobKind>,
     },
+    /// Check a job file without a coordinator: fields, files, furniture and stages
+    Check {
+        /// The job file, TOML or JSON; - reads standard input
+        file: PathBuf,
+        /// Use the values of the file's [scale.NAME]
+        #[arg(long, value_name = "NAME")]
+        scale: Option<String>,
+    },
     /// Show what a submission would run and reuse; changes nothing
     Plan {
         /// The job file, TOML or JSON; - reads standard input

@@ -178,6 +178,23 @@ pub enum Command {
         /// Follow until Ctrl-C
         #[arg(long, short)]
         follow: bool,
+        /// With --follow: run this shell command for each new event of --kinds, e.g. to send a
+        /// message. It gets the event as JSON on standard input, and PICOFARM_JOB, PICOFARM_EVENT
+        /// and PICOFARM_MESSAGE
+        #[arg(long, value_name = "COMMAND", requires = "follow")]
+        run: Option<String>,
+        /// With --run: the kinds of events
+        #[arg(
+            long,
+            value_name = "KINDS",
+            value_delimiter = ',',
+            requires = "run",
+            default_value = "ended,cancelled,dead,alarm"
+        )]
+        kinds: Vec<String>,
+        /// With --run: file that keeps the last event that was handled, so that a restart misses none
+        #[arg(long, value_name = "FILE", requires = "run")]
+        cursor: Option<std::path::PathBuf>,
         /// Only the last N lines
         #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
         last: u32,
@@ -210,6 +227,9 @@ pub enum Command {
     /// Manage who may use a coordinator
     #[command(subcommand)]
     Token(Token),
+    /// Make certificates for a farm: an authority of its own in a folder, and one for the
+    /// coordinator; the same command renews the second
+    Certificates(Certificates),
     /// Show the audit log, for administrators: who submitted, stopped, paused, retried or drained
     /// what
     Audit(Audit),
@@ -220,6 +240,11 @@ pub enum Command {
     Config,
     /// Check this machine: memory, disk, store, furniture, graphics processors, coordinator
     Doctor(Doctor),
+    /// Write manual pages, one for each command, to a folder: `man -l FOLDER/picofarm.1`
+    Man {
+        /// The folder, e.g. ~/.local/share/man/man1
+        folder: std::path::PathBuf,
+    },
     /// Print completions for a shell
     Completions {
         /// The shell
@@ -239,6 +264,23 @@ pub enum Assets {
         /// Folder of models [default: the assets folder]
         folder: Option<PathBuf>,
     },
+}
+
+#[derive(Args)]
+pub struct Certificates {
+    /// Folder for ca.pem, ca.key, farm.pem and farm.key
+    pub folder: std::path::PathBuf,
+    /// Names and addresses by which clients and workers reach the coordinator
+    #[arg(
+        long = "host",
+        value_name = "HOSTS",
+        value_delimiter = ',',
+        required = true
+    )]
+    pub hosts: Vec<String>,
+    /// Days for which the coordinator's certificate is valid
+    #[arg(long, default_value_t = 365, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=3650))]
+    pub days: u32,
 }
 
 #[derive(Args)]

@@ -19,6 +19,8 @@ use crate::{
     signals,
 };
 
+use super::hook::Hook;
+
 /// Interval between requests to the coordinator.
 const PAUSE: Duration = Duration::from_millis(500);
 /// Maximum time of a transaction from assigning a number to its end.
@@ -68,8 +70,8 @@ impl Window {
 /// exit code 130.
 pub async fn run(
     follow_on: bool,
-    last: u32,
-    verbose: bool,
+    (last, verbose): (u32, bool),
+    hook: Option<Hook>,
     settings: &Settings,
     output: Output,
 ) -> Result<()> {
@@ -84,7 +86,7 @@ pub async fn run(
         logs: verbose,
     };
     if follow_on {
-        return follow(client, page, output).await;
+        return follow_with(client, page, hook, output).await;
     }
     let (events, _) = client.history(newest(page)).await?;
     output.result(&events, || events.iter().map(|e| line(e, None)).collect());
@@ -112,20 +114,38 @@ fn line(event: &Event, job: Option<JobId>) -> String {
 /// # Errors
 /// Fails if the coordinator refuses, or is unreachable for a minute; Ctrl-C ends it with exit code
 /// 130.
-pub async fn follow(mut client: Client, page: Page, output: Output) -> Result<()> {
+pub async fn follow(client: Client, page: Page, output: Output) -> Result<()> {
+    follow_with(client, page, None, output).await
+}
+
+async fn follow_with(
+    mut client: Client,
+    page: Page,
+    hook: Option<Hook>,
+    output: Output,
+) -> Result<()> {
     let job = page.job;
     let shown = async {
         let mut window = Window::default();
-        let (first, ended) = client.history(newest(page)).await?;
-        window.after = first.first().map_or(0, |event| event.sequence - 1);
-        show(window.take(first, Instant::now()), job, output);
-        if ended {
-            return Ok(());
+        match hook.as_ref().map(Hook::start).transpose()?.flatten() {
+            Some(handled) => window.after = handled,
+            None => {
+                let (first, ended) = client.history(newest(page)).await?;
+                window.after = first.first().map_or(0, |event| event.sequence - 1);
+                let last = first.last().map_or(0, |event| event.sequence);
+                show(&window.take(first, Instant::now()), job, output);
+                if let Some(hook) = &hook {
+                    hook.keep(last)?;
+                }
+                if ended {
+                    return Ok(());
+                }
+            }
         }
         let mut away: Option<Instant> = None;
         loop {
             tokio::time::sleep(PAUSE).await;
-            match news(&mut client, page, &mut window, output).await {
+            match news(&mut client, page, &mut window, hook.as_ref(), output).await {
                 Ok(true) => return Ok(()),
                 Ok(false) => away = None,
                 Err(error) if error.code != Code::Coordinator => return Err(error),
@@ -150,7 +170,13 @@ pub async fn follow(mut client: Client, page: Page, output: Output) -> Result<()
 }
 
 /// Shows new events. Returns whether the job has ended and all its events were shown.
-async fn news(client: &mut Client, of: Page, window: &mut Window, output: Output) -> Result<bool> {
+async fn news(
+    client: &mut Client,
+    of: Page,
+    window: &mut Window,
+    hook: Option<&Hook>,
+    output: Output,
+) -> Result<bool> {
     let mut after = window.after;
     loop {
         let page = Page {
@@ -162,7 +188,13 @@ async fn news(client: &mut Client, of: Page, window: &mut Window, output: Output
         let (events, ended) = client.history(page).await?;
         let whole = events.len() < PAGE as usize;
         after = events.last().map_or(after, |event| event.sequence);
-        show(window.take(events, Instant::now()), of.job, output);
+        let events = window.take(events, Instant::now());
+        show(&events, of.job, output);
+        if let Some(hook) = hook {
+            for event in &events {
+                hook.handle(event, output)?;
+            }
+        }
         if whole {
             window.advance(Instant::now());
             return Ok(ended);
@@ -171,9 +203,9 @@ async fn news(client: &mut Client, of: Page, window: &mut Window, output: Output
 }
 
 /// Shows one event per line.
-fn show(events: Vec<Event>, job: Option<JobId>, output: Output) {
+fn show(events: &[Event], job: Option<JobId>, output: Output) {
     for event in events {
-        output.result(&event, || line(&event, job));
+        output.result(event, || line(event, job));
     }
 }
 

@@ -1,5 +1,6 @@
 //! `picofarm job …`.
 
+mod check;
 mod dark;
 mod explain;
 mod finish;
@@ -38,8 +39,14 @@ use crate::{
 };
 
 pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()> {
-    if let Job::Init { file, kind } = &command {
-        return init(file.as_deref(), *kind, output);
+    match &command {
+        Job::Init { file, kind } => return init(file.as_deref(), *kind, output),
+        Job::Check { file, scale } => {
+            let spec = jobfile::read_counted(file, scale.as_deref(), &settings.assets).await?;
+            check::show(file, &spec, output);
+            return Ok(());
+        }
+        _ => {}
     }
     let mut spec = match &command {
         Job::Plan { file, scale } => {
@@ -75,7 +82,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
     }
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     match command {
-        Job::Init { .. } => Ok(()),
+        Job::Init { .. } | Job::Check { .. } => Ok(()),
         Job::Plan { .. } => {
             let spec = spec.expect("read above");
             let mut plan = client.plan(spec.clone()).await?;

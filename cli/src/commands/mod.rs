@@ -3,6 +3,7 @@
 mod assets;
 mod audit;
 mod capture;
+mod certificates;
 mod completions;
 mod config;
 pub mod coordinator;
@@ -12,6 +13,7 @@ mod demultiplex;
 mod doctor;
 mod events;
 mod figure;
+mod hook;
 pub(crate) mod job;
 pub mod local;
 pub(crate) mod local_worker;
@@ -48,9 +50,16 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
         Command::Workers { what } => workers::run(what, settings, output).await,
         Command::Events {
             follow,
+            run,
+            kinds,
+            cursor,
             last,
             verbose,
-        } => events::run(follow, last, verbose, settings, output).await,
+        } => {
+            let hook = run.map(|command| hook::Hook::new(command, kinds, cursor));
+            let hook = hook.transpose()?;
+            events::run(follow, (last, verbose), hook, settings, output).await
+        }
         Command::Dataset(command) => dataset::run(command, settings, output).await,
         Command::Capture(command) => capture::run(command, output).await,
         Command::Model(command) => model::run(command, output).await,
@@ -63,6 +72,7 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
         Command::Demultiplex(args) => demultiplex::run(args, output).await,
         Command::Figure(args) => figure::run(args, output).await,
         Command::Token(command) => token::run(command, resolved, output).await,
+        Command::Certificates(args) => certificates::run(&args, output),
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,
         Command::Config => {
@@ -70,6 +80,7 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
             Ok(())
         }
         Command::Doctor(args) => doctor::run(args, settings, output).await,
+        Command::Man { folder } => completions::manual(&folder, output),
         Command::Completions { shell } => {
             completions::print(shell);
             Ok(())

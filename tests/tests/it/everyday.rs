@@ -474,3 +474,92 @@ fn names_from_elsewhere_move_no_cursor_and_forge_no_line() {
     assert_harmless(&cli.run(&["job", "plan", "job.toml"]).code(3).stderr);
     assert_harmless(&cli.run(&["dataset", "info", evil]).stderr);
 }
+
+#[test]
+fn a_job_file_is_checked_without_a_coordinator() {
+    let scratch = Scratch::new("check");
+    let cli = Cli::new(scratch.path());
+    cli.run(&["job", "init"]).ok();
+    let checked = cli.json(&["job", "check", "job.toml"]);
+    assert_eq!(checked["stages"][0]["kind"], "render");
+    assert_eq!(checked["stages"][0]["tasks"], checked["tasks"]);
+    let shown = cli.run(&["job", "check", "job.toml"]).ok().stdout;
+    assert!(shown.contains("no fault found"), "{shown}");
+    let text = fs::read_to_string(scratch.join("job.toml")).unwrap();
+    assert!(text.contains("resolution"));
+    let wrong = text.replace("resolution", "resolutoin");
+    fs::write(scratch.join("wrong.toml"), wrong).unwrap();
+    cli.run(&["job", "check", "wrong.toml"])
+        .fails(2, &["wrong.toml", "resolutoin", "resolution"]);
+    cli.run(&["man", "manuals"]).ok();
+    let page = fs::read_to_string(scratch.join("manuals/picofarm-job-check.1")).unwrap();
+    assert!(page.contains("without a coordinator"), "{page}");
+}
+
+#[test]
+fn jobs_are_found_by_number_and_name_and_the_latest_as_last() {
+    let farm = Farm::start("numbers");
+    let first = farm.submit(&Job::quick(&farm.store(), 1));
+    let mut other = Job::quick(&farm.store(), 2);
+    other.name = "other".into();
+    let second = farm.submit(&other);
+    for (name, id) in [
+        ("1", &first),
+        ("2", &second),
+        ("last", &second),
+        ("other", &second),
+    ] {
+        let status = farm.json(&["job", "status", name]);
+        assert_eq!(status["id"].as_str(), Some(id.as_str()), "{name}: {status}");
+    }
+    farm.run(&["job", "status", "3"])
+        .fails(2, &["no job \"3\"", "job list"]);
+    let list = farm.run(&["job", "list"]).ok().stdout;
+    let newest = list.lines().nth(1).unwrap();
+    assert!(
+        newest.starts_with('2') && newest.contains(&second),
+        "{list}"
+    );
+}
+
+#[test]
+fn a_command_runs_once_for_each_job_that_ends_also_after_a_restart() {
+    let farm = Farm::start("hook");
+    let _worker = farm.worker("worker");
+    let said = farm.scratch.join("said");
+    let run = "read event; echo \"$PICOFARM_EVENT $PICOFARM_JOB $event\" >> said; exit 3";
+    let follow = ["events", "--follow", "--cursor", "cursor", "--run", run];
+    let lines = |count: usize| {
+        until("the command", || {
+            let said = fs::read_to_string(&said).unwrap_or_default();
+            let lines: Vec<String> = said.lines().map(String::from).collect();
+            (lines.len() >= count).then_some(lines)
+        })
+    };
+    let mut watching = farm.cli().start("events", &follow);
+    until("the cursor", || {
+        farm.scratch.join("cursor").exists().then_some(())
+    });
+    let first = farm.submit(&Job::quick(&farm.store(), 1));
+    farm.until_ended(&first);
+    let heard = lines(1);
+    assert!(
+        heard[0].starts_with(&format!("ended {first} {{")),
+        "{heard:?}"
+    );
+    watching.until_says("the command ended with exit status: 3");
+    watching.kill();
+    let mut other = Job::quick(&farm.store(), 2);
+    other.name = "other".into();
+    let second = farm.submit(&other);
+    farm.until_ended(&second);
+    let _watching = farm.cli().start("events", &follow);
+    let heard = lines(2);
+    assert!(
+        heard[1].starts_with(&format!("ended {second} {{")),
+        "{heard:?}"
+    );
+    assert_eq!(heard.len(), 2);
+    farm.run(&["events", "--follow", "--run", "true", "--kinds", "end"])
+        .fails(2, &["--kinds", "\"end\"", "ended"]);
+}

@@ -69,6 +69,48 @@ fn token(cli: &Cli, name: &str, roles: &str) -> String {
 }
 
 #[test]
+fn made_certificates_serve_a_farm_and_are_renewed_while_it_runs() {
+    let scratch = Scratch::new("certificates");
+    let cli = Cli::new(scratch.path());
+    let make = ["certificates", "tls", "--host", "localhost,127.0.0.1"];
+    cli.run(&make).ok();
+    for (file, mode) in [("ca.key", 0o600), ("farm.key", 0o600), ("ca.pem", 0o644)] {
+        let meta = fs::metadata(scratch.join("tls").join(file)).unwrap();
+        assert_eq!(meta.permissions().mode() & 0o777, mode, "{file}");
+    }
+    let token = token(&cli, "ada", "view");
+    let tls = ["--tls-cert", "tls/farm.pem", "--tls-key", "tls/farm.key"];
+    let options = [&tls[..], &["--tokens", "tokens.toml"]].concat();
+    let (process, url) = coordinator(&cli, &options);
+    let port = url.rsplit(':').next().unwrap();
+    let list = ["job", "list"];
+    let caller = cli
+        .clone()
+        .with("PICOFARM_CA", "tls/ca.pem")
+        .with("PICOFARM_TOKEN", &token);
+    for host in ["localhost", "127.0.0.1"] {
+        let url = format!("https://{host}:{port}");
+        caller
+            .clone()
+            .with("PICOFARM_COORDINATOR", &url)
+            .run(&list)
+            .ok();
+    }
+    let authority = fs::read(scratch.join("tls/ca.pem")).unwrap();
+    let before = fs::read(scratch.join("tls/farm.pem")).unwrap();
+    cli.run(&make).ok();
+    assert_eq!(fs::read(scratch.join("tls/ca.pem")).unwrap(), authority);
+    assert_ne!(fs::read(scratch.join("tls/farm.pem")).unwrap(), before);
+    let at = caller.with("PICOFARM_COORDINATOR", &url);
+    at.run(&list).ok();
+    process.kill();
+    fs::remove_file(scratch.join("tls/ca.key")).unwrap();
+    cli.run(&make).fails(2, &["ca.pem", "without ca.key"]);
+    cli.run(&["certificates", "other", "--host", "é\u{7f}"])
+        .fails(2, &["--host"]);
+}
+
+#[test]
 fn the_right_certificate_and_token_are_let_in_and_all_others_are_told_why_not() {
     let scratch = Scratch::new("security");
     let cli = Cli::new(scratch.path());

@@ -64,6 +64,14 @@ async fn jobs_come_in_pages_and_the_answer_says_where_the_next_begins() {
         // Ids created at the same time have a common prefix.
         let page = list(&mut farm, found).await.unwrap();
         assert!(page.jobs.iter().any(|job| job.id == ids[2]));
+        for (find, id) in [("last", &ids[0]), ("1", ids.last().unwrap())] {
+            let request = wire::ListJobsRequest {
+                find: find.into(),
+                ..Default::default()
+            };
+            let page = list(&mut farm, request).await.unwrap();
+            assert_eq!((page.jobs.len(), &page.jobs[0].id), (1, id), "{find}");
+        }
     }
 }
 

@@ -97,6 +97,7 @@ async fn pages_hold_every_job_once_the_last_first_and_filters_leave_out_the_othe
             names.extend(page.jobs.iter().map(|job| job.name.clone()));
             for job in &page.jobs {
                 assert_eq!((job.tasks.total, job.tasks.pending), (9, 9), "{job:?}");
+                assert_eq!(job.name, format!("job {}", job.number));
             }
             next.before = page.next;
             if page.next.is_none() {
@@ -116,7 +117,7 @@ async fn pages_hold_every_job_once_the_last_first_and_filters_leave_out_the_othe
         };
         assert_eq!(listed(catalog, &active).await, ["job 6", "job 4"]);
         let id = job(3, "").id.to_string();
-        for text in ["job 3", &id, &id[..20]] {
+        for text in ["job 3", "3", &id, &id[..20]] {
             let find = JobQuery {
                 find: Some(text.into()),
                 ..query(9)
