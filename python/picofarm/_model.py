@@ -24,8 +24,7 @@ class Model:
         name: Name of the model; `picofarm model list` shows all.
 
     Raises:
-        FileNotFoundError: There is no such model.
-        ValueError: Another version made the model.
+        ValueError: There is no such model, or another version made it.
         OSError: The store cannot be read, or the weights are damaged.
     """
 

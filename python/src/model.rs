@@ -109,6 +109,15 @@ impl Model {
             );
             return Err(argument("transient", what));
         }
+        let values = histogram.as_slice().map_err(|_| contiguous("transient"))?;
+        if let Some(i) = values.iter().position(|x| !x.is_finite()) {
+            let (row, column, bin) = (i / bins / width, i / bins % width, i % bins);
+            let what = format!("{} at row {row}, column {column}, bin {bin}", values[i]);
+            return Err(argument(
+                "transient",
+                format!("expected finite numbers, found {what}"),
+            ));
+        }
         let pixels = height * width;
         let timed = question.timed();
         let mut scene = Scene {
@@ -117,10 +126,7 @@ impl Model {
             bins,
             first_m: self.gate.0,
             bin_width_m: self.gate.1,
-            histogram: histogram
-                .as_slice()
-                .map_err(|_| contiguous("transient"))?
-                .to_vec(),
+            histogram: values.to_vec(),
             depth_m: vec![0.0; pixels],
             specular: vec![0; pixels],
             lit: vec![0; pixels * question.spots],

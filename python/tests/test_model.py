@@ -86,7 +86,7 @@ def test_unusable_inputs_are_refused_by_name(store: pathlib.Path) -> None:
         tof.predict(transient[:, 1:])
     with pytest.raises(ValueError, match="transient: expected 3 dimensions"):
         tof.predict(transient[0])
-    with pytest.raises(ValueError, match="transient"):
+    with pytest.raises(ValueError, match="transient: expected finite numbers"):
         tof.predict(np.full_like(transient, np.nan))
     with pytest.raises(ValueError, match="depth: the model needs two-bounce times"):
         lit.predict(transient)
@@ -105,5 +105,5 @@ def test_unusable_inputs_are_refused_by_name(store: pathlib.Path) -> None:
 
 
 def test_a_missing_model_is_named(store: pathlib.Path) -> None:
-    with pytest.raises((FileNotFoundError, KeyError), match="absent"):
+    with pytest.raises(ValueError, match="absent"):
         picofarm.Model(store, "absent")

@@ -192,7 +192,8 @@ pub enum Command {
             default_value = "ended,cancelled,dead,alarm"
         )]
         kinds: Vec<String>,
-        /// With --run: file that keeps the last event that was handled, so that a restart misses none
+        /// With --run: file that keeps the last event that was handled, so that a restart misses
+        /// none
         #[arg(long, value_name = "FILE", requires = "run")]
         cursor: Option<std::path::PathBuf>,
         /// Only the last N lines

@@ -30,8 +30,8 @@ const AUTHORITY: Duration = DAY.saturating_mul(3_650);
 /// Makes the authority unless the folder has one, and a new certificate for the coordinator.
 ///
 /// # Errors
-/// Fails if a host is no name or address, or a file cannot be read or written. An authority is never
-/// replaced.
+/// Fails if a host is no name or address, or a file cannot be read or written. An authority is
+/// never replaced.
 pub fn run(args: &Certificates, output: Output) -> Result<()> {
     let folder = &args.folder;
     fs::create_dir_all(folder).map_err(|e| io(folder.display(), &e))?;
