@@ -91,7 +91,7 @@ impl Cache {
 
     /// Removes what the cache has of an object that turned out damaged.
     pub fn forget(&self, sha256: &str) {
-        // What is not removed is found damaged again, and named again.
+        // A file that remains is found damaged, and removed, at the next read.
         let _ = fs::remove_dir_all(self.0.folder.join(sha256));
     }
 
@@ -122,7 +122,7 @@ impl Inner {
             let _ = fs::remove_file(&path);
             return None;
         };
-        // The time of the last use decides what is removed first. A folder that cannot be written
+        // The time of the last use is the order of removal. A folder that cannot be written
         // loses only that order.
         let now = fs::File::options().append(true).open(&path);
         let _ = now.and_then(|file| file.set_modified(SystemTime::now()));

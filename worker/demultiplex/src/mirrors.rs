@@ -40,7 +40,7 @@ const SCALE: f32 = 0.05;
 /// Share of the pixels with a sure surface that may seem to be behind a wall.
 const OPEN: f32 = 0.02;
 
-/// What is searched.
+/// The search for mirrors.
 pub struct Mirrors<'a> {
     pub rays: &'a Rays,
     pub histogram: &'a [f32],

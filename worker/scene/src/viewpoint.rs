@@ -25,7 +25,7 @@ const STRAY: f32 = 10.0;
 /// The margin around an object in front of the camera.
 const MARGIN: f32 = 1.05;
 
-/// What is known of a viewpoint.
+/// Facts of a viewpoint.
 pub(crate) struct Viewpoint {
     /// The camera's position.
     pub(crate) from: Option<Vec3>,

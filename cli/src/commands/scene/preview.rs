@@ -3,7 +3,7 @@
 
 use picofarm_figures::{Canvas, TEXT, inferno, scene::quantile, viridis};
 
-/// What is drawn.
+/// The picture to draw.
 pub struct Preview<'a> {
     pub width: usize,
     pub height: usize,
