@@ -113,7 +113,7 @@ impl Core {
             .map_or_else(String::new, |at| format!("ends in {}", span(at - now_ms)))
     }
 
-    fn unfinished_tasks(&self, worker: &WorkerEntry) -> u64 {
+    pub(super) fn unfinished_tasks(&self, worker: &WorkerEntry) -> u64 {
         let ranges = worker.leases.iter().filter_map(|id| {
             let stage = self.leases.stage_of(*id)?;
             self.stages.get(&stage)?.held.leased_range(*id)

@@ -121,6 +121,9 @@ impl Life<'_> {
                 Command::FarmSnapshot(reply) => {
                     let _ = reply.send(Ok(self.core.farm_snapshot(self.now())));
                 }
+                Command::Demand(shape, reply) => {
+                    let _ = reply.send(Ok(self.core.demand(&shape, self.now())));
+                }
                 Command::JobSnapshot {
                     job,
                     stage,
