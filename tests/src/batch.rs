@@ -4,9 +4,9 @@ use std::{fs, path::PathBuf, process::Command};
 
 use crate::farm::Farm;
 
-/// Submits, lists and cancels allocations, in the folder of its first argument. At most as many run
-/// as the file `places` says; it refuses while there is a file `closed`. The file `most` has the
-/// largest number of allocations at one time.
+/// Submits, lists and cancels allocations, in the folder of its first argument. The file `places`
+/// has the number of allocations that may run at once, and `most` the largest number that waited or
+/// ran. It refuses while there is a file `closed`.
 const SCRIPT: &str = r#"
 set -eu
 cd "$1"

@@ -46,8 +46,7 @@ pub struct PoolWorker {
 }
 
 impl Client {
-    /// Returns the tasks that wait for workers such as this one. Its name is how the names of the
-    /// pool's workers begin.
+    /// Returns the tasks that wait for workers such as this one, which has the name of the pool.
     pub async fn demand(&mut self, worker: &WorkerHello) -> Result<Demand> {
         let request = wire::GetDemandRequest {
             worker: Some(worker.clone().into()),

@@ -3,6 +3,7 @@
 
 mod command;
 mod decide;
+mod fruitless;
 mod scheduler;
 mod script;
 mod slurm;
@@ -26,6 +27,7 @@ use uuid::Uuid;
 use self::{
     command::Commands,
     decide::{Allocation, Bounds, Decision, decide},
+    fruitless::Fruitless,
     scheduler::{Request, Scheduler},
     slurm::Slurm,
 };
@@ -105,6 +107,7 @@ pub async fn run(what: Autoalloc, settings: &Settings, output: Output) -> Result
         settings,
         client: None,
         surplus: BTreeSet::new(),
+        fruitless: Fruitless::default(),
         refusals: 0,
         pause_until: None,
         said: String::new(),
@@ -142,7 +145,9 @@ struct Pool<'a> {
     /// Allocations that the last decision wanted to cancel. Demand that is absent for one moment
     /// costs no place in the queue.
     surplus: BTreeSet<String>,
-    /// Refusals of the batch system in a row.
+    /// Allocations whose workers have not connected.
+    fruitless: Fruitless,
+    /// Refusals of the batch system, and allocations without a worker, in a row.
     refusals: u32,
     /// No submission before this time.
     pause_until: Option<Instant>,
@@ -158,12 +163,13 @@ impl Pool<'_> {
         let demand = self.demand().await?;
         let listed = self.scheduler.list(&self.request).await;
         let allocations = listed.map_err(|why| CliError::new(Code::Resource, why))?;
+        let prefix = script::prefix(&self.args.pool);
+        self.look(&demand, &allocations, &prefix);
         let bounds = Bounds {
             max_workers: self.args.max_workers,
             backlog: self.args.backlog,
             work_s: self.args.work_per_worker.as_secs_f64(),
         };
-        let prefix = self.hello.name.clone();
         let decision = decide(&demand, &allocations, &bounds, |name, allocation| {
             is_worker(name, &prefix, allocation)
         });
@@ -183,21 +189,60 @@ impl Pool<'_> {
                     continue;
                 }
                 match self.scheduler.cancel(&self.request, id).await {
-                    Ok(()) => round.cancelled.push(id.clone()),
+                    Ok(()) => {
+                        self.fruitless.cancelled(id);
+                        round.cancelled.push(id.clone());
+                    }
                     Err(why) => self.output.warn(format!("warning: {why}")),
                 }
             }
         }
         self.surplus = surplus;
-        let line = words(&round);
-        if line != self.said || once {
-            self.output.result(&round, || line.clone());
-            self.said = line;
+        // Numbers of tasks change all the time; a line is worth it if a number of workers does.
+        let d = &round.decision;
+        let state = format!(
+            "{:?} {:?}",
+            (d.wanted, d.pending, d.running, d.unable, d.submit),
+            (&round.cancelled, &round.refused)
+        );
+        if state != self.said || once {
+            self.output.result(&round, || words(&round));
+            self.said = state;
         }
         match round.refused {
             Some(why) if once => Err(CliError::new(Code::Resource, why)),
             _ => Ok(()),
         }
+    }
+
+    /// Pauses if allocations end before their workers connect.
+    fn look(&mut self, demand: &Demand, allocations: &[Allocation], prefix: &str) {
+        let connected = |a: &Allocation| {
+            let workers = &demand.workers;
+            workers.iter().any(|w| is_worker(&w.name, prefix, a))
+        };
+        let news = self.fruitless.look(allocations, connected);
+        if news.connected {
+            self.refusals = 0;
+            self.pause_until = None;
+        }
+        // Between two rounds, a worker may connect and end only if it is idle for less.
+        if !news.ended.is_empty() && self.args.idle > self.args.every {
+            let pause = self.pause();
+            self.output.warn(format!(
+                "warning: {} ended before a worker connected; the logs of the allocations may tell why; submits again in {}",
+                news.ended.join(", "),
+                duration(pause.as_secs_f64())
+            ));
+        }
+    }
+
+    /// Begins the next pause and returns its length.
+    fn pause(&mut self) -> Duration {
+        let pause = pause(self.refusals);
+        self.refusals += 1;
+        self.pause_until = Some(Instant::now() + pause);
+        pause
     }
 
     /// Submits the decided allocations until one is refused.
@@ -216,15 +261,11 @@ impl Pool<'_> {
             match self.scheduler.submit(&self.request).await {
                 Ok(id) => {
                     round.submitted.push(id);
-                    self.refusals = 0;
                     self.pause_until = None;
                 }
                 Err(why) => {
-                    let pause = pause(self.refusals);
-                    self.refusals += 1;
-                    self.pause_until = Some(Instant::now() + pause);
                     round.refused = Some(why);
-                    round.pause_s = Some(pause.as_secs());
+                    round.pause_s = Some(self.pause().as_secs());
                     return;
                 }
             }
@@ -274,7 +315,9 @@ fn words(round: &Round) -> String {
         // The remaining time is not part of the line, which would change with every round.
         parts.push(match &round.refused {
             Some(_) => format!("submits again in {}", duration(s as f64)),
-            None => "submits nothing for now after a refusal".into(),
+            None => {
+                "submits nothing for now after a refusal or an allocation without a worker".into()
+            }
         });
     }
     if round.dry_run {
@@ -321,7 +364,7 @@ fn hello(pool: &PoolArgs, settings: &Settings) -> WorkerHello {
     WorkerHello {
         id: WorkerId::from_uuid(Uuid::new_v4()),
         incarnation: Incarnation::from_uuid(Uuid::new_v4()),
-        name: script::prefix(&pool.pool),
+        name: pool.pool.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         protocol: PROTOCOL,
         held: Vec::new(),

@@ -9,17 +9,31 @@ use picofarm_proto::{
 };
 use uuid::Uuid;
 
-use super::{stage_entry::StageEntry, state::Core, store_faults::store_of, words::span};
+use super::{
+    pools::PoolFit, stage_entry::StageEntry, state::Core, store_faults::store_of, words::span,
+};
 
 /// The workers that a program can start.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Shape {
-    /// How the names of the pool's workers begin.
-    pub prefix: String,
+    /// Name of the pool. The names of its workers begin with it and a hyphen.
+    pub pool: String,
     /// What each worker has.
     pub abilities: Abilities,
     /// How long each worker may run, milliseconds; `None` without a limit.
     pub lasts_ms: Option<u64>,
+}
+
+impl Shape {
+    /// Returns the pool with regard to a stage that it refuses for this reason, or does not refuse.
+    pub(super) fn fit(&self, refused: Option<String>) -> PoolFit {
+        PoolFit {
+            name: self.pool.clone(),
+            refused,
+            cores: self.abilities.cores,
+            lasts_ms: self.lasts_ms,
+        }
+    }
 }
 
 /// The work that waits for workers of a shape.
@@ -98,14 +112,28 @@ impl Core {
                 refused,
             });
         }
-        let of_pool = self
-            .workers
-            .values()
-            .filter(|w| w.name.starts_with(&shape.prefix));
+        let begins = |name: &str| {
+            let rest = name.strip_prefix(&*shape.pool);
+            rest.is_some_and(|rest| rest.starts_with('-'))
+        };
+        let of_pool = self.workers.values().filter(|w| begins(&w.name));
         demand.workers = of_pool
             .map(|w| (w.name.clone(), self.unfinished_tasks(w)))
             .collect();
         demand
+    }
+
+    /// Records that a program asks for a pool.
+    pub(crate) fn pool_asks(&mut self, shape: &Shape, now_ms: i64) {
+        self.pools.asked(shape, now_ms);
+    }
+
+    /// Returns the pools whose programs run, with regard to a stage.
+    pub(super) fn pools_for(&self, id: StageRef, now_ms: i64) -> Vec<PoolFit> {
+        let pools = self.pools.live(now_ms);
+        pools
+            .map(|shape| shape.fit(self.refuses(id, shape, now_ms)))
+            .collect()
     }
 
     /// Returns why no worker of a shape may run a stage now.

@@ -7,6 +7,7 @@ use picofarm_proto::{
 
 use super::{
     candidate::{Candidate, RunningOn},
+    pools::PoolFit,
     stage_entry::StageEntry,
     state::Core,
     words::span,
@@ -44,6 +45,8 @@ pub(crate) struct JobSnapshot {
     pub elsewhere: u32,
     /// Progress of the requested task, if a worker of this instance has reported on it.
     pub running: Option<RunningOn>,
+    /// Pools of workers that other programs start.
+    pub pools: Vec<PoolFit>,
 }
 
 impl Core {
@@ -194,6 +197,7 @@ impl Core {
             ahead,
             elsewhere: self.peers.workers(),
             running: task.and_then(|task| self.running_on(entry, task)),
+            pools: self.pools_for(here, now_ms),
         }
     }
 

@@ -1398,8 +1398,8 @@ pub struct ListWorkersResponse {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct GetDemandRequest {
-    /// The greeting of such a worker: its abilities, and in ends_in_ms how long it may run. Its name is how the names of the
-    /// pool's workers begin.
+    /// The greeting of such a worker: its abilities, and in ends_in_ms how long it may run. Its name is that of the pool; the
+    /// names of the pool's workers begin with it and a hyphen.
     #[prost(message, optional, tag = "1")]
     pub worker: ::core::option::Option<Hello>,
 }

@@ -137,6 +137,30 @@ fn a_killed_autoalloc_leaves_no_orphan_and_its_successor_doubles_nothing() {
 }
 
 #[test]
+fn allocations_that_end_before_their_workers_connect_are_reported_and_pause_the_pool() {
+    let farm = Farm::start("autoalloc-fruitless");
+    let batch = Batch::new(&farm, 10);
+    farm.submit(&Job::quick(&farm.store(), 1));
+    let env = farm.scratch.join("worker.env");
+    std::fs::write(
+        &env,
+        format!(
+            "PICOFARM_COORDINATOR={}\nPICOFARM_BIN=/nowhere/picofarm\n",
+            farm.url()
+        ),
+    )
+    .expect("the test's folder is writable");
+    private(&env);
+    let file = env.display().to_string();
+    let args = batch.args(&[&POOL[..], &["--worker-env", &file]].concat());
+    let mut pool = farm.cli().start("autoalloc", &words(&args));
+    pool.until_says("1 ended before a worker connected");
+    pool.until_says("submits again in 5.0 s");
+    pool.until_says("2 ended before a worker connected");
+    pool.until_says("submits again in 10.0 s");
+}
+
+#[test]
 fn tasks_that_no_worker_of_the_pool_can_run_start_none_and_are_explained() {
     let farm = Farm::start("autoalloc-unable");
     let batch = Batch::new(&farm, 10);
@@ -169,17 +193,18 @@ fn unusable_settings_are_refused_before_anything_is_submitted() {
             &batch.args(&[&POOL[..], &["--once"], more].concat()),
         ))
     };
-    run(&["--time-limit", "90s"]).fails(2, &["--time-limit", "expected at least 2m"]);
+    let short: Vec<&str> = POOL
+        .iter()
+        .map(|word| if *word == "10m" { "90s" } else { word })
+        .collect();
+    farm.run(&words(&batch.args(&short)))
+        .fails(2, &["--time-limit", "expected at least 2m"]);
     run(&["--pool", "My pool"]).fails(2, &["--pool", "lower-case letters"]);
     let env = farm.scratch.join("worker.env");
     let file = env.display().to_string();
     std::fs::write(&env, "PICOFARM_LOG=info\n").expect("the test's folder is writable");
     run(&["--worker-env", &file]).fails(3, &["mode 644", "chmod 600"]);
-    let chmod = std::process::Command::new("chmod")
-        .arg("600")
-        .arg(&env)
-        .status();
-    assert!(chmod.is_ok_and(|s| s.success()));
+    private(&env);
     run(&["--worker-env", &file]).fails(3, &["no PICOFARM_COORDINATOR=URL"]);
     farm.cli()
         .with("PICOFARM_TOKEN", "secret")

@@ -13,7 +13,7 @@ use crate::{
 
 /// A running allocation whose worker has not connected for this long no longer counts as starting:
 /// its worker is at another coordinator, or has failed.
-const STARTS_WITHIN_S: f64 = 120.0;
+pub const STARTS_WITHIN_S: f64 = 120.0;
 /// Stages named in a reason.
 const NAMED: usize = 3;
 
@@ -50,6 +50,8 @@ pub struct Decision {
     pub starting: u32,
     /// Allocations that run.
     pub running: u32,
+    /// Waiting tasks that no worker of the pool can run.
+    pub unable: u64,
     /// Allocations to submit.
     pub submit: u32,
     /// Ids of waiting allocations to cancel.
@@ -121,6 +123,10 @@ pub fn decide(
         pending: count,
         starting,
         running,
+        unable: {
+            let refused = demand.stages.iter().filter(|s| !s.refused.is_empty());
+            refused.map(|s| s.tasks).sum()
+        },
         submit,
         cancel,
         reason: String::new(),

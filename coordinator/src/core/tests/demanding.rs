@@ -41,7 +41,7 @@ impl World {
 
     fn demand(&self, abilities: Abilities, lasts_ms: Option<u64>) -> Demand {
         let shape = Shape {
-            prefix: "w".into(),
+            pool: "w".into(),
             abilities,
             lasts_ms,
         };
@@ -104,7 +104,7 @@ fn idle_workers_count_once_and_tasks_that_do_not_fit_are_refused_with_the_reason
         };
         assert_eq!((&*first.stage, first.tasks), ("render", super::TASKS));
         assert_eq!((first.idle, &first.refused), (0, &None));
-        assert_eq!(before.workers, [("w0".to_owned(), 0)]);
+        assert_eq!(before.workers, [], "a worker named w0 is not of the pool w");
 
         // The worker takes a first task, whose duration is then known.
         world.act(&Op::Credit(0)).await;

@@ -66,6 +66,7 @@ pub(super) async fn explain(
         ahead,
         elsewhere,
         running,
+        pools,
     } = look;
     let (ahead, unseen) = seen(link, &sight, ahead).await?;
     let reasons = explain::job(&JobFacts {
@@ -84,6 +85,7 @@ pub(super) async fn explain(
         ahead,
         unseen,
         elsewhere,
+        pools,
         running: status.running.clone(),
         setback: setback(link, job).await?,
         now_ms,
@@ -131,7 +133,7 @@ pub(super) async fn demand(
     worker: WorkerHello,
 ) -> Result<wire::GetDemandResponse, Status> {
     let shape = Shape {
-        prefix: worker.name,
+        pool: worker.name,
         abilities: worker.abilities,
         lasts_ms: worker.ends_in_ms,
     };
