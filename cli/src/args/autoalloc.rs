@@ -11,24 +11,31 @@ pub const HAND_OVER: Duration = Duration::from_secs(60);
 
 const SLURM: &str = "\
 Examples:
-  picofarm autoalloc slurm --max-workers 50 --time-limit 1h --cores 8 --memory-gib 12 -- --partition=short
-  picofarm autoalloc slurm --pool gpu --max-workers 4 --time-limit 8h --cores 8 --memory-gib 24 --gpus 1 -- --account=lab
-  picofarm autoalloc slurm --max-workers 50 --time-limit 1h --cores 8 --memory-gib 12 --once --dry-run";
+  picofarm autoalloc slurm --max-workers 50 --time-limit 1h --cores 8 --memory-gib 12 \\
+    -- --partition=short
+  picofarm autoalloc slurm --pool gpu --max-workers 4 --time-limit 8h --cores 8 \\
+    --memory-gib 24 --gpus 1 -- --account=lab
+  picofarm autoalloc slurm --max-workers 50 --time-limit 1h --cores 8 --memory-gib 12 \\
+    --once --dry-run";
 
 const COMMAND: &str = "\
 Each command runs in a shell:
-  --submit  reads the script of a worker from its standard input, submits it as one allocation, and prints the
-            allocation's id. The next --list must contain it.
-  --list    prints a line for each allocation of the pool that waits or runs: ID pending, or ID running SECONDS
-  --cancel  ends the waiting allocation $PICOFARM_ALLOCATION
-They find in their environment: PICOFARM_POOL (a name for the allocations), PICOFARM_CORES, PICOFARM_MEMORY_MIB (to
-request), PICOFARM_GPUS and PICOFARM_TIME_LIMIT_S. The script needs the id of its allocation in SLURM_JOB_ID, PBS_JOBID,
-LSB_JOBID, JOB_ID or PICOFARM_ALLOCATION.
+  --submit  reads the script of a worker from standard input, submits it as one allocation,
+            and prints the allocation's id. The next --list must contain it.
+  --list    prints a line for each allocation of the pool that waits or runs, oldest first:
+            ID pending, or ID running SECONDS
+  --cancel  ends the allocation $PICOFARM_ALLOCATION if it still waits
+
+Their environment has PICOFARM_POOL (the name of the allocations), PICOFARM_CORES,
+PICOFARM_MEMORY_MIB, PICOFARM_GPUS and PICOFARM_TIME_LIMIT_S to request. The script finds the id
+of its allocation in SLURM_JOB_ID, PBS_JOBID, LSB_JOBID, JOB_ID or PICOFARM_ALLOCATION.
 
 Example (PBS):
   picofarm autoalloc command --max-workers 20 --time-limit 2h --cores 8 --memory-gib 12 \\
-    --submit 'qsub -N $PICOFARM_POOL -l select=1:ncpus=$PICOFARM_CORES:mem=${PICOFARM_MEMORY_MIB}mb,walltime=$PICOFARM_TIME_LIMIT_S' \\
-    --list ./list-pbs.sh --cancel 'qdel $PICOFARM_ALLOCATION'";
+    --submit ./submit-pbs.sh --list ./list-pbs.sh --cancel 'qdel $PICOFARM_ALLOCATION'
+where submit-pbs.sh is
+  exec qsub -N $PICOFARM_POOL -l walltime=$PICOFARM_TIME_LIMIT_S \\
+    -l select=1:ncpus=$PICOFARM_CORES:mem=${PICOFARM_MEMORY_MIB}mb";
 
 /// Starts workers by a batch system when tasks wait.
 #[derive(Subcommand)]

@@ -88,7 +88,6 @@ pub async fn run(what: Autoalloc, settings: &Settings, output: Output) -> Result
             (pool, Scheduler::Commands(commands))
         }
     };
-    let on_slurm = matches!(scheduler, Scheduler::Slurm(_));
     let request = Request {
         name: allocation_name(&pool.pool, &settings.coordinator),
         pool: pool.pool.clone(),
@@ -96,7 +95,7 @@ pub async fn run(what: Autoalloc, settings: &Settings, output: Output) -> Result
         memory_mib: (pool.memory_gib * 1024.0 / FOR_TASKS).ceil() as u64,
         gpus: pool.gpus,
         time_limit: pool.time_limit,
-        script: script::script(&pool, settings, on_slurm)?,
+        script: script::script(&pool, settings)?,
     };
     let hello = hello(&pool, settings);
     let stop = signals::stop_on_signal()?;

@@ -81,9 +81,11 @@ impl Core {
             if entry.is_paused() || entry.is_overdue(now_ms) {
                 continue;
             }
-            let ready = self.ready(id, now_ms);
-            demand.unknown |= ready.unknown;
-            let known = ready.known().saturating_sub(self.waits_for_others(id));
+            let free = entry.claimable(now_ms);
+            demand.unknown |= free.unknown;
+            // Unclaimed tasks may include those that run for other jobs.
+            let free = free.known().saturating_sub(self.waits_for_others(id));
+            let known = self.ready_here(id, now_ms).known() + free;
             let same = counted.entry(entry.set()).or_insert(0_u64);
             let tasks = known.saturating_sub(*same);
             *same += tasks;

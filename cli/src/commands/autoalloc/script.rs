@@ -14,11 +14,11 @@ use crate::{
 const IDS: &str = "${SLURM_JOB_ID:-${PBS_JOBID:-${LSB_JOBID:-${JOB_ID:-${PICOFARM_ALLOCATION:?\
                    the id of the allocation}}}}}";
 
-/// Returns the script. On Slurm, the worker knows the end of its job.
+/// Returns the script.
 ///
 /// # Errors
 /// Fails if the file of settings cannot be used, or if there is no way to pass the token on.
-pub fn script(pool: &PoolArgs, settings: &Settings, slurm: bool) -> Result<String> {
+pub fn script(pool: &PoolArgs, settings: &Settings) -> Result<String> {
     let mut text = format!(
         "#!/usr/bin/env bash\n# A worker of the pool {}, submitted by `picofarm autoalloc`.\nset -euo pipefail\n",
         pool.pool
@@ -65,21 +65,18 @@ pub fn script(pool: &PoolArgs, settings: &Settings, slurm: bool) -> Result<Strin
     // The worker replaces the shell, so that signals reach it exactly once.
     let mut worker = format!(
         "exec \"${{program[@]}}\" worker --name \"{}$id@${{node%%.*}}\" --threads {} --memory-gib {} \
-         --exit-idle-s {}",
+         --exit-idle-s {} --end-at {}s",
         prefix(&pool.pool),
         pool.cores,
         pool.memory_gib,
-        pool.idle.as_secs()
+        pool.idle.as_secs(),
+        pool.time_limit.saturating_sub(HAND_OVER).as_secs()
     );
     if pool.gpus > 0 {
         let _ = write!(worker, " --gpus {}", pool.gpus);
     }
     for label in &pool.label {
         let _ = write!(worker, " --label {}", show::argument(label));
-    }
-    if !slurm {
-        let lasts = pool.time_limit.saturating_sub(HAND_OVER).as_secs();
-        let _ = write!(worker, " --end-at {lasts}s");
     }
     line(format_args!("{worker}"));
     Ok(text)

@@ -8,7 +8,6 @@ use super::{
     decide::Allocation,
     scheduler::{Request, output_of},
 };
-use crate::args::HAND_OVER;
 
 /// Variables that Slurm's commands get. sbatch would pass all others on to the job, and Slurm keeps
 /// them on the controller's disk.
@@ -43,7 +42,6 @@ impl Slurm {
             &format!("--cpus-per-task={}", request.cores),
             &format!("--mem={}M", request.memory_mib),
             &format!("--time={}", time(request.time_limit)),
-            &format!("--signal=B:TERM@{}", HAND_OVER.as_secs()),
             &format!("--output=picofarm-{}-%j.log", request.pool),
         ]);
         if request.gpus > 0 {

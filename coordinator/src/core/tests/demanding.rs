@@ -30,13 +30,11 @@ fn concerns_new(op: &Op) -> bool {
 }
 
 impl World {
-    fn abilities(&self) -> Abilities {
+    /// Returns the abilities of a connected worker.
+    fn abilities(&self, w: u8) -> Abilities {
         let mut workers = self.instances[0].core.workers.values();
-        workers
-            .next()
-            .expect("a worker is connected")
-            .abilities
-            .clone()
+        let worker = workers.find(|worker| worker.name == format!("w{w}"));
+        worker.expect("it is connected").abilities.clone()
     }
 
     fn demand(&self, abilities: Abilities, lasts_ms: Option<u64>) -> Demand {
@@ -64,10 +62,11 @@ proptest! {
                 let spec = job(&format!("j{n}"), *priority, WAYS[*way]);
                 world.submit_as(0, "ada", spec).await;
             }
-            for w in 0..NEW {
+            for w in 0..=NEW {
                 world.connect(w, 0).await;
             }
-            let abilities = world.abilities();
+            let abilities = world.abilities(NEW);
+            world.act(&Op::Drop(NEW, true)).await;
             for op in history.iter().filter(|op| !concerns_new(op)) {
                 world.act(op).await;
             }
@@ -96,7 +95,7 @@ fn idle_workers_count_once_and_tasks_that_do_not_fit_are_refused_with_the_reason
         let folder = tempfile::tempdir().unwrap();
         let mut world = World::on_sqlite(folder.path()).await;
         world.connect(0, 0).await;
-        let abilities = world.abilities();
+        let abilities = world.abilities(0);
         world.act(&Op::InstanceBeats(0)).await;
         let before = world.demand(abilities.clone(), None);
         let [first] = &before.stages[..] else {
