@@ -36,6 +36,12 @@ fn once(farm: &Farm, batch: &Batch, more: &[&str]) -> Value {
     farm.json(&words(&batch.args(&more)))
 }
 
+fn private(file: &std::path::Path) {
+    use std::os::unix::fs::PermissionsExt;
+    std::fs::set_permissions(file, std::fs::Permissions::from_mode(0o600))
+        .expect("the test's own file");
+}
+
 fn until_empty(batch: &Batch) {
     until("the last allocation to end", || {
         batch.list().is_empty().then_some(())
