@@ -49,6 +49,9 @@ const STARTS: Duration = Duration::from_secs(10);
 const PAUSE: Duration = Duration::from_secs(5);
 const LONGEST_PAUSE: Duration = Duration::from_secs(600);
 
+/// Times that a single decision waits for the coordinator to know what waits.
+const ASK_AGAIN: u32 = 5;
+
 /// A decision, and what came of it. One line of the output.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Round {
@@ -159,7 +162,15 @@ impl Pool<'_> {
     /// Decides once, and acts.
     async fn round(&mut self, once: bool) -> Result<()> {
         // Before the allocations: a worker that connects in between then counts once, as starting.
-        let demand = self.demand().await?;
+        let mut demand = self.demand().await?;
+        for _ in 0..ASK_AGAIN {
+            if !once || !demand.unknown {
+                break;
+            }
+            // The coordinator reads its catalog once a second.
+            tokio::time::sleep(Duration::from_secs(1)).await;
+            demand = self.demand().await?;
+        }
         let listed = self.scheduler.list(&self.request).await;
         let allocations = listed.map_err(|why| CliError::new(Code::Resource, why))?;
         let prefix = script::prefix(&self.args.pool);

@@ -191,6 +191,42 @@ fn tasks_that_no_worker_of_the_pool_can_run_start_none_and_are_explained() {
 }
 
 #[test]
+fn scenes_longer_than_an_allocation_are_named_before_their_submission_with_parts_that_fit() {
+    let farm = Farm::start("autoalloc-long");
+    let batch = Batch::new(&farm, 0);
+    let file = farm.scratch.join("job.toml");
+    let path = file.display().to_string();
+    let job = Job {
+        resolution: 512,
+        samples: 64,
+        ..Job::quick(&farm.store(), 1)
+    };
+    job.write(&file);
+    let warnings = || farm.json(&["job", "plan", &path])["warnings"].to_string();
+    let before = warnings();
+    assert!(before.contains("no worker is connected"), "{before}");
+    // From its first question on, the coordinator knows the pool.
+    once(&farm, &batch, &["--dry-run"]);
+    let after = warnings();
+    assert!(!after.contains("no worker is connected"), "{after}");
+    assert!(
+        after.contains("workers of pool pool run for 8 min: set `parts = "),
+        "{after}"
+    );
+
+    let id = farm.submit(&Job::quick(&farm.store(), 1));
+    let why = farm.json(&["job", "explain", &id])["reasons"][0].clone();
+    assert_eq!(why["code"], "no_workers", "{why}");
+    assert!(
+        why["words"]
+            .as_str()
+            .expect("words")
+            .contains("pool pool starts workers"),
+        "{why}"
+    );
+}
+
+#[test]
 fn unusable_settings_are_refused_before_anything_is_submitted() {
     let farm = Farm::start("autoalloc-bad");
     let batch = Batch::new(&farm, 10);
@@ -261,10 +297,11 @@ fn on_slurm_a_pool_grows_to_its_bound_survives_its_end_and_shrinks_to_nothing() 
         let events = farm.events_of(&id, kind);
         assert!(events.is_empty(), "leaving is no {kind}: {events:?}");
     }
+    until("the last decision", || {
+        let said = pool.stdout();
+        said.contains("no task waits for this pool; 0 of at most 2")
+            .then_some(())
+    });
     let said = pool.stdout();
     assert!(!said.contains("3 of at most 2"), "{said}");
-    assert!(
-        said.contains("no task waits for this pool; 0 of at most 2"),
-        "{said}"
-    );
 }
