@@ -56,7 +56,7 @@ KillWait=20
 PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 CONF
   for ((node = 1; node <= $1; node++)); do
-    echo "NodeName=n$node NodeHostname=$host NodeAddr=127.0.0.1 Port=$((port + node)) CPUs=1 State=UNKNOWN"
+    echo "NodeName=n$node NodeHostname=$host NodeAddr=127.0.0.1 Port=$((port + node)) CPUs=1 RealMemory=16384 State=UNKNOWN"
   done
 }
 

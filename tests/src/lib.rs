@@ -5,6 +5,7 @@
 //! conditions (status, events, files, logs), never for a fixed time. Each test has a folder of its
 //! own, which is retained if the test fails.
 
+pub mod batch;
 pub mod binary;
 pub mod browser;
 pub mod cli;
@@ -29,6 +30,7 @@ pub mod slurm;
 pub mod store;
 pub mod wait;
 
+pub use batch::Batch;
 pub use browser::Browser;
 pub use cli::{Cli, Ended};
 pub use cluster::Cluster;

@@ -60,6 +60,11 @@ impl Slurm {
         )
     }
 
+    /// Returns the path of the cluster's slurm.conf, for SLURM_CONF.
+    pub fn conf(&self) -> &str {
+        &self.conf
+    }
+
     /// Runs one of Slurm's commands and returns its output.
     ///
     /// # Panics

@@ -1,5 +1,6 @@
 //! The command line. A single definition drives the parser, the help and the completions.
 
+mod autoalloc;
 mod capture;
 mod data;
 mod dataset;
@@ -27,6 +28,7 @@ use std::{ffi::OsString, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
+pub use autoalloc::{Autoalloc, HAND_OVER, PoolArgs};
 pub use capture::{Capture, CaptureImport, CaptureResample};
 pub use data::{
     DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, PresetArg,
@@ -160,6 +162,9 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Run a worker
     Worker(Worker),
+    /// Start workers by a batch system when tasks wait, and let them end when none do
+    #[command(subcommand)]
+    Autoalloc(Autoalloc),
     /// Show a farm, its data sets and light in flight in a browser
     Web(Web),
     /// The process of a worker that `up` or `demo` starts

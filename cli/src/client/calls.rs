@@ -18,7 +18,7 @@ use super::{Client, refused, required, unreadable};
 use crate::error::{CliError, Result};
 
 /// Timeout of calls that read or control.
-const ANSWER: Duration = Duration::from_secs(60);
+pub(super) const ANSWER: Duration = Duration::from_secs(60);
 /// Timeout of planning and submitting, because a large job is compared with the contents of its
 /// stores. Meanwhile, pings show whether the coordinator is alive.
 const SUBMIT: Duration = Duration::from_secs(15 * 60);

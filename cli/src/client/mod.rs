@@ -3,6 +3,7 @@
 
 mod calls;
 mod connection;
+mod demand;
 pub mod follow;
 pub mod jobfile;
 pub mod stores;
@@ -23,7 +24,10 @@ use self::connection::{
 pub use self::{
     calls::{Explained, Listing, Page, Submitted, Watch, Workers},
     connection::{Standing, standing},
+    demand::{Demand, PoolWorker, StageDemand},
 };
+
+use self::calls::ANSWER;
 
 type Jobs = JobsClient<InterceptedService<Channel, Bearer>>;
 

@@ -2,6 +2,7 @@
 
 mod assets;
 mod audit;
+mod autoalloc;
 mod capture;
 mod certificates;
 mod completions;
@@ -41,6 +42,7 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
         Command::Up(args) => up::run(args, settings, output).await,
         Command::Coordinator(args) => coordinator::run(args, output).await,
         Command::Worker(args) => worker::run(args, settings, output).await,
+        Command::Autoalloc(command) => autoalloc::run(command, settings, output).await,
         #[cfg(feature = "web")]
         Command::Web(args) => web::run(args, settings, output).await,
         #[cfg(not(feature = "web"))]

@@ -12,7 +12,8 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::sessions::HeartbeatQueue;
 use crate::core::{
-    EligibleWorkers, FarmSnapshot, JobSnapshot, NewJob, Overlay, Reported, SessionId, ToWorker,
+    Demand, EligibleWorkers, FarmSnapshot, JobSnapshot, NewJob, Overlay, Reported, SessionId,
+    Shape, ToWorker,
 };
 
 /// Sends the answer to a request, or the reason for its refusal.
@@ -86,6 +87,8 @@ pub(crate) enum Command {
     EligibleWorkers(Arc<JobSpec>, Reply<EligibleWorkers>),
     /// Returns this instance's knowledge without a query to the catalog.
     FarmSnapshot(Reply<FarmSnapshot>),
+    /// Returns the tasks that wait for workers of a shape.
+    Demand(Box<Shape>, Reply<Demand>),
     JobSnapshot {
         job: JobId,
         stage: Option<u32>,
@@ -152,6 +155,7 @@ pub(super) fn refuse(command: Command, error: &str) {
         Command::Workers(reply) => no(reply, error),
         Command::EligibleWorkers(_, reply) => no(reply, error),
         Command::FarmSnapshot(reply) => no(reply, error),
+        Command::Demand(_, reply) => no(reply, error),
         Command::JobSnapshot { reply, .. } => no(reply, error),
     }
 }

@@ -2,7 +2,7 @@
 
 use picofarm_proto::spec::JobSpec;
 
-use super::{placement, state::Core};
+use super::{placement, pools::PoolFit, state::Core};
 
 /// Distinct reasons stored for each stage.
 const REASONS: usize = 3;
@@ -27,11 +27,13 @@ pub(crate) struct StageWorkers {
     pub cores: u32,
     /// Distinct reasons why the other workers cannot.
     pub refusals: Vec<String>,
+    /// Pools of workers that other programs start.
+    pub pools: Vec<PoolFit>,
 }
 
 impl Core {
     /// Compares the requirements of a job's stages with the connected workers.
-    pub(crate) fn eligible_workers(&self, spec: &JobSpec) -> EligibleWorkers {
+    pub(crate) fn eligible_workers(&self, spec: &JobSpec, now_ms: i64) -> EligibleWorkers {
         let stages = spec.stages.iter().enumerate().map(|(position, stage)| {
             let known = spec.known(position);
             let mut fit = StageWorkers::default();
@@ -47,6 +49,11 @@ impl Core {
                     Err(_) => {}
                 }
             }
+            let pools = self.pools.live(now_ms).map(|pool| {
+                let fits = placement::may_run(stage, &known, &pool.abilities);
+                pool.fit(fits.err())
+            });
+            fit.pools = pools.collect();
             fit
         });
         EligibleWorkers {

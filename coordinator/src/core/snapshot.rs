@@ -7,6 +7,7 @@ use picofarm_proto::{
 
 use super::{
     candidate::{Candidate, RunningOn},
+    pools::PoolFit,
     stage_entry::StageEntry,
     state::Core,
     words::span,
@@ -44,6 +45,8 @@ pub(crate) struct JobSnapshot {
     pub elsewhere: u32,
     /// Progress of the requested task, if a worker of this instance has reported on it.
     pub running: Option<RunningOn>,
+    /// Pools of workers that other programs start.
+    pub pools: Vec<PoolFit>,
 }
 
 impl Core {
@@ -113,7 +116,7 @@ impl Core {
             .map_or_else(String::new, |at| format!("ends in {}", span(at - now_ms)))
     }
 
-    fn unfinished_tasks(&self, worker: &WorkerEntry) -> u64 {
+    pub(super) fn unfinished_tasks(&self, worker: &WorkerEntry) -> u64 {
         let ranges = worker.leases.iter().filter_map(|id| {
             let stage = self.leases.stage_of(*id)?;
             self.stages.get(&stage)?.held.leased_range(*id)
@@ -194,6 +197,7 @@ impl Core {
             ahead,
             elsewhere: self.peers.workers(),
             running: task.and_then(|task| self.running_on(entry, task)),
+            pools: self.pools_for(here, now_ms),
         }
     }
 

@@ -16,6 +16,7 @@ use super::{
     message::{SessionId, ToWorker},
     outcome::Outcome,
     peers::Peers,
+    pools::Pools,
     refunds::Refunds,
     second_runs::SecondRuns,
     settings::{MakeId, Settings},
@@ -47,6 +48,8 @@ pub(crate) struct Core {
     pub(super) refunds: Refunds,
     /// Other instances.
     pub(super) peers: Peers,
+    /// Pools of workers that other programs start.
+    pub(super) pools: Pools,
     /// Changes to commit, and messages to send.
     pub(super) outcome: Outcome,
 }
@@ -75,6 +78,7 @@ impl Core {
             failing_workers: FailingWorkers::default(),
             refunds: Refunds::default(),
             peers: Peers::default(),
+            pools: Pools::default(),
             outcome: Outcome::new(make_id),
         };
         for job in snapshot.jobs {

@@ -3,6 +3,7 @@
 //! There is one instance on SQLite, or two on Postgres, which lose workers to each other, lose
 //! their time, and lose their memory.
 
+mod demanding;
 mod starving;
 mod troubled;
 mod world;

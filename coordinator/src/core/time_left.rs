@@ -11,7 +11,7 @@ use super::{message::SessionId, state::Core};
 const MARGIN: f64 = 1.25;
 
 /// Returns the expected duration of a task from a measured one.
-fn with_margin(ms: f64) -> i64 {
+pub(super) fn with_margin(ms: f64) -> i64 {
     // The cast saturates.
     (MARGIN * ms) as i64
 }
@@ -43,7 +43,7 @@ impl Core {
 
     /// Returns the expected duration of a task of a stage, milliseconds. Returns `None` if it is
     /// unknown, or if a task continues from its saved progress.
-    fn needs_ms(&self, id: StageRef) -> Option<i64> {
+    pub(super) fn needs_ms(&self, id: StageRef) -> Option<i64> {
         let entry = &self.stages[&id];
         if entry.spec().task.resumes() {
             return None;

@@ -7,7 +7,7 @@ use picofarm_proto::{
     spec::Limits,
 };
 
-use crate::core::{Candidate, RunningOn};
+use crate::core::{Candidate, PoolFit, RunningOn};
 
 /// The facts that decide whether a job's tasks run.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,6 +39,8 @@ pub struct JobFacts {
     pub unseen: u64,
     /// Workers connected to other coordinators.
     pub elsewhere: u32,
+    /// Pools of workers that other programs start.
+    pub pools: Vec<PoolFit>,
     /// Currently running tasks.
     pub running: Vec<RunningTask>,
     /// Latest history line that explains an interruption: a failure, a returned task or an expired

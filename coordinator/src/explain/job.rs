@@ -232,7 +232,8 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     if facts.candidates.is_empty() {
         let words = match facts.elsewhere {
             0 => format!(
-                "no worker is connected, and {tasks} could run: start one with `picofarm worker`{}",
+                "no worker is connected, and {tasks} could run: {}{}",
+                starters(facts),
                 lately(facts)
             ),
             _ => format!(
@@ -344,6 +345,23 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     reason("busy", ready, words)
 }
 
+/// Describes who starts workers, and which pools cannot.
+fn starters(facts: &JobFacts) -> String {
+    let able = facts.pools.iter().find(|pool| pool.refused.is_none());
+    if let Some(pool) = able {
+        return format!(
+            "pool {} starts workers as its batch system allows (`picofarm autoalloc` prints each decision)",
+            pool.name
+        );
+    }
+    let cannot = facts.pools.iter().filter_map(|pool| {
+        let why = pool.refused.as_ref()?;
+        Some(format!("; pool {} starts none: {why}", pool.name))
+    });
+    let cannot: Vec<String> = cannot.collect();
+    format!("start one with `picofarm worker`{}", cannot.concat())
+}
+
 /// Explains the case in which every able worker ends too early.
 fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Reason> {
     if able.iter().any(|c| c.lacks_time.is_none()) {
@@ -352,7 +370,7 @@ fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Re
     let needs = facts.candidates.iter().filter_map(|c| c.lacks_time).min()?;
     let words = format!(
         "no connected worker has {} left for {}: a task is taken to need that long, by those that are done and the attempts that \
-         were interrupted; start a worker that may run longer",
+         were interrupted; start a worker that may run longer, or divide the scenes (`parts` of a render stage)",
         span(needs),
         n(ready, "task")
     );

@@ -41,6 +41,7 @@ fn facts() -> JobFacts {
         ahead: vec![],
         unseen: 0,
         elsewhere: 0,
+        pools: vec![],
         running: vec![],
         setback: None,
         now_ms: NOW,

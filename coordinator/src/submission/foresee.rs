@@ -4,12 +4,12 @@
 
 use picofarm_catalog::{Job, ResultSet, Timing};
 use picofarm_proto::{
-    messages::{Estimate, JobPlan},
-    spec::{JobSpec, StageSpec, TaskSpec},
+    messages::{Estimate, JobPlan, StagePlan},
+    spec::{JobSpec, RenderTask, StageSpec, TaskSpec},
 };
 use picofarm_settings::Budget;
 
-use crate::core::{EligibleWorkers, StageWorkers, plan::changes};
+use crate::core::{EligibleWorkers, StageWorkers, plan::changes, span};
 
 /// Earlier stages with speeds to be looked up, for each stage of a plan.
 pub(super) const SIMILAR: usize = 3;
@@ -99,7 +99,10 @@ pub(super) fn estimate(
         TaskSpec::Render(_) => {
             let room = f64::from(256_u32).powi(2) * ROOM_PATHS;
             let cores = match fit.able {
-                0 => 1.0,
+                0 => {
+                    let pools = fit.pools.iter().filter(|pool| pool.refused.is_none());
+                    f64::from(pools.map(|pool| pool.cores).max().unwrap_or(1).max(1))
+                }
                 able => f64::from(fit.cores.max(1)) / f64::from(able),
             };
             let seconds = ROOM_CPU_S * work(stage) / room / cores;
@@ -116,9 +119,14 @@ pub(super) fn estimate(
 
 /// Returns why no worker can run a stage; `None` if one can.
 fn unplaceable(fit: &StageWorkers, fits: &EligibleWorkers) -> Option<String> {
-    if fit.able > 0 {
+    if fit.able > 0 || fit.pools.iter().any(|pool| pool.refused.is_none()) {
         return None;
     }
+    let pools = fit.pools.iter().filter_map(|pool| {
+        let why = pool.refused.as_ref()?;
+        Some(format!("; pool {} starts none: {why}", pool.name))
+    });
+    let pools: Vec<String> = pools.collect();
     let others = match fits.elsewhere {
         0 => String::new(),
         n => {
@@ -127,10 +135,10 @@ fn unplaceable(fit: &StageWorkers, fits: &EligibleWorkers) -> Option<String> {
     };
     Some(match fits.here {
         0 if fits.elsewhere > 0 => return None,
-        0 => {
-            "no worker is connected: tasks wait until one is (`picofarm worker --coordinator URL`)"
-                .to_owned()
-        }
+        0 => format!(
+            "no worker is connected: tasks wait until one is (`picofarm worker --coordinator URL`){}",
+            pools.concat()
+        ),
         n => format!(
             "{}{others}: {}",
             match n {
@@ -145,6 +153,39 @@ fn unplaceable(fit: &StageWorkers, fits: &EligibleWorkers) -> Option<String> {
     })
 }
 
+/// Returns a warning if a task may take longer than the workers of every able pool run, and no
+/// other worker can run it. It names the number of parts with which a scene fits.
+fn too_long(stage: &StageSpec, planned: &StagePlan, fit: &StageWorkers) -> Option<String> {
+    let able = || fit.pools.iter().filter(|pool| pool.refused.is_none());
+    let seconds = planned.task_seconds.filter(|_| !stage.task.resumes())?;
+    let longest = able().max_by_key(|pool| pool.lasts_ms.unwrap_or(u64::MAX))?;
+    let lasts_s = longest.lasts_ms? as f64 / 1000.0;
+    if fit.able > 0 || seconds.high <= lasts_s {
+        return None;
+    }
+    let ms = |seconds: f64| span((seconds * 1000.0) as i64);
+    let longer = "start the pool with a longer --time-limit";
+    let remedy = match &stage.task {
+        TaskSpec::Render(task) if task.parts == 1 => {
+            let parts = (seconds.high / lasts_s).ceil() + 1.0;
+            let parts = parts.min(f64::from(RenderTask::MAX_PARTS));
+            let samples = match task.render.budget {
+                Budget::Samples(_) => "",
+                Budget::Error(_) => " and `samples` instead of `error`",
+            };
+            format!("set `parts = {parts}`{samples} in this stage, or {longer}")
+        }
+        _ => longer.to_owned(),
+    };
+    Some(format!(
+        "a task is expected to take {} to {}, and workers of pool {} run for {}: {remedy}",
+        ms(seconds.low),
+        ms(seconds.high),
+        longest.name,
+        ms(lasts_s)
+    ))
+}
+
 /// Returns the warnings of a plan. Stages with the same warning share a line.
 pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &EligibleWorkers) -> Vec<String> {
     const NAMED: usize = 3;
@@ -155,7 +196,11 @@ pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &EligibleWorkers) -
     };
     for (stage, (planned, fit)) in spec.stages.iter().zip(plan.stages.iter().zip(&fits.stages)) {
         let unplaceable = (planned.run > 0).then(|| unplaceable(fit, fits)).flatten();
-        for what in unplaceable.into_iter().chain(stage.task.remarks()) {
+        let too_long = (planned.run > 0)
+            .then(|| too_long(stage, planned, fit))
+            .flatten();
+        let about = unplaceable.into_iter().chain(too_long);
+        for what in about.chain(stage.task.remarks()) {
             add(what, &stage.name);
         }
     }
@@ -177,10 +222,10 @@ pub(super) fn warnings(spec: &JobSpec, plan: &JobPlan, fits: &EligibleWorkers) -
 
 #[cfg(test)]
 mod tests {
-    use picofarm_proto::messages::StagePlan;
     use serde_json::json;
 
     use super::*;
+    use crate::core::PoolFit;
 
     fn room(resolution: u32, budget: serde_json::Value) -> StageSpec {
         let mut render = json!({"resolution": resolution, "renderer": "r"});
@@ -203,6 +248,7 @@ mod tests {
             able,
             cores: 4 * able,
             refusals,
+            pools: Vec::new(),
         };
         EligibleWorkers {
             stages: vec![fit],
@@ -282,6 +328,38 @@ mod tests {
         assert!(
             warnings(&spec, &plan(8), &fits(0, &[], 0, 0))[0].contains("no worker is connected")
         );
+        // A pool that can run the tasks starts workers; the reason of another is named.
+        let with_pool = |refused: Option<&str>, lasts_s: u64| {
+            let mut fits = fits(0, &[], 0, 0);
+            fits.stages[0].pools.push(PoolFit {
+                name: "gpu".into(),
+                refused: refused.map(str::to_owned),
+                cores: 8,
+                lasts_ms: Some(1000 * lasts_s),
+            });
+            fits
+        };
+        assert!(warnings(&spec, &plan(8), &with_pool(None, 60)).is_empty());
+        let said = warnings(&spec, &plan(8), &with_pool(Some(why), 60));
+        assert!(
+            said[0].contains(&format!("pool gpu starts none: {why}")),
+            "{said:?}"
+        );
+        // Scenes longer than its workers run are named, with the number of parts that fit.
+        let mut long = plan(8);
+        long.stages[0].task_seconds = Some(Estimate {
+            low: 90.0,
+            high: 360.0,
+        });
+        let said = warnings(&spec, &long, &with_pool(None, 120));
+        assert_eq!(
+            said,
+            [
+                "a task is expected to take 90 s to 6 min, and workers of pool gpu run for 2 min: \
+              set `parts = 4` in this stage, or start the pool with a longer --time-limit"
+            ]
+        );
+        assert!(warnings(&spec, &long, &with_pool(None, 400)).is_empty());
         // There is no warning if nothing runs, if one worker can run it, or if only other
         // coordinators know.
         assert!(warnings(&spec, &plan(0), &fits(0, &[why], 3, 0)).is_empty());

@@ -44,6 +44,40 @@ pub struct AuditEntry {
     #[prost(string, tag = "7")]
     pub detail: ::prost::alloc::string::String,
 }
+/// Waiting tasks of a stage.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StageDemand {
+    /// Empty where the caller may not see the job.
+    #[prost(string, tag = "1")]
+    pub job_id: ::prost::alloc::string::String,
+    /// Name of the stage; empty likewise.
+    #[prost(string, tag = "2")]
+    pub stage: ::prost::alloc::string::String,
+    /// Tasks that could be leased now and that no other stage of this answer counts.
+    #[prost(uint64, tag = "3")]
+    pub tasks: u64,
+    /// Expected seconds of a task on one worker; absent = not known.
+    #[prost(double, optional, tag = "4")]
+    pub task_seconds: ::core::option::Option<f64>,
+    /// Connected workers that have nothing to do and may run them. Each counts for one stage.
+    #[prost(uint32, tag = "5")]
+    pub idle: u32,
+    /// How many more workers may join the job; absent = any number.
+    #[prost(uint32, optional, tag = "6")]
+    pub room: ::core::option::Option<u32>,
+    /// Why a worker of the asked shape cannot run them, for people; empty = it can.
+    #[prost(string, tag = "7")]
+    pub refused: ::prost::alloc::string::String,
+}
+/// A connected worker of a pool.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct PoolWorker {
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// Tasks of its leases that are not done.
+    #[prost(uint64, tag = "2")]
+    pub tasks: u64,
+}
 /// A checked job, as JSON: the same fields and names as in a job file, every default filled in. One description of jobs
 /// serves file, catalog and wire; what this version does not know is refused with the field's name.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1365,6 +1399,25 @@ pub struct ListWorkersResponse {
     #[prost(uint32, tag = "4")]
     pub coordinators: u32,
 }
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetDemandRequest {
+    /// The greeting of such a worker: its abilities, and in ends_in_ms how long it may run. Its name is that of the pool; the
+    /// names of the pool's workers begin with it and a hyphen.
+    #[prost(message, optional, tag = "1")]
+    pub worker: ::core::option::Option<Hello>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetDemandResponse {
+    /// Stages with waiting tasks, in the order in which they get workers.
+    #[prost(message, repeated, tag = "1")]
+    pub stages: ::prost::alloc::vec::Vec<StageDemand>,
+    /// Workers of the pool connected to this coordinator.
+    #[prost(message, repeated, tag = "2")]
+    pub workers: ::prost::alloc::vec::Vec<PoolWorker>,
+    /// Some stages may have more tasks than is known: ask again in a second.
+    #[prost(bool, tag = "3")]
+    pub unknown: bool,
+}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DrainWorkerRequest {
     /// Its id or its name.
@@ -1798,6 +1851,31 @@ pub mod jobs_client {
                 .insert(GrpcMethod::new("picofarm.v1.Jobs", "ListWorkers"));
             self.inner.unary(req, path, codec).await
         }
+        /// The tasks that workers of one shape could take now, for programs that start such workers.
+        pub async fn get_demand(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetDemandRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetDemandResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::SmallCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/picofarm.v1.Jobs/GetDemand",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("picofarm.v1.Jobs", "GetDemand"));
+            self.inner.unary(req, path, codec).await
+        }
         /// A worker connected to this coordinator finishes the task in hand, gives the rest back, and ends.
         pub async fn drain_worker(
             &mut self,
@@ -1963,6 +2041,14 @@ pub mod jobs_server {
             request: tonic::Request<super::ListWorkersRequest>,
         ) -> std::result::Result<
             tonic::Response<super::ListWorkersResponse>,
+            tonic::Status,
+        >;
+        /// The tasks that workers of one shape could take now, for programs that start such workers.
+        async fn get_demand(
+            &self,
+            request: tonic::Request<super::GetDemandRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetDemandResponse>,
             tonic::Status,
         >;
         /// A worker connected to this coordinator finishes the task in hand, gives the rest back, and ends.
@@ -2650,6 +2736,49 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ListWorkersSvc(inner);
+                        let codec = crate::codec::SmallCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/picofarm.v1.Jobs/GetDemand" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetDemandSvc<T: Jobs>(pub Arc<T>);
+                    impl<T: Jobs> tonic::server::UnaryService<super::GetDemandRequest>
+                    for GetDemandSvc<T> {
+                        type Response = super::GetDemandResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetDemandRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Jobs>::get_demand(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetDemandSvc(inner);
                         let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -3,6 +3,7 @@
 
 mod arrays;
 mod attack;
+mod autoalloc;
 mod bad_input;
 mod chaos;
 mod chaos_disks;

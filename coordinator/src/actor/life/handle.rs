@@ -116,10 +116,15 @@ impl Life<'_> {
                     let _ = reply.send(Ok(self.core.everywhere()));
                 }
                 Command::EligibleWorkers(spec, reply) => {
-                    let _ = reply.send(Ok(self.core.eligible_workers(&spec)));
+                    let _ = reply.send(Ok(self.core.eligible_workers(&spec, self.now())));
                 }
                 Command::FarmSnapshot(reply) => {
                     let _ = reply.send(Ok(self.core.farm_snapshot(self.now())));
+                }
+                Command::Demand(shape, reply) => {
+                    let now = self.now();
+                    self.core.pool_asks(&shape, now);
+                    let _ = reply.send(Ok(self.core.demand(&shape, now)));
                 }
                 Command::JobSnapshot {
                     job,

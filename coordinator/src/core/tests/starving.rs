@@ -14,7 +14,7 @@ use super::{
 };
 
 /// A job of one stage with settings that delay it.
-fn job(name: &str, priority: i32, settings: &str) -> JobSpec {
+pub(super) fn job(name: &str, priority: i32, settings: &str) -> JobSpec {
     let text = format!(
         r#"{{"name": "{name}", "priority": {priority}, "scenes": {{"kind": "primitive", "count": 8}},
             "render": {{"renderer": "r"}}, "output": {{"store": "{name}", "dataset": "d"}}, {settings}}}"#
@@ -23,7 +23,7 @@ fn job(name: &str, priority: i32, settings: &str) -> JobSpec {
 }
 
 /// Settings that may delay a stage.
-const WAYS: [&str; 6] = [
+pub(super) const WAYS: [&str; 6] = [
     r#""limits": {"max_failures": 50}"#,
     r#""limits": {"max_failures": 50, "max_crashes": 50}"#,
     r#""limits": {"max_workers": 1, "max_failures": 50}"#,
@@ -83,7 +83,7 @@ impl World {
     }
 }
 
-fn ops() -> impl Strategy<Value = Op> {
+pub(super) fn ops() -> impl Strategy<Value = Op> {
     let w = 0..3u8;
     let kind = prop_oneof![
         4 => Just(FailureKind::User),

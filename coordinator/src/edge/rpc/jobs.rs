@@ -376,6 +376,21 @@ impl Jobs for JobsService {
         Ok(answer)
     }
 
+    async fn get_demand(
+        &self,
+        request: Request<wire::GetDemandRequest>,
+    ) -> Result<Response<wire::GetDemandResponse>, Status> {
+        let (by, account) = (caller(&request), account(&request));
+        let worker = request.into_inner().worker;
+        let worker = worker.ok_or_else(|| invalid(ConvertError::Missing { field: "worker" }))?;
+        let workers = self.link.ask(Command::Workers).await?;
+        let _charge = account
+            .charge("the demand", WORKER * u64::from(workers))
+            .await?;
+        let worker = worker.try_into().map_err(invalid)?;
+        Ok(Response::new(look::demand(&self.link, &by, worker).await?))
+    }
+
     async fn list_audit(
         &self,
         request: Request<wire::ListAuditRequest>,

@@ -1,9 +1,11 @@
 //! Collects the facts for an explanation.
 
+use std::collections::BTreeSet;
+
 use picofarm_catalog::{EventQuery, Owner, ResultSet, Sight};
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    messages::{Event, EventKind},
+    messages::{Event, EventKind, WorkerHello},
     wire,
 };
 use tonic::Status;
@@ -12,7 +14,7 @@ use super::link::Link;
 use crate::{
     actor::Command,
     auth::Caller,
-    core::JobSnapshot,
+    core::{JobSnapshot, Shape},
     explain::{self, JobFacts, TaskFacts},
     memory::Account,
 };
@@ -64,6 +66,7 @@ pub(super) async fn explain(
         ahead,
         elsewhere,
         running,
+        pools,
     } = look;
     let (ahead, unseen) = seen(link, &sight, ahead).await?;
     let reasons = explain::job(&JobFacts {
@@ -82,6 +85,7 @@ pub(super) async fn explain(
         ahead,
         unseen,
         elsewhere,
+        pools,
         running: status.running.clone(),
         setback: setback(link, job).await?,
         now_ms,
@@ -115,6 +119,57 @@ pub(super) async fn explain(
         reasons: reasons.into_iter().map(Into::into).collect(),
         task: explained.map(Into::into),
         may_change: link.has_right(by, job).await?,
+    })
+}
+
+/// Returns the tasks that wait for workers of one shape. Jobs that the caller may not see have
+/// neither ids nor names.
+///
+/// # Errors
+/// Returns UNAVAILABLE if the catalog fails.
+pub(super) async fn demand(
+    link: &Link,
+    by: &Caller,
+    worker: WorkerHello,
+) -> Result<wire::GetDemandResponse, Status> {
+    let shape = Shape {
+        pool: worker.name,
+        abilities: worker.abilities,
+        lasts_ms: worker.ends_in_ms,
+    };
+    let demand = link
+        .ask(|reply| Command::Demand(Box::new(shape), reply))
+        .await?;
+    let sight = by.sight(link.visibility);
+    let jobs: BTreeSet<JobId> = demand.stages.iter().map(|stage| stage.job).collect();
+    let (seen, _) = seen(link, &sight, jobs.into_iter().collect()).await?;
+    let mut stages = Vec::new();
+    for stage in demand.stages {
+        let seen = seen.contains(&stage.job);
+        if stage.refused.is_some() && !seen {
+            continue;
+        }
+        stages.push(wire::StageDemand {
+            job_id: if seen {
+                stage.job.to_string()
+            } else {
+                String::new()
+            },
+            stage: if seen { stage.stage } else { String::new() },
+            tasks: stage.tasks,
+            task_seconds: stage.task_seconds,
+            idle: stage.idle,
+            room: stage.room.map(|n| u32::try_from(n).unwrap_or(u32::MAX)),
+            refused: stage.refused.unwrap_or_default(),
+        });
+    }
+    let workers = demand.workers.into_iter();
+    Ok(wire::GetDemandResponse {
+        stages,
+        workers: workers
+            .map(|(name, tasks)| wire::PoolWorker { name, tasks })
+            .collect(),
+        unknown: demand.unknown,
     })
 }
 

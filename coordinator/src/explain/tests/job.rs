@@ -7,7 +7,7 @@ use picofarm_proto::messages::{
 
 use super::{NOW, able, event, facts, failed, id};
 use crate::{
-    core::{Candidate, NotEligible},
+    core::{Candidate, NotEligible, PoolFit},
     explain::{facts::JobFacts, job},
 };
 
@@ -48,6 +48,25 @@ fn a_waiting_job_says_what_it_waits_for() {
     assert_eq!(code, "no_workers");
     assert!(
         words.contains("10 tasks") && words.contains("picofarm worker"),
+        "{words}"
+    );
+
+    let pool = |refused: Option<&str>| JobFacts {
+        pools: vec![PoolFit {
+            name: "gpu".into(),
+            refused: refused.map(str::to_owned),
+            cores: 8,
+            lasts_ms: Some(60_000),
+        }],
+        ..none.clone()
+    };
+    let (code, words) = first(&pool(None));
+    assert_eq!(code, "no_workers");
+    assert!(words.contains("pool gpu starts workers"), "{words}");
+    let (_, words) = first(&pool(Some("the stage needs 9 cores")));
+    assert!(
+        words.contains("picofarm worker")
+            && words.contains("pool gpu starts none: the stage needs 9 cores"),
         "{words}"
     );
 

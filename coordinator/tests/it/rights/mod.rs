@@ -109,6 +109,18 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
             }
         ),
         "ListWorkers" => code!(list_workers, wire::ListWorkersRequest {}),
+        "GetDemand" => code!(
+            get_demand,
+            wire::GetDemandRequest {
+                worker: Some(wire::Hello {
+                    worker_id: uuid::Uuid::new_v4().to_string(),
+                    incarnation: uuid::Uuid::new_v4().to_string(),
+                    name: "pool".into(),
+                    version: "1".into(),
+                    ..Default::default()
+                })
+            }
+        ),
         "DrainWorker" => code!(
             drain_worker,
             wire::DrainWorkerRequest {
